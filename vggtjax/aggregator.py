@@ -1,0 +1,141 @@
+"""Alternating frame and global attention as one scan over stacked pairs of blocks (VGGT)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jaxtyping import Array, Bool, Float
+
+from vggtjax.attention import Suppression
+from vggtjax.config import Suppress, VGGTConfig
+from vggtjax.layers import Block, Params, init_stacked
+from vggtjax.motion import GramCues
+from vggtjax.precision import full_precision
+from vggtjax.rope import rope_table
+
+REGISTERS = 4
+SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
+
+Capture = Callable[[Float[Array, "B S T E"]], Any]
+
+
+def identity(tokens: Float[Array, "B S T E"]) -> Float[Array, "B S T E"]:
+    """Capture a tap whole: frame output next to global output, E = 2C."""
+    return tokens
+
+
+@full_precision
+def aggregate(
+    params: Params,
+    patch_tokens: Float[Array, "B S P C"],
+    config: VGGTConfig,
+    grid: tuple[int, int],
+    *,
+    captures: Sequence[Capture],
+    cues: GramCues | None = None,
+    dynamic_tokens: Bool[Array, "B S h w"] | None = None,
+    suppress: Suppress = "zero",
+    mask_pairs: int = 5,
+    compute_dtype: str = "float32",
+) -> tuple[tuple[Any, ...], Any]:
+    """Run the alternating blocks; return what `captures` keep of the tapped pairs, and the cues' sums.
+
+    Args:
+        params: the model's parameter tree (`aggregator` is read).
+        patch_tokens: what `encode` returned.
+        grid: rows and columns of patches, h and w.
+        captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Nothing
+            else of the tapped pairs is stored, and nothing at all of the others.
+        cues: the Gram cues to accumulate from q and k of the global blocks, or None.
+        dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs, in both blocks of a pair.
+    """
+    params = params["aggregator"]
+    B, S, P, C = patch_tokens.shape
+    T = SPECIAL_TOKENS + P
+    block = _block(config, compute_dtype)
+    head_dim = C // config.num_heads
+    frame_rope = rope_table(grid, SPECIAL_TOKENS, head_dim)
+    global_rope = rope_table(grid, SPECIAL_TOKENS, head_dim, repeats=S)
+
+    def suppression(active: Bool[Array, ""], rows: int) -> Suppression | None:
+        if dynamic_tokens is None:
+            return None
+        keys = jnp.pad(dynamic_tokens.reshape(B, S, P), ((0, 0), (0, 0), (SPECIAL_TOKENS, 0)))  # [B, S, T]
+        return Suppression(keys.reshape(rows, -1), active, suppress)
+
+    def pair(carry, layer):
+        x, taps, sums = carry
+        frame_params, global_params, masked, tapped, cued = layer
+        x, _, _ = block.apply({"params": frame_params}, x.reshape(B * S, T, C), frame_rope, suppression(masked, B * S))
+        frame = x
+        x, q, k = block.apply({"params": global_params}, x.reshape(B, S * T, C), global_rope, suppression(masked, B))
+        if cues is not None:
+            sums = cues.add(sums, cued, *(_patches(a, B, S, T) for a in (q, k)))
+        taps = tuple(
+            jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
+            for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
+        )
+        return (x.reshape(B, S, T, C), taps, sums), None
+
+    index = np.arange(config.depth)
+    layers = (
+        params["frame_blocks"],
+        params["global_blocks"],
+        jnp.asarray(index) < mask_pairs,
+        jnp.asarray(index[:, None] == np.asarray(config.taps)[None]),
+        None if cues is None else jnp.asarray(cues.active_layers()),
+    )
+    taps = tuple(_empty(capture, (B, S, T, 2 * C)) for capture in captures)
+    sums = None if cues is None else cues.zeros(B, S, P)
+    (_, taps, sums), _ = jax.lax.scan(pair, (_tokens(params, patch_tokens), taps, sums), layers)
+    return taps, sums
+
+
+def init_aggregator(key: Array, config: VGGTConfig) -> Params:
+    """Return random parameters of the aggregator."""
+    keys = iter(jax.random.split(key, 4))
+    C = config.embed_dim
+    normal = nn.initializers.normal(0.02)
+    x = jnp.zeros((1, 1, C))
+    return {
+        "camera_token": normal(next(keys), (2, 1, C)),
+        "register_tokens": normal(next(keys), (2, REGISTERS, C)),
+        "frame_blocks": init_stacked(_block(config), next(keys), config.depth, x),
+        "global_blocks": init_stacked(_block(config), next(keys), config.depth, x),
+    }
+
+
+def _block(config: VGGTConfig, dtype: str = "float32") -> Block:
+    return Block(config.num_heads, qk_norm=True, dtype=jnp.dtype(dtype))
+
+
+def _tokens(params: Params, patch_tokens: Float[Array, "B S P C"]) -> Float[Array, "B S T C"]:
+    """Prepend camera and register tokens: variant 0 for the clip's first frame, variant 1 for all others."""
+    B, S, _, C = patch_tokens.shape
+    special = jnp.concatenate([params["camera_token"], params["register_tokens"]], axis=1)  # [2, 5, C]
+    special = special.astype(patch_tokens.dtype)[(np.arange(S) > 0).astype(int)]  # [S, 5, C]
+    return jnp.concatenate([jnp.broadcast_to(special, (B, S, SPECIAL_TOKENS, C)), patch_tokens], axis=2)
+
+
+def _patches(x: Float[Array, "B ST N D"], B: int, S: int, T: int) -> Float[Array, "B S P N D"]:
+    return x.reshape(B, S, T, *x.shape[2:])[:, :, SPECIAL_TOKENS:]
+
+
+def _captured(capture: Capture, shape: tuple[int, int, int, int]) -> Callable:
+    """The branch of a tapped pair: join frame and global output, keep what `capture` makes of them."""
+
+    def branch(frame, x, tap):
+        del tap
+        return capture(jnp.concatenate([frame.reshape(shape), x.reshape(shape)], axis=-1))
+
+    return branch
+
+
+def _empty(capture: Capture, shape: tuple[int, ...]) -> Any:
+    kept = jax.eval_shape(capture, jax.ShapeDtypeStruct(shape, jnp.float32))
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), kept)

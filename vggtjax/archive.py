@@ -1,0 +1,104 @@
+"""Reading and writing .npz files of plain arrays: nothing is unpickled and sizes are checked before they are read."""
+
+from __future__ import annotations
+
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from tokenize import TokenError
+from typing import IO, NamedTuple
+
+import numpy as np
+
+from vggtjax.errors import ResultError
+
+SIZE_LIMIT = 64 * 2**30  # bytes of all arrays of one archive
+
+
+# What zipfile and numpy raise on files that are cut off or changed.
+_BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, SyntaxError, TokenError, RuntimeError)
+
+
+class Header(NamedTuple):
+    """What the header of a stored array says."""
+
+    dtype: np.dtype
+    shape: tuple[int, ...]
+
+
+def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write `arrays` to a compressed .npz file."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def read_headers(path: Path) -> dict[str, Header]:
+    """Return the type and shape of every array of an .npz file, without reading the arrays.
+
+    Raises ResultError for a file that is not a whole .npz, has arrays of Python objects, or is larger than SIZE_LIMIT;
+    the message says "it" and leaves naming the file to the caller.
+    """
+    with _opened(path) as archive:
+        return {name: _read_header(file, member) for name, member, file in _members(archive)}
+
+
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file; raises what `read_headers` raises."""
+    arrays = {}
+    with _opened(path) as archive:
+        for name, member, file in _members(archive):
+            _read_header(file, member)
+            file.seek(0)
+            arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
+    return arrays
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield archive
+    except ResultError:
+        raise
+    except OSError as error:
+        raise ResultError(f"it cannot be read ({error.strerror or error})") from error
+    except (*_BROKEN, MemoryError) as error:
+        raise ResultError(f"it is not a whole .npz file ({error})") from error
+
+
+def _members(archive: zipfile.ZipFile) -> Iterator[tuple[str, zipfile.ZipInfo, IO[bytes]]]:
+    members = archive.infolist()
+    total = sum(member.file_size for member in members)
+    if total > SIZE_LIMIT:
+        raise ResultError(f"its arrays take {total} bytes; expected at most {SIZE_LIMIT}")
+    if len({member.filename for member in members}) < len(members):
+        raise ResultError("it holds two arrays of the same name")
+    for member in members:
+        name, dot, suffix = member.filename.rpartition(".")
+        if not dot or suffix != "npy":
+            raise ResultError(f"it holds {member.filename!r}; expected arrays only")
+        if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ResultError(f"array '{name}' is compressed in a way that numpy does not write")
+        with archive.open(member) as file:
+            yield name, member, file
+
+
+def _read_header(file: IO[bytes], member: zipfile.ZipInfo) -> Header:
+    version = np.lib.format.read_magic(file)
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in readers:
+        raise ResultError(f"{member.filename} has version {version} of the array format; expected (1, 0) or (2, 0)")
+    shape, fortran_order, dtype = readers[version](file)
+    if dtype.hasobject:
+        raise ResultError(f"{member.filename} holds Python objects, which are never loaded")
+    if fortran_order and len(shape) > 1:
+        raise ResultError(f"{member.filename} is stored by columns; expected rows")
+    size = dtype.itemsize
+    for length in shape:
+        size *= length
+    if size != member.file_size - file.tell():
+        raise ResultError(f"{member.filename} is {member.file_size - file.tell()} bytes long; its header says {size}")
+    return Header(dtype, shape)

@@ -1,0 +1,207 @@
+"""DPT head: tapped tokens -> a dense map per frame (VGGT; Vision Transformers for Dense Prediction, 2103.13413)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jaxtyping import Array, Float
+
+from vggtjax.config import VGGTConfig
+from vggtjax.layers import LayerNorm, Params
+from vggtjax.precision import full_precision
+
+HIDDEN = 32
+FRAMES_AT_ONCE = 4  # bounds the memory of the full-resolution maps
+
+
+class TapProjection(nn.Module):
+    """Norm and 1 x 1 convolution of one tap. The norm is shared by the four taps of a head."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, tokens: Float[Array, "... E"]) -> Float[Array, "... F"]:
+        return nn.Dense(self.features, name="projection")(LayerNorm(name="norm")(tokens))
+
+
+class DepthToSpace(nn.Module):
+    """Transposed convolution whose stride is its kernel size: every input pixel becomes its own square."""
+
+    factor: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "F h w C"]) -> Float[Array, "F H W C"]:
+        F, h, w, C = x.shape
+        s = self.factor
+        kernel = self.param("kernel", nn.initializers.lecun_normal(0, -1, batch_axis=(1, 2)), (C, s, s, C))
+        bias = self.param("bias", nn.initializers.zeros, (C,))
+        x = jnp.einsum("fhwc,cabo->fhawbo", x, kernel.astype(x.dtype)).reshape(F, h * s, w * s, C)
+        return x + bias.astype(x.dtype)[None, None, None]
+
+
+class ResidualUnit(nn.Module):
+    """Two convolutions around a skip that adds relu(x), as the published weights were trained with."""
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "F h w C"]) -> Float[Array, "F h w C"]:
+        C = x.shape[-1]
+        x = nn.relu(x)
+        y = nn.relu(nn.Conv(C, (3, 3), name="conv1")(x))
+        return x + nn.Conv(C, (3, 3), name="conv2")(y)
+
+
+class Fusion(nn.Module):
+    """Merge a coarser map with a lateral one, and resize the result."""
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "F h w C"], lateral: Float[Array, "F h w C"] | None, size: tuple[int, int]
+    ) -> Float[Array, "F H W C"]:
+        if lateral is not None:
+            x = x + ResidualUnit(name="residual1")(lateral)
+        x = ResidualUnit(name="residual2")(x)
+        x = nn.Dense(x.shape[-1], name="projection")(x)  # 1 x 1: commutes with the resize, and is cheaper before it
+        return resize_aligned(x, size)
+
+
+class DPTFeatures(nn.Module):
+    """Reassemble four projected taps into one map at eight times the patch grid (four levels, coarse to fine)."""
+
+    features: int
+    out_features: int
+    position_embedding: bool = True
+
+    @nn.compact
+    def __call__(self, taps: list[Float[Array, "F h w C"]]) -> Float[Array, "F 8h 8w O"]:
+        h, w = taps[0].shape[1:3]
+        if self.position_embedding:
+            taps = [add_positions(tap, aspect=w / h) for tap in taps]
+        levels = [
+            DepthToSpace(4, name="upsample0")(taps[0]),
+            DepthToSpace(2, name="upsample1")(taps[1]),
+            taps[2],
+            nn.Conv(taps[3].shape[-1], (3, 3), strides=(2, 2), padding=1, name="downsample3")(taps[3]),
+        ]
+        levels = [
+            nn.Conv(self.features, (3, 3), use_bias=False, name=f"level{i}")(level) for i, level in enumerate(levels)
+        ]
+        x, lateral = levels[3], None
+        for i in (3, 2, 1, 0):
+            lateral = levels[i] if i < 3 else None
+            size = levels[i - 1].shape[1:3] if i else (2 * x.shape[1], 2 * x.shape[2])
+            x = Fusion(name=f"fusion{i}")(x, lateral, size)
+        return nn.Conv(self.out_features, (3, 3), name="output")(x)
+
+
+class Regression(nn.Module):
+    """Last convolutions at full resolution: features -> values and a confidence logit."""
+
+    channels: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "F H W C"]) -> Float[Array, "F H W O"]:
+        x = nn.relu(nn.Conv(HIDDEN, (3, 3), name="conv1")(x))
+        return nn.Dense(self.channels, name="conv2")(x)
+
+
+CHANNELS = {"depth": 2, "points": 4}  # values and confidence logit of the heads that regress
+
+
+def project_tap(params: Params, tokens: Float[Array, "... E"], slot: int, config: VGGTConfig) -> Float[Array, "... F"]:
+    """Return what a head reads of the tap in `slot`: all that needs to be stored of it."""
+    weights = {"norm": params["norm"], "projection": params[f"projection{slot}"]}
+    return TapProjection(config.dpt_channels[slot]).apply({"params": weights}, tokens)
+
+
+@full_precision
+def predict_dense(
+    params: Params, taps: list[Float[Array, "B S P F"]], config: VGGTConfig, grid: tuple[int, int], kind: str
+) -> tuple[Float[Array, "B S H W V"], Float[Array, "B S H W"]]:
+    """Return a dense head's values and confidence (1 + exp(c), at least 1) at full resolution.
+
+    Args:
+        params: the head's parameters (`depth_head` or `point_head` of the model's tree).
+        taps: what `project_tap` returned for the four taps.
+        config: the model's configuration.
+        grid: rows and columns of patches.
+        kind: "depth" (V = 1, exp(x)) or "points" (V = 3, sign(x) (exp|x| - 1)).
+    """
+    (h, w), p = grid, config.patch_size
+    B, S = taps[0].shape[:2]
+
+    def one_frame(frame_taps: list[Float[Array, "P F"]]) -> Float[Array, "H W O"]:
+        maps = [tap.reshape(1, h, w, tap.shape[-1]) for tap in frame_taps]
+        features = _features(config).apply({"params": params["features"]}, maps)
+        x = add_positions(resize_aligned(jnp.asarray(features), (h * p, w * p)), aspect=w / h)
+        return jnp.asarray(Regression(CHANNELS[kind]).apply({"params": params["regression"]}, x))[0]
+
+    frames = [tap.reshape(B * S, *tap.shape[2:]) for tap in taps]
+    out = jax.lax.map(one_frame, frames, batch_size=min(FRAMES_AT_ONCE, B * S))
+    out = out.reshape(B, S, h * p, w * p, CHANNELS[kind])
+    values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
+    if kind == "depth":
+        return jnp.exp(values), confidence
+    return jnp.sign(values) * jnp.expm1(jnp.abs(values)), confidence
+
+
+def init_dense_head(key: Array, config: VGGTConfig, kind: Literal["depth", "points"]) -> Params:
+    """Return random parameters of a head that regresses a dense map."""
+    feature_key, regression_key = jax.random.split(key)
+    x = jnp.zeros((1, 1, 1, config.dpt_features // 2))
+    return init_features(feature_key, config, _features(config)) | {
+        "regression": Regression(CHANNELS[kind]).init(regression_key, x)["params"]
+    }
+
+
+def init_features(key: Array, config: VGGTConfig, features: DPTFeatures) -> Params:
+    """Return random parameters of the tap projections and of the reassembly that follows them."""
+    keys = iter(jax.random.split(key, 5))
+    params, maps = {}, []
+    for slot, channels in enumerate(config.dpt_channels):
+        weights = TapProjection(channels).init(next(keys), jnp.zeros((1, config.camera_dim)))["params"]
+        params |= {"norm": weights["norm"], f"projection{slot}": weights["projection"]}
+        maps.append(jnp.zeros((1, 1, 1, channels)))
+    return params | {"features": features.init(next(keys), maps)["params"]}
+
+
+def resize_aligned(x: Float[Array, "F h w C"], size: tuple[int, int]) -> Float[Array, "F H W C"]:
+    """Resize bilinearly with aligned corners: the centres of corner pixels map onto each other."""
+    for axis, length in zip((1, 2), size, strict=True):
+        if x.shape[axis] == length:
+            continue
+        step = (x.shape[axis] - 1) / max(length - 1, 1)
+        position = np.arange(length, dtype=np.float32) * np.float32(step)
+        low = np.minimum(position.astype(np.int32), x.shape[axis] - 1)
+        high = np.minimum(low + 1, x.shape[axis] - 1)
+        shape = [length if i == axis else 1 for i in range(4)]
+        fraction = jnp.asarray((position - low).reshape(shape), x.dtype)
+        x = jnp.take(x, low, axis=axis) * (1 - fraction) + jnp.take(x, high, axis=axis) * fraction
+    return x
+
+
+def add_positions(x: Float[Array, "F h w C"], aspect: float, weight: float = 0.1) -> Float[Array, "F h w C"]:
+    """Add a sinusoidal embedding of the position on the image plane, whose diagonal has length 2."""
+    h, w, C = x.shape[1:]
+    diagonal = (1 + aspect**2) ** 0.5
+    u, v = (
+        np.linspace(-span * (n - 1) / n, span * (n - 1) / n, n) for span, n in ((aspect / diagonal, w), (1 / diagonal, h))
+    )
+    frequencies = 1.0 / 100.0 ** (np.arange(C // 4) / (C / 4))
+
+    def waves(position):
+        angles = position[:, None] * frequencies
+        return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)
+
+    across, down = waves(u), waves(v)  # [w, C/2], [h, C/2]
+    embedding = np.concatenate(
+        [np.broadcast_to(across[None], (h, w, C // 2)), np.broadcast_to(down[:, None], (h, w, C // 2))], axis=-1
+    )
+    return x + jnp.asarray(weight * embedding, x.dtype)[None]
+
+
+def _features(config: VGGTConfig) -> DPTFeatures:
+    return DPTFeatures(config.dpt_features, config.dpt_features // 2)

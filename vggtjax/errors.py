@@ -1,0 +1,32 @@
+"""Exceptions of the public boundary: one clear sentence each; the command line turns them into exit code 2."""
+
+
+class VggtjaxError(Exception):
+    """Base of everything that this library raises on purpose."""
+
+
+class InputError(VggtjaxError, ValueError):
+    """An argument has a value that cannot work."""
+
+
+class ClipError(InputError):
+    """Frames or video that cannot be read, or cannot be used as a clip."""
+
+
+class CheckpointError(InputError):
+    """Weights that cannot be read, or are not those of the model they are said to be."""
+
+
+class ResultError(InputError):
+    """A folder or file that is not a result of this library."""
+
+
+class OutputError(VggtjaxError, OSError):
+    """Results that cannot be written."""
+
+
+class MissingExtraError(VggtjaxError, ImportError):
+    """An optional dependency that is not installed; the message names the extra that brings it."""
+
+    def __init__(self, purpose: str, extra: str) -> None:
+        super().__init__(f"{purpose} needs the extra '{extra}': pip install 'vggtjax[{extra}]'")

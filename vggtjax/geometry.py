@@ -1,0 +1,119 @@
+"""Pinhole cameras on the host: inverses, unprojection, fields of view, frusta. OpenCV axes: x right, y down, z forward.
+
+Pixel coordinates put edges at integers: a picture spans [0, W] x [0, H] and the centre of its first pixel is (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Float32
+
+from vggtjax.errors import ResultError
+
+FIELD_OF_VIEW_RANGE = (0.01, 3.1)  # radians; beyond it a pinhole camera has no usable focal length
+_FIELD_OF_VIEW_SLACK = 1e-6  # radians; a clamped camera that went through float32 is not clamped again
+
+
+def camera_centres(camera_from_world: Float32[np.ndarray, "S 3 4"]) -> Float32[np.ndarray, "S 3"]:
+    """Return the camera centres in the world, -R^T t."""
+    rotation, translation = camera_from_world[..., :3], camera_from_world[..., 3]
+    return -np.einsum("sji,sj->si", rotation, translation)
+
+
+def world_from_camera(camera_from_world: Float32[np.ndarray, "S 3 4"]) -> Float32[np.ndarray, "S 4 4"]:
+    """Invert rigid transforms: rotation R^T, translation -R^T t, last row (0, 0, 0, 1)."""
+    inverse = np.zeros((len(camera_from_world), 4, 4), camera_from_world.dtype)
+    inverse[:, :3, :3] = camera_from_world[..., :3].swapaxes(-1, -2)
+    inverse[:, :3, 3] = camera_centres(camera_from_world)
+    inverse[:, 3, 3] = 1
+    return inverse
+
+
+def unproject(
+    depth: Float32[np.ndarray, "S H W"],
+    intrinsics: Float32[np.ndarray, "S 3 3"],
+    camera_from_world: Float32[np.ndarray, "S 3 4"],
+    *,
+    pixel_offset: float,
+) -> Float32[np.ndarray, "S H W 3"]:
+    """Lift every pixel to its point in the world.
+
+    Args:
+        depth: z in the camera; a non-finite depth gives a non-finite point.
+        intrinsics: focal lengths and principal point in pixels of `depth`; skew is not used.
+        camera_from_world: rigid transforms.
+        pixel_offset: where in its cell a pixel is seen. 0.5, the centre, is right for principal points at (W/2, H/2);
+            0.0, the corner, is what VGGT's public code does and shifts the points by half a pixel.
+    """
+    height, width = depth.shape[1:]
+    u = np.arange(width, dtype=np.float32) + np.float32(pixel_offset)
+    v = np.arange(height, dtype=np.float32) + np.float32(pixel_offset)
+    right = (u - intrinsics[:, 0, 2, None]) / intrinsics[:, 0, 0, None]  # [S, W]
+    down = (v - intrinsics[:, 1, 2, None]) / intrinsics[:, 1, 1, None]  # [S, H]
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = np.stack([right[:, None, :] * depth, down[:, :, None] * depth, depth], axis=-1)
+        points -= camera_from_world[:, None, None, :, 3]
+        return points @ camera_from_world[:, None, :, :3]  # row vectors: p R is R^T p
+
+
+def clamp_field_of_view(fov: Float[np.ndarray, "S 2"]) -> tuple[Float[np.ndarray, "S 2"], tuple[int, ...]]:
+    """Clamp fields of view to FIELD_OF_VIEW_RANGE, as untrained weights give 0 or more than pi.
+
+    Args:
+        fov: two angles a frame in radians; the order does not matter.
+
+    Returns:
+        The clamped angles (values inside the range are untouched), and the frames where something was clamped.
+
+    Raises:
+        ResultError: an angle is not a number.
+    """
+    lowest, highest = FIELD_OF_VIEW_RANGE
+    undefined = np.flatnonzero(np.isnan(fov).any(axis=-1))
+    if undefined.size:
+        raise ResultError(
+            f"the field of view of frame {undefined[0]} is not a number; "
+            f"expected radians in [{lowest}, {highest}]: check the weights for NaN"
+        )
+    outside = (fov < lowest - _FIELD_OF_VIEW_SLACK) | (fov > highest + _FIELD_OF_VIEW_SLACK)
+    frames = tuple(int(frame) for frame in np.flatnonzero(outside.any(axis=-1)))
+    return np.where(outside, np.clip(fov, lowest, highest), fov), frames
+
+
+def clamp_intrinsics(
+    intrinsics: Float32[np.ndarray, "S 3 3"], height: int, width: int
+) -> tuple[Float32[np.ndarray, "S 3 3"], tuple[int, ...]]:
+    """Clamp the fields of view behind focal lengths; see `clamp_field_of_view` for what is returned and raised.
+
+    A field of view of 0 arrives as an infinite focal length and one beyond pi as a negative one. The principal
+    points are expected at (W/2, H/2) and stay as they are.
+    """
+    half = np.array([width, height]) / 2
+    focal = np.stack([intrinsics[:, 0, 0], intrinsics[:, 1, 1]], axis=-1).astype(np.float64)
+    fov = 2 * np.arctan2(half, focal)
+    clamped, frames = clamp_field_of_view(fov)
+    focal = np.where(clamped == fov, focal, half / np.tan(clamped / 2))
+    intrinsics = intrinsics.copy()
+    intrinsics[:, 0, 0], intrinsics[:, 1, 1] = focal[:, 0], focal[:, 1]
+    return intrinsics, frames
+
+
+def frustum_corners(
+    intrinsics: Float32[np.ndarray, "S 3 3"],
+    camera_from_world: Float32[np.ndarray, "S 3 4"],
+    height: int,
+    width: int,
+    size: float,
+) -> Float32[np.ndarray, "S 5 3"]:
+    """Return the world points that outline each camera: its centre, then the picture's corners.
+
+    Corners go top left, top right, bottom right, bottom left, `size` away from the centre along their rays, so that
+    a very wide camera is drawn no larger than the others.
+    """
+    pixels = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    focal, principal_point = intrinsics[:, None, [0, 1], [0, 1]], intrinsics[:, None, :2, 2]
+    rays = np.ones((len(intrinsics), 4, 3), np.float32)
+    rays[..., :2] = (pixels - principal_point) / focal
+    rays *= np.float32(size) / np.linalg.norm(rays, axis=-1, keepdims=True)
+    centres = camera_centres(camera_from_world)[:, None]
+    return np.concatenate([centres, centres + rays @ camera_from_world[..., :3]], axis=1)

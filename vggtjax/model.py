@@ -1,0 +1,177 @@
+"""The whole network as one pure function: images and patch tokens -> pose encoding, depth, points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vggtjax.aggregator import aggregate, init_aggregator
+from vggtjax.backbone import encode, init_backbone
+from vggtjax.camera_head import init_camera_head, predict_pose
+from vggtjax.config import Suppress, VGGTConfig
+from vggtjax.dpt_head import init_dense_head, predict_dense, project_tap
+from vggtjax.errors import InputError
+from vggtjax.layers import Params
+from vggtjax.motion import GramCues, Sums
+from vggtjax.precision import full_precision
+from vggtjax.track_head import init_track_head
+
+DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
+OUTPUTS = ("camera", *DENSE_HEADS)
+HEADS = {"camera": "camera_head", **DENSE_HEADS, "tracks": "track_head"}
+
+
+class Predictions(NamedTuple):
+    """What a pass predicts; None where it was not asked for. Depth and points are up to scale."""
+
+    pose_encoding: Float[Array, "B S 9"] | None = None
+    depth: Float[Array, "B S H W"] | None = None
+    depth_confidence: Float[Array, "B S H W"] | None = None
+    world_points: Float[Array, "B S H W 3"] | None = None
+    world_points_confidence: Float[Array, "B S H W"] | None = None
+
+
+def forward(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    config: VGGTConfig,
+    *,
+    patch_tokens: Float[Array, "B S P C"] | None = None,
+    dynamic_tokens: Bool[Array, "B S h w"] | None = None,
+    suppress: Suppress = "zero",
+    mask_pairs: int = 5,
+    outputs: Sequence[str] = ("camera", "depth"),
+    stop_camera_gradient: bool = True,
+    compute_dtype: str = "float32",
+) -> Predictions:
+    """Run VGGT on clips, optionally with the keys of dynamic tokens suppressed.
+
+    Pure: works under jit, grad, vmap and remat, and never donates.
+
+    Args:
+        params: the model's parameter tree.
+        images: RGB in [0, 1], any number of frames; H and W are multiples of the patch size.
+        config: the model's configuration (static under jit).
+        patch_tokens: what `encode` returned for these images; computed here if None.
+        dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs; None for the plain pass.
+        suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value leave the softmax, VGGT4D).
+        mask_pairs: number of pairs in which keys are suppressed (L_mask of the paper).
+        outputs: any of "camera", "depth", "points".
+        stop_camera_gradient: whether the camera head's iterations see the previous estimate as a constant.
+        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
+
+    Raises:
+        InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing.
+    """
+    predictions, _ = forward_with_cues(
+        params,
+        images,
+        config,
+        None,
+        patch_tokens=patch_tokens,
+        dynamic_tokens=dynamic_tokens,
+        suppress=suppress,
+        mask_pairs=mask_pairs,
+        outputs=outputs,
+        stop_camera_gradient=stop_camera_gradient,
+        compute_dtype=compute_dtype,
+    )
+    return predictions
+
+
+@full_precision
+def forward_with_cues(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    config: VGGTConfig,
+    cues: GramCues | None,
+    *,
+    patch_tokens: Float[Array, "B S P C"] | None = None,
+    dynamic_tokens: Bool[Array, "B S h w"] | None = None,
+    suppress: Suppress = "zero",
+    mask_pairs: int = 5,
+    outputs: Sequence[str] = ("camera", "depth"),
+    stop_camera_gradient: bool = True,
+    compute_dtype: str = "float32",
+) -> tuple[Predictions, Sums | None]:
+    """Run `forward` and accumulate motion cues on the way: the predictions, and the sums that `cues` made."""
+    grid = _checked_grid(images, config, dynamic_tokens, suppress, outputs, compute_dtype)
+    if patch_tokens is None:
+        patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
+    dense = [name for name in outputs if name in DENSE_HEADS]
+    last = len(config.taps) - 1
+
+    def capture(slot: int):
+        def kept(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
+            patches = tokens[:, :, -grid[0] * grid[1] :]
+            result = {name: project_tap(params[DENSE_HEADS[name]], patches, slot, config) for name in dense}
+            return result | ({"camera": tokens[:, :, 0]} if slot == last and "camera" in outputs else {})
+
+        return kept
+
+    taps, sums = aggregate(
+        params,
+        patch_tokens,
+        config,
+        grid,
+        captures=[capture(slot) for slot in range(last + 1)],
+        cues=cues,
+        dynamic_tokens=dynamic_tokens,
+        suppress=suppress,
+        mask_pairs=mask_pairs,
+        compute_dtype=compute_dtype,
+    )
+    found: dict[str, Array] = {}
+    if "camera" in outputs:
+        found["pose_encoding"] = predict_pose(params, taps[last]["camera"], config, stop_gradient=stop_camera_gradient)
+    for name in dense:
+        head_taps = [tap[name] for tap in taps]
+        values, confidence = predict_dense(params[DENSE_HEADS[name]], head_taps, config, grid, name)
+        if name == "depth":
+            found |= {"depth": values[..., 0], "depth_confidence": confidence}
+        else:
+            found |= {"world_points": values, "world_points_confidence": confidence}
+    return Predictions(**found), sums
+
+
+def init_params(key: Array, config: VGGTConfig) -> Params:
+    """Return a random parameter tree: nested dicts with Flax names, layers stacked on axis 0."""
+    keys = jax.random.split(key, 6)
+    return {
+        "backbone": init_backbone(keys[0], config),
+        "aggregator": init_aggregator(keys[1], config),
+        "camera_head": init_camera_head(keys[2], config),
+        "depth_head": init_dense_head(keys[3], config, "depth"),
+        "point_head": init_dense_head(keys[4], config, "points"),
+        "track_head": init_track_head(keys[5], config),
+    }
+
+
+def parameter_shapes(config: VGGTConfig) -> Params:
+    """Return the parameter tree's shapes and dtypes (`jax.ShapeDtypeStruct` leaves) without making any array."""
+    return jax.eval_shape(lambda key: init_params(key, config), jax.ShapeDtypeStruct((2,), jnp.uint32))
+
+
+def _checked_grid(images, config, dynamic_tokens, suppress, outputs, compute_dtype) -> tuple[int, int]:
+    size = config.patch_size
+    if images.ndim != 5 or images.shape[-1] != 3 or 0 in images.shape:
+        raise InputError(f"images have shape {tuple(images.shape)}; expected [B, S, H, W, 3] with at least one frame")
+    H, W = images.shape[2:4]
+    if H % size or W % size:
+        raise InputError(f"images are {H} x {W} pixels; expected multiples of the patch size {size}")
+    grid = (H // size, W // size)
+    if dynamic_tokens is not None and tuple(dynamic_tokens.shape) != (*images.shape[:2], *grid):
+        raise InputError(
+            f"dynamic_tokens have shape {tuple(dynamic_tokens.shape)}; expected {(*images.shape[:2], *grid)}"
+        )
+    if unknown := [name for name in outputs if name not in OUTPUTS]:
+        raise InputError(f"outputs has {unknown}; expected some of {OUTPUTS}")
+    if suppress not in ("zero", "drop"):
+        raise InputError(f"suppress is {suppress!r}; expected 'zero' or 'drop'")
+    if compute_dtype not in ("float32", "bfloat16"):
+        raise InputError(f"compute_dtype is {compute_dtype!r}; expected 'float32' or 'bfloat16'")
+    return grid

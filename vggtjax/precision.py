@@ -1,0 +1,26 @@
+"""Float32 means float32: matrix products at full precision, whatever the accelerator's default."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import jax
+
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
+
+
+def full_precision(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+    """Trace `function` with every matrix product and convolution at the highest precision (never TF32).
+
+    The setting holds while `function` is traced and is gone afterwards; nothing global changes.
+    """
+
+    @functools.wraps(function)
+    def wrapped(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **kwargs)
+
+    return wrapped

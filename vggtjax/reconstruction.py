@@ -1,0 +1,243 @@
+"""The result of a clip: cameras, depth, dynamic masks, and everything needed to use them."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8
+
+from vggtjax import archive, geometry
+from vggtjax.errors import ResultError
+
+ARCHIVE_NAME = "reconstruction.npz"
+_FORMAT_VERSION = 1
+
+# Arrays: type and dimensions. depth binds S, H, W and saliency binds h, w; the others must agree.
+_ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
+    "depth": (np.float32, ("S", "H", "W")),
+    "depth_confidence": (np.float32, ("S", "H", "W")),
+    "saliency": (np.float32, ("S", "h", "w")),
+    "dynamic_mask": (np.bool_, ("S", "H", "W")),
+    "camera_from_world": (np.float32, ("S", 3, 4)),
+    "intrinsics": (np.float32, ("S", 3, 3)),
+    "images": (np.uint8, ("S", "H", "W", 3)),
+    "source_size": (np.int64, ("S", 2)),
+    "source_scale": (np.float64, ("S", 2)),
+    "source_offset": (np.float64, ("S", 2)),
+    "valid_box": (np.int64, ("S", 4)),
+    "timestamps": (np.float64, ("S",)),
+}
+_STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": (), "model_name": (), "settings": ()}
+
+
+class FieldOfViewWarning(UserWarning):
+    """Cameras whose field of view was clamped because no pinhole camera has it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstruction:
+    """Cameras, depth and motion of a clip of S frames, at the model's size of H x W pixels in h x w patches.
+
+    Arrays of a wider type are cast to the one named. Fields of view outside [0.01, 3.1] rad are clamped with a
+    FieldOfViewWarning that names the frames. Raises ResultError where the fields do not fit together.
+    """
+
+    depth: Float32[np.ndarray, "S H W"]  # z in the camera, up to scale
+    depth_confidence: Float32[np.ndarray, "S H W"]  # above 0; higher is surer; compare by rank, not by value
+    saliency: Float32[np.ndarray, "S h w"]  # motion of each patch, in [0, 1]
+    dynamic_mask: Bool[np.ndarray, "S H W"]
+    camera_from_world: Float32[np.ndarray, "S 3 4"]  # OpenCV axes: x right, y down, z forward
+    intrinsics: Float32[np.ndarray, "S 3 3"]  # pixels of H x W
+    images: UInt8[np.ndarray, "S H W 3"]
+    frame_names: tuple[str, ...]
+    timestamps: Float64[np.ndarray, " S"] | None  # seconds, where known
+    method: str
+    model_name: str
+    settings: dict[str, Any]  # JSON values
+    source_size: Int64[np.ndarray, "S 2"]  # height, width of the source pictures
+    source_scale: Float64[np.ndarray, "S 2"]  # source (x, y) = scale * (x, y) + offset; pixel edges at integers
+    source_offset: Float64[np.ndarray, "S 2"]
+    valid_box: Int64[np.ndarray, "S 4"]  # left, top, right, bottom; pixels outside are padding
+    passes: Any = None  # what the network computed on the way; in memory only, never saved
+
+    def __post_init__(self) -> None:
+        for name, (dtype, _) in _ARRAYS.items():
+            if name != "timestamps" or self.timestamps is not None:
+                object.__setattr__(self, name, _cast(name, getattr(self, name), dtype))
+        object.__setattr__(self, "frame_names", tuple(self.frame_names))
+        object.__setattr__(self, "settings", _json_values(self.settings))
+        shapes = {name: getattr(self, name).shape for name in _ARRAYS if getattr(self, name) is not None}
+        _check_shapes(shapes | {"frame_names": (len(self.frame_names),)})
+        intrinsics, clamped = geometry.clamp_intrinsics(self.intrinsics, *self.depth.shape[1:])
+        object.__setattr__(self, "intrinsics", intrinsics)
+        self._check_values()
+        if clamped:
+            lowest, highest = geometry.FIELD_OF_VIEW_RANGE
+            warnings.warn(
+                f"the field of view of frames {_listed(clamped)} was clamped to [{lowest}, {highest}] rad; "
+                "their cameras and points are not to be trusted",
+                FieldOfViewWarning,
+                stacklevel=3,
+            )
+
+    def _check_values(self) -> None:
+        height, width = self.depth.shape[1:]
+        rotation = self.camera_from_world[:, :, :3]
+        with np.errstate(invalid="ignore", over="ignore"):
+            error = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+            rigid = (error < 0.01) & (np.linalg.det(rotation) > 0)
+        rigid &= np.isfinite(self.camera_from_world).all(axis=(1, 2))
+        if not rigid.all():
+            raise ResultError(
+                f"camera_from_world of frame {np.argmin(rigid)} is not a finite rotation and translation; "
+                "check the weights for NaN"
+            )
+        for name in ("intrinsics", "timestamps", "source_scale", "source_offset"):
+            value = getattr(self, name)
+            if value is not None and not np.isfinite(value).all():
+                raise ResultError(f"{name} holds {value[~np.isfinite(value)][0]}; expected finite numbers")
+        left, top, right, bottom = self.valid_box.T
+        inside = (0 <= left) & (left < right) & (right <= width) & (0 <= top) & (top < bottom) & (bottom <= height)
+        if not inside.all():
+            frame = int(np.argmin(inside))
+            raise ResultError(
+                f"valid_box of frame {frame} is {self.valid_box[frame].tolist()}; expected left < right and "
+                f"top < bottom inside {width} x {height} pixels"
+            )
+
+    @property
+    def camera_centres(self) -> Float32[np.ndarray, "S 3"]:
+        """Centres of the cameras in the world."""
+        return geometry.camera_centres(self.camera_from_world)
+
+    @property
+    def world_from_camera(self) -> Float32[np.ndarray, "S 4 4"]:
+        """Poses of the cameras in the world, as 4x4 matrices."""
+        return geometry.world_from_camera(self.camera_from_world)
+
+    def world_points(self, *, pixel_offset: float = 0.5) -> Float32[np.ndarray, "S H W 3"]:
+        """Lift every pixel to its point in the world, padding and unsure pixels too.
+
+        `pixel_offset` 0.5 sees each pixel at its centre, which fits principal points at (W/2, H/2) and what refining
+        the masks does; VGGT's own unprojection uses 0.0, so its points lie half a pixel up and left of these.
+        """
+        return geometry.unproject(self.depth, self.intrinsics, self.camera_from_world, pixel_offset=pixel_offset)
+
+    def save(
+        self,
+        folder: str | Path,
+        *,
+        confidence_percentile: float = 20.0,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Write the result into `folder`, made if missing; see vggtjax.export for the files.
+
+        An earlier result in the folder is replaced as a whole, or left untouched if anything fails; other files
+        stay. Point clouds leave out the `confidence_percentile` percent of pixels with the lowest confidence.
+        `progress(done, total)` is called as files are written.
+
+        Raises InputError for a percentile outside [0, 100), and OutputError where the folder cannot be written or
+        holds files of the same names that are not an earlier result.
+        """
+        from vggtjax import export
+
+        export.save(self, folder, confidence_percentile=confidence_percentile, progress=progress)
+
+    def save_archive(self, path: Path) -> None:
+        """Write everything but `passes` to one compressed .npz file, which `load` reads back."""
+        arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
+        strings = {name: getattr(self, name) for name in _STRINGS} | {"settings": json.dumps(self.settings)}
+        arrays |= {name: np.array(value, np.str_) for name, value in strings.items()}
+        archive.write_arrays(path, arrays | {"format_version": np.array(_FORMAT_VERSION)})
+
+    @classmethod
+    def load(cls, path: str | Path) -> Reconstruction:
+        """Read a result back from its folder, or from its reconstruction.npz.
+
+        Raises ResultError for anything but a whole result of a known version.
+        """
+        path = Path(path)
+        file = path / ARCHIVE_NAME if path.is_dir() else path
+        try:
+            _check_headers(archive.read_headers(file))
+            arrays: dict[str, Any] = archive.read_arrays(file)
+            version = int(arrays.pop("format_version"))
+            if version != _FORMAT_VERSION:
+                raise ResultError(f"it has format version {version}; expected {_FORMAT_VERSION}")
+            for name in ("method", "model_name", "settings"):
+                arrays[name] = arrays[name].item()
+            arrays["frame_names"] = tuple(arrays["frame_names"].tolist())
+            arrays["settings"] = json.loads(arrays["settings"])
+            return cls(**{"timestamps": None} | arrays)
+        except (ResultError, ValueError, RecursionError) as error:  # ValueError: text that is not Unicode or JSON
+            raise ResultError(f"{file} cannot be loaded as a result: {error}") from error
+
+
+def is_result(path: Path) -> bool:
+    """Tell whether `path` looks like a reconstruction.npz of this library, of any version."""
+    try:
+        return {"format_version", "depth", "camera_from_world"} <= set(archive.read_headers(path))
+    except ResultError:
+        return False
+
+
+def _cast(name: str, value: Any, dtype: type) -> np.ndarray:
+    array = np.asarray(value)
+    if not np.can_cast(array.dtype, dtype, "same_kind"):
+        raise ResultError(f"{name} has type {array.dtype}; expected {np.dtype(dtype)}")
+    return array.astype(dtype, copy=False)
+
+
+def _check_headers(headers: Mapping[str, archive.Header]) -> None:
+    version = headers.get("format_version")
+    if version is None or version != (np.dtype(np.int64), ()):
+        raise ResultError("it has no format version")
+    expected = {"format_version", *_ARRAYS, *_STRINGS}
+    wrong = sorted((expected - {"timestamps"} - set(headers)) | (set(headers) - expected))
+    if wrong:
+        raise ResultError(f"arrays are missing or unknown: {', '.join(wrong)}")
+    for name, header in headers.items():
+        if name in _ARRAYS and header.dtype != np.dtype(_ARRAYS[name][0]):
+            raise ResultError(f"{name} has type {header.dtype}; expected {np.dtype(_ARRAYS[name][0])}")
+        if name in _STRINGS and header.dtype.kind != "U":
+            raise ResultError(f"{name} has type {header.dtype}; expected text")
+    _check_shapes({name: header.shape for name, header in headers.items() if name != "format_version"})
+
+
+def _check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise ResultError unless every shape is as the tables say."""
+    for name in ("depth", "saliency"):
+        if len(shapes[name]) != 3 or 0 in shapes[name]:
+            raise ResultError(f"{name} has shape {shapes[name]}; expected (frames, rows, columns), none of them 0")
+    sizes: dict[str | int, int] = dict(zip("SHW", shapes["depth"], strict=True))
+    sizes |= dict(zip("hw", shapes["saliency"][1:], strict=True))
+    for name, shape in shapes.items():
+        dimensions = _ARRAYS[name][1] if name in _ARRAYS else _STRINGS[name]
+        expected = tuple(sizes.get(dimension, dimension) for dimension in dimensions)
+        if shape != expected:
+            raise ResultError(f"{name} has shape {shape}; expected {expected} to go with depth {shapes['depth']}")
+    if sizes["H"] % sizes["h"] or sizes["W"] % sizes["w"]:
+        raise ResultError(
+            f"saliency has {sizes['h']} x {sizes['w']} patches, which do not divide {sizes['H']} x {sizes['W']} pixels"
+        )
+
+
+def _json_values(settings: Any) -> dict[str, Any]:
+    try:
+        values = json.loads(json.dumps(settings, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ResultError(f"settings cannot be written as JSON: {error}") from None
+    if not isinstance(values, dict):
+        raise ResultError(f"settings is a {type(settings).__name__}; expected a dictionary")
+    return values
+
+
+def _listed(frames: tuple[int, ...], shown: int = 10) -> str:
+    listed = ", ".join(map(str, frames[:shown]))
+    return f"{listed} and {len(frames) - shown} more" if len(frames) > shown else listed

@@ -1,0 +1,74 @@
+"""Parameters of the track head (VGGT's CoTracker-like point tracker): its leaves and their shapes."""
+
+from __future__ import annotations
+
+from flax import linen as nn
+from jax import Array
+from jax import numpy as jnp
+from jax import random
+
+from vggtjax.config import VGGTConfig
+from vggtjax.dpt_head import DPTFeatures, init_features
+from vggtjax.layers import MLP, LayerNorm, Params, init_stacked
+
+LAYERS = 6
+VIRTUAL_TRACKS = 64
+
+
+class AttentionWeights(nn.Module):
+    """The two matrices of a multi-head attention whose q, k and v are computed as one."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        nn.Dense(3 * self.features, name="qkv")(x)
+        return nn.Dense(self.features, name="projection")(x)
+
+
+class UpdateBlock(nn.Module):
+    """A block of the update transformer; with a context it attends to that instead of to itself."""
+
+    features: int
+    context: bool = False
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        for name in ("norm1", "norm2") + ("norm_context",) * self.context:
+            x = LayerNorm(name=name)(x)
+        x = AttentionWeights(self.features, name="attention")(x)
+        return MLP(4 * self.features, self.features, name="mlp")(x)
+
+
+def init_track_head(key: Array, config: VGGTConfig) -> Params:
+    """Return random parameters of the track head."""
+    keys = iter(random.split(key, 20))
+    F, C = config.track_features, config.track_hidden
+    E = 3 * F + 4  # flow embedding, correlation, track features, flow
+    correlations = config.track_corr_levels * (2 * config.track_corr_radius + 1) ** 2
+    normal = nn.initializers.normal(0.02)
+
+    def init(module: nn.Module, channels: int) -> Params:
+        return module.init(next(keys), jnp.zeros((1, 1, channels)))["params"]
+
+    def blocks(context: bool) -> Params:
+        return init_stacked(UpdateBlock(C, context), next(keys), LAYERS, jnp.zeros((1, 1, C)))
+
+    return init_features(next(keys), config, DPTFeatures(F, F, config.track_position_embedding)) | {
+        "query_token": normal(next(keys), (2, E)),
+        "virtual_tracks": normal(next(keys), (VIRTUAL_TRACKS, C)),
+        "correlation_mlp": init(MLP(C, F), correlations),
+        "input_norm": init(LayerNorm(), E),
+        "input_projection": init(nn.Dense(C), E),
+        "time_blocks": blocks(context=False),
+        "virtual_blocks": blocks(context=False),
+        "point_to_virtual_blocks": blocks(context=True),
+        "virtual_to_point_blocks": blocks(context=True),
+        "output_norm": init(LayerNorm(), C),
+        "flow_projection": init(nn.Dense(F + 2), C),
+        "feature_map_norm": init(LayerNorm(), F),
+        "feature_norm": init(LayerNorm(), F),
+        "feature_update": init(nn.Dense(F), F),
+        "visibility": init(nn.Dense(1), F),
+        "confidence": init(nn.Dense(1), F),
+    }
