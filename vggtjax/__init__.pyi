@@ -1,12 +1,27 @@
 from .backbone import encode as encode
+from .checkpoint import Model as Model
+from .checkpoint import load_model as load_model
+from .clip import Clip as Clip
+from .clip import load_clip as load_clip
 from .config import Cue as Cue
 from .config import MotionConfig as MotionConfig
 from .config import VGGTConfig as VGGTConfig
 from .config import vggt_1b as vggt_1b
+from .errors import VggtjaxError as VggtjaxError
+from .fusion import fuse_depth as fuse_depth
+from .methods import METHODS as METHODS
 from .model import Predictions as Predictions
 from .model import forward as forward
 from .model import init_params as init_params
+from .passes import Assembly as Assembly
+from .passes import Passes as Passes
+from .passes import assemble as assemble
+from .passes import motion_saliency as motion_saliency
+from .passes import run_passes as run_passes
+from .pipeline import infer as infer
+from .pipeline import reconstruct as reconstruct
 from .pose import decode_pose as decode_pose
 from .pose import encode_pose as encode_pose
+from .reconstruction import Reconstruction as Reconstruction
 
 __version__: str

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
@@ -15,6 +16,7 @@ import numpy as np
 
 from vggtjax.errors import ResultError
 
+_DEFLATE_LEVEL = 1  # higher ones take several times as long for a few percent
 SIZE_LIMIT = 64 * 2**30  # bytes of all arrays of one archive
 
 
@@ -31,8 +33,10 @@ class Header(NamedTuple):
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write `arrays` to a compressed .npz file."""
-    with path.open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_DEFLATE_LEVEL) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, np.asarray(array, order="C"), allow_pickle=False)
 
 
 def read_headers(path: Path) -> dict[str, Header]:
@@ -52,7 +56,10 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         for name, member, file in _members(archive):
             _read_header(file, member)
             file.seek(0)
-            arrays[name] = np.lib.format.read_array(file, allow_pickle=False)
+            array = np.lib.format.read_array(file, allow_pickle=False)
+            if array.dtype.kind == "U" and (np.atleast_1d(array).view(np.uint32) > sys.maxunicode).any():
+                raise ResultError(f"{member.filename} holds text that is not Unicode")
+            arrays[name] = array
     return arrays
 
 
@@ -94,6 +101,8 @@ def _read_header(file: IO[bytes], member: zipfile.ZipInfo) -> Header:
     shape, fortran_order, dtype = readers[version](file)
     if dtype.hasobject:
         raise ResultError(f"{member.filename} holds Python objects, which are never loaded")
+    if not dtype.isnative:
+        raise ResultError(f"{member.filename} has type {dtype}, in the byte order of another machine")
     if fortran_order and len(shape) > 1:
         raise ResultError(f"{member.filename} is stored by columns; expected rows")
     size = dtype.itemsize

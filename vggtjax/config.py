@@ -100,6 +100,8 @@ class VGGTConfig:
                 raise InputError(f"{name} is {value}; expected four numbers")
         if isinstance(self.motion, Mapping):
             object.__setattr__(self, "motion", MotionConfig(**self.motion))
+        if not isinstance(self.motion, MotionConfig):
+            raise InputError(f"motion is {self.motion!r}; expected the fields of a MotionConfig")
         for field_ in dataclasses.fields(self):
             value = getattr(self, field_.name)
             values = value if isinstance(value, tuple) else (value,)
@@ -165,6 +167,8 @@ def vggt_1b() -> VGGTConfig:
 
 def _cue(value: Cue | Mapping[str, Any]) -> Cue:
     cue = Cue(**value) if isinstance(value, Mapping) else value
+    if not isinstance(cue, Cue):
+        raise InputError(f"a cue is {cue!r}; expected the fields of a Cue")
     choices = {"rows": ("q", "k"), "columns": ("q", "k"), "statistic": ("mean", "std"), "inverted": (True, False)}
     for name, allowed in choices.items():
         if getattr(cue, name) not in allowed:

@@ -1,6 +1,7 @@
-"""Pinhole cameras on the host: inverses, unprojection, fields of view, frusta. OpenCV axes: x right, y down, z forward.
+"""Pinhole cameras on the host: inverses, unprojection, fields of view, frusta.
 
-Pixel coordinates put edges at integers: a picture spans [0, W] x [0, H] and the centre of its first pixel is (0.5, 0.5).
+Axes are OpenCV's: x right, y down, z forward. Pixel coordinates put edges at integers: a picture spans
+[0, W] x [0, H] and the centre of its first pixel is (0.5, 0.5).
 """
 
 from __future__ import annotations

@@ -103,7 +103,7 @@ class Reconstruction:
             if value is not None and not np.isfinite(value).all():
                 raise ResultError(f"{name} holds {value[~np.isfinite(value)][0]}; expected finite numbers")
         left, top, right, bottom = self.valid_box.T
-        inside = (0 <= left) & (left < right) & (right <= width) & (0 <= top) & (top < bottom) & (bottom <= height)
+        inside = (left >= 0) & (left < right) & (right <= width) & (top >= 0) & (top < bottom) & (bottom <= height)
         if not inside.all():
             frame = int(np.argmin(inside))
             raise ResultError(
@@ -134,7 +134,7 @@ class Reconstruction:
         folder: str | Path,
         *,
         confidence_percentile: float = 20.0,
-        progress: Callable[[int, int], None] | None = None,
+        progress: Callable[[int, int], object] | None = None,
     ) -> None:
         """Write the result into `folder`, made if missing; see vggtjax.export for the files.
 
@@ -164,18 +164,20 @@ class Reconstruction:
         """
         path = Path(path)
         file = path / ARCHIVE_NAME if path.is_dir() else path
+        if not file.is_file():
+            raise ResultError(f"there is no {file}; give the folder of a saved result or its {ARCHIVE_NAME}")
         try:
             _check_headers(archive.read_headers(file))
-            arrays: dict[str, Any] = archive.read_arrays(file)
-            version = int(arrays.pop("format_version"))
+            fields: dict[str, Any] = {"timestamps": None, **archive.read_arrays(file)}
+            version = int(fields.pop("format_version"))
             if version != _FORMAT_VERSION:
                 raise ResultError(f"it has format version {version}; expected {_FORMAT_VERSION}")
             for name in ("method", "model_name", "settings"):
-                arrays[name] = arrays[name].item()
-            arrays["frame_names"] = tuple(arrays["frame_names"].tolist())
-            arrays["settings"] = json.loads(arrays["settings"])
-            return cls(**{"timestamps": None} | arrays)
-        except (ResultError, ValueError, RecursionError) as error:  # ValueError: text that is not Unicode or JSON
+                fields[name] = fields[name].item()
+            fields["frame_names"] = tuple(fields["frame_names"].tolist())
+            fields["settings"] = json.loads(fields["settings"])
+            return cls(**fields)
+        except (ResultError, ValueError, RecursionError) as error:  # ValueError: not JSON
             raise ResultError(f"{file} cannot be loaded as a result: {error}") from error
 
 

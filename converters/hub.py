@@ -1,0 +1,68 @@
+"""Weights from the Hugging Face hub, in its own cache and with its own token."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from converters.sources import choose_file, weight_files
+from vggtjax.errors import CheckpointError, MissingExtraError
+
+
+def download(hub_id: str) -> Path:
+    """Return the file of weights of a hub repository in the hub's cache, downloaded if it is not there.
+
+    A cached copy does without the network. Of several formats safetensors comes first, see `choose_file`.
+
+    Raises:
+        CheckpointError: the repository is missing, gated, out of reach, or holds no weights.
+        MissingExtraError: huggingface_hub is not installed.
+    """
+    try:
+        from huggingface_hub import errors
+        from huggingface_hub.errors import HTTPError  # pyright: ignore[reportPrivateImportUsage]: of httpx or httpx2
+    except ImportError as error:
+        raise MissingExtraError(f"downloading '{hub_id}'", "hub") from error
+
+    try:
+        return _download(hub_id)
+    except CheckpointError:
+        raise
+    except errors.GatedRepoError as error:
+        raise CheckpointError(
+            f"the hub's '{hub_id}' is gated; ask for access on its page, then log in with 'hf auth login'"
+        ) from error
+    except errors.RepositoryNotFoundError as error:
+        raise CheckpointError(
+            f"'{hub_id}' is neither a path here nor a repository on the hub that you can see; check the spelling, "
+            "or log in with 'hf auth login' if it is private"
+        ) from error
+    except (HTTPError, OSError, ValueError) as error:
+        reason = str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
+        raise CheckpointError(
+            f"'{hub_id}' is not in the hub's cache and cannot be downloaded ({reason}); check the network and try again"
+        ) from error
+
+
+def _download(hub_id: str) -> Path:
+    from huggingface_hub import HfApi, hf_hub_download, snapshot_download
+    from huggingface_hub.errors import (
+        HTTPError,  # pyright: ignore[reportPrivateImportUsage]: of httpx or httpx2
+        LocalEntryNotFoundError,
+    )
+
+    cached = False
+    try:
+        names = [file.rfilename for file in HfApi().model_info(hub_id).siblings or []]
+    except (HTTPError, OSError) as error:  # out of reach, or closed to us: what was downloaded before still serves
+        try:
+            folder = Path(snapshot_download(hub_id, allow_patterns=[], local_files_only=True))
+        except LocalEntryNotFoundError:
+            raise error from None
+        names = [entry.name for entry in folder.iterdir()]
+        cached = True
+    name = choose_file(names, f"the hub's '{hub_id}'")
+    path = Path(hf_hub_download(hub_id, name, local_files_only=cached))
+    for file in weight_files(path):
+        if Path(hf_hub_download(hub_id, file.name, local_files_only=cached)) != file:
+            raise CheckpointError(f"the hub's '{hub_id}' changed while it was downloaded; try again")
+    return path

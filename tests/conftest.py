@@ -1,0 +1,52 @@
+"""What every test shares: strict jax settings, the tiny model of the golden files, real footage where it is present."""
+
+import json
+from pathlib import Path
+
+import jax
+import pytest
+
+from benchmarks.seeded import seeded_state_dict
+from converters import convert_state_dict
+from vggtjax import VGGTConfig
+
+GOLDEN = Path(__file__).parent / "golden"
+CLIPS = Path(__file__).parents[2] / "shared" / "clips"
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(scope="session")
+def golden() -> Path:
+    """Folder of numbers that the public PyTorch code computed for seeded weights."""
+    return GOLDEN
+
+
+@pytest.fixture(scope="session")
+def config() -> VGGTConfig:
+    """The tiny model: 24 pairs like VGGT-1B, so that every layer index is a real one."""
+    return VGGTConfig(**json.loads((GOLDEN / "config.json").read_text()))
+
+
+@pytest.fixture(scope="session")
+def seeded_params(config):
+    """Return the tiny model's parameters for a seed."""
+    shapes = json.loads((GOLDEN / "shapes.json").read_text())
+
+    def make(seed: int):
+        return jax.tree.map(jax.numpy.asarray, convert_state_dict(seeded_state_dict(shapes, seed), config))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def params(seeded_params):
+    return seeded_params(7)
+
+
+@pytest.fixture(scope="session")
+def clips() -> Path:
+    """Folder of real footage; tests that need it are skipped where it is absent."""
+    if not CLIPS.is_dir():
+        pytest.skip("real footage (shared/clips beside the repository) is not here")
+    return CLIPS

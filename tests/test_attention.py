@@ -1,0 +1,36 @@
+"""Attention as computed on every platform, against the formula written out."""
+
+import jax
+import numpy as np
+import pytest
+
+from vggtjax import attention
+
+
+def _formula(q, k, v, kept):
+    logits = np.einsum("btnd,bknd->bntk", q, k, dtype=np.float64) / np.sqrt(q.shape[-1])
+    logits = np.where(kept[:, None, None, :], logits, -np.inf)
+    weights = np.exp(logits - logits.max(-1, keepdims=True))
+    return np.einsum("bntk,bknd->btnd", weights / weights.sum(-1, keepdims=True), v)
+
+
+@pytest.mark.parametrize("implementation", [attention._at_once, attention._in_chunks, attention.attention])
+@pytest.mark.parametrize("masked", [False, True])
+def test_equals_the_formula(monkeypatch, implementation, masked):
+    monkeypatch.setattr(attention, "QUERIES_AT_ONCE", 4)  # 11 queries: three chunks, one padded
+    generator = np.random.default_rng(0)
+    q, k, v = (generator.normal(size=(2, 11, 3, 8)).astype(np.float32) for _ in range(3))
+    kept = generator.random((2, 11)) < 0.6 if masked else np.ones((2, 11), bool)
+    with jax.default_matmul_precision("highest"):
+        made = implementation(q, k, v, kept if masked else None)
+    assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
+
+
+def test_heads_and_tokens_are_not_swapped():
+    """A key far larger than the others takes all the weight in its own head, and in no other."""
+    q = np.ones((1, 5, 2, 4), np.float32)
+    k, v = np.zeros_like(q), np.zeros_like(q)
+    k[0, 3, 1], v[0, 3] = 100.0, 1.0
+    made = np.asarray(attention.attention(q, k, v))
+    assert np.allclose(made[0, :, 1], 1)
+    assert np.allclose(made[0, :, 0], 0.2)

@@ -1,0 +1,133 @@
+"""The command line: what it writes, what it says, and its exit codes."""
+
+import functools
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.seeded import seeded_images, seeded_state_dict
+from vggtjax import Reconstruction, cli
+
+README = Path(__file__).parents[1] / "README.md"
+
+pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frames")
+    for i, image in enumerate(seeded_images(3, 90, 120, seed=1).transpose(0, 2, 3, 1)):
+        Image.fromarray((255 * image).astype(np.uint8)).save(folder / f"frame_{i}.png")
+    return folder
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    code = cli.main([str(a) for a in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_demo(tmp_path, capsys):
+    code, out, _ = run(capsys, "demo", tmp_path / "result")
+    assert code == 0
+    assert "untrained" in out
+    assert "peak memory" in out
+    result = Reconstruction.load(tmp_path / "result")
+    assert result.method == "4dvggt-d"
+    assert (tmp_path / "result" / "scene.glb").stat().st_size > 1000
+
+
+def test_reconstruct_with_a_converted_model(tmp_path, capsys, frames, golden, monkeypatch):
+    from safetensors.numpy import save_file
+
+    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path / "cache"))
+    shapes = json.loads((golden / "shapes.json").read_text())
+    save_file(seeded_state_dict(shapes, 7), tmp_path / "torch.safetensors")
+    config = golden / "config.json"
+    code, out, _ = run(capsys, "convert", tmp_path / "torch.safetensors", tmp_path / "m.safetensors", "--config", config)
+    assert code == 0
+    assert "wrote" in out
+    code, out, _ = run(capsys, "info", tmp_path / "m.safetensors")
+    assert code == 0
+    assert "float32" in out
+    code, out, err = run(
+        capsys, "reconstruct", frames, "--model", tmp_path / "m.safetensors", "--out", tmp_path / "out", "--max-frames",
+        2, "--method", "pose-decoupling",
+    )  # fmt: skip
+    assert code == 0, err
+    result = Reconstruction.load(tmp_path / "out")
+    assert result.depth.shape == (2, 98, 140)
+    assert result.frame_names == ("frame_0", "frame_1")
+    assert result.method == "pose-decoupling"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["reconstruct", "{tmp}/nothing", "--out", "{tmp}/out"], "nothing"),
+        (["reconstruct", "--out", "{tmp}/out"], "no input"),
+        (["reconstruct", "{tmp}", "--out", "{tmp}/out"], "no images"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--size", "100"], "100"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--stride", "0"], "stride"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--start", "7"], "7"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--model", "{tmp}/none.safetensors"], "none.safetensors"),
+        (["convert", "{tmp}/none.pt", "{tmp}/out.safetensors"], "none.pt"),
+        (["convert", "{frames}/frame_0.png", "{tmp}/out.safetensors"], "frame_0.png"),
+        (["convert", "{tmp}/none.pt", "{tmp}/out.safetensors", "--config", "{tmp}/none.json"], "none.json"),
+        (["info", "{frames}/frame_0.png"], "frame_0.png"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, frames, arguments, sentence):
+    places = {"tmp": tmp_path, "frames": frames}
+    code, _, err = run(capsys, *(a.format(**places) for a in arguments))
+    assert code == 2
+    last = err.strip().splitlines()[-1]
+    assert "Traceback" not in err
+    assert sentence in err
+    assert last
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_a_folder_that_cannot_be_written(tmp_path, capsys, frames):
+    (tmp_path / "file").write_text("")
+    code, _, err = run(capsys, "reconstruct", frames, "--out", tmp_path / "file" / "out", "--max-frames", 1)
+    assert code == 2
+    assert "cannot write" in err
+
+
+def test_an_unknown_option_is_exit_code_2():
+    made = subprocess.run(
+        [sys.executable, "-m", "vggtjax", "reconstruct", "--no-such-option"], capture_output=True, text=True, check=False
+    )
+    assert made.returncode == 2
+    assert "Traceback" not in made.stderr
+
+
+def _shell_lines():
+    blocks = README.read_text().split("```sh\n")[1:]
+    lines = [line for block in blocks for line in block.split("```")[0].splitlines()]
+    return [line for line in lines if line.startswith("vggtjax ")]
+
+
+def test_the_readme_has_commands():
+    assert len(_shell_lines()) >= 2
+
+
+@pytest.mark.parametrize("line", _shell_lines())
+def test_the_commands_of_the_readme_are_understood(line, monkeypatch):
+    called = []
+
+    def recorder(name, command):
+        return functools.wraps(command)(lambda *_, **__: called.append(name))
+
+    monkeypatch.setattr(cli, "COMMANDS", {name: recorder(name, command) for name, command in cli.COMMANDS.items()})
+    arguments = shlex.split(line)[1:]
+    assert cli.main(arguments) == 0
+    assert called == [arguments[0]]

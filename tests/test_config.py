@@ -1,0 +1,63 @@
+"""The configuration: hashable, checked, and readable from a stranger's JSON."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from vggtjax import MotionConfig, VGGTConfig, vggt_1b
+from vggtjax.errors import InputError
+
+
+def test_defaults_are_vggt_1b(golden):
+    assert VGGTConfig() == vggt_1b()
+    assert hash(VGGTConfig()) == hash(vggt_1b())
+    assert VGGTConfig().camera_dim == 2048
+    assert VGGTConfig().grid_size == 37
+
+
+def test_lists_become_tuples(config):
+    assert config.taps == (4, 11, 17, 23)
+    assert isinstance(hash(config), int)
+
+
+def test_json_round_trip(config):
+    assert VGGTConfig.from_json(config.to_json()) == config
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"taps": (4, 11, 17, 24)}, "below depth 24"),
+        ({"taps": (4, 11, 17)}, "four numbers"),
+        ({"depth": 0}, "depth is 0"),
+        ({"depth": "24"}, "whole numbers"),
+        ({"embed_dim": 1000}, "embed_dim 1000 is not a multiple"),
+        ({"image_size": 500}, "multiple of patch_size"),
+        ({"embed_dim": 10**12}, "whole numbers"),
+    ],
+)
+def test_bad_values_are_named(change, sentence):
+    with pytest.raises(InputError, match=sentence):
+        VGGTConfig(**change)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", '{"depht": 3}', '{"motion": 3}', '{"motion": {"cues": [3]}}', '{"taps": 3}', "[" * 100_000]
+)
+def test_bad_json_is_one_sentence(text):
+    with pytest.raises(InputError):
+        VGGTConfig.from_json(text)
+
+
+def test_bad_cues_are_named():
+    cue = json.loads(VGGTConfig().to_json())["motion"]["cues"][0]
+    for change in ({"layers": [24]}, {"layers": []}, {"rows": "v"}, {"statistic": "median"}):
+        with pytest.raises(InputError, match="shallow_kk_mean"):
+            MotionConfig(cues=(cue | change,))
+
+
+def test_the_command_line_starts_without_jax():
+    code = "import sys, vggtjax, vggtjax.cli, vggtjax.config, vggtjax.clip; sys.exit('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,146 @@
+"""Image files of every kind as RGB, and files that cannot be read."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vggtjax.errors import ClipError
+from vggtjax.images import ImageFiles, is_image_name, read_image
+from vggtjax.sampling import Sampling
+
+RAMP = np.array([[0, 128, 129, 33023, 65535]], np.uint16)
+RAMP_8 = [0, 0, 1, 128, 255]
+
+
+def pixels(path):
+    image = read_image(path)
+    assert image.mode == "RGB"
+    return np.asarray(image)
+
+
+def save(path, image, **options):
+    image.save(path, **options)
+    return path
+
+
+@pytest.mark.parametrize("name", ["grey.png", "grey.tif", "grey.pgm"])
+def test_sixteen_bit_grey_is_scaled_not_clipped(tmp_path, name):
+    image = pixels(save(tmp_path / name, Image.fromarray(RAMP)))
+    np.testing.assert_array_equal(image, np.repeat(np.array([RAMP_8])[..., None], 3, 2))
+
+
+def test_sixteen_bit_colour_is_scaled_not_clipped(tmp_path):
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    colours = np.array([[[0, 32896, 65535], [65535, 0, 257]]], ">u2")
+    header = struct.pack(">IIBBBBB", 2, 1, 16, 2, 0, 0, 0)
+    data = zlib.compress(b"\0" + colours.tobytes())
+    path = tmp_path / "colour.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", data) + chunk(b"IEND", b""))
+    np.testing.assert_array_equal(pixels(path), [[[0, 128, 255], [255, 0, 1]]])
+
+
+def test_more_than_sixteen_bits(tmp_path):
+    path = save(tmp_path / "deep.tif", Image.fromarray(np.array([[70000, 0]], np.int32)))
+    with pytest.raises(ClipError, match=r"frame deep.tif has values from 0 to 70000; expected 16 bits"):
+        read_image(path)
+
+
+def test_floating_point(tmp_path):
+    image = pixels(save(tmp_path / "float.tif", Image.fromarray(np.array([[0, 0.5, 1]], np.float32))))
+    np.testing.assert_array_equal(image[..., 0], [[0, 128, 255]])
+    path = save(tmp_path / "nan.tif", Image.fromarray(np.array([[np.nan, 0.5]], np.float32)))
+    with pytest.raises(ClipError, match=r"frame nan.tif has values that are not finite"):
+        read_image(path)
+
+
+def test_transparency_is_composited_over_white(tmp_path):
+    clear, half = (10, 20, 30, 0), (0, 100, 200, 128)
+    image = Image.new("RGBA", (2, 1), clear)
+    image.putpixel((1, 0), half)
+    expected = [[[255, 255, 255], [127, 177, 227]]]
+    np.testing.assert_array_equal(pixels(save(tmp_path / "rgba.png", image)), expected)
+
+    grey = Image.new("LA", (2, 1), (10, 0))
+    grey.putpixel((1, 0), (100, 255))
+    np.testing.assert_array_equal(pixels(save(tmp_path / "la.png", grey))[0, :, 0], [255, 100])
+
+
+def test_palettes(tmp_path):
+    image = Image.new("P", (3, 1))
+    image.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
+    image.putdata([0, 1, 2])
+    colours = [[255, 0, 0], [0, 255, 0], [0, 0, 255]]
+    np.testing.assert_array_equal(pixels(save(tmp_path / "p.png", image))[0], colours)
+    white = [[255, 255, 255], *colours[1:]]
+    np.testing.assert_array_equal(pixels(save(tmp_path / "index.png", image, transparency=0))[0], white)
+    alpha = bytes([0, 255, 255])
+    np.testing.assert_array_equal(pixels(save(tmp_path / "bytes.png", image, transparency=alpha))[0], white)
+
+
+def test_one_bit_and_cmyk(tmp_path):
+    bits = Image.new("1", (2, 1))
+    bits.putpixel((1, 0), 1)
+    np.testing.assert_array_equal(pixels(save(tmp_path / "bits.png", bits))[0, :, 0], [0, 255])
+    ink = Image.new("CMYK", (8, 8), (0, 255, 255, 0))
+    assert np.abs(pixels(save(tmp_path / "ink.jpg", ink, quality=100)).astype(int) - (255, 0, 0)).max() < 8
+
+
+def test_exif_orientation(tmp_path):
+    image = Image.new("RGB", (4, 2), "black")
+    image.putpixel((0, 0), (255, 255, 255))
+    exif = Image.Exif()
+    exif[0x0112] = 6  # shown turned by 90 degrees clockwise: the upper left corner goes to the upper right
+    turned = pixels(save(tmp_path / "a.png", image, exif=exif))
+    assert turned.shape == (4, 2, 3)
+    assert turned[0, 1].tolist() == [255, 255, 255]
+    assert turned.sum() == 3 * 255
+
+
+def test_files_are_frames_named_by_their_stems(tmp_path):
+    paths = tuple(save(tmp_path / f"view.{i}.png", Image.new("RGB", (2, 2), (i, 0, 0))) for i in range(4))
+    frames = list(ImageFiles(paths).frames(Sampling(start=1, stride=2)))
+    assert [frame.name for frame in frames] == ["view.1", "view.3"]
+    assert [frame.image.getpixel((0, 0)) for frame in frames] == [(1, 0, 0), (3, 0, 0)]
+    assert ImageFiles(paths).total(Sampling(start=1, stride=2)) == 2
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg", "tif", "bmp", "webp", "ppm"])
+@pytest.mark.parametrize("kept", [0.0, 0.6])
+def test_truncated_files(tmp_path, ending, kept):
+    noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8)
+    path = save(tmp_path / f"cut.{ending}", Image.fromarray(noise))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * kept)])
+    with pytest.raises(ClipError, match=f"cut.{ending}"):
+        read_image(path)
+
+
+def test_files_that_are_no_images(tmp_path):
+    path = tmp_path / "a.png"
+    with pytest.raises(ClipError, match="does not exist"):
+        read_image(path)
+    path.write_text("not a picture")
+    with pytest.raises(ClipError, match="not an image of a known format; expected one of PNG, JPEG"):
+        read_image(path)
+    path.write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n")  # a program for another interpreter
+    with pytest.raises(ClipError, match="not an image of a known format"):
+        read_image(path)
+    with pytest.raises(ClipError, match=r"cannot read image .*directory"):
+        read_image(tmp_path)
+
+
+def test_an_absurdly_large_image(tmp_path, monkeypatch):
+    path = save(tmp_path / "bomb.png", Image.new("1", (400, 400)))
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 400 * 400 // 3)
+    with pytest.raises(ClipError, match=r"cannot read image .*bomb.png.*exceeds limit"):
+        read_image(path)
+
+
+def test_names_of_images(tmp_path):
+    assert all(is_image_name(tmp_path / name) for name in ("a.png", "a.JPG", "a.jpeg", "a.tiff", "a.webp"))
+    assert not any(is_image_name(tmp_path / name) for name in ("a.mp4", "a.gif", "a.txt", "a.eps", "png", "a"))

@@ -1,0 +1,64 @@
+"""Otsu against scikit-image, upsampling, token masks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage.filters import threshold_otsu
+
+from vggtjax.mask import dynamic_pixels, dynamic_tokens, otsu_threshold, upsample
+
+_otsu = jax.jit(otsu_threshold)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    share=st.floats(0.01, 0.99),
+    gap=st.floats(0, 5),
+    scale=st.sampled_from([1e-4, 1.0, 1e3]),
+)
+def test_otsu_agrees_with_scikit_image_within_a_bin(seed, share, gap, scale):
+    generator = np.random.default_rng(seed)
+    values = generator.normal(size=4000) + gap * (generator.random(4000) < share)
+    values = (scale * values).astype(np.float32)
+    width = (values.max() - values.min()) / 256
+    assert abs(float(_otsu(values)) - threshold_otsu(values)) <= 1.01 * width
+
+
+def test_otsu_by_hand():
+    values = jnp.asarray([0.0] * 6 + [1.0] * 2)
+    assert float(otsu_threshold(values)) == pytest.approx(0.5 / 256)  # the lowest of equally good bin centres
+    assert float(otsu_threshold(jnp.full((4,), 0.3))) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.7])
+def test_constant_saliency_has_no_dynamic_pixels(value):
+    assert not dynamic_pixels(jnp.full((1, 3, 2, 2), value), (28, 28)).any()
+
+
+def test_dynamic_pixels_are_at_or_above_the_threshold_of_their_own_clip():
+    saliency = np.zeros((2, 2, 3, 4), np.float32)
+    saliency[0, 0, 1, 1] = 1.0
+    saliency[1, 1, 2, 3] = 0.01  # another clip, another range
+    mask = np.asarray(dynamic_pixels(jnp.asarray(saliency), (42, 56)))
+    pixels = np.asarray(upsample(jnp.asarray(saliency), (42, 56)))
+    for clip in range(2):
+        threshold = threshold_otsu(pixels[clip])
+        bin_width = pixels[clip].max() / 256
+        sure = np.abs(pixels[clip] - threshold) > bin_width
+        assert (mask[clip] == (pixels[clip] >= threshold))[sure].all()
+        assert 0 < mask[clip].mean() < 0.5
+
+
+def test_upsampling_has_half_pixel_centres():
+    made = np.asarray(upsample(jnp.asarray([[[[0.0, 1.0]]]]), (1, 4)))
+    assert np.allclose(made, [[[[0, 0.25, 0.75, 1]]]])
+
+
+def test_a_token_is_dynamic_if_any_of_its_pixels_is():
+    mask = np.zeros((1, 1, 28, 42), bool)
+    mask[0, 0, 13, 14] = True
+    assert np.asarray(dynamic_tokens(jnp.asarray(mask), 14)).tolist() == [[[[False, True, False], [False] * 3]]]

@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+
+from tests.room import make_room
+from vggtjax import previews
+
+
+def test_range_by_hand():
+    depth = np.array([[[1, 2, 4]]], np.float32)
+    far, near = previews.inverse_depth_range(depth, np.ones((1, 1, 3), bool))
+    # Of 0.25, 0.5, 1 the 2nd percentile lies 0.04 of the way from the first to the second.
+    assert (far, near) == pytest.approx((0.26, 0.98))
+    assert previews.inverse_depth_range(depth, depth < 2) == (1, 1)
+    assert previews.inverse_depth_range(depth, depth < 0) == (0, 1)
+
+
+def test_near_is_warm_far_is_cold_and_none_is_grey():
+    depth = np.array([[1, 5, 1000, np.inf]], np.float32)
+    near, middle, far, none = previews.color_depth(depth, np.isfinite(depth), (0.0, 0.4))[0].astype(int)
+    assert near[0] > near[2] + 80
+    assert middle[1] > 200
+    assert far[2] >= far[0]
+    assert none.max() - none.min() < 10
+
+
+def test_equal_depth_has_one_color():
+    depth = np.full((4, 4), 3, np.float32)
+    valid = np.ones((4, 4), bool)
+    colored = previews.color_depth(depth, valid, previews.inverse_depth_range(depth[None], valid[None]))
+    assert len(np.unique(colored.reshape(-1, 3), axis=0)) == 1
+
+
+def test_overlay_by_hand():
+    image = np.full((9, 9, 3), (30, 60, 90), np.uint8)
+    mask = np.zeros((9, 9), bool)
+    mask[2:7, 2:7] = True
+    drawn = previews.overlay(image, mask)
+    assert tuple(drawn[4, 4]) == (131, 51, 90)  # 0.55 x image + 0.45 x (255, 40, 90)
+    assert tuple(drawn[0, 0]) == (45, 60, 75)  # half way to the mean of its channels
+    assert tuple(drawn[2, 4]) == tuple(drawn[1, 4]) == (255, 235, 60)
+    assert (image == (30, 60, 90)).all()
+
+
+@pytest.mark.parametrize("value", [False, True])
+def test_overlay_without_a_boundary(value):
+    drawn = previews.overlay(np.zeros((5, 5, 3), np.uint8), np.full((5, 5), value))
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) == 1
+
+
+@pytest.mark.parametrize("frames", [1, 3, 20])
+def test_sheet_shows_frames_in_columns(frames):
+    room = make_room(frames)
+    sheet = previews.contact_sheet(room)
+    assert sheet.dtype == np.uint8
+    assert sheet.shape[1] <= 2100
+    pure = (sheet == (255, 235, 60)).all(axis=-1).any(axis=0)  # columns of the outline of the moving box
+    starts = np.flatnonzero(np.diff(pure.astype(int)) == 1)
+    assert min(frames, 8) <= len(starts) <= 2 * min(frames, 8)
+
+
+def test_sheet_of_tall_pictures_without_times_or_depth():
+    room = make_room(
+        2, 140, 14, timestamps=None, depth=np.full((2, 140, 14), np.nan), saliency=np.full((2, 10, 1), np.nan)
+    )
+    assert previews.contact_sheet(room).shape[0] < 1500

@@ -1,0 +1,27 @@
+"""The Python of the README runs as it stands."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vggtjax.demo import demo_frames
+
+README = Path(__file__).parents[1] / "README.md"
+
+
+@pytest.mark.filterwarnings("ignore:the field of view")
+def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("frames").mkdir()
+    for i, frame in enumerate(demo_frames(6)):
+        Image.fromarray((255 * frame).astype(np.uint8)).save(f"frames/{i}.png")
+    blocks = [part.split("```")[0] for part in README.read_text().split("```python\n")[1:]]
+    assert len(blocks) == 2
+    names = {}
+    for block in blocks:
+        exec(compile(block, str(README), "exec"), names)
+    assert (names["again"].depth == names["result"].depth).all()
+    assert set(names["ablation"]) == {"vggt", "pose-decoupling", "hard-replacement", "4dvggt-d"}
+    assert names["ablation"]["4dvggt-d"].depth.shape == names["images"].shape[:4]

@@ -1,0 +1,129 @@
+"""What can be named as the source of a clip."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from vggtjax.arrays import ArrayFrames
+from vggtjax.errors import ClipError
+from vggtjax.images import ImageFiles
+from vggtjax.sources import natural_key, open_source
+from vggtjax.video import VideoFile
+
+
+@pytest.fixture
+def folder(tmp_path):
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for name in ("frame_10.png", "frame_2.png", "frame_1.JPG", ".frame_0.png", "._frame_1.png"):
+        Image.new("RGB", (2, 2)).save(frames / name)
+    (frames / "notes.txt").write_text("hidden files and notes are no frames")
+    (frames / "frame_3.png").mkdir()
+    return frames
+
+
+def names(source):
+    assert isinstance(source, ImageFiles)
+    assert all(path.is_absolute() for path in source.paths)
+    return [path.name for path in source.paths]
+
+
+def test_natural_order():
+    ordered = ["2", "10", "a1b2", "a1b10", "a02", "a10", "B1"]
+    shuffled = [Path(name) for name in ("B1", "a10", "10", "a1b10", "2", "a02", "a1b2")]
+    assert [path.name for path in sorted(shuffled, key=natural_key)] == ordered
+    assert natural_key(Path("cam2/frame_10")) < natural_key(Path("cam10/frame_2"))
+    sorted([Path("1"), Path("a"), Path("1a"), Path("²"), Path("٣")], key=natural_key)  # other digits do not break it
+
+
+def test_folder(folder):
+    ordered = ["frame_1.JPG", "frame_2.png", "frame_10.png"]
+    assert names(open_source(folder)) == ordered
+    assert names(open_source(str(folder))) == ordered
+    assert names(open_source(f"{folder}/*")) == ordered
+    assert names(open_source(f"{folder.parent}/**/frame_*.png")) == ordered[1:]
+
+
+def test_relative_paths_become_absolute(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    assert names(open_source(".")) == ["frame_1.JPG", "frame_2.png", "frame_10.png"]
+    assert names(open_source("frame_?.*")) == ["frame_1.JPG", "frame_2.png"]
+
+
+def test_a_list_keeps_its_order(folder):
+    assert names(open_source([folder / "frame_10.png", str(folder / "frame_2.png")])) == ["frame_10.png", "frame_2.png"]
+
+
+def test_single_files(folder):
+    assert names(open_source(folder / "frame_2.png")) == ["frame_2.png"]
+    video = folder / "clip.MP4"
+    video.touch()
+    assert open_source(video) == VideoFile(video)
+
+
+def test_a_name_with_brackets_is_not_a_pattern(folder):
+    (folder / "frame_2.png").rename(folder / "frame[2].png")
+    assert names(open_source(str(folder / "frame[2].png"))) == ["frame[2].png"]
+
+
+def test_arrays():
+    frames = np.zeros((2, 4, 5, 3), np.uint8)
+    for source in (frames, list(frames), tuple(frames)):
+        opened = open_source(source)
+        assert isinstance(opened, ArrayFrames)
+        assert len(opened.arrays) == 2
+
+
+def test_a_folder_without_images_says_what_it_holds(tmp_path):
+    with pytest.raises(ClipError, match="holds no images but nothing at all"):
+        open_source(tmp_path)
+    for name in ("b10", "b9"):
+        (tmp_path / name).mkdir()
+    for name in ("a.mp4", "x.txt", "y.txt"):
+        (tmp_path / name).touch()
+    message = r"no images but 2 folders \(b9, b10\) and 1 videos \(a.mp4\) and 2 other files \(.txt\)"
+    with pytest.raises(ClipError, match=message):
+        open_source(tmp_path)
+    with pytest.raises(ClipError, match=r"matches no images but 1 videos \(a.mp4\)"):
+        open_source(f"{tmp_path}/*.mp4")
+    with pytest.raises(ClipError, match="matches no images but nothing at all"):
+        open_source(f"{tmp_path}/*.png")
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("missing/frames", "missing/frames does not exist"),
+        ("https://example.org/clip.mp4", "does not exist"),
+        ("", "'' is not a path"),
+        ("a\0b", "is not a path"),
+        ("x" * 5000, "cannot look for frames in x+: File name too long"),
+        ([], "the list of frames is empty"),
+        (["missing.png"], "image missing.png does not exist"),
+        (["a.png", np.zeros((1, 1, 3))], "holds ndarray, str; expected image paths only, or arrays only"),
+        (b"frames", "of type bytes"),
+        (7, "of type int"),
+        ("/dev/null", "neither a file nor a folder"),
+    ],
+)
+def test_sources_that_are_none(source, message):
+    with pytest.raises(ClipError, match=message):
+        open_source(source)
+
+
+def test_a_file_of_another_kind(tmp_path):
+    path = tmp_path / "weights.pt"
+    path.touch()
+    with pytest.raises(ClipError, match="name of neither an image nor a video"):
+        open_source(path)
+
+
+def test_an_unreadable_folder(tmp_path, monkeypatch):
+    def refuse(self):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(ClipError, match=r"cannot look for frames in .*: Permission denied"):
+        open_source(tmp_path)

@@ -1,0 +1,224 @@
+"""The conversion of PyTorch weights: the rule table, its strictness, and the file that it streams to."""
+
+import errno
+import json
+import math
+import tracemalloc
+from itertools import pairwise
+
+import jax
+import ml_dtypes
+import numpy as np
+import pytest
+from flax.traverse_util import flatten_dict
+from safetensors import safe_open
+from safetensors.numpy import save_file
+
+from benchmarks.seeded import seeded_images, seeded_state_dict
+from converters import convert, convert_state_dict
+from converters.rules import CONV, DENSE, DEPTH_TO_SPACE, IGNORED, POINTWISE, RULES, SAME, TRACKS, UNBATCHED
+from converters.torch_to_flax import source_shapes
+from vggtjax import VGGTConfig, forward, load_model, vggt_1b
+from vggtjax.checkpoint import flat_shapes
+from vggtjax.errors import CheckpointError, InputError, OutputError
+
+VIRTUAL_TRACKS = "track_head.tracker.updateformer.virual_tracks"
+BIAS = "camera_head.pose_branch.fc1.bias"
+
+
+@pytest.fixture(scope="module")
+def shapes(golden):
+    return json.loads((golden / "shapes.json").read_text())
+
+
+@pytest.fixture
+def state_dict(shapes):
+    return seeded_state_dict(shapes)
+
+
+@pytest.fixture
+def source(state_dict, tmp_path):
+    save_file(state_dict, tmp_path / "tiny.safetensors", metadata={"format": "pt"})
+    return tmp_path / "tiny.safetensors"
+
+
+def problems(state_dict, config) -> str:
+    with pytest.raises(CheckpointError) as raised:
+        convert_state_dict(state_dict, config)
+    return str(raised.value)
+
+
+def test_rules_name_every_tensor_of_the_published_layout(golden, config):
+    for model, file in ((config, "shapes.json"), (vggt_1b(), "shapes_vggt_1b.json")):
+        published = {name: tuple(shape) for name, shape in json.loads((golden / file).read_text()).items()}
+        assert source_shapes(model) == {name: shape for name, shape in published.items() if name not in IGNORED}
+
+
+def test_rules_fill_every_parameter_once(config):
+    assert {rule.path for rule in RULES} == set(flat_shapes(config))
+    assert len({rule.source for rule in RULES}) == len(RULES)
+
+
+@pytest.mark.parametrize(
+    ("transform", "shape", "index", "target_index"),
+    [
+        (SAME, (2, 3), (1, 2), (1, 2)),
+        (DENSE, (2, 3), (1, 2), (2, 1)),
+        (CONV, (2, 3, 4, 5), (1, 2, 3, 4), (3, 4, 2, 1)),
+        (POINTWISE, (2, 3, 1, 1), (1, 2, 0, 0), (2, 1)),
+        (DEPTH_TO_SPACE, (2, 3, 4, 5), (1, 2, 3, 4), (1, 3, 4, 2)),
+        (UNBATCHED, (1, 2, 3), (0, 1, 2), (1, 2)),
+        (TRACKS, (1, 5, 1, 3), (0, 4, 0, 2), (4, 2)),
+    ],
+)
+def test_transforms(transform, shape, index, target_index):
+    x = np.arange(math.prod(shape)).reshape(shape)
+    made = transform(x)
+    assert made[target_index] == x[index]
+    assert np.shares_memory(made, x)
+    assert transform.source_shape(made.shape) == shape
+
+
+def test_layers_are_stacked_in_order(state_dict, config):
+    params = convert_state_dict(state_dict, config)
+    kernel = params["aggregator"]["frame_blocks"]["attention"]["qkv"]["kernel"]
+    assert kernel.shape == (24, 32, 96)
+    for layer in (0, 7, 23):
+        assert np.array_equal(kernel[layer], state_dict[f"aggregator.frame_blocks.{layer}.attn.qkv.weight"].T)
+
+
+def test_types_are_kept(state_dict, config):
+    flat = flatten_dict(convert_state_dict({k: v.astype(ml_dtypes.bfloat16) for k, v in state_dict.items()}, config))
+    assert {leaf.dtype for leaf in flat.values()} == {np.dtype(ml_dtypes.bfloat16)}
+
+
+def test_both_spellings_of_virtual_tracks(state_dict, config):
+    published = convert_state_dict(state_dict, config)
+    state_dict[VIRTUAL_TRACKS.replace("virual", "virtual")] = state_dict.pop(VIRTUAL_TRACKS)
+    assert jax.tree.all(jax.tree.map(np.array_equal, convert_state_dict(state_dict, config), published))
+
+
+def test_one_problem_of_each_kind(state_dict, config):
+    def without(name):
+        return {key: value for key, value in state_dict.items() if key != name}
+
+    assert f"1 problem: missing key {BIAS}" in problems(without(BIAS), config)
+    assert "1 problem: unknown key extra.weight" in problems(state_dict | {"extra.weight": np.ones(3)}, config)
+    beyond = "aggregator.frame_blocks.24.norm1.weight"
+    assert f"1 problem: unknown key {beyond}" in problems(state_dict | {beyond: np.ones(32, np.float32)}, config)
+    both = VIRTUAL_TRACKS.replace("virual", "virtual")
+    message = problems(state_dict | {both: state_dict[VIRTUAL_TRACKS]}, config)
+    assert f"1 problem: duplicate keys {VIRTUAL_TRACKS} and {both}" in message
+    message = problems(state_dict | {BIAS: np.ones((1, 64), np.float32)}, config)
+    assert f"1 problem: mis-shaped key {BIAS}: [1, 64], expected [32]" in message
+    message = problems(state_dict | {BIAS: np.ones(32, np.int64)}, config)
+    assert f"1 problem: key {BIAS} has type int64" in message
+
+
+def test_all_problems_at_once(state_dict, config):
+    del state_dict[BIAS]
+    state_dict["extra.weight"] = np.ones(3)
+    state_dict["aggregator.camera_token"] = np.ones((2, 1, 32), np.int32)
+    message = problems(state_dict, config)
+    assert "4 problems" in message
+    for part in (BIAS, "extra.weight", "mis-shaped key aggregator.camera_token", "type int32"):
+        assert part in message
+
+
+def test_many_problems_make_one_short_message(config, state_dict):
+    message = problems({}, config)
+    assert f"{len(state_dict) - 1} problems" in message
+    assert "and 1482 more" in message
+    message = problems(state_dict | {"\x1b[31m" + "x" * 10_000: np.ones(1)}, config)
+    assert "\x1b" not in message
+    assert len(message) < 600
+
+
+def test_convert_streams_the_same_arrays(state_dict, source, config, tmp_path):
+    calls = []
+    out = convert(source, tmp_path / "out" / "ours.safetensors", config=config, progress=lambda *c: calls.append(c))
+    expected = flatten_dict(convert_state_dict(state_dict, config), sep=".")
+    with safe_open(out, framework="numpy") as file:
+        assert file.metadata() == {"format": "vggtjax", "version": "1", "config": config.to_json(), "name": "tiny"}
+        assert set(file.keys()) == set(expected)
+        for name, array in expected.items():
+            made = file.get_tensor(name)
+            assert made.dtype == np.float32
+            assert np.array_equal(made, array)
+    tensors = len(state_dict) - len(IGNORED)
+    assert calls == [(done, tensors) for done in range(1, tensors + 1)]
+    assert [path.name for path in out.parent.iterdir()] == ["ours.safetensors"]
+
+
+def test_convert_rounds_to_bfloat16(state_dict, source, config, tmp_path):
+    model = load_model(convert(source, tmp_path / "half.safetensors", config=config, dtype="bfloat16"))
+    expected = convert_state_dict(state_dict, config)
+    same = jax.tree.map(lambda a, b: np.array_equal(a, b.astype(ml_dtypes.bfloat16)), model.params, expected)
+    assert jax.tree.all(same)
+    assert model.dtype == "bfloat16"
+
+
+def test_large_arrays_are_aligned_for_memory_maps(source, config, tmp_path):
+    out = convert(source, tmp_path / "ours.safetensors", config=config)
+    content = out.read_bytes()
+    length = int.from_bytes(content[:8], "little")
+    header = json.loads(content[8 : 8 + length])
+    header.pop("__metadata__")
+    spans = sorted(entry["data_offsets"] for entry in header.values())
+    assert (8 + length) % 64 == 0
+    assert all(end == begin for (_, end), (begin, _) in pairwise(spans))
+    assert all(begin % 64 == 0 for begin, end in spans if (end - begin) % 64 == 0)
+
+
+def test_convert_holds_one_tensor_at_a_time(source, config, tmp_path):
+    out = convert(source, tmp_path / "first.safetensors", config=config)  # shapes are traced once
+    tracemalloc.start()
+    try:
+        convert(source, out, config=config)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 0.3 * out.stat().st_size
+
+
+@pytest.mark.parametrize(
+    ("failure", "expected"),
+    [(KeyboardInterrupt(), KeyboardInterrupt), (OSError(errno.ENOSPC, "No space left on device"), OutputError)],
+)
+def test_interrupted_conversion_leaves_nothing(source, config, tmp_path, failure, expected):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "ours.safetensors").write_text("before")
+
+    def fail(done, total):
+        if done == 700:
+            raise failure
+
+    with pytest.raises(expected):
+        convert(source, folder / "ours.safetensors", config=config, progress=fail)
+    with pytest.raises(expected):
+        convert(source, folder / "new.safetensors", config=config, progress=fail)
+    assert [(path.name, path.read_text()) for path in folder.iterdir()] == [("ours.safetensors", "before")]
+
+
+def test_convert_checks_its_arguments(source, config, tmp_path):
+    with pytest.raises(InputError, match=r"tiny\.safetensors is the source itself"):
+        convert(source, source, config=config)
+    with pytest.raises(InputError, match="dtype is 'float16'; expected one of"):
+        convert(source, tmp_path / "x.safetensors", config=config, dtype="float16")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(CheckpointError, match="does not fit the configuration"):
+        convert(source, tmp_path / "x.safetensors")
+    assert not (tmp_path / "x.safetensors").exists()
+
+
+def test_golden_forward_through_a_file(golden, shapes, tmp_path):
+    arrays = np.load(golden / "forward_single.npz")
+    meta = json.loads(str(arrays["meta"]))
+    config = VGGTConfig(**json.loads((golden / "config.json").read_text()))
+    save_file(seeded_state_dict(shapes, meta["seed"]), tmp_path / "torch.safetensors")
+    model = load_model(convert(tmp_path / "torch.safetensors", tmp_path / "ours.safetensors", config=config))
+    images = seeded_images(meta["frames"], meta["height"], meta["width"], meta["seed"]).transpose(0, 2, 3, 1)[None]
+    made = jax.jit(forward, static_argnames="config")(model.params, images, model.config)
+    for name, key in (("pose_encoding", "pose_enc"), ("depth", "depth"), ("depth_confidence", "depth_conf")):
+        expected = arrays[f"plain/{key}"]
+        assert np.abs(np.asarray(getattr(made, name)).reshape(expected.shape) - expected).max() < 1e-4 * expected.std()

@@ -1,0 +1,77 @@
+"""Frames that are arrays in memory, and values of any depth as 8 bits. Does not import jax."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from vggtjax.errors import ClipError
+from vggtjax.sampling import Frame, Sampling
+
+
+@dataclass(frozen=True, eq=False)
+class ArrayFrames:
+    """Frames [H, W, 3] in memory: uint8, uint16 or floating point in [0, 1]. The arrays are kept, not copied."""
+
+    arrays: tuple[np.ndarray, ...]
+
+    @classmethod
+    def from_arrays(cls, arrays: Any) -> ArrayFrames:
+        """Take one array [S, H, W, 3] or a sequence of arrays [H, W, 3]; raise ClipError for any other shape."""
+        if not isinstance(arrays, Sequence):
+            stacked = np.asarray(arrays)
+            if stacked.ndim != 4:
+                raise ClipError(f"the array has shape {stacked.shape}; expected frames [S, H, W, 3]")
+            arrays = stacked
+        frames = tuple(np.asarray(array) for array in arrays)
+        if not frames:
+            raise ClipError("the array holds no frames; expected at least one")
+        for index, frame in enumerate(frames):
+            if frame.ndim != 3 or frame.shape[2] != 3 or frame.size == 0:
+                raise ClipError(f"frame {frame_name(index)} has shape {frame.shape}; expected [H, W, 3], none empty")
+        return cls(frames)
+
+    def total(self, sampling: Sampling) -> int:
+        """Return how many frames `sampling` takes."""
+        return len(sampling.indices(len(self.arrays)))
+
+    def frames(self, sampling: Sampling) -> Iterator[Frame]:
+        """Yield the frames that `sampling` takes, named by their index."""
+        for index in sampling.indices(len(self.arrays)):
+            name = frame_name(index)
+            yield Frame(name, Image.fromarray(eight_bit(self.arrays[index], name)))
+
+
+def frame_name(index: int) -> str:
+    """Return the name of a frame that has none of its own: its index in the source."""
+    return f"{index:06d}"
+
+
+def eight_bit(values: np.ndarray, name: str) -> np.ndarray:
+    """Return `values` as uint8, the largest value of their kind becoming 255, rounded to nearest.
+
+    Args:
+        values: uint8, uint16, or floating point in [0, 1].
+        name: frame, for the error.
+
+    Raises:
+        ClipError: another type, or a floating-point value that is not finite or not in [0, 1].
+    """
+    if values.dtype == np.uint8:
+        return values
+    if np.issubdtype(values.dtype, np.uint16):
+        return ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)  # 65535 = 255 * 257
+    if not np.issubdtype(values.dtype, np.floating):
+        raise ClipError(f"frame {name} has values of type {values.dtype}; expected uint8, uint16 or floating point")
+    lowest, highest = values.min(), values.max()
+    if not (np.isfinite(lowest) and np.isfinite(highest)):
+        raise ClipError(f"frame {name} has values that are not finite; expected floating point in [0, 1]")
+    if lowest < 0 or highest > 1:
+        raise ClipError(
+            f"frame {name} has values from {lowest:g} to {highest:g}; expected floating point in [0, 1], or uint8"
+        )
+    return np.rint(values.astype(np.float32) * 255).astype(np.uint8)

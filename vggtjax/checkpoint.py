@@ -1,0 +1,270 @@
+"""Models on disk: one safetensors file with flat Flax names, the configuration and the name in its metadata."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Literal
+
+import jax
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from vggtjax.config import VGGTConfig, vggt_1b
+from vggtjax.errors import CheckpointError, InputError
+from vggtjax.layers import Params
+from vggtjax.model import HEADS, parameter_shapes
+from vggtjax.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
+
+DType = Literal["float32", "bfloat16"]
+Progress = Callable[[int, int], object]
+
+FORMAT = "vggtjax"
+VERSION = "1"
+
+_DTYPES = {name: np.dtype(jax.numpy.dtype(name)) for name in ("float32", "bfloat16")}
+_MOST_CONFIG_LETTERS = 2**16
+_MOST_NAME_LETTERS = 200
+_MOST_PROBLEMS = 20  # spelt out in one message
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A network ready to run."""
+
+    config: VGGTConfig
+    params: Params = field(repr=False)  # nested dicts of arrays with Flax names, layers stacked on axis 0
+    name: str
+    path: Path | None = None  # the file that the parameters are in
+    trained: bool = True  # False: random parameters, whose results mean nothing
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of parameters."""
+        return sum(leaf.size for leaf in jax.tree.leaves(self.params))
+
+    @property
+    def parameter_bytes(self) -> int:
+        """Bytes that the parameters take."""
+        return sum(leaf.nbytes for leaf in jax.tree.leaves(self.params))
+
+    @property
+    def dtype(self) -> str:
+        """Type of the parameters, or of most of them."""
+        sizes = Counter[str]()
+        for leaf in jax.tree.leaves(self.params):
+            sizes[str(leaf.dtype)] += leaf.size
+        return sizes.most_common(1)[0][0]
+
+    @property
+    def heads(self) -> tuple[str, ...]:
+        """Names of the heads that the parameters hold."""
+        return tuple(name for name, key in HEADS.items() if key in self.params)
+
+    def summary(self) -> dict[str, Any]:
+        """Return what a person asks about a model, as plain values."""
+        return {
+            "name": self.name,
+            "path": None if self.path is None else str(self.path),
+            "trained": self.trained,
+            "parameters": self.parameter_count,
+            "bytes": self.parameter_bytes,
+            "dtype": self.dtype,
+            "heads": list(self.heads),
+            "pairs": self.config.depth,
+            "embed_dim": self.config.embed_dim,
+            "num_heads": self.config.num_heads,
+            "image_size": self.config.image_size,
+            "patch_size": self.config.patch_size,
+        }
+
+
+def load_model(
+    name_or_path: str | Path,
+    *,
+    config: VGGTConfig | None = None,
+    dtype: DType | None = None,
+    progress: Progress | None = None,
+) -> Model:
+    """Load a model by path or name.
+
+    PyTorch weights are converted once, into the folder that VGGTJAX_CACHE names or else the user's cache; after that
+    the conversion is loaded, as long as the source does not change. On a CPU the parameters stay in the file, which is
+    mapped into memory: replace it, but never write into it, while the model is in use.
+
+    Args:
+        name_or_path: "demo" (tiny and untrained), a file of this library, PyTorch weights (.safetensors, a sharded
+            one's index or folder, .pt, .pth), or a hub id such as "facebook/VGGT-1B".
+        config: the configuration of PyTorch weights; None for VGGT-1B. A file of this library knows its own.
+        dtype: of the parameters; None keeps the file's, and makes float32 of PyTorch weights.
+        progress: called during a conversion with the tensors converted and their number.
+
+    Raises:
+        CheckpointError: nothing is there, or it cannot be read, or does not fit the configuration.
+        MissingExtraError: the weights need torch or huggingface_hub, which is not installed.
+    """
+    from converters.sources import locate
+
+    if dtype is not None:
+        numpy_dtype(dtype)
+    if str(name_or_path) == "demo":
+        from vggtjax.demo_model import demo_model
+
+        model = demo_model(dtype or "float32")
+    else:
+        weights = locate(name_or_path)
+        path = weights.path
+        if not is_checkpoint(path):
+            path = _converted(path, weights.name, config or vggt_1b(), dtype or "float32", progress)
+        model = read_model(path, dtype=dtype)
+    if config not in (None, model.config):
+        raise CheckpointError(f"{name_or_path} knows its configuration, and it is not the one given; leave that out")
+    return model
+
+
+def is_checkpoint(path: str | Path) -> bool:
+    """Return whether a file is one of this library, by its content."""
+    return is_tensor_file(path) and read_tensors(path).metadata.get("format") == FORMAT
+
+
+def read_model(path: str | Path, *, dtype: DType | None = None) -> Model:
+    """Read a file of this library; the parameters keep its types unless `dtype` says otherwise.
+
+    Raises:
+        CheckpointError: the file is no whole checkpoint of this library, or does not fit the configuration in it; all
+            problems at once.
+    """
+    path = Path(path)
+    tensors, metadata = read_tensors(path)
+    config = _config(path, metadata)
+    _check(f"{path} does not fit the configuration in it", tensors, config)
+    flat = {}
+    for name, tensor in tensors.items():
+        leaf = jax.device_put(tensor)  # on a CPU without a copy, where it is aligned in the file
+        flat[name] = leaf if dtype is None else leaf.astype(numpy_dtype(dtype))
+    name = metadata.get("name", "")
+    return Model(
+        config,
+        unflatten_dict(flat, sep="."),
+        name if name.isprintable() and 0 < len(name) <= _MOST_NAME_LETTERS else path.stem,
+        path,
+    )
+
+
+def save_model(path: str | Path, params: Params, config: VGGTConfig, *, name: str | None = None) -> Path:
+    """Write parameters as a file of this library, with their types; return its path.
+
+    Args:
+        path: the file; one that is there is replaced.
+        params: nested dicts of float32 or bfloat16 arrays.
+        config: the model that they are of.
+        name: the model's name; None for the file's stem.
+
+    Raises:
+        CheckpointError: the parameters are not those of the configuration; all problems at once.
+        OutputError: the file cannot be written.
+    """
+    flat: dict[str, Any] = flatten_dict(params, sep=".")
+    _check("the parameters do not fit the configuration", flat, config)
+    specs = {key: Spec(leaf.shape, leaf.dtype) for key, leaf in flat.items()}
+    return write_checkpoint(path, specs, lambda key: [np.asarray(flat[key])], config, name=name)
+
+
+def write_checkpoint(
+    path: str | Path,
+    specs: Mapping[str, Spec],
+    pieces: Callable[[str], Iterable[np.ndarray]],
+    config: VGGTConfig,
+    *,
+    name: str | None = None,
+) -> Path:
+    """Write a file of this library piece by piece, as `write_tensors` does; return its path."""
+    path = Path(path)
+    metadata = {"format": FORMAT, "version": VERSION, "config": config.to_json(), "name": name or path.stem}
+    write_tensors(path, specs, pieces, metadata)
+    return path
+
+
+@lru_cache(maxsize=8)
+def flat_shapes(config: VGGTConfig) -> Mapping[str, tuple[int, ...]]:
+    """Return flat dotted names -> shapes of a model's parameters."""
+    flat: dict[str, Any] = flatten_dict(parameter_shapes(config), sep=".")
+    return MappingProxyType({path: leaf.shape for path, leaf in flat.items()})
+
+
+def numpy_dtype(dtype: DType) -> np.dtype:
+    """Return the numpy type of a parameter type's name, or raise InputError for another name."""
+    if dtype not in _DTYPES:
+        raise InputError(f"dtype is {dtype!r}; expected one of {tuple(_DTYPES)}")
+    return _DTYPES[dtype]
+
+
+def problems_sentence(subject: str, problems: Sequence[str]) -> str:
+    """Return one sentence that says how many problems there are and spells out the first ones."""
+    shown = "; ".join("".join(c if c.isprintable() else "?" for c in text[:300]) for text in problems[:_MOST_PROBLEMS])
+    more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
+    return f"{subject}: {len(problems)} {'problem' if len(problems) == 1 else 'problems'}: {shown}{more}"
+
+
+def _check(subject: str, tensors: Mapping[str, Any], config: VGGTConfig) -> None:
+    shapes = flat_shapes(config)
+    problems = [f"missing parameter {name}" for name in shapes if name not in tensors]
+    for name, tensor in tensors.items():
+        if name not in shapes:
+            problems.append(f"unknown parameter {name}")
+        elif tensor.shape != shapes[name]:
+            problems.append(f"mis-shaped parameter {name}: {list(tensor.shape)}, expected {list(shapes[name])}")
+        if tensor.dtype not in _DTYPES.values():
+            problems.append(f"parameter {name} has type {tensor.dtype}, expected {' or '.join(_DTYPES)}")
+    if problems:
+        raise CheckpointError(problems_sentence(subject, problems))
+
+
+def _config(path: Path, metadata: Mapping[str, str]) -> VGGTConfig:
+    if metadata.get("format") != FORMAT:
+        raise CheckpointError(f"{path} is not a checkpoint of this library; load_model converts PyTorch weights")
+    if metadata.get("version") != VERSION:
+        raise CheckpointError(
+            f"{path} has version {metadata.get('version', '')[:20]!r} of the format; this vggtjax reads {VERSION!r}"
+        )
+    text = metadata.get("config", "")
+    if len(text) > _MOST_CONFIG_LETTERS:
+        raise CheckpointError(f"{path} has a configuration of {len(text)} letters; at most {_MOST_CONFIG_LETTERS} go")
+    try:
+        return VGGTConfig.from_json(text)
+    except InputError as error:
+        raise CheckpointError(f"{path} cannot be used: its {error}") from error
+
+
+def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:
+    """Return the conversion of PyTorch weights in the cache, made now if it is not there."""
+    from converters.sources import Weights, weight_files
+    from converters.torch_to_flax import convert_weights
+
+    stats = [(file.resolve(), file.stat()) for file in weight_files(path)]
+    facts = [VERSION, dtype, config.to_json(), *(f"{file} {stat.st_size} {stat.st_mtime_ns}" for file, stat in stats)]
+    key = hashlib.sha256("\n".join(facts).encode("utf-8", "surrogateescape")).hexdigest()[:16]
+    destination = _cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', name)[:80]}-{key}.safetensors"
+    if not destination.exists():
+        logger.info("converting %s to %s, this once", path, destination)
+        convert_weights(Weights(path, name), destination, dtype=dtype, config=config, progress=progress)
+    logger.info("loading %s", destination)
+    return destination
+
+
+def _cache_folder() -> Path:
+    if folder := os.environ.get("VGGTJAX_CACHE"):
+        return Path(folder).expanduser()
+    import platformdirs
+
+    return platformdirs.user_cache_path("vggtjax")

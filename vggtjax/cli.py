@@ -1,0 +1,208 @@
+"""The command line: `vggtjax reconstruct | convert | demo | info`. Does not import jax before it is needed."""
+
+from __future__ import annotations
+
+import logging
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from vggtjax.config import Gram, Suppress, VGGTConfig
+from vggtjax.errors import InputError, VggtjaxError
+from vggtjax.methods import MethodName
+from vggtjax.report import Report
+
+ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
+
+
+def reconstruct(
+    source: tyro.conf.Positional[tuple[str, ...]],
+    /,
+    out: Path,
+    *,
+    model: ModelName = "demo",
+    method: MethodName = "4dvggt-d",
+    config: Path | None = None,
+    mode: Literal["crop", "pad"] = "crop",
+    size: int | None = None,
+    fps: float | None = None,
+    stride: int = 1,
+    start: int = 0,
+    max_frames: int | None = None,
+    gram: Gram | None = None,
+    suppress: Suppress | None = None,
+    mask_pairs: int = 5,
+    align_scale: bool = False,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+    confidence_percentile: float = 20.0,
+) -> None:
+    """Cameras, depth, dynamic masks and a 4-D point cloud of a clip.
+
+    Args:
+        source: a folder of images, a pattern, images, or a video.
+        out: folder for the results; an earlier result in it is replaced.
+        model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id such as facebook/VGGT-1B.
+        method: which passes give depth and cameras (see the README's table).
+        config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
+        mode: "crop" cuts tall frames, "pad" keeps every pixel and pads to a square.
+        size: side in pixels to run at; the model's own by default.
+        fps: frames per second to take of a video.
+        stride: take every stride-th frame.
+        start: index of the first frame to take.
+        max_frames: take so many frames at most.
+        gram: similarity of the motion cues; the method's own by default.
+        suppress: what becomes of the keys of dynamic tokens; the method's own by default.
+        mask_pairs: number of pairs of blocks in which they are suppressed.
+        align_scale: bring the second pass to the first one's scale before fusing (not in the paper).
+        dtype: of the blocks' matrix products.
+        confidence_percentile: leave so many percent of the pixels, the least confident, out of the point clouds.
+    """
+    if not source:
+        raise InputError("no input; name a folder of images, a pattern, images, or a video")
+    report = Report()
+    with report.running():
+        loaded = _load_model(report, model, config)
+        with report.stage("load clip") as progress:
+            from vggtjax.clip import load_clip
+
+            clip = load_clip(
+                source[0] if len(source) == 1 else list(source),
+                mode=mode,
+                size=size or loaded.config.image_size,
+                patch=loaded.config.patch_size,
+                fps=fps,
+                stride=stride,
+                start=start,
+                max_frames=max_frames,
+                progress=progress,
+            )
+        from vggtjax.pipeline import reconstruct as run
+
+        result = run(
+            loaded,
+            clip,
+            method=method,
+            size=size,
+            gram=gram,
+            suppress=suppress,
+            mask_pairs=mask_pairs,
+            align_scale=align_scale,
+            compute_dtype=dtype,
+            on_stage=report.stage,
+        )
+        with report.stage("write") as progress:
+            result.save(out, confidence_percentile=confidence_percentile, progress=progress)
+    report.summary(result, out, trained=loaded.trained)
+
+
+def convert(
+    source: tyro.conf.Positional[str],
+    destination: tyro.conf.Positional[Path],
+    /,
+    *,
+    config: Path | None = None,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+) -> None:
+    """Convert a PyTorch VGGT checkpoint to one .safetensors with Flax names.
+
+    Args:
+        source: a .safetensors file, a sharded one (its index or folder), a .pt or .pth file, or a hub id.
+        destination: the .safetensors file to write.
+        config: JSON file with the configuration; VGGT-1B by default.
+        dtype: of the written weights.
+    """
+    report = Report()
+    with report.running(), report.stage("convert") as progress:
+        from converters import convert as run
+
+        run(source, destination, dtype=dtype, config=_read_config(config), progress=progress)
+    report.line(f"wrote {destination} ({destination.stat().st_size / 1e6:.1f} MB)")
+
+
+def demo(out: Path = Path("demo-output"), /, *, method: MethodName = "4dvggt-d") -> None:
+    """Reconstruct the generated clip with the embedded model: no download, nothing to choose.
+
+    Args:
+        out: folder for the results.
+        method: which passes give depth and cameras.
+    """
+    report = Report()
+    with report.running():
+        loaded = _load_model(report, "demo", None)
+        with report.stage("generate clip"):
+            from vggtjax.clip import load_clip
+            from vggtjax.demo import demo_frames
+
+            clip = load_clip(demo_frames(), size=loaded.config.image_size, patch=loaded.config.patch_size)
+        from vggtjax.pipeline import reconstruct as run
+
+        result = run(loaded, clip, method=method, on_stage=report.stage)
+        with report.stage("write") as progress:
+            result.save(out, progress=progress)
+    report.summary(result, out, trained=loaded.trained)
+
+
+def info(model: tyro.conf.Positional[str] = "demo", /, *, config: Path | None = None) -> None:
+    """Say what a model is: configuration, heads, parameters, dtype.
+
+    Args:
+        model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id.
+        config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
+    """
+    report = Report()
+    with report.running():
+        loaded = _load_model(report, model, config)
+    report.table(loaded.summary())
+
+
+COMMANDS = {"reconstruct": reconstruct, "convert": convert, "demo": demo, "info": info}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; return the exit code: 0, 2 for bad input or output, 130 when interrupted."""
+    logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
+    for chatty in ("jax", "absl", "httpx", "huggingface_hub"):
+        logging.getLogger(chatty).setLevel(logging.ERROR)
+    warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="vggtjax",
+            description="4-D reconstruction of monocular video of a moving world, in JAX.",
+            args=arguments,
+        )
+    except VggtjaxError as error:
+        sys.stderr.write(f"vggtjax: {error}\n")
+        return 2
+    except MemoryError:
+        sys.stderr.write("vggtjax: out of memory; take fewer frames (--max-frames, --stride) or a smaller --size\n")
+        return 2
+    except KeyboardInterrupt:
+        sys.stderr.write("vggtjax: interrupted\n")
+        return 130
+    return 0
+
+
+def _load_model(report: Report, name: str, config: Path | None):
+    with report.stage("load model") as progress:
+        from vggtjax.checkpoint import load_model
+
+        return load_model(name, config=_read_config(config), progress=progress)
+
+
+def _read_config(path: Path | None) -> VGGTConfig | None:
+    if path is None:
+        return None
+    try:
+        if path.stat().st_size > 1 << 20:
+            raise InputError(f"{path} is {path.stat().st_size} bytes; expected a small JSON file with a configuration")
+        return VGGTConfig.from_json(path.read_text())
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path} is not text; expected a JSON file with a configuration") from None
+

@@ -1,0 +1,180 @@
+"""A clip: frames of the model's size with the way back to the pixels they came from. Does not import jax."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, Int, UInt8
+
+from vggtjax.errors import ClipError, InputError
+from vggtjax.preprocessing import Fit, Layout, Mode
+from vggtjax.sampling import Sampling, Source
+from vggtjax.sources import ClipSource, open_source
+
+logger = logging.getLogger(__name__)
+
+Progress = Callable[[int, int | None], object]
+
+_MOST_WORKERS = 4
+_MOST_BYTES = 2**34  # of the images of one clip; over 5000 frames of 518 x 518
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Frames as the model takes them, and where each of their pixels lies in the source.
+
+    Continuous coordinates are (x, y) with pixel edges at whole numbers, so the centre of the first pixel is at
+    (0.5, 0.5); source pixels are those of the upright frame, after EXIF orientation or rotation of the video.
+    """
+
+    images: Float32[np.ndarray, "S H W 3"] = field(repr=False)  # RGB in [0, 1]
+    frame_names: list[str] = field(repr=False)  # stem of the image file, or 000000-style index in the source
+    timestamps: Float64[np.ndarray, " S"] | None = field(repr=False)  # seconds from the video's first frame; or None
+    mode: Mode
+    size: int
+    patch: int
+    source_size: Int[np.ndarray, "S 2"] = field(repr=False)  # (height, width)
+    source_scale: Float64[np.ndarray, "S 2"] = field(repr=False)  # source = scale * clip + offset, in (x, y)
+    source_offset: Float64[np.ndarray, "S 2"] = field(repr=False)
+    valid_box: Int[np.ndarray, "S 4"] = field(repr=False)  # (left, top, right, bottom) of clip pixels not padding
+    source: Source = field(repr=False)
+    sampling: Sampling
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def to_source(self, frame: int, points: Float[np.ndarray, "... 2"]) -> Float64[np.ndarray, "... 2"]:
+        """Return the source coordinates (x, y) of points given in clip coordinates of `frame`."""
+        return _points(points) * self.source_scale[frame] + self.source_offset[frame]
+
+    def from_source(self, frame: int, points: Float[np.ndarray, "... 2"]) -> Float64[np.ndarray, "... 2"]:
+        """Return the clip coordinates (x, y) of points given in source coordinates of `frame`."""
+        return (_points(points) - self.source_offset[frame]) / self.source_scale[frame]
+
+    def refit(self, size: int, patch: int, mode: Mode | None = None) -> Clip:
+        """Return the same frames, read from the source again, at another size, patch or mode.
+
+        Raises:
+            InputError: a value out of range, as in `load_clip`.
+            ClipError: the source cannot be read any more, or gives other frames than before.
+        """
+        clip = _read(self.source, self.sampling, Layout(mode or self.mode, size, patch), None)
+        if clip.frame_names != self.frame_names or not np.array_equal(clip.source_size, self.source_size):
+            raise ClipError("the source of the clip gives other frames than before; load the clip anew")
+        return clip
+
+
+def load_clip(
+    source: ClipSource,
+    *,
+    mode: Mode = "crop",
+    size: int = 518,
+    patch: int = 14,
+    fps: float | None = None,
+    stride: int = 1,
+    start: int = 0,
+    max_frames: int | None = None,
+    progress: Progress | None = None,
+) -> Clip:
+    """Load frames and bring them to the model's size the way VGGT was trained (Pillow's bicubic, 8 bits).
+
+    Args:
+        source: a folder of images, a pattern such as "frames/*.png", an image or video file, a list of image paths,
+            a list of arrays [H, W, 3] or one array [S, H, W, 3] (uint8, uint16, or floating point in [0, 1], all
+            brought to 8 bits). Files of folders and patterns are taken in natural order (frame_2 before frame_10),
+            hidden files and files that are not images left out; a list keeps its order.
+        mode: "crop" makes frames `size` wide and cuts the height to `size` at most; "pad" makes the long side `size`
+            and the frame square with white.
+        size: width, or side of the square; a multiple of `patch`.
+        patch: side of the model's patches; sides of frames are multiples of it.
+        fps: frames to take per second of a video, by presentation time: of every 1 / fps seconds the first frame.
+        stride: take every stride-th frame; not together with `fps`.
+        start: index of the first frame to take, counted in frames of the source, for video too.
+        max_frames: take so many frames at most; a video is not decoded further.
+        progress: called after each frame with the frames done and their number, None where it is not known.
+
+    Returns:
+        The clip. Frames of different sizes are padded with white to the largest, as VGGT does, with a warning logged.
+
+    Raises:
+        InputError: an argument out of range.
+        ClipError: no frames, a source that is missing or cannot be read, or a frame that cannot be used.
+        MissingExtraError: the source is a video, and PyAV is not installed.
+    """
+    layout = Layout(mode, size, patch)
+    sampling = Sampling(start, stride, fps, max_frames)
+    return _read(open_source(source), sampling, layout, progress)
+
+
+def _read(source: Source, sampling: Sampling, layout: Layout, progress: Progress | None) -> Clip:
+    total = source.total(sampling)
+    names: list[str] = []
+    times: list[float] = []
+    pixels: list[UInt8[np.ndarray, "H W 3"]] = []
+    fits: list[Fit] = []
+    rendering: deque[Future[UInt8[np.ndarray, "H W 3"]]] = deque()
+    workers = min(os.cpu_count() or 1, _MOST_WORKERS)
+    with ThreadPoolExecutor(workers) as pool:  # Pillow resizes without holding the interpreter
+        for frame in source.frames(sampling):
+            fit = layout.fit(*frame.image.size, frame.name)
+            width, height = fit.frame_size
+            if 12 * width * height * (len(fits) + 1) > _MOST_BYTES:  # 3 channels of 4 bytes
+                raise ClipError(
+                    f"more than {len(fits)} frames of {width} x {height} exceed the {_MOST_BYTES >> 30} GiB of a clip; "
+                    f"take fewer with max_frames, stride or fps, or a smaller size"
+                )
+            names.append(frame.name)
+            if frame.time is not None:
+                times.append(frame.time)
+            fits.append(fit)
+            rendering.append(pool.submit(fit.render, frame.image))
+            if len(rendering) > workers:  # no more than so many frames of the source's size at a time
+                pixels.append(rendering.popleft().result())
+            if progress is not None:
+                progress(len(fits), total)
+        pixels.extend(render.result() for render in rendering)
+    images, fits = _joined(pixels, fits)
+    return Clip(
+        images=images,
+        frame_names=names,
+        timestamps=np.array(times, np.float64) if times else None,
+        mode=layout.mode,
+        size=layout.size,
+        patch=layout.patch,
+        source_size=np.array([fit.source_size[::-1] for fit in fits], np.int64),
+        source_scale=np.array([fit.scale for fit in fits], np.float64),
+        source_offset=np.array([fit.offset for fit in fits], np.float64),
+        valid_box=np.array([fit.box for fit in fits], np.int64),
+        source=source,
+        sampling=sampling,
+    )
+
+
+def _joined(
+    pixels: list[UInt8[np.ndarray, "H W 3"]], fits: list[Fit]
+) -> tuple[Float32[np.ndarray, "S H W 3"], list[Fit]]:
+    """Return the frames in one array, the smaller ones centred on white, and where they are now."""
+    sizes = {fit.frame_size for fit in fits}
+    width, height = max(size[0] for size in sizes), max(size[1] for size in sizes)
+    if len(sizes) > 1:
+        listed = ", ".join(f"{size[0]} x {size[1]}" for size in sorted(sizes)[:4])
+        logger.warning("frames have different sizes (%s); they are padded with white to %d x %d", listed, width, height)
+    images = np.ones((len(pixels), height, width, 3), np.float32)
+    widened = [fit.widen(width, height) for fit in fits]
+    for image, frame, before, after in zip(images, pixels, fits, widened, strict=True):
+        left, top = after.box[0] - before.box[0], after.box[1] - before.box[1]
+        image[top : top + frame.shape[0], left : left + frame.shape[1]] = frame / np.float32(255)
+    return images, widened
+
+
+def _points(points: Float[np.ndarray, "... 2"]) -> Float64[np.ndarray, "... 2"]:
+    values = np.asarray(points, np.float64)
+    if values.ndim == 0 or values.shape[-1] != 2:
+        raise InputError(f"points have shape {values.shape}; expected (x, y) along the last axis")
+    return values

@@ -1,0 +1,63 @@
+"""Region-aware depth from the two passes (method, section 4)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+EPSILON = 1e-6
+
+
+def replace_depth(
+    depth1: Float[Array, "*F H W"],
+    confidence1: Float[Array, "*F H W"],
+    depth2: Float[Array, "*F H W"],
+    confidence2: Float[Array, "*F H W"],
+    dynamic_mask: Bool[Array, "*F H W"],
+) -> tuple[Float[Array, "*F H W"], Float[Array, "*F H W"]]:
+    """Hard replacement (D_3a): depth and confidence of pass 1 on dynamic pixels, of pass 2 on static ones."""
+    return jnp.where(dynamic_mask, depth1, depth2), jnp.where(dynamic_mask, confidence1, confidence2)
+
+
+def fuse_depth(
+    depth1: Float[Array, "*F H W"],
+    confidence1: Float[Array, "*F H W"],
+    depth2: Float[Array, "*F H W"],
+    confidence2: Float[Array, "*F H W"],
+    dynamic_mask: Bool[Array, "*F H W"],
+    eps: float = EPSILON,
+) -> tuple[Float[Array, "*F H W"], Float[Array, "*F H W"]]:
+    """Confidence fusion (D_3b): inverse-variance weighting with confidence as precision, vmapped over frames.
+
+    On static pixels w = C2 / (C1 + C2 + eps), depth = (1 - w) D1 + w D2, and the fused precision is C1 + C2; on
+    dynamic pixels pass 1 stands alone.
+
+    Args:
+        depth1, confidence1: of the plain pass; any number of leading axes.
+        depth2, confidence2: of the mask-aware pass.
+        dynamic_mask: True where the scene moves.
+        eps: keeps the weight finite where both confidences are 0.
+
+    Returns:
+        Fused depth and confidence, of the inputs' shape.
+    """
+
+    def one_frame(d1, c1, d2, c2, dynamic):
+        total = c1 + c2 + eps
+        fused = (c1 + eps) / total * d1 + c2 / total * d2  # 1 - w without its cancellation
+        return jnp.where(dynamic, d1, fused), jnp.where(dynamic, c1, c1 + c2)
+
+    fused = one_frame
+    for _ in range(jnp.ndim(depth1) - 2):
+        fused = jax.vmap(fused)
+    return fused(*(jnp.asarray(x) for x in (depth1, confidence1, depth2, confidence2, dynamic_mask)))
+
+
+def scale_between(
+    depth1: Float[Array, "B S H W"], depth2: Float[Array, "B S H W"], dynamic_mask: Bool[Array, "B S H W"]
+) -> Float[Array, " B"]:
+    """Return the factor per clip that takes depth2 to depth1: the median ratio over static pixels, 1 if none."""
+    ratio = jnp.where(dynamic_mask, jnp.nan, depth1 / depth2)
+    median = jnp.nanmedian(ratio.reshape(ratio.shape[0], -1), axis=-1)
+    return jnp.where(jnp.isfinite(median), median, 1.0)

@@ -1,0 +1,105 @@
+"""Image files as upright 8-bit RGB frames. Does not import jax."""
+
+from __future__ import annotations
+
+import functools
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from vggtjax.arrays import eight_bit
+from vggtjax.errors import ClipError
+from vggtjax.sampling import Frame, Sampling
+
+# Formats of still pictures only: Pillow also knows some that start other programs (EPS) or are no pictures.
+FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP", "PPM", "WEBP", "TGA", "JPEG2000", "AVIF", "HEIF")
+
+# What Pillow's decoders raise on broken files; its size limit is DecompressionBombError.
+_UNREADABLE = (
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    IndexError,
+    KeyError,
+    RuntimeError,
+    EOFError,
+    OverflowError,
+    struct.error,
+    Image.DecompressionBombError,
+)
+
+
+@dataclass(frozen=True)
+class ImageFiles:
+    """Image files, one frame each, named by the stem of the file; an animated image gives its first picture."""
+
+    paths: tuple[Path, ...]
+
+    def total(self, sampling: Sampling) -> int:
+        """Return how many frames `sampling` takes."""
+        return len(sampling.indices(len(self.paths)))
+
+    def frames(self, sampling: Sampling) -> Iterator[Frame]:
+        """Yield the frames that `sampling` takes. Raises ClipError for a file that cannot be read."""
+        for index in sampling.indices(len(self.paths)):
+            path = self.paths[index]
+            yield Frame(path.stem, read_image(path))
+
+
+def is_image_name(path: Path) -> bool:
+    """Return whether the name ends as that of an image file does."""
+    return path.suffix.lower() in _suffixes()
+
+
+def read_image(path: Path) -> Image.Image:
+    """Read an image file as upright RGB.
+
+    The orientation of its EXIF data is applied, transparency is composited over white, 16-bit values are scaled to
+    8 bits and floating-point values must lie in [0, 1].
+
+    Raises:
+        ClipError: the file is missing, is not an image, is truncated or corrupt, or is absurdly large.
+    """
+    try:
+        with Image.open(path, formats=_formats()) as image:
+            return to_rgb(ImageOps.exif_transpose(image), path.name)
+    except ClipError:
+        raise
+    except FileNotFoundError as error:
+        raise ClipError(f"image {path} does not exist; check the path") from error
+    except UnidentifiedImageError as error:
+        raise ClipError(f"{path} is not an image of a known format; expected one of {', '.join(FORMATS)}") from error
+    except _UNREADABLE as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise ClipError(f"cannot read image {path}: {reason}; leave it out or write it anew") from error
+
+
+def to_rgb(image: Image.Image, name: str) -> Image.Image:
+    """Return an image of any mode as RGB, as `read_image` says; `name` is for the error."""
+    if image.mode == "I" or image.mode == "F" or image.mode.startswith("I;16"):
+        values = np.asarray(image)
+        if image.mode == "I":  # 32 bits that hold 16
+            if values.min() < 0 or values.max() > 65535:
+                raise ClipError(f"frame {name} has values from {values.min()} to {values.max()}; expected 16 bits")
+            values = values.astype(np.uint16)
+        return Image.fromarray(eight_bit(values, name)).convert("RGB")
+    if image.has_transparency_data:
+        image = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
+    return image.convert("RGB")
+
+
+@functools.cache
+def _formats() -> tuple[str, ...]:
+    Image.init()
+    return tuple(name for name in FORMATS if name in Image.OPEN)
+
+
+@functools.cache
+def _suffixes() -> frozenset[str]:
+    return frozenset(suffix for suffix, name in Image.registered_extensions().items() if name in FORMATS)

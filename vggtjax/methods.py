@@ -1,0 +1,42 @@
+"""The methods, as a table: which pass gives what (method, section 5). Does not import jax."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vggtjax.config import Gram, Suppress
+from vggtjax.errors import InputError
+
+Pass = Literal["first", "second"]
+MethodName = Literal["vggt", "pose-decoupling", "hard-replacement", "4dvggt-d"]
+
+
+@dataclass(frozen=True)
+class Method:
+    """Where a method takes its depth (and confidence) and its cameras from, and how it masks the second pass."""
+
+    depth: Literal["first", "second", "replaced", "fused"]
+    extrinsics: Pass
+    intrinsics: Pass
+    gram: Gram = "cosine"
+    suppress: Suppress = "zero"
+
+    @property
+    def needs_second_pass(self) -> bool:
+        return {self.depth, self.extrinsics, self.intrinsics} != {"first"}
+
+
+METHODS: dict[str, Method] = {
+    "vggt": Method("first", "first", "first"),
+    "pose-decoupling": Method("second", "second", "second"),
+    "hard-replacement": Method("replaced", "second", "second"),
+    "4dvggt-d": Method("fused", "second", "second"),
+}
+
+
+def find_method(name: str) -> Method:
+    """Return the method of that name; InputError if there is none."""
+    if name not in METHODS:
+        raise InputError(f"unknown method {name!r}; expected one of {', '.join(METHODS)}")
+    return METHODS[name]

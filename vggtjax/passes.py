@@ -1,0 +1,185 @@
+"""The two passes and what is made of them: the stages of 4DVGGT-D as pure functions (method, sections 2 to 5)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vggtjax.backbone import encode
+from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
+from vggtjax.errors import InputError
+from vggtjax.fusion import fuse_depth, replace_depth, scale_between
+from vggtjax.layers import Params
+from vggtjax.mask import dynamic_pixels, dynamic_tokens
+from vggtjax.methods import find_method
+from vggtjax.model import Predictions, forward, forward_with_cues
+from vggtjax.motion import GramCues
+from vggtjax.pose import decode_pose
+
+
+class Passes(NamedTuple):
+    """Both passes over clips, and the mask between them. `second` is None where no second pass was run."""
+
+    first: Predictions
+    second: Predictions | None
+    saliency: Float[Array, "B S h w"]
+    dynamic_mask: Bool[Array, "B S H W"]
+
+
+class Assembly(NamedTuple):
+    """What a method returns: depth up to scale, its confidence, and OpenCV cameras."""
+
+    depth: Float[Array, "B S H W"]
+    confidence: Float[Array, "B S H W"]
+    camera_from_world: Float[Array, "B S 3 4"]
+    intrinsics: Float[Array, "B S 3 3"]
+
+
+def first_pass(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    patch_tokens: Float[Array, "B S P C"],
+    config: VGGTConfig,
+    *,
+    gram: Gram = "cosine",
+    motion: MotionConfig | None = None,
+    outputs: tuple[str, ...] = ("camera", "depth"),
+    compute_dtype: str = "float32",
+) -> tuple[Predictions, Float[Array, "B S h w"]]:
+    """Run the plain pass and mine the motion saliency on the way."""
+    if gram not in ("cosine", "dot"):
+        raise InputError(f"gram is {gram!r}; expected 'cosine' or 'dot'")
+    cues = GramCues(motion or config.motion, config.depth, gram)
+    predictions, sums = forward_with_cues(
+        params, images, config, cues, patch_tokens=patch_tokens, outputs=outputs, compute_dtype=compute_dtype
+    )
+    assert sums is not None
+    h, w = (side // config.patch_size for side in images.shape[2:4])
+    return predictions, cues.saliency(sums).reshape(*images.shape[:2], h, w)
+
+
+def second_pass(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    patch_tokens: Float[Array, "B S P C"],
+    dynamic_mask: Bool[Array, "B S H W"],
+    config: VGGTConfig,
+    *,
+    suppress: Suppress = "zero",
+    mask_pairs: int = 5,
+    compute_dtype: str = "float32",
+) -> Predictions:
+    """Run the mask-aware pass: the keys of dynamic tokens suppressed in the first `mask_pairs` pairs."""
+    return forward(
+        params,
+        images,
+        config,
+        patch_tokens=patch_tokens,
+        dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size),
+        suppress=suppress,
+        mask_pairs=mask_pairs,
+        compute_dtype=compute_dtype,
+    )
+
+
+def motion_saliency(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    config: VGGTConfig,
+    *,
+    gram: Gram = "cosine",
+    motion: MotionConfig | None = None,
+) -> Float[Array, "B S h w"]:
+    """Return how much each patch seems to move, in [0, 1]: the product of the five Gram maps.
+
+    Args:
+        params: the model's parameter tree.
+        images: RGB in [0, 1].
+        config: the model's configuration.
+        gram: "cosine" (rows of q and k normalised per head, 4DVGGT-D) or "dot" (VGGT4D).
+        motion: the table of cues; the configuration's own if None.
+    """
+    return first_pass(params, images, encode(params, images, config), config, gram=gram, motion=motion, outputs=())[1]
+
+
+def run_passes(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    config: VGGTConfig,
+    *,
+    gram: Gram = "cosine",
+    suppress: Suppress = "zero",
+    mask_pairs: int = 5,
+    motion: MotionConfig | None = None,
+    compute_dtype: str = "float32",
+) -> Passes:
+    """Run both passes once, sharing the backbone's features; `assemble` makes every method's result of them.
+
+    Args:
+        params: the model's parameter tree.
+        images: RGB in [0, 1]; any batch and any number of frames.
+        config: the model's configuration.
+        gram: similarity of the motion cues, "cosine" or "dot".
+        suppress: how keys of dynamic tokens are suppressed, "zero" or "drop".
+        mask_pairs: number of pairs in which they are.
+        motion: the table of cues; the configuration's own if None.
+        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
+    """
+    patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
+    first, saliency = first_pass(
+        params, images, patch_tokens, config, gram=gram, motion=motion, compute_dtype=compute_dtype
+    )
+    mask = dynamic_pixels(saliency, (images.shape[2], images.shape[3]))
+    second = second_pass(
+        params,
+        images,
+        patch_tokens,
+        mask,
+        config,
+        suppress=suppress,
+        mask_pairs=mask_pairs,
+        compute_dtype=compute_dtype,
+    )
+    return Passes(first, second, saliency, mask)
+
+
+def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False) -> Assembly:
+    """Make a method's depth, confidence and cameras of two passes; several methods share one run of them.
+
+    Args:
+        passes: what `run_passes` returned.
+        method: a name of `METHODS`.
+        align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
+            pixels before it is used. Not in the paper.
+    """
+    row = find_method(method)
+    if passes.second is None and row.needs_second_pass:
+        raise InputError(f"method {method!r} needs the second pass, which was not run")
+    first, second = passes.first, passes.second or passes.first
+    scale = jnp.ones(passes.dynamic_mask.shape[0])
+    if align_scale and passes.second is not None:
+        scale = scale_between(_present(first.depth), _present(second.depth), passes.dynamic_mask)
+    depth1, confidence1 = _present(first.depth), _present(first.depth_confidence)
+    depth2, confidence2 = _present(second.depth) * scale[:, None, None, None], _present(second.depth_confidence)
+    both = (depth1, confidence1, depth2, confidence2, passes.dynamic_mask)
+    makers = {
+        "first": lambda: (depth1, confidence1),
+        "second": lambda: (depth2, confidence2),
+        "replaced": lambda: replace_depth(*both),
+        "fused": lambda: fuse_depth(*both),
+    }
+    depth, confidence = makers[row.depth]()
+    size = (depth.shape[2], depth.shape[3])
+    cameras = {"first": decode_pose(_present(first.pose_encoding), size)}
+    extrinsics, intrinsics = decode_pose(_present(second.pose_encoding), size)
+    extrinsics = extrinsics.at[..., 3].multiply(scale[:, None, None])
+    cameras["second"] = (extrinsics, intrinsics)
+    return Assembly(depth, confidence, cameras[row.extrinsics][0], cameras[row.intrinsics][1])
+
+
+def _present(value: Array | None) -> Array:
+    if value is None:
+        raise InputError("the passes lack depth or cameras; run them with outputs=('camera', 'depth')")
+    return value

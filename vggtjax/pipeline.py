@@ -1,0 +1,203 @@
+"""A clip and a model -> a Reconstruction: the stages one by one, or all of them under a single jit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vggtjax.backbone import encode
+from vggtjax.checkpoint import Model
+from vggtjax.clip import Clip
+from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
+from vggtjax.layers import Params
+from vggtjax.mask import dynamic_pixels
+from vggtjax.methods import find_method
+from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass
+from vggtjax.reconstruction import Reconstruction
+
+OnStage = Callable[[str], AbstractContextManager[Any]]
+
+
+class Stage(NamedTuple):
+    """A jitted function, the arrays that it reads and makes (by name), and its static options."""
+
+    name: str
+    reads: tuple[str, ...]
+    makes: tuple[str, ...]
+    function: Any
+    options: dict[str, Any]
+
+
+def _assemble(first, second, saliency, dynamic_mask, *, method: str, align_scale: bool) -> Assembly:
+    return assemble(Passes(first, second, saliency, dynamic_mask), method, align_scale=align_scale)
+
+
+_encode = jax.jit(encode, static_argnames=("config", "compute_dtype"))
+_first_pass = jax.jit(first_pass, static_argnames=("config", "gram", "motion", "outputs", "compute_dtype"))
+_dynamic_pixels = jax.jit(dynamic_pixels, static_argnames=("size",))
+_second_pass = jax.jit(second_pass, static_argnames=("config", "suppress", "mask_pairs", "compute_dtype"))
+_assembled = jax.jit(_assemble, static_argnames=("method", "align_scale"))
+
+
+@partial(
+    jax.jit,
+    static_argnames=(
+        "config", "method", "gram", "suppress", "mask_pairs", "motion", "align_scale", "compute_dtype",
+    ),
+)  # fmt: skip
+def infer(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    config: VGGTConfig,
+    *,
+    method: str = "4dvggt-d",
+    gram: Gram | None = None,
+    suppress: Suppress | None = None,
+    mask_pairs: int = 5,
+    motion: MotionConfig | None = None,
+    align_scale: bool = False,
+    compute_dtype: str = "float32",
+) -> tuple[Assembly, Passes]:
+    """Run a method on a batch of clips as one compiled function.
+
+    Args:
+        params: the model's parameter tree.
+        images: RGB in [0, 1]; H and W are multiples of the patch size.
+        config: the model's configuration.
+        method: a name of `METHODS`.
+        gram, suppress: override the method's own.
+        mask_pairs, motion, compute_dtype: as for `run_passes`.
+        align_scale: as for `assemble`.
+
+    Returns:
+        The method's depth, confidence and cameras, and the passes that they were made of.
+    """
+    row = find_method(method)
+    passes = run_passes(
+        params,
+        images,
+        config,
+        gram=gram or row.gram,
+        suppress=suppress or row.suppress,
+        mask_pairs=mask_pairs,
+        motion=motion,
+        compute_dtype=compute_dtype,
+    )
+    return assemble(passes, method, align_scale=align_scale), passes
+
+
+def reconstruct(
+    model: Model,
+    clip: Clip,
+    *,
+    method: str = "4dvggt-d",
+    size: int | None = None,
+    gram: Gram | None = None,
+    suppress: Suppress | None = None,
+    mask_pairs: int = 5,
+    align_scale: bool = False,
+    compute_dtype: str = "float32",
+    keep_passes: bool = False,
+    on_stage: OnStage | None = None,
+) -> Reconstruction:
+    """Reconstruct a clip: cameras, depth, its confidence, and what moves.
+
+    Args:
+        model: what `load_model` returned.
+        clip: what `load_clip` returned. It is refitted from its source where its size or patch is not the model's.
+        method: a name of `METHODS`.
+        size: side in pixels to run at, a multiple of the patch size; the model's own if None.
+        gram, suppress: override the method's own similarity and suppression.
+        mask_pairs: number of pairs in which the keys of dynamic tokens are suppressed (L_mask of the paper).
+        align_scale: bring the second pass to the first one's scale before it is used (not in the paper).
+        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
+        keep_passes: keep both passes on the result, as `.passes`.
+        on_stage: called with the name of each stage, returns a context in which it runs; for progress and timing.
+
+    Raises:
+        InputError: an unknown method, or a size that is not a multiple of the patch size.
+    """
+    row = find_method(method)
+    config = model.config
+    on_stage = on_stage or (lambda name: nullcontext())
+    if (clip.size, clip.patch) != (size or config.image_size, config.patch_size):
+        with on_stage("fit clip to model"):
+            clip = clip.refit(size or config.image_size, config.patch_size)
+    settings = {
+        "gram": gram or row.gram,
+        "suppress": suppress or row.suppress,
+        "mask_pairs": mask_pairs,
+        "align_scale": align_scale,
+        "compute_dtype": compute_dtype,
+    }
+    stages = _stages(config, method, clip.images.shape[1:3], **settings)
+    arrays: dict[str, Any] = {"params": model.params, "images": jnp.asarray(clip.images)[None], "second": None}
+    with on_stage("compile"):
+        _compile(stages, arrays)
+    for stage in stages:
+        with on_stage(stage.name):
+            made = jax.block_until_ready(stage.function(*(arrays[name] for name in stage.reads), **stage.options))
+            arrays |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
+    assembly: Assembly = jax.tree.map(lambda x: np.asarray(x[0]), arrays["assembly"])
+    passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
+    return Reconstruction(
+        depth=assembly.depth,
+        depth_confidence=assembly.confidence,
+        saliency=np.asarray(passes.saliency[0]),
+        dynamic_mask=np.asarray(passes.dynamic_mask[0]),
+        camera_from_world=assembly.camera_from_world,
+        intrinsics=assembly.intrinsics,
+        images=np.round(clip.images * 255).astype(np.uint8),
+        frame_names=tuple(clip.frame_names),
+        timestamps=clip.timestamps,
+        method=method,
+        model_name=model.name,
+        settings=settings | {"mode": clip.mode, "size": clip.size, "patch": clip.patch},
+        source_size=clip.source_size,
+        source_scale=clip.source_scale,
+        source_offset=clip.source_offset,
+        valid_box=clip.valid_box,
+        passes=jax.tree.map(np.asarray, passes) if keep_passes else None,
+    )
+
+
+def _stages(
+    config: VGGTConfig,
+    method: str,
+    size: tuple[int, int],
+    *,
+    gram: Gram,
+    suppress: Suppress,
+    mask_pairs: int,
+    align_scale: bool,
+    compute_dtype: str,
+) -> list[Stage]:
+    network = {"config": config, "compute_dtype": compute_dtype}
+    masking = {"suppress": suppress, "mask_pairs": mask_pairs}
+    making = {"method": method, "align_scale": align_scale}
+    seen = ("params", "images", "patch_tokens")
+    stages = [
+        Stage("image features", ("params", "images"), ("patch_tokens",), _encode, network),
+        Stage("first pass", seen, ("first", "saliency"), _first_pass, network | {"gram": gram}),
+        Stage("dynamic mask", ("saliency",), ("dynamic_mask",), _dynamic_pixels, {"size": size}),
+        Stage("second pass", (*seen, "dynamic_mask"), ("second",), _second_pass, network | masking),
+        Stage("assemble", ("first", "second", "saliency", "dynamic_mask"), ("assembly",), _assembled, making),
+    ]
+    return [stage for stage in stages if stage.name != "second pass" or find_method(method).needs_second_pass]
+
+
+def _compile(stages: list[Stage], arrays: dict[str, Any]) -> None:
+    """Compile every stage for the shapes that it will see; the calls that follow find the result in jit's cache."""
+    shapes = dict(arrays)
+    for stage in stages:
+        lowered = stage.function.lower(*(shapes[name] for name in stage.reads), **stage.options)
+        lowered.compile()
+        made = lowered.out_info
+        shapes |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))

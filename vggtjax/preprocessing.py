@@ -1,0 +1,107 @@
+"""Frames of any size as frames of the model's size, the way VGGT was trained. Does not import jax."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from vggtjax.errors import ClipError, InputError
+from vggtjax.sampling import whole_number
+
+Mode = Literal["crop", "pad"]
+
+_MOST_PIXELS = 2**26  # of a resized frame, before it is cut: 8192 x 8192
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The frames that the model takes: `crop` fills the width `size` and cuts the height down to it, `pad` makes the
+    long side `size` and the frame square with white; sides of the picture are multiples of `patch`.
+    """
+
+    mode: Mode = "crop"
+    size: int = 518
+    patch: int = 14
+
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(Mode):
+            raise InputError(f"mode is {self.mode!r}; expected 'crop' or 'pad'")
+        object.__setattr__(self, "patch", whole_number("patch", self.patch, 1))
+        object.__setattr__(self, "size", whole_number("size", self.size, 1))
+        if self.size % self.patch:
+            raise InputError(f"size is {self.size}; expected a multiple of patch {self.patch}")
+
+    def fit(self, width: int, height: int, name: str) -> Fit:
+        """Return where a picture of `width` x `height` lands; `name` is for the error.
+
+        Raises:
+            ClipError: a side would become less than half a patch, or a picture to be cut absurdly long.
+        """
+        wide = self.mode == "crop" or width >= height
+        # The order of these operations decides how halves round; it is that of VGGT.
+        if wide:
+            resized_width = self.size
+            resized_height = round(height * (self.size / width) / self.patch) * self.patch
+        else:
+            resized_height = self.size
+            resized_width = round(width * (self.size / height) / self.patch) * self.patch
+        if not resized_width or not resized_height or resized_width * resized_height > _MOST_PIXELS:
+            raise ClipError(
+                f"frame {name} is {width} x {height}, which becomes {resized_width} x {resized_height} at size "
+                f"{self.size} and patch {self.patch}; cut it to a less extreme shape"
+            )
+        kept = (resized_width, min(resized_height, self.size))
+        fit = Fit(
+            source_size=(width, height),
+            resized_size=(resized_width, resized_height),
+            cut=(resized_height - kept[1]) // 2,
+            frame_size=kept,
+            box=(0, 0, *kept),
+        )
+        return fit.widen(self.size, self.size) if self.mode == "pad" else fit
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a picture lands in a frame of the clip: resized, cut above and below, placed on white.
+
+    Sizes are (width, height). `cut` rows of the resized picture are gone above; what is kept fills `box`
+    (left, top, right, bottom) of the frame. Continuous coordinates have pixel edges at whole numbers, and
+    source = scale * frame + offset in (x, y).
+    """
+
+    source_size: tuple[int, int]
+    resized_size: tuple[int, int]
+    cut: int
+    frame_size: tuple[int, int]
+    box: tuple[int, int, int, int]
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Source pixels per frame pixel."""
+        return self.source_size[0] / self.resized_size[0], self.source_size[1] / self.resized_size[1]
+
+    @property
+    def offset(self) -> tuple[float, float]:
+        """Source coordinates of the frame's upper left corner."""
+        return -self.box[0] * self.scale[0], (self.cut - self.box[1]) * self.scale[1]
+
+    def widen(self, width: int, height: int) -> Fit:
+        """Return the fit of the same frame centred in a larger one; an odd rest goes to the right and below."""
+        right, down = (width - self.frame_size[0]) // 2, (height - self.frame_size[1]) // 2
+        left, top, *ends = self.box
+        box = (left + right, top + down, ends[0] + right, ends[1] + down)
+        return dataclasses.replace(self, frame_size=(width, height), box=box)
+
+    def render(self, image: Image.Image) -> UInt8[np.ndarray, "H W 3"]:
+        """Return the frame of an RGB image of `source_size`."""
+        left, top, right, bottom = self.box
+        resized = np.asarray(image.resize(self.resized_size, Image.Resampling.BICUBIC))
+        frame = np.full((*self.frame_size[::-1], 3), 255, np.uint8)
+        frame[top:bottom, left:right] = resized[self.cut : self.cut + bottom - top]
+        return frame

@@ -1,0 +1,108 @@
+"""Pictures of a result for people: coloured depth, masks over the frames, and a sheet that sums up the clip."""
+
+from __future__ import annotations
+
+import numpy as np
+from cmap import Colormap
+from jaxtyping import Bool, Float32, UInt8
+from PIL import Image, ImageDraw, ImageFont
+from skimage.segmentation import find_boundaries
+
+from vggtjax.point_cloud import valid_pixels
+from vggtjax.reconstruction import Reconstruction
+
+_DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm
+_SALIENCY_COLORS = (Colormap("inferno").lut(256)[:, :3] * 255).round().astype(np.uint8)
+_NO_DEPTH = np.array([40, 40, 46], np.uint8)
+_TINT = np.array([255, 40, 90], np.float32)
+_OUTLINE = np.array([255, 235, 60], np.uint8)
+
+_SHEET_FRAMES = 8
+_SHEET_WIDTH = 1800  # pixels that the columns share
+_TITLE_WIDTH = 700  # pixels that the title has at least
+_THUMBNAIL = (480, 300)  # widest and highest
+_MARGIN, _GAP, _LABEL_WIDTH, _LEGEND_WIDTH, _HEADER_HEIGHT = 24, 6, 150, 120, 88
+_BACKGROUND, _TEXT, _FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)
+
+
+def inverse_depth_range(depth: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]) -> tuple[float, float]:
+    """Return the 2nd and 98th percentile of 1/depth over the valid pixels of a clip, (0, 1) where there are none."""
+    if not valid.any():
+        return 0.0, 1.0
+    with np.errstate(over="ignore"):
+        inverse = 1 / depth[valid].astype(np.float64)
+    far, near = np.percentile(inverse, (2, 98))
+    return float(far), float(near)
+
+
+def color_depth(
+    depth: Float32[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"], inverse_range: tuple[float, float]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Colour inverse depth from blue, at or beyond the first of `inverse_range`, to red; grey where not valid."""
+    far, near = inverse_range
+    inverse = 1 / np.where(valid, depth, 1).astype(np.float64)
+    level = np.clip((inverse - far) / max(near - far, np.finfo(np.float64).tiny), 0, 1)
+    return np.where(valid[..., None], _DEPTH_COLORS[(level * 255).round().astype(np.uint8)], _NO_DEPTH)
+
+
+def overlay(image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Tint and outline the region of `mask`; the rest loses half of its colour, so that the tint shows on any hue."""
+    grey = image.mean(axis=-1, keepdims=True)
+    drawn = np.where(mask[..., None], 0.55 * image + 0.45 * _TINT, 0.5 * image + 0.5 * grey).round().astype(np.uint8)
+    drawn[find_boundaries(mask, mode="thick")] = _OUTLINE
+    return drawn
+
+
+def contact_sheet(reconstruction: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw up to eight frames, evenly spread: columns of picture, depth, saliency and dynamic mask."""
+    frames, height, width = reconstruction.depth.shape
+    shown = np.linspace(0, frames - 1, min(frames, _SHEET_FRAMES)).round().astype(int)
+    scale = min(_THUMBNAIL[0] / width, _THUMBNAIL[1] / height, _SHEET_WIDTH / len(shown) / width)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    step_x, step_y = size[0] + _GAP, size[1] + _GAP
+    left, top = _MARGIN + _LABEL_WIDTH, _MARGIN + _HEADER_HEIGHT
+
+    sheet_width = max(left + len(shown) * step_x - _GAP, _TITLE_WIDTH) + _MARGIN
+    sheet = Image.new("RGB", (sheet_width, top + 4 * step_y - _GAP + _MARGIN), _BACKGROUND)
+    draw = ImageDraw.Draw(sheet)
+    large, small = ImageFont.load_default(22), ImageFont.load_default(15)
+    draw.text((_MARGIN, _MARGIN), f"{reconstruction.method}  ·  {reconstruction.model_name}", _TEXT, large)
+    count = f"{frames} frame{'s' if frames > 1 else ''} of {width} x {height} pixels"
+    draw.text((_MARGIN, _MARGIN + 30), count, _FAINT, small)
+
+    share = f"{reconstruction.dynamic_mask.mean():.1%} of pixels"
+    for row, label in enumerate(("Picture", "Depth", "Saliency", "Dynamic")):
+        draw.text((_MARGIN, top + row * step_y), label, _TEXT, small)
+    draw.text((_MARGIN, top + 3 * step_y + 22), share, _FAINT, small)
+    for row, colors, lowest, highest in ((1, _DEPTH_COLORS, "far", "near"), (2, _SALIENCY_COLORS, "0", "1")):
+        y = top + row * step_y
+        sheet.paste(Image.fromarray(colors[None]).resize((_LEGEND_WIDTH, 10)), (_MARGIN, y + 24))
+        draw.text((_MARGIN, y + 38), lowest, _FAINT, small)
+        draw.text((_MARGIN + _LEGEND_WIDTH, y + 38), highest, _FAINT, small, "ra")
+
+    valid = valid_pixels(reconstruction)
+    inverse_range = inverse_depth_range(reconstruction.depth, valid)
+    for column, frame in enumerate(shown):
+        x = left + column * step_x
+        time = "" if reconstruction.timestamps is None else f"  ·  {reconstruction.timestamps[frame]:.2f} s"
+        draw.text((x, top - 24), f"frame {frame}{time}", _FAINT, small)
+        depth = color_depth(reconstruction.depth[frame], valid[frame], inverse_range)
+        for row, thumbnail in enumerate(_thumbnails(reconstruction, int(frame), depth, size)):
+            sheet.paste(thumbnail, (x, top + row * step_y))
+    return np.asarray(sheet)
+
+
+def _thumbnails(
+    reconstruction: Reconstruction, frame: int, depth: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]
+) -> tuple[Image.Image, ...]:
+    """Return one column of the sheet, from top to bottom."""
+    picture = Image.fromarray(reconstruction.images[frame]).resize(size, Image.Resampling.LANCZOS)
+    saliency = np.nan_to_num(reconstruction.saliency[frame]).clip(0, 1)
+    saliency = np.asarray(Image.fromarray(saliency).resize(size, Image.Resampling.BILINEAR))
+    mask = np.asarray(Image.fromarray(reconstruction.dynamic_mask[frame]).resize(size, Image.Resampling.NEAREST))
+    return (
+        picture,
+        Image.fromarray(depth).resize(size, Image.Resampling.LANCZOS),
+        Image.fromarray(_SALIENCY_COLORS[(saliency * 255).round().astype(np.uint8)]),
+        Image.fromarray(overlay(np.asarray(picture), mask)),
+    )

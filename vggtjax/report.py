@@ -1,0 +1,105 @@
+"""What the command line shows: live progress of every stage, and a summary at the end."""
+
+from __future__ import annotations
+
+import resource
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from vggtjax.reconstruction import Reconstruction
+
+Advance = Callable[[int, int | None], None]
+
+
+class Report:
+    """Stages with a clock each, on standard error; tables on standard output."""
+
+    def __init__(self) -> None:
+        self._console = Console(stderr=True)
+        self._out = Console()
+        self._progress = Progress(
+            SpinnerColumn(finished_text="[green]✓"),
+            TextColumn("{task.description:<18}"),
+            BarColumn(bar_width=24),
+            _Count(),
+            TimeElapsedColumn(),
+            console=self._console,
+        )
+        self._seconds: dict[str, float] = {}
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Show the stages that run inside."""
+        with self._progress:
+            yield
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[Advance]:
+        """Time a stage and show it; yields a callable that takes the steps done and their number, if known."""
+        task = self._progress.add_task(name, total=None)
+        started = time.perf_counter()
+        yield lambda done, total: self._progress.update(task, completed=done, total=total)
+        self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - started
+        self._finish(task)
+
+    def summary(self, result: Reconstruction, out: Path, *, trained: bool) -> None:
+        """Print what was reconstructed, what it took, and where the files are."""
+        S, H, W = result.depth.shape
+        rows = {
+            "frames": f"{S} of {W} x {H} pixels",
+            "method": f"{result.method}, model {result.model_name}",
+            "dynamic": f"{100 * result.dynamic_mask.mean():.1f} % of the pixels",
+            **{name: f"{seconds:.2f} s" for name, seconds in self._seconds.items()},
+            "total": f"{sum(self._seconds.values()):.2f} s",
+            "peak memory": _peak_memory(),
+            "results": f"{out}/",
+            "look at": f"{out / 'preview' / 'sheet.png'}, {out / 'scene.glb'}",
+        }
+        self.table(rows)
+        if not trained:
+            self.line(
+                "The weights of this model are untrained: this shows that everything runs, not what the scene is. "
+                "Pass --model with converted weights to see a reconstruction."
+            )
+
+    def table(self, rows: Mapping[str, object]) -> None:
+        """Print names and values as a table."""
+        table = Table(show_header=False, box=None, pad_edge=False)
+        for name, value in rows.items():
+            table.add_row(name, str(value))
+        self._out.print(table, soft_wrap=True)
+
+    def line(self, text: str) -> None:
+        """Print one line."""
+        self._out.print(text, highlight=False, soft_wrap=True)
+
+    def _finish(self, task: TaskID) -> None:
+        total = next(t.total for t in self._progress.tasks if t.id == task) or 1
+        self._progress.update(task, total=total, completed=total)
+
+
+class _Count(MofNCompleteColumn):
+    """Steps done of all steps, where there is more than one."""
+
+    def render(self, task):
+        return super().render(task) if task.total and task.total > 1 else ""
+
+
+def _peak_memory() -> str:
+    unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is bytes there, kilobytes elsewhere
+    text = f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9:.2f} GB of host memory"
+    import jax
+
+    statistics = jax.local_devices()[0].memory_stats() or {}
+    if "peak_bytes_in_use" in statistics:
+        text += f", {statistics['peak_bytes_in_use'] / 1e9:.2f} GB of device memory"
+    return text

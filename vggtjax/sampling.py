@@ -1,0 +1,116 @@
+"""Which frames of a source make a clip, and what every source of frames offers. Does not import jax."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from numbers import Real
+from typing import Protocol, TypeVar
+
+from PIL import Image
+
+from vggtjax.errors import ClipError, InputError
+
+Item = TypeVar("Item")
+
+TIME_ROUNDING = 1e-3  # seconds; containers such as Matroska round presentation times to milliseconds
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of a source: its name, its upright RGB image and, for video, its time in seconds."""
+
+    name: str
+    image: Image.Image
+    time: float | None = None
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """The frames to take: from source frame `start` every `stride`-th, or `fps` a second; `max_frames` at most."""
+
+    start: int = 0
+    stride: int = 1
+    fps: float | None = None
+    max_frames: int | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "start", whole_number("start", self.start, 0))
+        object.__setattr__(self, "stride", whole_number("stride", self.stride, 1))
+        if self.max_frames is not None:
+            object.__setattr__(self, "max_frames", whole_number("max_frames", self.max_frames, 1))
+        if self.fps is None:
+            return
+        if isinstance(self.fps, bool) or not isinstance(self.fps, Real) or not 0 < self.fps < math.inf:
+            raise InputError(f"fps is {self.fps!r}; expected a number of frames per second above 0")
+        if self.stride != 1:
+            raise InputError(f"fps={self.fps} and stride={self.stride} exclude each other; give one of them")
+        object.__setattr__(self, "fps", float(self.fps))
+
+    def indices(self, count: int) -> range:
+        """Return the indices taken of `count` still frames. Raises InputError for `fps`, ClipError past the end."""
+        if self.fps is not None:
+            raise InputError(f"fps is {self.fps}, but still images have no presentation times; use stride")
+        if self.start >= count:
+            raise ClipError(f"start is {self.start}, but the source has only {count} frames; expected below {count}")
+        return range(self.start, count, self.stride)[: self.max_frames]
+
+    def select(self, frames: Iterable[tuple[float, Item]]) -> Iterator[tuple[int, float, Item]]:
+        """Yield (index, time, item) of the frames taken, and ask for none after the last of them.
+
+        With `fps`, ticks are 1 / fps apart from the time of frame `start`, and each tick takes the first frame at or
+        after it; a frame is taken once, however many ticks wait for it.
+
+        Args:
+            frames: (presentation time in seconds, item) of every frame of the source, in order.
+
+        Raises:
+            ClipError: there are no frames, or none from `start` on.
+        """
+        count, taken, tick, begin = 0, 0, 0, 0.0
+        for index, (time, item) in enumerate(frames):
+            count = index + 1
+            if index < self.start:
+                continue
+            if index == self.start:
+                begin = time
+            if self.fps is None:
+                wanted = (index - self.start) % self.stride == 0
+            else:
+                passed = (time - begin + TIME_ROUNDING) * self.fps
+                wanted = passed >= tick
+                tick = max(tick, math.floor(passed) + 1)
+            if wanted:
+                yield index, time, item
+                taken += 1
+                if taken == self.max_frames:
+                    return
+        if not count:
+            raise ClipError("the source has no frames; expected at least one")
+        if not taken:
+            raise ClipError(f"start is {self.start}, but the source has only {count} frames; expected below {count}")
+
+
+class Source(Protocol):
+    """Something that frames come from, as often as they are asked for."""
+
+    def total(self, sampling: Sampling) -> int | None:
+        """Return how many frames `sampling` takes, or None where only reading the source can tell."""
+        ...
+
+    def frames(self, sampling: Sampling) -> Iterator[Frame]:
+        """Yield the frames that `sampling` takes, one in memory at a time."""
+        ...
+
+
+def whole_number(name: str, value: object, lowest: int) -> int:
+    """Return `value` as an int of at least `lowest`, else raise InputError naming the argument."""
+    try:
+        number = operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool) or number < lowest:
+        raise InputError(f"{name} is {value!r}; expected a whole number of at least {lowest}")
+    return number

@@ -1,0 +1,125 @@
+"""What the user names as the source of a clip: files, folders, patterns or arrays. Does not import jax."""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from vggtjax.arrays import ArrayFrames
+from vggtjax.errors import ClipError
+from vggtjax.images import ImageFiles, is_image_name
+from vggtjax.sampling import Source
+from vggtjax.video import VideoFile, is_video_name
+
+ClipSource: TypeAlias = str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | Sequence[np.ndarray] | np.ndarray
+
+
+def open_source(source: ClipSource) -> Source:
+    """Return the frames that `source` names, found but not read; see `load_clip` for what it can be.
+
+    Raises:
+        ClipError: nothing is there, or nothing that frames can come from.
+    """
+    if isinstance(source, (str, os.PathLike)):
+        return _from_path(os.fspath(source))
+    if hasattr(source, "__array__"):
+        return ArrayFrames.from_arrays(source)
+    if isinstance(source, Sequence) and not isinstance(source, bytes):
+        items: list[Any] = list(source)
+        if not items:
+            raise ClipError("the list of frames is empty; expected image paths or arrays")
+        if all(isinstance(item, (str, os.PathLike)) for item in items):
+            return _from_list([Path(item) for item in items])
+        if all(hasattr(item, "__array__") for item in items):
+            return ArrayFrames.from_arrays(items)
+        kinds = ", ".join(sorted({type(item).__name__ for item in items}))
+        raise ClipError(f"the list of frames holds {kinds}; expected image paths only, or arrays only")
+    raise ClipError(
+        f"the source is of type {type(source).__name__}; expected a folder, a pattern, an image or video file, "
+        f"a list of image paths, or arrays"
+    )
+
+
+def natural_key(path: Path) -> list[list[str | int]]:
+    """Return the key that sorts frame_2 before frame_10: runs of digits in each part of the path are numbers."""
+    return [
+        [int(piece) if piece.isdecimal() else piece.casefold() for piece in re.split(r"(\d+)", part)]
+        for part in path.parts
+    ]
+
+
+def _from_path(name: str) -> Source:
+    path = Path(name)
+    try:
+        if not name or "\0" in name:
+            raise ClipError(f"{name!r} is not a path; expected a folder, a pattern, or an image or video file")
+        if path.is_dir():
+            return _from_folder(path)
+        if path.is_file():
+            return _from_file(path)
+        if path.exists():
+            raise ClipError(f"{path} is neither a file nor a folder; expected images or a video")
+        if glob.has_magic(name):
+            return _from_pattern(name)
+    except OSError as error:
+        raise ClipError(f"cannot look for frames in {name}: {error.strerror}; check the path") from error
+    raise ClipError(f"{path} does not exist; expected a folder, a pattern, or an image or video file")
+
+
+def _from_file(path: Path) -> Source:
+    if is_image_name(path):
+        return ImageFiles((path.absolute(),))
+    if is_video_name(path):
+        return VideoFile(path.absolute())
+    raise ClipError(f"{path} has the name of neither an image nor a video; expected one such as .png, .jpg or .mp4")
+
+
+def _from_folder(folder: Path) -> Source:
+    entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+    images = _images(entries)
+    if not images:
+        raise ClipError(f"folder {folder} holds no images but {_inventory(entries)}; name what the frames are in")
+    return ImageFiles(images)
+
+
+def _from_pattern(pattern: str) -> Source:
+    matches = [Path(match) for match in glob.glob(pattern, recursive=True)]  # noqa: PTH207 - absolute patterns too
+    images = _images(matches)
+    if not images:
+        raise ClipError(f"pattern {pattern} matches no images but {_inventory(matches)}; expected images")
+    return ImageFiles(images)
+
+
+def _from_list(paths: list[Path]) -> Source:
+    for path in paths:
+        if not path.is_file():
+            raise ClipError(f"image {path} does not exist or is no file; check the list of frames")
+    return ImageFiles(tuple(path.absolute() for path in paths))
+
+
+def _images(paths: Iterable[Path]) -> tuple[Path, ...]:
+    """Return the image files among `paths` in natural order, absolute; names that tie keep a fixed order."""
+    images = [path.absolute() for path in paths if is_image_name(path) and path.is_file()]
+    return tuple(sorted(images, key=lambda path: (natural_key(path), str(path))))
+
+
+def _inventory(entries: list[Path]) -> str:
+    """Return in words what else there is: folders and videos by name, other files by ending."""
+    folders = sorted((entry for entry in entries if entry.is_dir()), key=natural_key)
+    videos = sorted((entry for entry in entries if entry.is_file() and is_video_name(entry)), key=natural_key)
+    endings = Counter(entry.suffix or "no ending" for entry in entries if entry.is_file() and not is_video_name(entry))
+    found = []
+    for kind, paths in (("folders", folders), ("videos", videos)):
+        if paths:
+            names = ", ".join(path.name for path in paths[:3]) + (", ..." if len(paths) > 3 else "")
+            found.append(f"{len(paths)} {kind} ({names})")
+    if endings:
+        found.append(f"{endings.total()} other files ({', '.join(ending for ending, _ in endings.most_common(3))})")
+    return " and ".join(found) or "nothing at all"

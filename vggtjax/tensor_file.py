@@ -1,0 +1,150 @@
+"""Safetensors files: read through a memory map, written one piece at a time. Does not import jax."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from math import prod
+from pathlib import Path
+from typing import NamedTuple
+
+import ml_dtypes
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from vggtjax.errors import CheckpointError
+from vggtjax.files import writing
+
+ALIGNMENT = 64  # of tensors that XLA takes from a memory map without a copy
+MAX_HEADER_BYTES = 2**24  # a model of this kind needs a quarter of a megabyte
+
+_DTYPES: dict[str, np.dtype] = {
+    code: np.dtype(kind)
+    for code, kind in {
+        "F64": np.float64,
+        "F32": np.float32,
+        "F16": np.float16,
+        "BF16": ml_dtypes.bfloat16,
+        "F8_E4M3": ml_dtypes.float8_e4m3fn,
+        "F8_E5M2": ml_dtypes.float8_e5m2,
+        "C64": np.complex64,
+        "I64": np.int64,
+        "I32": np.int32,
+        "I16": np.int16,
+        "I8": np.int8,
+        "U64": np.uint64,
+        "U32": np.uint32,
+        "U16": np.uint16,
+        "U8": np.uint8,
+        "BOOL": np.bool_,
+    }.items()
+}
+_CODES = {dtype: code for code, dtype in _DTYPES.items()}
+
+
+class TensorFile(NamedTuple):
+    """What a safetensors file holds; each array is read-only and a memory map of its own, gone when it is dropped."""
+
+    tensors: dict[str, np.ndarray]
+    metadata: dict[str, str]
+
+
+class Spec(NamedTuple):
+    """Shape and type of a tensor to be written."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+def is_tensor_file(path: str | Path) -> bool:
+    """Return whether a file begins like a safetensors file: eight bytes of length, then JSON."""
+    try:
+        with Path(path).open("rb") as file:
+            start = file.read(9)
+    except OSError as error:
+        raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
+    return start[8:] == b"{" and int.from_bytes(start[:8], "little") < 2**48  # other formats begin with text
+
+
+def read_tensors(path: str | Path) -> TensorFile:
+    """Map a safetensors file into memory; no tensor is read before it is used.
+
+    Raises:
+        CheckpointError: the file cannot be read, is no whole safetensors file, or has a type that is not supported.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+        if length > MAX_HEADER_BYTES:
+            raise CheckpointError(
+                f"{path} is not a safetensors file of weights: its header claims {length} bytes; "
+                f"expected at most {MAX_HEADER_BYTES}"
+            )
+        with safe_open(path, framework="numpy") as opened:
+            metadata = opened.metadata() or {}
+            slices = {name: opened.get_slice(name) for name in opened.offset_keys()}
+            layout = {name: (tuple(piece.get_shape()), piece.get_dtype()) for name, piece in slices.items()}
+    except SafetensorError as error:
+        raise CheckpointError(f"{path} is not a whole safetensors file ({error}); copy or download it again") from None
+    except OSError as error:
+        raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
+    unsupported = sorted({code for _, code in layout.values()} - set(_DTYPES))
+    if unsupported:
+        raise CheckpointError(f"{path} has tensors of type {', '.join(unsupported)}; expected floating point")
+
+    # The library has checked that the tensors fill the file without gaps, so their sizes give their places.
+    offset = 8 + length
+    tensors = {}
+    for name, (shape, code) in layout.items():
+        tensors[name] = _mapped(path, shape, _DTYPES[code], offset)
+        offset += tensors[name].nbytes
+    return TensorFile(tensors, metadata)
+
+
+def write_tensors(
+    path: str | Path,
+    specs: Mapping[str, Spec],
+    pieces: Callable[[str], Iterable[np.ndarray]],
+    metadata: Mapping[str, str] | None = None,
+) -> None:
+    """Write a safetensors file with one piece in memory at a time; an interrupted run leaves no file.
+
+    Args:
+        path: the file; one that is there is replaced.
+        specs: names -> shape and type.
+        pieces: the parts of a tensor by its name, consecutive on axis 0, of any type: they are cast.
+        metadata: texts for the header.
+
+    Raises:
+        OutputError: the folder cannot be written or the disk is full.
+    """
+    sizes = {name: prod(spec.shape) * spec.dtype.itemsize for name, spec in specs.items()}
+    names = sorted(specs, key=lambda name: sizes[name] % ALIGNMENT != 0)  # aligned ones first: they stay aligned
+    header: dict[str, object] = {"__metadata__": dict(metadata)} if metadata else {}
+    total = 0
+    for name in names:
+        shape, dtype = specs[name]
+        header[name] = {
+            "dtype": _CODES[dtype],
+            "shape": list(shape),
+            "data_offsets": [total, total + sizes[name]],
+        }
+        total += sizes[name]
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-(8 + len(text)) % ALIGNMENT)
+
+    with writing(path) as temporary:
+        with temporary.open("wb") as file:
+            file.write(len(text).to_bytes(8, "little") + text)
+            for name in names:
+                for piece in pieces(name):
+                    piece = np.ascontiguousarray(piece, dtype=specs[name].dtype)
+                    file.write(piece.reshape(-1).view(np.uint8).data)
+        read_tensors(temporary)  # the library's own check that the file is whole
+
+
+def _mapped(path: Path, shape: tuple[int, ...], dtype: np.dtype, offset: int) -> np.ndarray:
+    if 0 in shape:
+        return np.empty(shape, dtype)
+    return np.asarray(np.memmap(path, dtype, mode="r", offset=offset, shape=shape))

@@ -1,0 +1,187 @@
+"""Frames of a video file by their presentation times, upright, decoded one at a time. Does not import jax."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+from PIL import Image
+
+from vggtjax.arrays import frame_name
+from vggtjax.errors import ClipError, MissingExtraError
+from vggtjax.sampling import Frame, Sampling
+
+if TYPE_CHECKING:
+    from types import ModuleType
+
+    from av import Packet, VideoFrame, VideoStream
+    from av.container import InputContainer
+    from av.stream import Stream
+
+logger = logging.getLogger(__name__)
+
+# Ends of names, for telling a video from other files.
+_SUFFIXES = (
+    *(".mp4", ".m4v", ".mov", ".3gp", ".mkv", ".webm", ".avi", ".mpg", ".mpeg"),
+    *(".ts", ".mts", ".m2ts", ".wmv", ".flv", ".ogv", ".mxf", ".gif"),
+)
+# Containers that hold their own video. FFmpeg also reads playlists and text, which can name other files.
+_CONTAINERS = "mov,matroska,avi,mpeg,mpegts,asf,flv,ogg,mxf,gif"
+_MOST_PIXELS = 2**27  # of one frame; 15360 x 8640 is below it
+_EXACT_CONTAINERS = frozenset(("mov", "matroska", "avi"))  # those whose stated length can be relied upon ...
+_MISSING_END = 0.5  # ... up to so many seconds
+
+
+@dataclass(frozen=True)
+class VideoFile:
+    """A video file; frames are named by their index in it, and times count from its first frame."""
+
+    path: Path
+
+    def total(self, sampling: Sampling) -> None:
+        """Return None: only decoding tells how many frames there are."""
+
+    def frames(self, sampling: Sampling) -> Iterator[Frame]:
+        """Yield the frames that `sampling` takes; decoding stops after the last of them.
+
+        Raises:
+            ClipError: not a video, no video stream, no frame at `start`, or the file breaks off before its end.
+            MissingExtraError: PyAV is not installed.
+        """
+        try:
+            import av
+            import av.error
+        except ImportError as error:
+            raise MissingExtraError("reading video files", "video") from error
+        rotation, matrix = None, np.eye(2)
+        for index, time, frame in sampling.select(_timed(self.path, av)):
+            if frame.rotation != rotation:  # asking a frame for its matrix keeps it alive until garbage is collected
+                rotation, matrix = frame.rotation, _display_matrix(frame, self.path)
+            try:
+                pixels = frame.to_ndarray(format="rgb24")
+            except (av.error.FFmpegError, ValueError) as error:
+                raise _unreadable(self.path, index, error) from error
+            yield Frame(frame_name(index), Image.fromarray(upright(pixels, matrix)), time)
+
+
+def is_video_name(path: Path) -> bool:
+    """Return whether the name ends as that of a video file does."""
+    return path.suffix.lower() in _SUFFIXES
+
+
+def upright(pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Turn and mirror a stored frame the way it is to be shown.
+
+    Args:
+        pixels: [H, W, C] as stored.
+        matrix: [2, 2] with entries of which two are 0; stored (x, y) is shown at (x, y) @ matrix, y pointing down.
+
+    Returns:
+        [H, W, C] or [W, H, C], a view of `pixels`.
+    """
+    (a, b), (c, d) = matrix
+    across, down = a, d  # x' = a x, y' = d y
+    if not a and not d:
+        pixels = pixels.swapaxes(0, 1)
+        across, down = c, b  # x' = c y, y' = b x
+    if across < 0:
+        pixels = pixels[:, ::-1]
+    return pixels[::-1] if down < 0 else pixels
+
+
+def _display_matrix(frame: VideoFrame, path: Path) -> np.ndarray:
+    """Return the upper left of the frame's 3 x 3 display matrix as -1, 0 and 1; the unit matrix where there is none."""
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return np.eye(2)
+    matrix = np.frombuffer(data, np.int32).reshape(3, 3)[:2, :2].astype(np.float64)
+    lengths = np.linalg.norm(matrix, axis=1, keepdims=True)
+    if not lengths.all():  # some files leave it at 0
+        return np.eye(2)
+    matrix /= lengths
+    turned = np.rint(matrix)
+    if np.abs(matrix - turned).max() > 0.02 or not np.linalg.det(turned):
+        raise ClipError(f"video {path} is to be shown turned by {frame.rotation} degrees; expected a multiple of 90")
+    return turned
+
+
+def _timed(path: Path, av: ModuleType) -> Iterator[tuple[float, VideoFrame]]:
+    """Yield (seconds since the first frame, frame) of every frame of the file's best video stream."""
+    count, first = 0, 0.0
+    try:
+        # An absolute path cannot be taken for a protocol such as "concat:"; titles in odd encodings do not matter.
+        options = {"format_whitelist": _CONTAINERS}
+        with av.open(str(path.absolute()), container_options=options, metadata_errors="replace") as container:
+            stream = _video_stream(container, path)
+            for frame in _decoded(container, stream):
+                if frame.pts is None or stream.time_base is None:
+                    raise ClipError(f"frame {count} of video {path} has no presentation time; write the video as MP4")
+                if frame.width * frame.height > _MOST_PIXELS:
+                    raise ClipError(
+                        f"video {path} has frames of {frame.width} x {frame.height}; expected at most {_MOST_PIXELS} "
+                        f"pixels, make them smaller"
+                    )
+                time = float(frame.pts * stream.time_base)
+                if count == 0:
+                    first = time
+                count += 1
+                yield time - first, frame
+    except (av.error.FFmpegError, OSError, EOFError) as error:
+        raise _unreadable(path, count, error) from error
+
+
+def _video_stream(container: InputContainer, path: Path) -> VideoStream:
+    from av.stream import Disposition
+
+    stream = cast("VideoStream | None", container.streams.best("video"))
+    if stream is None or stream.disposition & Disposition.attached_pic:  # the cover of a piece of music
+        raise ClipError(f"{path} has no video stream; expected a whole video file")
+    stream.thread_type = "AUTO"
+    if stream.sample_aspect_ratio not in (None, 0, 1):
+        logger.warning("%s has pixels of aspect %s; they are taken as square", path, stream.sample_aspect_ratio)
+    return stream
+
+
+def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
+    """Yield every frame of the stream; raise EOFError where the file ends before its video does."""
+    end = 0.0
+    for packet in container.demux(_timing_streams(container, stream)):
+        if packet.is_corrupt:
+            yield from stream.decode(None)  # the decoder runs behind the packets
+            raise EOFError("the next packet is damaged or incomplete")
+        end = max(end, _packet_end(packet))
+        if packet.stream is stream:
+            yield from stream.decode(packet)
+    expected = _expected_end(container, stream)
+    if end < expected - _MISSING_END:
+        raise EOFError(f"the file ends at {end:.2f} s of {expected:.2f} s")
+
+
+def _timing_streams(container: InputContainer, stream: VideoStream) -> list[Stream]:
+    """Return the streams whose packets tell where the file ends: Matroska knows the length of all together only."""
+    return [stream] if stream.duration is not None else list(container.streams)
+
+
+def _packet_end(packet: Packet) -> float:
+    start = packet.dts if packet.pts is None else packet.pts
+    return 0.0 if start is None else float((start + (packet.duration or 0)) * packet.time_base)
+
+
+def _expected_end(container: InputContainer, stream: VideoStream) -> float:
+    """Return the time in seconds at which the packets should end, or 0 where the container does not know."""
+    if not _EXACT_CONTAINERS.intersection(container.format.name.split(",")):
+        return 0.0
+    if stream.duration is not None and stream.time_base is not None:
+        return float(((stream.start_time or 0) + stream.duration) * stream.time_base)
+    return (container.duration or 0) / 1e6  # Matroska counts it from 0, wherever its first frame is
+
+
+def _unreadable(path: Path, count: int, error: Exception) -> ClipError:
+    reason = getattr(error, "strerror", None) or error
+    if count:
+        return ClipError(f"video {path} breaks off at frame {count} ({reason}); set max_frames, or write it anew")
+    return ClipError(f"cannot read video {path}: {reason}; expected a whole file of a known video format")
