@@ -71,9 +71,7 @@ def aggregate(params, patch_tokens, config: VGGTConfig, grid, dynamic=None, mode
     positions = [(0, 0)] * SPECIAL + [(y + 1, x + 1) for y in range(grid[0]) for x in range(grid[1])]
     taps, q_all, k_all = [], [], []
     for layer in range(config.depth):
-        frame_weights, global_weights = (
-            pick(params[name], layer) for name in ("frame_blocks", "global_blocks")
-        )
+        frame_weights, global_weights = (pick(params[name], layer) for name in ("frame_blocks", "global_blocks"))
         masked = dynamic is not None and layer < mask_pairs
         keys = np.zeros((S, T), bool)
         if masked:
@@ -98,7 +96,9 @@ def aggregate(params, patch_tokens, config: VGGTConfig, grid, dynamic=None, mode
 
 def pick(tree, layer):
     """One layer of a stacked tree."""
-    return {name: pick(leaf, layer) if isinstance(leaf, dict) else np.float64(leaf[layer]) for name, leaf in tree.items()}
+    return {
+        name: pick(leaf, layer) if isinstance(leaf, dict) else np.float64(leaf[layer]) for name, leaf in tree.items()
+    }
 
 
 def gram_map(rows, columns, layers, statistic, offsets, gram):

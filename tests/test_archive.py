@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vggtjax import archive
 from vggtjax.errors import ResultError
+from vggtjax.results import archive
 
 ARRAYS = {
     "grid": np.arange(12, dtype=np.float32).reshape(3, 4),

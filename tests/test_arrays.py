@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.arrays import ArrayFrames, eight_bit
+from vggtjax.clips.arrays import ArrayFrames, eight_bit
+from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import ClipError
-from vggtjax.sampling import Sampling
 
 
 def test_depths():

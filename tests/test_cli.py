@@ -50,7 +50,9 @@ def test_reconstruct_with_a_converted_model(tmp_path, capsys, frames, golden, mo
     shapes = json.loads((golden / "shapes.json").read_text())
     save_file(seeded_state_dict(shapes, 7), tmp_path / "torch.safetensors")
     config = golden / "config.json"
-    code, out, _ = run(capsys, "convert", tmp_path / "torch.safetensors", tmp_path / "m.safetensors", "--config", config)
+    code, out, _ = run(
+        capsys, "convert", tmp_path / "torch.safetensors", tmp_path / "m.safetensors", "--config", config
+    )
     assert code == 0
     assert "wrote" in out
     code, out, _ = run(capsys, "info", tmp_path / "m.safetensors")
@@ -104,7 +106,10 @@ def test_a_folder_that_cannot_be_written(tmp_path, capsys, frames):
 
 def test_an_unknown_option_is_exit_code_2():
     made = subprocess.run(
-        [sys.executable, "-m", "vggtjax", "reconstruct", "--no-such-option"], capture_output=True, text=True, check=False
+        [sys.executable, "-m", "vggtjax", "reconstruct", "--no-such-option"],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert made.returncode == 2
     assert "Traceback" not in made.stderr

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from vggtjax.clip import load_clip
+from vggtjax.clips.clip import load_clip
 from vggtjax.errors import ClipError, InputError
 
 GREY = 100
@@ -174,14 +174,14 @@ def test_errors_name_the_frame():
 
 
 def test_more_frames_than_fit(monkeypatch):
-    monkeypatch.setattr("vggtjax.clip._MOST_BYTES", 3 * 12 * 28 * 14)
+    monkeypatch.setattr("vggtjax.clips.clip._MOST_BYTES", 3 * 12 * 28 * 14)
     assert len(load_clip(frames(*[(40, 20)] * 3), size=28)) == 3
     with pytest.raises(ClipError, match="more than 3 frames of 28 x 14 exceed"):
         load_clip(frames(*[(40, 20)] * 4), size=28)
 
 
 def test_loading_does_not_import_jax():
-    code = "import sys; import vggtjax.clip; sys.exit('jax' in sys.modules or 'av' in sys.modules)"
+    code = "import sys; import vggtjax.clips.clip; sys.exit('jax' in sys.modules or 'av' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -59,5 +59,5 @@ def test_bad_cues_are_named():
 
 
 def test_the_command_line_starts_without_jax():
-    code = "import sys, vggtjax, vggtjax.cli, vggtjax.config, vggtjax.clip; sys.exit('jax' in sys.modules)"
+    code = "import sys, vggtjax, vggtjax.cli, vggtjax.config, vggtjax.clips.clip; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

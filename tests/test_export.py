@@ -9,9 +9,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.room import make_room
-from vggtjax import export, point_cloud
 from vggtjax.errors import InputError, OutputError
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.results import export, point_cloud
+from vggtjax.results.reconstruction import Reconstruction
 
 FILES = {
     "reconstruction.npz",

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.room import WALL, make_room
-from vggtjax import geometry
 from vggtjax.errors import ResultError
+from vggtjax.results import geometry
 
 
 @pytest.mark.parametrize("name", ["forward_single", "forward_frames4"])

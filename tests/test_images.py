@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from vggtjax.clips.images import ImageFiles, is_image_name, read_image
+from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import ClipError
-from vggtjax.images import ImageFiles, is_image_name, read_image
-from vggtjax.sampling import Sampling
 
 RAMP = np.array([[0, 128, 129, 33023, 65535]], np.uint16)
 RAMP_8 = [0, 0, 1, 128, 255]

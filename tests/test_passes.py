@@ -60,9 +60,7 @@ def test_every_method_takes_what_the_table_says(inferred):
     _, passes = inferred
     first, second = passes.first, passes.second
     cameras = {"first": decode_pose(first.pose_encoding, SIZE), "second": decode_pose(second.pose_encoding, SIZE)}
-    fused = fuse_depth(
-        first.depth, first.depth_confidence, second.depth, second.depth_confidence, passes.dynamic_mask
-    )
+    fused = fuse_depth(first.depth, first.depth_confidence, second.depth, second.depth_confidence, passes.dynamic_mask)
     replaced = tuple(
         np.where(passes.dynamic_mask, a, b)
         for a, b in ((first.depth, second.depth), (first.depth_confidence, second.depth_confidence))
@@ -87,7 +85,9 @@ def test_aligning_the_scale_moves_depth_and_cameras_together(inferred):
     scale = np.asarray(scale_between(passes.first.depth, passes.second.depth, passes.dynamic_mask))
     plain, aligned = (assemble(passes, "pose-decoupling", align_scale=on) for on in (False, True))
     assert np.allclose(aligned.depth, plain.depth * scale[:, None, None, None], rtol=1e-5)
-    assert np.allclose(aligned.camera_from_world[..., 3], plain.camera_from_world[..., 3] * scale[:, None, None], rtol=1e-5)
+    assert np.allclose(
+        aligned.camera_from_world[..., 3], plain.camera_from_world[..., 3] * scale[:, None, None], rtol=1e-5
+    )
     assert np.allclose(aligned.camera_from_world[..., :3], plain.camera_from_world[..., :3])
 
 
@@ -154,4 +154,3 @@ def test_unknown_names(params, config, images, inferred):
         assemble(inferred[1]._replace(second=None), "4dvggt-d")
     with pytest.raises(InputError, match="'cosine' or 'dot'"):
         motion_saliency(params, images, config, gram="sine")  # pyright: ignore[reportArgumentType]
-

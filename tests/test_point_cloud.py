@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from tests.room import make_room
-from vggtjax import point_cloud
 from vggtjax.errors import InputError
+from vggtjax.results import point_cloud
 
 
 def test_percentile_is_taken_over_the_clip_and_ties_stay():

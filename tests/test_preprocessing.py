@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from vggtjax.clips.images import to_rgb
+from vggtjax.clips.preprocessing import Fit, Layout
 from vggtjax.errors import ClipError, InputError
-from vggtjax.images import to_rgb
-from vggtjax.preprocessing import Fit, Layout
 
 GOLDEN = Path(__file__).parent / "golden" / "preprocess.npz"
 

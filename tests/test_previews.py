@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from tests.room import make_room
-from vggtjax import previews
+from vggtjax.results import previews
 
 
 def test_range_by_hand():

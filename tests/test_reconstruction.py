@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tests.room import make_room
-from vggtjax import archive
 from vggtjax.errors import ResultError
-from vggtjax.reconstruction import FieldOfViewWarning, Reconstruction, is_result
+from vggtjax.results import archive
+from vggtjax.results.reconstruction import FieldOfViewWarning, Reconstruction, is_result
 
 
 def assert_equal(first: Reconstruction, second: Reconstruction) -> None:

@@ -5,8 +5,8 @@ import pytest
 import trimesh
 
 from tests.room import WALL, make_room
-from vggtjax import point_cloud
-from vggtjax.scene import build_scene
+from vggtjax.results import point_cloud
+from vggtjax.results.scene import build_scene
 
 
 def load_scene(room, percentile=0.0, **options):
@@ -104,7 +104,7 @@ def test_single_frame_and_cameras_in_one_place():
     assert len(load_scene(make_room(camera_from_world=still)).geometry["cameras"].faces) == 3 * (8 * 8 + 2)
 
 
-@pytest.mark.filterwarnings("ignore::vggtjax.reconstruction.FieldOfViewWarning")
+@pytest.mark.filterwarnings("ignore::vggtjax.results.reconstruction.FieldOfViewWarning")
 def test_extreme_depths_and_fields_of_view():
     depth = make_room().depth.copy()
     depth[:, ::2] = 1e38

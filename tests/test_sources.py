@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.arrays import ArrayFrames
+from vggtjax.clips.arrays import ArrayFrames
+from vggtjax.clips.images import ImageFiles
+from vggtjax.clips.sources import natural_key, open_source
+from vggtjax.clips.video import VideoFile
 from vggtjax.errors import ClipError
-from vggtjax.images import ImageFiles
-from vggtjax.sources import natural_key, open_source
-from vggtjax.video import VideoFile
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ import pytest
 from av.stream import Disposition
 from av.video.format import VideoFormat
 
+from vggtjax.clips.sampling import Sampling
+from vggtjax.clips.video import VideoFile, is_video_name, upright
 from vggtjax.errors import ClipError, MissingExtraError
-from vggtjax.sampling import Sampling
-from vggtjax.video import VideoFile, is_video_name, upright
 
 WIDTH, HEIGHT = 64, 48
 
@@ -307,7 +307,7 @@ def test_past_the_end(even):
 
 
 def test_frames_larger_than_any_camera_makes(even, monkeypatch):
-    monkeypatch.setattr("vggtjax.video._MOST_PIXELS", WIDTH * HEIGHT - 1)
+    monkeypatch.setattr("vggtjax.clips.video._MOST_PIXELS", WIDTH * HEIGHT - 1)
     with pytest.raises(ClipError, match=f"has frames of {WIDTH} x {HEIGHT}"):
         read(even)
 

@@ -1,8 +1,8 @@
 from .backbone import encode as encode
 from .checkpoint import Model as Model
 from .checkpoint import load_model as load_model
-from .clip import Clip as Clip
-from .clip import load_clip as load_clip
+from .clips.clip import Clip as Clip
+from .clips.clip import load_clip as load_clip
 from .config import Cue as Cue
 from .config import MotionConfig as MotionConfig
 from .config import VGGTConfig as VGGTConfig
@@ -22,6 +22,6 @@ from .pipeline import infer as infer
 from .pipeline import reconstruct as reconstruct
 from .pose import decode_pose as decode_pose
 from .pose import encode_pose as encode_pose
-from .reconstruction import Reconstruction as Reconstruction
+from .results.reconstruction import Reconstruction as Reconstruction
 
 __version__: str

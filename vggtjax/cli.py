@@ -67,7 +67,7 @@ def reconstruct(
     with report.running():
         loaded = _load_model(report, model, config)
         with report.stage("load clip") as progress:
-            from vggtjax.clip import load_clip
+            from vggtjax.clips.clip import load_clip
 
             clip = load_clip(
                 source[0] if len(source) == 1 else list(source),
@@ -134,7 +134,7 @@ def demo(out: Path = Path("demo-output"), /, *, method: MethodName = "4dvggt-d")
     with report.running():
         loaded = _load_model(report, "demo", None)
         with report.stage("generate clip"):
-            from vggtjax.clip import load_clip
+            from vggtjax.clips.clip import load_clip
             from vggtjax.demo import demo_frames
 
             clip = load_clip(demo_frames(), size=loaded.config.image_size, patch=loaded.config.patch_size)
@@ -205,4 +205,3 @@ def _read_config(path: Path | None) -> VGGTConfig | None:
         raise InputError(f"cannot read {path}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise InputError(f"{path} is not text; expected a JSON file with a configuration") from None
-

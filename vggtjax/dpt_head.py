@@ -188,7 +188,8 @@ def add_positions(x: Float[Array, "F h w C"], aspect: float, weight: float = 0.1
     h, w, C = x.shape[1:]
     diagonal = (1 + aspect**2) ** 0.5
     u, v = (
-        np.linspace(-span * (n - 1) / n, span * (n - 1) / n, n) for span, n in ((aspect / diagonal, w), (1 / diagonal, h))
+        np.linspace(-span * (n - 1) / n, span * (n - 1) / n, n)
+        for span, n in ((aspect / diagonal, w), (1 / diagonal, h))
     )
     frequencies = 1.0 / 100.0 ** (np.arange(C // 4) / (C / 4))
 

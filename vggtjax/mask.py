@@ -15,7 +15,7 @@ def upsample(saliency: Float[Array, "B S h w"], size: tuple[int, int]) -> Float[
     return jax.image.resize(saliency, (*saliency.shape[:2], *size), "bilinear", antialias=False)
 
 
-def otsu_threshold(values: Float[Array, "..."], bins: int = BINS) -> Float[Array, ""]:
+def otsu_threshold(values: Float[Array, ...], bins: int = BINS) -> Float[Array, ""]:
     """Return Otsu's threshold: the bin centre that maximises the variance between the two classes it makes.
 
     The histogram has `bins` bins from the smallest to the largest value, as scikit-image's `threshold_otsu`; of

@@ -125,7 +125,7 @@ def _unit(x: Float[Array, "... D"]) -> Float[Array, "... D"]:
     return x * jax.lax.rsqrt(jnp.maximum(jnp.sum(x * x, axis=-1, keepdims=True), 1e-24))
 
 
-def _sample_std(x: Float[Array, "... J"]) -> Float[Array, "..."]:
+def _sample_std(x: Float[Array, "... J"]) -> Float[Array, ...]:
     """Unbiased standard deviation over the last axis; 0 where there is a single token."""
     centred = x - x.mean(axis=-1, keepdims=True)
     variance = jnp.sum(centred * centred, axis=-1) / max(x.shape[-1] - 1, 1)

@@ -14,13 +14,13 @@ from jaxtyping import Array, Float
 
 from vggtjax.backbone import encode
 from vggtjax.checkpoint import Model
-from vggtjax.clip import Clip
+from vggtjax.clips.clip import Clip
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
 from vggtjax.layers import Params
 from vggtjax.mask import dynamic_pixels
 from vggtjax.methods import find_method
 from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.results.reconstruction import Reconstruction
 
 OnStage = Callable[[str], AbstractContextManager[Any]]
 

@@ -15,7 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from vggtjax.reconstruction import Reconstruction
+    from vggtjax.results.reconstruction import Reconstruction
 
 Advance = Callable[[int, int | None], None]
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from flax import linen as nn
-from jax import Array
+from jax import Array, random
 from jax import numpy as jnp
-from jax import random
 
 from vggtjax.config import VGGTConfig
 from vggtjax.dpt_head import DPTFeatures, init_features

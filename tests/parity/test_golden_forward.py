@@ -81,7 +81,10 @@ def test_tokens(golden, seeded_params, config):
     layers = (4, 11, 17, 23)
     for taps in (layers, (0, *layers[1:])):  # layer 0 is not a tap of the model, but a tap can be anywhere
         run = partial(
-            aggregate, config=dataclasses.replace(config, taps=taps), grid=case.tokens.shape[2:], captures=[identity] * 4
+            aggregate,
+            config=dataclasses.replace(config, taps=taps),
+            grid=case.tokens.shape[2:],
+            captures=[identity] * 4,
         )
         tokens, _ = jax.jit(run)(case.params, patch_tokens)
         for layer, made in zip(taps, tokens, strict=True):

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from vggtjax import geometry
 from vggtjax.errors import InputError
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.results import geometry
+from vggtjax.results.reconstruction import Reconstruction
 
 
 @dataclass(frozen=True, eq=False)

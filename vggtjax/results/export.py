@@ -29,12 +29,12 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from scipy.spatial.transform import Rotation
 
-from vggtjax import point_cloud, previews
 from vggtjax.errors import OutputError
 from vggtjax.files import staging, writing
-from vggtjax.point_cloud import PointCloud
-from vggtjax.reconstruction import ARCHIVE_NAME, Reconstruction, is_result
-from vggtjax.scene import build_scene
+from vggtjax.results import point_cloud, previews
+from vggtjax.results.point_cloud import PointCloud
+from vggtjax.results.reconstruction import ARCHIVE_NAME, Reconstruction, is_result
+from vggtjax.results.scene import build_scene
 
 _NAMES = ("depth", "mask", "preview", "frames", "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb")
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent

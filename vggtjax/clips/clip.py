@@ -12,10 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, UInt8
 
+from vggtjax.clips.preprocessing import Fit, Layout, Mode
+from vggtjax.clips.sampling import Sampling, Source
+from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import ClipError, InputError
-from vggtjax.preprocessing import Fit, Layout, Mode
-from vggtjax.sampling import Sampling, Source
-from vggtjax.sources import ClipSource, open_source
 
 logger = logging.getLogger(__name__)
 

@@ -10,9 +10,9 @@ from cmap import Colormap
 from jaxtyping import Float, Int, UInt8
 from trimesh.visual import ColorVisuals
 
-from vggtjax import geometry
-from vggtjax.point_cloud import PointCloud
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.results import geometry
+from vggtjax.results.point_cloud import PointCloud
+from vggtjax.results.reconstruction import Reconstruction
 
 POINT_LIMIT = 1_000_000  # points that viewers in a browser still turn smoothly
 _TO_GLTF = np.array([1, -1, -1], np.float32)  # half a turn about x: y down and z forward become y up and z backward

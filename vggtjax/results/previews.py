@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float32, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from skimage.segmentation import find_boundaries
 
-from vggtjax.point_cloud import valid_pixels
-from vggtjax.reconstruction import Reconstruction
+from vggtjax.results.point_cloud import valid_pixels
+from vggtjax.results.reconstruction import Reconstruction
 
 _DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm
 _SALIENCY_COLORS = (Colormap("inferno").lut(256)[:, :3] * 255).round().astype(np.uint8)

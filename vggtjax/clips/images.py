@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from vggtjax.arrays import eight_bit
+from vggtjax.clips.arrays import eight_bit
+from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.errors import ClipError
-from vggtjax.sampling import Frame, Sampling
 
 # Formats of still pictures only: Pillow also knows some that start other programs (EPS) or are no pictures.
 FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP", "PPM", "WEBP", "TGA", "JPEG2000", "AVIF", "HEIF")

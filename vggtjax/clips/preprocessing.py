@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from vggtjax.clips.sampling import whole_number
 from vggtjax.errors import ClipError, InputError
-from vggtjax.sampling import whole_number
 
 Mode = Literal["crop", "pad"]
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from PIL import Image
 
-from vggtjax.arrays import frame_name
+from vggtjax.clips.arrays import frame_name
+from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.errors import ClipError, MissingExtraError
-from vggtjax.sampling import Frame, Sampling
 
 if TYPE_CHECKING:
     from types import ModuleType

@@ -12,11 +12,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from vggtjax.arrays import ArrayFrames
+from vggtjax.clips.arrays import ArrayFrames
+from vggtjax.clips.images import ImageFiles, is_image_name
+from vggtjax.clips.sampling import Source
+from vggtjax.clips.video import VideoFile, is_video_name
 from vggtjax.errors import ClipError
-from vggtjax.images import ImageFiles, is_image_name
-from vggtjax.sampling import Source
-from vggtjax.video import VideoFile, is_video_name
 
 ClipSource: TypeAlias = str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | Sequence[np.ndarray] | np.ndarray
 

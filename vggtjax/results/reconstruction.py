@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
-from vggtjax import archive, geometry
 from vggtjax.errors import ResultError
+from vggtjax.results import archive, geometry
 
 ARCHIVE_NAME = "reconstruction.npz"
 _FORMAT_VERSION = 1
@@ -136,7 +136,7 @@ class Reconstruction:
         confidence_percentile: float = 20.0,
         progress: Callable[[int, int], object] | None = None,
     ) -> None:
-        """Write the result into `folder`, made if missing; see vggtjax.export for the files.
+        """Write the result into `folder`, made if missing; see vggtjax.results.export for the files.
 
         An earlier result in the folder is replaced as a whole, or left untouched if anything fails; other files
         stay. Point clouds leave out the `confidence_percentile` percent of pixels with the lowest confidence.
@@ -145,7 +145,7 @@ class Reconstruction:
         Raises InputError for a percentile outside [0, 100), and OutputError where the folder cannot be written or
         holds files of the same names that are not an earlier result.
         """
-        from vggtjax import export
+        from vggtjax.results import export
 
         export.save(self, folder, confidence_percentile=confidence_percentile, progress=progress)
 

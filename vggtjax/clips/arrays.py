@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.errors import ClipError
-from vggtjax.sampling import Frame, Sampling
 
 
 @dataclass(frozen=True, eq=False)
