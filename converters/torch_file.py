@@ -53,6 +53,8 @@ def _load(path: Path) -> Any:
     except ImportError as error:
         raise MissingExtraError(f"reading the torch file {path}", "convert") from error
 
+    if path.suffix == ".safetensors":  # torch goes by the name
+        raise CheckpointError(f"{path} is a torch file by its content; rename it to .pt")
     mapped = zipfile.is_zipfile(path)
     if not mapped:
         logger.warning("%s is no archive (whole, and by torch 1.6 or later): all of it is read into memory", path)

@@ -139,7 +139,7 @@ def test_ply_by_hand(tmp_path):
     export.write_ply(tmp_path / "one.ply", cloud)
     header, _, body = (tmp_path / "one.ply").read_bytes().partition(b"end_header\n")
     assert b"element vertex 1\n" in header
-    assert body == np.array([1, 2, 3], "<f4").tobytes() + bytes([4, 5, 6])
+    assert body == np.array([1, 2, 3], "<f4").tobytes() + bytes([4, 5, 6, 255])
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float32, UInt16
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -179,14 +180,7 @@ def write_intrinsics(path: Path, reconstruction: Reconstruction) -> None:
 
 def write_ply(path: Path, cloud: PointCloud) -> None:
     """Write a cloud as binary PLY with float32 positions and 8-bit colours; it may be empty."""
-    properties = [f"property float {name}" for name in "xyz"]
-    properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud)}", *properties, "end_header", ""]
-    vertices = np.empty(len(cloud), [("point", "<f4", 3), ("color", "u1", 3)])
-    vertices["point"], vertices["color"] = cloud.points, cloud.colors
-    with path.open("wb") as file:
-        file.write("\n".join(lines).encode("ascii"))
-        file.write(vertices.data)
+    path.write_bytes(trimesh.PointCloud(cloud.points, cloud.colors).export(file_type="ply"))
 
 
 def _write_png(path: Path, pixels: np.ndarray, **texts: str) -> None:
