@@ -11,7 +11,7 @@ demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo demo-output
 
 test: lint
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 lint: $(VENV)/.development
 	$(BIN)/ruff check

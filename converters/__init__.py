@@ -1,7 +1,5 @@
 """Foreign checkpoints -> parameter trees of vggtjax."""
 
-import lazy_loader
+from converters.torch_to_flax import convert, convert_state_dict
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(
-    __name__, submod_attrs={"torch_to_flax": ["convert", "convert_state_dict"]}
-)
+__all__ = ["convert", "convert_state_dict"]

@@ -44,25 +44,26 @@ def download(hub_id: str) -> Path:
 
 
 def _download(hub_id: str) -> Path:
-    from huggingface_hub import HfApi, hf_hub_download, snapshot_download
+    from huggingface_hub import HfApi
     from huggingface_hub.errors import (
         HTTPError,  # pyright: ignore[reportPrivateImportUsage]: of httpx or httpx2
         LocalEntryNotFoundError,
     )
 
+    hub = HfApi()
     cached = False
     try:
-        names = [file.rfilename for file in HfApi().model_info(hub_id).siblings or []]
+        names = [file.rfilename for file in hub.model_info(hub_id).siblings or []]
     except (HTTPError, OSError) as error:  # out of reach, or closed to us: what was downloaded before still serves
         try:
-            folder = Path(snapshot_download(hub_id, allow_patterns=[], local_files_only=True))
+            folder = Path(hub.snapshot_download(hub_id, allow_patterns=[], local_files_only=True))
         except LocalEntryNotFoundError:
             raise error from None
         names = [entry.name for entry in folder.iterdir()]
         cached = True
     name = choose_file(names, f"the hub's '{hub_id}'")
-    path = Path(hf_hub_download(hub_id, name, local_files_only=cached))
+    path = Path(hub.hf_hub_download(hub_id, name, local_files_only=cached))
     for file in weight_files(path):
-        if Path(hf_hub_download(hub_id, file.name, local_files_only=cached)) != file:
+        if Path(hub.hf_hub_download(hub_id, file.name, local_files_only=cached)) != file:
             raise CheckpointError(f"the hub's '{hub_id}' changed while it was downloaded; try again")
     return path

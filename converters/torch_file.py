@@ -55,9 +55,10 @@ def _load(path: Path) -> Any:
 
     if path.suffix == ".safetensors":  # torch goes by the name
         raise CheckpointError(f"{path} is a torch file by its content; rename it to .pt")
-    mapped = zipfile.is_zipfile(path)
+    with path.open("rb") as file:
+        mapped = file.read(4) == b"PK\x03\x04"
     if not mapped:
-        logger.warning("%s is no archive (whole, and by torch 1.6 or later): all of it is read into memory", path)
+        logger.warning("%s is of torch's old format, before 1.6: all of it is read into memory", path)
     try:
         if mapped:
             _check_archive(path)

@@ -72,9 +72,9 @@ def aggregate(params, patch_tokens, config: VGGTConfig, grid, dynamic=None, mode
     taps, q_all, k_all = [], [], []
     for layer in range(config.depth):
         frame_weights, global_weights = (pick(params[name], layer) for name in ("frame_blocks", "global_blocks"))
-        masked = dynamic is not None and layer < mask_pairs
         keys = np.zeros((S, T), bool)
-        if masked:
+        masked = dynamic is not None and layer < mask_pairs
+        if dynamic is not None and masked:
             keys[:, SPECIAL:] = dynamic.reshape(S, P)
         x = np.stack(
             [

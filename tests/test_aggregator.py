@@ -8,6 +8,7 @@ import pytest
 
 from tests import reference
 from vggtjax import VGGTConfig
+from vggtjax.config import Suppress
 from vggtjax.aggregator import aggregate, identity
 from vggtjax.model import parameter_shapes
 from vggtjax.motion import GramCues
@@ -37,7 +38,7 @@ def small():
 
 
 @partial(jax.jit, static_argnames=("suppress", "mask_pairs", "with_cues"))
-def run(params, tokens, dynamic=None, suppress="zero", mask_pairs=5, with_cues=False):
+def run(params, tokens, dynamic=None, suppress: Suppress = "zero", mask_pairs=5, with_cues=False):
     return aggregate(
         params, tokens, CONFIG, GRID, captures=[identity] * 4, dynamic_tokens=dynamic, suppress=suppress,
         mask_pairs=mask_pairs, cues=GramCues(CONFIG.motion, CONFIG.depth) if with_cues else None,
@@ -51,7 +52,7 @@ def test_scan_equals_unrolled_reference(small, suppress):
     made, _ = run(params, tokens, dynamic, suppress or "zero", mask_pairs=3)
     for b in range(2):
         taps, _, _ = reference.aggregate(
-            params, tokens[b], CONFIG, GRID, None if dynamic is None else dynamic[b], suppress, mask_pairs=3
+            params, tokens[b], CONFIG, GRID, None if dynamic is None else dynamic[b], suppress or "zero", mask_pairs=3
         )
         for tap, expected in zip(made, taps, strict=True):
             assert np.abs(np.asarray(tap[b]) - expected).max() <= 2e-5 * expected.std()

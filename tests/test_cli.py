@@ -64,7 +64,7 @@ def test_reconstruct_with_a_converted_model(tmp_path, capsys, frames, golden, mo
     )  # fmt: skip
     assert code == 0, err
     result = Reconstruction.load(tmp_path / "out")
-    assert result.depth.shape == (2, 98, 140)
+    assert result.depth.shape == (2, 112, 140)
     assert result.frame_names == ("frame_0", "frame_1")
     assert result.method == "pose-decoupling"
 

@@ -43,20 +43,22 @@ def test_fusion_equals_the_formula_and_stays_between_the_passes(d1, c1, d2, c2, 
 
 
 def test_any_number_of_leading_axes():
-    maps = [jnp.asarray(np.random.default_rng(i).uniform(1, 2, (2, 3, 4, 5)).astype(np.float32)) for i in range(4)]
-    dynamic = maps[0] > 1.5
-    batch, _ = fuse_depth(*maps, dynamic)
+    d1, c1, d2, c2 = (
+        jnp.asarray(np.random.default_rng(i).uniform(1, 2, (2, 3, 4, 5)).astype(np.float32)) for i in range(4)
+    )
+    maps = (d1, c1, d2, c2, d1 > 1.5)
+    batch, _ = fuse_depth(*maps)
     for b in range(2):
-        assert np.allclose(batch[b], fuse_depth(*(m[b] for m in maps), dynamic[b])[0])
-        assert np.allclose(batch[b, 0], fuse_depth(*(m[b, 0] for m in maps), dynamic[b, 0])[0])
+        assert np.allclose(batch[b], jax.vmap(fuse_depth)(*maps)[0][b])
+        assert np.allclose(batch[b, 0], fuse_depth(d1[b, 0], c1[b, 0], d2[b, 0], c2[b, 0], maps[4][b, 0])[0])
 
 
 def test_an_optimiser_learns_which_pass_to_trust():
     """The second pass is exact and its confidence understated: scaling that up must bring the fused depth to truth."""
     generator = np.random.default_rng(0)
-    truth = generator.uniform(1, 3, (2, 8, 8)).astype(np.float32)
-    noisy = truth + generator.normal(size=truth.shape).astype(np.float32)
-    ones, static = np.ones_like(truth), np.zeros(truth.shape, bool)
+    truth = jnp.asarray(generator.uniform(1, 3, (2, 8, 8)), jnp.float32)
+    noisy = truth + jnp.asarray(generator.normal(size=truth.shape), jnp.float32)
+    ones, static = jnp.ones_like(truth), jnp.zeros(truth.shape, bool)
 
     def loss(log_scale):
         depth, _ = fuse_depth(noisy, ones, truth, jnp.exp(log_scale) * ones, static)

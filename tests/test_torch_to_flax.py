@@ -6,6 +6,7 @@ import json
 import math
 import tracemalloc
 from itertools import pairwise
+from typing import Any
 
 import jax
 import ml_dtypes
@@ -89,8 +90,8 @@ def test_layers_are_stacked_in_order(state_dict, config):
 
 
 def test_types_are_kept(state_dict, config):
-    flat = flatten_dict(convert_state_dict({k: v.astype(ml_dtypes.bfloat16) for k, v in state_dict.items()}, config))
-    assert {leaf.dtype for leaf in flat.values()} == {np.dtype(ml_dtypes.bfloat16)}
+    params = convert_state_dict({k: v.astype(ml_dtypes.bfloat16) for k, v in state_dict.items()}, config)
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {np.dtype(ml_dtypes.bfloat16)}
 
 
 def test_both_spellings_of_virtual_tracks(state_dict, config):
@@ -138,7 +139,7 @@ def test_many_problems_make_one_short_message(config, state_dict):
 def test_convert_streams_the_same_arrays(state_dict, source, config, tmp_path):
     calls = []
     out = convert(source, tmp_path / "out" / "ours.safetensors", config=config, progress=lambda *c: calls.append(c))
-    expected = flatten_dict(convert_state_dict(state_dict, config), sep=".")
+    expected: dict[str, Any] = flatten_dict(convert_state_dict(state_dict, config), sep=".")
     with safe_open(out, framework="numpy") as file:
         assert file.metadata() == {"format": "vggtjax", "version": "1", "config": config.to_json(), "name": "tiny"}
         assert set(file.keys()) == set(expected)

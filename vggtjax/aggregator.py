@@ -8,12 +8,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.attention import Suppression
 from vggtjax.config import Suppress, VGGTConfig
-from vggtjax.layers import Block, Params, init_stacked
+from vggtjax.layers import Block, Params, apply, declare_stacked
 from vggtjax.motion import GramCues
 from vggtjax.precision import full_precision
 from vggtjax.rope import rope_table
@@ -71,9 +70,9 @@ def aggregate(
     def pair(carry, layer):
         x, taps, sums = carry
         frame_params, global_params, masked, tapped, cued = layer
-        x, _, _ = block.apply({"params": frame_params}, x.reshape(B * S, T, C), frame_rope, suppression(masked, B * S))
+        x, _, _ = apply(block, frame_params, x.reshape(B * S, T, C), frame_rope, suppression(masked, B * S))
         frame = x
-        x, q, k = block.apply({"params": global_params}, x.reshape(B, S * T, C), global_rope, suppression(masked, B))
+        x, q, k = apply(block, global_params, x.reshape(B, S * T, C), global_rope, suppression(masked, B))
         if cues is not None:
             sums = cues.add(sums, cued, *(_patches(a, B, S, T) for a in (q, k)))
         taps = tuple(
@@ -96,17 +95,15 @@ def aggregate(
     return taps, sums
 
 
-def init_aggregator(key: Array, config: VGGTConfig) -> Params:
-    """Return random parameters of the aggregator."""
-    keys = iter(jax.random.split(key, 4))
+def declare_aggregator(config: VGGTConfig) -> Params:
+    """Declare the parameters of the aggregator."""
     C = config.embed_dim
-    normal = nn.initializers.normal(0.02)
-    x = jnp.zeros((1, 1, C))
+    blocks = declare_stacked(_block(config), config.depth, jnp.zeros((1, 1, C)))
     return {
-        "camera_token": normal(next(keys), (2, 1, C)),
-        "register_tokens": normal(next(keys), (2, REGISTERS, C)),
-        "frame_blocks": init_stacked(_block(config), next(keys), config.depth, x),
-        "global_blocks": init_stacked(_block(config), next(keys), config.depth, x),
+        "camera_token": jnp.zeros((2, 1, C)),
+        "register_tokens": jnp.zeros((2, REGISTERS, C)),
+        "frame_blocks": blocks,
+        "global_blocks": blocks,
     }
 
 

@@ -8,7 +8,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.layers import Block, LayerNorm, Params, init_stacked
+from vggtjax.layers import Block, LayerNorm, Params, apply, declare, declare_stacked
 from vggtjax.precision import full_precision
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
@@ -37,32 +37,30 @@ def encode(
     size, C = config.patch_size, config.embed_dim
     grid = (H // size, W // size)
     x = (images - jnp.asarray(IMAGE_MEAN)[(None,) * 4]) / jnp.asarray(IMAGE_STD)[(None,) * 4]
-    x = _patch_embedding(config, compute_dtype).apply({"params": params["patch_embedding"]}, x.reshape(B * S, H, W, 3))
-    x = jnp.asarray(x, jnp.float32).reshape(B * S, grid[0] * grid[1], C)
+    x = apply(_patch_embedding(config, compute_dtype), params["patch_embedding"], x.reshape(B * S, H, W, 3))
+    x = x.astype(jnp.float32).reshape(B * S, grid[0] * grid[1], C)
     positions = params["position_embedding"].astype(jnp.float32)
     x = x + _patch_positions(positions[1:], config.grid_size, grid)[None]
     special = jnp.concatenate([params["class_token"] + positions[:1], params["register_tokens"]])  # [1 + R, C]
     special = jnp.broadcast_to(special.astype(jnp.float32), (B * S, *special.shape))
     x = jnp.concatenate([special, x], axis=1)  # [B*S, 1 + R + P, C]
     block = _block(config, compute_dtype)
-    x, _ = jax.lax.scan(lambda x, layer: (block.apply({"params": layer}, x)[0], None), x, params["blocks"])
-    x = LayerNorm(_EPSILON).apply({"params": params["norm"]}, x)
-    return jnp.asarray(x)[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
+    x, _ = jax.lax.scan(lambda x, layer: (apply(block, layer, x)[0], None), x, params["blocks"])
+    x = apply(LayerNorm(_EPSILON), params["norm"], x)
+    return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
 
 
-def init_backbone(key: Array, config: VGGTConfig) -> Params:
-    """Return random parameters of the backbone."""
-    keys = iter(jax.random.split(key, 6))
+def declare_backbone(config: VGGTConfig) -> Params:
+    """Declare the parameters of the backbone."""
     C, size = config.embed_dim, config.patch_size
-    normal = nn.initializers.normal(0.02)
     x = jnp.zeros((1, 1, C))
     return {
-        "patch_embedding": _patch_embedding(config).init(next(keys), jnp.zeros((1, size, size, 3)))["params"],
-        "class_token": normal(next(keys), (1, C)),
-        "register_tokens": normal(next(keys), (REGISTERS, C)),
-        "position_embedding": normal(next(keys), (1 + config.grid_size**2, C)),
-        "blocks": init_stacked(_block(config), next(keys), config.dino_depth, x),
-        "norm": LayerNorm().init(next(keys), x)["params"],
+        "patch_embedding": declare(_patch_embedding(config), jnp.zeros((1, size, size, 3))),
+        "class_token": jnp.zeros((1, C)),
+        "register_tokens": jnp.zeros((REGISTERS, C)),
+        "position_embedding": jnp.zeros((1 + config.grid_size**2, C)),
+        "blocks": declare_stacked(_block(config), config.dino_depth, x),
+        "norm": declare(LayerNorm(), x),
     }
 
 
@@ -72,7 +70,7 @@ def _patch_embedding(config: VGGTConfig, dtype: str = "float32") -> nn.Conv:
 
 
 def _block(config: VGGTConfig, dtype: str = "float32") -> Block:
-    return Block(config.dino_num_heads, epsilon=_EPSILON, initial_scale=1.0, dtype=jnp.dtype(dtype))
+    return Block(config.dino_num_heads, epsilon=_EPSILON, dtype=jnp.dtype(dtype))
 
 
 def _patch_positions(table: Float[Array, "G C"], side: int, grid: tuple[int, int]) -> Float[Array, "P C"]:

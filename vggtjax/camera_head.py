@@ -8,7 +8,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.layers import MLP, Block, LayerNorm, Params, init_stacked
+from vggtjax.layers import MLP, Block, LayerNorm, Params, apply, declare, declare_stacked
 from vggtjax.pose import POSE_SIZE
 from vggtjax.precision import full_precision
 
@@ -30,39 +30,34 @@ def predict_pose(
     params = params["camera_head"]
     E = config.camera_dim
     block = Block(config.camera_num_heads)
-    tokens = LayerNorm().apply({"params": params["token_norm"]}, camera_tokens)
-    normed = LayerNorm(1e-6, use_bias=False, use_scale=False).apply({}, tokens)
-    pose = None
+    tokens = apply(LayerNorm(), params["token_norm"], camera_tokens)
+    normed = apply(LayerNorm(1e-6, use_bias=False, use_scale=False), {}, tokens)
+    seen = jnp.broadcast_to(params["empty_pose"], (*tokens.shape[:2], POSE_SIZE))
+    pose = jnp.zeros(seen.shape)
     for _ in range(ITERATIONS):
-        if pose is None:
-            seen = jnp.broadcast_to(params["empty_pose"], (*tokens.shape[:2], POSE_SIZE))
-        else:
-            seen = jax.lax.stop_gradient(pose) if stop_gradient else pose
-        embedded = nn.Dense(E).apply({"params": params["pose_embedding"]}, seen)
-        modulation = nn.Dense(3 * E).apply({"params": params["modulation"]}, nn.silu(embedded))
-        shift, scale, gate = jnp.split(jnp.asarray(modulation), 3, axis=-1)
+        embedded = apply(nn.Dense(E), params["pose_embedding"], seen)
+        modulation = apply(nn.Dense(3 * E), params["modulation"], nn.silu(embedded))
+        shift, scale, gate = jnp.split(modulation, 3, axis=-1)
         x = tokens + gate * (normed * (1 + scale) + shift)
-        x, _ = jax.lax.scan(lambda x, layer: (block.apply({"params": layer}, x)[0], None), x, params["trunk"])
-        x = LayerNorm().apply({"params": params["trunk_norm"]}, x)
-        delta = _branch(config).apply({"params": params["pose_branch"]}, x)
-        pose = delta if pose is None else pose + delta
-    pose = jnp.asarray(pose)
+        x, _ = jax.lax.scan(lambda x, layer: (apply(block, layer, x)[0], None), x, params["trunk"])
+        x = apply(LayerNorm(), params["trunk_norm"], x)
+        pose = pose + apply(_branch(config), params["pose_branch"], x)
+        seen = jax.lax.stop_gradient(pose) if stop_gradient else pose
     return jnp.concatenate([pose[..., :7], nn.relu(pose[..., 7:])], axis=-1)
 
 
-def init_camera_head(key: Array, config: VGGTConfig) -> Params:
-    """Return random parameters of the camera head."""
-    keys = iter(jax.random.split(key, 6))
+def declare_camera_head(config: VGGTConfig) -> Params:
+    """Declare the parameters of the camera head."""
     E = config.camera_dim
     x, pose = jnp.zeros((1, 1, E)), jnp.zeros((1, 1, POSE_SIZE))
     return {
-        "token_norm": LayerNorm().init(next(keys), x)["params"],
-        "empty_pose": jnp.zeros((1, 1, POSE_SIZE)),
-        "pose_embedding": nn.Dense(E).init(next(keys), pose)["params"],
-        "modulation": nn.Dense(3 * E).init(next(keys), x)["params"],
-        "trunk": init_stacked(Block(config.camera_num_heads), next(keys), config.camera_depth, x),
-        "trunk_norm": LayerNorm().init(next(keys), x)["params"],
-        "pose_branch": _branch(config).init(next(keys), x)["params"],
+        "token_norm": declare(LayerNorm(), x),
+        "empty_pose": pose,
+        "pose_embedding": declare(nn.Dense(E), pose),
+        "modulation": declare(nn.Dense(3 * E), x),
+        "trunk": declare_stacked(Block(config.camera_num_heads), config.camera_depth, x),
+        "trunk_norm": declare(LayerNorm(), x),
+        "pose_branch": declare(_branch(config), x),
     }
 
 

@@ -150,8 +150,9 @@ def read_model(path: str | Path, *, dtype: DType | None = None) -> Model:
     _check(f"{path} does not fit the configuration in it", tensors, config)
     flat = {}
     for name, tensor in tensors.items():
-        leaf = jax.device_put(tensor)  # on a CPU without a copy, where it is aligned in the file
-        flat[name] = leaf if dtype is None else leaf.astype(numpy_dtype(dtype))
+        if dtype is not None:
+            tensor = tensor.astype(numpy_dtype(dtype), copy=False)
+        flat[name] = jax.device_put(tensor).block_until_ready()  # on a CPU a view of the file, if aligned there
     name = metadata.get("name", "")
     return Model(
         config,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import jax
+import numpy as np
 
-from vggtjax.checkpoint import DType, Model
+from vggtjax.checkpoint import DType, Model, numpy_dtype
 from vggtjax.config import VGGTConfig
 from vggtjax.model import init_params
 
@@ -30,5 +31,7 @@ def demo_config() -> VGGTConfig:
 def demo_model(dtype: DType = "float32") -> Model:
     """Return the demo's model, which is untrained: it shows the way through the library, not a reconstruction."""
     config = demo_config()
-    params = init_params(jax.random.key(0), config)
-    return Model(config, jax.tree.map(lambda leaf: leaf.astype(dtype), params), "demo", trained=False)
+    params = init_params(0, config)
+    if dtype != "float32":  # by numpy: XLA would compile the cast for every shape
+        params = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf).astype(numpy_dtype(dtype))), params)
+    return Model(config, params, "demo", trained=False)

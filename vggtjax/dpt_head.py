@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +9,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.layers import LayerNorm, Params
+from vggtjax.layers import LayerNorm, Params, apply, declare
 from vggtjax.precision import full_precision
 
 HIDDEN = 32
@@ -114,7 +112,7 @@ CHANNELS = {"depth": 2, "points": 4}  # values and confidence logit of the heads
 def project_tap(params: Params, tokens: Float[Array, "... E"], slot: int, config: VGGTConfig) -> Float[Array, "... F"]:
     """Return what a head reads of the tap in `slot`: all that needs to be stored of it."""
     weights = {"norm": params["norm"], "projection": params[f"projection{slot}"]}
-    return TapProjection(config.dpt_channels[slot]).apply({"params": weights}, tokens)
+    return apply(TapProjection(config.dpt_channels[slot]), weights, tokens)
 
 
 @full_precision
@@ -135,9 +133,9 @@ def predict_dense(
 
     def one_frame(frame_taps: list[Float[Array, "P F"]]) -> Float[Array, "H W O"]:
         maps = [tap.reshape(1, h, w, tap.shape[-1]) for tap in frame_taps]
-        features = _features(config).apply({"params": params["features"]}, maps)
-        x = add_positions(resize_aligned(jnp.asarray(features), (h * p, w * p)), aspect=w / h)
-        return jnp.asarray(Regression(CHANNELS[kind]).apply({"params": params["regression"]}, x))[0]
+        features = apply(_features(config), params["features"], maps)
+        x = add_positions(resize_aligned(features, (h * p, w * p)), aspect=w / h)
+        return apply(Regression(CHANNELS[kind]), params["regression"], x)[0]
 
     frames = [tap.reshape(B * S, *tap.shape[2:]) for tap in taps]
     out = jax.lax.map(one_frame, frames, batch_size=min(FRAMES_AT_ONCE, B * S))
@@ -148,24 +146,19 @@ def predict_dense(
     return jnp.sign(values) * jnp.expm1(jnp.abs(values)), confidence
 
 
-def init_dense_head(key: Array, config: VGGTConfig, kind: Literal["depth", "points"]) -> Params:
-    """Return random parameters of a head that regresses a dense map."""
-    feature_key, regression_key = jax.random.split(key)
+def declare_dense_head(config: VGGTConfig, kind: str) -> Params:
+    """Declare the parameters of a head that regresses a dense map."""
     x = jnp.zeros((1, 1, 1, config.dpt_features // 2))
-    return init_features(feature_key, config, _features(config)) | {
-        "regression": Regression(CHANNELS[kind]).init(regression_key, x)["params"]
-    }
+    return declare_features(config, _features(config)) | {"regression": declare(Regression(CHANNELS[kind]), x)}
 
 
-def init_features(key: Array, config: VGGTConfig, features: DPTFeatures) -> Params:
-    """Return random parameters of the tap projections and of the reassembly that follows them."""
-    keys = iter(jax.random.split(key, 5))
-    params, maps = {}, []
+def declare_features(config: VGGTConfig, features: DPTFeatures) -> Params:
+    """Declare the parameters of the tap projections and of the reassembly that follows them."""
+    params = {"features": declare(features, [jnp.zeros((1, 1, 1, channels)) for channels in config.dpt_channels])}
     for slot, channels in enumerate(config.dpt_channels):
-        weights = TapProjection(channels).init(next(keys), jnp.zeros((1, config.camera_dim)))["params"]
+        weights = declare(TapProjection(channels), jnp.zeros((1, config.camera_dim)))
         params |= {"norm": weights["norm"], f"projection{slot}": weights["projection"]}
-        maps.append(jnp.zeros((1, 1, 1, channels)))
-    return params | {"features": features.init(next(keys), maps)["params"]}
+    return params
 
 
 def resize_aligned(x: Float[Array, "F h w C"], size: tuple[int, int]) -> Float[Array, "F H W C"]:

@@ -65,7 +65,6 @@ class Block(nn.Module):
     num_heads: int
     qk_norm: bool = False
     epsilon: float = 1e-5
-    initial_scale: float = 0.01
     dtype: DType = jnp.float32
 
     @nn.compact
@@ -75,7 +74,7 @@ class Block(nn.Module):
         C = x.shape[-1]
 
         def add(x, name, y):
-            scale = self.param(name, nn.initializers.constant(self.initial_scale), (C,))
+            scale = self.param(name, nn.initializers.ones, (C,))
             return x + scale.astype(x.dtype)[None, None, :] * y.astype(x.dtype)
 
         y = LayerNorm(self.epsilon, dtype=self.dtype, name="norm1")(x)
@@ -85,6 +84,19 @@ class Block(nn.Module):
         return add(x, "scale2", MLP(4 * C, C, self.dtype, name="mlp")(y)), q, k
 
 
-def init_stacked(module: nn.Module, key: Array, depth: int, *inputs: Array) -> Params:
-    """Initialise `depth` copies of `module`, stacked on axis 0."""
-    return jax.vmap(lambda k: module.init(k, *inputs)["params"])(jax.random.split(key, depth))
+def apply(module: nn.Module, params: Params, *inputs: Any) -> Any:
+    """Run a module on its own parameters."""
+    return module.apply({"params": params}, *inputs)
+
+
+def declare(module: nn.Module, *inputs: Any) -> Params:
+    """Return a module's parameters for inputs of these shapes.
+
+    Only names and shapes count: `model.parameter_shapes` evaluates this without computing, `model.init_params` draws.
+    """
+    return dict(module.init(jax.random.key(0), *inputs)["params"])
+
+
+def declare_stacked(module: nn.Module, depth: int, *inputs: Any) -> Params:
+    """Return the parameters of `depth` copies of a module, stacked on axis 0."""
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (depth, *leaf.shape)), declare(module, *inputs))

@@ -7,18 +7,19 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.aggregator import aggregate, init_aggregator
-from vggtjax.backbone import encode, init_backbone
-from vggtjax.camera_head import init_camera_head, predict_pose
+from vggtjax.aggregator import aggregate, declare_aggregator
+from vggtjax.backbone import declare_backbone, encode
+from vggtjax.camera_head import ITERATIONS, declare_camera_head, predict_pose
 from vggtjax.config import Suppress, VGGTConfig
-from vggtjax.dpt_head import init_dense_head, predict_dense, project_tap
+from vggtjax.dpt_head import declare_dense_head, predict_dense, project_tap
 from vggtjax.errors import InputError
 from vggtjax.layers import Params
 from vggtjax.motion import GramCues, Sums
 from vggtjax.precision import full_precision
-from vggtjax.track_head import init_track_head
+from vggtjax.track_head import declare_track_head
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
 OUTPUTS = ("camera", *DENSE_HEADS)
@@ -138,22 +139,51 @@ def forward_with_cues(
     return Predictions(**found), sums
 
 
-def init_params(key: Array, config: VGGTConfig) -> Params:
-    """Return a random parameter tree: nested dicts with Flax names, layers stacked on axis 0."""
-    keys = jax.random.split(key, 6)
-    return {
-        "backbone": init_backbone(keys[0], config),
-        "aggregator": init_aggregator(keys[1], config),
-        "camera_head": init_camera_head(keys[2], config),
-        "depth_head": init_dense_head(keys[3], config, "depth"),
-        "point_head": init_dense_head(keys[4], config, "points"),
-        "track_head": init_track_head(keys[5], config),
-    }
-
-
 def parameter_shapes(config: VGGTConfig) -> Params:
     """Return the parameter tree's shapes and dtypes (`jax.ShapeDtypeStruct` leaves) without making any array."""
-    return jax.eval_shape(lambda key: init_params(key, config), jax.ShapeDtypeStruct((2,), jnp.uint32))
+
+    def declare() -> Params:
+        return {
+            "backbone": declare_backbone(config),
+            "aggregator": declare_aggregator(config),
+            "camera_head": declare_camera_head(config),
+            "depth_head": declare_dense_head(config, "depth"),
+            "point_head": declare_dense_head(config, "points"),
+            "track_head": declare_track_head(config),
+        }
+
+    return jax.eval_shape(declare)
+
+
+def init_params(seed: int, config: VGGTConfig) -> Params:
+    """Return random parameters to start training from: nested dicts with Flax names, layers stacked on axis 0.
+
+    Values are drawn on the host, leaf by leaf: compiling jax's generator for every shape takes a minute, this a second.
+    Kernels have variance 1 / fan-in, tables 0.02^2; LayerScale starts as in VGGT (1 in the backbone, 0.01 elsewhere),
+    and the camera head near no motion and a field of view of 1 rad.
+    """
+    generator = np.random.default_rng(seed)
+
+    def draw(path: tuple, leaf: jax.ShapeDtypeStruct) -> Array:
+        names = [entry.key for entry in path]
+        if names[-1] in ("bias", "empty_pose"):
+            values = np.zeros(leaf.shape)
+        elif names[-1] == "scale":
+            values = np.ones(leaf.shape)
+        elif names[-1] in ("scale1", "scale2"):
+            values = np.full(leaf.shape, 1.0 if names[0] == "backbone" else 0.01)
+        else:
+            stacked = any(name.endswith("blocks") or name == "trunk" for name in names)
+            fan_in = leaf.shape[0] if "upsample" in names[-2] else np.prod(leaf.shape[stacked:-1])
+            spread = fan_in**-0.5 if names[-1] == "kernel" else 0.02
+            values = spread * generator.standard_normal(leaf.shape, np.float32)
+        return jnp.asarray(values, leaf.dtype)
+
+    params = jax.tree_util.tree_map_with_path(draw, parameter_shapes(config))
+    start = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]) / ITERATIONS  # every iteration adds it
+    pose = params["camera_head"]["pose_branch"]["fc2"]
+    pose |= {"kernel": 0.1 * pose["kernel"], "bias": jnp.asarray(start, jnp.float32)}
+    return params
 
 
 def _checked_grid(images, config, dynamic_tokens, suppress, outputs, compute_dtype) -> tuple[int, int]:

@@ -145,15 +145,15 @@ def reconstruct(
         with on_stage(stage.name):
             made = jax.block_until_ready(stage.function(*(arrays[name] for name in stage.reads), **stage.options))
             arrays |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
-    assembly: Assembly = jax.tree.map(lambda x: np.asarray(x[0]), arrays["assembly"])
+    depth, confidence, camera_from_world, intrinsics = (np.asarray(array[0]) for array in arrays["assembly"])
     passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
     return Reconstruction(
-        depth=assembly.depth,
-        depth_confidence=assembly.confidence,
+        depth=depth,
+        depth_confidence=confidence,
         saliency=np.asarray(passes.saliency[0]),
         dynamic_mask=np.asarray(passes.dynamic_mask[0]),
-        camera_from_world=assembly.camera_from_world,
-        intrinsics=assembly.intrinsics,
+        camera_from_world=camera_from_world,
+        intrinsics=intrinsics,
         images=np.round(clip.images * 255).astype(np.uint8),
         frame_names=tuple(clip.frame_names),
         timestamps=clip.timestamps,

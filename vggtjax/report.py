@@ -11,8 +11,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+)
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from vggtjax.results.reconstruction import Reconstruction
@@ -21,7 +31,10 @@ Advance = Callable[[int, int | None], None]
 
 
 class Report:
-    """Stages with a clock each, on standard error; tables on standard output."""
+    """Stages with a clock each, on standard error; tables on standard output.
+
+    A terminal shows the stages live; a log gets a line for each when it is done.
+    """
 
     def __init__(self) -> None:
         self._console = Console(stderr=True)
@@ -33,6 +46,7 @@ class Report:
             _Count(),
             TimeElapsedColumn(),
             console=self._console,
+            disable=not self._console.is_terminal,
         )
         self._seconds: dict[str, float] = {}
 
@@ -48,8 +62,11 @@ class Report:
         task = self._progress.add_task(name, total=None)
         started = time.perf_counter()
         yield lambda done, total: self._progress.update(task, completed=done, total=total)
-        self._seconds[name] = self._seconds.get(name, 0.0) + time.perf_counter() - started
+        seconds = time.perf_counter() - started
+        self._seconds[name] = self._seconds.get(name, 0.0) + seconds
         self._finish(task)
+        if not self._console.is_terminal:
+            self._console.print(f"{name:<18} {seconds:8.2f} s", highlight=False)
 
     def summary(self, result: Reconstruction, out: Path, *, trained: bool) -> None:
         """Print what was reconstructed, what it took, and where the files are."""
@@ -90,8 +107,8 @@ class Report:
 class _Count(MofNCompleteColumn):
     """Steps done of all steps, where there is more than one."""
 
-    def render(self, task):
-        return super().render(task) if task.total and task.total > 1 else ""
+    def render(self, task: Task) -> Text:
+        return super().render(task) if task.total and task.total > 1 else Text()
 
 
 def _peak_memory() -> str:

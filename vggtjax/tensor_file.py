@@ -120,7 +120,7 @@ def write_tensors(
         OutputError: the folder cannot be written or the disk is full.
     """
     sizes = {name: prod(spec.shape) * spec.dtype.itemsize for name, spec in specs.items()}
-    names = sorted(specs, key=lambda name: sizes[name] % ALIGNMENT != 0)  # aligned ones first: they stay aligned
+    names = sorted(specs, key=lambda name: (sizes[name] % ALIGNMENT != 0, name))  # so that the first ones are aligned
     header: dict[str, object] = {"__metadata__": dict(metadata)} if metadata else {}
     total = 0
     for name in names:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from flax import linen as nn
-from jax import Array, random
+from jax import Array
 from jax import numpy as jnp
 
 from vggtjax.config import VGGTConfig
-from vggtjax.dpt_head import DPTFeatures, init_features
-from vggtjax.layers import MLP, LayerNorm, Params, init_stacked
+from vggtjax.dpt_head import DPTFeatures, declare_features
+from vggtjax.layers import MLP, LayerNorm, Params, declare, declare_stacked
 
 LAYERS = 6
 VIRTUAL_TRACKS = 64
@@ -39,35 +39,33 @@ class UpdateBlock(nn.Module):
         return MLP(4 * self.features, self.features, name="mlp")(x)
 
 
-def init_track_head(key: Array, config: VGGTConfig) -> Params:
-    """Return random parameters of the track head."""
-    keys = iter(random.split(key, 20))
+def declare_track_head(config: VGGTConfig) -> Params:
+    """Declare the parameters of the track head."""
     F, C = config.track_features, config.track_hidden
     E = 3 * F + 4  # flow embedding, correlation, track features, flow
     correlations = config.track_corr_levels * (2 * config.track_corr_radius + 1) ** 2
-    normal = nn.initializers.normal(0.02)
 
-    def init(module: nn.Module, channels: int) -> Params:
-        return module.init(next(keys), jnp.zeros((1, 1, channels)))["params"]
+    def declared(module: nn.Module, channels: int) -> Params:
+        return declare(module, jnp.zeros((1, 1, channels)))
 
     def blocks(context: bool) -> Params:
-        return init_stacked(UpdateBlock(C, context), next(keys), LAYERS, jnp.zeros((1, 1, C)))
+        return declare_stacked(UpdateBlock(C, context), LAYERS, jnp.zeros((1, 1, C)))
 
-    return init_features(next(keys), config, DPTFeatures(F, F, config.track_position_embedding)) | {
-        "query_token": normal(next(keys), (2, E)),
-        "virtual_tracks": normal(next(keys), (VIRTUAL_TRACKS, C)),
-        "correlation_mlp": init(MLP(C, F), correlations),
-        "input_norm": init(LayerNorm(), E),
-        "input_projection": init(nn.Dense(C), E),
+    return declare_features(config, DPTFeatures(F, F, config.track_position_embedding)) | {
+        "query_token": jnp.zeros((2, E)),
+        "virtual_tracks": jnp.zeros((VIRTUAL_TRACKS, C)),
+        "correlation_mlp": declared(MLP(C, F), correlations),
+        "input_norm": declared(LayerNorm(), E),
+        "input_projection": declared(nn.Dense(C), E),
         "time_blocks": blocks(context=False),
         "virtual_blocks": blocks(context=False),
         "point_to_virtual_blocks": blocks(context=True),
         "virtual_to_point_blocks": blocks(context=True),
-        "output_norm": init(LayerNorm(), C),
-        "flow_projection": init(nn.Dense(F + 2), C),
-        "feature_map_norm": init(LayerNorm(), F),
-        "feature_norm": init(LayerNorm(), F),
-        "feature_update": init(nn.Dense(F), F),
-        "visibility": init(nn.Dense(1), F),
-        "confidence": init(nn.Dense(1), F),
+        "output_norm": declared(LayerNorm(), C),
+        "flow_projection": declared(nn.Dense(F + 2), C),
+        "feature_map_norm": declared(LayerNorm(), F),
+        "feature_norm": declared(LayerNorm(), F),
+        "feature_update": declared(nn.Dense(F), F),
+        "visibility": declared(nn.Dense(1), F),
+        "confidence": declared(nn.Dense(1), F),
     }

@@ -180,7 +180,7 @@ def write_intrinsics(path: Path, reconstruction: Reconstruction) -> None:
 
 def write_ply(path: Path, cloud: PointCloud) -> None:
     """Write a cloud as binary PLY with float32 positions and 8-bit colours; it may be empty."""
-    path.write_bytes(trimesh.PointCloud(cloud.points, cloud.colors).export(file_type="ply"))
+    trimesh.PointCloud(cloud.points, cloud.colors).export(path, file_type="ply")
 
 
 def _write_png(path: Path, pixels: np.ndarray, **texts: str) -> None:

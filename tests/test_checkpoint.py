@@ -1,0 +1,294 @@
+"""Files of this library, and what `load_model` makes of names, paths and PyTorch weights."""
+
+import dataclasses
+import json
+import logging
+import sys
+from pathlib import Path
+
+import jax
+import ml_dtypes
+import numpy as np
+import platformdirs
+import pytest
+from flax.traverse_util import flatten_dict
+from safetensors import safe_open
+from safetensors.numpy import save_file
+
+import converters.torch_to_flax
+from benchmarks.make_checkpoint import make_checkpoint
+from benchmarks.seeded import seeded_state_dict
+from converters import convert_state_dict
+from vggtjax import load_model
+from vggtjax.checkpoint import is_checkpoint, read_model, save_model
+from vggtjax.demo_model import demo_config
+from vggtjax.errors import CheckpointError, InputError, OutputError
+
+
+@pytest.fixture(scope="module")
+def shapes(golden):
+    return json.loads((golden / "shapes.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def tree(shapes, config):
+    """Parameters as numpy arrays."""
+    return convert_state_dict(seeded_state_dict(shapes), config)
+
+
+@pytest.fixture(scope="module")
+def saved_once(tree, config, tmp_path_factory):
+    return save_model(tmp_path_factory.mktemp("saved") / "tiny.safetensors", tree, config, name="tiny model")
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def rewritten(saved, path, metadata=None, **changes):
+    """Copy a checkpoint with other metadata; the values of `changes` replace tensors, None removes them."""
+    with safe_open(saved, framework="numpy") as file:
+        tensors = file.get_tensors() | changes
+        save_file({k: v for k, v in tensors.items() if v is not None}, path, file.metadata() | (metadata or {}))
+    return path
+
+
+def refusal(path, **options) -> str:
+    with pytest.raises(CheckpointError) as raised:
+        load_model(path, **options)
+    assert "\n" not in str(raised.value)
+    return str(raised.value)
+
+
+# Files of this library
+
+
+def test_round_trip(saved_once, tree, config):
+    model = load_model(saved_once)
+    assert model.config == config
+    assert (model.name, model.path, model.trained, model.dtype) == ("tiny model", saved_once, True, "float32")
+    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, tree))
+    assert is_checkpoint(saved_once)
+
+
+def test_bfloat16_and_mixed_round_trip(tree, config, tmp_path):
+    half = jax.tree.map(lambda leaf: leaf.astype(ml_dtypes.bfloat16), tree)
+    half["camera_head"] = tree["camera_head"]
+    model = load_model(save_model(tmp_path / "half.safetensors", half, config))
+    same = jax.tree.map(lambda a, b: a.dtype == b.dtype and np.array_equal(a, b), model.params, half)
+    assert jax.tree.all(same)
+    assert (model.name, model.dtype) == ("half", "bfloat16")
+
+
+def test_saving_what_was_loaded_writes_the_same_bytes(saved_once, tmp_path):
+    model = load_model(saved_once)
+    copy = save_model(tmp_path / "copy.safetensors", model.params, model.config, name=model.name)
+    assert copy.read_bytes() == saved_once.read_bytes()
+
+
+def test_type_on_loading(saved_once, tree):
+    model = load_model(saved_once, dtype="bfloat16")
+    same = jax.tree.map(lambda a, b: np.array_equal(a, b.astype(ml_dtypes.bfloat16)), model.params, tree)
+    assert jax.tree.all(same)
+    with pytest.raises(InputError, match="dtype is 'int8'; expected one of"):
+        load_model(saved_once, dtype="int8")  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.skipif(
+    jax.default_backend() != "cpu" or sys.platform != "linux", reason="a CPU reads from the map, Linux lists it"
+)
+def test_parameters_stay_in_the_file(saved_once):
+    model = load_model(saved_once)
+    addresses = [leaf.unsafe_buffer_pointer() for leaf in jax.tree.leaves(model.params)]
+    lines = Path("/proc/self/maps").read_text().splitlines()
+    maps = [line.split()[0].split("-") for line in lines if line.endswith(str(saved_once))]
+    spans = [(int(begin, 16), int(end, 16)) for begin, end in maps]
+    mapped = sum(any(begin <= address < end for begin, end in spans) for address in addresses)
+    assert mapped > 0.9 * len(addresses)
+
+
+def test_donation_does_not_write_into_the_file(saved_once):
+    before = saved_once.read_bytes()
+    model = load_model(saved_once)
+    step = jax.jit(lambda params: jax.tree.map(lambda leaf: leaf + 1, params), donate_argnums=0)
+    jax.block_until_ready(step(model.params))
+    assert saved_once.read_bytes() == before
+
+
+def test_summary(saved_once, config):
+    model = load_model(saved_once)
+    assert model.heads == ("camera", "depth", "points", "tracks")
+    summary = model.summary()
+    assert summary["parameters"] == 1_806_508
+    assert summary["bytes"] == 4 * 1_806_508
+    assert (summary["name"], summary["dtype"], summary["pairs"]) == ("tiny model", "float32", 24)
+    json.dumps(summary)
+
+
+def test_save_is_strict(tree, config, tmp_path):
+    flat = flatten_dict(tree, sep=".")
+    wrong = {"camera_head": tree["camera_head"], "extra": np.zeros(2, np.float64)}
+    with pytest.raises(CheckpointError) as raised:
+        save_model(tmp_path / "x.safetensors", wrong, config)
+    missing = sum(not name.startswith("camera_head") for name in flat)
+    assert f"{missing + 2} problems: missing parameter" in str(raised.value)
+    narrow = dataclasses.replace(config, dpt_features=8)
+    with pytest.raises(CheckpointError, match="mis-shaped parameter depth_head"):
+        save_model(tmp_path / "x.safetensors", tree, narrow)
+    assert not list(tmp_path.iterdir())
+
+
+def test_save_says_where_it_cannot_write(tree, config, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot write"):
+        save_model(tmp_path / "file" / "x.safetensors", tree, config)
+
+
+def test_file_is_checked_against_its_configuration(saved_once, tmp_path):
+    path = rewritten(
+        saved_once,
+        tmp_path / "x.safetensors",
+        **{
+            "camera_head.trunk_norm.bias": None,
+            "extra": np.zeros(3, np.float32),
+            "camera_head.empty_pose": np.zeros((1, 2, 9), np.float32),
+            "backbone.norm.scale": np.zeros(32, np.int64),
+        },
+    )
+    message = refusal(path)
+    assert "4 problems" in message
+    for part in (
+        "missing parameter camera_head.trunk_norm.bias",
+        "unknown parameter extra",
+        "mis-shaped parameter camera_head.empty_pose: [1, 2, 9], expected [1, 1, 9]",
+        "parameter backbone.norm.scale has type int64",
+    ):
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("metadata", "reason"),
+    [
+        ({"version": "2"}, "has version '2' of the format; this vggtjax reads '1'"),
+        ({"config": ""}, "configuration is not JSON"),
+        ({"config": "[" * 60_000}, "configuration is not JSON"),
+        ({"config": "[]"}, "configuration is a JSON list"),
+        ({"config": '{"depht": 1}'}, "unknown fields ['depht']"),
+        ({"config": '{"depth": "24"}'}, "depth is '24'"),
+        ({"config": '{"embed_dim": 100000000000}'}, "embed_dim is 100000000000"),
+        ({"config": '{"embed_dim": 1000000, "num_heads": 10, "dino_num_heads": 10}'}, "mis-shaped parameter"),
+        ({"config": '{"motion": {"cues": [5]}}'}, "cannot be used"),
+        ({"config": " " * 70_000}, "configuration of 70000 letters"),
+    ],
+)
+def test_metadata_is_not_trusted(saved_once, tmp_path, metadata, reason):
+    assert reason in refusal(rewritten(saved_once, tmp_path / "x.safetensors", metadata))
+
+
+def test_unprintable_name_is_replaced_by_the_files(saved_once, tmp_path):
+    for name in ("\x1b[31mred", "", "x" * 1000):
+        assert load_model(rewritten(saved_once, tmp_path / "file.safetensors", {"name": name})).name == "file"
+
+
+def test_configuration_given_must_be_the_files(saved_once, config):
+    assert load_model(saved_once, config=config).config == config
+    other = dataclasses.replace(config, num_heads=1)
+    assert "knows its configuration" in refusal(saved_once, config=other)
+
+
+def test_reading_torch_layout_as_own_is_refused(shapes, tmp_path):
+    make_checkpoint(tmp_path / "torch.safetensors", shapes)
+    with pytest.raises(CheckpointError, match="is not a checkpoint of this library; load_model converts"):
+        read_model(tmp_path / "torch.safetensors")
+
+
+# The demo
+
+
+def test_demo_model(config, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    model = load_model("demo")
+    assert model.config == demo_config() == config
+    assert (model.name, model.path, model.trained, model.dtype) == ("demo", None, False, "float32")
+    again = load_model("demo")
+    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, again.params))
+    assert load_model("demo", dtype="bfloat16").dtype == "bfloat16"
+    assert "knows its configuration" in refusal("demo", config=dataclasses.replace(config, num_heads=1))
+
+
+# PyTorch weights
+
+
+def test_torch_weights_are_converted_once(shapes, tree, config, tmp_path, cache, caplog, monkeypatch):
+    caplog.set_level(logging.INFO)
+    source = tmp_path / "weights.safetensors"
+    make_checkpoint(source, shapes)
+    calls = []
+    model = load_model(source, config=config, progress=lambda *call: calls.append(call))
+    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, tree))
+    assert model.name == "weights"
+    assert [model.path] == list(cache.iterdir())
+    assert f"converting {source} to {model.path}" in caplog.text
+    assert calls[-1] == (1502, 1502)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(converters.torch_to_flax, "convert_weights", None)
+        assert load_model(source, config=config).path == model.path
+
+    make_checkpoint(source, shapes, seed=1)  # another file of that name
+    changed = load_model(source, config=config)
+    assert changed.path != model.path
+    assert not np.array_equal(changed.params["camera_head"]["empty_pose"], model.params["camera_head"]["empty_pose"])
+
+
+def test_conversions_differ_by_what_makes_them(shapes, config, tmp_path, cache):
+    make_checkpoint(tmp_path / "weights.safetensors", shapes)
+    source = tmp_path / "weights.safetensors"
+    other = dataclasses.replace(config, dino_num_heads=1)
+    models = [
+        load_model(source, config=config),
+        load_model(source, config=config, dtype="bfloat16"),
+        load_model(source, config=other),
+    ]
+    assert len({model.path for model in models}) == 3 == len(list(cache.iterdir()))
+    assert [model.dtype for model in models] == ["float32", "bfloat16", "float32"]
+    assert models[2].config == other
+
+
+def test_folder_of_shards(shapes, tree, config, tmp_path, cache):
+    make_checkpoint(tmp_path / "sharded", shapes, shards=2)
+    model = load_model(tmp_path / "sharded", config=config)
+    assert model.name == "sharded"
+    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, tree))
+    make_checkpoint(tmp_path / "sharded", shapes, shards=2, seed=1)
+    assert load_model(tmp_path / "sharded", config=config).path != model.path
+
+
+def test_folder_of_an_own_file(saved_once, cache):
+    assert load_model(saved_once.parent).path == saved_once
+    assert not cache.exists()
+
+
+def test_conversion_that_fails_leaves_nothing(shapes, config, tmp_path, cache):
+    make_checkpoint(tmp_path / "weights.safetensors", shapes)
+    narrow = dataclasses.replace(config, dpt_features=8)
+    assert "does not fit the configuration" in refusal(tmp_path / "weights.safetensors", config=narrow)
+    assert not cache.exists()
+
+
+def test_cache_is_the_users(shapes, config, tmp_path, monkeypatch):
+    monkeypatch.delenv("VGGTJAX_CACHE", raising=False)
+    monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path / "user" / name)
+    make_checkpoint(tmp_path / "my weights.safetensors", shapes)
+    path = load_model(tmp_path / "my weights.safetensors", config=config).path
+    assert path is not None
+    assert path.parent == tmp_path / "user" / "vggtjax"
+    assert path.name.startswith("my-weights-")
+
+
+def test_nothing_there(tmp_path):
+    message = refusal(tmp_path / "missing.safetensors")
+    for part in ("missing.safetensors", ".pt", "index", "facebook/VGGT-1B", "'demo'"):
+        assert part in message
