@@ -9,9 +9,9 @@ import pytest
 from tests import reference
 from vggtjax import VGGTConfig
 from vggtjax.config import Suppress
-from vggtjax.aggregator import aggregate, identity
-from vggtjax.model import parameter_shapes
 from vggtjax.motion import GramCues
+from vggtjax.network.aggregator import aggregate, identity
+from vggtjax.network.model import parameter_shapes
 
 GRID = (2, 3)
 CONFIG = VGGTConfig(

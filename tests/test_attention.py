@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vggtjax import attention
+from vggtjax.network import attention
 
 
 def _formula(q, k, v, kept):

@@ -11,7 +11,7 @@ import pytest
 from benchmarks.seeded import seeded_images
 from vggtjax import VGGTConfig, encode, forward
 from vggtjax.errors import InputError
-from vggtjax.model import parameter_shapes
+from vggtjax.network.model import parameter_shapes
 
 SIZE = (28, 42)
 

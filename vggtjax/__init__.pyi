@@ -1,4 +1,3 @@
-from .backbone import encode as encode
 from .checkpoint import Model as Model
 from .checkpoint import load_model as load_model
 from .clips.clip import Clip as Clip
@@ -10,9 +9,12 @@ from .config import vggt_1b as vggt_1b
 from .errors import VggtjaxError as VggtjaxError
 from .fusion import fuse_depth as fuse_depth
 from .methods import METHODS as METHODS
-from .model import Predictions as Predictions
-from .model import forward as forward
-from .model import init_params as init_params
+from .network.backbone import encode as encode
+from .network.model import Predictions as Predictions
+from .network.model import forward as forward
+from .network.model import init_params as init_params
+from .network.pose import decode_pose as decode_pose
+from .network.pose import encode_pose as encode_pose
 from .passes import Assembly as Assembly
 from .passes import Passes as Passes
 from .passes import assemble as assemble
@@ -20,8 +22,6 @@ from .passes import motion_saliency as motion_saliency
 from .passes import run_passes as run_passes
 from .pipeline import infer as infer
 from .pipeline import reconstruct as reconstruct
-from .pose import decode_pose as decode_pose
-from .pose import encode_pose as encode_pose
 from .results.reconstruction import Reconstruction as Reconstruction
 
 __version__: str

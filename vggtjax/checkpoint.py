@@ -20,8 +20,8 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from vggtjax.config import VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError
-from vggtjax.layers import Params
-from vggtjax.model import HEADS, parameter_shapes
+from vggtjax.network.layers import Params
+from vggtjax.network.model import HEADS, parameter_shapes
 from vggtjax.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
 
 DType = Literal["float32", "bfloat16"]

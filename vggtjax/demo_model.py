@@ -7,7 +7,7 @@ import numpy as np
 
 from vggtjax.checkpoint import DType, Model, numpy_dtype
 from vggtjax.config import VGGTConfig
-from vggtjax.model import init_params
+from vggtjax.network.model import init_params
 
 
 def demo_config() -> VGGTConfig:

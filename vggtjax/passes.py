@@ -7,16 +7,16 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.backbone import encode
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.fusion import fuse_depth, replace_depth, scale_between
-from vggtjax.layers import Params
 from vggtjax.mask import dynamic_pixels, dynamic_tokens
 from vggtjax.methods import find_method
-from vggtjax.model import Predictions, forward, forward_with_cues
 from vggtjax.motion import GramCues
-from vggtjax.pose import decode_pose
+from vggtjax.network.backbone import encode
+from vggtjax.network.layers import Params
+from vggtjax.network.model import Predictions, forward, forward_with_cues
+from vggtjax.network.pose import decode_pose
 
 
 class Passes(NamedTuple):

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from vggtjax.backbone import encode
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
-from vggtjax.layers import Params
 from vggtjax.mask import dynamic_pixels
 from vggtjax.methods import find_method
+from vggtjax.network.backbone import encode
+from vggtjax.network.layers import Params
 from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass
 from vggtjax.results.reconstruction import Reconstruction
 

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.seeded import seeded_images
 from vggtjax import decode_pose, encode, encode_pose, forward
-from vggtjax.aggregator import aggregate, identity
+from vggtjax.network.aggregator import aggregate, identity
 
 TOLERANCE = 1e-4  # of each array's standard deviation; measured: 1e-6 (poses) to 3e-5 (points)
 

@@ -8,8 +8,8 @@ import pytest
 
 from benchmarks.seeded import seeded_images
 from vggtjax.mask import upsample
-from vggtjax.model import forward_with_cues
 from vggtjax.motion import GramCues
+from vggtjax.network.model import forward_with_cues
 
 TOLERANCE = 1e-4  # absolute, of maps in [0, 1]; measured: 4e-6
 

@@ -7,8 +7,8 @@ from jax import Array
 from jax import numpy as jnp
 
 from vggtjax.config import VGGTConfig
-from vggtjax.dpt_head import DPTFeatures, declare_features
-from vggtjax.layers import MLP, LayerNorm, Params, declare, declare_stacked
+from vggtjax.network.dpt_head import DPTFeatures, declare_features
+from vggtjax.network.layers import MLP, LayerNorm, Params, declare, declare_stacked
 
 LAYERS = 6
 VIRTUAL_TRACKS = 64

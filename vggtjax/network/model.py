@@ -10,16 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.aggregator import aggregate, declare_aggregator
-from vggtjax.backbone import declare_backbone, encode
-from vggtjax.camera_head import ITERATIONS, declare_camera_head, predict_pose
 from vggtjax.config import Suppress, VGGTConfig
-from vggtjax.dpt_head import declare_dense_head, predict_dense, project_tap
 from vggtjax.errors import InputError
-from vggtjax.layers import Params
 from vggtjax.motion import GramCues, Sums
-from vggtjax.precision import full_precision
-from vggtjax.track_head import declare_track_head
+from vggtjax.network.aggregator import aggregate, declare_aggregator
+from vggtjax.network.backbone import declare_backbone, encode
+from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict_pose
+from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_tap
+from vggtjax.network.layers import Params
+from vggtjax.network.precision import full_precision
+from vggtjax.network.track_head import declare_track_head
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
 OUTPUTS = ("camera", *DENSE_HEADS)

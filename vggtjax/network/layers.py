@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from vggtjax.attention import Suppression, suppressed_attention
-from vggtjax.rope import Rope, apply_rope
+from vggtjax.network.attention import Suppression, suppressed_attention
+from vggtjax.network.rope import Rope, apply_rope
 
 Params = dict[str, Any]
 DType = Any

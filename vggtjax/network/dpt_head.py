@@ -9,8 +9,8 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.layers import LayerNorm, Params, apply, declare
-from vggtjax.precision import full_precision
+from vggtjax.network.layers import LayerNorm, Params, apply, declare
+from vggtjax.network.precision import full_precision
 
 HIDDEN = 32
 FRAMES_AT_ONCE = 4  # bounds the memory of the full-resolution maps

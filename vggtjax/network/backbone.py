@@ -8,8 +8,8 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.layers import Block, LayerNorm, Params, apply, declare, declare_stacked
-from vggtjax.precision import full_precision
+from vggtjax.network.layers import Block, LayerNorm, Params, apply, declare, declare_stacked
+from vggtjax.network.precision import full_precision
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)

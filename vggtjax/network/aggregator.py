@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.attention import Suppression
 from vggtjax.config import Suppress, VGGTConfig
-from vggtjax.layers import Block, Params, apply, declare_stacked
 from vggtjax.motion import GramCues
-from vggtjax.precision import full_precision
-from vggtjax.rope import rope_table
+from vggtjax.network.attention import Suppression
+from vggtjax.network.layers import Block, Params, apply, declare_stacked
+from vggtjax.network.precision import full_precision
+from vggtjax.network.rope import rope_table
 
 REGISTERS = 4
 SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers

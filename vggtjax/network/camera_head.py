@@ -8,9 +8,9 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.layers import MLP, Block, LayerNorm, Params, apply, declare, declare_stacked
-from vggtjax.pose import POSE_SIZE
-from vggtjax.precision import full_precision
+from vggtjax.network.layers import MLP, Block, LayerNorm, Params, apply, declare, declare_stacked
+from vggtjax.network.pose import POSE_SIZE
+from vggtjax.network.precision import full_precision
 
 ITERATIONS = 4
 

@@ -1,0 +1,1 @@
+"""VGGT as pure functions: backbone -> aggregator -> camera head and dense heads. linen modules are its leaves."""
