@@ -17,9 +17,10 @@ from vggtjax import (
     infer,
     load_clip,
     motion_saliency,
+    pipeline,
     reconstruct,
 )
-from vggtjax.errors import InputError
+from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.fusion import scale_between
 from vggtjax.mask import dynamic_pixels, dynamic_tokens
 
@@ -154,3 +155,12 @@ def test_unknown_names(params, config, images, inferred):
         assemble(inferred[1]._replace(second=None), "4dvggt-d")
     with pytest.raises(InputError, match="'cosine' or 'dot'"):
         motion_saliency(params, images, config, gram="sine")  # pyright: ignore[reportArgumentType]
+
+
+def test_running_out_of_memory_is_one_sentence(params, config, images, monkeypatch):
+    def exhausted(*_):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
+
+    monkeypatch.setattr(pipeline, "_compile", exhausted)
+    with pytest.raises(DeviceMemoryError, match="4 frames of 140 x 140 pixels do not fit"):
+        reconstruct(Model(config, params, "tiny"), load_clip(images[0], size=140))

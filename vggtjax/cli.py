@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
@@ -16,15 +16,13 @@ from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.methods import MethodName
 from vggtjax.report import Report
 
-ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
-
 
 def reconstruct(
     source: tyro.conf.Positional[tuple[str, ...]],
     /,
     out: Path,
     *,
-    model: ModelName = "demo",
+    model: str = "demo",
     method: MethodName = "4dvggt-d",
     config: Path | None = None,
     mode: Literal["crop", "pad"] = "crop",
@@ -65,6 +63,7 @@ def reconstruct(
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
     report = Report()
     with report.running():
+        _check_folder(out)
         loaded = _load_model(report, model, config)
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import load_clip
@@ -132,6 +131,7 @@ def demo(out: Path = Path("demo-output"), /, *, method: MethodName = "4dvggt-d")
     """
     report = Report()
     with report.running():
+        _check_folder(out)
         loaded = _load_model(report, "demo", None)
         with report.stage("generate clip"):
             from vggtjax.clips.clip import load_clip
@@ -178,13 +178,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except VggtjaxError as error:
         sys.stderr.write(f"vggtjax: {error}\n")
         return 2
-    except MemoryError:
+    except MemoryError:  # of the host
         sys.stderr.write("vggtjax: out of memory; take fewer frames (--max-frames, --stride) or a smaller --size\n")
         return 2
     except KeyboardInterrupt:
         sys.stderr.write("vggtjax: interrupted\n")
         return 130
     return 0
+
+
+def _check_folder(out: Path) -> None:
+    from vggtjax.results.export import check_folder
+
+    check_folder(out)
 
 
 def _load_model(report: Report, name: str, config: Path | None):

@@ -25,6 +25,10 @@ class OutputError(VggtjaxError, OSError):
     """Results that cannot be written."""
 
 
+class DeviceMemoryError(VggtjaxError, MemoryError):
+    """A clip that does not fit in the memory of the device."""
+
+
 class MissingExtraError(VggtjaxError, ImportError):
     """An optional dependency that is not installed; the message names the extra that brings it."""
 

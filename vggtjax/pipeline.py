@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
+from vggtjax.errors import DeviceMemoryError
 from vggtjax.mask import dynamic_pixels
 from vggtjax.methods import find_method
 from vggtjax.network.backbone import encode
@@ -123,6 +124,7 @@ def reconstruct(
 
     Raises:
         InputError: an unknown method, or a size that is not a multiple of the patch size.
+        DeviceMemoryError: the clip does not fit.
     """
     row = find_method(method)
     config = model.config
@@ -139,12 +141,21 @@ def reconstruct(
     }
     stages = _stages(config, method, clip.images.shape[1:3], **settings)
     arrays: dict[str, Any] = {"params": model.params, "images": jnp.asarray(clip.images)[None], "second": None}
-    with on_stage("compile"):
-        _compile(stages, arrays)
-    for stage in stages:
-        with on_stage(stage.name):
-            made = jax.block_until_ready(stage.function(*(arrays[name] for name in stage.reads), **stage.options))
-            arrays |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
+    try:
+        with on_stage("compile"):
+            _compile(stages, arrays)
+        for stage in stages:
+            with on_stage(stage.name):
+                made = jax.block_until_ready(stage.function(*(arrays[name] for name in stage.reads), **stage.options))
+                arrays |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        S, H, W = clip.images.shape[:3]
+        raise DeviceMemoryError(
+            f"{S} frames of {W} x {H} pixels do not fit in the memory of the device; take fewer frames "
+            "(max_frames, stride, fps), a smaller size, or bfloat16"
+        ) from error
     depth, confidence, camera_from_world, intrinsics = (np.asarray(array[0]) for array in arrays["assembly"])
     passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
     return Reconstruction(

@@ -52,7 +52,7 @@ def save(
     """Write all files of a result; see `Reconstruction.save`."""
     folder = Path(folder)
     pixels = point_cloud.confident_pixels(reconstruction, confidence_percentile)
-    _check_replaceable(folder)
+    check_folder(folder)
     done, total = itertools.count(1), len(reconstruction.depth) + 4
 
     def advance() -> None:
@@ -64,14 +64,23 @@ def save(
         _install(staged, folder)
 
 
-def _check_replaceable(folder: Path) -> None:
-    """Raise OutputError if `folder` holds files of our names that are not an earlier result."""
+def check_folder(folder: Path) -> None:
+    """Make sure that a result can be saved in `folder`, before hours are spent on one.
+
+    Raises OutputError where the folder cannot be made or written, or holds files of our names that are not an earlier
+    result.
+    """
     taken = [name for name in (ARCHIVE_NAME, *_NAMES) if os.path.lexists(folder / name)]
     if taken and not is_result(folder / ARCHIVE_NAME):
         raise OutputError(
             f"{folder / taken[0]} exists and is not part of an earlier result, so it is not replaced; "
             "choose another folder or move it away"
         )
+    new = not folder.exists()
+    with staging(folder):
+        pass
+    if new:
+        folder.rmdir()
 
 
 def _install(staged: Path, folder: Path) -> None:
