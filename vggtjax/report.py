@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -112,6 +111,10 @@ class _Count(MofNCompleteColumn):
 
 
 def _peak_memory() -> str:
+    if sys.platform == "win32":
+        return "not measured on this system"
+    import resource
+
     unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is bytes there, kilobytes elsewhere
     text = f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9:.2f} GB of host memory"
     import jax
