@@ -91,12 +91,12 @@ class Report:
         """Print names and values as a table."""
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in rows.items():
-            table.add_row(name, str(value))
+            table.add_row(name, Text(str(value)))
         self._out.print(table, soft_wrap=True)
 
     def line(self, text: str) -> None:
         """Print one line."""
-        self._out.print(text, highlight=False, soft_wrap=True)
+        self._out.print(Text(text), soft_wrap=True)
 
     def _finish(self, task: TaskID) -> None:
         total = next(t.total for t in self._progress.tasks if t.id == task) or 1
