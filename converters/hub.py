@@ -63,7 +63,7 @@ def _download(hub_id: str) -> Path:
         cached = True
     name = choose_file(names, f"the hub's '{hub_id}'")
     path = Path(hub.hf_hub_download(hub_id, name, local_files_only=cached))
-    for file in weight_files(path):
-        if Path(hub.hf_hub_download(hub_id, file.name, local_files_only=cached)) != file:
+    for shard in weight_files(path)[1:]:
+        if Path(hub.hf_hub_download(hub_id, shard.name, local_files_only=cached)) != shard:
             raise CheckpointError(f"the hub's '{hub_id}' changed while it was downloaded; try again")
     return path

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,12 +12,14 @@ import numpy as np
 
 from vggtjax.checkpoint import problems_sentence
 from vggtjax.errors import CheckpointError
-from vggtjax.tensor_file import is_tensor_file, read_tensors
+from vggtjax.tensor_file import StoredTensor, is_tensor_file, read_tensors
 
 _INDEX = ".safetensors.index.json"
 _SUFFIXES = (".safetensors", _INDEX, ".pt", ".pth")
 _HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.ASCII)
 _MOST_INDEX_BYTES = 2**24
+
+Tensor = np.ndarray | StoredTensor
 
 
 class Weights(NamedTuple):
@@ -28,9 +30,9 @@ class Weights(NamedTuple):
 
 
 class StateDict(NamedTuple):
-    """Tensors by name, as views of memory maps, and what is wrong with the way they are stored."""
+    """Tensors by name, not yet read from their files, and what is wrong with the way they are stored."""
 
-    tensors: dict[str, np.ndarray]
+    tensors: Mapping[str, Tensor]
     problems: Sequence[str] = ()
 
 
@@ -87,7 +89,7 @@ def weight_files(path: Path) -> list[Path]:
 
 
 def read_state_dict(path: Path) -> StateDict:
-    """Map the tensors of a file of weights into memory, whatever its name, by its content.
+    """Find the tensors of a file of weights, by its content.
 
     Raises:
         CheckpointError: it cannot be read, or is none of the formats.
@@ -115,7 +117,7 @@ def _read_shards(index: Path) -> StateDict:
     missing = [f"missing shard {name}" for name in shards if not (index.parent / name).is_file()]
     if missing:
         raise CheckpointError(problems_sentence(f"{index} names shards that are not beside it", missing))
-    tensors: dict[str, np.ndarray] = {}
+    tensors: dict[str, StoredTensor] = {}
     holders: dict[str, list[str]] = {name: [] for name in weight_map}
     for shard in shards:
         for name, tensor in read_tensors(index.parent / shard).tensors.items():

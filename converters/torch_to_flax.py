@@ -12,7 +12,7 @@ import numpy as np
 from flax.traverse_util import unflatten_dict
 
 from converters.rules import IGNORED, RULES, Rule, Transform
-from converters.sources import Weights, locate, read_state_dict
+from converters.sources import Tensor, Weights, locate, read_state_dict
 from vggtjax.checkpoint import DType, Progress, flat_shapes, numpy_dtype, problems_sentence, write_checkpoint
 from vggtjax.config import VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError
@@ -36,10 +36,10 @@ class Target(NamedTuple):
     pieces: list[Piece]
     stacked: bool
 
-    def parts(self, tensors: dict[str, np.ndarray]) -> Iterator[np.ndarray]:
-        """Yield the target's parts, consecutive on axis 0, as views of their sources, which are taken out."""
+    def parts(self, tensors: Mapping[str, Tensor]) -> Iterator[np.ndarray]:
+        """Yield the target's parts, consecutive on axis 0, as views of their sources, which are mapped one by one."""
         for piece in self.pieces:
-            part = piece.transform(tensors.pop(piece.source))
+            part = piece.transform(np.asarray(tensors[piece.source]))
             yield part[None] if self.stacked else part
 
 
@@ -115,12 +115,12 @@ def convert_weights(
 
 
 def plan_conversion(
-    tensors: Mapping[str, np.ndarray], config: VGGTConfig, problems: Sequence[str] = ()
+    tensors: Mapping[str, Tensor], config: VGGTConfig, problems: Sequence[str] = ()
 ) -> dict[str, Target]:
     """Match every tensor with the rule table; return flat target names -> what each is made of.
 
     Args:
-        tensors: source names -> arrays, whose shapes and types alone are looked at.
+        tensors: by source name; their shapes and types alone are looked at.
         config: the model that the tensors are said to be.
         problems: what the reader found already.
 

@@ -44,7 +44,22 @@ def test_bad_values_are_named(change, sentence):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "[]", "{", '{"depht": 3}', '{"motion": 3}', '{"motion": {"cues": [3]}}', '{"taps": 3}', "[" * 100_000]
+    "text",
+    [
+        "",
+        "[]",
+        "{",
+        '{"depht": 3}',
+        '{"motion": 3}',
+        '{"motion": {"cues": [3]}}',
+        '{"taps": 3}',
+        "[" * 100_000,
+        '{"motion": {"offsets": ["a"]}}',
+        '{"motion": {"offsets": [{}]}}',
+        '{"motion": {"offsets": 2}}',
+        '{"motion": {"reference_depth": "x"}}',
+        '{"track_position_embedding": "x"}',
+    ],
 )
 def test_bad_json_is_one_sentence(text):
     with pytest.raises(InputError):
@@ -53,7 +68,14 @@ def test_bad_json_is_one_sentence(text):
 
 def test_bad_cues_are_named():
     cue = json.loads(VGGTConfig().to_json())["motion"]["cues"][0]
-    for change in ({"layers": [24]}, {"layers": []}, {"rows": "v"}, {"statistic": "median"}):
+    for change in (
+        {"layers": [24]},
+        {"layers": []},
+        {"layers": [[]]},
+        {"rows": "v"},
+        {"rows": []},
+        {"statistic": "median"},
+    ):
         with pytest.raises(InputError, match="shallow_kk_mean"):
             MotionConfig(cues=(cue | change,))
 

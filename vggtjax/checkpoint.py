@@ -148,8 +148,10 @@ def read_model(path: str | Path, *, dtype: DType | None = None) -> Model:
     tensors, metadata = read_tensors(path)
     config = _config(path, metadata)
     _check(f"{path} does not fit the configuration in it", tensors, config)
+    content = np.asarray(np.memmap(path, np.uint8, mode="r"))
     flat = {}
-    for name, tensor in tensors.items():
+    for name, stored in tensors.items():
+        tensor = stored.within(content)
         if dtype is not None:
             tensor = tensor.astype(numpy_dtype(dtype), copy=False)
         flat[name] = jax.device_put(tensor).block_until_ready()  # on a CPU a view of the file, if aligned there

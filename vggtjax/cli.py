@@ -165,7 +165,7 @@ COMMANDS = {"reconstruct": reconstruct, "convert": convert, "demo": demo, "info"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, 2 for bad input or output, 130 when interrupted."""
     logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
-    for chatty in ("jax", "absl", "httpx", "huggingface_hub"):
+    for chatty in ("jax", "absl", "httpx", "httpx2", "huggingface_hub"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
     try:

@@ -49,10 +49,12 @@ class MotionConfig:
         object.__setattr__(self, "cues", tuple(_cue(cue) for cue in self.cues))
         if not self.cues:
             raise InputError("motion.cues is empty; at least one cue is needed")
-        if not self.offsets or 0 in self.offsets:
-            raise InputError(f"motion.offsets is {self.offsets}; expected frame offsets other than 0")
+        if not self.offsets or not all(type(offset) is int and offset for offset in self.offsets):
+            raise InputError(f"motion.offsets is {self.offsets}; expected frame offsets, whole numbers other than 0")
+        if type(self.reference_depth) is not int or self.reference_depth < 1:
+            raise InputError(f"motion.reference_depth is {self.reference_depth!r}; expected a whole number above 0")
         for cue in self.cues:
-            wrong = [layer for layer in cue.layers if not 0 <= layer < self.reference_depth]
+            wrong = [layer for layer in cue.layers if type(layer) is not int or not 0 <= layer < self.reference_depth]
             if wrong or not cue.layers:
                 raise InputError(
                     f"cue '{cue.name}' has layers {cue.layers}; expected indices in [0, {self.reference_depth})"
@@ -110,6 +112,8 @@ class VGGTConfig:
                 type(v) is int and lowest <= v <= 1_000_000 for v in values
             ):
                 raise InputError(f"{field_.name} is {value!r}; expected whole numbers of at least {lowest}")
+        if type(self.track_position_embedding) is not bool:
+            raise InputError(f"track_position_embedding is {self.track_position_embedding!r}; expected true or false")
         if self.image_size % self.patch_size:
             raise InputError(f"image_size {self.image_size} is not a multiple of patch_size {self.patch_size}")
         for channels, heads, multiple in (

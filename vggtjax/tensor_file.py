@@ -42,10 +42,34 @@ _DTYPES: dict[str, np.dtype] = {
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 
 
-class TensorFile(NamedTuple):
-    """What a safetensors file holds; each array is read-only and a memory map of its own, gone when it is dropped."""
+class StoredTensor(NamedTuple):
+    """A tensor in a file: `numpy.asarray` maps it into memory, read-only, until the array is dropped."""
 
-    tensors: dict[str, np.ndarray]
+    path: Path
+    offset: int
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it takes."""
+        return prod(self.shape) * self.dtype.itemsize
+
+    def within(self, content: np.ndarray) -> np.ndarray:
+        """Return the tensor as a view of the bytes of its whole file."""
+        return content[self.offset :][: self.nbytes].view(self.dtype).reshape(self.shape)
+
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
+        if 0 in self.shape:
+            return np.empty(self.shape, dtype or self.dtype)
+        mapped = np.memmap(self.path, self.dtype, mode="r", offset=self.offset, shape=self.shape)
+        return np.array(mapped, dtype, copy=copy)
+
+
+class TensorFile(NamedTuple):
+    """What the header of a safetensors file says."""
+
+    tensors: dict[str, StoredTensor]
     metadata: dict[str, str]
 
 
@@ -67,7 +91,7 @@ def is_tensor_file(path: str | Path) -> bool:
 
 
 def read_tensors(path: str | Path) -> TensorFile:
-    """Map a safetensors file into memory; no tensor is read before it is used.
+    """Read the header of a safetensors file, and check that the file is whole.
 
     Raises:
         CheckpointError: the file cannot be read, is no whole safetensors file, or has a type that is not supported.
@@ -76,29 +100,28 @@ def read_tensors(path: str | Path) -> TensorFile:
     try:
         with path.open("rb") as file:
             length = int.from_bytes(file.read(8), "little")
-        if length > MAX_HEADER_BYTES:
-            raise CheckpointError(
-                f"{path} is not a safetensors file of weights: its header claims {length} bytes; "
-                f"expected at most {MAX_HEADER_BYTES}"
-            )
-        with safe_open(path, framework="numpy") as opened:
-            metadata = opened.metadata() or {}
-            slices = {name: opened.get_slice(name) for name in opened.offset_keys()}
-            layout = {name: (tuple(piece.get_shape()), piece.get_dtype()) for name, piece in slices.items()}
+            if length > MAX_HEADER_BYTES:
+                raise CheckpointError(
+                    f"{path} is not a safetensors file of weights: its header claims {length} bytes; "
+                    f"expected at most {MAX_HEADER_BYTES}"
+                )
+            with safe_open(path, framework="numpy") as opened:
+                metadata = opened.metadata() or {}
+                slices = {name: opened.get_slice(name) for name in opened.offset_keys()}
+                layout = {name: (tuple(piece.get_shape()), piece.get_dtype()) for name, piece in slices.items()}
+            unsupported = sorted({code for _, code in layout.values()} - set(_DTYPES))
+            if unsupported:
+                raise CheckpointError(f"{path} has tensors of type {', '.join(unsupported)}; expected floating point")
+            # The library has checked that the tensors fill the file without gaps, so their sizes give their places.
+            offset = 8 + length
+            tensors = {}
+            for name, (shape, code) in layout.items():
+                tensors[name] = StoredTensor(path, offset, shape, _DTYPES[code])
+                offset += tensors[name].nbytes
     except SafetensorError as error:
         raise CheckpointError(f"{path} is not a whole safetensors file ({error}); copy or download it again") from None
     except OSError as error:
         raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
-    unsupported = sorted({code for _, code in layout.values()} - set(_DTYPES))
-    if unsupported:
-        raise CheckpointError(f"{path} has tensors of type {', '.join(unsupported)}; expected floating point")
-
-    # The library has checked that the tensors fill the file without gaps, so their sizes give their places.
-    offset = 8 + length
-    tensors = {}
-    for name, (shape, code) in layout.items():
-        tensors[name] = _mapped(path, shape, _DTYPES[code], offset)
-        offset += tensors[name].nbytes
     return TensorFile(tensors, metadata)
 
 
@@ -142,9 +165,3 @@ def write_tensors(
                     piece = np.ascontiguousarray(piece, dtype=specs[name].dtype)
                     file.write(piece.reshape(-1).view(np.uint8).data)
         read_tensors(temporary)  # the library's own check that the file is whole
-
-
-def _mapped(path: Path, shape: tuple[int, ...], dtype: np.dtype, offset: int) -> np.ndarray:
-    if 0 in shape:
-        return np.empty(shape, dtype)
-    return np.asarray(np.memmap(path, dtype, mode="r", offset=offset, shape=shape))
