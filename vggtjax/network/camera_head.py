@@ -32,9 +32,10 @@ def predict_pose(
     block = Block(config.camera_num_heads)
     tokens = apply(LayerNorm(), params["token_norm"], camera_tokens)
     normed = apply(LayerNorm(1e-6, use_bias=False, use_scale=False), {}, tokens)
-    seen = jnp.broadcast_to(params["empty_pose"], (*tokens.shape[:2], POSE_SIZE))
-    pose = jnp.zeros(seen.shape)
-    for _ in range(ITERATIONS):
+    empty = jnp.broadcast_to(params["empty_pose"], (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
+
+    def iteration(estimates, _):
+        pose, seen = estimates  # the sum of all updates so far, and what this iteration is shown
         embedded = apply(nn.Dense(E), params["pose_embedding"], seen)
         modulation = apply(nn.Dense(3 * E), params["modulation"], nn.silu(embedded))
         shift, scale, gate = jnp.split(modulation, 3, axis=-1)
@@ -42,7 +43,9 @@ def predict_pose(
         x, _ = jax.lax.scan(lambda x, layer: (apply(block, layer, x)[0], None), x, params["trunk"])
         x = apply(LayerNorm(), params["trunk_norm"], x)
         pose = pose + apply(_branch(config), params["pose_branch"], x)
-        seen = jax.lax.stop_gradient(pose) if stop_gradient else pose
+        return (pose, jax.lax.stop_gradient(pose) if stop_gradient else pose), None
+
+    (pose, _), _ = jax.lax.scan(iteration, (jnp.zeros_like(empty), empty), length=ITERATIONS)
     return jnp.concatenate([pose[..., :7], nn.relu(pose[..., 7:])], axis=-1)
 
 

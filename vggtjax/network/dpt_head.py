@@ -138,7 +138,8 @@ def predict_dense(
         return apply(Regression(CHANNELS[kind]), params["regression"], x)[0]
 
     frames = [tap.reshape(B * S, *tap.shape[2:]) for tap in taps]
-    out = jax.lax.map(one_frame, frames, batch_size=min(FRAMES_AT_ONCE, B * S))
+    at_once = max(n for n in range(1, FRAMES_AT_ONCE + 1) if B * S % n == 0)  # no remainder: it is compiled apart
+    out = jax.lax.map(one_frame, frames, batch_size=at_once)
     out = out.reshape(B, S, h * p, w * p, CHANNELS[kind])
     values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
     if kind == "depth":
