@@ -1,5 +1,6 @@
 """The wheel holds everything that an installation needs."""
 
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -9,7 +10,13 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_the_wheel_works_outside_the_repository(tmp_path):
-    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)]
+    source = tmp_path / "source"  # setuptools leaves a build folder, whose stale files would end up in later wheels
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for name in ("vggtjax", "converters", "tests"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(source)]
     made = subprocess.run(build, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stdout[-2000:] + made.stderr[-2000:]
     (wheel,) = tmp_path.glob("*.whl")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -15,8 +15,10 @@ from vggtjax.methods import find_method
 from vggtjax.motion import GramCues
 from vggtjax.network.backbone import encode
 from vggtjax.network.layers import Params
-from vggtjax.network.model import Predictions, forward, forward_with_cues
+from vggtjax.network.model import Predictions, forward
 from vggtjax.network.pose import decode_pose
+
+_Value = TypeVar("_Value")
 
 
 class Passes(NamedTuple):
@@ -52,12 +54,12 @@ def first_pass(
     if gram not in ("cosine", "dot"):
         raise InputError(f"gram is {gram!r}; expected 'cosine' or 'dot'")
     cues = GramCues(motion or config.motion, config.depth, gram)
-    predictions, sums = forward_with_cues(
-        params, images, config, cues, patch_tokens=patch_tokens, outputs=outputs, compute_dtype=compute_dtype
+    predictions = forward(
+        params, images, config, patch_tokens=patch_tokens, outputs=outputs, cues=cues, compute_dtype=compute_dtype
     )
-    assert sums is not None
     h, w = (side // config.patch_size for side in images.shape[2:4])
-    return predictions, cues.saliency(sums).reshape(*images.shape[:2], h, w)
+    saliency = cues.saliency(_present(predictions.cue_sums)).reshape(*images.shape[:2], h, w)
+    return predictions._replace(cue_sums=None), saliency
 
 
 def second_pass(
@@ -179,7 +181,7 @@ def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = Fa
     return Assembly(depth, confidence, cameras[row.extrinsics][0], cameras[row.intrinsics][1])
 
 
-def _present(value: Array | None) -> Array:
+def _present(value: _Value | None) -> _Value:
     if value is None:
         raise InputError("the passes lack depth or cameras; run them with outputs=('camera', 'depth')")
     return value

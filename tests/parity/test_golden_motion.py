@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from benchmarks.seeded import seeded_images
+from vggtjax import forward
 from vggtjax.mask import upsample
 from vggtjax.motion import GramCues
-from vggtjax.network.model import forward_with_cues
 
 TOLERANCE = 1e-4  # absolute, of maps in [0, 1]; measured: 4e-6
 
@@ -24,7 +24,7 @@ def test_maps_and_saliency(arrays, seeded_params, config, gram):
     meta = json.loads(str(arrays["meta"]))
     images = seeded_images(meta["frames"], meta["height"], meta["width"], meta["seed"]).transpose(0, 2, 3, 1)[None]
     cues = GramCues(config.motion, config.depth, gram)
-    run = jax.jit(lambda params, images: forward_with_cues(params, images, config, cues, outputs=())[1])
+    run = jax.jit(lambda params, images: forward(params, images, config, cues=cues, outputs=()).cue_sums)
     sums = run(seeded_params(meta["seed"]), images)
     assert sums is not None
     for name, made in (cues.maps(sums) | {"saliency": cues.saliency(sums)}).items():

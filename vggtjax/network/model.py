@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,8 +34,10 @@ class Predictions(NamedTuple):
     depth_confidence: Float[Array, "B S H W"] | None = None
     world_points: Float[Array, "B S H W 3"] | None = None
     world_points_confidence: Float[Array, "B S H W"] | None = None
+    cue_sums: Sums | None = None
 
 
+@full_precision
 def forward(
     params: Params,
     images: Float[Array, "B S H W 3"],
@@ -46,6 +48,7 @@ def forward(
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
     outputs: Sequence[str] = ("camera", "depth"),
+    cues: GramCues | None = None,
     stop_camera_gradient: bool = True,
     compute_dtype: str = "float32",
 ) -> Predictions:
@@ -62,44 +65,13 @@ def forward(
         suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value leave the softmax, VGGT4D).
         mask_pairs: number of pairs in which keys are suppressed (L_mask of the paper).
         outputs: any of "camera", "depth", "points".
+        cues: motion cues to accumulate on the way, into `.cue_sums`.
         stop_camera_gradient: whether the camera head's iterations see the previous estimate as a constant.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
 
     Raises:
         InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing.
     """
-    predictions, _ = forward_with_cues(
-        params,
-        images,
-        config,
-        None,
-        patch_tokens=patch_tokens,
-        dynamic_tokens=dynamic_tokens,
-        suppress=suppress,
-        mask_pairs=mask_pairs,
-        outputs=outputs,
-        stop_camera_gradient=stop_camera_gradient,
-        compute_dtype=compute_dtype,
-    )
-    return predictions
-
-
-@full_precision
-def forward_with_cues(
-    params: Params,
-    images: Float[Array, "B S H W 3"],
-    config: VGGTConfig,
-    cues: GramCues | None,
-    *,
-    patch_tokens: Float[Array, "B S P C"] | None = None,
-    dynamic_tokens: Bool[Array, "B S h w"] | None = None,
-    suppress: Suppress = "zero",
-    mask_pairs: int = 5,
-    outputs: Sequence[str] = ("camera", "depth"),
-    stop_camera_gradient: bool = True,
-    compute_dtype: str = "float32",
-) -> tuple[Predictions, Sums | None]:
-    """Run `forward` and accumulate motion cues on the way: the predictions, and the sums that `cues` made."""
     grid = _checked_grid(images, config, dynamic_tokens, suppress, outputs, compute_dtype)
     if patch_tokens is None:
         patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
@@ -126,7 +98,7 @@ def forward_with_cues(
         mask_pairs=mask_pairs,
         compute_dtype=compute_dtype,
     )
-    found: dict[str, Array] = {}
+    found: dict[str, Any] = {"cue_sums": sums}
     if "camera" in outputs:
         found["pose_encoding"] = predict_pose(params, taps[last]["camera"], config, stop_gradient=stop_camera_gradient)
     for name in dense:
@@ -136,7 +108,7 @@ def forward_with_cues(
             found |= {"depth": values[..., 0], "depth_confidence": confidence}
         else:
             found |= {"world_points": values, "world_points_confidence": confidence}
-    return Predictions(**found), sums
+    return Predictions(**found)
 
 
 def parameter_shapes(config: VGGTConfig) -> Params:
