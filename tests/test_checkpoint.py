@@ -21,7 +21,7 @@ from benchmarks.seeded import seeded_state_dict
 from converters import convert_state_dict
 from vggtjax import load_model
 from vggtjax.checkpoint import is_checkpoint, read_model, save_model
-from vggtjax.demo_model import demo_config
+from vggtjax.demo import demo_config
 from vggtjax.errors import CheckpointError, InputError, OutputError
 
 

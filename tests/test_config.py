@@ -35,6 +35,8 @@ def test_json_round_trip(config):
         ({"depth": "24"}, "whole numbers"),
         ({"embed_dim": 1000}, "embed_dim 1000 is not a multiple"),
         ({"image_size": 500}, "multiple of patch_size"),
+        ({"dpt_features": 20}, "dpt_features 20"),
+        ({"dpt_channels": (4, 4, 4, 6)}, "of 4"),
         ({"embed_dim": 10**12}, "whole numbers"),
     ],
 )

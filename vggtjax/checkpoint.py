@@ -118,7 +118,7 @@ def load_model(
     if dtype is not None:
         numpy_dtype(dtype)
     if str(name_or_path) == "demo":
-        from vggtjax.demo_model import demo_model
+        from vggtjax.demo import demo_model
 
         model = demo_model(dtype or "float32")
     else:

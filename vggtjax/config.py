@@ -126,6 +126,10 @@ class VGGTConfig:
                     f"{channels} {getattr(self, channels)} is not a multiple of {multiple} x {heads} "
                     f"{getattr(self, heads)}"
                 )
+        if self.dpt_features % 8 or any(channels % 4 for channels in self.dpt_channels):  # sin and cos of x and of y
+            raise InputError(
+                f"dpt_features {self.dpt_features} is not a multiple of 8, or dpt_channels {self.dpt_channels} of 4"
+            )
         if list(self.taps) != sorted(set(self.taps)) or self.taps[-1] >= self.depth:
             raise InputError(f"taps is {self.taps}; expected rising pair indices below depth {self.depth}")
 

@@ -1,16 +1,48 @@
-"""The embedded clip of `vggtjax demo`: a textured wall and floor, a panning camera, and a ball that crosses."""
+"""What `vggtjax demo` runs: an embedded model, tiny and untrained, and a generated clip with something that moves."""
 
 from __future__ import annotations
 
+import jax
 import numpy as np
 from jaxtyping import Float
+
+from vggtjax.checkpoint import DType, Model, numpy_dtype
+from vggtjax.config import VGGTConfig
+from vggtjax.network.model import init_params
 
 FRAMES = 8
 SIZE = 140
 
 
+def demo_config() -> VGGTConfig:
+    """Return the configuration of the demo's model."""
+    return VGGTConfig(
+        image_size=140,
+        embed_dim=32,
+        num_heads=2,
+        dino_depth=3,
+        dino_num_heads=2,
+        camera_num_heads=4,
+        dpt_features=16,
+        dpt_channels=(16, 16, 32, 32),
+        track_features=16,
+        track_hidden=48,
+        track_corr_levels=5,
+        track_corr_radius=3,
+    )
+
+
+def demo_model(dtype: DType = "float32") -> Model:
+    """Return the demo's model, which is untrained: it shows the way through the library, not a reconstruction."""
+    config = demo_config()
+    params = init_params(0, config)
+    if dtype != "float32":  # by numpy: XLA would compile the cast for every shape
+        params = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf).astype(numpy_dtype(dtype))), params)
+    return Model(config, params, "demo", trained=False)
+
+
 def demo_frames(frames: int = FRAMES, size: int = SIZE) -> Float[np.ndarray, "S H W 3"]:
-    """Return generated RGB frames in [0, 1] of a square picture with `size` pixels a side."""
+    """Return RGB frames in [0, 1]: a textured wall and floor, a panning camera, and a ball that crosses."""
     generator = np.random.default_rng(0)
     waves = generator.normal(size=(24, 5))
     y, x = np.mgrid[0:size, 0:size] / size
