@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from PIL import Image
@@ -113,9 +113,11 @@ def _timed(path: Path, av: ModuleType) -> Iterator[tuple[float, VideoFrame]]:
     """Yield (seconds since the first frame, frame) of every frame of the file's best video stream."""
     count, first = 0, 0.0
     try:
-        # An absolute path cannot be taken for a protocol such as "concat:"; titles in odd encodings do not matter.
-        options = {"format_whitelist": _CONTAINERS}
-        with av.open(str(path.absolute()), container_options=options, metadata_errors="replace") as container:
+        # An absolute path cannot be taken for a protocol such as "concat:".
+        options: dict[str, Any] = {"container_options": {"format_whitelist": _CONTAINERS}}
+        if int(av.__version__.split(".")[0]) < 19:  # later ones never fail on titles in odd encodings
+            options["metadata_errors"] = "replace"
+        with av.open(str(path.absolute()), **options) as container:
             stream = _video_stream(container, path)
             for frame in _decoded(container, stream):
                 if frame.pts is None or stream.time_base is None:
