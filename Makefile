@@ -8,7 +8,7 @@ WORKERS ?= 2
 .PHONY: demo test lint format clean
 
 demo: $(VENV)/.runtime
-	$(BIN)/vggtjax demo demo-output
+	$(BIN)/vggtjax demo --out demo-output
 
 test: lint
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile

@@ -49,7 +49,7 @@ def run(params, tokens, dynamic=None, suppress: Suppress = "zero", mask_pairs=5,
 def test_scan_equals_unrolled_reference(small, suppress):
     params, tokens, mask = small
     dynamic = None if suppress is None else mask
-    made, _ = run(params, tokens, dynamic, suppress or "zero", mask_pairs=3)
+    _, made, _ = run(params, tokens, dynamic, suppress or "zero", mask_pairs=3)
     for b in range(2):
         taps, _, _ = reference.aggregate(
             params, tokens[b], CONFIG, GRID, None if dynamic is None else dynamic[b], suppress or "zero", mask_pairs=3
@@ -60,7 +60,7 @@ def test_scan_equals_unrolled_reference(small, suppress):
 
 def test_suppression_does_something(small):
     params, tokens, mask = small
-    plain, zero, drop = (run(params, tokens, *how)[0][-1] for how in [(), (mask, "zero"), (mask, "drop")])
+    plain, zero, drop = (run(params, tokens, *how)[1][-1] for how in [(), (mask, "zero"), (mask, "drop")])
     for a, b in [(plain, zero), (plain, drop), (zero, drop)]:
         assert np.abs(np.asarray(a - b)).max() > 1e-2
 
@@ -68,25 +68,25 @@ def test_suppression_does_something(small):
 @pytest.mark.parametrize("suppress", ["zero", "drop"])
 def test_suppressing_nothing_is_the_plain_pass(small, suppress):
     params, tokens, mask = small
-    plain, _ = run(params, tokens)
+    _, plain, _ = run(params, tokens)
     for how in [(np.zeros_like(mask), suppress), (mask, suppress, 0)]:
-        for a, b in zip(run(params, tokens, *how)[0], plain, strict=True):
+        for a, b in zip(run(params, tokens, *how)[1], plain, strict=True):
             assert np.abs(np.asarray(a - b)).max() <= 1e-5
 
 
 @pytest.mark.parametrize("suppress", ["zero", "drop"])
 def test_suppressing_everything_is_finite(small, suppress):
     params, tokens, mask = small
-    taps, _ = run(params, tokens, np.ones_like(mask), suppress)
+    _, taps, _ = run(params, tokens, np.ones_like(mask), suppress)
     assert all(np.isfinite(tap).all() for tap in taps)
 
 
 def test_only_captures_are_kept(small):
     params, tokens, _ = small
-    kept, _ = aggregate(
+    _, kept, _ = aggregate(
         params, tokens, CONFIG, GRID, captures=[lambda t: {"camera": t[:, :, 0]}, lambda t: (), identity, identity]
     )
-    whole, _ = run(params, tokens)
+    _, whole, _ = run(params, tokens)
     assert kept[1] == ()
     assert np.allclose(kept[0]["camera"], whole[0][:, :, 0], atol=1e-5)
 
@@ -95,7 +95,9 @@ def test_only_captures_are_kept(small):
 def test_linear_cost_cues_equal_the_gram_matrices(small, gram):
     params, tokens, _ = small
     cues = GramCues(CONFIG.motion, CONFIG.depth, gram)
-    _, sums = jax.jit(partial(aggregate, config=CONFIG, grid=GRID, captures=[identity] * 4, cues=cues))(params, tokens)
+    _, _, sums = jax.jit(partial(aggregate, config=CONFIG, grid=GRID, captures=[identity] * 4, cues=cues))(
+        params, tokens
+    )
     maps = cues.maps(sums)
     for b in range(2):
         _, q, k = reference.aggregate(params, tokens[b], CONFIG, GRID)

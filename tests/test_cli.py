@@ -34,7 +34,7 @@ def run(capsys, *arguments) -> tuple[int, str, str]:
 
 
 def test_demo(tmp_path, capsys):
-    code, out, _ = run(capsys, "demo", tmp_path / "result")
+    code, out, _ = run(capsys, "demo", "--out", tmp_path / "result")
     assert code == 0
     assert "untrained" in out
     assert "peak memory" in out

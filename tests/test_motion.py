@@ -29,14 +29,14 @@ def test_a_single_frame_has_no_source_and_no_saliency():
     assert source_weights(1, OFFSETS).tolist() == [[0]]
     cues = GramCues(MotionConfig(), 24)
     q = jnp.asarray(np.random.default_rng(0).normal(size=(1, 1, 4, 2, 8)).astype(np.float32))
-    sums = cues.add(cues.zeros(1, 1, 4), jnp.ones(5, bool), q, q)
+    sums = cues.add(cues.zeros(1, 1, 4), jnp.ones(5, int), q, q)
     assert np.asarray(cues.saliency(sums)).tolist() == [[[0, 0, 0, 0]]]
 
 
 def test_one_patch_per_frame_is_finite():
     cues = GramCues(MotionConfig(), 24)
     q = jnp.ones((1, 3, 1, 2, 8))
-    sums = cues.add(cues.zeros(1, 3, 1), jnp.ones(5, bool), q, q)
+    sums = cues.add(cues.zeros(1, 3, 1), jnp.ones(5, int), q, q)
     assert np.isfinite(cues.saliency(sums)).all()
 
 
@@ -49,7 +49,7 @@ def test_layers_of_another_depth():
     motion = MotionConfig()
     deep = motion.cues[3]
     assert motion.layers(deep, 24) == (17, 18, 19, 20, 21)
-    assert motion.layers(deep, 12) == (8, 9, 10)  # 8.13, 8.61, 9.09, 9.57, 10.04
+    assert motion.layers(deep, 12) == (8, 9, 9, 10, 10)  # 8.13, 8.61, 9.09, 9.57, 10.04
     assert motion.layers(motion.cues[0], 1) == (0,)
 
 

@@ -44,7 +44,7 @@ class Model:
 
     config: VGGTConfig
     params: Params = field(repr=False)  # nested dicts of arrays with Flax names, layers stacked on axis 0
-    name: str
+    name: str = ""
     path: Path | None = None  # the file that the parameters are in
     trained: bool = True  # False: random parameters, whose results mean nothing
 

@@ -71,7 +71,7 @@ def reconstruct(
             clip = load_clip(
                 source[0] if len(source) == 1 else list(source),
                 mode=mode,
-                size=size or loaded.config.image_size,
+                size=loaded.config.image_size if size is None else size,
                 patch=loaded.config.patch_size,
                 fps=fps,
                 stride=stride,
@@ -122,7 +122,7 @@ def convert(
     report.line(f"wrote {destination} ({destination.stat().st_size / 1e6:.1f} MB)")
 
 
-def demo(out: Path = Path("demo-output"), /, *, method: MethodName = "4dvggt-d") -> None:
+def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-d") -> None:
     """Reconstruct the generated clip with the embedded model: no download, nothing to choose.
 
     Args:

@@ -61,11 +61,14 @@ class MotionConfig:
                 )
 
     def layers(self, cue: Cue, depth: int) -> tuple[int, ...]:
-        """Layers of `cue` in a model with `depth` pairs: l becomes round(l (depth - 1) / (reference_depth - 1))."""
+        """Layers of `cue` in a model with `depth` pairs: l becomes round(l (depth - 1) / (reference_depth - 1)).
+
+        A shallower model can read a layer more than once, which then weighs more.
+        """
         if depth == self.reference_depth:
             return cue.layers
         scale = (depth - 1) / max(self.reference_depth - 1, 1)
-        return tuple(sorted({round(layer * scale) for layer in cue.layers}))
+        return tuple(round(layer * scale) for layer in cue.layers)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Region-aware depth from the two passes (method, section 4)."""
+"""Region-aware depth from the two passes (4DVGGT-D, stage 3)."""
 
 from __future__ import annotations
 
@@ -44,6 +44,7 @@ def fuse_depth(
     """
 
     def one_frame(d1, c1, d2, c2, dynamic):
+        c1, c2 = (jnp.minimum(c, jnp.finfo(c.dtype).max / 4) for c in (c1, c2))  # odd weights can overflow
         total = c1 + c2 + eps
         fused = (c1 + eps) / total * d1 + c2 / total * d2  # 1 - w without its cancellation
         return jnp.where(dynamic, d1, fused), jnp.where(dynamic, c1, c1 + c2)

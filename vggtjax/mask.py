@@ -1,4 +1,4 @@
-"""Saliency -> dynamic pixels -> dynamic tokens (method, section 2)."""
+"""Saliency -> dynamic pixels -> dynamic tokens (4DVGGT-D, stage 1)."""
 
 from __future__ import annotations
 

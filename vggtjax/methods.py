@@ -1,4 +1,4 @@
-"""The methods, as a table: which pass gives what (method, section 5). Does not import jax."""
+"""The methods, as a table: which pass gives what (the ladder of 4DVGGT-D, table 2). Does not import jax."""
 
 from __future__ import annotations
 

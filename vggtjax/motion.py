@@ -1,4 +1,4 @@
-"""Motion cues from Gram similarities of q and k, and the saliency that they make (method, section 2).
+"""Motion cues from Gram similarities of q and k, and their saliency (4DVGGT-D, stage 1; the cues are VGGT4D's).
 
 A mean map needs no Gram matrix: mean_{s,j} q_i . q_sj = q_i . mean_{s,j} q_sj. A std map needs one P x P product
 per frame, of its rows with keys averaged over the source frames. Both are exact, and both are accumulated inside the
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float, Int
 
 from vggtjax.config import Cue, Gram, MotionConfig
 
@@ -29,16 +29,16 @@ class GramCues:
     depth: int
     gram: Gram = "cosine"
 
-    def active_layers(self) -> np.ndarray:
-        """Return bool [depth, cues]: whether a cue reads a pair."""
-        return np.array([[layer in self._layers(cue) for cue in self.motion.cues] for layer in range(self.depth)])
+    def layer_counts(self) -> np.ndarray:
+        """Return int [depth, cues]: how often a cue reads a pair; never or once, unless layers were scaled down."""
+        return np.array([[self._layers(cue).count(layer) for cue in self.motion.cues] for layer in range(self.depth)])
 
     def zeros(self, B: int, S: int, P: int) -> Sums:
         """Return empty sums: [B, S, P], or [B, S, P, P] for a std over several layers, which are averaged first."""
         return tuple(jnp.zeros((B, S, P) + (P,) * self._keeps_gram(cue)) for cue in self.motion.cues)
 
     def add(
-        self, sums: Sums, active: Bool[Array, " cues"], q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
+        self, sums: Sums, counts: Int[Array, " cues"], q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
     ) -> Sums:
         """Add one pair's q and k (after norm and rotation) to the cues whose layers it belongs to."""
         q, k = (x.astype(jnp.float32) for x in (q, k))
@@ -51,19 +51,19 @@ class GramCues:
                 gram = _similarities(rows, columns)
                 return gram if self._keeps_gram(cue) else _sample_std(gram)
 
-            def branch(total, q, k):
+            def branch(total, count, q, k):
                 rows, columns = ({"q": q, "k": k}[name] for name in (cue.rows, cue.columns))
                 if self.gram == "cosine":
                     rows, columns = _unit(rows), _unit(columns)
                 if cue.statistic == "mean":
                     columns = columns.mean(axis=2)  # [B, S, N, D]
                 columns = jnp.einsum("rs,bs...->br...", weights, columns)  # averaged over each frame's sources
-                return total + jax.vmap(jax.vmap(one_frame))(rows, columns)
+                return total + count * jax.vmap(jax.vmap(one_frame))(rows, columns)
 
             return branch
 
         return tuple(
-            jax.lax.cond(active[i], added(cue), lambda total, q, k: total, total, q, k)
+            jax.lax.cond(counts[i] > 0, added(cue), lambda total, count, q, k: total, total, counts[i], q, k)
             for i, (cue, total) in enumerate(zip(self.motion.cues, sums, strict=True))
         )
 
@@ -92,7 +92,7 @@ class GramCues:
         return self.motion.layers(cue, self.depth)
 
     def _keeps_gram(self, cue: Cue) -> bool:
-        return cue.statistic == "std" and len(self._layers(cue)) > 1
+        return cue.statistic == "std" and len(set(self._layers(cue))) > 1
 
 
 def source_weights(S: int, offsets: tuple[int, ...]) -> np.ndarray:

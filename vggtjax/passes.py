@@ -1,4 +1,4 @@
-"""The two passes and what is made of them: the stages of 4DVGGT-D as pure functions (method, sections 2 to 5)."""
+"""The two passes and what is made of them: the stages of 4DVGGT-D as pure functions (arXiv 2605.12027)."""
 
 from __future__ import annotations
 
@@ -30,13 +30,27 @@ class Passes(NamedTuple):
     dynamic_mask: Bool[Array, "B S H W"]
 
 
+class Cameras(NamedTuple):
+    """OpenCV cameras: x right, y down, z forward; intrinsics in pixels."""
+
+    camera_from_world: Float[Array, "B S 3 4"]
+    intrinsics: Float[Array, "B S 3 3"]
+
+
 class Assembly(NamedTuple):
-    """What a method returns: depth up to scale, its confidence, and OpenCV cameras."""
+    """What a method returns: depth up to scale, its confidence, and the cameras."""
 
     depth: Float[Array, "B S H W"]
     confidence: Float[Array, "B S H W"]
-    camera_from_world: Float[Array, "B S 3 4"]
-    intrinsics: Float[Array, "B S 3 3"]
+    cameras: Cameras
+
+    @property
+    def camera_from_world(self) -> Float[Array, "B S 3 4"]:
+        return self.cameras.camera_from_world
+
+    @property
+    def intrinsics(self) -> Float[Array, "B S 3 3"]:
+        return self.cameras.intrinsics
 
 
 def first_pass(
@@ -116,6 +130,7 @@ def run_passes(
     mask_pairs: int = 5,
     motion: MotionConfig | None = None,
     compute_dtype: str = "float32",
+    second: bool = True,
 ) -> Passes:
     """Run both passes once, sharing the backbone's features; `assemble` makes every method's result of them.
 
@@ -128,23 +143,17 @@ def run_passes(
         mask_pairs: number of pairs in which they are.
         motion: the table of cues; the configuration's own if None.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
+        second: whether to run the second pass at all.
     """
     patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
     first, saliency = first_pass(
         params, images, patch_tokens, config, gram=gram, motion=motion, compute_dtype=compute_dtype
     )
     mask = dynamic_pixels(saliency, (images.shape[2], images.shape[3]))
-    second = second_pass(
-        params,
-        images,
-        patch_tokens,
-        mask,
-        config,
-        suppress=suppress,
-        mask_pairs=mask_pairs,
-        compute_dtype=compute_dtype,
-    )
-    return Passes(first, second, saliency, mask)
+    if not second:
+        return Passes(first, None, saliency, mask)
+    masking = {"suppress": suppress, "mask_pairs": mask_pairs, "compute_dtype": compute_dtype}
+    return Passes(first, second_pass(params, images, patch_tokens, mask, config, **masking), saliency, mask)
 
 
 def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False) -> Assembly:
@@ -174,11 +183,13 @@ def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = Fa
     }
     depth, confidence = makers[row.depth]()
     size = (depth.shape[2], depth.shape[3])
-    cameras = {"first": decode_pose(_present(first.pose_encoding), size)}
     extrinsics, intrinsics = decode_pose(_present(second.pose_encoding), size)
-    extrinsics = extrinsics.at[..., 3].multiply(scale[:, None, None])
-    cameras["second"] = (extrinsics, intrinsics)
-    return Assembly(depth, confidence, cameras[row.extrinsics][0], cameras[row.intrinsics][1])
+    cameras = {
+        "first": Cameras(*decode_pose(_present(first.pose_encoding), size)),
+        "second": Cameras(extrinsics.at[..., 3].multiply(scale[:, None, None]), intrinsics),
+    }
+    chosen = Cameras(cameras[row.extrinsics].camera_from_world, cameras[row.intrinsics].intrinsics)
+    return Assembly(depth, confidence, chosen)
 
 
 def _present(value: _Value | None) -> _Value:

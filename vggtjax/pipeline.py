@@ -90,6 +90,7 @@ def infer(
         mask_pairs=mask_pairs,
         motion=motion,
         compute_dtype=compute_dtype,
+        second=row.needs_second_pass,
     )
     return assemble(passes, method, align_scale=align_scale), passes
 
@@ -129,9 +130,10 @@ def reconstruct(
     row = find_method(method)
     config = model.config
     on_stage = on_stage or (lambda name: nullcontext())
-    if (clip.size, clip.patch) != (size or config.image_size, config.patch_size):
+    size = config.image_size if size is None else size
+    if (clip.size, clip.patch) != (size, config.patch_size):
         with on_stage("fit clip to model"):
-            clip = clip.refit(size or config.image_size, config.patch_size)
+            clip = clip.refit(size, config.patch_size)
     settings = {
         "gram": gram or row.gram,
         "suppress": suppress or row.suppress,
@@ -156,7 +158,10 @@ def reconstruct(
             f"{S} frames of {W} x {H} pixels do not fit in the memory of the device; take fewer frames "
             "(max_frames, stride, fps), a smaller size, or bfloat16"
         ) from error
-    depth, confidence, camera_from_world, intrinsics = (np.asarray(array[0]) for array in arrays["assembly"])
+    depth, confidence, camera_from_world, intrinsics = (np.array(x[0]) for x in jax.tree.leaves(arrays["assembly"]))
+    fields = np.asarray(arrays[row.intrinsics].pose_encoding[0])[:, [8, 7]]  # of width and height
+    focal = intrinsics[:, [0, 1], [0, 1]]
+    intrinsics[:, [0, 1], [0, 1]] = np.where(fields > np.pi, -np.abs(focal), focal)  # beyond 2 pi the tangent repeats
     passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
     return Reconstruction(
         depth=depth,

@@ -84,7 +84,7 @@ class Report:
         if not trained:
             self.line(
                 "The weights of this model are untrained: this shows that everything runs, not what the scene is. "
-                "Pass --model with converted weights to see a reconstruction."
+                "For a reconstruction, run: vggtjax reconstruct CLIP --out DIR --model WEIGHTS"
             )
 
     def table(self, rows: Mapping[str, object]) -> None:

@@ -87,6 +87,7 @@ def test_tokens(golden, seeded_params, config):
             grid=case.tokens.shape[2:],
             captures=[identity] * 4,
         )
-        tokens, _ = jax.jit(run)(case.params, patch_tokens)
+        camera, tokens, _ = jax.jit(run)(case.params, patch_tokens)
         for layer, made in zip(taps, tokens, strict=True):
             assert_close(made, case.arrays[f"plain/tokens_{layer}"])
+        assert_close(camera, case.arrays["plain/tokens_23"][:, :, 0])

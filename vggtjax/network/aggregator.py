@@ -41,8 +41,8 @@ def aggregate(
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
     compute_dtype: str = "float32",
-) -> tuple[tuple[Any, ...], Any]:
-    """Run the alternating blocks; return what `captures` keep of the tapped pairs, and the cues' sums.
+) -> tuple[Float[Array, "B S E"], tuple[Any, ...], Any]:
+    """Run the alternating blocks; return the last pair's camera tokens, the captured taps, and the cues' sums.
 
     Args:
         params: the model's parameter tree (`aggregator` is read).
@@ -68,7 +68,7 @@ def aggregate(
         return Suppression(keys.reshape(rows, -1), active, suppress)
 
     def pair(carry, layer):
-        x, taps, sums = carry
+        x, _, taps, sums = carry
         frame_params, global_params, masked, tapped, cued = layer
         x, _, _ = apply(block, frame_params, x.reshape(B * S, T, C), frame_rope, suppression(masked, B * S))
         frame = x
@@ -79,7 +79,9 @@ def aggregate(
             jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
             for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
         )
-        return (x.reshape(B, S, T, C), taps, sums), None
+        x = x.reshape(B, S, T, C)
+        camera = jnp.concatenate([frame.reshape(B, S, T, C)[:, :, 0], x[:, :, 0]], axis=-1)  # [B, S, 2C]
+        return (x, camera, taps, sums), None
 
     index = np.arange(config.depth)
     layers = (
@@ -87,12 +89,14 @@ def aggregate(
         params["global_blocks"],
         jnp.asarray(index) < mask_pairs,
         jnp.asarray(index[:, None] == np.asarray(config.taps)[None]),
-        None if cues is None else jnp.asarray(cues.active_layers()),
+        None if cues is None else jnp.asarray(cues.layer_counts()),
     )
     taps = tuple(_empty(capture, (B, S, T, 2 * C)) for capture in captures)
     sums = None if cues is None else cues.zeros(B, S, P)
-    (_, taps, sums), _ = jax.lax.scan(pair, (_tokens(params, patch_tokens), taps, sums), layers)
-    return taps, sums
+    tokens = _tokens(params, patch_tokens.astype(jnp.float32))
+    camera = jnp.zeros((B, S, 2 * C))
+    (_, camera, taps, sums), _ = jax.lax.scan(pair, (tokens, camera, taps, sums), layers)
+    return camera, taps, sums
 
 
 def declare_aggregator(config: VGGTConfig) -> Params:

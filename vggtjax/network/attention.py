@@ -1,4 +1,4 @@
-"""Scaled dot-product attention, and the suppression of dynamic keys (method, section 3)."""
+"""Scaled dot-product attention, and the suppression of dynamic keys (4DVGGT-D, stage 2)."""
 
 from __future__ import annotations
 

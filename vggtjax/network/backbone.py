@@ -8,6 +8,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
+from vggtjax.errors import InputError
 from vggtjax.network.layers import Block, LayerNorm, Params, apply, declare, declare_stacked
 from vggtjax.network.precision import full_precision
 
@@ -31,11 +32,14 @@ def encode(
 
     Returns:
         Tokens in row-major patch order, float32. They are the same for both passes: compute them once.
+
+    Raises:
+        InputError: images of a shape that does not fit.
     """
     params = params["backbone"]
+    grid = patch_grid(images, config)
     B, S, H, W, _ = images.shape
-    size, C = config.patch_size, config.embed_dim
-    grid = (H // size, W // size)
+    C = config.embed_dim
     x = (images - jnp.asarray(IMAGE_MEAN)[(None,) * 4]) / jnp.asarray(IMAGE_STD)[(None,) * 4]
     x = apply(_patch_embedding(config, compute_dtype), params["patch_embedding"], x.reshape(B * S, H, W, 3))
     x = x.astype(jnp.float32).reshape(B * S, grid[0] * grid[1], C)
@@ -48,6 +52,17 @@ def encode(
     x, _ = jax.lax.scan(lambda x, layer: (apply(block, layer, x)[0], None), x, params["blocks"])
     x = apply(LayerNorm(_EPSILON), params["norm"], x)
     return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
+
+
+def patch_grid(images: Float[Array, "B S H W 3"], config: VGGTConfig) -> tuple[int, int]:
+    """Return the rows and columns of patches; InputError if the images have none, or not a whole number."""
+    size = config.patch_size
+    if images.ndim != 5 or images.shape[-1] != 3 or 0 in images.shape:
+        raise InputError(f"images have shape {tuple(images.shape)}; expected [B, S, H, W, 3] with at least one frame")
+    H, W = images.shape[2:4]
+    if H % size or W % size:
+        raise InputError(f"images are {H} x {W} pixels; expected multiples of the patch size {size}")
+    return H // size, W // size
 
 
 def declare_backbone(config: VGGTConfig) -> Params:

@@ -14,7 +14,7 @@ from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.motion import GramCues, Sums
 from vggtjax.network.aggregator import aggregate, declare_aggregator
-from vggtjax.network.backbone import declare_backbone, encode
+from vggtjax.network.backbone import declare_backbone, encode, patch_grid
 from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict_pose
 from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_tap
 from vggtjax.network.layers import Params
@@ -72,26 +72,25 @@ def forward(
     Raises:
         InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing.
     """
-    grid = _checked_grid(images, config, dynamic_tokens, suppress, outputs, compute_dtype)
+    grid = patch_grid(images, config)
+    _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pairs, outputs, compute_dtype)
     if patch_tokens is None:
         patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
     dense = [name for name in outputs if name in DENSE_HEADS]
-    last = len(config.taps) - 1
 
     def capture(slot: int):
         def kept(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
             patches = tokens[:, :, -grid[0] * grid[1] :]
-            result = {name: project_tap(params[DENSE_HEADS[name]], patches, slot, config) for name in dense}
-            return result | ({"camera": tokens[:, :, 0]} if slot == last and "camera" in outputs else {})
+            return {name: project_tap(params[DENSE_HEADS[name]], patches, slot, config) for name in dense}
 
         return kept
 
-    taps, sums = aggregate(
+    camera_tokens, taps, sums = aggregate(
         params,
         patch_tokens,
         config,
         grid,
-        captures=[capture(slot) for slot in range(last + 1)],
+        captures=[capture(slot) for slot in range(len(config.taps))],
         cues=cues,
         dynamic_tokens=dynamic_tokens,
         suppress=suppress,
@@ -100,7 +99,7 @@ def forward(
     )
     found: dict[str, Any] = {"cue_sums": sums}
     if "camera" in outputs:
-        found["pose_encoding"] = predict_pose(params, taps[last]["camera"], config, stop_gradient=stop_camera_gradient)
+        found["pose_encoding"] = predict_pose(params, camera_tokens, config, stop_gradient=stop_camera_gradient)
     for name in dense:
         head_taps = [tap[name] for tap in taps]
         values, confidence = predict_dense(params[DENSE_HEADS[name]], head_taps, config, grid, name)
@@ -158,22 +157,20 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
     return params
 
 
-def _checked_grid(images, config, dynamic_tokens, suppress, outputs, compute_dtype) -> tuple[int, int]:
-    size = config.patch_size
-    if images.ndim != 5 or images.shape[-1] != 3 or 0 in images.shape:
-        raise InputError(f"images have shape {tuple(images.shape)}; expected [B, S, H, W, 3] with at least one frame")
-    H, W = images.shape[2:4]
-    if H % size or W % size:
-        raise InputError(f"images are {H} x {W} pixels; expected multiples of the patch size {size}")
-    grid = (H // size, W // size)
-    if dynamic_tokens is not None and tuple(dynamic_tokens.shape) != (*images.shape[:2], *grid):
-        raise InputError(
-            f"dynamic_tokens have shape {tuple(dynamic_tokens.shape)}; expected {(*images.shape[:2], *grid)}"
-        )
+def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pairs, outputs, compute_dtype) -> None:
+    B, S = images.shape[:2]
+    tokens_shape = (B, S, grid[0] * grid[1], config.embed_dim)
+    if patch_tokens is not None and tuple(patch_tokens.shape) != tokens_shape:
+        raise InputError(f"patch_tokens have shape {tuple(patch_tokens.shape)}; expected {tokens_shape}")
+    if dynamic_tokens is not None and tuple(dynamic_tokens.shape) != (B, S, *grid):
+        raise InputError(f"dynamic_tokens have shape {tuple(dynamic_tokens.shape)}; expected {(B, S, *grid)}")
+    if dynamic_tokens is not None and dynamic_tokens.dtype != bool:
+        raise InputError(f"dynamic_tokens have type {dynamic_tokens.dtype}; expected bool")
+    if isinstance(mask_pairs, int | float) and (mask_pairs != int(mask_pairs) or mask_pairs < 0):
+        raise InputError(f"mask_pairs is {mask_pairs}; expected a whole number of at least 0")
     if unknown := [name for name in outputs if name not in OUTPUTS]:
         raise InputError(f"outputs has {unknown}; expected some of {OUTPUTS}")
     if suppress not in ("zero", "drop"):
         raise InputError(f"suppress is {suppress!r}; expected 'zero' or 'drop'")
     if compute_dtype not in ("float32", "bfloat16"):
         raise InputError(f"compute_dtype is {compute_dtype!r}; expected 'float32' or 'bfloat16'")
-    return grid

@@ -1,4 +1,4 @@
-"""Rotary position embedding in two dimensions (VGGT, section 1 of the method)."""
+"""Rotary position embedding in two dimensions (VGGT)."""
 
 from __future__ import annotations
 

@@ -1,42 +1,17 @@
-"""Parameters of the track head (VGGT's CoTracker-like point tracker): its leaves and their shapes."""
+"""Parameters of the track head (VGGT's CoTracker-like point tracker): their names and shapes."""
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 from flax import linen as nn
-from jax import Array
-from jax import numpy as jnp
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.dpt_head import DPTFeatures, declare_features
-from vggtjax.network.layers import MLP, LayerNorm, Params, declare, declare_stacked
+from vggtjax.network.layers import MLP, LayerNorm, Params, declare
 
 LAYERS = 6
 VIRTUAL_TRACKS = 64
-
-
-class AttentionWeights(nn.Module):
-    """The two matrices of a multi-head attention whose q, k and v are computed as one."""
-
-    features: int
-
-    @nn.compact
-    def __call__(self, x: Array) -> Array:
-        nn.Dense(3 * self.features, name="qkv")(x)
-        return nn.Dense(self.features, name="projection")(x)
-
-
-class UpdateBlock(nn.Module):
-    """A block of the update transformer; with a context it attends to that instead of to itself."""
-
-    features: int
-    context: bool = False
-
-    @nn.compact
-    def __call__(self, x: Array) -> Array:
-        for name in ("norm1", "norm2") + ("norm_context",) * self.context:
-            x = LayerNorm(name=name)(x)
-        x = AttentionWeights(self.features, name="attention")(x)
-        return MLP(4 * self.features, self.features, name="mlp")(x)
 
 
 def declare_track_head(config: VGGTConfig) -> Params:
@@ -49,7 +24,13 @@ def declare_track_head(config: VGGTConfig) -> Params:
         return declare(module, jnp.zeros((1, 1, channels)))
 
     def blocks(context: bool) -> Params:
-        return declare_stacked(UpdateBlock(C, context), LAYERS, jnp.zeros((1, 1, C)))
+        block = {
+            "attention": {"qkv": declared(nn.Dense(3 * C), C), "projection": declared(nn.Dense(C), C)},
+            "mlp": declared(MLP(4 * C, C), C),
+        }
+        for name in ("norm1", "norm2") + ("norm_context",) * context:
+            block[name] = declared(LayerNorm(), C)
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LAYERS, *leaf.shape)), block)
 
     return declare_features(config, DPTFeatures(F, F, config.track_position_embedding)) | {
         "query_token": jnp.zeros((2, E)),
