@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import count
 from pathlib import Path
@@ -97,7 +98,7 @@ def convert_weights(
     """Do what `convert` does with weights that are located."""
     kind = numpy_dtype(dtype)
     destination = Path(destination).expanduser()
-    if destination.exists() and destination.samefile(weights.path):
+    if os.path.isfile(destination) and os.path.samefile(destination, weights.path):  # noqa: PTH113, PTH121
         raise InputError(f"the destination {destination} is the source itself; choose another name")
     tensors, problems = read_state_dict(weights.path)
     targets = plan_conversion(tensors, config, problems)

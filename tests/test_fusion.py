@@ -80,3 +80,11 @@ def test_scale_is_the_median_ratio_over_static_pixels():
     dynamic = jnp.asarray([[[[False, False, False, True]]]])
     assert np.asarray(scale_between(d1, d2, dynamic)).tolist() == [3.0]
     assert np.asarray(scale_between(d1, d2, jnp.ones_like(dynamic))).tolist() == [1.0]
+
+
+def test_overflowing_confidence_stays_finite():
+    one = jnp.ones((1, 1, 2))
+    for c1, c2 in ((jnp.inf, 1.0), (1.0, jnp.inf), (jnp.inf, jnp.inf), (1e30, 1e30)):
+        depth, confidence = fuse_depth(one, c1 * one, 3 * one, c2 * one, jnp.zeros((1, 1, 2), bool))
+        assert np.isfinite(depth).all()
+        assert np.isfinite(confidence).all()

@@ -8,6 +8,7 @@ from PIL import Image
 
 from vggtjax.clips.arrays import ArrayFrames
 from vggtjax.clips.images import ImageFiles
+from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import natural_key, open_source
 from vggtjax.clips.video import VideoFile
 from vggtjax.errors import ClipError
@@ -127,3 +128,9 @@ def test_an_unreadable_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "iterdir", refuse)
     with pytest.raises(ClipError, match=r"cannot look for frames in .*: Permission denied"):
         open_source(tmp_path)
+
+
+def test_a_list_of_pil_images_is_read_like_their_files():
+    transparent = Image.new("RGBA", (28, 14), (255, 0, 0, 0))
+    frames = list(open_source([transparent, Image.new("L", (28, 14), 7)]).frames(Sampling()))
+    assert [frame.image.getpixel((0, 0)) for frame in frames] == [(255, 255, 255), (7, 7, 7)]

@@ -61,15 +61,16 @@ def reconstruct(
     """
     if not source:
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
+    frames = source[0] if len(source) == 1 else list(source)
     report = Report()
     with report.running():
-        _check_folder(out)
+        _check_early(frames, (start, stride, fps, max_frames), confidence_percentile, out)
         loaded = _load_model(report, model, config)
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import load_clip
 
             clip = load_clip(
-                source[0] if len(source) == 1 else list(source),
+                frames,
                 mode=mode,
                 size=loaded.config.image_size if size is None else size,
                 patch=loaded.config.patch_size,
@@ -181,10 +182,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MemoryError:  # of the host
         sys.stderr.write("vggtjax: out of memory; take fewer frames (--max-frames, --stride) or a smaller --size\n")
         return 2
+    except OSError as error:  # a file that cannot be looked at, in a place that no other message covers
+        sys.stderr.write(f"vggtjax: {error.filename or 'a file'}: {error.strerror or error}\n")
+        return 2
     except KeyboardInterrupt:
         sys.stderr.write("vggtjax: interrupted\n")
         return 130
     return 0
+
+
+def _check_early(frames: str | list[str], sampling: tuple, confidence_percentile: float, out: Path) -> None:
+    """Raise now what would otherwise be raised after minutes of work."""
+    from vggtjax.clips.sampling import Sampling
+    from vggtjax.clips.sources import open_source
+    from vggtjax.results.point_cloud import check_percentile
+
+    Sampling(*sampling)
+    open_source(frames)
+    check_percentile(confidence_percentile)
+    _check_folder(out)
 
 
 def _check_folder(out: Path) -> None:

@@ -12,6 +12,8 @@ from PIL import Image
 from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.errors import ClipError
 
+_SLACK = 1e-3  # what rounding may leave of floating-point values beyond 0 and 1
+
 
 @dataclass(frozen=True, eq=False)
 class ArrayFrames:
@@ -70,8 +72,8 @@ def eight_bit(values: np.ndarray, name: str) -> np.ndarray:
     lowest, highest = values.min(), values.max()
     if not (np.isfinite(lowest) and np.isfinite(highest)):
         raise ClipError(f"frame {name} has values that are not finite; expected floating point in [0, 1]")
-    if lowest < 0 or highest > 1:
+    if lowest < -_SLACK or highest > 1 + _SLACK:
         raise ClipError(
             f"frame {name} has values from {lowest:g} to {highest:g}; expected floating point in [0, 1], or uint8"
         )
-    return np.rint(values.astype(np.float32) * 255).astype(np.uint8)
+    return np.rint(values.astype(np.float32).clip(0, 1) * 255).astype(np.uint8)

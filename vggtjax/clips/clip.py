@@ -86,9 +86,9 @@ def load_clip(
 
     Args:
         source: a folder of images, a pattern such as "frames/*.png", an image or video file, a list of image paths,
-            a list of arrays [H, W, 3] or one array [S, H, W, 3] (uint8, uint16, or floating point in [0, 1], all
-            brought to 8 bits). Files of folders and patterns are taken in natural order (frame_2 before frame_10),
-            hidden files and files that are not images left out; a list keeps its order.
+            a list of PIL images or of arrays [H, W, 3], or one array [S, H, W, 3] (uint8, uint16, or floating point
+            in [0, 1], all brought to 8 bits). Files of folders and patterns are taken in natural order (frame_2 before
+            frame_10), hidden files and files that are not images left out; a list keeps its order.
         mode: "crop" makes frames `size` wide and cuts the height to `size` at most; "pad" makes the long side `size`
             and the frame square with white.
         size: width, or side of the square; a multiple of `patch`.

@@ -11,14 +11,22 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from PIL import Image, ImageOps
 
 from vggtjax.clips.arrays import ArrayFrames
-from vggtjax.clips.images import ImageFiles, is_image_name
+from vggtjax.clips.images import ImageFiles, is_image_name, to_rgb
 from vggtjax.clips.sampling import Source
 from vggtjax.clips.video import VideoFile, is_video_name
 from vggtjax.errors import ClipError
 
-ClipSource: TypeAlias = str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | Sequence[np.ndarray] | np.ndarray
+ClipSource: TypeAlias = (
+    str
+    | os.PathLike[str]
+    | Sequence[str | os.PathLike[str]]
+    | Sequence[Image.Image]
+    | Sequence[np.ndarray]
+    | np.ndarray
+)
 
 
 def open_source(source: ClipSource) -> Source:
@@ -37,6 +45,8 @@ def open_source(source: ClipSource) -> Source:
             raise ClipError("the list of frames is empty; expected image paths or arrays")
         if all(isinstance(item, (str, os.PathLike)) for item in items):
             return _from_list([Path(item) for item in items])
+        if all(isinstance(item, Image.Image) for item in items):
+            items = [np.asarray(to_rgb(ImageOps.exif_transpose(item), f"{i}")) for i, item in enumerate(items)]
         if all(hasattr(item, "__array__") for item in items):
             return ArrayFrames.from_arrays(items)
         kinds = ", ".join(sorted({type(item).__name__ for item in items}))
@@ -99,7 +109,7 @@ def _from_pattern(pattern: str) -> Source:
 
 def _from_list(paths: list[Path]) -> Source:
     for path in paths:
-        if not path.is_file():
+        if not os.path.isfile(path):  # noqa: PTH113 - an over-long or forbidden path is no file, not an error
             raise ClipError(f"image {path} does not exist or is no file; check the list of frames")
     return ImageFiles(tuple(path.absolute() for path in paths))
 

@@ -76,11 +76,11 @@ def check_folder(folder: Path) -> None:
             f"{folder / taken[0]} exists and is not part of an earlier result, so it is not replaced; "
             "choose another folder or move it away"
         )
-    new = not folder.exists()
+    new = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
     with staging(folder):
         pass
-    if new:
-        folder.rmdir()
+    for parent in new:
+        parent.rmdir()
 
 
 def _install(staged: Path, folder: Path) -> None:

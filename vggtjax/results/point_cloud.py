@@ -32,14 +32,19 @@ def valid_pixels(reconstruction: Reconstruction) -> Bool[np.ndarray, "S H W"]:
     return inside & np.isfinite(depth) & (depth > 0) & np.isfinite(reconstruction.depth_confidence)
 
 
+def check_percentile(confidence_percentile: float) -> None:
+    """Raise InputError for a percentile outside [0, 100)."""
+    if not 0 <= confidence_percentile < 100:
+        raise InputError(f"confidence_percentile is {confidence_percentile}; expected at least 0 and below 100")
+
+
 def confident_pixels(reconstruction: Reconstruction, confidence_percentile: float) -> Bool[np.ndarray, "S H W"]:
     """Return the valid pixels less the `confidence_percentile` percent with the lowest confidence of the clip.
 
     The percentile is taken over the valid pixels of all frames together; pixels that equal it stay.
     Raises InputError for a percentile outside [0, 100).
     """
-    if not 0 <= confidence_percentile < 100:
-        raise InputError(f"confidence_percentile is {confidence_percentile}; expected at least 0 and below 100")
+    check_percentile(confidence_percentile)
     valid = valid_pixels(reconstruction)
     if not valid.any():
         return valid
