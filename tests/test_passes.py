@@ -23,6 +23,7 @@ from vggtjax import (
 from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.fusion import scale_between
 from vggtjax.mask import dynamic_pixels, dynamic_tokens
+from vggtjax.results.reconstruction import FieldOfViewWarning
 
 FRAMES, SIZE = 4, (140, 140)
 
@@ -164,3 +165,13 @@ def test_running_out_of_memory_is_one_sentence(params, config, images, monkeypat
     monkeypatch.setattr(pipeline, "_compile", exhausted)
     with pytest.raises(DeviceMemoryError, match="4 frames of 140 x 140 pixels do not fit"):
         reconstruct(Model(config, params, "tiny"), load_clip(images[0], size=140))
+
+
+def test_fields_of_view_beyond_a_full_turn_are_clamped_and_named(params, config, images):
+    wide = jax.tree.map(lambda leaf: leaf, params)
+    branch = wide["camera_head"]["pose_branch"]["fc2"]
+    branch["bias"] = branch["bias"].at[7:].set(7.0 / 4)  # four iterations add it; the tangent repeats after 2 pi
+    branch["kernel"] = 0.01 * branch["kernel"]
+    with pytest.warns(FieldOfViewWarning, match="frames 0, 1, 2, 3 "):
+        made = reconstruct(Model(config, wide), load_clip(images[0], size=140))
+    assert np.allclose(2 * np.arctan(70 / made.intrinsics[:, [0, 1], [0, 1]]), 3.1, atol=1e-4)
