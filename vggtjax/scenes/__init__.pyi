@@ -1,0 +1,9 @@
+from .render import Surface as Surface
+from .render import SyntheticClip as SyntheticClip
+from .render import cast as cast
+from .render import generate as generate
+from .scene import Scene as Scene
+from .scene import SceneConfig as SceneConfig
+from .scene import sample_scene as sample_scene
+from .textures import Textures as Textures
+from .textures import load_textures as load_textures
