@@ -49,22 +49,56 @@ def _in_chunks(q, k, v, kept):
     def by_head(x: Float[Array, "B L N D"]) -> Float[Array, "BN L D"]:
         return x.transpose(0, 2, 1, 3).reshape(B * N, -1, D)
 
-    def one_head(inputs):
-        queries, keys, values, bias = inputs
-
-        def one_chunk(rows: Float[Array, "R D"]) -> Float[Array, "R D"]:
-            logits = jnp.matmul(rows, keys.T, preferred_element_type=jnp.float32)
-            logits = logits if bias is None else logits + bias[None]
-            weights = jnp.exp(logits - logits.max(axis=-1, keepdims=True))
-            out = jnp.matmul(weights.astype(values.dtype), values, preferred_element_type=jnp.float32)
-            return (out / weights.sum(axis=-1, keepdims=True)).astype(values.dtype)
-
-        return jax.lax.map(one_chunk, queries.reshape(chunks, -1, D))
-
     queries = jnp.pad(by_head(q * D**-0.5), ((0, 0), (0, padding), (0, 0)))
     bias = None if kept is None else jnp.repeat(jnp.where(kept, 0.0, -jnp.inf), N, axis=0)
-    out = jax.lax.map(one_head, (queries, by_head(k), by_head(v), bias))
+    queries = queries.reshape(B * N, chunks, -1, D)
+    out = jax.lax.map(lambda inputs: _one_head(*inputs), (queries, by_head(k), by_head(v), bias))
     return out.reshape(B, N, T + padding, D)[:, :, :T].transpose(0, 2, 1, 3)
+
+
+@jax.custom_vjp
+def _one_head(queries, keys, values, bias):
+    """Attention of one head: queries [c, R, D], keys and values [K, D], bias [K] or None."""
+    return jax.lax.map(lambda rows: _attended(rows, keys, values, bias), queries)
+
+
+def _attended(rows, keys, values, bias):
+    weights = _weights(rows, keys, bias)
+    out = jnp.matmul(weights.astype(values.dtype), values, preferred_element_type=jnp.float32)
+    return (out / weights.sum(axis=-1, keepdims=True)).astype(values.dtype)
+
+
+def _weights(rows, keys, bias):
+    logits = jnp.matmul(rows, keys.T, preferred_element_type=jnp.float32)
+    logits = logits if bias is None else logits + bias[None]
+    return jnp.exp(logits - logits.max(axis=-1, keepdims=True))
+
+
+def _one_head_forward(queries, keys, values, bias):
+    out = _one_head(queries, keys, values, bias)
+    return out, (queries, keys, values, bias, out)
+
+
+def _one_head_backward(kept, gradient):
+    """Weights are computed again: to keep them costs more than they do."""
+    queries, keys, values, bias, out = kept
+
+    def one_chunk(sums, inputs):
+        rows, result, upstream = inputs
+        weights = _weights(rows, keys, bias)
+        weights = (weights / weights.sum(axis=-1, keepdims=True)).astype(values.dtype)
+        inner = jnp.sum(result.astype(jnp.float32) * upstream, axis=-1, keepdims=True)
+        logits = (weights * (upstream @ values.T - inner)).astype(keys.dtype)
+        added = (logits.T @ rows, weights.T @ upstream)
+        return jax.tree.map(lambda a, b: a + b.astype(a.dtype), sums, added), logits @ keys
+
+    start = tuple(jnp.zeros(x.shape, jnp.float32) for x in (keys, values))
+    (to_keys, to_values), to_queries = jax.lax.scan(one_chunk, start, (queries, out, gradient))
+    to_bias = None if bias is None else jnp.zeros_like(bias)
+    return to_queries.astype(queries.dtype), to_keys.astype(keys.dtype), to_values.astype(values.dtype), to_bias
+
+
+_one_head.defvjp(_one_head_forward, _one_head_backward)
 
 
 def suppressed_attention(

@@ -187,7 +187,7 @@ def _albedo(textures: Textures, material, local, normal, width, direction, world
     flat = (y >= x) & (y >= z)
     u = jnp.where(~flat & (x > z), local[2], local[0])
     v = jnp.where(flat, local[2], local[1])
-    uv = repeat * jnp.stack([cos * u - sin * v, sin * u + cos * v]) + jnp.stack(offset)
+    uv = repeat[None] * jnp.stack([cos * u - sin * v, sin * u + cos * v]) + jnp.stack(offset)
     slant = jnp.abs(_dot(direction, world_normal)) / jnp.sqrt(_dot(direction, direction))
     footprint = repeat * width / jnp.maximum(slant, 0.3)
     texture = sample(textures, tile.astype(jnp.int32), uv, footprint)

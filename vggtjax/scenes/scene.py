@@ -26,7 +26,7 @@ class SceneConfig:
     Attributes:
         height, width: of the images, in pixels.
         frames: at equal steps of the clip's time from 0 to 1.
-        dynamic: whether up to three things move.
+        dynamic: share of clips in which one to three things move; False and True are 0 and 1.
         boxes, ellipsoids, cylinders: things in a scene besides the articulated figure; each is there or not.
         motion: range of the camera's share of its largest path.
         static_camera: share of clips whose camera stands still.
@@ -40,7 +40,7 @@ class SceneConfig:
     height: int = 64
     width: int = 64
     frames: int = 4
-    dynamic: bool = False
+    dynamic: float = 0.0
     boxes: int = 5
     ellipsoids: int = 2
     cylinders: int = 2
@@ -70,6 +70,7 @@ class SceneConfig:
             if type(value) is not int or not low <= value <= high:
                 raise InputError(f"{name} is {value!r}; expected a whole number from {low} to {high}")
         for name, low, high in (
+            ("dynamic", 0, 1),
             ("static_camera", 0, 1),
             ("shutter", 0, 1),
             ("noise", 0, 1),
@@ -219,7 +220,7 @@ def sample_scene(key: Array, tiles: int, config: SceneConfig) -> Scene:
     # Movers: at most three, of those that are there; bounded paths over the floor, hops, turns.
     order = jnp.argsort(jnp.where(jnp.zeros(count, bool).at[objects].max(present), dice(0.0, 1.0, count), 2.0))
     rank = jnp.zeros(count, jnp.int32).at[order].set(jnp.arange(count, dtype=jnp.int32))
-    moving = (rank < 1 + jnp.floor(dice(0.0, 3.0))) & config.dynamic
+    moving = (rank < 1 + jnp.floor(dice(0.0, 3.0))) & (dice(0.0, 1.0) < config.dynamic)
     centre = distance * dice(-0.2, 0.2, count, 2)
     reach = distance * dice(0.05, 0.3, count, 2)
     position = jnp.where(moving[:, None], jnp.stack([centre[:, 0], height, centre[:, 1]], axis=-1), position)

@@ -1,0 +1,33 @@
+"""The benchmarks' command line: python -m benchmarks NAME ..."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import tyro
+
+from benchmarks.demo_model import demo_model
+from benchmarks.make_checkpoint import main as make_checkpoint
+from vggtjax.errors import VggtjaxError
+
+COMMANDS = {"demo-model": demo_model, "make-checkpoint": make_checkpoint}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a benchmark; return the exit code: 0, or 2 for bad input or output."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="python -m benchmarks",
+            description="Measurements of vggtjax, and the files that they need.",
+            args=arguments,
+        )
+    except VggtjaxError as error:
+        sys.stderr.write(f"benchmarks: {error}\n")
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,258 @@
+"""How good a model is on generated scenes that it has not seen, and on filmed ones: python -m benchmarks demo-model."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from benchmarks.blind_guesses import Comparison, Guess, Prior, compare, guesses, training_prior
+from benchmarks.plots import check_matplotlib, plot_ladder, plot_rotations, plot_sweep
+from benchmarks.real_clips import is_clip_folder, load_windows
+from benchmarks.summaries import Spread, Summary, comparison_table, ladder_table, saliency_auc, summarise
+from vggtjax.checkpoint import Model, load_model
+from vggtjax.errors import InputError
+from vggtjax.evaluation.ladder import LadderRow, ladder
+from vggtjax.evaluation.truth import Truth, batched_truth
+from vggtjax.files import staging, writing
+from vggtjax.scenes import SceneConfig, held_out_scenes
+
+CLIPS = Path(__file__).parents[2] / "shared" / "clips"
+SUPPRESS = ("zero", "drop")
+SWEPT = ("pose-decoupling", "4dvggt-d")  # methods whose sweep is shown; report.json has all
+
+Advance = Callable[[int, int], object]
+
+
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """Clips on which the plain pass was compared with blind guesses."""
+
+    clips: list[str]
+    rows: list[LadderRow]
+    guesses: list[Guess]
+    comparisons: list[Comparison]
+
+
+@dataclasses.dataclass(frozen=True)
+class Laddered:
+    """Clips with something that moves, on which every method was run."""
+
+    rows: list[list[LadderRow]]  # of each seed
+    summaries: list[Summary]  # with the number of pairs that was asked for
+    sweep: list[Summary]  # with every number of pairs, over the seeds on which all were tried
+    saliency_auc: Spread | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What was asked for; see `demo_model`."""
+
+    static: int
+    dynamic: int
+    seeds: int
+    frames: int
+    mask_pairs: int
+    sweep: tuple[int, ...]
+    sweep_seeds: int
+    training_scenes: int
+    batch: int
+    dtype: Literal["float32", "bfloat16"]
+
+    def __post_init__(self) -> None:
+        lowest = {"static": 0, "dynamic": 0, "frames": 3, "mask_pairs": 0, "sweep_seeds": 0}
+        for field in dataclasses.fields(self):
+            value, least = getattr(self, field.name), lowest.get(field.name, 1)
+            if isinstance(value, int) and value < least:
+                raise InputError(f"{field.name} is {value}; expected at least {least}")
+        if wrong := [pairs for pairs in self.sweep if pairs < 0]:
+            raise InputError(f"sweep has {wrong}; expected numbers of pairs of at least 0")
+
+
+def demo_model(
+    *,
+    model: str = "demo",
+    out: Path = Path("demo-model-benchmark"),
+    static: int = 64,
+    dynamic: int = 64,
+    seeds: int = 5,
+    frames: int = 12,
+    mask_pairs: int = 5,
+    sweep: tuple[int, ...] = (1, 3, 5, 8, 12, 24),
+    sweep_seeds: int = 1,
+    training_scenes: int = 256,
+    clips: Path = CLIPS,
+    batch: int = 4,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+) -> None:
+    """Measure a model against guesses that see no image, and the methods against each other.
+
+    Args:
+        model: "demo", or weights as for vggtjax reconstruct.
+        out: folder for report.json, report.md and figures.
+        static: held-out scenes in which nothing moves; 0 leaves them out.
+        dynamic: held-out scenes of each seed in which things move; 0 leaves them out.
+        seeds: draws of dynamic scenes, for the spread.
+        frames: frames of a scene, and of a window of a filmed clip.
+        mask_pairs: pairs in which keys are suppressed.
+        sweep: further numbers of pairs to try.
+        sweep_seeds: draws of dynamic scenes on which they are tried.
+        training_scenes: scenes of the training split that the blind guesses know.
+        clips: folder with hololens/ and composite/ inside; what is absent is left out.
+        batch: clips that go through the network together.
+        dtype: of the blocks' matrix products.
+    """
+    settings = Settings(static, dynamic, seeds, frames, mask_pairs, sweep, sweep_seeds, training_scenes, batch, dtype)
+    check_matplotlib()
+    with staging(out):  # a folder that cannot be written is told now
+        pass
+    loaded = load_model(model)
+    bench = _Bench(loaded, settings)
+    with bench.running():
+        results: dict[str, Any] = {"model": loaded.summary(), "settings": dataclasses.asdict(settings)}
+        results["static"] = bench.static_scenes() if static else None
+        results["hololens"] = bench.filmed([clips / "hololens"], "hololens")
+        folders = sorted(clips.joinpath("composite").glob("*"))
+        results["composite"] = bench.filmed(folders, "composite")
+        results["composite ladder"] = bench.filmed_ladder(folders)
+        results["dynamic"] = bench.dynamic_scenes() if dynamic else None
+    text = report_text(loaded, results)
+    write_report(out, results, text, mask_pairs)
+    console = Console()
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    console.print(
+        f"\nwrote {out / 'report.md'}, report.json and figures", markup=False, highlight=False, soft_wrap=True
+    )
+
+
+class _Bench:
+    """A model, the settings, and a progress bar for each stretch of work."""
+
+    def __init__(self, model: Model, settings: Settings) -> None:
+        self.model, self.settings = model, settings
+        columns = (TextColumn("{task.description:<28}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+        self.console = Console(stderr=True)
+        self.progress = Progress(*columns, console=self.console, disable=not self.console.is_terminal)
+        self.priors: dict[tuple[int, int], Prior] = {}
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        with self.progress:
+            yield
+
+    def stage(self, name: str) -> Advance:
+        task = self.progress.add_task(name, total=None)
+
+        def advance(done: int, total: int) -> None:
+            self.progress.update(task, completed=done, total=total)
+            if done == total and not self.console.is_terminal:  # a log gets a line for each stretch
+                self.console.print(f"{name}: done", highlight=False)
+
+        return advance
+
+    def static_scenes(self) -> Compared:
+        truth = self.scenes("static", self.settings.static, 0)
+        return self.compared("static scenes", [f"scene {i}" for i in range(len(truth.images))], truth)
+
+    def dynamic_scenes(self) -> Laddered:
+        seeds = range(self.settings.seeds)
+        return self.laddered("dynamic scenes", (self.scenes("dynamic", self.settings.dynamic, seed) for seed in seeds))
+
+    def filmed(self, folders: Sequence[Path], name: str) -> Compared | None:
+        if not (folders := [folder for folder in folders if is_clip_folder(folder)]):
+            return None
+        windows = load_windows(folders, self.model.config, self.settings.frames)
+        return self.compared(name, windows.names, windows.truth)
+
+    def filmed_ladder(self, folders: Sequence[Path]) -> Laddered | None:
+        if not (folders := [folder for folder in folders if is_clip_folder(folder)]):
+            return None
+        return self.laddered("composite", [load_windows(folders, self.model.config, self.settings.frames).truth])
+
+    def compared(self, name: str, clips: list[str], truth: Truth) -> Compared:
+        prior = self.prior(truth.images.shape[2], truth.images.shape[3])
+        rows = ladder(self.model, truth, methods=["vggt"], **self._network(name))
+        guessed = guesses(truth, prior)
+        return Compared(clips, rows, guessed, compare(rows, guessed))
+
+    def laddered(self, name: str, truths: Iterable[Truth]) -> Laddered:
+        settings, rows = self.settings, []
+        for seed, truth in enumerate(truths):
+            pairs = {settings.mask_pairs, *(settings.sweep if seed < settings.sweep_seeds else ())}
+            network = self._network(f"ladder, {name} {seed}")
+            rows.append(ladder(self.model, truth, mask_pairs=sorted(pairs), suppress=SUPPRESS, **network))
+        main = [[row for row in found if row.mask_pairs in (None, settings.mask_pairs)] for found in rows]
+        swept = rows[: settings.sweep_seeds] if settings.sweep else []
+        return Laddered(rows, summarise(main), summarise(swept), saliency_auc(rows))
+
+    def scenes(self, kind: Literal["static", "dynamic"], count: int, seed: int) -> Truth:
+        side = self.model.config.image_size
+        config = SceneConfig(height=side, width=side, frames=self.settings.frames, dynamic=kind == "dynamic")
+        return batched_truth(held_out_scenes(kind, count, config, seed=seed))
+
+    def prior(self, height: int, width: int) -> Prior:
+        if (height, width) not in self.priors:
+            config = SceneConfig(height=height, width=width, frames=self.settings.frames)
+            advance = self.stage(f"training scenes {width} x {height}")
+            self.priors[height, width] = training_prior(config, self.settings.training_scenes, progress=advance)
+        return self.priors[height, width]
+
+    def _network(self, name: str) -> dict[str, Any]:
+        settings = self.settings
+        return {"compute_dtype": settings.dtype, "batch_size": settings.batch, "progress": self.stage(name)}
+
+
+def report_text(model: Model, results: dict[str, Any]) -> str:
+    """Return the report as markdown."""
+    frames = results["settings"]["frames"]
+    parts = [f"# Benchmark of {model.name}", f"{model.parameter_count / 1e6:.1f} M parameters, {frames} frames a clip."]
+    if not model.trained:
+        parts.append("The parameters are untrained: the numbers say that everything runs, and nothing of the method.")
+    if left_out := [name for name in ("static", "hololens", "composite", "dynamic") if not results[name]]:
+        parts.append(f"Left out, as not asked for or not there: {', '.join(left_out)}.")
+    for name in ("static", "hololens", "composite"):
+        if compared := results[name]:
+            parts += [f"## Plain pass against blind guesses: {name}, {len(compared.clips)} clips"]
+            parts += [comparison_table(compared.comparisons), *_failures(compared.rows)]
+    for name in ("composite ladder", "dynamic"):
+        if laddered := results[name]:
+            parts += [f"## Methods: {name}", f"Saliency AUC {laddered.saliency_auc or '-'}."]
+            parts += [ladder_table(laddered.summaries), *_failures(row for rows in laddered.rows for row in rows)]
+            if swept := sorted(
+                (s for s in laddered.sweep if s.method in SWEPT),
+                key=lambda s: (s.method, s.mask_source, s.suppress, s.mask_pairs),
+            ):
+                parts += [f"## Pairs with suppressed keys: {name}", ladder_table(swept)]
+    return "\n\n".join(parts)
+
+
+def write_report(out: Path, results: dict[str, Any], text: str, mask_pairs: int) -> None:
+    """Write report.json, report.md and the figures."""
+    with writing(out / "report.json") as temporary:
+        temporary.write_text(json.dumps(results, default=dataclasses.asdict, indent=1, allow_nan=False) + "\n")
+    with writing(out / "report.md") as temporary:
+        temporary.write_text(text + "\n")
+    compared = {name: found for name in ("static", "hololens", "composite") if (found := results[name])}
+    if compared:
+        plot_rotations(out / "rotations.png", {name: (found.rows, found.guesses) for name, found in compared.items()})
+    for name in ("composite ladder", "dynamic"):
+        if not (laddered := results[name]):
+            continue
+        stem = name.replace(" ", "-")
+        for how in SUPPRESS:
+            chosen = [s for s in laddered.summaries if s.suppress in (None, how)]
+            title = f"{name}, {mask_pairs} pairs, keys {'zeroed' if how == 'zero' else 'dropped'}"
+            plot_ladder(out / f"{stem}-{how}.png", chosen, title)
+        for method in SWEPT if laddered.sweep else ():
+            plot_sweep(out / f"{stem}-sweep-{method}.png", laddered.sweep, method)
+
+
+def _failures(rows) -> list[str]:
+    sentences = dict.fromkeys(row.failure for row in rows if row.failure)
+    return ["What could not be computed: " + "; ".join(sentences) + "."] if sentences else []

@@ -1,0 +1,101 @@
+"""Filmed clips with ground truth: folders of rgb/, depth/, perhaps mask/, K.txt and world_from_camera.txt."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float64, UInt16
+from PIL import Image
+
+from vggtjax.clips.clip import load_clip
+from vggtjax.config import VGGTConfig
+from vggtjax.errors import InputError
+from vggtjax.evaluation.truth import Truth, at_clip_pixels, intrinsics_at_clip_pixels
+
+_NEW_TAKE = 10.0  # times the median step of the camera: a jump between takes in one folder
+
+
+class Windows(NamedTuple):
+    """Stretches of a folder's clips, all of one shape: truth [B, S, ...] and what each is called."""
+
+    names: list[str]
+    truth: Truth
+
+
+def is_clip_folder(folder: Path) -> bool:
+    """Return whether a folder holds such a clip."""
+    return (folder / "rgb").is_dir() and (folder / "world_from_camera.txt").is_file()
+
+
+def load_windows(folders: list[Path], config: VGGTConfig, frames: int) -> Windows:
+    """Load every clip in windows of `frames` consecutive frames, fitted to the model.
+
+    The fewest windows that cover each take, spread evenly, so that the last ones overlap where they must. The truth is
+    taken to the prediction's pixels without averaging; depth files are millimetres, 0 where nothing was measured.
+
+    Raises:
+        InputError: a take shorter than a window, or files that do not belong together.
+    """
+    names, truths = [], []
+    for folder in folders:
+        world_from_camera = _matrices(folder / "world_from_camera.txt", 4)
+        for take in takes(world_from_camera[:, :3, 3]):
+            if len(take) < frames:
+                raise InputError(f"{folder} has a take of {len(take)} frames; choose --frames of at most that")
+            for start in window_starts(len(take), frames):
+                names.append(f"{folder.name} {take[start]}-{take[start] + frames - 1}")
+                truths.append(_window(folder, config, world_from_camera, take[start], frames))
+    try:
+        return Windows(names, Truth(*(np.stack(arrays) for arrays in zip(*truths, strict=True))))
+    except ValueError:
+        raise InputError(f"the clips {', '.join(str(folder) for folder in folders)} differ in size") from None
+
+
+def takes(centres: Float64[np.ndarray, "S 3"]) -> list[range]:
+    """Return the stretches of frames without a cut: no step ten times as long as the median one."""
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    cuts = 1 + np.flatnonzero(steps > _NEW_TAKE * np.median(steps)) if len(steps) else np.zeros(0, int)
+    edges = [0, *cuts.tolist(), len(centres)]
+    return [range(start, end) for start, end in pairwise(edges)]
+
+
+def window_starts(count: int, frames: int) -> list[int]:
+    """Return where the fewest windows of `frames` that cover `count` frames start, evenly spread."""
+    windows = -(-count // frames)
+    return np.linspace(0, count - frames, windows).round().astype(int).tolist()
+
+
+def _window(folder: Path, config: VGGTConfig, world_from_camera: np.ndarray, start: int, frames: int) -> Truth:
+    clip = load_clip(folder / "rgb", size=config.image_size, patch=config.patch_size, start=start, max_frames=frames)
+    depth = np.stack([_image(folder / "depth" / f"{name}.png") for name in clip.frame_names])
+    masks = folder / "mask"
+    mask = np.stack([_image(masks / f"{name}.png") > 0 for name in clip.frame_names]) if masks.is_dir() else depth < 0
+    poses = world_from_camera[start : start + frames]
+    if len(poses) != len(clip):
+        raise InputError(f"{folder} has {len(world_from_camera)} poses; expected one for each image")
+    rotation = poses[:, :3, :3].swapaxes(1, 2)
+    return Truth(
+        images=clip.images,
+        depth=at_clip_pixels(clip, depth).astype(np.float32) / 1000,
+        dynamic_mask=at_clip_pixels(clip, mask),
+        camera_from_world=np.concatenate([rotation, -rotation @ poses[:, :3, 3:]], axis=2),
+        intrinsics=intrinsics_at_clip_pixels(clip, _matrices(folder / "K.txt", 3)[0]),
+    )
+
+
+def _matrices(path: Path, size: int) -> Float64[np.ndarray, "N size size"]:
+    try:
+        return np.loadtxt(path).reshape(-1, size, size)
+    except (OSError, ValueError):
+        raise InputError(f"{path} cannot be read; expected rows of numbers, {size} x {size} of them a matrix") from None
+
+
+def _image(path: Path) -> UInt16[np.ndarray, "h w"]:
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image).astype(np.uint16)
+    except OSError:
+        raise InputError(f"{path} cannot be read; expected one image with one channel for each frame") from None

@@ -1,0 +1,125 @@
+import dataclasses
+import json
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.training_runs import RECIPE
+from vggtjax.config import VGGTConfig
+from vggtjax.errors import InputError
+from vggtjax.training.objective import LossWeights
+from vggtjax.training.recipe import OptimiserConfig, Recipe, Stage, read_recipe
+
+STAGE = {"steps": 5, "batch": 2, "frames": [2, 4], "height": 28, "width": 42}
+
+
+def changed(**values) -> str:
+    return json.dumps({**json.loads(RECIPE.to_json()), **values})
+
+
+def test_json_round_trip():
+    recipe = dataclasses.replace(RECIPE, losses=LossWeights(depth=0.25), remat=True)
+    again = Recipe.from_json(recipe.to_json())
+    assert again == recipe
+    assert hash(again) == hash(recipe)
+    assert isinstance(again.model, VGGTConfig)
+    assert isinstance(again.stages[0].frames, tuple)
+
+
+def test_only_name_and_stages_are_needed():
+    values = {"name": "short", "stages": [STAGE], "optimiser": {"warmup_steps": 1, "decay_steps": 2}}
+    recipe = Recipe.from_json(json.dumps(values))
+    assert recipe.model == VGGTConfig()
+    assert recipe.stages == (Stage(5, 2, (2, 4), 28, 42),)
+    assert recipe.optimiser == OptimiserConfig(warmup_steps=1, decay_steps=2)
+
+
+def test_stages_follow_each_other():
+    assert RECIPE.total_steps == 6
+    assert [RECIPE.stage_at(step)[0] for step in range(8)] == [0, 0, 0, 0, 1, 1, 1, 1]
+    assert RECIPE.stage_at(4)[1] is RECIPE.stages[1]
+
+
+def test_frozen_modules():
+    assert RECIPE.frozen == ("track_head", "depth_head", "point_head")
+    heads = dataclasses.replace(RECIPE, trainable="heads", untrained=("track_head",))
+    assert heads.frozen == ("backbone", "aggregator", "track_head")
+
+
+@given(st.integers(1, 1000))
+def test_other_numbers_of_steps_keep_the_shares(steps):
+    recipe = RECIPE.with_steps(steps)
+    assert recipe.total_steps == steps
+    for stage in recipe.stages:
+        whole = next(s for s in RECIPE.stages if s.width == stage.width)
+        assert abs(stage.steps - steps * whole.steps / 6) < 1
+    assert recipe.optimiser.warmup_steps == 2 * steps // 6
+
+
+def test_whole_numbers_become_floats():
+    assert type(OptimiserConfig(learning_rate=1).learning_rate) is float
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("{", "not JSON"),
+        ("[" * 100_000, "not JSON"),
+        ("[]", "expected an object"),
+        (json.dumps({"name": "x"}), r"lacks the fields \['stages'\]"),
+        (changed(colour=1), r"unknown fields \['colour'\]"),
+        (changed(stages=[]), "stages is empty"),
+        (changed(stages=3), "recipe.stages is 3"),
+        (changed(stages=[STAGE | {"speed": 2}]), r"a stage has unknown fields \['speed'\]"),
+        (changed(stages=[STAGE | {"steps": 0}]), "stage.steps is 0; expected more than 0"),
+        (changed(stages=[STAGE | {"steps": 2.5}]), "stage.steps is 2.5; expected int"),
+        (changed(stages=[STAGE | {"steps": True}]), "stage.steps is True; expected int"),
+        (changed(stages=[STAGE | {"batch": "2"}]), "stage.batch is '2'; expected int"),
+        (changed(stages=[STAGE | {"frames": []}]), "stage.frames is empty"),
+        (changed(stages=[STAGE | {"frames": [2, -1]}]), "stage.frames"),
+        (changed(stages=[STAGE | {"frames": 2}]), "stage.frames is 2"),
+        (changed(stages=[STAGE | {"dynamic": 1.5}]), "share"),
+        (changed(stages=[STAGE | {"height": 30}]), "multiples of the model's patch_size 14"),
+        (changed(optimiser={"learning_rate": 0}), "optimiser.learning_rate is 0.0; expected more than 0"),
+        (changed(optimiser={"learning_rate": float("nan")}), "optimiser.learning_rate is nan"),
+        (changed(optimiser={"learning_rate": 10**400}), "optimiser.learning_rate"),
+        (changed(optimiser={"b2": 1}), "optimiser.b2 is 1.0"),
+        (changed(optimiser={"kind": "sgd"}), "optimiser.kind is 'sgd'; expected one of"),
+        (changed(optimiser={"warmup_steps": 7}), "warm-up and decay take"),
+        (changed(optimiser={"momentum": 0.9}), r"unknown fields \['momentum'\]"),
+        (changed(model={"depth": "4"}), "depth"),
+        (changed(model={"size": 4}), "unknown fields"),
+        (changed(losses={"depth": -1}), "losses.depth is -1.0"),
+        (changed(losses={"smell": 1}), "unknown fields"),
+        (changed(trainable="camera"), "recipe.trainable is 'camera'"),
+        (changed(compute_dtype="float16"), "recipe.compute_dtype"),
+        (changed(untrained=["neck"]), r"recipe.untrained has \['neck'\]"),
+        (changed(untrained="track_head"), "recipe.untrained"),
+        (changed(seed=-1), "recipe.seed is -1"),
+        (changed(remat=1), "recipe.remat is 1; expected bool"),
+        (changed(name="a\nb"), "recipe.name"),
+    ],
+)
+def test_bad_recipes_are_named(text, says):
+    with pytest.raises(InputError, match=says):
+        Recipe.from_json(text)
+
+
+def test_reading_a_file(tmp_path):
+    path = tmp_path / "recipe.json"
+    path.write_text(RECIPE.to_json())
+    assert read_recipe(path) == RECIPE
+    for content, says in ((b"\xff\xfe", "not text"), (b"{}", "cannot be used"), (b" " * (1 << 21), "bytes")):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=says):
+            read_recipe(path)
+    with pytest.raises(InputError, match="cannot read"):
+        read_recipe(tmp_path / "none.json")
+
+
+def test_values_given_are_left_alone():
+    weights = LossWeights(match_layers=[0, 1])  # type: ignore[arg-type]
+    recipe = dataclasses.replace(RECIPE, losses=weights)
+    assert recipe.losses.match_layers == (0, 1)
+    assert weights.match_layers == [0, 1]

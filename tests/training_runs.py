@@ -1,0 +1,60 @@
+"""A training run small enough for tests: a tiny model, and an objective that pulls it towards the batch."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from vggtjax.config import VGGTConfig
+from vggtjax.training.recipe import OptimiserConfig, Recipe, Stage
+
+CONFIG = VGGTConfig(
+    image_size=28,
+    embed_dim=16,
+    depth=4,
+    num_heads=2,
+    dino_depth=1,
+    dino_num_heads=2,
+    camera_depth=1,
+    camera_num_heads=2,
+    dpt_features=8,
+    dpt_channels=(4, 4, 4, 4),
+    taps=(0, 1, 2, 3),
+    track_features=8,
+    track_hidden=16,
+    track_corr_levels=2,
+    track_corr_radius=1,
+)
+RECIPE = Recipe(
+    name="tiny",
+    stages=(Stage(4, 2, (2, 3), 28, 28), Stage(2, 1, (2,), 28, 42)),
+    model=CONFIG,
+    optimiser=OptimiserConfig(learning_rate=1e-2, warmup_steps=2, decay_steps=2),
+    untrained=("track_head", "depth_head", "point_head"),
+)
+SHORT = dataclasses.replace(RECIPE, trainable="heads")  # fewer parameters, which compile faster
+PROBES = dataclasses.replace(SHORT, untrained=(*SHORT.untrained, "camera_head"))  # and none of the model
+
+
+def init_probes(seed: int, config: VGGTConfig):
+    """Return a read-out that says zero."""
+    return {"mean": {"kernel": jnp.full((3, 3), 0.1 * (1 + seed)), "bias": jnp.zeros(3)}}
+
+
+def make_batch(key, textures, stage: Stage, frames: int):
+    """Return noise images."""
+    return textures * jax.random.uniform(key, (stage.batch, frames, stage.height, stage.width, 3))
+
+
+def objective(trained, batch, config, weights, *, compute_dtype, remat):
+    """Pull the probes' colour and the camera head's pose to the batch."""
+    colour = batch.mean(axis=(0, 1, 2, 3))
+    found = colour @ trained["probes"]["mean"]["kernel"] + trained["probes"]["mean"]["bias"]
+    colour_loss = jnp.sum((found - colour) ** 2)
+    pose = trained["model"]["camera_head"]["pose_branch"]["fc2"]
+    pose_loss = jnp.mean((pose["kernel"] - colour.mean()) ** 2) + jnp.mean(pose["bias"] ** 2)
+    loss = weights.translation * colour_loss + weights.rotation * pose_loss
+    return loss, {"colour_loss": colour_loss, "pose_loss": pose_loss}
+
+
+PARTS = {"textures": jnp.float32(1), "make_batch": make_batch, "init_probes": init_probes, "objective": objective}

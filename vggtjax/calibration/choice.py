@@ -1,0 +1,163 @@
+"""A table of cues for a checkpoint: greedy choice on half of the clips, confirmed by the other half."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float32, Int8
+
+from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Progress, Sweep, token_auc
+from vggtjax.config import Cue, Gram, MotionConfig
+from vggtjax.errors import InputError
+from vggtjax.motion import normalise
+
+MAX_TERMS = 5  # as many as VGGT4D's table has
+MIN_GAIN = 0.001
+_MOST_NEIGHBOURS = 3
+
+
+class Rating(NamedTuple):
+    """Area under the ROC curve on either half of the clips, in [0, 1]."""
+
+    calibration: float
+    held_out: float
+
+
+class Step(NamedTuple):
+    """A cue, and the rating of the product of it and the cues before it."""
+
+    cue: Cue
+    rating: Rating
+
+
+class Choice(NamedTuple):
+    """A chosen table, and what it is worth."""
+
+    motion: MotionConfig
+    gram: Gram
+    steps: tuple[Step, ...]  # one per cue of the table
+    refused: Step | None  # the next best cue, which the held-out half did not confirm
+    table: Rating  # of the sweep's own table
+
+
+def choose(
+    sweep: Sweep,
+    *,
+    gram: Gram = "cosine",
+    max_terms: int = MAX_TERMS,
+    min_gain: float = MIN_GAIN,
+    progress: Progress | None = None,
+) -> Choice:
+    """Choose cues whose product tells what moves.
+
+    Every second clip, from the first on, is the calibration half; the others are held out. The start is the map that is
+    best alone; then, again and again, the map, plain or inverted, that raises the product's area under the ROC curve on
+    the calibration half most. The product is that of `GramCues.saliency`. It ends where the held-out half gains nothing
+    or less than `min_gain`. As that half decides how many cues there are, the rating on it is slightly optimistic.
+    Candidates are all maps of one pair, and the means over two or three neighbouring pairs.
+
+    Args:
+        sweep: what `sweep` returned.
+        gram: the similarity that the table is for.
+        max_terms: number of cues at most.
+        min_gain: what a further cue must add to the area on the held-out half.
+        progress: called with the candidates tried and the largest number of them.
+
+    Raises:
+        InputError: a half lacks tokens that move or tokens that do not, or an argument is out of range.
+    """
+    if gram not in GRAMS:
+        raise InputError(f"gram is {gram!r}; expected one of {GRAMS}")
+    if type(max_terms) is not int or max_terms < 1:
+        raise InputError(f"max_terms is {max_terms!r}; expected a whole number of at least 1")
+    if not 0 <= min_gain <= 1:
+        raise InputError(f"min_gain is {min_gain}; expected a number in [0, 1]")
+    calibration, held_out = halves(sweep)
+    _check_truth("calibration", calibration)
+    _check_truth("held-out", held_out)
+    pool = candidates(sweep.depth)
+    steps: list[Step] = []
+    refused = None
+    while len(steps) < max_terms and refused is None:
+        chosen = [step.cue for step in steps]
+        best_cue, best = None, steps[-1].rating.calibration if steps else -1.0
+        product = _product(calibration, gram, chosen)
+        for tried, cue in enumerate(pool, 1):
+            for inverted in (False, True):
+                candidate = dataclasses.replace(cue, inverted=inverted)
+                value = _product_auc(product * _term(calibration, gram, candidate), calibration.truth)
+                if value > best and cue.name not in [taken.name for taken in chosen]:
+                    best_cue, best = candidate, value
+            if progress is not None:
+                progress(len(steps) * len(pool) + tried, max_terms * len(pool))
+        if best_cue is None:
+            break
+        rating = Rating(best, _product_auc(_product(held_out, gram, [*chosen, best_cue]), held_out.truth))
+        gain = rating.held_out - steps[-1].rating.held_out if steps else 1.0
+        if gain > 0 and gain >= min_gain:
+            steps.append(Step(best_cue, rating))
+        else:
+            refused = Step(best_cue, rating)
+    motion = dataclasses.replace(sweep.table, cues=tuple(step.cue for step in steps), reference_depth=sweep.depth)
+    table = Rating(*(token_auc(half.table_saliency[GRAMS.index(gram)], half.truth) for half in (calibration, held_out)))
+    return Choice(motion, gram, tuple(steps), refused, table)
+
+
+def halves(sweep: Sweep) -> tuple[Sweep, Sweep]:
+    """Return the clips to choose by (the first, third, ...) and those to confirm with."""
+
+    def part(start: int) -> Sweep:
+        every_second = slice(start, None, 2)
+        return sweep._replace(
+            maps=sweep.maps[:, :, :, every_second],
+            truth=sweep.truth[every_second],
+            table_saliency=sweep.table_saliency[:, every_second],
+        )
+
+    return part(0), part(1)
+
+
+def candidates(depth: int) -> tuple[Cue, ...]:
+    """Return the cues to choose from, not inverted: every map of one pair, then means over neighbouring pairs."""
+
+    def found() -> Iterator[Cue]:
+        for count in range(1, _MOST_NEIGHBOURS + 1):
+            for kind in KINDS:
+                if count > 1 and kind.statistic == "std":  # is made of the averaged Gram map, not of averaged maps
+                    continue
+                for first in range(depth - count + 1):
+                    layers = tuple(range(first, first + count))
+                    place = f"layer{first}" if count == 1 else f"layers{first}to{layers[-1]}"
+                    yield dataclasses.replace(kind, name=f"{place}_{kind.name}", layers=layers)
+
+    return tuple(found())
+
+
+def _check_truth(name: str, half: Sweep) -> None:
+    for kind, value in (("dynamic", DYNAMIC), ("static", STATIC)):
+        if not (half.truth == value).any():
+            raise InputError(
+                f"the {len(half.truth)} clips of the {name} half have no {kind} token; "
+                "take clips in which some patches move and others do not"
+            )
+
+
+def _term(sweep: Sweep, gram: Gram, cue: Cue) -> Float32[np.ndarray, "N S P"]:
+    plain = sweep.map(gram, cue)
+    return 1 - plain if cue.inverted else plain
+
+
+def _product(sweep: Sweep, gram: Gram, cues: Sequence[Cue]) -> Float32[np.ndarray, "N S P"]:
+    """The product of maps that the method normalises only at its end."""
+    product = np.ones(sweep.truth.shape, np.float32)
+    for cue in cues:
+        product = product * _term(sweep, gram, cue)
+    return product
+
+
+def _product_auc(product: Float32[np.ndarray, "N S P"], truth: Int8[np.ndarray, "N S P"]) -> float:
+    return token_auc(np.asarray(normalise(jnp.asarray(product))), truth)

@@ -1,0 +1,136 @@
+"""Writing a calibration as files.
+
+In the folder:
+
+    model.safetensors       the model with the chosen table in its configuration; load_model reads it
+    sweep.png               how well each pair's maps tell what moves, the chosen ones outlined
+    calibration.json        the numbers: sweep, choice, clips; written last, so its presence says that all is whole
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from PIL import Image
+
+from vggtjax.calibration.choice import Choice, Rating, Step, halves
+from vggtjax.calibration.heatmap import draw_sweep
+from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, UNCLEAR, Sweep
+from vggtjax.checkpoint import Model, save_model
+from vggtjax.errors import OutputError
+from vggtjax.files import staging
+
+FORMAT = "vggtjax calibration"
+VERSION = 1
+NUMBERS, MODEL, PICTURE = "calibration.json", "model.safetensors", "sweep.png"
+_MOST_BYTES = 2**24  # of an earlier calibration.json
+
+
+def save_calibration(
+    folder: str | Path, model: Model, sweep: Sweep, choice: Choice, *, source: Mapping[str, Any] | None = None
+) -> Path:
+    """Write the calibrated model, the numbers and the picture; return the model's path.
+
+    Args:
+        folder: made if missing; an earlier calibration in it is replaced.
+        model: the one that was swept.
+        sweep: what `sweep` returned.
+        choice: what `choose` returned.
+        source: plain values that say where the clips are from, for calibration.json.
+
+    Raises:
+        OutputError: the folder cannot be written, or holds files of our names that are no earlier calibration.
+    """
+    folder = Path(folder)
+    check_folder(folder)
+    auc = sweep.auc()
+    config = dataclasses.replace(model.config, motion=choice.motion)
+    numbers = calibration_numbers(model, sweep, choice, auc) | {"source": dict(source or {})}
+    with staging(folder) as staged:
+        save_model(staged / MODEL, model.params, config, name=model.name or None)
+        Image.fromarray(draw_sweep(auc, choice, title=model.name)).save(staged / PICTURE)
+        (staged / NUMBERS).write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        (folder / NUMBERS).unlink(missing_ok=True)
+        for name in (MODEL, PICTURE, NUMBERS):
+            (staged / name).replace(folder / name)
+    return folder / MODEL
+
+
+def check_folder(folder: Path) -> None:
+    """Make sure that a calibration can be saved in `folder`, before it is made; OutputError as `save_calibration`."""
+    taken = [name for name in (NUMBERS, MODEL, PICTURE) if os.path.lexists(folder / name)]
+    if taken and not _is_calibration(folder / NUMBERS):
+        raise OutputError(
+            f"{folder / taken[0]} exists and is not part of an earlier calibration, so it is not replaced; "
+            "choose another folder or move it away"
+        )
+    new = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
+    with staging(folder):
+        pass
+    for parent in new:
+        parent.rmdir()
+
+
+def calibration_numbers(
+    model: Model, sweep: Sweep, choice: Choice, auc: Float64[np.ndarray, "G C L"]
+) -> dict[str, Any]:
+    """Return the content of calibration.json: plain values, areas under the ROC curve in [0, 1]."""
+    calibration, held_out = halves(sweep)
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "model": model.summary(),
+        "clips": {
+            "shape": {"frames": sweep.truth.shape[1], "patches": sweep.truth.shape[2]},
+            "calibration": _counts(calibration),
+            "held_out": _counts(held_out),
+        },
+        "choice": {
+            "gram": choice.gram,
+            "motion": dataclasses.asdict(choice.motion),
+            "steps": [_step(step) for step in choice.steps],
+            "refused": None if choice.refused is None else _step(choice.refused),
+        },
+        "default_table": {"motion": dataclasses.asdict(sweep.table), "auc": _rating(choice.table)},
+        "sweep": [
+            {
+                "gram": gram,
+                "rows": kind.rows,
+                "columns": kind.columns,
+                "statistic": kind.statistic,
+                "auc_of_layers": [round(float(value), 6) for value in auc[g, c]],  # on all clips
+            }
+            for g, gram in enumerate(GRAMS)
+            for c, kind in enumerate(KINDS)
+        ],
+    }
+
+
+def _step(step: Step) -> dict[str, Any]:
+    return {"cue": dataclasses.asdict(step.cue), "auc": _rating(step.rating)}
+
+
+def _rating(rating: Rating) -> dict[str, float]:
+    return {name: round(value, 6) for name, value in rating._asdict().items()}
+
+
+def _counts(half: Sweep) -> dict[str, int]:
+    kinds = {"dynamic_tokens": DYNAMIC, "static_tokens": STATIC, "ignored_tokens": UNCLEAR}
+    return {"clips": len(half.truth)} | {name: int((half.truth == value).sum()) for name, value in kinds.items()}
+
+
+def _is_calibration(path: Path) -> bool:
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            return False
+        numbers = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(numbers, dict) and numbers.get("format") == FORMAT

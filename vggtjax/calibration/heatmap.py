@@ -1,0 +1,89 @@
+"""The sweep as a picture: one cell per map, coloured by how well it tells what moves."""
+
+from __future__ import annotations
+
+import numpy as np
+from cmap import Colormap
+from jaxtyping import Float64, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from vggtjax.calibration.choice import Choice
+from vggtjax.calibration.sweep import GRAMS, KINDS, kind_index
+
+_COLORS = (
+    (Colormap("colorbrewer:RdBu_r").lut(256)[:, :3] * 255).round().astype(np.uint8)
+)  # blue below one half, red above
+_BACKGROUND, _TEXT, _FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)
+_DARK, _OUTLINE = (20, 20, 24), (30, 200, 90)
+_CELL, _GAP, _MARGIN = (46, 30), 26, 24  # width and height; between the similarities; around everything
+_LABEL_WIDTH, _HEADER_HEIGHT, _LINE, _LEGEND = 150, 96, 22, (256, 12)
+_COLUMNS = (_MARGIN, 600, 700)  # left edges of the table below the cells
+_LEAST_WIDTH = 800  # pixels; what the title, the legend and that table need
+_MOST_LETTERS = 32  # of the title
+_LEAST_REACH = 0.1  # of the colours from one half, so that noise looks pale
+
+
+def draw_sweep(auc: Float64[np.ndarray, "G C L"], choice: Choice, *, title: str = "") -> UInt8[np.ndarray, "H W 3"]:
+    """Draw areas under the ROC curve: rows are similarity, Gram map and statistic, columns are pairs.
+
+    The chosen cues are outlined and numbered in the order of choice; one over several pairs spans their columns.
+    """
+    G, C, L = auc.shape
+    reach = max(float(np.abs(auc - 0.5).max()), _LEAST_REACH)
+    left, top = _MARGIN + _LABEL_WIDTH, _MARGIN + _HEADER_HEIGHT
+    bottom = top + G * (C * _CELL[1] + _GAP)
+    width = max(left + L * _CELL[0], _LEAST_WIDTH) + _MARGIN
+    sheet = Image.new("RGB", (width, bottom + (len(choice.steps) + 2) * _LINE + _MARGIN), _BACKGROUND)
+    draw = ImageDraw.Draw(sheet)
+    large, small, tiny = (ImageFont.load_default(size) for size in (22, 15, 12))
+    title = title if len(title) <= _MOST_LETTERS else f"{title[: _MOST_LETTERS - 1]}…"
+    draw.text((_MARGIN, _MARGIN), f"Motion cues of {title or 'the model'}", _TEXT, large)
+    draw.text((_MARGIN, _MARGIN + 32), "area under the ROC curve of every pair's map against what moves", _FAINT, small)
+    _draw_legend(sheet, draw, small, reach, width)
+
+    for layer in range(L):
+        draw.text((left + (layer + 0.5) * _CELL[0], top - 8), str(layer), _FAINT, small, "ms")
+    draw.text((left - 12, top - 8), "pair", _FAINT, small, "rs")
+    for g, c, layer in np.ndindex(G, C, L):
+        x, y = left + layer * _CELL[0], _row(top, g, c)
+        value = float(auc[g, c, layer])
+        color = _COLORS[round(255 * (0.5 + (value - 0.5) / (2 * reach)))]
+        draw.rectangle((x, y, x + _CELL[0] - 2, y + _CELL[1] - 2), tuple(color.tolist()))
+        ink = _DARK if color.mean() > 110 else _TEXT
+        draw.text((x + _CELL[0] / 2 - 1, y + _CELL[1] / 2 - 1), f"{value:.2f}", ink, tiny, "mm")
+        if layer == 0:
+            text = f"{GRAMS[g]}  {(KINDS[c].rows + KINDS[c].columns).upper()} {KINDS[c].statistic}"
+            draw.text((left - 12, y + _CELL[1] / 2), text, _TEXT, small, "rm")
+
+    for number, step in enumerate(choice.steps, 1):
+        x = left + step.cue.layers[0] * _CELL[0]
+        y = _row(top, GRAMS.index(choice.gram), kind_index(step.cue))
+        right = x + len(step.cue.layers) * _CELL[0]
+        draw.rectangle((x - 2, y - 2, right, y + _CELL[1]), outline=_OUTLINE, width=3)
+        draw.rectangle((x - 2, y - 2, x + 10, y + 12), _OUTLINE)
+        draw.text((x + 4, y + 5), str(number), _DARK, tiny, "mm")
+    heading = f"Chosen for {choice.gram} similarity; AUC of the product of each cue and those above it"
+    rows = [(heading, ("calibration", "held-out half"), _FAINT)]
+    rated = [
+        (f"{number}  {step.cue.name}{'  (1 - m)' if step.cue.inverted else ''}", step.rating, _TEXT)
+        for number, step in enumerate(choice.steps, 1)
+    ]
+    for name, (calibration, held_out), ink in (*rated, ("default table", choice.table, _FAINT)):
+        rows.append((name, (f"{calibration:.3f}", f"{held_out:.3f}"), ink))
+    for number, (name, values, ink) in enumerate(rows):
+        for text, x in zip((name, *values), _COLUMNS, strict=True):
+            draw.text((x, bottom + number * _LINE), text, ink, small)
+    return np.asarray(sheet)
+
+
+def _row(top: int, g: int, c: int) -> int:
+    return top + g * (len(KINDS) * _CELL[1] + _GAP) + c * _CELL[1]
+
+
+def _draw_legend(sheet: Image.Image, draw: ImageDraw.ImageDraw, font, reach: float, width: int) -> None:
+    x, y = width - _MARGIN - _LEGEND[0], _MARGIN + 6
+    sheet.paste(Image.fromarray(_COLORS[None]).resize(_LEGEND), (x, y))
+    for share, anchor in ((0, "la"), (0.5, "ma"), (1, "ra")):
+        text = f"{0.5 + (share - 0.5) * 2 * reach:.2f}"
+        draw.text((x + share * _LEGEND[0], y + _LEGEND[1] + 4), text, _FAINT, font, anchor)
+    draw.text((x + _LEGEND[0], y + _LEGEND[1] + 24), "below 0.5 the inverted map, 1 - m, tells it", _FAINT, font, "ra")

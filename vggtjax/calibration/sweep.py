@@ -1,0 +1,202 @@
+"""Every pair's motion maps on clips whose moving pixels are known, and how well each map tells them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Float32, Float64, Int, Int8
+
+from vggtjax.config import Cue, Gram, MotionConfig, VGGTConfig
+from vggtjax.errors import DeviceMemoryError, InputError
+from vggtjax.evaluation.masks import auc
+from vggtjax.motion import GramCues, Sums, normalise
+from vggtjax.network.layers import Params
+from vggtjax.network.model import forward
+
+GRAMS: tuple[Gram, ...] = ("cosine", "dot")
+_GRAM_MAPS: tuple[tuple[Literal["q", "k"], Literal["q", "k"]], ...] = (("q", "q"), ("k", "k"), ("q", "k"))
+_STATISTICS: tuple[Literal["mean", "std"], ...] = ("mean", "std")
+KINDS = tuple(
+    Cue(f"{rows}{columns}_{statistic}", rows, columns, (0,), statistic)
+    for rows, columns in _GRAM_MAPS
+    for statistic in _STATISTICS
+)
+STATIC, DYNAMIC, UNCLEAR = 0, 1, -1
+
+Progress = Callable[[int, int | None], object]
+
+
+class Sweep(NamedTuple):
+    """The maps of every pair over clips, and the truth. G counts `GRAMS`, C `KINDS`, L pairs, N clips."""
+
+    maps: Float32[np.ndarray, "G C L N S P"]  # before they are normalised, so that neighbouring pairs can be averaged
+    truth: Int8[np.ndarray, "N S P"]  # STATIC, DYNAMIC or UNCLEAR
+    table: MotionConfig  # what a chosen table is compared with: the default cues, the model's own offsets
+    table_saliency: Float32[np.ndarray, "G N S P"]
+
+    @property
+    def depth(self) -> int:
+        """Number of pairs."""
+        return self.maps.shape[2]
+
+    def map(self, gram: Gram, cue: Cue) -> Float32[np.ndarray, "N S P"]:
+        """Return a cue's map as `GramCues` makes it: averaged over its layers, min-max normalised per frame.
+
+        Raises InputError for a std over several layers: it is no average of the maps of each.
+        """
+        if cue.statistic == "std" and len(cue.layers) > 1:
+            raise InputError(f"cue '{cue.name}' is a std over layers {cue.layers}; a sweep knows those of one layer")
+        maps = self.maps[GRAMS.index(gram), kind_index(cue)]
+        return np.asarray(normalise(jnp.asarray(sum(maps[layer] for layer in cue.layers) / len(cue.layers))))
+
+    def auc(self) -> Float64[np.ndarray, "G C L"]:
+        """Return each map's area under the ROC curve over all clips; of the inverted map it is 1 minus that."""
+        result = np.empty(self.maps.shape[:3])
+        for place in np.ndindex(result.shape):
+            result[place] = token_auc(np.asarray(normalise(jnp.asarray(self.maps[place]))), self.truth)
+        return result
+
+
+@dataclass(frozen=True)
+class SweepCues(GramCues):
+    """The cues of `KINDS` of every pair by itself, next to those of a table, for both similarities: all in one pass.
+
+    `measured` reads the sums; `maps`, `saliency` and `gram` do not apply.
+    """
+
+    def zeros(self, B: int, S: int, P: int) -> Sums:
+        """Return empty sums: the number of pairs added, the maps of every pair, the table's sums per similarity."""
+        every = jnp.zeros((len(GRAMS), len(KINDS), self.depth, B, S, P))
+        tables = [total for cues in self._tables() for total in cues.zeros(B, S, P)]
+        return (jnp.zeros((), jnp.int32), every, *tables)
+
+    def add(
+        self, sums: Sums, counts: Int[Array, " cues"], q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
+    ) -> Sums:
+        """Put the maps of the next pair in their place, and add it to the table's sums."""
+        pair, every, *_ = sums
+        single = MotionConfig(KINDS, self.motion.offsets, reference_depth=1)
+        made = [
+            jnp.stack(cues.add(cues.zeros(*q.shape[:3]), jnp.ones(len(KINDS), int), q, k))
+            for cues in (GramCues(single, 1, gram) for gram in GRAMS)
+        ]
+        every = every.at[:, :, pair].set(jnp.stack(made))
+        tables = [
+            total
+            for cues, totals in zip(self._tables(), self._split(sums), strict=True)
+            for total in cues.add(totals, counts, q, k)
+        ]
+        return (pair + 1, every, *tables)
+
+    def measured(self, sums: Sums) -> tuple[Float[Array, "G C L B S P"], Float[Array, "G B S P"]]:
+        """Return the maps of every pair, not normalised, and the table's saliency."""
+        tables = zip(self._tables(), self._split(sums), strict=True)
+        return sums[1], jnp.stack([cues.saliency(totals) for cues, totals in tables])
+
+    def _tables(self) -> list[GramCues]:
+        return [GramCues(self.motion, self.depth, gram) for gram in GRAMS]
+
+    def _split(self, sums: Sums) -> list[Sums]:
+        count = len(self.motion.cues)
+        return [sums[2 + g * count :][:count] for g in range(len(GRAMS))]
+
+
+def sweep(
+    params: Params,
+    clips: Iterable[tuple[Float[np.ndarray, "S H W 3"], Bool[np.ndarray, "S H W"]]],
+    config: VGGTConfig,
+    *,
+    progress: Progress | None = None,
+    total: int | None = None,
+) -> Sweep:
+    """Measure the maps of every pair on clips of known truth.
+
+    One clip at a time is on the device. The maps stay on the host: 48 x depth bytes for every token of every clip.
+
+    Args:
+        params: the model's parameter tree.
+        clips: pictures, RGB in [0, 1], and their dynamic pixels; all clips of one shape.
+        config: the model's configuration.
+        progress: called with the clips done and `total`.
+        total: number of clips, if it is known.
+
+    Raises:
+        InputError: fewer than two clips or two frames, shapes that do not fit, or a model that gives no numbers.
+        DeviceMemoryError: a clip does not fit.
+    """
+    default = MotionConfig()
+    table = dataclasses.replace(config.motion, cues=default.cues, reference_depth=default.reference_depth)
+    cues = SweepCues(table, config.depth)
+    maps, saliencies, truths, shapes = [], [], [], []
+    for done, (images, mask) in enumerate(clips, 1):
+        shapes.append(tuple(images.shape))
+        _check_clip(shapes, tuple(mask.shape))
+        truths.append(token_truth(np.asarray(mask), config.patch_size))
+        try:
+            made, saliency = jax.device_get(_measure(params, jnp.asarray(images)[None], config, cues))
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            S, H, W, _ = shapes[0]
+            raise DeviceMemoryError(
+                f"{S} frames of {W} x {H} pixels do not fit in the memory of the device; take fewer frames or a "
+                "smaller size"
+            ) from error
+        if not np.isfinite(made).all():
+            raise InputError("the model's motion maps are not finite; its weights cannot be calibrated")
+        maps.append(made[..., 0, :, :])
+        saliencies.append(saliency[:, 0])
+        if progress is not None:
+            progress(done, total)
+    if len(maps) < 2:
+        raise InputError(f"{len(maps)} clips; expected at least two, one to choose the cues and one to confirm them")
+    return Sweep(np.stack(maps, axis=3), np.stack(truths), table, np.stack(saliencies, axis=1))
+
+
+def kind_index(cue: Cue) -> int:
+    """Return the place in `KINDS` of a cue's Gram map and statistic."""
+    return [(kind.rows, kind.columns, kind.statistic) for kind in KINDS].index((cue.rows, cue.columns, cue.statistic))
+
+
+def token_truth(mask: Bool[np.ndarray, "S H W"], patch_size: int) -> Int8[np.ndarray, "S P"]:
+    """Return DYNAMIC for patches at least half of whose pixels move, STATIC where none does, else UNCLEAR."""
+    if mask.ndim != 3 or mask.dtype != bool or mask.shape[1] % patch_size or mask.shape[2] % patch_size:
+        raise InputError(
+            f"a mask has shape {mask.shape} and type {mask.dtype}; expected bool [S, H, W] with H and W multiples of "
+            f"the patch size {patch_size}"
+        )
+    S, H, W = mask.shape
+    share = mask.reshape(S, H // patch_size, patch_size, W // patch_size, patch_size).mean(axis=(2, 4)).reshape(S, -1)
+    return np.where(share >= 0.5, DYNAMIC, np.where(share == 0, STATIC, UNCLEAR)).astype(np.int8)
+
+
+def token_auc(values: Float[np.ndarray, "N S P"], truth: Int8[np.ndarray, "N S P"]) -> float:
+    """Return the area under the ROC curve over all tokens together, without the unclear ones."""
+    known = truth != UNCLEAR
+    return float(auc(values[known], truth[known] == DYNAMIC))
+
+
+@partial(jax.jit, static_argnames=("config", "cues"))
+def _measure(
+    params: Params, images: Float[Array, "B S H W 3"], config: VGGTConfig, cues: SweepCues
+) -> tuple[Float[Array, "G C L B S P"], Float[Array, "G B S P"]]:
+    sums = forward(params, images, config, outputs=(), cues=cues).cue_sums
+    return cues.measured(sums or ())
+
+
+def _check_clip(shapes: list[tuple[int, ...]], mask_shape: tuple[int, ...]) -> None:
+    shape = shapes[-1]
+    if len(shape) != 4 or shape[0] < 2 or mask_shape != shape[:3]:
+        raise InputError(
+            f"a clip has pictures of shape {shape} and a mask of shape {mask_shape}; expected [S, H, W, 3] and "
+            "[S, H, W] with at least two frames"
+        )
+    if shape != shapes[0]:
+        raise InputError(f"a clip has shape {shape}, the first one {shapes[0]}; expected clips of one shape")

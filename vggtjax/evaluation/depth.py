@@ -1,0 +1,106 @@
+"""Depth up to scale against the truth, in float64 on the host. Does not import jax."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from vggtjax.errors import InputError
+
+DELTA = 1.25
+
+
+class DepthErrors(NamedTuple):
+    """AbsRel, the mean of |d - g| / g, and delta1, the share of pixels with max(d / g, g / d) < 1.25."""
+
+    abs_rel: float
+    delta1: float
+
+
+def median_scale(
+    predicted: Float[np.ndarray, "*S H W"],
+    truth: Float[np.ndarray, "*S H W"],
+    valid: Bool[np.ndarray, "*S H W"] | None = None,
+) -> float:
+    """Return the factor that takes a clip's predicted depth to the truth: the median of truth / predicted.
+
+    Args:
+        predicted: depth up to scale, above 0.
+        truth: depth; a value that is not above 0 and finite is not measured and never counts.
+        valid: pixels to use; all that are measured if None.
+
+    Raises:
+        InputError: shapes that differ, no pixel to use, or a predicted depth that is not above 0 and finite on one.
+    """
+    predicted, truth = _used(predicted, truth, valid)
+    return float(np.median(truth / predicted))
+
+
+def depth_errors(
+    predicted: Float[np.ndarray, "*S H W"],
+    truth: Float[np.ndarray, "*S H W"],
+    valid: Bool[np.ndarray, "*S H W"] | None = None,
+    *,
+    scale: float | None = None,
+) -> DepthErrors:
+    """Return AbsRel and delta1 of a clip after one scale for all its frames.
+
+    Args:
+        predicted, truth, valid: as for `median_scale`.
+        scale: factor to put on `predicted`; `median_scale` of the same pixels if None. Give the whole clip's scale
+            to see how well a part of it is placed among the rest.
+
+    Raises:
+        InputError: as `median_scale`.
+    """
+    predicted, truth = _used(predicted, truth, valid)
+    scaled = predicted * (float(np.median(truth / predicted)) if scale is None else scale)
+    close = np.maximum(scaled / truth, truth / scaled) < DELTA
+    return DepthErrors(float((np.abs(scaled - truth) / truth).mean()), float(close.mean()))
+
+
+def measured(truth: Float[np.ndarray, "*S H W"]) -> Bool[np.ndarray, "*S H W"]:
+    """Return where a depth is there: finite and above 0."""
+    truth = np.asarray(truth)
+    return np.isfinite(truth) & (truth > 0)
+
+
+def mean_depth_map(clips: Float[np.ndarray, "N S H W"]) -> Float64[np.ndarray, "H W"]:
+    """Return the mean depth of every pixel over the frames of all clips: a guess that sees no image.
+
+    Broadcast to a clip's frames, it goes through the same alignment as a prediction. Depths that are not measured
+    do not count.
+
+    Raises:
+        InputError: another number of axes than 4, or a pixel that is measured nowhere.
+    """
+    clips = np.asarray(clips)
+    if clips.ndim != 4:
+        raise InputError(f"depths have shape {clips.shape}; expected clips [N, S, H, W]")
+    there = measured(clips)
+    counts = there.sum(axis=(0, 1))
+    if not counts.all():
+        raise InputError(f"{int((counts == 0).sum())} pixels have no depth in any frame; expected one at least in each")
+    return np.where(there, clips, 0).sum(axis=(0, 1), dtype=np.float64) / counts
+
+
+def _used(predicted, truth, valid) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+    """Return the depths of the pixels that count."""
+    predicted, truth = np.asarray(predicted), np.asarray(truth)
+    if predicted.shape != truth.shape:
+        raise InputError(f"predicted depth has shape {predicted.shape} and the truth {truth.shape}; expected the same")
+    used = measured(truth)
+    if valid is not None:
+        valid = np.asarray(valid)
+        if valid.shape != truth.shape or valid.dtype != bool:
+            raise InputError(
+                f"valid pixels have shape {valid.shape} and type {valid.dtype}; expected {truth.shape} of bool"
+            )
+        used &= valid
+    if not used.any():
+        raise InputError("no pixel has a true depth; nothing can be compared")
+    if (wrong := int((~measured(predicted[used])).sum())) > 0:
+        raise InputError(f"{wrong} predicted depths are not finite and above 0; expected all of them to be")
+    return predicted[used].astype(np.float64), truth[used].astype(np.float64)

@@ -1,0 +1,225 @@
+"""The ladder of methods on clips with exact truth: every method, with the mined mask and with the true one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from vggtjax.checkpoint import Model
+from vggtjax.config import Gram, MotionConfig, Suppress
+from vggtjax.errors import InputError
+from vggtjax.evaluation.depth import depth_errors, measured, median_scale
+from vggtjax.evaluation.masks import auc, jaccard
+from vggtjax.evaluation.trajectory import centre_error, rotation_error
+from vggtjax.evaluation.truth import ClipTruth, Truth, batched_truth
+from vggtjax.mask import dynamic_pixels, upsample
+from vggtjax.methods import METHODS, find_method
+from vggtjax.network.backbone import encode
+from vggtjax.passes import Passes, assemble, first_pass, second_pass
+
+MaskSource = Literal["mined", "true"]
+Progress = Callable[[int, int], object]
+
+
+@dataclass(frozen=True)
+class LadderRow:
+    """What one method scores on one clip.
+
+    A value is None where the truth leaves it undefined (no dynamic pixels, nothing that moves) or where it could not
+    be computed, which `failure` then explains. Mask source, pairs and suppression are None for a method without a
+    second pass.
+    """
+
+    clip: int  # index in the batch
+    method: str
+    mask_source: MaskSource | None
+    mask_pairs: int | None
+    suppress: Suppress | None
+    abs_rel: float | None  # of depth, after one median scale per clip, which the two below share
+    abs_rel_static: float | None
+    abs_rel_dynamic: float | None
+    delta1: float | None
+    rotation_error: float | None  # degrees, mean over frames, relative to frame 0
+    centre_error: float | None  # RMSE after Sim(3), in the truth's unit
+    centre_error_ratio: float | None  # the same over the clip's median true depth
+    saliency_auc: float | None  # of the first pass, over pixels
+    mask_jaccard: float | None  # of the mask that the second pass was given
+    failure: str = ""
+
+
+class _Scene(NamedTuple):
+    """One clip's truth and what the first pass says of its motion."""
+
+    clip: int
+    truth: Truth
+    saliency: Float[np.ndarray, "S H W"]
+
+
+class _Setting(NamedTuple):
+    """How the second pass was run, and with which mask (of one clip)."""
+
+    source: MaskSource | None = None
+    pairs: int | None = None
+    suppress: Suppress | None = None
+
+
+_encode = jax.jit(encode, static_argnames=("config", "compute_dtype"))
+_first_pass = jax.jit(first_pass, static_argnames=("config", "gram", "motion", "compute_dtype"))
+_second_pass = jax.jit(second_pass, static_argnames=("config", "suppress", "compute_dtype"))  # one for all mask_pairs
+_dynamic_pixels = jax.jit(dynamic_pixels, static_argnames=("size",))
+_upsample = jax.jit(upsample, static_argnames=("size",))
+_assemble = jax.jit(assemble, static_argnames=("method",))
+
+
+def ladder(
+    model: Model,
+    truth: ClipTruth,
+    *,
+    methods: Sequence[str] = tuple(METHODS),
+    masks: Sequence[MaskSource] = ("mined", "true"),
+    mask_pairs: Sequence[int] = (5,),
+    suppress: Sequence[Suppress] = ("zero",),
+    gram: Gram = "cosine",
+    motion: MotionConfig | None = None,
+    compute_dtype: str = "float32",
+    batch_size: int = 4,
+    progress: Progress | None = None,
+) -> list[LadderRow]:
+    """Score methods on clips of one shape; features and first pass are computed once per clip.
+
+    Args:
+        model: the network.
+        truth: clips with exact truth, [S, ...] or [B, S, ...]; height and width are multiples of the patch size.
+        methods: names of `METHODS`. One without a second pass gives one row per clip, any other one for each
+            combination of the three that follow.
+        masks: "mined" from the first pass, or "true": the truth's own, which bounds what any mining can reach.
+        mask_pairs: numbers of pairs in which the keys of dynamic tokens are suppressed.
+        suppress: how they are; the methods' own choice is not read.
+        gram, motion, compute_dtype: as for `first_pass`.
+        batch_size: clips that go through the network together.
+        progress: called with the passes done and their number.
+
+    Returns:
+        Rows in the order of clips, then mask, pairs, suppression and method, methods without a second pass first.
+
+    Raises:
+        InputError: an unknown name, or shapes that do not fit. What a model's odd prediction makes impossible is no
+            error: the row says so.
+    """
+    truth = batched_truth(truth)
+    rows = [find_method(method) for method in methods]
+    if unknown := [source for source in masks if source not in ("mined", "true")]:
+        raise InputError(f"masks has {unknown}; expected 'mined' or 'true'")
+    if unknown := [how for how in suppress if how not in ("zero", "drop")]:
+        raise InputError(f"suppress has {unknown}; expected 'zero' or 'drop'")
+    if wrong := [pairs for pairs in mask_pairs if pairs != int(pairs) or pairs < 0]:
+        raise InputError(f"mask_pairs has {wrong}; expected whole numbers of at least 0")
+    if batch_size < 1:
+        raise InputError(f"batch_size is {batch_size}; expected at least 1")
+    plain = [name for name, row in zip(methods, rows, strict=True) if not row.needs_second_pass]
+    masked = [name for name, row in zip(methods, rows, strict=True) if row.needs_second_pass]
+    settings = list(product(masks, mask_pairs, suppress)) if masked else []
+
+    config, size = model.config, truth.images.shape[2:4]
+    network = {"config": config, "compute_dtype": compute_dtype}
+    found: list[LadderRow] = []
+    batches = list(_batches(len(truth.images), batch_size))
+    done, total = 0, len(batches) * (1 + len(settings))
+
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress(done, total)
+
+    for clips, padded in batches:
+        images = jnp.asarray(truth.images[padded], jnp.float32)
+        patch_tokens = _encode(model.params, images, **network)
+        first, saliency = _first_pass(model.params, images, patch_tokens, gram=gram, motion=motion, **network)
+        dynamic = {"mined": _dynamic_pixels(saliency, size), "true": jnp.asarray(truth.dynamic_mask[padded])}
+        pixels = np.asarray(_upsample(saliency, size))
+        scenes = [_Scene(clip, Truth(*(a[clip] for a in truth)), pixels[i]) for i, clip in enumerate(clips)]
+        passes = Passes(first, None, saliency, dynamic["mined"])
+        found += _scored(passes, plain, scenes, _Setting())
+        advance()
+        for source, pairs, how in settings:
+            mask = dynamic[source]
+            masking = {"suppress": how, "mask_pairs": pairs}
+            second = _second_pass(model.params, images, patch_tokens, mask, **masking, **network)
+            both = passes._replace(second=second, dynamic_mask=mask)
+            found += _scored(both, masked, scenes, _Setting(source, pairs, how))
+            advance()
+    return sorted(found, key=lambda row: row.clip)
+
+
+def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the clips of each batch, and the same filled up with the last one, so that all have one shape."""
+    size = min(size, count)
+    for start in range(0, count, size):
+        indices = np.arange(start, start + size)
+        yield indices[indices < count], np.minimum(indices, count - 1)
+
+
+def _scored(passes: Passes, methods: Sequence[str], scenes: list[_Scene], setting: _Setting) -> Iterator[LadderRow]:
+    mask = np.asarray(passes.dynamic_mask)
+    for method in methods:
+        depth, _, cameras, _ = (np.asarray(leaf) for leaf in jax.tree.leaves(_assemble(passes, method)))
+        for i, scene in enumerate(scenes):
+            yield _row(scene, method, setting, depth[i], cameras[i], mask[i])
+
+
+def _row(
+    scene: _Scene,
+    method: str,
+    setting: _Setting,
+    depth: Float[np.ndarray, "S H W"],
+    camera_from_world: Float[np.ndarray, "S 3 4"],
+    mask: Bool[np.ndarray, "S H W"],
+) -> LadderRow:
+    truth, failures = scene.truth, []
+
+    def attempt(function: Callable[..., Any], *arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except InputError as error:
+            failures.append(str(error))
+            return None
+
+    centres = attempt(centre_error, camera_from_world, truth.camera_from_world)
+    there, dynamic = measured(truth.depth), truth.dynamic_mask
+    distance = float(np.median(truth.depth[there])) if there.any() else None
+    return LadderRow(
+        clip=int(scene.clip),
+        method=method,
+        mask_source=setting.source,
+        mask_pairs=setting.pairs,
+        suppress=setting.suppress,
+        **(attempt(_depth_scores, depth, truth) or dict.fromkeys(_DEPTH_SCORES)),
+        rotation_error=attempt(rotation_error, camera_from_world, truth.camera_from_world),
+        centre_error=centres,
+        centre_error_ratio=None if centres is None or distance is None else centres / distance,
+        saliency_auc=attempt(auc, scene.saliency, dynamic) if dynamic.any() and not dynamic.all() else None,
+        mask_jaccard=None if setting.source is None else jaccard(mask, dynamic),
+        failure="; ".join(failures),
+    )
+
+
+_DEPTH_SCORES = ("abs_rel", "abs_rel_static", "abs_rel_dynamic", "delta1")
+
+
+def _depth_scores(depth: Float[np.ndarray, "S H W"], truth: Truth) -> dict[str, float | None]:
+    scale, there = median_scale(depth, truth.depth), measured(truth.depth)
+    everywhere = depth_errors(depth, truth.depth, scale=scale)
+    regions = {"abs_rel_static": ~truth.dynamic_mask, "abs_rel_dynamic": truth.dynamic_mask}
+    within = {
+        name: depth_errors(depth, truth.depth, region, scale=scale).abs_rel if (region & there).any() else None
+        for name, region in regions.items()
+    }
+    return {"abs_rel": everywhere.abs_rel, "delta1": everywhere.delta1, **within}

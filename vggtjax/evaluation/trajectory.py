@@ -1,0 +1,190 @@
+"""Camera trajectories against the truth: Sim(3) alignment and errors, in float64. Does not import jax."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64
+from scipy.spatial.transform import Rotation
+
+from vggtjax.errors import InputError
+
+FEWEST_POSES = 3  # fewer centres can always be aligned exactly
+_NO_MOTION = 1e-6  # a spread of centres below this share of their distance from the origin is float32's rounding
+_NO_WIDTH = 1e-6  # centres whose second extent is below this share of the first are a line
+_NOT_RIGID = 1e-2  # how far R^T R may be from the identity
+
+
+class Similarity(NamedTuple):
+    """A Sim(3) transform: x -> scale * rotation @ x + translation."""
+
+    scale: float
+    rotation: Float64[np.ndarray, "3 3"]
+    translation: Float64[np.ndarray, " 3"]
+
+    def apply(self, points: Float[np.ndarray, "*N 3"]) -> Float64[np.ndarray, "*N 3"]:
+        """Return the transformed points."""
+        return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
+
+
+class RelativeErrors(NamedTuple):
+    """Errors between consecutive poses: RMSE of the translation in the truth's unit, of the angle in degrees."""
+
+    translation: float
+    rotation: float
+
+
+def centres(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarray, "S 3"]:
+    """Return the camera centres in the world, -R^T t."""
+    poses = checked_poses(camera_from_world)
+    return -np.einsum("sji,sj->si", poses[:, :, :3], poses[:, :, 3])
+
+
+def umeyama_sim3(
+    source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], *, allow_line: bool = False
+) -> Similarity:
+    """Return the similarity that takes `source` to `target` with the least squared error (Umeyama 1991).
+
+    Args:
+        source, target: corresponding points.
+        allow_line: accept points on one line, around which the rotation is arbitrary: one of the equally good ones is
+            returned. Scale and remaining error do not depend on it.
+
+    Raises:
+        InputError: shapes that differ, values that are not finite, fewer than 3 points, points that all coincide, or
+            (unless allowed) points on one line.
+    """
+    source, target = (_points(name, points) for name, points in (("source", source), ("target", target)))
+    if len(source) != len(target):
+        raise InputError(f"source has {len(source)} points and target {len(target)}; expected as many of both")
+    mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
+    left, values, right = np.linalg.svd((target - mean_target).T @ (source - mean_source) / len(source))
+    for name, points, mean in (("source", source, mean_source), ("target", target, mean_target)):
+        extents = np.linalg.svd(points - mean, compute_uv=False)
+        if not moves(points):
+            raise InputError(f"the {len(points)} {name} points all coincide: without motion there is nothing to align")
+        if not allow_line and extents[1] < _NO_WIDTH * extents[0]:
+            raise InputError(f"the {name} points lie on one line, around which no rotation can be found")
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
+    rotation = left @ (signs[:, None] * right)
+    scale = float(values @ signs / ((source - mean_source) ** 2).sum(axis=1).mean())
+    if scale <= 0:
+        raise InputError("source and target points are not correlated: no positive scale takes one to the other")
+    return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+
+
+def align(camera_from_world: Float[np.ndarray, "S 3 4"], similarity: Similarity) -> Float64[np.ndarray, "S 3 4"]:
+    """Return the same cameras in the transformed world: centres and orientations moved, images unchanged."""
+    poses = checked_poses(camera_from_world)
+    rotation = poses[:, :, :3] @ similarity.rotation.T
+    moved = similarity.apply(centres(poses))
+    return np.concatenate([rotation, -np.einsum("sij,sj->si", rotation, moved)[:, :, None]], axis=2)
+
+
+def centre_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray, "S 3 4"]) -> float:
+    """Return the RMSE of the camera centres after Sim(3) alignment, in the truth's unit (ATE).
+
+    Raises:
+        InputError: fewer than 3 poses, or a trajectory that does not move.
+    """
+    return point_error(*_pair_of_centres(predicted, truth))
+
+
+def point_error(predicted: Float[np.ndarray, "N 3"], truth: Float[np.ndarray, "N 3"]) -> float:
+    """Return the RMSE of points after Sim(3) alignment, in the truth's unit; raises as `umeyama_sim3`, lines pass."""
+    aligned = umeyama_sim3(predicted, truth, allow_line=True).apply(predicted)
+    return float(np.sqrt(((aligned - truth) ** 2).sum(axis=1).mean()))
+
+
+def rotation_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray, "S 3 4"]) -> float:
+    """Return the mean angle in degrees between rotations relative to frame 0, over frames 1 to S - 1.
+
+    Both trajectories are expressed relative to their own first frame; nothing is aligned.
+
+    Raises:
+        InputError: fewer than 2 poses, or another number of one than of the other.
+    """
+    predicted, truth = _pair(predicted, truth, 2)
+    return float(np.degrees((from_first(predicted) * from_first(truth).inv()).magnitude().mean()))
+
+
+def from_first(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Rotation:
+    """Return the rotations of frames 1 to S - 1 relative to frame 0: R_i R_0^T."""
+    rotations = _rotations(checked_poses(camera_from_world))
+    return rotations[1:] * rotations[0].inv()
+
+
+def relative_errors(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray, "S 3 4"]) -> RelativeErrors:
+    """Return RTE and RRE: errors of E = (Q_i^-1 Q_i+1)^-1 (P_i^-1 P_i+1), world-from-camera, aligned by Sim(3).
+
+    Every consecutive pair counts once; P is the prediction, aligned by its centres, and Q the truth.
+
+    Raises:
+        InputError: fewer than 3 poses, or a trajectory that does not move.
+    """
+    source, target = _pair_of_centres(predicted, truth)
+    aligned = align(predicted, umeyama_sim3(source, target, allow_line=True))
+    steps = [_steps(poses) for poses in (aligned, checked_poses(truth))]
+    (rotation, translation), (true_rotation, true_translation) = steps
+    apart = true_rotation.inv().apply(translation - true_translation)
+    angles = (true_rotation.inv() * rotation).magnitude()
+    return RelativeErrors(float(np.sqrt((apart**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((angles**2).mean()))))
+
+
+def checked_poses(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarray, "S 3 4"]:
+    """Return poses in float64, or raise InputError where they are not rigid transforms [S, 3, 4]."""
+    poses = np.asarray(camera_from_world, np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (3, 4):
+        raise InputError(f"camera poses have shape {poses.shape}; expected [S, 3, 4]")
+    if not np.isfinite(poses).all():
+        raise InputError("camera poses hold values that are not finite; expected rotations and translations")
+    rotation = poses[:, :, :3]
+    skewed = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2)) > _NOT_RIGID
+    if (wrong := np.flatnonzero(skewed | (np.linalg.det(rotation) < 0))).size:
+        raise InputError(f"the camera pose of frame {wrong[0]} is not a rotation and a translation")
+    return poses
+
+
+def _pair(predicted, truth, fewest: int) -> tuple[Float64[np.ndarray, "S 3 4"], Float64[np.ndarray, "S 3 4"]]:
+    predicted, truth = checked_poses(predicted), checked_poses(truth)
+    if len(predicted) != len(truth):
+        raise InputError(f"{len(predicted)} predicted poses and {len(truth)} true ones; expected as many of both")
+    if len(truth) < fewest:
+        raise InputError(f"a trajectory of {len(truth)} poses; expected at least {fewest}")
+    return predicted, truth
+
+
+def _pair_of_centres(predicted, truth) -> tuple[Float64[np.ndarray, "S 3"], Float64[np.ndarray, "S 3"]]:
+    predicted, truth = (centres(poses) for poses in _pair(predicted, truth, FEWEST_POSES))
+    for name, points in (("predicted", predicted), ("true", truth)):
+        if not moves(points):
+            raise InputError(f"the {name} cameras do not move: their centres cannot be aligned")
+    return predicted, truth
+
+
+def moves(points: Float[np.ndarray, "N 3"]) -> bool:
+    """Return whether points differ by more than rounding."""
+    points = np.asarray(points, np.float64)
+    return bool(np.linalg.norm(points - points.mean(axis=0)) > _NO_MOTION * np.linalg.norm(points))
+
+
+def _steps(camera_from_world: Float64[np.ndarray, "S 3 4"]) -> tuple[Rotation, Float64[np.ndarray, "S-1 3"]]:
+    """Return P_i^-1 P_i+1 of world-from-camera poses P: the next camera as seen from this one."""
+    rotations, positions = _rotations(camera_from_world), centres(camera_from_world)
+    return rotations[:-1] * rotations[1:].inv(), rotations[:-1].apply(np.diff(positions, axis=0))
+
+
+def _rotations(poses: Float64[np.ndarray, "S 3 4"]) -> Rotation:
+    return Rotation.from_matrix(poses[:, :, :3])
+
+
+def _points(name: str, points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3"]:
+    points = np.asarray(points, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"{name} points have shape {points.shape}; expected [N, 3]")
+    if len(points) < FEWEST_POSES:
+        raise InputError(f"{len(points)} {name} points; expected at least {FEWEST_POSES}")
+    if not np.isfinite(points).all():
+        raise InputError(f"{name} points hold values that are not finite")
+    return points

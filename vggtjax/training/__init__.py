@@ -1,0 +1,1 @@
+"""Training on generated scenes: recipe -> batches -> objective -> optimiser -> checkpoints, metrics, a model."""

@@ -1,0 +1,143 @@
+"""Checkpoints of a training run: its whole state, written so that an interrupted write leaves the one before."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import orbax.checkpoint as orbax
+
+from vggtjax.errors import CheckpointError, OutputError, VggtjaxError
+from vggtjax.training.recipe import Recipe
+from vggtjax.training.state import TrainingState
+
+KEPT = 2
+
+_STATE, _RUN = "state", "run"
+
+
+class Restored(NamedTuple):
+    """What a checkpoint holds: the state, the recipe that it was written under, and the loop's own notes."""
+
+    state: TrainingState
+    recipe: Recipe
+    notes: dict[str, Any]
+
+
+def latest(folder: str | Path) -> int | None:
+    """Return the step of the newest whole checkpoint in `folder`; None if there is none."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        return None
+    with _opened(folder) as manager:
+        return manager.latest_step()
+
+
+def save(folder: str | Path, state: TrainingState, recipe: Recipe, notes: dict[str, Any] | None = None) -> None:
+    """Write a checkpoint of a step, and remove all but the newest `KEPT`.
+
+    A checkpoint of this step that is there already is left as it is.
+
+    Args:
+        folder: of this run's checkpoints, made if missing.
+        state: the state to write.
+        recipe: written beside it, as JSON.
+        notes: plain values of JSON to keep with it.
+
+    Raises:
+        OutputError: the folder cannot be written or the disk is full.
+    """
+    folder = Path(folder)
+    step = int(state.step)
+    try:
+        with _opened(folder, create=True) as manager:
+            if step in manager.all_steps():
+                return
+            run = {"recipe": json.loads(recipe.to_json()), "notes": notes or {}}
+            items = {_STATE: orbax.args.StandardSave(state), _RUN: orbax.args.JsonSave(run)}
+            manager.save(step, args=orbax.args.Composite(**items), force=True)
+    except OSError as error:
+        raise OutputError(f"cannot write the checkpoint {folder / str(step)}: {error.strerror or error}") from error
+
+
+def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe, *, step: int | None = None) -> Restored:
+    """Read a checkpoint onto the default device, whatever device it was written from.
+
+    Args:
+        folder: of a run's checkpoints.
+        shapes: the recipe's state as shapes and dtypes (`state_shapes`).
+        recipe: the recipe to go on with. Stages, learning rate or losses may differ from those of the checkpoint.
+        step: of the checkpoint; None for the newest.
+
+    Raises:
+        CheckpointError: there is no checkpoint, it cannot be read, or its state has another form.
+    """
+    folder = Path(folder)
+    step = latest(folder) if step is None else step
+    if step is None:
+        raise CheckpointError(f"{folder} holds no checkpoint of a training run; name the folder of one")
+    place = folder / str(step)
+    device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
+    target = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=device), shapes)
+    with _opened(folder) as manager, _explaining(place):
+        run = manager.restore(step, args=orbax.args.Composite(**{_RUN: orbax.args.JsonRestore()}))[_RUN]
+        written = Recipe.from_json(json.dumps(run["recipe"]))
+        for name, old, new in (
+            ("model", written.model, recipe.model),
+            ("trainable", written.trainable, recipe.trainable),
+            ("untrained", set(written.untrained), set(recipe.untrained)),
+            ("optimiser.kind", written.optimiser.kind, recipe.optimiser.kind),
+        ):
+            if old != new:
+                raise CheckpointError(
+                    f"{place} is a checkpoint of the recipe '{written.name}' with another {name}; choose another "
+                    "folder for this run, or go on with that recipe"
+                )
+        _check_shapes(place, manager.item_metadata(step)[_STATE], shapes)
+        found = manager.restore(step, args=orbax.args.Composite(**{_STATE: orbax.args.StandardRestore(target)}))
+    return Restored(found[_STATE], written, dict(run["notes"]))
+
+
+@contextmanager
+def _opened(folder: Path, *, create: bool = False) -> Iterator[orbax.CheckpointManager]:
+    options = orbax.CheckpointManagerOptions(max_to_keep=KEPT, create=create, enable_async_checkpointing=False)
+    handlers = {_STATE: orbax.StandardCheckpointHandler(), _RUN: orbax.JsonCheckpointHandler()}
+    with orbax.CheckpointManager(folder.resolve(), options=options, item_handlers=handlers) as manager:
+        yield manager
+
+
+@contextmanager
+def _explaining(place: Path) -> Iterator[None]:
+    try:
+        yield
+    except VggtjaxError as error:
+        if isinstance(error, CheckpointError):
+            raise
+        raise CheckpointError(f"{place} cannot be used: {error}") from error
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        text = " ".join(str(error).split())[:300]
+        raise CheckpointError(f"{place} cannot be read as a checkpoint of a training run: {text}") from error
+
+
+def _check_shapes(place: Path, metadata: Any, shapes: TrainingState) -> None:
+    """Compare leaf by leaf, by path: what is stored has lost the types of its containers."""
+
+    def flat(tree: Any) -> dict[str, tuple[int, ...]]:
+        leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+        return {
+            ".".join(str(getattr(k, "key", getattr(k, "idx", getattr(k, "name", k)))) for k in path): tuple(leaf.shape)
+            for path, leaf in leaves
+        }
+
+    stored, wanted = flat(metadata), flat(shapes)
+    wrong = sorted(name for name in stored.keys() | wanted.keys() if stored.get(name) != wanted.get(name))
+    if wrong:
+        name = wrong[0]
+        raise CheckpointError(
+            f"{place} holds the state of another run: {len(wrong)} arrays differ, such as {name}: "
+            f"{stored.get(name, 'missing')}, expected {wanted.get(name, 'none')}"
+        )

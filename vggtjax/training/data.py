@@ -1,0 +1,50 @@
+"""Batches of generated clips: drawn on the device, from one key, as the training run goes."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from vggtjax.scenes.render import SyntheticClip, generate
+from vggtjax.scenes.scene import SceneConfig
+from vggtjax.scenes.textures import Textures
+from vggtjax.training.recipe import Stage
+
+GREY = 0.1  # share of clips without colour
+IN_ORDER = 0.5  # share of clips whose frames stay in the order of time
+
+
+def make_batch(key: Array, textures: Textures, stage: Stage, frames: int) -> SyntheticClip:
+    """Return `stage.batch` clips of `frames` frames: random order of frames, random colours. Pure.
+
+    Args:
+        key: a JAX random key; the same key gives the same batch.
+        textures: the tiles of a split.
+        stage: size, motion and share of dynamic scenes (static).
+        frames: number of frames (static).
+    """
+    config = SceneConfig(
+        height=stage.height, width=stage.width, frames=frames, dynamic=stage.dynamic, motion=stage.motion
+    )
+
+    def one(key: Array) -> SyntheticClip:
+        scene_key, order_key, colour_key = jax.random.split(key, 3)
+        clip = generate(scene_key, textures, config)
+        shuffle_key, coin_key = jax.random.split(order_key)
+        order = jax.random.permutation(shuffle_key, frames)
+        order = jnp.where(jax.random.uniform(coin_key) < IN_ORDER, jnp.arange(frames), order)
+        clip = jax.tree.map(lambda leaf: leaf[order], clip)
+        return clip._replace(images=_recolour(colour_key, clip.images))
+
+    return jax.vmap(one)(jax.random.split(key, stage.batch))
+
+
+def _recolour(key: Array, images: Array) -> Array:
+    """Gain per channel, a gamma, sometimes no colour: the same for all frames of a clip."""
+    draw = jax.random.uniform(key, (5,))
+    grey = images.mean(axis=-1, keepdims=True)
+    images = jnp.where(draw[0] < GREY, grey, images)
+    gamma = jnp.exp(0.5 * (draw[1] - 0.5))
+    gain = jnp.exp(0.3 * (draw[2:] - 0.5))
+    return jnp.clip(jnp.maximum(images, 1e-4) ** gamma * gain[None, None, None], 0, 1)

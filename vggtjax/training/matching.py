@@ -1,0 +1,77 @@
+"""True matches as a target of global attention: it finds correspondence long before the heads' losses would."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from vggtjax.training.truth import Matches
+
+
+class MatchSums(NamedTuple):
+    """Sums over the supervised layers."""
+
+    loss: Float[Array, ""]
+    accuracy: Float[Array, ""]
+
+
+class MatchLoss:
+    """Accumulates, inside the scan over pairs of blocks, how well q and k of the global blocks find true matches.
+
+    Goes in the place of the motion cues (the same methods). The first half of the heads is to attend from every patch to its
+    match in the first frame, among the patches of all frames; the other half to its match in each other frame, among
+    that frame's patches.
+    """
+
+    def __init__(self, matches: Matches, layers: tuple[int, ...], depth: int) -> None:
+        self._matches, self._layers, self._depth = matches, layers, depth
+
+    def layer_counts(self) -> Int[np.ndarray, L]:
+        """Return 1 for the layers that are supervised."""
+        return np.isin(np.arange(self._depth), self._layers).astype(np.int32)
+
+    def zeros(self, B: int, S: int, P: int) -> MatchSums:
+        """Return the sums to start from."""
+        del B, S, P
+        return MatchSums(jnp.zeros(()), jnp.zeros(()))
+
+    def add(
+        self, sums: MatchSums, supervised: Int[Array, ""], q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
+    ) -> MatchSums:
+        """Add a layer's loss if it is supervised; a real branch, so that other layers cost nothing."""
+
+        @jax.checkpoint  # else the scan keeps room for the logits of every layer
+        def layer(sums: MatchSums, q: Array, k: Array) -> MatchSums:
+            loss, accuracy = match_loss(self._matches, q, k)
+            return MatchSums(sums.loss + loss / len(self._layers), sums.accuracy + accuracy / len(self._layers))
+
+        return jax.lax.cond(supervised > 0, layer, lambda sums, q, k: sums, sums, q, k)
+
+
+def match_loss(
+    matches: Matches, q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the cross-entropy of attention against true matches, and the share of patches whose match is found."""
+    B, S, P, N, D = q.shape
+    half = N // 2
+    logits = jnp.einsum("brpnd,bsjnd->bnrpsj", q, k) / D**0.5
+    first = jax.nn.log_softmax(logits[:, :half].reshape(B, half, S, P, S * P), axis=-1)
+    to_first = matches.patch[:, :, 0]  # [B, R, P]; frame 0 comes first, so the index is that of the key
+    weight = matches.visible[:, :, 0].at[:, 0].set(False)
+    picked = jnp.take_along_axis(first, to_first[:, None, :, :, None], axis=-1)[..., 0].mean(axis=1)  # [B, R, P]
+    loss = -_mean(picked, weight)
+
+    each = jax.nn.log_softmax(logits[:, half:].mean(axis=1), axis=-1)  # [B, R, P, S, P]
+    index = matches.patch.swapaxes(2, 3)  # [B, R, P, S]
+    other = matches.visible.swapaxes(2, 3) & ~jnp.eye(S, dtype=bool)[None, :, None, :]
+    picked = jnp.take_along_axis(each, index[..., None], axis=-1)[..., 0]
+    found = jnp.argmax(each, axis=-1) == index
+    return loss - _mean(picked, other), _mean(found.astype(jnp.float32), other)
+
+
+def _mean(values: Array, weight: Array) -> Float[Array, ""]:
+    return (values * weight).sum() / jnp.maximum(weight.sum(), 1)

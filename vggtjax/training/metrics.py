@@ -1,0 +1,180 @@
+"""The numbers of a training run: averages per interval in metrics.csv, and their curves in metrics.png."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vggtjax.errors import InputError, OutputError
+from vggtjax.files import writing
+
+Row = dict[str, float]
+
+COLUMNS = ("step", "stage", "seconds", "samples")  # of every row, before the metrics
+COMPARED = {  # metric -> what it has to beat, the value of predicting no motion
+    "rotation_error": "rotation_identity",
+    "centre_error": "centre_identity",
+}
+
+_LABELS = {
+    "rotation_error": "rotation error (degrees)",
+    "rotation_identity": "identity",
+    "centre_error": "centre error",
+    "centre_identity": "identity",
+}
+_OPTIMISATION = ("learning_rate", "grad_norm")
+_LOG = ("loss", "error", "probe", "grad_norm", "learning_rate")  # names with one of these get a log axis
+_MOST_BYTES = 1 << 28
+
+
+@dataclass
+class Averages:
+    """Means of metrics since the last row. Plain numbers, which go into a checkpoint and come back unchanged."""
+
+    sums: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def add(self, metrics: Mapping[str, float], *, finite_only: bool = False) -> None:
+        """Take in one step's metrics; of a step that was skipped, only the finite ones."""
+        for name, value in metrics.items():
+            if finite_only and not math.isfinite(value):
+                continue
+            self.sums[name] = self.sums.get(name, 0.0) + float(value)
+            self.counts[name] = self.counts.get(name, 0) + 1
+
+    def take(self) -> Row:
+        """Return the means and start again."""
+        row = {name: self.sums[name] / self.counts[name] for name in self.sums}
+        self.sums, self.counts = {}, {}
+        return row
+
+
+class MetricsFile:
+    """metrics.csv of a run: a row is appended at a time; the header grows when a new metric comes up."""
+
+    def __init__(self, path: str | Path, *, last_step: int) -> None:
+        """Open the file of a run that goes on from `last_step`: rows past it are dropped, as they will come again."""
+        self.path = Path(path)
+        self.rows = [row for row in read_metrics(self.path) if row["step"] <= last_step] if self.path.exists() else []
+        self.names = _header(self.rows)
+        self._write_all()
+
+    def append(self, row: Row) -> None:
+        """Add a row: the columns `COLUMNS` and any metrics."""
+        self.rows.append(row)
+        names = _header([*self.rows[-1:]], self.names)
+        if names != self.names:
+            self.names = names
+            self._write_all()
+            return
+        try:
+            with self.path.open("a", newline="", encoding="utf-8") as file:
+                csv.writer(file).writerow(_cells(row, self.names))
+        except OSError as error:
+            raise OutputError(f"cannot write {self.path}: {error.strerror or error}") from error
+
+    def _write_all(self) -> None:
+        with writing(self.path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(self.names)
+            writer.writerows(_cells(row, self.names) for row in self.rows)
+
+
+def read_metrics(path: str | Path) -> list[Row]:
+    """Read metrics.csv; a last line that was cut short is left out.
+
+    Raises InputError for a file that cannot be read or is none of these.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{path} is {path.stat().st_size} bytes; expected the metrics of a training run")
+        with path.open(newline="", encoding="utf-8") as file:
+            lines = list(csv.reader(file))
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error):
+        raise InputError(f"{path} is not a table of text; expected the metrics of a training run") from None
+    if not lines or tuple(lines[0][: len(COLUMNS)]) != COLUMNS:
+        raise InputError(f"{path} does not begin with the columns {COLUMNS}; expected the metrics of a training run")
+    rows: list[Row] = []
+    for number, line in enumerate(lines[1:], start=2):
+        try:
+            if len(line) != len(lines[0]):
+                raise ValueError
+            row = {name: float(cell) for name, cell in zip(lines[0], line, strict=True) if cell}
+            row |= {name: int(row[name]) for name in ("step", "stage", "samples")}
+        except (ValueError, KeyError, OverflowError):
+            if number == len(lines):  # the machine stopped while it was written
+                break
+            raise InputError(f"{path} has a line {number} that is not a row of numbers") from None
+        rows.append(row)
+    return rows
+
+
+def plot(table: str | Path, picture: str | Path) -> None:
+    """Draw the curves of metrics.csv as a PNG: losses, errors against what predicting no motion gives, the rest.
+
+    Raises InputError for a table that cannot be read, OutputError where the picture cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = read_metrics(table)
+    panels = _panels([name for name in _header(rows) if name not in COLUMNS])
+    columns = min(3, max(len(panels), 1))
+    height = -(-max(len(panels), 1) // columns)
+    figure = Figure(figsize=(5 * columns, 3.4 * height), layout="constrained")
+    FigureCanvasAgg(figure)
+    for index, (title, names) in enumerate(panels):
+        axes = figure.add_subplot(height, columns, index + 1)
+        for name in names:
+            points = [(row["step"], row[name]) for row in rows if math.isfinite(row.get(name, math.nan))]
+            style = "--" if name in COMPARED.values() else "-"
+            axes.plot(
+                [x for x, _ in points],
+                [y for _, y in points],
+                style,
+                label=_LABELS.get(name, name),
+                marker="." if len(points) < 3 else None,
+            )
+        values = [row[name] for row in rows for name in names if math.isfinite(row.get(name, math.nan))]
+        if values and min(values) > 0 and any(part in names[0] for part in _LOG):
+            axes.set_yscale("log")
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel("step")
+        axes.grid(visible=True, which="both", alpha=0.25)
+        axes.legend(fontsize=8)
+    with writing(picture) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+
+
+def _panels(names: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Group metrics: losses, probes, an error with what it has to beat; every other one is by itself."""
+    losses = [name for name in names if "loss" in name]
+    panels = [("losses", losses)] if losses else []
+    for name, reference in COMPARED.items():
+        pair = [found for found in (name, reference) if found in names]
+        if pair:
+            panels.append((f"{_LABELS[name]}, against no motion", pair))
+    probes = [name for name in names if name.startswith("probe_")]
+    panels += [("probes", probes)] if probes else []
+    grouped = {name for _, group in panels for name in group} | set(_OPTIMISATION)
+    panels += [(name.replace("_", " "), [name]) for name in names if name not in grouped]
+    return panels + [(name.replace("_", " "), [name]) for name in _OPTIMISATION if name in names]
+
+
+def _header(rows: Sequence[Row], start: Sequence[str] = COLUMNS) -> list[str]:
+    """Return `start` and the names of the rows' metrics after it, in the order in which they came up."""
+    names: dict[str, Any] = dict.fromkeys(start)
+    for row in rows:
+        names |= dict.fromkeys(row)
+    return list(names)
+
+
+def _cells(row: Row, names: Sequence[str]) -> list[str]:
+    return [repr(row[name]) if name in row else "" for name in names]

@@ -1,0 +1,215 @@
+"""The training objective: VGGT's losses, and supervision that finds geometry across frames from little data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from vggtjax.config import VGGTConfig
+from vggtjax.network.aggregator import SPECIAL_TOKENS, aggregate
+from vggtjax.network.backbone import encode, patch_grid
+from vggtjax.network.camera_head import predict_pose
+from vggtjax.network.dpt_head import predict_dense, project_tap
+from vggtjax.network.layers import LayerNorm, Params, apply
+from vggtjax.network.model import DENSE_HEADS
+from vggtjax.network.pose import quaternion_to_matrix
+from vggtjax.network.precision import full_precision
+from vggtjax.scenes.render import SyntheticClip
+from vggtjax.training.matching import MatchLoss
+from vggtjax.training.truth import Matches, Targets, matches, targets
+
+PATCH_PROBE = 6  # position in the first frame (2), logarithm of depth (1), point in the first camera's frame (3)
+CAMERA_PROBE = 7  # translation (3), quaternion (4)
+CONFIDENCE = 0.2  # weight of the logarithm of confidence, as in VGGT
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weights of the terms; a term of weight 0 is not computed.
+
+    Attributes:
+        translation, rotation, field_of_view: L1 or Huber distance of the pose encoding's parts.
+        huber: half width of the quadratic zone of the camera loss; 0 for L1.
+        depth, points: confidence-weighted L1 of the dense heads; `gradient` is the share of the gradient term.
+        match: cross-entropy of attention in `match_layers` against true matches.
+        probe: linear read-outs of the tapped tokens (positions, depths, points, poses); their parameters serve training alone.
+    """
+
+    translation: float = 1.0
+    rotation: float = 5.0
+    field_of_view: float = 1.0
+    huber: float = 0.0
+    depth: float = 1.0
+    points: float = 1.0
+    gradient: float = 1.0
+    match: float = 0.0
+    match_layers: tuple[int, ...] = (1, 2, 3)
+    probe: float = 0.0
+
+
+def init_probes(seed: int, config: VGGTConfig) -> Params:
+    """Return the parameters of the linear read-outs of the taps: zero, so that they start by saying nothing."""
+    del seed
+    E, taps = config.camera_dim, len(config.taps)
+    return {
+        "patch": {"kernel": jnp.zeros((taps, E, PATCH_PROBE)), "bias": jnp.zeros((taps, PATCH_PROBE))},
+        "camera": {"kernel": jnp.zeros((taps, E, CAMERA_PROBE)), "bias": jnp.zeros((taps, CAMERA_PROBE))},
+    }
+
+
+@full_precision
+def objective(
+    trained: Params,
+    batch: SyntheticClip,
+    config: VGGTConfig,
+    weights: LossWeights,
+    *,
+    compute_dtype: str = "float32",
+    remat: bool = False,
+) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
+    """Return the loss of a batch of clips and what to log.
+
+    Args:
+        trained: {"model": the model's parameters, "probes": what `init_probes` returned}.
+        batch: clips of equal size, with a batch axis.
+        config: the model's configuration.
+        weights: of the terms (static).
+        compute_dtype: of the blocks' matrix products.
+        remat: compute the activations of encoder, aggregator and dense heads again in the backward pass.
+    """
+    model, probes = trained["model"], trained["probes"]
+    images = batch.images
+    grid = patch_grid(images, config)
+    truth = targets(batch)
+    paired = matches(batch, config.patch_size)
+    dense = [name for name, weight in (("depth", weights.depth), ("points", weights.points)) if weight]
+    matching = MatchLoss(paired, weights.match_layers, config.depth) if weights.match else None
+
+    def capture(slot: int):
+        @jax.checkpoint  # else the scan keeps room for this in every layer
+        def kept(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
+            patches = tokens[:, :, SPECIAL_TOKENS:]
+            found = {name: project_tap(model[DENSE_HEADS[name]], patches, slot, config) for name in dense}
+            if weights.probe:
+                found |= {
+                    "patch_probe": _probe(probes["patch"], slot, patches),
+                    "camera_probe": _probe(probes["camera"], slot, tokens[:, :, 0]),
+                }
+            return found
+
+        return kept
+
+    def network(model: Params):
+        tokens = encode(model, images, config, compute_dtype=compute_dtype)
+        return aggregate(
+            model,
+            tokens,
+            config,
+            grid,
+            captures=[capture(slot) for slot in range(len(config.taps))],
+            cues=matching,  # type: ignore[arg-type]
+            compute_dtype=compute_dtype,
+        )
+
+    camera_tokens, taps, sums = (jax.checkpoint(network) if remat else network)(model)
+    pose = predict_pose(model, camera_tokens, config)
+    terms = _camera_terms(pose, truth.pose_encoding, weights)
+    metrics = _camera_metrics(pose, truth.pose_encoding)
+    for name in dense:
+        predict = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4)) if remat else predict_dense
+        values, confidence = predict(model[DENSE_HEADS[name]], [tap[name] for tap in taps], config, grid, name)
+        goal = truth.depth[..., None] if name == "depth" else truth.points
+        terms[name] = getattr(weights, name) * dense_loss(values, confidence, goal, weights.gradient)
+        if name == "depth":
+            metrics["depth_error"] = _depth_error(values[..., 0], truth.depth)
+            metrics["confidence"] = confidence.mean()
+    if weights.match:
+        terms["match"] = weights.match * sums.loss
+        metrics["match_accuracy"] = sums.accuracy
+    if weights.probe:
+        found = _probe_terms(taps, truth, paired, config.patch_size)
+        terms["probe"] = weights.probe * sum(found.values())
+        metrics |= {f"probe_{name}": value for name, value in found.items()}
+    loss = sum(terms.values(), start=jnp.zeros(()))
+    return loss, {"loss": loss} | {f"loss_{name}": value for name, value in terms.items()} | metrics
+
+
+def dense_loss(
+    values: Float[Array, "B S H W V"],
+    confidence: Float[Array, "B S H W"],
+    truth: Float[Array, "B S H W V"],
+    gradient: float,
+) -> Float[Array, ""]:
+    """Return VGGT's dense loss: the error weighted by confidence, minus its logarithm, and that of image gradients."""
+    error = jnp.linalg.norm(values - truth, axis=-1) if values.shape[-1] > 1 else jnp.abs(values - truth)[..., 0]
+    loss = (confidence * error - CONFIDENCE * jnp.log(confidence)).mean()
+    for axis in (2, 3) if gradient else ():
+        step = jnp.diff(values, axis=axis) - jnp.diff(truth, axis=axis)
+        kept = jax.lax.slice_in_dim(confidence, 1, None, axis=axis)
+        loss = loss + gradient * (kept * jnp.abs(step).mean(axis=-1)).mean()
+    return loss
+
+
+def _camera_terms(pose: Array, truth: Array, weights: LossWeights) -> dict[str, Array]:
+    error = jnp.abs(pose - truth)
+    if weights.huber:
+        error = jnp.where(error < weights.huber, error**2 / (2 * weights.huber), error - weights.huber / 2)
+    parts = {"translation": np.s_[:3], "rotation": np.s_[3:7], "field_of_view": np.s_[7:]}
+    return {name: getattr(weights, name) * error[..., part].sum(axis=-1).mean() for name, part in parts.items()}
+
+
+def _camera_metrics(pose: Array, truth: Array) -> dict[str, Array]:
+    """Errors against the truth, next to those of a camera that does not move: the honest sign of geometry."""
+    rotation, right = (quaternion_to_matrix(x[:, 1:, 3:7]) for x in (pose, truth))
+    relative = rotation @ quaternion_to_matrix(pose[:, :1, 3:7]).swapaxes(-1, -2)
+    centre = -jnp.einsum("bsji,bsj->bsi", rotation, pose[:, 1:, :3])
+    right_centre = -jnp.einsum("bsji,bsj->bsi", right, truth[:, 1:, :3])
+    return {
+        "rotation_error": _angle(relative, right),
+        "rotation_identity": _angle(jnp.broadcast_to(jnp.eye(3), right.shape), right),
+        "centre_error": jnp.linalg.norm(centre - right_centre, axis=-1).mean(),
+        "centre_identity": jnp.linalg.norm(right_centre, axis=-1).mean(),
+    }
+
+
+def _angle(a: Float[Array, "B S 3 3"], b: Float[Array, "B S 3 3"]) -> Float[Array, ""]:
+    """Mean angle between rotations, in degrees."""
+    chord = jnp.sqrt(jnp.sum((a - b) ** 2, axis=(-1, -2)))  # 2 sqrt(2) sin(angle / 2)
+    return jnp.rad2deg(2 * jnp.arcsin(jnp.clip(chord / 8**0.5, 0, 1))).mean()
+
+
+def _depth_error(depth: Float[Array, "B S H W"], truth: Float[Array, "B S H W"]) -> Float[Array, ""]:
+    """Mean absolute relative error after alignment of every clip's medians."""
+    ratio = (jnp.log(truth) - jnp.log(depth)).reshape(depth.shape[0], -1)
+    scale = jnp.exp(jnp.median(ratio, axis=-1))[:, None, None, None]
+    return (jnp.abs(scale * depth - truth) / truth).mean()
+
+
+def _probe(params: Params, slot: int, tokens: Float[Array, "... E"]) -> Float[Array, "... F"]:
+    normed = apply(LayerNorm(use_bias=False, use_scale=False), {}, tokens)
+    return jnp.einsum("...e,ef->...f", normed, params["kernel"][slot]) + params["bias"][slot].reshape(
+        (1,) * (tokens.ndim - 1) + (-1,)
+    )
+
+
+def _probe_terms(taps, truth: Targets, paired: Matches, patch_size: int) -> dict[str, Array]:
+    B, S = truth.depth.shape[:2]
+    middle = slice(patch_size // 2, None, patch_size)
+    depth = jnp.log(truth.depth[:, :, middle, middle]).reshape(B, S, -1)
+    points = truth.points[:, :, middle, middle].reshape(B, S, -1, 3)
+    position = paired.position[:, :, 0]  # [B, R, P, 2]
+    seen = paired.visible[:, :, 0][..., None]
+    found = {"position": jnp.zeros(()), "depth": jnp.zeros(()), "points": jnp.zeros(()), "camera": jnp.zeros(())}
+    for tap in taps:
+        patch, camera = tap["patch_probe"], tap["camera_probe"]
+        away = jnp.abs(patch[..., :2] - position) * seen
+        found["position"] += away.sum() / jnp.maximum(2 * seen.sum(), 1)
+        found["depth"] += jnp.abs(patch[..., 2] - depth).mean()
+        found["points"] += jnp.abs(patch[..., 3:] - points).mean()
+        off = jnp.abs(camera - truth.pose_encoding[..., :7])
+        found["camera"] += off[..., :3].mean() + 5 * off[..., 3:].mean()
+    return {name: value / len(taps) for name, value in found.items()}

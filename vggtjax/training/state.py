@@ -1,0 +1,163 @@
+"""The state of a training run, and one step of it as a pure function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax.traverse_util import flatten_dict
+from jaxtyping import Array, Float, Int
+
+from vggtjax.checkpoint import flat_shapes, problems_sentence
+from vggtjax.errors import CheckpointError
+from vggtjax.network.layers import Params
+from vggtjax.network.model import init_params, parameter_shapes
+from vggtjax.training.optimiser import join, make_optimiser, make_schedule, split
+from vggtjax.training.recipe import Recipe
+
+Objective = Callable[..., tuple[Float[Array, ""], dict[str, Float[Array, ""]]]]
+Metrics = dict[str, Float[Array, ""]]
+
+
+class TrainingState(NamedTuple):
+    """Everything that a step reads and replaces."""
+
+    step: Int[Array, ""]  # steps done
+    trained: Params  # {"model": ..., "probes": ...}
+    ema: Params  # exponential moving average of the parameters that are optimised
+    optimiser: Any
+    skipped: Int[Array, ""]  # steps whose loss or gradient was not finite: they changed nothing
+
+
+def initial_state(recipe: Recipe, probes: Params, init: Params | None = None) -> TrainingState:
+    """Return the state before the first step, in float32.
+
+    Args:
+        recipe: the run's recipe.
+        probes: parameters that serve the objective alone.
+        init: the model's parameters to start from; None for random ones.
+
+    Raises:
+        CheckpointError: `init` does not have the shapes of the recipe's model.
+    """
+    if init is None:
+        init = init_params(recipe.seed, recipe.model)
+    else:
+        _check(init, recipe)
+    # Copies: a step consumes its state, and whoever gave the parameters keeps them.
+    trained = jax.tree.map(lambda leaf: jnp.array(leaf, jnp.float32), {"model": init, "probes": probes})
+    moving, _ = split(trained, recipe)
+    ema = jax.tree.map(jnp.copy, moving)
+    return TrainingState(jnp.int32(0), trained, ema, make_optimiser(recipe).init(moving), jnp.int32(0))
+
+
+def state_shapes(recipe: Recipe, probes: Params) -> TrainingState:
+    """Return shapes and dtypes of a recipe's state without making its arrays; of `probes` only the shapes are read."""
+    return jax.eval_shape(
+        lambda model, probes: initial_state(recipe, probes, model), parameter_shapes(recipe.model), probes
+    )
+
+
+def loss_and_gradient(trained: Params, batch: Any, recipe: Recipe, objective: Objective) -> tuple[Metrics, Params]:
+    """Return the objective's metrics with the loss, and its gradient by the parameters that are optimised.
+
+    Args:
+        trained: {"model": ..., "probes": ...}.
+        batch: what the objective takes: clips [B, S, ...].
+        recipe: the run's recipe (static under jit).
+        objective: (trained, batch, config, weights, *, compute_dtype, remat) -> loss, metrics (static under jit).
+    """
+    moving, frozen = split(trained, recipe)
+
+    def loss_of(moving: Params):
+        return objective(
+            join(moving, frozen),
+            batch,
+            recipe.model,
+            recipe.losses,
+            compute_dtype=compute_dtype(recipe),
+            remat=recipe.remat,
+        )
+
+    (loss, metrics), gradient = jax.value_and_grad(loss_of, has_aux=True)(moving)
+    return {**metrics, "loss": loss}, gradient
+
+
+def apply_gradient(
+    state: TrainingState, gradient: Params, metrics: Metrics, recipe: Recipe
+) -> tuple[TrainingState, Metrics]:
+    """Update the state by a gradient; pure, for `jax.jit` with the state donated.
+
+    A step whose loss or gradient norm is not finite leaves parameters, averages and optimiser as they are, and counts
+    as skipped. The average forgets with min(ema_decay, (1 + t) / (10 + t)) after t updates, so that it leaves its start
+    behind early.
+
+    Args:
+        state: what the last step returned.
+        gradient: by the parameters that are optimised.
+        metrics: with the loss.
+        recipe: the run's recipe (static under jit).
+
+    Returns:
+        The next state; and the metrics, in float32, with grad_norm (before clipping), learning_rate and skipped (1 for
+        a step that was skipped, else 0).
+    """
+    norm = optax.tree.norm(gradient)
+    finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(norm)
+    moving, frozen = split(state.trained, recipe)
+    updates, optimiser_state = make_optimiser(recipe).update(gradient, state.optimiser, moving)
+    moved = jax.tree.map(jnp.add, moving, updates)
+    done = state.step - state.skipped  # updates before this one
+    decay = jnp.minimum(recipe.optimiser.ema_decay, (1 + done) / (10 + done))
+    ema = jax.tree.map(lambda average, new: decay * average + (1 - decay) * new, state.ema, moved)
+
+    def kept(new: Any, old: Any) -> Any:
+        return jax.tree.map(lambda new, old: jnp.where(finite, new, old), new, old)
+
+    skipped = 1 - finite.astype(jnp.int32)
+    next_state = TrainingState(
+        step=state.step + 1,
+        trained=join(kept(moved, moving), frozen),
+        ema=kept(ema, state.ema),
+        optimiser=kept(optimiser_state, state.optimiser),
+        skipped=state.skipped + skipped,
+    )
+    rate = make_schedule(recipe.optimiser, recipe.total_steps)(done)
+    found = {**metrics, "grad_norm": norm, "learning_rate": rate, "skipped": skipped}
+    return next_state, {name: jnp.asarray(value, jnp.float32) for name, value in found.items()}
+
+
+def train_step(state: TrainingState, batch: Any, recipe: Recipe, objective: Objective) -> tuple[TrainingState, Metrics]:
+    """Do one step of training: `loss_and_gradient`, then `apply_gradient`. Pure."""
+    metrics, gradient = loss_and_gradient(state.trained, batch, recipe, objective)
+    return apply_gradient(state, gradient, metrics, recipe)
+
+
+def exported(state: TrainingState, recipe: Recipe) -> Params:
+    """Return the model's averaged parameters."""
+    _, frozen = split(state.trained, recipe)
+    return join(state.ema, frozen)["model"]
+
+
+def compute_dtype(recipe: Recipe) -> str:
+    """Return the dtype of the blocks' matrix products: "auto" is bfloat16 on a GPU and float32 elsewhere."""
+    if recipe.compute_dtype != "auto":
+        return recipe.compute_dtype
+    return "bfloat16" if jax.default_backend() == "gpu" else "float32"
+
+
+def _check(params: Mapping[str, Any], recipe: Recipe) -> None:
+    flat: dict[str, Any] = flatten_dict(params, sep=".")
+    shapes = flat_shapes(recipe.model)
+    problems = [f"missing parameter {name}" for name in shapes if name not in flat]
+    problems += [f"unknown parameter {name}" for name in flat if name not in shapes]
+    problems += [
+        f"mis-shaped parameter {name}: {list(flat[name].shape)}, expected {list(shape)}"
+        for name, shape in shapes.items()
+        if name in flat and flat[name].shape != shape
+    ]
+    if problems:
+        raise CheckpointError(problems_sentence("the parameters to start from do not fit the recipe's model", problems))
