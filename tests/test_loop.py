@@ -68,6 +68,7 @@ def test_time_spent_rendering_is_measured(tmp_path):
 def test_interrupted_after_every_step_gives_the_same_numbers(straight, tmp_path):
     """Also in the middle of an interval that a row averages over, and between stages."""
     whole, out, _ = straight
+    part = whole
     for step in range(1, 7):
         part = train(SHORT, tmp_path, log_every=2, stop_after=0.0, **PARTS)
         assert int(part.state.step) == step
@@ -127,7 +128,7 @@ def test_bad_steps_are_skipped_and_counted(tmp_path):
         return jnp.where(jax.random.uniform(key) < 0.5, jnp.nan, batch)
 
     recipe = dataclasses.replace(PROBES, stages=(Stage(12, 1, (2,), 28, 28),))
-    outcome = train(recipe, tmp_path, log_every=6, **(PARTS | {"make_batch": sometimes}))
+    outcome = train(recipe, tmp_path, log_every=6, **{**PARTS, "make_batch": sometimes})
     rows = read_metrics(tmp_path / "metrics.csv")
     skipped = int(outcome.state.skipped)
     assert 0 < skipped < 12
@@ -139,7 +140,7 @@ def test_bad_steps_are_skipped_and_counted(tmp_path):
 def test_a_run_that_only_skips_ends(tmp_path):
     recipe = dataclasses.replace(PROBES, stages=(Stage(MOST_SKIPPED + 50, 1, (2,), 28, 28),))
     with pytest.raises(VggtjaxError, match="50 steps in a row up to step 50 had a loss or gradient"):
-        train(recipe, tmp_path, **(PARTS | {"textures": jnp.float32(np.nan)}))
+        train(recipe, tmp_path, **{**PARTS, "textures": jnp.float32(np.nan)})
 
 
 def test_a_start_is_read_once(tmp_path):

@@ -55,7 +55,7 @@ def test_bad_input(recipe, tmp_path, monkeypatch):
         ({"checkpoint_seconds": -1.0}, "checkpoint_seconds is -1.0"),
     ):
         with pytest.raises(InputError, match=says):
-            command.train(recipe, tmp_path / "out", **values)
+            command.train(recipe, tmp_path / "out", **values)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="cannot read"):
         command.train(tmp_path / "none.json", tmp_path / "out")
     with pytest.raises(CheckpointError):

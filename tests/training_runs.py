@@ -1,6 +1,7 @@
 """A training run small enough for tests: a tiny model, and an objective that pulls it towards the batch."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,4 +58,9 @@ def objective(trained, batch, config, weights, *, compute_dtype, remat):
     return loss, {"colour_loss": colour_loss, "pose_loss": pose_loss}
 
 
-PARTS = {"textures": jnp.float32(1), "make_batch": make_batch, "init_probes": init_probes, "objective": objective}
+PARTS: dict[str, Any] = {
+    "textures": jnp.float32(1),
+    "make_batch": make_batch,
+    "init_probes": init_probes,
+    "objective": objective,
+}

@@ -211,7 +211,7 @@ def sample_scene(key: Array, tiles: int, config: SceneConfig) -> Scene:
     half_height = half_height.at[0].set(1.8 * tall)
     hung = dice(0.0, 1.0, count) < jnp.where(np.arange(count) == 0, 0.0, 0.25)
     height = jnp.where(hung, dice(-0.35, 0.1, count) * distance, floor - half_height)
-    position = jnp.stack([-radius * jnp.sin(angle + azimuth), height, radius * jnp.cos(angle + azimuth)], axis=-1)
+    position = jnp.stack([radius * jnp.sin(angle + azimuth), height, -radius * jnp.cos(angle + azimuth)], axis=-1)
     tilt = _rotation_y(dice(-jnp.pi, jnp.pi, K)) @ _rotation_x(
         jnp.where(jnp.asarray(hung)[objects], dice(-1.0, 1.0, K), 0.0)
     )

@@ -74,8 +74,8 @@ def train(
     """Train a model, or go on from the newest checkpoint in `out`.
 
     The batch of a step depends on the recipe and the step alone, so a run that was interrupted gives the numbers of one
-    that was not. SIGINT and SIGTERM end the run after the step at hand, with a checkpoint; a second SIGINT ends it at
-    once.
+    that was not (on a GPU as far as its sums have a fixed order: XLA_FLAGS=--xla_gpu_deterministic_ops=true).
+    SIGINT and SIGTERM end the run after the step at hand, with a checkpoint; a second SIGINT ends it at once.
 
     Args:
         recipe: what to train, on what, and how.

@@ -148,7 +148,8 @@ def plot(table: str | Path, picture: str | Path) -> None:
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("step")
         axes.grid(visible=True, which="both", alpha=0.25)
-        axes.legend(fontsize=8)
+        if len(names) > 1:
+            axes.legend(fontsize=7)
     with writing(picture) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
 

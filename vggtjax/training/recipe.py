@@ -13,8 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.model import HEADS
@@ -145,7 +143,7 @@ class Recipe:
         if type(steps) is not int or steps < 1:
             raise InputError(f"steps is {steps!r}; expected a whole number above 0")
         total = self.total_steps
-        ends = np.cumsum([0, *(stage.steps for stage in self.stages)]).tolist()
+        ends = list(itertools.accumulate((stage.steps for stage in self.stages), initial=0))
         lengths = [end * steps // total - start * steps // total for start, end in itertools.pairwise(ends)]
         pairs = zip(self.stages, lengths, strict=True)
         stages = tuple(dataclasses.replace(stage, steps=length) for stage, length in pairs if length)
