@@ -1,3 +1,6 @@
+from .held_out import Hardness as Hardness
+from .held_out import hardness as hardness
+from .held_out import held_out_scenes as held_out_scenes
 from .render import Surface as Surface
 from .render import SyntheticClip as SyntheticClip
 from .render import cast as cast

@@ -34,8 +34,8 @@ class SyntheticClip(NamedTuple):
 class Surface(NamedTuple):
     """What rays hit first."""
 
-    depth: Float[Array, "P"]
-    part_ids: Int[Array, "P"]
+    depth: Float[Array, " P"]
+    part_ids: Int[Array, " P"]
     point: Float[Array, "3 P"]
     colour: Float[Array, "3 P"]
 
@@ -149,7 +149,7 @@ def _intervals(scene: Scene, config: SceneConfig, poses, origin, direction):
     return first, (jnp.concatenate([n for _, n, _ in leave]), jnp.concatenate([f for *_, f in leave]))
 
 
-def _shaded(scene: Scene, config: SceneConfig, poses, point, light) -> Bool[Array, "P"]:
+def _shaded(scene: Scene, config: SceneConfig, poses, point, light) -> Bool[Array, " P"]:
     """Whether a part stands between each point and the light."""
     _, (near, far) = _intervals(scene, config, poses, point, light)
     return ((jnp.maximum(near, 0) + _SELF) < jnp.minimum(far, 1)).any(axis=0)
@@ -197,12 +197,12 @@ def _albedo(textures: Textures, material, local, normal, width, direction, world
     return jnp.clip(gain * (0.5 + contrast[None] * (colour - 0.5)), 0.02, 1)
 
 
-def _dot(a: Float[Array, "3 *P"], b: Float[Array, "3 *P"]) -> Float[Array, "*P"]:
-    """Sum over the leading axis of three, written out: as a reduction, XLA's CPU compiler (jax 0.10) fuses it wrongly."""
+def _dot(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Float[Array, "..."]:
+    """Sum over the leading axis, written out: as a reduction, XLA's CPU compiler (jax 0.10) fuses it wrongly."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _one_hot(index: Int[Array, "P"], count: int) -> Float[Array, "N P"]:
+def _one_hot(index: Int[Array, " P"], count: int) -> Float[Array, "N P"]:
     return (index[None] == jnp.arange(count, dtype=index.dtype)[:, None]).astype(jnp.float32)
 
 

@@ -109,15 +109,13 @@ class Wave(NamedTuple):
     phase: Float[Array, "... C"]
 
     def at(self, time: Float[Array, ""]) -> Float[Array, "... C"]:
-        return self.slope * (time - 0.5) + self.amplitude * jnp.sin(
-            2 * jnp.pi * self.frequency * time + self.phase
-        )
+        return self.slope * (time - 0.5) + self.amplitude * jnp.sin(2 * jnp.pi * self.frequency * time + self.phase)
 
 
 class Camera(NamedTuple):
     """A hand-held camera that looks at a wandering point: azimuth, elevation, log distance, roll; target; shake."""
 
-    start: Float[Array, "4"]
+    start: Float[Array, 4]
     orbit: Wave
     target: Wave
     shake: Wave
@@ -129,19 +127,19 @@ class Scene(NamedTuple):
     """All that a clip is drawn from. Metres, y down; the point of interest is the origin."""
 
     size: Float[Array, "K 3"]
-    present: Bool[Array, "K"]
-    moving: Bool[Array, "O"]
+    present: Bool[Array, " K"]
+    moving: Bool[Array, " O"]
     position: Float[Array, "O 3"]
-    heading: Float[Array, "O"]
+    heading: Float[Array, " O"]
     path: Wave  # of each object, [O, 4]: position and heading
     joint: Float[Array, "K 3"]  # of each part, in its object's frame
     arm: Float[Array, "K 3"]  # from the joint to the part's centre
     swing: Wave  # angle of each part about its joint, [K, 1]
     tilt: Float[Array, "K 3 3"]  # fixed rotation of each part
-    room_low: Float[Array, "3"]
-    room_high: Float[Array, "3"]
+    room_low: Float[Array, 3]
+    room_high: Float[Array, 3]
     material: Float[Array, "M 12"]  # parts, then the room's faces
-    light: Float[Array, "3"]
+    light: Float[Array, 3]
     ambient: Float[Array, ""]
     camera: Camera
     exposure: Wave  # of the three channels, logarithm
@@ -226,7 +224,9 @@ def sample_scene(key: Array, tiles: int, config: SceneConfig) -> Scene:
     position = jnp.where(moving[:, None], jnp.stack([centre[:, 0], height, centre[:, 1]], axis=-1), position)
     hop = jnp.where(hung, 0.08 * distance, 0.03 * distance) * dice(0.0, 1.0, count)
     amplitude = jnp.stack([reach[:, 0], hop, reach[:, 1], dice(0.0, 0.6, count)], axis=-1)
-    slope = jnp.concatenate([distance * dice(-0.25, 0.25, count, 3) * np.array([[1, 0, 1]]), dice(-2.0, 2.0, count, 1)], -1)
+    slope = jnp.concatenate(
+        [distance * dice(-0.25, 0.25, count, 3) * np.array([[1, 0, 1]]), dice(-2.0, 2.0, count, 1)], -1
+    )
     frequency = dice(0.3, 1.3, count, 4) * np.array([[1, 2, 1, 1]])
     path = Wave(slope, amplitude, frequency, dice(-jnp.pi, jnp.pi, count, 4))
     path = Wave(*(jnp.where(moving[:, None], part, 0) for part in path))
@@ -282,7 +282,7 @@ def part_poses(scene: Scene, config: SceneConfig, time: Float[Array, ""]) -> tup
     return rotation @ scene.tilt, centre
 
 
-def camera_pose(camera: Camera, time: Float[Array, ""]) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+def camera_pose(camera: Camera, time: Float[Array, ""]) -> tuple[Float[Array, "3 3"], Float[Array, 3]]:
     """Return world_from_camera at a time: rotation (columns right, down, forward) and centre."""
     azimuth, elevation, log_distance, roll = camera.start + camera.orbit.at(time)
     distance = camera.distance * jnp.exp(log_distance)
@@ -315,9 +315,7 @@ def _camera(dice: _Dice, distance: Array, azimuth: Array, config: SceneConfig) -
         dice(0.4, 1.2, 3),
         dice(-jnp.pi, jnp.pi, 3),
     )
-    shake = Wave(
-        jnp.zeros(3), moving * distance * dice(0.0, 0.012, 3), dice(2.0, 5.0, 3), dice(-jnp.pi, jnp.pi, 3)
-    )
+    shake = Wave(jnp.zeros(3), moving * distance * dice(0.0, 0.012, 3), dice(2.0, 5.0, 3), dice(-jnp.pi, jnp.pi, 3))
     start = jnp.stack([azimuth, dice(-0.05, 0.3), dice(-0.05, 0.05), dice(-0.08, 0.08)])
     low, high = config.field_of_view
     return Camera(start, orbit, target, shake, distance, jnp.deg2rad(dice(low, high)) / 2)
@@ -347,11 +345,11 @@ def _materials(dice: _Dice, tiles: int, distance: Array, parts: int) -> Float[Ar
     )
 
 
-def _rotation_y(angle: Float[Array, "N"]) -> Float[Array, "N 3 3"]:
+def _rotation_y(angle: Float[Array, " N"]) -> Float[Array, "N 3 3"]:
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
     return jnp.stack([c, zero, s, zero, one, zero, -s, zero, c], axis=-1).reshape(-1, 3, 3)
 
 
-def _rotation_x(angle: Float[Array, "N"]) -> Float[Array, "N 3 3"]:
+def _rotation_x(angle: Float[Array, " N"]) -> Float[Array, "N 3 3"]:
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
     return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c], axis=-1).reshape(-1, 3, 3)

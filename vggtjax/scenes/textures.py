@@ -52,7 +52,7 @@ def load_textures(split: Split = "training") -> Textures:
 
 
 def sample(
-    textures: Textures, tile: Int[Array, "P"], uv: Float[Array, "2 P"], footprint: Float[Array, "P"]
+    textures: Textures, tile: Int[Array, " P"], uv: Float[Array, "2 P"], footprint: Float[Array, " P"]
 ) -> Float[Array, "3 P"]:
     """Return bilinear samples, RGB in [0, 1].
 
@@ -73,7 +73,7 @@ def sample(
     fx, fy = position - low
     corner = start + low[1] * side + low[0]
 
-    def texel(offset: Int[Array, "P"]) -> Float[Array, "P 3"]:
+    def texel(offset: Int[Array, " P"]) -> Float[Array, "P 3"]:
         return textures.texels[corner + offset].astype(jnp.float32)
 
     top = texel(jnp.zeros_like(corner)) * (1 - fx)[:, None] + texel(jnp.ones_like(corner)) * fx[:, None]
