@@ -197,7 +197,7 @@ def _albedo(textures: Textures, material, local, normal, width, direction, world
     return jnp.clip(gain * (0.5 + contrast[None] * (colour - 0.5)), 0.02, 1)
 
 
-def _dot(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Float[Array, "..."]:
+def _dot(a: Float[Array, "3 ..."], b: Float[Array, "3 ..."]) -> Float[Array, ...]:
     """Sum over the leading axis, written out: as a reduction, XLA's CPU compiler (jax 0.10) fuses it wrongly."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
