@@ -17,8 +17,10 @@ def _formula(q, k, v, kept):
 
 @pytest.mark.parametrize("implementation", [attention._at_once, attention._in_chunks, attention.attention])
 @pytest.mark.parametrize("masked", [False, True])
-def test_equals_the_formula(monkeypatch, implementation, masked):
+@pytest.mark.parametrize("at_once", [0, 1000])
+def test_equals_the_formula(monkeypatch, implementation, masked, at_once):
     monkeypatch.setattr(attention, "QUERIES_AT_ONCE", 4)  # 11 queries: three chunks, one padded
+    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", at_once)
     generator = np.random.default_rng(0)
     q, k, v = (generator.normal(size=(2, 11, 3, 8)).astype(np.float32) for _ in range(3))
     kept = generator.random((2, 11)) < 0.6 if masked else np.ones((2, 11), bool)
@@ -35,3 +37,20 @@ def test_heads_and_tokens_are_not_swapped():
     made = np.asarray(attention.attention(*map(jnp.asarray, (q, k, v))))
     assert np.allclose(made[0, :, 1], 1)
     assert np.allclose(made[0, :, 0], 0.2)
+
+
+@pytest.mark.parametrize("at_once", [0, 1000])
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_gradient_is_that_of_jaxs_own_attention(monkeypatch, at_once, masked):
+    monkeypatch.setattr(attention, "QUERIES_AT_ONCE", 4)
+    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", at_once)
+    generator = np.random.default_rng(1)
+    q, k, v, weight = (generator.normal(size=(2, 11, 3, 8)).astype(np.float32) for _ in range(4))
+    kept = generator.random((2, 11)) < 0.6 if masked else None
+
+    def gradient(implementation):
+        return jax.grad(lambda *x: (implementation(*x, kept) * weight).sum(), argnums=(0, 1, 2))(q, k, v)
+
+    with jax.default_matmul_precision("highest"):
+        for made, expected in zip(gradient(attention._in_chunks), gradient(attention._at_once), strict=True):
+            assert np.abs(made - expected).max() < 2e-6

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from vggtjax.config import Suppress
 
 QUERIES_AT_ONCE = 512
+LOGITS_AT_ONCE = 320**2  # queries times keys of a head up to which all heads go at once on a CPU
 
 
 @dataclass(frozen=True)
@@ -49,56 +50,59 @@ def _in_chunks(q, k, v, kept):
     def by_head(x: Float[Array, "B L N D"]) -> Float[Array, "BN L D"]:
         return x.transpose(0, 2, 1, 3).reshape(B * N, -1, D)
 
-    queries = jnp.pad(by_head(q * D**-0.5), ((0, 0), (0, padding), (0, 0)))
+    def one_head(inputs):
+        queries, keys, values, bias = inputs
+        return jax.lax.map(lambda chunk: _attended(chunk, keys, values, bias), queries)
+
+    queries, keys, values = by_head(q * D**-0.5), by_head(k), by_head(v)
     bias = None if kept is None else jnp.repeat(jnp.where(kept, 0.0, -jnp.inf), N, axis=0)
-    queries = queries.reshape(B * N, chunks, -1, D)
-    out = jax.lax.map(lambda inputs: _one_head(*inputs), (queries, by_head(k), by_head(v), bias))
-    return out.reshape(B, N, T + padding, D)[:, :, :T].transpose(0, 2, 1, 3)
+    if T * k.shape[1] <= LOGITS_AT_ONCE:  # short clips: a loop over heads would cost more than it saves
+        out = _attended(queries, keys, values, bias)
+    else:
+        queries = jnp.pad(queries, ((0, 0), (0, padding), (0, 0))).reshape(B * N, chunks, -1, D)
+        out = jax.lax.map(one_head, (queries, keys, values, bias)).reshape(B * N, T + padding, D)[:, :T]
+    return out.reshape(B, N, T, D).transpose(0, 2, 1, 3)
 
 
 @jax.custom_vjp
-def _one_head(queries, keys, values, bias):
-    """Attention of one head: queries [c, R, D], keys and values [K, D], bias [K] or None."""
-    return jax.lax.map(lambda rows: _attended(rows, keys, values, bias), queries)
-
-
-def _attended(rows, keys, values, bias):
-    weights = _weights(rows, keys, bias)
+def _attended(
+    queries: Float[Array, "... R D"],
+    keys: Float[Array, "... K D"],
+    values: Float[Array, "... K D"],
+    bias: Float[Array, "... K"] | None,
+) -> Float[Array, "... R D"]:
+    weights = _weights(queries, keys, bias)
     out = jnp.matmul(weights.astype(values.dtype), values, preferred_element_type=jnp.float32)
     return (out / weights.sum(axis=-1, keepdims=True)).astype(values.dtype)
 
 
-def _weights(rows, keys, bias):
-    logits = jnp.matmul(rows, keys.T, preferred_element_type=jnp.float32)
-    logits = logits if bias is None else logits + bias[None]
+def _weights(queries, keys, bias):
+    """Attention weights up to their sum over the keys."""
+    logits = jnp.matmul(queries, keys.swapaxes(-1, -2), preferred_element_type=jnp.float32)
+    logits = logits if bias is None else logits + bias[..., None, :]
     return jnp.exp(logits - logits.max(axis=-1, keepdims=True))
 
 
-def _one_head_forward(queries, keys, values, bias):
-    out = _one_head(queries, keys, values, bias)
+def _forward(queries, keys, values, bias):
+    out = _attended(queries, keys, values, bias)
     return out, (queries, keys, values, bias, out)
 
 
-def _one_head_backward(kept, gradient):
-    """Weights are computed again: to keep them costs more than they do."""
-    queries, keys, values, bias, out = kept
-
-    def one_chunk(sums, inputs):
-        rows, result, upstream = inputs
-        weights = _weights(rows, keys, bias)
-        weights = (weights / weights.sum(axis=-1, keepdims=True)).astype(values.dtype)
-        inner = jnp.sum(result.astype(jnp.float32) * upstream, axis=-1, keepdims=True)
-        logits = (weights * (upstream @ values.T - inner)).astype(keys.dtype)
-        added = (logits.T @ rows, weights.T @ upstream)
-        return jax.tree.map(lambda a, b: a + b.astype(a.dtype), sums, added), logits @ keys
-
-    start = tuple(jnp.zeros(x.shape, jnp.float32) for x in (keys, values))
-    (to_keys, to_values), to_queries = jax.lax.scan(one_chunk, start, (queries, out, gradient))
-    to_bias = None if bias is None else jnp.zeros_like(bias)
-    return to_queries.astype(queries.dtype), to_keys.astype(keys.dtype), to_values.astype(values.dtype), to_bias
+def _backward(residuals, gradient):
+    """The weights are computed again: to keep them costs more than they do."""
+    queries, keys, values, bias, out = residuals
+    weights = _weights(queries, keys, bias)
+    weights = weights / weights.sum(axis=-1, keepdims=True)
+    upstream = gradient.astype(jnp.float32)
+    inner = jnp.sum(out * upstream, axis=-1, keepdims=True)
+    logits = weights * (upstream @ values.swapaxes(-1, -2).astype(jnp.float32) - inner)
+    to_queries = (logits @ keys).astype(queries.dtype)
+    to_keys = (logits.swapaxes(-1, -2) @ queries).astype(keys.dtype)
+    to_values = (weights.swapaxes(-1, -2) @ upstream).astype(values.dtype)
+    return to_queries, to_keys, to_values, None if bias is None else jnp.zeros_like(bias)
 
 
-_one_head.defvjp(_one_head_forward, _one_head_backward)
+_attended.defvjp(_forward, _backward)
 
 
 def suppressed_attention(
