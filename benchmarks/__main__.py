@@ -8,10 +8,11 @@ from collections.abc import Sequence
 import tyro
 
 from benchmarks.demo_model import demo_model
+from benchmarks.embed import embed
 from benchmarks.make_checkpoint import main as make_checkpoint
 from vggtjax.errors import VggtjaxError
 
-COMMANDS = {"demo-model": demo_model, "make-checkpoint": make_checkpoint}
+COMMANDS = {"demo-model": demo_model, "embed": embed, "make-checkpoint": make_checkpoint}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.demo import demo_frames
+from tests.tiny import moving_ball
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -15,7 +15,7 @@ README = Path(__file__).parents[1] / "README.md"
 def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("frames").mkdir()
-    for i, frame in enumerate(demo_frames(6)):
+    for i, frame in enumerate(moving_ball(6)):
         Image.fromarray((255 * frame).astype(np.uint8)).save(f"frames/{i}.png")
     blocks = [part.split("```")[0] for part in README.read_text().split("```python\n")[1:]]
     assert len(blocks) == 2

@@ -103,8 +103,8 @@ def load_model(
     mapped into memory: replace it, but never write into it, while the model is in use.
 
     Args:
-        name_or_path: "demo" (tiny and untrained), a file of this library, PyTorch weights (.safetensors, a sharded
-            one's index or folder, .pt, .pth), or a hub id such as "facebook/VGGT-1B".
+        name_or_path: "demo" (the small model in the package), a file of this library, PyTorch weights (.safetensors, a
+            sharded one's index or folder, .pt, .pth), or a hub id such as "facebook/VGGT-1B".
         config: the configuration of PyTorch weights; None for VGGT-1B. A file of this library knows its own.
         dtype: of the parameters; None keeps the file's, and makes float32 of PyTorch weights.
         progress: called during a conversion with the tensors converted and their number.

@@ -1,4 +1,4 @@
-"""The command line: `vggtjax reconstruct | convert | demo | info`. Does not import jax before it is needed."""
+"""The command line, a function per command. Does not import jax before it is needed."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from typing import Literal
 
 import tyro
 
+from vggtjax.calibration.command import calibrate_cues
 from vggtjax.config import Gram, Suppress, VGGTConfig
 from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.methods import MethodName
 from vggtjax.report import Report
+from vggtjax.scenes.command import scenes
+from vggtjax.training.command import train
 
 
 def reconstruct(
@@ -124,27 +127,42 @@ def convert(
 
 
 def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-d") -> None:
-    """Reconstruct the generated clip with the embedded model: no download, nothing to choose.
+    """Reconstruct the embedded clip with the embedded model, and measure every method against the clip's truth.
 
     Args:
         out: folder for the results.
-        method: which passes give depth and cameras.
+        method: which passes give the depth and cameras that are written.
     """
     report = Report()
     with report.running():
         _check_folder(out)
         loaded = _load_model(report, "demo", None)
-        with report.stage("generate clip"):
+        with report.stage("load clip"):
             from vggtjax.clips.clip import load_clip
-            from vggtjax.demo import demo_frames
+            from vggtjax.demo import demo_clip
 
-            clip = load_clip(demo_frames(), size=loaded.config.image_size, patch=loaded.config.patch_size)
+            truth = demo_clip()
+            clip = load_clip(truth.images, size=truth.images.shape[2], patch=loaded.config.patch_size)
         from vggtjax.pipeline import reconstruct as run
 
-        result = run(loaded, clip, method=method, on_stage=report.stage)
+        result = run(loaded, clip, method=method, size=truth.images.shape[2], on_stage=report.stage)
         with report.stage("write") as progress:
+            from PIL import Image
+
+            from vggtjax.evaluation.picture import truth_sheet
+            from vggtjax.files import writing
+
             result.save(out, progress=progress)
+            sheet = out / "preview" / "truth.png"
+            with writing(sheet) as temporary:
+                Image.fromarray(truth_sheet(result, truth)).save(temporary)
+        with report.stage("measure") as progress:
+            from vggtjax.evaluation.ladder import ladder
+
+            rows = ladder(loaded, truth, progress=progress)
     report.summary(result, out, trained=loaded.trained)
+    report.ladder(rows)
+    report.line(f"Next to the truth: {sheet}")
 
 
 def info(model: tyro.conf.Positional[str] = "demo", /, *, config: Path | None = None) -> None:
@@ -160,13 +178,21 @@ def info(model: tyro.conf.Positional[str] = "demo", /, *, config: Path | None = 
     report.table(loaded.summary())
 
 
-COMMANDS = {"reconstruct": reconstruct, "convert": convert, "demo": demo, "info": info}
+COMMANDS = {
+    "reconstruct": reconstruct,
+    "convert": convert,
+    "demo": demo,
+    "info": info,
+    "train": train,
+    "calibrate-cues": calibrate_cues,
+    "scenes": scenes,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, 2 for bad input or output, 130 when interrupted."""
     logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
-    for chatty in ("jax", "absl", "httpx", "httpx2", "huggingface_hub"):
+    for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
     try:

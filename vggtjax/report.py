@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,6 +24,7 @@ from rich.table import Table
 from rich.text import Text
 
 if TYPE_CHECKING:
+    from vggtjax.evaluation.ladder import LadderRow
     from vggtjax.results.reconstruction import Reconstruction
 
 Advance = Callable[[int, int | None], None]
@@ -93,6 +94,32 @@ class Report:
         for name, value in rows.items():
             table.add_row(name, Text(str(value)))
         self._out.print(table, soft_wrap=True)
+
+    def ladder(self, rows: Sequence[LadderRow]) -> None:
+        """Print errors against the truth as a table, a row per method and mask."""
+        table = Table(title="errors against the truth", title_justify="left", box=None, pad_edge=False)
+        columns = {
+            "abs_rel": ("AbsRel", "{:.3f}"),
+            "abs_rel_static": ("static", "{:.3f}"),
+            "abs_rel_dynamic": ("dynamic", "{:.3f}"),
+            "rotation_error": ("rotation", "{:.2f}°"),
+            "centre_error_ratio": ("centres", "{:.3f}"),
+            "mask_jaccard": ("mask IoU", "{:.2f}"),
+        }
+        for name in ("method", "mask"):
+            table.add_column(name)
+        for heading, _ in columns.values():
+            table.add_column(heading, justify="right")
+        for row in rows:
+            values = [getattr(row, name) for name in columns]
+            forms = [form for _, form in columns.values()]
+            cells = ["-" if v is None else form.format(v) for v, form in zip(values, forms, strict=True)]
+            table.add_row(row.method, row.mask_source or "-", *cells)
+        self._out.print(table, soft_wrap=True)
+        self.line(
+            "AbsRel: of depth after one median scale. Rotation: mean, relative to the first frame. Centres: RMSE after "
+            "Sim(3), in median depths. Mask: mined from the first pass, or the true one."
+        )
 
     def line(self, text: str) -> None:
         """Print one line."""

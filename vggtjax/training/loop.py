@@ -22,6 +22,7 @@ from vggtjax.training.data import make_batch as make_scene_batch
 from vggtjax.training.metrics import Row
 from vggtjax.training.objective import init_probes as init_scene_probes
 from vggtjax.training.objective import objective as scene_objective
+from vggtjax.training.placement import placement
 from vggtjax.training.recipe import Recipe, Stage
 from vggtjax.training.run import Run
 from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient
@@ -102,7 +103,9 @@ def train(
 
         textures = load_textures("training")
     run = Run(recipe, Path(out), init_probes(recipe.seed, recipe.model), init, export_dtype)
-    batch_of = jax.jit(make_batch, static_argnums=(2, 3))
+    where = placement(recipe)
+    textures = jax.device_put(textures, where.whole)
+    batch_of = jax.jit(make_batch, static_argnums=(2, 3), out_shardings=where.by_clip)
     key = jax.random.key(recipe.data_seed)
     seen: set[tuple[Stage, int]] = set()  # what is compiled, and can be timed
     ahead: deque[Metrics] = deque()

@@ -22,15 +22,15 @@ class MatchSums(NamedTuple):
 class MatchLoss:
     """Accumulates, inside the scan over pairs of blocks, how well q and k of the global blocks find true matches.
 
-    Goes in the place of the motion cues (the same methods). The first half of the heads is to attend from every patch to its
-    match in the first frame, among the patches of all frames; the other half to its match in each other frame, among
-    that frame's patches.
+    Goes in the place of the motion cues (the same methods). The first half of the heads is to attend from every patch
+    to its match in the first frame, among the patches of all frames; the other half to its match in each other frame,
+    among that frame's patches.
     """
 
     def __init__(self, matches: Matches, layers: tuple[int, ...], depth: int) -> None:
         self._matches, self._layers, self._depth = matches, layers, depth
 
-    def layer_counts(self) -> Int[np.ndarray, L]:
+    def layer_counts(self) -> Int[np.ndarray, " L"]:
         """Return 1 for the layers that are supervised."""
         return np.isin(np.arange(self._depth), self._layers).astype(np.int32)
 

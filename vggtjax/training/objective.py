@@ -36,7 +36,7 @@ class LossWeights:
         huber: half width of the quadratic zone of the camera loss; 0 for L1.
         depth, points: confidence-weighted L1 of the dense heads; `gradient` is the share of the gradient term.
         match: cross-entropy of attention in `match_layers` against true matches.
-        probe: linear read-outs of the tapped tokens (positions, depths, points, poses); their parameters serve training alone.
+        probe: linear read-outs of the tapped tokens (positions, depths, points, poses), which serve training alone.
     """
 
     translation: float = 1.0

@@ -16,6 +16,7 @@ from vggtjax.files import writing
 from vggtjax.network.layers import Params
 from vggtjax.training import checkpoints
 from vggtjax.training.metrics import Averages, MetricsFile, Row, plot
+from vggtjax.training.placement import placement
 from vggtjax.training.recipe import Recipe, Stage
 from vggtjax.training.state import Metrics, exported, initial_state, state_shapes
 
@@ -41,7 +42,7 @@ class Run:
         self.earlier = 0.0  # seconds of the runs before this one
         if checkpoints.latest(self.checkpoints) is None:
             # Committed to the device like a restored state, for which jit would compile again otherwise.
-            self.state = jax.device_put(initial_state(recipe, probes, init), jax.local_devices()[0])
+            self.state = jax.device_put(initial_state(recipe, probes, init), placement(recipe).whole)
         else:
             self._restore(probes)
         with writing(out / "recipe.json") as temporary:
@@ -108,7 +109,7 @@ class Run:
         found = checkpoints.restore(self.checkpoints, state_shapes(self.recipe, probes), self.recipe)
         if found.recipe != self.recipe:
             logger.warning("the recipe is not the one that the checkpoint was written under; going on with the new one")
-        self.state = found.state
+        self.state = jax.device_put(found.state, placement(self.recipe).whole)
         self.step = self.saved = int(found.state.step)
         try:
             self.averages = Averages(**found.notes["averages"])

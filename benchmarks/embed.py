@@ -1,0 +1,42 @@
+"""Put a trained model, and a clip that it has never seen, into the package: what `vggtjax demo` runs."""
+
+from __future__ import annotations
+
+import hashlib
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from vggtjax.checkpoint import load_model, numpy_dtype, save_model
+from vggtjax.demo import CLIP, MODEL, SCENE_SEED, write_demo_clip
+from vggtjax.errors import InputError
+from vggtjax.evaluation.truth import Truth
+from vggtjax.scenes import SceneConfig, held_out_scenes
+
+MOST_MODEL_BYTES = 24 << 20
+MOST_CLIP_BYTES = 1 << 20
+
+
+def embed(model: str, /, *, frames: int = 16, scene: int = 0, image_size: int | None = None) -> None:
+    """Write the model, in bfloat16, and a held-out dynamic clip into the package.
+
+    Args:
+        model: a .safetensors of this library, as `vggtjax train` or `vggtjax calibrate-cues` wrote it.
+        frames: of the clip.
+        scene: index of the held-out scene.
+        image_size: side of the clip in pixels; the model's own by default.
+    """
+    loaded = load_model(model)
+    params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(numpy_dtype("bfloat16")), loaded.params)
+    save_model(MODEL, params, loaded.config, name="demo")
+    side = image_size or loaded.config.image_size
+    config = SceneConfig(height=side, width=side, frames=frames, samples=3)
+    clips = held_out_scenes("dynamic", scene + 1, config, seed=SCENE_SEED)
+    write_demo_clip(CLIP, Truth(*(getattr(clips, name)[scene] for name in Truth._fields)))
+    console = Console()
+    for path, most in ((MODEL, MOST_MODEL_BYTES), (CLIP, MOST_CLIP_BYTES)):
+        size = path.stat().st_size
+        if size > most:
+            raise InputError(f"{path} has {size} bytes; at most {most} go into the package")
+        console.print(f"{path}  {size} bytes  sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}", soft_wrap=True)

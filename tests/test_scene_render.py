@@ -1,0 +1,290 @@
+"""The renderer is exact: what one frame's truth says of a point, another frame's rays find there."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.generated import DYNAMIC, QUICK, STATIC, clips, gauge, keys, scenes, textures
+from vggtjax.scenes import SceneConfig, cast, generate, sample_scene
+from vggtjax.scenes.scene import camera_pose, part_poses
+
+COUNT = 6
+BLURRED = dataclasses.replace(DYNAMIC, samples=2, shutter=0.5, exposures=2)
+S, H, W = DYNAMIC.frames, DYNAMIC.height, DYNAMIC.width
+KINDS = np.array(["room", *DYNAMIC.kinds])
+PLANAR = np.isin(KINDS, ("room", "box"))
+TIMES = np.arange(S, dtype=np.float32) * np.float32(1 / (S - 1))
+
+
+class Pair(NamedTuple):
+    """The pixels of frame i, [P, ...], carried to frame j with the things they are on."""
+
+    clip: int
+    i: int
+    j: int
+    part_ids: np.ndarray
+    world: np.ndarray  # where the point is at the time of frame j
+    pixels: np.ndarray  # where frame j's camera sees it
+    z: np.ndarray
+    inside: np.ndarray  # that frame's picture
+    outward: np.ndarray  # below 1 where the way to the camera starts inside the point's own part
+
+
+@pytest.fixture(scope="module")
+def dynamic():
+    return clips(DYNAMIC, COUNT)
+
+
+@pytest.fixture(scope="module")
+def static():
+    return clips(STATIC, 3)
+
+
+@pytest.fixture(scope="module")
+def look():
+    """Depth and parts that scene n's rays find at a time and at pixels [P, 2]."""
+
+    def at(key, time, pixels):
+        scene = sample_scene(jax.random.split(key)[0], textures().tiles, DYNAMIC)
+        surface = cast(scene, textures(), DYNAMIC, time, pixels)
+        return surface.depth, surface.part_ids
+
+    compiled = jax.jit(at, compiler_options=QUICK)
+    return lambda n, time, pixels: jax.device_get(compiled(keys(COUNT)[n], time, jnp.asarray(pixels, jnp.float32)))
+
+
+@pytest.fixture(scope="module")
+def pairs(dynamic):
+    """Every ordered pair of frames of every clip."""
+    sizes = np.asarray(scenes(DYNAMIC, COUNT).size, np.float64)
+    return [
+        carried(dynamic, sizes[clip], clip, i, j) for clip in range(COUNT) for j in range(S) for i in range(S) if i != j
+    ]
+
+
+def carried(truth, sizes, clip, i, j):
+    world, ids = points(truth, clip, i), truth.part_ids[clip, i].ravel()
+    before, after = (truth.world_from_part[clip, frame, ids].astype(np.float64) for frame in (i, j))
+    local = np.einsum("pji,pj->pi", before[..., :3], world - before[..., 3])
+    world = np.einsum("pij,pj->pi", after[..., :3], local) + after[..., 3]
+    camera, intrinsics = camera_of(truth, clip, j)
+    seen = world @ camera[:, :3].T + camera[:, 3]
+    pixels, z = project(seen, intrinsics), seen[:, 2]
+    inside = (z > 0.05) & (pixels > 0).all(axis=1) & (pixels < [W, H]).all(axis=1)
+    towards = np.einsum("pji,pj->pi", after[..., :3], -camera[:, :3].T @ camera[:, 3] - world)
+    outward = np.full(len(ids), 2.0)  # nothing hides behind the room itself, which is seen from inside
+    for part in np.unique(ids[ids > 0]):
+        own = ids == part
+        outward[own] = gauge(KINDS[part], (local + 2e-3 * towards)[own], sizes[part - 1])
+    return Pair(clip, i, j, ids, world, np.where(inside[:, None], pixels, 0.0), z, inside, outward)
+
+
+def points(truth, clip, frame):
+    """World points [P, 3] of a frame's pixels, in float64."""
+    camera, intrinsics = camera_of(truth, clip, frame)
+    y, x = np.mgrid[0:H, 0:W] + 0.5
+    rays = np.stack([(x - W / 2) / intrinsics[0, 0], (y - H / 2) / intrinsics[1, 1], np.ones((H, W))], axis=-1)
+    seen = (rays * truth.depth[clip, frame, ..., None].astype(np.float64)).reshape(-1, 3)
+    return (seen - camera[:, 3]) @ camera[:, :3]
+
+
+def camera_of(truth, clip, frame):
+    return truth.camera_from_world[clip, frame].astype(np.float64), truth.intrinsics[clip, frame].astype(np.float64)
+
+
+def project(seen, intrinsics):
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return (seen / seen[:, 2:] @ intrinsics.T)[:, :2]
+
+
+def test_points_are_found_where_they_are_said_to_be(pairs, look):
+    agreeing = 0
+    for pair in pairs:
+        depth, part_ids = look(pair.clip, TIMES[pair.j], pair.pixels)
+        relative = (depth - pair.z) / np.maximum(pair.z, 0.05)
+        same = pair.inside & (part_ids == pair.part_ids)
+        faces = same & (pair.outward > 1 + 1e-4)
+        assert (np.abs(relative[faces]) < 1e-3).all()
+        hidden = same & (pair.outward < 1 - 1e-4)  # by its own part
+        assert (relative[hidden] < -1e-4).all()
+        behind = pair.inside & (relative > 1e-3)  # seen past a silhouette, half a rounding away
+        assert behind.sum() <= 0.005 * pair.inside.sum()
+        agreeing += (np.abs(relative[faces]) < 1e-3).sum()
+    assert agreeing > 0.5 * sum(pair.inside.sum() for pair in pairs)
+    moved = [np.isin(pair.part_ids, movers(clips(DYNAMIC, COUNT), pair.clip)) & pair.inside for pair in pairs]
+    assert sum(m.sum() for m in moved) > 1000
+
+
+def test_depth_images_agree_off_edges(dynamic, pairs):
+    """The same against what a user has: frame j's depth image, inverse depth interpolated where it is smooth."""
+    checked = 0
+    for pair in pairs:
+        clip, ids = pair.clip, pair.part_ids
+        inverse = 1 / dynamic.depth[clip, pair.j].astype(np.float64)
+        parts = dynamic.part_ids[clip, pair.j]
+        smooth = (curvature(inverse) < np.where(PLANAR[parts], 1e-4, 1e-3)) & (spread(parts) == 0)
+        static = ~dynamic.dynamic_mask[clip, pair.i].ravel()
+        column, row = np.floor(pair.pixels - 0.5).astype(int).T
+        usable = pair.inside & static & (pair.outward > 1 + 1e-4)
+        usable &= (column >= 0) & (row >= 0) & (column < W - 1) & (row < H - 1)
+        column, row = (np.where(usable, a, 0) for a in (column, row))
+        fx, fy = (pair.pixels - 0.5 - np.stack([column, row], axis=1)).T
+        found = 0.0
+        for dy, dx in np.ndindex(2, 2):
+            usable &= (parts[row + dy, column + dx] == ids) & smooth[row + dy, column + dx]
+            weight = (fy if dy else 1 - fy) * (fx if dx else 1 - fx)
+            found = found + weight * inverse[row + dy, column + dx]
+        relative = (found * pair.z - 1)[usable]
+        assert (np.abs(relative) < 1e-3).all()
+        checked += usable.sum()
+    assert checked > 0.3 * sum(pair.inside.sum() for pair in pairs)
+
+
+def curvature(values):
+    """Second differences [H, W] relative to the values, the larger of both directions; the border has none."""
+    result = np.full(values.shape, np.inf)
+    middle = values[1:-1, 1:-1]
+    x = values[1:-1, :-2] + values[1:-1, 2:] - 2 * middle
+    y = values[:-2, 1:-1] + values[2:, 1:-1] - 2 * middle
+    result[1:-1, 1:-1] = np.maximum(np.abs(x), np.abs(y)) / middle
+    return result
+
+
+def spread(parts):
+    """How much the ids [H, W] of a pixel and its eight neighbours differ."""
+    padded = np.pad(parts, 1, mode="edge")
+    near = np.stack([padded[y : y + H, x : x + W] for y, x in np.ndindex(3, 3)])
+    return np.ptp(near, axis=0)
+
+
+def test_scene_flow_leads_to_the_next_frame(dynamic, pairs):
+    for pair in pairs:
+        if pair.j == pair.i + 1:
+            flow = dynamic.scene_flow[pair.clip, pair.i].reshape(-1, 3)
+            np.testing.assert_allclose(points(dynamic, pair.clip, pair.i) + flow, pair.world, atol=1e-5)
+    last = np.abs(dynamic.scene_flow[:, -1][dynamic.dynamic_mask[:, -1]])
+    assert last.max() > 1e-3  # things go on after the last frame
+
+
+def movers(truth, clip):
+    """Parts whose pose changes between frames."""
+    poses = truth.world_from_part[clip]
+    return np.flatnonzero((np.abs(poses - poses[:1]) > 1e-6).any(axis=(0, 2, 3)))
+
+
+def test_the_dynamic_mask_is_where_movers_are(dynamic):
+    objects = np.array([0, *(1 + np.array(DYNAMIC.objects))])
+    np.testing.assert_array_equal(dynamic.object_ids, objects[dynamic.part_ids])
+    for clip in range(COUNT):
+        moving = movers(dynamic, clip)
+        assert 0 not in moving
+        assert 1 <= len(np.unique(objects[moving])) <= 3
+        assert set(np.flatnonzero(np.isin(objects, objects[moving]))) == set(moving)  # things move as a whole
+        np.testing.assert_array_equal(dynamic.dynamic_mask[clip], np.isin(dynamic.part_ids[clip], moving))
+    flow = np.abs(dynamic.scene_flow).max(axis=-1)
+    assert flow[~dynamic.dynamic_mask].max() < 1e-5
+    assert np.median(flow[dynamic.dynamic_mask]) > 1e-2
+
+
+def test_nothing_moves_in_static_clips(static):
+    assert not static.dynamic_mask.any()
+    assert np.abs(static.scene_flow).max() < 1e-5
+    np.testing.assert_array_equal(static.world_from_part, static.world_from_part[:, :1].repeat(S, axis=1))
+    assert (np.abs(np.diff(static.camera_from_world, axis=1)).max(axis=(2, 3)) > 1e-4).all()  # but the camera does
+
+
+def test_shapes_and_ranges(dynamic, static):
+    for clip, config in ((dynamic, DYNAMIC), (static, STATIC)):
+        N = len(clip.images)
+        assert clip.images.shape == clip.scene_flow.shape == (N, S, H, W, 3)
+        assert clip.depth.shape == clip.part_ids.shape == clip.object_ids.shape == clip.dynamic_mask.shape
+        assert clip.images.min() >= 0
+        assert clip.images.max() <= 1
+        assert clip.images.std(axis=(2, 3)).min() > 0.02  # no blank frames
+        assert np.isfinite(clip.depth).all()
+        assert clip.depth.min() > 0.1
+        rotation = clip.camera_from_world[..., :3].astype(np.float64)
+        np.testing.assert_allclose(
+            rotation @ rotation.swapaxes(-1, -2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-5
+        )
+        np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-5)
+        focal, centre = clip.intrinsics[..., [0, 1], [0, 1]], clip.intrinsics[..., :2, 2]
+        np.testing.assert_array_equal(focal[..., 0], focal[..., 1])
+        np.testing.assert_array_equal(centre, np.broadcast_to([W / 2, H / 2], centre.shape))
+        degrees = np.degrees(2 * np.arctan(W / 2 / focal[..., 0]))
+        low, high = config.field_of_view
+        assert (degrees > low - 1e-3).all()
+        assert (degrees < high + 1e-3).all()
+
+
+def test_cameras_stay_in_the_room_and_out_of_things():
+    def one(key):
+        scene = sample_scene(key, 3, DYNAMIC)
+        times = jnp.linspace(0, 1, 9)
+        centre = jax.vmap(lambda time: camera_pose(scene.camera, time)[1])(times)
+        rotation, middle = jax.vmap(lambda time: part_poses(scene, DYNAMIC, time))(times)
+        local = jnp.einsum("tkji,tkj->tki", rotation, centre[:, None] - middle)
+        return centre, local, scene
+
+    centre, local, scene = jax.device_get(jax.jit(jax.vmap(one))(keys(200)))
+    assert (centre > scene.room_low[:, None]).all()
+    assert (centre < scene.room_high[:, None]).all()
+    for part, kind in enumerate(DYNAMIC.kinds):
+        assert gauge(kind, local[:, :, part], scene.size[:, None, part])[scene.present[:, part]].min() > 1
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_static_cameras_stand_still(share):
+    config = dataclasses.replace(DYNAMIC, static_camera=share)
+
+    def poses(key):
+        camera = sample_scene(key, 3, config).camera
+        return jax.vmap(lambda time: camera_pose(camera, time))(jnp.asarray(TIMES))
+
+    rotation, centre = jax.device_get(jax.jit(jax.vmap(poses), compiler_options=QUICK)(keys(20)))
+    change = np.abs(rotation - rotation[:, :1]).max(axis=(1, 2, 3)) + np.abs(centre - centre[:, :1]).max(axis=(1, 2))
+    assert (change == 0).all() if share else (change > 1e-4).all()
+
+
+def test_samples_and_exposures_change_images_only(dynamic):
+    for n in range(2):
+        blurred = jax.tree.map(lambda leaf, n=n: leaf[n], clips(BLURRED, 2))
+        sharp = jax.tree.map(lambda leaf, n=n: leaf[n], dynamic)
+        same_clip(blurred._replace(images=sharp.images), sharp)
+        difference = np.abs(blurred.images - sharp.images)
+        assert difference.max() > 0.1
+        assert difference.mean() < 0.05  # it is the same scene
+
+
+def test_a_key_has_one_clip_whatever_the_batch(dynamic):
+    alone = jax.jit(generate, static_argnums=2, compiler_options=QUICK)(keys(COUNT)[2], textures(), DYNAMIC)
+    same_clip(jax.device_get(alone), jax.tree.map(lambda leaf: leaf[2], dynamic))
+
+
+def same_clip(found, expected):
+    """Equal but for rounding, which may turn a pixel on an edge or a texel's level."""
+    for name, a, b in zip(found._fields, found, expected, strict=True):
+        assert a.shape == b.shape
+        assert a.dtype == b.dtype
+        differs = np.abs(a.astype(np.float64) - b.astype(np.float64)) > 2e-3
+        assert differs.mean() < 1e-3, name
+
+
+def test_compiled_and_eager_casts_agree_on_large_frames():
+    """At this size, compilers fuse what they leave alone in small frames."""
+    config = SceneConfig(height=128, width=128, frames=1, dynamic=1.0, noise=0.0, flicker=0.0)
+    scene = jax.tree.map(lambda leaf: leaf[0], scenes(DYNAMIC, COUNT))  # does not depend on the size
+    y, x = np.mgrid[0:128, 0:128] + 0.5
+    pixels = jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=-1), jnp.float32)
+    eager = cast(scene, textures(), config, jnp.float32(0), pixels)
+    compiled = jax.jit(cast, static_argnums=2)(scene, textures(), config, jnp.float32(0), pixels)
+    same_clip(jax.device_get(compiled), jax.device_get(eager))
+    assert np.abs(compiled.depth - eager.depth).max() < 2e-3
+    clip = jax.jit(generate, static_argnums=2)(keys(COUNT)[0], textures(), dataclasses.replace(config, flicker=0.0))
+    differs = np.abs(np.asarray(clip.images[0]).reshape(-1, 3) - np.asarray(eager.colour).T) > 2e-3
+    assert differs.any(axis=-1).mean() < 1e-3
+    assert (np.asarray(clip.part_ids).ravel() != np.asarray(eager.part_ids)).mean() < 1e-3

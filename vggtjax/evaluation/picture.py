@@ -1,0 +1,85 @@
+"""A picture of a result next to the truth: depth, mask, and the way of the cameras from above."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from vggtjax.evaluation.depth import median_scale
+from vggtjax.evaluation.trajectory import centres, moves, umeyama_sim3
+from vggtjax.evaluation.truth import Truth
+from vggtjax.results.previews import color_depth, inverse_depth_range, overlay
+from vggtjax.results.reconstruction import Reconstruction
+
+_FRAMES = 6
+_SIDE = 220  # of a picture, in pixels
+_MARGIN, _GAP, _LABEL, _PLOT = 24, 6, 130, 460
+_BACKGROUND, _TEXT, _FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)
+_TRUE, _FOUND = (120, 200, 255), (255, 150, 60)
+
+
+def truth_sheet(result: Reconstruction, truth: Truth) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw frames of a result with exact truth: picture, depth found and true, mask found and true; cameras from above.
+
+    Depth found is brought to the truth's scale by the ratio of medians, the cameras by a similarity of their centres.
+    """
+    S, H, W = result.depth.shape
+    shown = np.linspace(0, S - 1, min(S, _FRAMES)).round().astype(int)
+    size = (_SIDE, round(_SIDE * H / W))
+    rows = ("Picture", "Depth found", "Depth true", "Moving found", "Moving true")
+    left, top = _MARGIN + _LABEL, _MARGIN + 40
+    plot_left = left + len(shown) * (size[0] + _GAP) + 2 * _MARGIN
+    height = top + len(rows) * (size[1] + _GAP) + _MARGIN
+    sheet = Image.new("RGB", (plot_left + _PLOT + _MARGIN, max(height, top + _PLOT + 80)), _BACKGROUND)
+    draw, font, small = ImageDraw.Draw(sheet), ImageFont.load_default(22), ImageFont.load_default(15)
+    draw.text((_MARGIN, _MARGIN - 6), f"{result.method}  ·  {result.model_name}  ·  against the truth", _TEXT, font)
+
+    everywhere = np.ones(result.depth.shape, bool)
+    true_depth = np.asarray(truth.depth, np.float32)
+    found_depth = (result.depth * median_scale(result.depth, true_depth)).astype(np.float32)
+    inverse_range = inverse_depth_range(true_depth, everywhere)
+    for row, label in enumerate(rows):
+        draw.text((_MARGIN, top + row * (size[1] + _GAP)), label, _TEXT, small)
+    for column, frame in enumerate(shown):
+        image = result.images[frame]
+        pictures = (
+            image,
+            color_depth(found_depth[frame], everywhere[frame], inverse_range),
+            color_depth(true_depth[frame], everywhere[frame], inverse_range),
+            overlay(image, result.dynamic_mask[frame]),
+            overlay(image, truth.dynamic_mask[frame]),
+        )
+        for row, picture in enumerate(pictures):
+            place = left + column * (size[0] + _GAP), top + row * (size[1] + _GAP)
+            sheet.paste(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC), place)
+    _draw_cameras(draw, (plot_left, top), small, result.camera_from_world, np.asarray(truth.camera_from_world))
+    return np.asarray(sheet)
+
+
+def _draw_cameras(
+    draw: ImageDraw.ImageDraw,
+    corner: tuple[int, int],
+    font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
+    found: Float[np.ndarray, "S 3 4"],
+    true: Float[np.ndarray, "S 3 4"],
+) -> None:
+    """Plot centres from above, x to the right and z up, in the axes of the true first camera."""
+    true_rotation, origin = true[0, :, :3], centres(true)[0]
+    ways = {"true": (centres(true), _TRUE)}
+    if moves(centres(true)) and moves(centres(found)):
+        ways["found"] = (umeyama_sim3(centres(found), centres(true), allow_line=True).apply(centres(found)), _FOUND)
+    flat = {name: ((way - origin) @ true_rotation.T)[:, [0, 2]] for name, (way, _) in ways.items()}
+    points = np.concatenate(list(flat.values()))
+    middle, span = (points.max(0) + points.min(0)) / 2, max(np.ptp(points, axis=0).max(), 1e-9)
+    draw.text(corner, "Cameras from above", _TEXT, font)
+    for i, (name, way) in enumerate(flat.items()):
+        colour = ways[name][1]
+        draw.text((corner[0] + 90 * i, corner[1] + 22), name, colour, font)
+        pixels = (way - middle) / span * (_PLOT - 80) * [1, -1] + [corner[0] + _PLOT / 2, corner[1] + 40 + _PLOT / 2]
+        draw.line([tuple(p) for p in pixels], fill=colour, width=3)
+        for x, y in pixels:
+            draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=colour)
+        x, y = pixels[0]
+        draw.ellipse((x - 8, y - 8, x + 8, y + 8), outline=colour, width=2)
+    draw.text((corner[0], corner[1] + _PLOT + 30), f"square of {span:.2f} m; ring: first frame", _FAINT, font)

@@ -1,0 +1,32 @@
+"""Where a run computes: parameters on every device, clips spread over them."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from vggtjax.training.recipe import Recipe
+
+
+class Placement(NamedTuple):
+    """Shardings of what every device holds whole, and of arrays whose first axis is the batch."""
+
+    whole: NamedSharding
+    by_clip: NamedSharding
+
+
+def placement(recipe: Recipe) -> Placement:
+    """Return shardings over as many of this machine's devices as divide the batch of every stage.
+
+    A CPU counts as one device unless XLA_FLAGS=--xla_force_host_platform_device_count=N makes more of it, which keeps
+    more of its cores busy with small models.
+    """
+    devices = jax.local_devices()
+    batches = math.gcd(*(stage.batch for stage in recipe.stages))
+    count = max(n for n in range(1, len(devices) + 1) if batches % n == 0)
+    mesh = Mesh(np.array(devices[:count]), ("clips",))
+    return Placement(NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("clips")))
