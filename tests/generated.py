@@ -27,14 +27,18 @@ def keys(count: int) -> jax.Array:
 def clips(config: SceneConfig, count: int) -> SyntheticClip:
     """Return clips of the first keys, [count, S, ...] numpy."""
     options = None if config == DYNAMIC else QUICK
-    made = jax.jit(jax.vmap(lambda key: generate(key, textures(), config)), compiler_options=options)
-    return jax.device_get(made(keys(count)))
+
+    def make(keys: jax.Array, textures: Textures) -> SyntheticClip:
+        return jax.vmap(lambda key: generate(key, textures, config))(keys)
+
+    return jax.device_get(jax.jit(make, compiler_options=options)(keys(count), textures()))
 
 
 @functools.cache
 def scenes(config: SceneConfig, count: int) -> Scene:
     """Return the scenes behind `clips`."""
-    return jax.jit(jax.vmap(lambda key: sample_scene(jax.random.split(key)[0], textures().tiles, config)))(keys(count))
+    tiles = textures().tiles
+    return jax.jit(jax.vmap(lambda key: sample_scene(jax.random.split(key)[0], tiles, config)))(keys(count))
 
 
 def gauge(kind: str, points: np.ndarray, size: np.ndarray) -> np.ndarray:

@@ -15,8 +15,8 @@ from vggtjax.scenes.scene import camera_pose, part_poses
 COUNT = 6
 BLURRED = dataclasses.replace(DYNAMIC, samples=2, shutter=0.5, exposures=2)
 S, H, W = DYNAMIC.frames, DYNAMIC.height, DYNAMIC.width
-KINDS = np.array(["room", *DYNAMIC.kinds])
-PLANAR = np.isin(KINDS, ("room", "box"))
+KINDS = ("room", *DYNAMIC.kinds)
+PLANAR = np.isin(np.array(KINDS), ("room", "box"))
 TIMES = np.arange(S, dtype=np.float32) * np.float32(1 / (S - 1))
 
 
@@ -48,13 +48,19 @@ def static():
 def look():
     """Depth and parts that scene n's rays find at a time and at pixels [P, 2]."""
 
-    def at(key, time, pixels):
-        scene = sample_scene(jax.random.split(key)[0], textures().tiles, DYNAMIC)
-        surface = cast(scene, textures(), DYNAMIC, time, pixels)
+    every = scenes(DYNAMIC, COUNT)
+
+    def at(scene, textures, time, pixels):
+        surface = cast(scene, textures, DYNAMIC, time, pixels)
         return surface.depth, surface.part_ids
 
     compiled = jax.jit(at, compiler_options=QUICK)
-    return lambda n, time, pixels: jax.device_get(compiled(keys(COUNT)[n], time, jnp.asarray(pixels, jnp.float32)))
+
+    def find(n, time, pixels):
+        scene = jax.tree.map(lambda leaf: leaf[n], every)
+        return jax.device_get(compiled(scene, textures(), time, jnp.asarray(pixels, jnp.float32)))
+
+    return find
 
 
 @pytest.fixture(scope="module")
@@ -79,7 +85,7 @@ def carried(truth, sizes, clip, i, j):
     outward = np.full(len(ids), 2.0)  # nothing hides behind the room itself, which is seen from inside
     for part in np.unique(ids[ids > 0]):
         own = ids == part
-        outward[own] = gauge(KINDS[part], (local + 2e-3 * towards)[own], sizes[part - 1])
+        outward[own] = gauge(KINDS[part], (local + 5e-4 * towards)[own], sizes[part - 1])
     return Pair(clip, i, j, ids, world, np.where(inside[:, None], pixels, 0.0), z, inside, outward)
 
 
@@ -230,7 +236,7 @@ def test_cameras_stay_in_the_room_and_out_of_things():
         local = jnp.einsum("tkji,tkj->tki", rotation, centre[:, None] - middle)
         return centre, local, scene
 
-    centre, local, scene = jax.device_get(jax.jit(jax.vmap(one))(keys(200)))
+    centre, local, scene = jax.device_get(jax.jit(jax.vmap(one), compiler_options=QUICK)(keys(200)))
     assert (centre > scene.room_low[:, None]).all()
     assert (centre < scene.room_high[:, None]).all()
     for part, kind in enumerate(DYNAMIC.kinds):
@@ -280,11 +286,11 @@ def test_compiled_and_eager_casts_agree_on_large_frames():
     scene = jax.tree.map(lambda leaf: leaf[0], scenes(DYNAMIC, COUNT))  # does not depend on the size
     y, x = np.mgrid[0:128, 0:128] + 0.5
     pixels = jnp.asarray(np.stack([x.ravel(), y.ravel()], axis=-1), jnp.float32)
-    eager = cast(scene, textures(), config, jnp.float32(0), pixels)
+    eager = jax.device_get(cast(scene, textures(), config, jnp.float32(0), pixels))
     compiled = jax.jit(cast, static_argnums=2)(scene, textures(), config, jnp.float32(0), pixels)
-    same_clip(jax.device_get(compiled), jax.device_get(eager))
-    assert np.abs(compiled.depth - eager.depth).max() < 2e-3
-    clip = jax.jit(generate, static_argnums=2)(keys(COUNT)[0], textures(), dataclasses.replace(config, flicker=0.0))
-    differs = np.abs(np.asarray(clip.images[0]).reshape(-1, 3) - np.asarray(eager.colour).T) > 2e-3
-    assert differs.any(axis=-1).mean() < 1e-3
-    assert (np.asarray(clip.part_ids).ravel() != np.asarray(eager.part_ids)).mean() < 1e-3
+    same_clip(jax.device_get(compiled), eager)
+    clip = jax.device_get(jax.jit(generate, static_argnums=2)(keys(COUNT)[0], textures(), config))
+    differs = np.abs(clip.images.reshape(-1, 3) - np.clip(eager.colour.T, 0, 1)) > 2e-3
+    assert differs.mean() < 1e-3
+    assert (np.abs(clip.depth.ravel() - eager.depth) > 2e-3).mean() < 1e-3
+    assert (clip.part_ids.ravel() != eager.part_ids).mean() < 1e-3

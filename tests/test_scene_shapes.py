@@ -12,8 +12,8 @@ SIZE = (1.0, 2.0, 3.0)
 
 def interval(shape, origin, direction, size):
     """Where one ray enters and leaves one shape."""
-    rays = (jnp.asarray(v, jnp.float32)[None, :, None] for v in (origin, direction))
-    near, far = SHAPES[shape][0](*rays, jnp.asarray(size, jnp.float32)[None])
+    origin, direction = (jnp.asarray(v, jnp.float32)[None, :, None] for v in (origin, direction))
+    near, far = SHAPES[shape][0](origin, direction, jnp.asarray(size, jnp.float32)[None])
     assert near.shape == far.shape == (1, 1)
     return float(near[0, 0]), float(far[0, 0])
 

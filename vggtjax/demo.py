@@ -16,7 +16,8 @@ EMBEDDED = Path(__file__).parent / "embedded"
 MODEL = EMBEDDED / "model.safetensors"
 CLIP = EMBEDDED / "clip.npz"
 SCENE_SEED = 100  # of the held-out dynamic scenes that the clip is the first of; no evaluation takes this seed
-DEPTH_STEPS = 20_000  # of the logarithm of depth, from 1 mm: 16 bits hold it to better than 0.1 %
+_NEAREST = np.float32(1e-3)  # metres
+_STEP = 5e-4  # of the logarithm of depth that 16 bits count
 
 
 def demo_model(dtype: DType = "float32") -> Model:
@@ -39,24 +40,26 @@ def demo_clip() -> Truth:
     """
     if not CLIP.is_file():
         raise ClipError(f"the embedded clip {CLIP} is missing; install vggtjax again")
-    with np.load(CLIP, allow_pickle=False) as stored:
+    return read_demo_clip(CLIP)
+
+
+def read_demo_clip(path: Path) -> Truth:
+    """Read what `write_demo_clip` wrote."""
+    with np.load(path, allow_pickle=False) as stored:
+        depth = _NEAREST * np.exp(stored["log_depth"].astype(np.float32) * np.float32(_STEP))
+        mask = np.unpackbits(stored["dynamic_mask"], count=depth.size).astype(bool).reshape(depth.shape)
         images = stored["images"].astype(np.float32) / 255
-        depth = 1e-3 * np.exp(
-            stored["log_depth"].astype(np.float32) / np.float32(DEPTH_STEPS) * np.float32(np.log(2e5))
-        )
-        shape = depth.shape
-        mask = np.unpackbits(stored["dynamic_mask"], count=depth.size).astype(bool).reshape(shape)
-        return Truth(images, depth.astype(np.float32), mask, stored["camera_from_world"], stored["intrinsics"])
+        return Truth(images, depth, mask, stored["camera_from_world"], stored["intrinsics"])
 
 
 def write_demo_clip(path: Path, truth: Truth) -> None:
     """Write a clip as the file that `demo_clip` reads: colours in 8 bits, depth in 16, the mask in one."""
-    steps = np.log(np.clip(truth.depth, 1e-3, 200) / 1e-3) / np.log(2e5) * DEPTH_STEPS
+    steps = np.log(np.maximum(truth.depth, _NEAREST) / _NEAREST) / _STEP
     content = io.BytesIO()
     np.savez_compressed(
         content,
         images=np.rint(255 * truth.images).astype(np.uint8),
-        log_depth=np.rint(steps).astype(np.uint16),
+        log_depth=np.rint(np.minimum(steps, 65535)).astype(np.uint16),
         dynamic_mask=np.packbits(truth.dynamic_mask),
         camera_from_world=truth.camera_from_world.astype(np.float32),
         intrinsics=truth.intrinsics.astype(np.float32),

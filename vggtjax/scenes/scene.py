@@ -302,16 +302,19 @@ def _camera(dice: _Dice, distance: Array, azimuth: Array, config: SceneConfig) -
     still = dice(0.0, 1.0) < config.static_camera
     share = jnp.where(still, 0.0, dice(*config.motion))
     moving = jnp.where(still, 0.0, 1.0)
+    # From a walk around a thing to a pan on the spot: the larger of the two motions takes the whole share.
+    mixed = dice(0.0, 1.0, 2)
+    walk, pan = share * mixed / mixed.max()
     signs = jnp.sign(dice(-1.0, 1.0, 4))
     orbit = Wave(
-        share * signs * jnp.asarray([0.55, 0.12, 0.25, 0.12]) * dice(0.2, 1.0, 4),
-        share * jnp.asarray([0.2, 0.12, 0.12, 0.06]) * dice(0.2, 1.0, 4),
+        walk * signs * jnp.asarray([0.55, 0.12, 0.25, 0.12]) * dice(0.2, 1.0, 4),
+        walk * jnp.asarray([0.2, 0.12, 0.12, 0.06]) * dice(0.2, 1.0, 4),
         dice(0.5, 1.3, 4),
         dice(-jnp.pi, jnp.pi, 4),
     )
     target = Wave(
-        share * distance * dice(-0.3, 0.3, 3),
-        share * distance * dice(0.0, 0.12, 3),
+        pan * distance * dice(-0.5, 0.5, 3),
+        pan * distance * dice(0.0, 0.2, 3),
         dice(0.4, 1.2, 3),
         dice(-jnp.pi, jnp.pi, 3),
     )

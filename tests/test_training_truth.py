@@ -1,0 +1,298 @@
+"""What the network should say, and where patches are seen again: by hand and against slow loops in float64."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.generated import DYNAMIC, QUICK, STATIC, clips, scenes
+from tests.training_runs import CONFIG
+from vggtjax.network.aggregator import aggregate
+from vggtjax.network.model import init_params
+from vggtjax.network.pose import decode_pose
+from vggtjax.scenes import SyntheticClip
+from vggtjax.training.matching import MatchLoss, match_loss
+from vggtjax.training.truth import OCCLUDED, Matches, matches, targets
+
+PATCH = 4
+COUNT = {STATIC: 3, DYNAMIC: 6}  # as the tests of the renderer, which may have drawn them already
+CENTRE = slice(PATCH // 2, None, PATCH)
+
+quick_targets = jax.jit(targets, compiler_options=QUICK)
+quick_matches = jax.jit(matches, static_argnums=1, compiler_options=QUICK)
+
+
+@pytest.fixture(scope="module", params=[STATIC, DYNAMIC], ids=["static", "dynamic"])
+def clip(request):
+    return clips(request.param, COUNT[request.param])
+
+
+@pytest.fixture(scope="module")
+def found(clip):
+    return jax.device_get(quick_matches(jax.tree.map(jnp.asarray, clip), PATCH))
+
+
+def doubled(clip):
+    """Everything that is computed with, in float64."""
+    return clip._replace(
+        **{
+            name: getattr(clip, name).astype(np.float64)
+            for name in ("depth", "scene_flow", "camera_from_world", "intrinsics", "world_from_part")
+        }
+    )
+
+
+def world_points(clip):
+    """[B, S, H, W, 3], of a clip in float64."""
+    H, W = clip.depth.shape[2:]
+    y, x = np.mgrid[0:H, 0:W] + 0.5
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+    rays = np.einsum("bsij,hwj->bshwi", np.linalg.inv(clip.intrinsics), pixels)
+    seen = rays * clip.depth[..., None] - clip.camera_from_world[:, :, None, None, :, 3]
+    return np.einsum("bsji,bshwj->bshwi", clip.camera_from_world[..., :3], seen)
+
+
+def project(clip, points):
+    """Positions in pixels and depth of points [B, S, P, 3], those of frame s in frame s."""
+    seen = np.einsum("bsij,bspj->bspi", clip.camera_from_world[..., :3], points)
+    seen = seen + clip.camera_from_world[:, :, None, :, 3]
+    pixels = np.einsum("bsij,bspj->bspi", clip.intrinsics, seen / seen[..., 2:])
+    return pixels[..., :2], seen[..., 2]
+
+
+def test_targets(clip):
+    truth = jax.device_get(quick_targets(jax.tree.map(jnp.asarray, clip)))
+    clip = doubled(clip)
+    H, W = clip.depth.shape[2:]
+    np.testing.assert_allclose(np.linalg.norm(truth.points, axis=-1).mean(axis=(1, 2, 3)), 1, atol=1e-5)
+    scale = (clip.depth / truth.depth).mean(axis=(1, 2, 3))
+    np.testing.assert_allclose(truth.depth * scale[:, None, None, None], clip.depth, rtol=1e-5)
+
+    camera, intrinsics = jax.device_get(decode_pose(jnp.asarray(truth.pose_encoding), (H, W)))
+    np.testing.assert_allclose(camera[:, 0], np.broadcast_to(np.eye(3, 4), camera[:, 0].shape), atol=2e-6)
+    np.testing.assert_allclose(intrinsics, clip.intrinsics, rtol=1e-4)
+    rotation, translation = clip.camera_from_world[..., :3], clip.camera_from_world[..., 3]
+    relative = rotation @ rotation[:, :1].swapaxes(-1, -2)
+    np.testing.assert_allclose(camera[..., :3], relative, atol=1e-5)
+    moved = translation - np.einsum("bsij,bj->bsi", relative, translation[:, 0])
+    np.testing.assert_allclose(camera[..., 3] * scale[:, None, None], moved, atol=1e-4)
+
+    world = truth.points * scale[:, None, None, None, None] - translation[:, 0, None, None, None]
+    world = np.einsum("bji,bshwj->bshwi", rotation[:, 0], world)
+    np.testing.assert_allclose(world, world_points(clip), atol=1e-4)
+
+
+def test_walls_stay_where_they_are_from_frame_to_frame():
+    """Target points on the room's faces lie on the same planes in all frames of a clip."""
+    clip, scene = clips(STATIC, COUNT[STATIC]), scenes(STATIC, COUNT[STATIC])
+    truth = jax.device_get(quick_targets(jax.tree.map(jnp.asarray, clip)))
+    for b in range(COUNT[STATIC]):
+        scale = clip.depth[b].mean() / truth.depth[b].mean()
+        first = clip.camera_from_world[b, 0].astype(np.float64)
+        corners = np.stack([scene.room_low[b], scene.room_high[b]])
+        for s in range(STATIC.frames):
+            wall = clip.part_ids[b, s] == 0
+            assert wall.sum() > 100
+            points = (truth.points[b, s][wall] * scale - first[:, 3]) @ first[:, :3]
+            off = np.abs(points[:, None] - corners[None]).min(axis=(1, 2))
+            assert off.max() < 1e-3
+
+
+def passage():
+    """A camera that stands, and a box that goes by, a patch further to the right in every frame.
+
+    The wall is 8 m away, the box 4 m; the focal length is 16 pixels, so a patch of 4 pixels is 1 m wide at the box.
+    """
+    S, side = 3, 16
+    part_ids = np.zeros((1, S, side, side), np.int32)
+    for s in range(S):
+        part_ids[0, s, 4:12, 4 * s : 4 * s + 4] = 1
+    poses = np.tile(np.eye(3, 4, dtype=np.float32), (1, S, 2, 1, 1))
+    poses[0, :, 1, 0, 3] = np.arange(S)
+    intrinsics = np.array([[16, 0, 8], [0, 16, 8], [0, 0, 1]], np.float32)
+    fields = {
+        "images": np.zeros((1, S, side, side, 3), np.float32),
+        "depth": np.where(part_ids == 1, 4, 8).astype(np.float32),
+        "object_ids": part_ids,
+        "part_ids": part_ids,
+        "dynamic_mask": part_ids == 1,
+        "scene_flow": np.zeros((1, S, side, side, 3), np.float32),
+        "camera_from_world": np.tile(np.eye(3, 4, dtype=np.float32), (1, S, 1, 1)),
+        "intrinsics": np.tile(intrinsics, (1, S, 1, 1)),
+        "world_from_part": poses,
+    }
+    return SyntheticClip(**{name: jnp.asarray(field) for name, field in fields.items()})
+
+
+def test_matches_by_hand():
+    found = jax.device_get(quick_matches(passage(), PATCH))
+    assert found.position.shape == (1, 3, 3, 16, 2)
+    for r, s, patch in np.ndindex(3, 3, 16):
+        row, column = divmod(patch, 4)
+        on_box = row in (1, 2) and column == r
+        seen_at = column + s - r if on_box else column
+        covered = not on_box and row in (1, 2) and column == s
+        assert found.visible[0, r, s, patch] == (not covered)
+        assert found.patch[0, r, s, patch] == 4 * row + seen_at
+        expected = (4 * np.array([seen_at, row]) + 2.5) / 8 - 1  # the centre is the middle pixel's, of index 2
+        np.testing.assert_allclose(found.position[0, r, s, patch], expected, atol=1e-5)
+
+
+def test_every_patch_matches_itself(found):
+    S, P = found.patch.shape[2:]
+    for s in range(S):
+        assert found.visible[:, s, s].all()
+        np.testing.assert_array_equal(found.patch[:, s, s], np.broadcast_to(np.arange(P), found.patch[:, s, s].shape))
+
+
+def test_matches_of_what_stands_still_need_no_poses_of_parts(clip, found):
+    """Rigid geometry alone: unproject, project, compare with the depth shown there."""
+    clip = doubled(clip)
+    B, S = clip.depth.shape[:2]
+    points = world_points(clip)[:, :, CENTRE, CENTRE].reshape(B, S, -1, 3)
+    still = ~clip.dynamic_mask[:, :, CENTRE, CENTRE].reshape(B, S, -1)
+    for r in range(S):
+        pixels, z = project(clip, np.repeat(points[:, r : r + 1], S, axis=1))
+        check(clip, found, r, pixels, z, np.repeat(still[:, r : r + 1], S, axis=1))
+    assert found.visible[:, 0, 1].mean() > 0.3
+
+
+def test_matches_of_what_moves_follow_the_scene_flow():
+    clip = clips(DYNAMIC, COUNT[DYNAMIC])
+    found = jax.device_get(quick_matches(jax.tree.map(jnp.asarray, clip), PATCH))
+    clip = doubled(clip)
+    B, S = clip.depth.shape[:2]
+    points = (world_points(clip) + clip.scene_flow)[:, :, CENTRE, CENTRE].reshape(B, S, -1, 3)
+    moving = clip.dynamic_mask[:, :, CENTRE, CENTRE].reshape(B, S, -1)
+    for r in range(S - 1):
+        pixels, z = project(clip, np.repeat(points[:, r : r + 1], S, axis=1))
+        later = np.zeros((B, S, 1), bool)
+        later[:, r + 1] = True
+        check(clip, found, r, pixels, z, moving[:, r : r + 1] & later)
+    assert (found.visible[:, 0, 1] & moving[:, 0]).sum() > 20
+
+
+def check(clip, found, r, pixels, z, chosen):
+    """Compare matches from frame r with positions [B, S, P, 2] and depths [B, S, P], where `chosen`."""
+    B, S, H, W = clip.depth.shape
+    chosen = chosen & (z > 0.1)
+    position = 2 * pixels / [W, H] - 1
+    off = np.abs(found.position[:, r] - np.clip(position, -2, 2)).max(axis=-1)
+    assert off[chosen].max() < 1e-3
+    inside = (pixels > 0).all(axis=-1) & (pixels < [W, H]).all(axis=-1)
+    column, row = np.moveaxis(np.floor(np.where(inside[..., None], pixels, 0)).astype(int), -1, 0)
+    b, s = np.ogrid[:B, :S]
+    shown = clip.depth[b[..., None], s[..., None], row, column]
+    visible = inside & (np.abs(shown - z) < OCCLUDED * z)
+    # Rounding may turn pixels that lie on a border of the grid, and depths on the tolerance.
+    clear = chosen & (np.abs(pixels - np.round(pixels)).min(axis=-1) > 1e-3)
+    clear &= np.abs(np.abs(shown - z) / z - OCCLUDED) > 1e-4
+    assert clear.sum() > 0.8 * chosen.sum()
+    np.testing.assert_array_equal(found.visible[:, r][clear], visible[clear])
+    patch = row // PATCH * (W // PATCH) + column // PATCH
+    np.testing.assert_array_equal(found.patch[:, r][clear & visible], patch[clear & visible])
+    occluded = clear & inside & (shown < z * (1 - OCCLUDED))
+    assert not found.visible[:, r][occluded].any()
+
+
+def random_matches(generator, B, S, P):
+    """Matches anywhere, of which some are seen; every patch is its own match."""
+    patch = generator.integers(0, P, (B, S, S, P)).astype(np.int32)
+    visible = generator.random((B, S, S, P)) < 0.6
+    for s in range(S):
+        patch[:, s, s], visible[:, s, s] = np.arange(P), True
+    position = np.zeros((B, S, S, P, 2), np.float32)
+    return Matches(*map(jnp.asarray, (position, patch, visible)))
+
+
+def slow_match_loss(matches, q, k):
+    """The cross-entropies and the accuracy, one patch at a time."""
+    patch, visible = np.asarray(matches.patch), np.asarray(matches.visible)
+    q, k = (np.asarray(a, np.float64) for a in (q, k))
+    B, S, P, N, D = q.shape
+    to_first, to_each, right = [], [], []
+    for b, r, p in np.ndindex(B, S, P):
+        logits = np.einsum("nd,sjnd->nsj", q[b, r, p], k[b]) / np.sqrt(D)
+        if r > 0 and visible[b, r, 0, p]:
+            heads = [log_softmax(logits[n].ravel())[patch[b, r, 0, p]] for n in range(N // 2)]
+            to_first.append(np.mean(heads))
+        for s in range(S):
+            if s != r and visible[b, r, s, p]:
+                among = log_softmax(logits[N // 2 :, s].mean(axis=0))
+                to_each.append(among[patch[b, r, s, p]])
+                right.append(among.argmax() == patch[b, r, s, p])
+    return -np.mean(to_first) - np.mean(to_each), np.mean(right)
+
+
+def log_softmax(x):
+    return x - x.max() - np.log(np.exp(x - x.max()).sum())
+
+
+@pytest.mark.parametrize("heads", [2, 5])
+def test_match_loss_against_a_slow_one(heads):
+    generator = np.random.default_rng(heads)
+    B, S, P, D = 2, 3, 4, 8
+    q, k = (jnp.asarray(generator.normal(0, 2, (B, S, P, heads, D)), jnp.float32) for _ in range(2))
+    found = random_matches(generator, B, S, P)
+    loss, accuracy = match_loss(found, q, k)
+    expected = slow_match_loss(found, q, k)
+    assert (float(loss), float(accuracy)) == pytest.approx(expected, rel=1e-5)
+    assert 0 < expected[1] < 1
+
+
+def test_perfect_attention_has_no_loss_and_nothing_seen_none_at_all():
+    P = 16
+    found = quick_matches(passage(), PATCH)
+    names = jnp.eye(3 * P).reshape(1, 3, P, 1, 3 * P)  # every patch of every frame by itself
+
+    def said(frame):
+        return jnp.take_along_axis(jnp.eye(3 * P)[None, None], P * frame + found.patch[:, :, frame, :, None], axis=2)
+
+    to_first, to_each = said(0), sum(said(s) for s in range(3))
+    sharp = 4000.0
+    q = sharp * jnp.stack([to_first, to_each], axis=3)
+    loss, accuracy = match_loss(found, q, jnp.concatenate([names, names], axis=3))
+    assert float(loss) == pytest.approx(0, abs=1e-5)
+    assert float(accuracy) == 1
+    unseen = found._replace(visible=jnp.zeros_like(found.visible))
+    assert [float(x) for x in match_loss(unseen, q, jnp.concatenate([names, names], axis=3))] == [0, 0]
+
+
+class Watched:
+    """A MatchLoss in the place of the cues, and the q and k that it saw of the layers that are supervised."""
+
+    def __init__(self, loss, layers):
+        self.loss, self.layers = loss, layers
+
+    def layer_counts(self):
+        counts = self.loss.layer_counts()
+        return counts.cumsum() * counts  # the first supervised layer is 1, the next one 2
+
+    def zeros(self, B, S, P):
+        heads = CONFIG.num_heads
+        kept = jnp.zeros((len(self.layers), B, S, P, heads, CONFIG.embed_dim // heads))
+        return self.loss.zeros(B, S, P), kept, kept
+
+    def add(self, sums, slot, q, k):
+        sums, *kept = sums
+        kept = [jnp.where(slot > 0, old.at[slot - 1].set(new), old) for old, new in zip(kept, (q, k), strict=True)]
+        return self.loss.add(sums, slot, q, k), *kept
+
+
+def test_match_loss_inside_the_aggregator_is_that_of_its_queries_and_keys():
+    layers, B, S, grid = (1, 3), 1, 3, (2, 2)
+    generator = np.random.default_rng(0)
+    tokens = jnp.asarray(generator.normal(0, 1, (B, S, 4, CONFIG.embed_dim)), jnp.float32)
+    found = random_matches(generator, B, S, 4)
+    loss = MatchLoss(found, layers, CONFIG.depth)
+    np.testing.assert_array_equal(loss.layer_counts(), [0, 1, 0, 1])
+    captures = [lambda tokens: tokens[:, :, 0, :1]] * len(CONFIG.taps)
+    cues: Any = Watched(loss, layers)
+    sums = aggregate(init_params(0, CONFIG), tokens, CONFIG, grid, captures=captures, cues=cues)[2]
+    accumulated, q, k = sums
+    by_hand = [[float(x) for x in match_loss(found, q[layer], k[layer])] for layer in range(2)]
+    assert abs(by_hand[0][0] - by_hand[1][0]) > 1e-4  # the layers differ
+    expected = np.mean(by_hand, axis=0)
+    assert (float(accumulated.loss), float(accumulated.accuracy)) == pytest.approx(expected, rel=1e-5)

@@ -1,0 +1,252 @@
+"""Writing generated scenes as a data set for others.
+
+In the folder:
+
+    index.json              what the set is: conventions, files, settings, and the scenes that are whole
+    preview.png             some scenes at a glance
+    scene_0000/             a scene, there only when it is whole; with a frame's number as its file name
+        images/             .png, 8 bits
+        depth/              .npy float32 metres along z, and 16-bit .png in millimetres
+        mask/               .png, 255 where the pixel is on something that moves, else 0
+        parts/              .png, number of the rigid part, 0 for the room
+        flow/               .npy float32, where the pixel's point is a frame later, minus where it is
+        part_poses.npy      float32 [S, K, 3, 4], world from part by number: the way of every point to every frame
+        trajectory.txt      camera poses, TUM format, as a result has it; the frame number stands for the time
+        intrinsics.txt      fx fy cx cy of every frame, in pixels, as a result has it
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any, get_args
+
+import jax
+import numpy as np
+from PIL import Image
+
+from vggtjax.errors import InputError, OutputError
+from vggtjax.files import staging, writing
+from vggtjax.results.export import encode_depth, write_intrinsics, write_trajectory
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.scenes.held_out import Kind
+from vggtjax.scenes.render import SyntheticClip, generate
+from vggtjax.scenes.scene import SceneConfig
+from vggtjax.scenes.sheet import draw_sheet
+from vggtjax.scenes.textures import Split, load_textures
+
+INDEX, PREVIEW = "index.json", "preview.png"
+MOST = 10_000  # scenes of a set
+_FORMAT_VERSION = 1
+_STREAM = 0x73657473  # folded into the seed's key, so that no other use of a seed draws these scenes
+_MILLIMETRES = 1000.0
+_PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
+_WORKERS = 8
+_INDEX_BYTES = 2**22
+
+_draw = jax.jit(generate, static_argnums=2)
+
+
+def write_scenes(
+    out: str | Path,
+    config: SceneConfig,
+    *,
+    count: int,
+    kind: Kind = "dynamic",
+    split: Split = "training",
+    seed: int = 0,
+    progress: Callable[[int, int], object] | None = None,
+) -> list[Path]:
+    """Generate scenes into a folder; scenes that are there already are kept, so an interrupted set goes on.
+
+    A scene depends on the settings and on its number, not on `count`.
+
+    Args:
+        out: folder of the set, made if missing.
+        config: size, frames and how images are drawn. Its `dynamic` follows from `kind`.
+        count: number of scenes, at most 10 000.
+        kind: "static", or "dynamic" where one to three things move, which the camera need not see.
+        split: of the textures.
+        seed: different seeds share no scene.
+        progress: called with the number of scenes written and wanted.
+
+    Returns:
+        The folders of the scenes.
+
+    Raises:
+        InputError: a value out of range, motion blur without exposures, or a folder with a set of other settings.
+        OutputError: the folder cannot be written, or holds files of our names that are no set.
+    """
+    out = Path(out)
+    _check(config, count, kind, split, seed)
+    config = dataclasses.replace(config, dynamic=float(kind == "dynamic"))
+    index = _describe(config, kind, split, seed)
+    _check_folder(out, index)
+    textures = load_textures(split)
+    stream = jax.random.fold_in(jax.random.key(seed), _STREAM)
+    folders = [out / f"scene_{number:04d}" for number in range(count)]
+    _write_index(out, index)  # comes first, so that no scene is ever without it
+    missing = [number for number in range(count) if not folders[number].is_dir()]
+    for done, number in enumerate(missing, start=count - len(missing)):
+        if progress is not None:
+            progress(done, count)
+        clip = jax.device_get(_draw(jax.random.fold_in(stream, number), textures, config))
+        with staging(out) as staged:
+            scene = staged / "scene"
+            scene.mkdir()
+            _write_scene(scene, clip)
+            scene.rename(folders[number])
+        _write_index(out, index)
+    with writing(out / PREVIEW) as path:
+        draw_sheet(folders, f"{kind} scenes, seed {seed}, {split} textures").save(path)
+    if progress is not None:
+        progress(count, count)
+    return folders
+
+
+def read_index(out: str | Path) -> dict[str, Any]:
+    """Return what index.json of a set says. Raises InputError where there is none of this format."""
+    path = Path(out) / INDEX
+    try:
+        size = path.stat().st_size
+        text = path.read_bytes() if size <= _INDEX_BYTES else b""
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror}; expected the folder of a set of scenes") from None
+    if size > _INDEX_BYTES:
+        raise InputError(f"{path} is {size} bytes; expected the index of a set of scenes")
+    try:
+        index = json.loads(text)
+    except (ValueError, RecursionError):  # not JSON, or not text
+        index = None
+    if not isinstance(index, dict) or index.get("format") != "vggtjax scenes":
+        raise InputError(f"{path} is not the index of a set of scenes; choose another folder")
+    if index.get("version") != _FORMAT_VERSION:
+        raise InputError(f"{path} has version {index.get('version')!r}; expected {_FORMAT_VERSION}")
+    return index
+
+
+def _check(config: SceneConfig, count: int, kind: str, split: str, seed: int) -> None:
+    for name, value, names in (("kind", kind, get_args(Kind)), ("split", split, get_args(Split))):
+        if value not in names:
+            raise InputError(f"{name} is {value!r}; expected one of {names}")
+    if type(count) is not int or not 1 <= count <= MOST:
+        raise InputError(f"count is {count!r}; expected a whole number from 1 to {MOST}")
+    if type(seed) is not int or not 0 <= seed < 2**31:
+        raise InputError(f"seed is {seed!r}; expected a whole number in [0, 2**31)")
+    if (config.shutter > 0) != (config.exposures > 1):
+        raise InputError(
+            f"shutter is {config.shutter} with {config.exposures} exposures; motion blur needs a shutter above 0 and "
+            "at least 2 exposures, sharp images a shutter of 0 and 1"
+        )
+
+
+def _check_folder(out: Path, index: dict[str, Any]) -> None:
+    """Raise unless `out` is free, or holds scenes of the same settings."""
+    if not os.path.lexists(out / INDEX):
+        taken = [*out.glob(PREVIEW), *out.glob("scene_*")]
+        if taken:
+            raise OutputError(f"{taken[0]} exists, but no {INDEX} beside it; choose another folder or move it away")
+        return
+    there = read_index(out)
+    other = [name for name in ("kind", "split", "seed", "config") if there.get(name) != index[name]]
+    if other:
+        said = ", ".join(f"{name} {there.get(name)!r} instead of {index[name]!r}" for name in other)
+        raise InputError(f"{out} holds scenes with {said}; choose another folder, or the same settings to go on")
+
+
+def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str, Any]:
+    """Return the index of a set without its scenes."""
+    settings = dataclasses.asdict(config)
+    return {
+        "format": "vggtjax scenes",
+        "version": _FORMAT_VERSION,
+        "about": "Generated rooms in which things stand or move, seen by a hand-held camera, with exact truth.",
+        "conventions": {
+            "units": "metres",
+            "camera": "OpenCV: x right, y down, z forward; intrinsics in pixels, principal point at the image centre",
+            "pixels": "the centre of the first pixel is at (0.5, 0.5); truth is that of the pixel's centre",
+            "world": "axes of the scene, y down; the room is at rest in it",
+            "parts": "0 is the room; every rigid part has a number, and every pixel shows one",
+        },
+        "files": {
+            "images/*.png": "RGB, 8 bits",
+            "depth/*.npy": "float32 [H, W], metres along z",
+            "depth/*.png": "uint16, the same in millimetres",
+            "mask/*.png": "uint8, 255 on parts that move in the clip, else 0; shadows do not count",
+            "parts/*.png": "uint8, number of the part",
+            "flow/*.npy": "float32 [H, W, 3], world axes: where the pixel's point is a frame later, minus where it is",
+            "part_poses.npy": "float32 [S, K, 3, 4], world from part by number: "
+            "a point X of part k at frame s is at P[t, k] inverse(P[s, k]) X at frame t",
+            "trajectory.txt": "frame tx ty tz qx qy qz qw, world from camera (TUM format)",
+            "intrinsics.txt": "fx fy cx cy of every frame",
+        },
+        "kind": kind,
+        "split": split,
+        "seed": seed,
+        "key": f"scene n is generate(fold_in(fold_in(key({seed}), {_STREAM}), n), textures of the split, config)",
+        "config": json.loads(json.dumps(settings)),
+        "objects": [0, *(1 + number for number in config.objects)],
+        "about_objects": "thing that each part belongs to, by number of the part; 0 is the room, 1 the figure",
+    }
+
+
+def _write_index(out: Path, index: dict[str, Any]) -> None:
+    scenes = sorted(path.name for path in out.glob("scene_[0-9][0-9][0-9][0-9]") if path.is_dir())
+    with writing(out / INDEX) as path:
+        path.write_text(json.dumps(index | {"scenes": scenes}, indent=2) + "\n", encoding="utf-8")
+
+
+def _write_scene(folder: Path, clip: SyntheticClip) -> None:
+    """Write a clip [S, ...] of numpy arrays into the empty `folder`."""
+    truth = _as_result(clip)
+    write_trajectory(folder / "trajectory.txt", truth)
+    write_intrinsics(folder / "intrinsics.txt", truth)
+    np.save(folder / "part_poses.npy", clip.world_from_part.astype(np.float32), allow_pickle=False)
+    for name in ("images", "depth", "mask", "parts", "flow"):
+        (folder / name).mkdir()
+    with ThreadPoolExecutor(min(_WORKERS, os.cpu_count() or 1)) as pool:
+        for _ in pool.map(partial(_write_frame, folder, clip, truth), range(len(truth.depth))):
+            pass
+
+
+def _write_frame(folder: Path, clip: SyntheticClip, truth: Reconstruction, frame: int) -> None:
+    name, depth = f"{frame:05d}", truth.depth[frame]
+    _write_png(folder / f"images/{name}.png", truth.images[frame])
+    np.save(folder / f"depth/{name}.npy", depth, allow_pickle=False)
+    _write_png(folder / f"depth/{name}.png", encode_depth(depth, depth > 0, _MILLIMETRES))
+    _write_png(folder / f"mask/{name}.png", truth.dynamic_mask[frame].astype(np.uint8) * 255)
+    _write_png(folder / f"parts/{name}.png", np.asarray(clip.part_ids)[frame].astype(np.uint8))
+    np.save(folder / f"flow/{name}.npy", np.asarray(clip.scene_flow)[frame].astype(np.float32), allow_pickle=False)
+
+
+def _as_result(clip: SyntheticClip) -> Reconstruction:
+    """Return the truth as the result that a perfect method would have: what writes results writes it too."""
+    S, H, W = clip.depth.shape
+    mask = np.asarray(clip.dynamic_mask)
+    return Reconstruction(
+        depth=np.asarray(clip.depth),
+        depth_confidence=np.ones((S, H, W), np.float32),
+        saliency=mask.astype(np.float32),
+        dynamic_mask=mask,
+        camera_from_world=np.asarray(clip.camera_from_world),
+        intrinsics=np.asarray(clip.intrinsics),
+        images=np.rint(255 * np.asarray(clip.images)).astype(np.uint8),
+        frame_names=tuple(f"{frame:05d}" for frame in range(S)),
+        timestamps=None,
+        method="truth",
+        model_name="none",
+        settings={},
+        source_size=np.tile([H, W], (S, 1)),
+        source_scale=np.ones((S, 2)),
+        source_offset=np.zeros((S, 2)),
+        valid_box=np.tile([0, 0, W, H], (S, 1)),
+    )
+
+
+def _write_png(path: Path, pixels: np.ndarray) -> None:
+    Image.fromarray(pixels).save(path, compress_level=_PNG_LEVEL)

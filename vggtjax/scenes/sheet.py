@@ -1,0 +1,91 @@
+"""One picture of a set of scenes for people: frames, and the truth of the middle one. Does not import jax."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from vggtjax.results.previews import color_depth, inverse_depth_range, overlay
+
+_MOST_ROWS = 8
+_THUMBNAIL = (260, 200)  # widest and highest
+_MARGIN, _GAP, _HEADER, _LABEL = 24, 6, 76, 108
+_BACKGROUND, _TEXT, _FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)
+_REST = np.array([48, 48, 54], np.uint8)
+_COLUMNS = ("first", "middle", "last", "depth", "dynamic", "parts", "flow")
+_UNMIXED = ("parts", "flow")  # colours that say nothing when they are mixed
+
+
+def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
+    """Draw up to eight scenes, evenly spread, a row each: three frames, then depth, mask, parts and flow of the middle.
+
+    Args:
+        scenes: folders that `write_scenes` wrote, of images of one size.
+        title: what the set is.
+    """
+    chosen = [scenes[i] for i in np.linspace(0, len(scenes) - 1, min(len(scenes), _MOST_ROWS)).round().astype(int)]
+    rows = [_row(scene) for scene in chosen]
+    height, width = rows[0][0].shape[:2]
+    scale = min(_THUMBNAIL[0] / width, _THUMBNAIL[1] / height)
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    step_x, step_y = size[0] + _GAP, size[1] + _GAP
+    left, top = _MARGIN + _LABEL, _MARGIN + _HEADER
+    sheet = Image.new(
+        "RGB",
+        (left + len(_COLUMNS) * step_x - _GAP + _MARGIN, top + len(rows) * step_y - _GAP + _MARGIN),
+        _BACKGROUND,
+    )
+    draw = ImageDraw.Draw(sheet)
+    large, small = ImageFont.load_default(22), ImageFont.load_default(15)
+    draw.text((_MARGIN, _MARGIN), title, _TEXT, large)
+    for column, name in enumerate(_COLUMNS):
+        draw.text((left + column * step_x, top - 24), name, _FAINT, small)
+    for row, (scene, pictures) in enumerate(zip(chosen, rows, strict=True)):
+        y = top + row * step_y
+        draw.text((_MARGIN, y), scene.name, _TEXT, small)
+        for column, picture in enumerate(pictures):
+            filtering = Image.Resampling.NEAREST if _COLUMNS[column] in _UNMIXED else Image.Resampling.LANCZOS
+            sheet.paste(Image.fromarray(picture).resize(size, filtering), (left + column * step_x, y))
+    return sheet
+
+
+def color_parts(part_ids: Int[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Give every part a colour of its own, the same in all pictures; the room is grey."""
+    hues = [colorsys.hsv_to_rgb((0.618034 * n) % 1, 0.55 + 0.4 * (n % 2), 0.95 - 0.25 * (n % 3)) for n in range(256)]
+    colors = (255 * np.array(hues)).round().astype(np.uint8)
+    colors[0] = _REST
+    return colors[part_ids]
+
+
+def color_flow(flow: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Show flow along x, y and z as red, green and blue about a mid grey, the fastest at full colour; rest is dark."""
+    fastest = np.abs(flow).max()
+    moving = np.linalg.norm(flow, axis=-1) > 1e-4
+    colors = (255 * (0.5 + 0.5 * flow / max(float(fastest), 1e-4))).round().astype(np.uint8)
+    return np.where(moving[..., None], colors, _REST)
+
+
+def _row(scene: Path) -> list[np.ndarray]:
+    names = sorted(path.stem for path in (scene / "images").glob("*.png"))
+    middle = names[len(names) // 2]
+    images = [_pixels(scene / f"images/{name}.png") for name in (names[0], middle, names[-1])]
+    depth = np.load(scene / f"depth/{middle}.npy", allow_pickle=False)
+    valid = np.ones(depth.shape, bool)
+    mask = _pixels(scene / f"mask/{middle}.png") > 0
+    return [
+        *images,
+        color_depth(depth, valid, inverse_depth_range(depth[None], valid[None])),
+        overlay(images[1], mask),
+        color_parts(_pixels(scene / f"parts/{middle}.png")),
+        color_flow(np.load(scene / f"flow/{middle}.npy", allow_pickle=False)),
+    ]
+
+
+def _pixels(path: Path) -> np.ndarray:
+    with Image.open(path, formats=("PNG",)) as image:
+        return np.asarray(image)
