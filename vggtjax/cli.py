@@ -14,6 +14,7 @@ import tyro
 from vggtjax.calibration.command import calibrate_cues
 from vggtjax.config import Gram, Suppress, VGGTConfig
 from vggtjax.errors import InputError, VggtjaxError
+from vggtjax.host_memory import keep_freed_memory
 from vggtjax.methods import MethodName
 from vggtjax.report import Report
 from vggtjax.scenes.command import scenes
@@ -191,6 +192,7 @@ COMMANDS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, 2 for bad input or output, 130 when interrupted."""
+    keep_freed_memory()
     logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
     for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub"):
         logging.getLogger(chatty).setLevel(logging.ERROR)

@@ -1,3 +1,5 @@
+from .dataset import read_index as read_index
+from .dataset import write_scenes as write_scenes
 from .held_out import Hardness as Hardness
 from .held_out import hardness as hardness
 from .held_out import held_out_scenes as held_out_scenes

@@ -17,7 +17,7 @@ from vggtjax.scenes.scene import SceneConfig
 from vggtjax.scenes.textures import Textures, load_textures
 
 Kind = Literal["static", "dynamic"]
-STREAM = 0x7E57  # folded into every key: no key of training, which folds in step numbers of its own key, is met
+STREAM = 0x7E57_7E57  # folded into every key; training folds in step numbers, which stay far below
 MIN_FRAMES = 12
 MIN_PATH = 0.15  # of the camera's centres, in median depths
 MIN_BEND = 0.1  # largest distance of the path from its chord, as a share of its length
@@ -125,7 +125,7 @@ def _hard_keys(kind: Kind, count: int, config: SceneConfig, seed: int, textures:
     stream = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), STREAM), get_args(Kind).index(kind))
     kept, candidate = [], 0
     while len(kept) < count:
-        keys = jax.vmap(lambda i: jax.random.fold_in(stream, i))(np.arange(candidate, candidate + _AT_ONCE))
+        keys = jax.vmap(lambda i: jax.random.fold_in(stream, i))(jax.numpy.arange(candidate, candidate + _AT_ONCE))
         hard = hardness(jax.device_get(_generate(keys, textures, small))).kept(kind)
         kept += [keys[i] for i in np.flatnonzero(hard)]
         candidate += _AT_ONCE

@@ -55,7 +55,10 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         for name in ("motion", "field_of_view"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+            value = getattr(self, name)
+            if not isinstance(value, list | tuple) or len(value) != 2:
+                raise InputError(f"{name} is {value!r}; expected two numbers, the smaller first")
+            object.__setattr__(self, name, tuple(value))
         for name, low, high in (
             ("height", 8, 2048),
             ("width", 8, 2048),
@@ -79,14 +82,15 @@ class SceneConfig:
             ("field_of_view", 10, 150),
         ):
             value = getattr(self, name)
-            values = value if isinstance(value, tuple) else (value,)
-            if not all(isinstance(v, int | float) and low <= v <= high for v in values) or sorted(values) != [*values]:
-                raise InputError(f"{name} is {value!r}; expected numbers from {low} to {high}, the smaller first")
+            values = value if name in ("motion", "field_of_view") else (value,)
+            numbers = all(isinstance(v, int | float) and low <= v <= high for v in values)
+            if not numbers or sorted(values) != [*values]:
+                raise InputError(f"{name} is {value!r}; expected from {low} to {high}, of two numbers the smaller first")
 
     @property
     def kinds(self) -> tuple[str, ...]:
         """Shape of every part: the articulated figure's first in each kind."""
-        counts = dict(zip(KINDS, (self.boxes, self.ellipsoids, self.cylinders), strict=True))
+        counts: dict[str, int] = dict(zip(KINDS, (self.boxes, self.ellipsoids, self.cylinders), strict=True))
         return tuple(kind for kind, parts in BODY for _ in range(parts + counts[kind]))
 
     @property

@@ -111,6 +111,12 @@ class Recipe:
                     f"a stage has frames of {stage.height} x {stage.width} pixels; expected multiples of the "
                     f"model's patch_size {self.model.patch_size}"
                 )
+        layers = [layer for layer in self.losses.match_layers if layer >= self.model.depth]
+        if self.losses.match and (layers or not self.losses.match_layers or self.model.num_heads < 2):
+            raise InputError(
+                f"losses.match needs a model of two heads or more and match_layers below its depth {self.model.depth}; "
+                f"they are {self.losses.match_layers}, of {self.model.num_heads} heads"
+            )
         spent = self.optimiser.warmup_steps
         spent += self.optimiser.decay_steps if self.optimiser.schedule == "stable" else 0
         if spent > self.total_steps:

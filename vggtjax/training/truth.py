@@ -26,7 +26,7 @@ class Targets(NamedTuple):
 class Matches(NamedTuple):
     """Where the centre of every patch of frame r is seen in frame s."""
 
-    position: Float[Array, "B R S P 2"]  # x, y in [-1, 1] over the image; outside of it if it is not seen
+    position: Float[Array, "B R S P 2"]  # x, y in [-1, 1] over the image, up to 2 beyond its edge
     patch: Int[Array, "B R S P"]
     visible: Bool[Array, "B R S P"]
 
