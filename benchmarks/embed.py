@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 
 import jax
@@ -9,9 +10,12 @@ import numpy as np
 from rich.console import Console
 
 from vggtjax.checkpoint import load_model, numpy_dtype, save_model
+from vggtjax.config import VGGTConfig
 from vggtjax.demo import CLIP, MODEL, SCENE_SEED, write_demo_clip
 from vggtjax.errors import InputError
 from vggtjax.evaluation.truth import Truth
+from vggtjax.network.backbone import patch_positions
+from vggtjax.network.layers import Params
 from vggtjax.scenes import SceneConfig, held_out_scenes
 
 MOST_MODEL_BYTES = 24 << 20
@@ -25,12 +29,15 @@ def embed(model: str, /, *, frames: int = 16, scene: int = 0, image_size: int | 
         model: a .safetensors of this library, as `vggtjax train` or `vggtjax calibrate-cues` wrote it.
         frames: of the clip.
         scene: index of the held-out scene.
-        image_size: side of the clip in pixels; the model's own by default.
+        image_size: side in pixels that the model was last trained at, which becomes its own and the clip's; the
+            model's own by default.
     """
     loaded = load_model(model)
-    params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(numpy_dtype("bfloat16")), loaded.params)
-    save_model(MODEL, params, loaded.config, name="demo")
     side = image_size or loaded.config.image_size
+    network = dataclasses.replace(loaded.config, image_size=side)
+    params = {**loaded.params, "backbone": _at_size(loaded.params["backbone"], loaded.config, network)}
+    params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(numpy_dtype("bfloat16")), params)
+    save_model(MODEL, params, network, name="demo")
     config = SceneConfig(height=side, width=side, frames=frames, samples=3)
     clips = held_out_scenes("dynamic", scene + 1, config, seed=SCENE_SEED)
     write_demo_clip(CLIP, Truth(*(getattr(clips, name)[scene] for name in Truth._fields)))
@@ -40,3 +47,11 @@ def embed(model: str, /, *, frames: int = 16, scene: int = 0, image_size: int | 
         if size > most:
             raise InputError(f"{path} has {size} bytes; at most {most} go into the package")
         console.print(f"{path}  {size} bytes  sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}", soft_wrap=True)
+
+
+def _at_size(backbone: Params, config: VGGTConfig, network: VGGTConfig) -> Params:
+    """Return the backbone with its positions resized, as it resizes them itself for images of that size."""
+    positions = jax.numpy.asarray(backbone["position_embedding"], jax.numpy.float32)
+    grid = (network.grid_size, network.grid_size)
+    patches = patch_positions(positions[1:], config.grid_size, grid)
+    return {**backbone, "position_embedding": jax.numpy.concatenate([positions[:1], patches])}

@@ -44,7 +44,7 @@ def encode(
     x = apply(_patch_embedding(config, compute_dtype), params["patch_embedding"], x.reshape(B * S, H, W, 3))
     x = x.astype(jnp.float32).reshape(B * S, grid[0] * grid[1], C)
     positions = params["position_embedding"].astype(jnp.float32)
-    x = x + _patch_positions(positions[1:], config.grid_size, grid)[None]
+    x = x + patch_positions(positions[1:], config.grid_size, grid)[None]
     special = jnp.concatenate([params["class_token"] + positions[:1], params["register_tokens"]])  # [1 + R, C]
     special = jnp.broadcast_to(special.astype(jnp.float32), (B * S, *special.shape))
     x = jnp.concatenate([special, x], axis=1)  # [B*S, 1 + R + P, C]
@@ -88,7 +88,7 @@ def _block(config: VGGTConfig, dtype: str = "float32") -> Block:
     return Block(config.dino_num_heads, epsilon=_EPSILON, dtype=jnp.dtype(dtype))
 
 
-def _patch_positions(table: Float[Array, "G C"], side: int, grid: tuple[int, int]) -> Float[Array, "P C"]:
+def patch_positions(table: Float[Array, "G C"], side: int, grid: tuple[int, int]) -> Float[Array, "P C"]:
     """Resize the learned square grid of positions to `grid`: bicubic with antialias, as DINOv2."""
     if grid == (side, side):
         return table

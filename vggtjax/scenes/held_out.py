@@ -103,7 +103,7 @@ def hardness(clips: SyntheticClip) -> Hardness:
         bend=np.linalg.norm(away, axis=-1).max(axis=1) / np.maximum(length, 1e-9),
         turn=turn,
         spread=high / low,
-        layers=np.array([_layers(clips.part_ids[n], clips.depth[n]) for n in range(N)], float),
+        layers=np.array([_layers(np.asarray(clips.part_ids[n]), depth[n]) for n in range(N)], float),
         movers=np.asarray(clips.dynamic_mask).reshape(N, -1).mean(axis=1),
     )
 

@@ -85,7 +85,7 @@ class SceneConfig:
             values = value if name in ("motion", "field_of_view") else (value,)
             numbers = all(isinstance(v, int | float) and low <= v <= high for v in values)
             if not numbers or sorted(values) != [*values]:
-                raise InputError(f"{name} is {value!r}; expected from {low} to {high}, of two numbers the smaller first")
+                raise InputError(f"{name} is {value!r}; expected {low} to {high}, of two numbers the smaller first")
 
     @property
     def kinds(self) -> tuple[str, ...]:

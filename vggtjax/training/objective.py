@@ -184,6 +184,7 @@ def _angle(a: Float[Array, "B S 3 3"], b: Float[Array, "B S 3 3"]) -> Float[Arra
 
 def _depth_error(depth: Float[Array, "B S H W"], truth: Float[Array, "B S H W"]) -> Float[Array, ""]:
     """Mean absolute relative error after alignment of every clip's medians."""
+    depth = jnp.clip(depth, 1e-6, 1e6)  # a head at its start says anything
     ratio = (jnp.log(truth) - jnp.log(depth)).reshape(depth.shape[0], -1)
     scale = jnp.exp(jnp.median(ratio, axis=-1))[:, None, None, None]
     return (jnp.abs(scale * depth - truth) / truth).mean()
@@ -203,7 +204,7 @@ def _probe_terms(taps, truth: Targets, paired: Matches, patch_size: int) -> dict
     points = truth.points[:, :, middle, middle].reshape(B, S, -1, 3)
     position = paired.position[:, :, 0]  # [B, R, P, 2]
     seen = paired.visible[:, :, 0][..., None]
-    found = {"position": jnp.zeros(()), "depth": jnp.zeros(()), "points": jnp.zeros(()), "camera": jnp.zeros(())}
+    found: dict[str, Array] = {name: jnp.zeros(()) for name in ("position", "depth", "points", "camera")}
     for tap in taps:
         patch, camera = tap["patch_probe"], tap["camera_probe"]
         away = jnp.abs(patch[..., :2] - position) * seen

@@ -75,6 +75,24 @@ class OptimiserConfig:
 
 
 @dataclass(frozen=True)
+class Start:
+    """Random parameters to start from. The defaults are VGGT's, whose backbone already sees.
+
+    Attributes:
+        layer_scale: start of the aggregator's LayerScale. 0.01 keeps attention across frames out of the residual
+            stream for hundreds of steps; a model that learns from nothing wants more.
+        tied_keys: the keys of the global blocks start equal to their queries, so that attention starts as similarity
+            and looks for the same thing in other frames from the first step on.
+    """
+
+    layer_scale: float = 0.01
+    tied_keys: bool = False
+
+    def __post_init__(self) -> None:
+        _settle(self, "start", may_be_zero=())
+
+
+@dataclass(frozen=True)
 class Recipe:
     """Everything that decides what a training run computes: two runs of one recipe give the same numbers."""
 
@@ -83,6 +101,7 @@ class Recipe:
     model: VGGTConfig = field(default_factory=VGGTConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     losses: LossWeights = field(default_factory=LossWeights)
+    start: Start = field(default_factory=Start)  # not read with parameters to start from
     trainable: Literal["all", "heads"] = "all"  # "heads": backbone and aggregator stay as they are
     untrained: tuple[str, ...] = ("track_head",)  # modules of the model that stay as they are: those without a loss
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"  # bfloat16 on a GPU, else float32
@@ -93,7 +112,12 @@ class Recipe:
     def __post_init__(self) -> None:
         if isinstance(self.stages, list | tuple):
             object.__setattr__(self, "stages", tuple(_built(Stage, value, "a stage") for value in self.stages))
-        for name, kind in (("optimiser", OptimiserConfig), ("losses", LossWeights), ("model", VGGTConfig)):
+        for name, kind in (
+            ("optimiser", OptimiserConfig),
+            ("losses", LossWeights),
+            ("model", VGGTConfig),
+            ("start", Start),
+        ):
             object.__setattr__(self, name, _built(kind, getattr(self, name), name))
         _settle(self, "recipe", may_be_zero=("seed", "data_seed"))
         object.__setattr__(self, "losses", dataclasses.replace(self.losses))  # what was given stays as it is

@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax.numpy as jnp
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from vggtjax.config import VGGTConfig
 from vggtjax.network.layers import Params
 from vggtjax.network.model import init_params
+from vggtjax.training.recipe import Recipe
 
 
-def start_params(seed: int, config: VGGTConfig, layer_scale: float = 0.3, tied_keys: bool = True) -> Params:
-    """Return random parameters for a model that learns without a pretrained backbone.
-
-    Args:
-        seed: of the random numbers.
-        config: the model's configuration.
-        layer_scale: start of the aggregator's LayerScale. VGGT's 0.01 suits a backbone that already sees; here it
-            would keep attention across frames out of the residual stream for hundreds of steps.
-        tied_keys: the global blocks' keys start equal to their queries, so that attention starts as similarity and
-            looks for the same thing in other frames from the first step on.
-    """
-    flat = flatten_dict(init_params(seed, config))
+def start_params(recipe: Recipe) -> Params:
+    """Return the random parameters that a recipe starts from, by its `seed` and its `start`."""
+    flat: dict[Any, Any] = flatten_dict(init_params(recipe.seed, recipe.model))
     for path, leaf in flat.items():
         if path[0] == "aggregator" and path[-1] in ("scale1", "scale2"):
-            flat[path] = jnp.full_like(leaf, layer_scale)
-        if tied_keys and path[:2] == ("aggregator", "global_blocks") and path[-2:] == ("qkv", "kernel"):
+            flat[path] = jnp.full_like(leaf, recipe.start.layer_scale)
+        if recipe.start.tied_keys and path[:2] == ("aggregator", "global_blocks") and path[-2:] == ("qkv", "kernel"):
             query, _, value = jnp.split(leaf, 3, axis=-1)
             flat[path] = jnp.concatenate([query, query, value], axis=-1)
     return unflatten_dict(flat)

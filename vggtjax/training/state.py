@@ -14,9 +14,10 @@ from jaxtyping import Array, Float, Int
 from vggtjax.checkpoint import flat_shapes, problems_sentence
 from vggtjax.errors import CheckpointError
 from vggtjax.network.layers import Params
-from vggtjax.network.model import init_params, parameter_shapes
+from vggtjax.network.model import parameter_shapes
 from vggtjax.training.optimiser import join, make_optimiser, make_schedule, split
 from vggtjax.training.recipe import Recipe
+from vggtjax.training.start import start_params
 
 Objective = Callable[..., tuple[Float[Array, ""], dict[str, Float[Array, ""]]]]
 Metrics = dict[str, Float[Array, ""]]
@@ -44,7 +45,7 @@ def initial_state(recipe: Recipe, probes: Params, init: Params | None = None) ->
         CheckpointError: `init` does not have the shapes of the recipe's model.
     """
     if init is None:
-        init = init_params(recipe.seed, recipe.model)
+        init = start_params(recipe)
     else:
         _check(init, recipe)
     # Copies: a step consumes its state, and whoever gave the parameters keeps them.
