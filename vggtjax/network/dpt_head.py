@@ -15,7 +15,7 @@ from vggtjax.network.layers import LayerNorm, Params, apply, declare
 from vggtjax.network.precision import full_precision
 
 HIDDEN = 32
-FRAMES_AT_ONCE = 4  # bounds the memory of the full-resolution maps
+PIXELS_AT_ONCE = 4 * 518 * 518  # bounds the memory of the full-resolution maps
 
 
 class TapProjection(nn.Module):
@@ -133,15 +133,21 @@ def predict_dense(
     (h, w), p = grid, config.patch_size
     B, S = taps[0].shape[:2]
 
-    def one_frame(frame_taps: list[Float[Array, "P F"]]) -> Float[Array, "H W O"]:
-        maps = [tap.reshape(1, h, w, tap.shape[-1]) for tap in frame_taps]
+    def some_frames(frame_taps: list[Float[Array, "n P F"]]) -> Float[Array, "n H W O"]:
+        maps = [tap.reshape(-1, h, w, tap.shape[-1]) for tap in frame_taps]
         features = apply(_features(config), params["features"], maps)
         x = add_positions(resize_aligned(features, (h * p, w * p)), aspect=w / h)
-        return apply(Regression(CHANNELS[kind]), params["regression"], x)[0]
+        return apply(Regression(CHANNELS[kind]), params["regression"], x)
 
+    # Frames share the batch axis of the convolutions, and small maps need no loop: mapped one by one, or inside a loop,
+    # the gradient by a kernel is a convolution for which XLA has but a plain implementation on a CPU.
     frames = [tap.reshape(B * S, *tap.shape[2:]) for tap in taps]
-    at_once = max(n for n in range(1, FRAMES_AT_ONCE + 1) if B * S % n == 0)  # no remainder: it is compiled apart
-    out = jax.lax.map(one_frame, frames, batch_size=at_once)
+    most = max(PIXELS_AT_ONCE // (h * p * w * p), 1)
+    if B * S <= most:
+        out = some_frames(frames)
+    else:
+        at_once = max(n for n in range(1, most + 1) if B * S % n == 0)  # no remainder: it is compiled apart
+        out = jax.lax.map(some_frames, [tap.reshape(-1, at_once, *tap.shape[1:]) for tap in frames])
     out = out.reshape(B, S, h * p, w * p, CHANNELS[kind])
     values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
     if kind == "depth":

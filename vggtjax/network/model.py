@@ -131,7 +131,7 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
 
     Values are drawn on the host, leaf by leaf: compiling jax's generator for every shape takes a minute, this a second.
     Kernels have variance 1 / fan-in, tables 0.02^2; LayerScale starts as in VGGT (1 in the backbone, 0.01 elsewhere),
-    and the camera head near no motion and a field of view of 1 rad.
+    the camera head near no motion and a field of view of 1 rad, the dense heads near depth 1 and confidence 2.
     """
     generator = np.random.default_rng(seed)
 
@@ -154,6 +154,8 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
     start = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]) / ITERATIONS  # every iteration adds it
     pose = params["camera_head"]["pose_branch"]["fc2"]
     pose |= {"kernel": 0.1 * pose["kernel"], "bias": jnp.asarray(start, jnp.float32)}
+    for name in DENSE_HEADS.values():  # exp of what comes in at full size would overflow
+        params[name]["regression"]["conv2"]["kernel"] *= 0.01
     return params
 
 
