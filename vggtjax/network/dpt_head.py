@@ -143,7 +143,7 @@ def predict_dense(
     # the gradient by a kernel is a convolution for which XLA has but a plain implementation on a CPU.
     frames = [tap.reshape(B * S, *tap.shape[2:]) for tap in taps]
     most = max(PIXELS_AT_ONCE // (h * p * w * p), 1)
-    if B * S <= most:
+    if most >= B * S:
         out = some_frames(frames)
     else:
         at_once = max(n for n in range(1, most + 1) if B * S % n == 0)  # no remainder: it is compiled apart
