@@ -132,7 +132,7 @@ def objective(
         metrics["match_accuracy"] = sums.accuracy
     if weights.probe:
         found = _probe_terms(taps, truth, paired, config.patch_size)
-        terms["probe"] = weights.probe * sum(found.values())
+        terms["probe"] = weights.probe * sum(found.values(), start=jnp.zeros(()))
         metrics |= {f"probe_{name}": value for name, value in found.items()}
     loss = sum(terms.values(), start=jnp.zeros(()))
     return loss, {"loss": loss} | {f"loss_{name}": value for name, value in terms.items()} | metrics
