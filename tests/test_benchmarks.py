@@ -186,9 +186,9 @@ def test_summaries_by_hand():
 
 def test_a_small_run_of_everything(tmp_path, config, capsys):
     model = save_model(tmp_path / "tiny.safetensors", init_params(0, config), config)
-    write_clip(tmp_path / "clips" / "hololens", frames=4)
-    write_clip(tmp_path / "clips" / "composite" / "one", frames=4, mask=True)
-    arguments = "--static 2 --dynamic 2 --seeds 1 --frames 3 --mask-pairs 2 --sweep 1 --training-scenes 2 --batch 2"
+    write_clip(tmp_path / "clips" / "hololens", frames=13)
+    write_clip(tmp_path / "clips" / "composite" / "one", frames=13, mask=True)
+    arguments = "--static 2 --dynamic 2 --seeds 1 --frames 12 --mask-pairs 2 --sweep 1 --training-scenes 2 --batch 2"
     out = tmp_path / "out"
     code = benchmarks.main(
         ["demo-model", "--model", str(model), "--out", str(out), "--clips", str(tmp_path / "clips"), *arguments.split()]
@@ -209,7 +209,7 @@ def test_a_small_run_of_everything(tmp_path, config, capsys):
         "mean_depth_map", "no_rotation", "mean_rate", "best_rate", "no_motion", "line",
     ]  # fmt: skip
     assert report["static"]["comparisons"][0]["ratio"] > 0
-    assert report["composite"]["clips"] == ["one 0-2", "one 1-3"]
+    assert report["composite"]["clips"] == ["one 0-11", "one 1-12"]
     for name in ("composite ladder", "dynamic"):
         assert len(report[name]["rows"][0]) == 2 * (1 + 3 * 2 * 2 * 2)
         assert len(report[name]["summaries"]) == 1 + 3 * 2 * 2

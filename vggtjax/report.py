@@ -90,10 +90,9 @@ class Report:
 
     def table(self, rows: Mapping[str, object]) -> None:
         """Print names and values as a table."""
-        table = Table(show_header=False, box=None, pad_edge=False)
+        width = max(len(name) for name in rows)
         for name, value in rows.items():
-            table.add_row(name, Text(str(value)))
-        self._out.print(table, soft_wrap=True)
+            self.line(f"{name:<{width}}  {value}")  # never folded: a path can be copied
 
     def ladder(self, rows: Sequence[LadderRow]) -> None:
         """Print errors against the truth as a table, a row per method and mask."""
