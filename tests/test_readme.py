@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.tiny import moving_ball
+from tests.moving_ball import moving_ball
 
 README = Path(__file__).parents[1] / "README.md"
 

@@ -1,35 +1,7 @@
-"""A model too small to see anything, and a clip too simple to ask for it: what the tests run fast on."""
+"""A clip too simple to ask for understanding: what tests of the way through the library run on."""
 
 import numpy as np
 from jaxtyping import Float
-
-from vggtjax.checkpoint import Model
-from vggtjax.config import VGGTConfig
-from vggtjax.network.model import init_params
-
-
-def tiny_config() -> VGGTConfig:
-    """Return the configuration of the golden files' model: 24 pairs like VGGT-1B, 32 channels."""
-    return VGGTConfig(
-        image_size=140,
-        embed_dim=32,
-        num_heads=2,
-        dino_depth=3,
-        dino_num_heads=2,
-        camera_num_heads=4,
-        dpt_features=16,
-        dpt_channels=(16, 16, 32, 32),
-        track_features=16,
-        track_hidden=48,
-        track_corr_levels=5,
-        track_corr_radius=3,
-    )
-
-
-def tiny_model() -> Model:
-    """Return random parameters of that configuration."""
-    config = tiny_config()
-    return Model(config, init_params(0, config), "tiny", trained=False)
 
 
 def moving_ball(frames: int = 8, size: int = 140) -> Float[np.ndarray, "S H W 3"]:
