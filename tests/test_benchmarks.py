@@ -13,6 +13,7 @@ from benchmarks import __main__ as benchmarks
 from benchmarks.blind_guesses import Prior, compare, guesses, training_prior
 from benchmarks.real_clips import load_windows, takes, window_starts
 from benchmarks.summaries import comparison_table, ladder_table, saliency_auc, spread, summarise
+from tests.tiny import tiny_config
 from vggtjax.checkpoint import save_model
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
@@ -25,19 +26,7 @@ SIDE, FRAMES = 28, 3
 
 @pytest.fixture(scope="module")
 def config() -> VGGTConfig:
-    return VGGTConfig(
-        image_size=SIDE,
-        embed_dim=16,
-        depth=4,
-        taps=(0, 1, 2, 3),
-        num_heads=2,
-        dino_depth=1,
-        dino_num_heads=2,
-        camera_depth=1,
-        camera_num_heads=2,
-        dpt_features=8,
-        dpt_channels=(8, 8, 8, 8),
-    )
+    return tiny_config(image_size=SIDE)
 
 
 def write_clip(folder, frames=FRAMES, mask=False, jump_at=None) -> None:

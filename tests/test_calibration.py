@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from vggtjax import Cue, Model, MotionConfig, VGGTConfig, init_params, load_model, motion_saliency
+from tests.tiny import tiny_config
+from vggtjax import Cue, Model, MotionConfig, init_params, load_model, motion_saliency
 from vggtjax.calibration import command
 from vggtjax.calibration.choice import candidates, choose, halves
 from vggtjax.calibration.command import calibrate_cues, generated_clips
@@ -40,17 +41,9 @@ FRAMES, SIZE, CLIPS = 4, 56, 4
 
 @pytest.fixture(scope="module")
 def model():
-    config = VGGTConfig(
-        image_size=56,
-        embed_dim=16,
-        depth=4,
-        num_heads=2,
-        dino_depth=1,
-        dino_num_heads=2,
+    config = tiny_config(
+        camera_depth=4,
         camera_num_heads=4,
-        dpt_features=8,
-        dpt_channels=(8, 8, 8, 8),
-        taps=(0, 1, 2, 3),
         track_features=16,
         track_hidden=48,
         motion=MotionConfig(offsets=(-2, -1, 1, 2)),

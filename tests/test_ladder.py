@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from benchmarks.seeded import seeded_images
-from vggtjax import METHODS, Model, Passes, VGGTConfig, assemble, infer, init_params
+from tests.tiny import tiny_config
+from vggtjax import METHODS, Model, Passes, assemble, infer, init_params
 from vggtjax.errors import InputError
 from vggtjax.evaluation.depth import depth_errors, median_scale
 from vggtjax.evaluation.ladder import LadderRow, ladder
@@ -23,19 +24,7 @@ SETTING = ("method", "mask_source", "mask_pairs", "suppress")
 
 @pytest.fixture(scope="module")
 def model() -> Model:
-    config = VGGTConfig(
-        image_size=56,
-        embed_dim=16,
-        depth=4,
-        taps=(0, 1, 2, 3),
-        num_heads=2,
-        dino_depth=1,
-        dino_num_heads=2,
-        camera_depth=1,
-        camera_num_heads=2,
-        dpt_features=8,
-        dpt_channels=(8, 8, 8, 8),
-    )
+    config = tiny_config()
     params = init_params(3, config)
     for blocks in ("frame_blocks", "global_blocks"):  # let what attention sees matter
         for scale in ("scale1", "scale2"):

@@ -6,21 +6,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from tests.tiny import tiny_config
 from vggtjax.config import VGGTConfig
 from vggtjax.training.recipe import OptimiserConfig, Recipe, Stage
 
-CONFIG = VGGTConfig(
+CONFIG = tiny_config(
     image_size=28,
-    embed_dim=16,
-    depth=4,
-    num_heads=2,
-    dino_depth=1,
-    dino_num_heads=2,
-    camera_depth=1,
-    camera_num_heads=2,
-    dpt_features=8,
     dpt_channels=(4, 4, 4, 4),
-    taps=(0, 1, 2, 3),
     track_features=8,
     track_hidden=16,
     track_corr_levels=2,

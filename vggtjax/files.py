@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -50,6 +50,30 @@ def staging(folder: str | Path) -> Iterator[Path]:
             yield temporary
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
+
+
+def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str) -> None:
+    """Make sure that files of these names can be written in `folder`, before hours are spent on them.
+
+    Args:
+        folder: need not be there; it is not made.
+        names: of the files.
+        replaced: whether what is there is an earlier one of the same kind, and may go.
+        what: that kind, for the message.
+
+    Raises OutputError where the folder cannot be made or written, or holds such files that may not go.
+    """
+    taken = [name for name in names if os.path.lexists(folder / name)]
+    if taken and not replaced:
+        raise OutputError(
+            f"{folder / taken[0]} exists and is not part of an earlier {what}, so it is not replaced; "
+            "choose another folder or move it away"
+        )
+    new = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
+    with staging(folder):
+        pass
+    for parent in new:
+        parent.rmdir()
 
 
 @contextmanager

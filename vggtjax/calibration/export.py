@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,7 @@ from vggtjax.calibration.choice import Choice, Rating, Step, halves
 from vggtjax.calibration.heatmap import draw_sweep
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, UNCLEAR, Sweep
 from vggtjax.checkpoint import Model, save_model
-from vggtjax.errors import OutputError
-from vggtjax.files import staging
+from vggtjax.files import check_free, staging
 
 FORMAT = "vggtjax calibration"
 VERSION = 1
@@ -65,17 +63,7 @@ def save_calibration(
 
 def check_folder(folder: Path) -> None:
     """Make sure that a calibration can be saved in `folder`, before it is made; OutputError as `save_calibration`."""
-    taken = [name for name in (NUMBERS, MODEL, PICTURE) if os.path.lexists(folder / name)]
-    if taken and not _is_calibration(folder / NUMBERS):
-        raise OutputError(
-            f"{folder / taken[0]} exists and is not part of an earlier calibration, so it is not replaced; "
-            "choose another folder or move it away"
-        )
-    new = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
-    with staging(folder):
-        pass
-    for parent in new:
-        parent.rmdir()
+    check_free(folder, (NUMBERS, MODEL, PICTURE), replaced=_is_calibration(folder / NUMBERS), what="calibration")
 
 
 def calibration_numbers(

@@ -9,11 +9,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from vggtjax.calibration.choice import Choice
 from vggtjax.calibration.sweep import GRAMS, KINDS, kind_index
+from vggtjax.results.previews import BACKGROUND, FAINT, TEXT
 
 _COLORS = (
     (Colormap("colorbrewer:RdBu_r").lut(256)[:, :3] * 255).round().astype(np.uint8)
 )  # blue below one half, red above
-_BACKGROUND, _TEXT, _FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)
 _DARK, _OUTLINE = (20, 20, 24), (30, 200, 90)
 _CELL, _GAP, _MARGIN = (46, 30), 26, 24  # width and height; between the similarities; around everything
 _LABEL_WIDTH, _HEADER_HEIGHT, _LINE, _LEGEND = 150, 96, 22, (256, 12)
@@ -33,27 +33,27 @@ def draw_sweep(auc: Float64[np.ndarray, "G C L"], choice: Choice, *, title: str 
     left, top = _MARGIN + _LABEL_WIDTH, _MARGIN + _HEADER_HEIGHT
     bottom = top + G * (C * _CELL[1] + _GAP)
     width = max(left + L * _CELL[0], _LEAST_WIDTH) + _MARGIN
-    sheet = Image.new("RGB", (width, bottom + (len(choice.steps) + 2) * _LINE + _MARGIN), _BACKGROUND)
+    sheet = Image.new("RGB", (width, bottom + (len(choice.steps) + 2) * _LINE + _MARGIN), BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     large, small, tiny = (ImageFont.load_default(size) for size in (22, 15, 12))
     title = title if len(title) <= _MOST_LETTERS else f"{title[: _MOST_LETTERS - 1]}…"
-    draw.text((_MARGIN, _MARGIN), f"Motion cues of {title or 'the model'}", _TEXT, large)
-    draw.text((_MARGIN, _MARGIN + 32), "area under the ROC curve of every pair's map against what moves", _FAINT, small)
+    draw.text((_MARGIN, _MARGIN), f"Motion cues of {title or 'the model'}", TEXT, large)
+    draw.text((_MARGIN, _MARGIN + 32), "area under the ROC curve of every pair's map against what moves", FAINT, small)
     _draw_legend(sheet, draw, small, reach, width)
 
     for layer in range(L):
-        draw.text((left + (layer + 0.5) * _CELL[0], top - 8), str(layer), _FAINT, small, "ms")
-    draw.text((left - 12, top - 8), "pair", _FAINT, small, "rs")
+        draw.text((left + (layer + 0.5) * _CELL[0], top - 8), str(layer), FAINT, small, "ms")
+    draw.text((left - 12, top - 8), "pair", FAINT, small, "rs")
     for g, c, layer in np.ndindex(G, C, L):
         x, y = left + layer * _CELL[0], _row(top, g, c)
         value = float(auc[g, c, layer])
         color = _COLORS[round(255 * (0.5 + (value - 0.5) / (2 * reach)))]
         draw.rectangle((x, y, x + _CELL[0] - 2, y + _CELL[1] - 2), tuple(color.tolist()))
-        ink = _DARK if color.mean() > 110 else _TEXT
+        ink = _DARK if color.mean() > 110 else TEXT
         draw.text((x + _CELL[0] / 2 - 1, y + _CELL[1] / 2 - 1), f"{value:.2f}", ink, tiny, "mm")
         if layer == 0:
             text = f"{GRAMS[g]}  {(KINDS[c].rows + KINDS[c].columns).upper()} {KINDS[c].statistic}"
-            draw.text((left - 12, y + _CELL[1] / 2), text, _TEXT, small, "rm")
+            draw.text((left - 12, y + _CELL[1] / 2), text, TEXT, small, "rm")
 
     for number, step in enumerate(choice.steps, 1):
         x = left + step.cue.layers[0] * _CELL[0]
@@ -63,12 +63,12 @@ def draw_sweep(auc: Float64[np.ndarray, "G C L"], choice: Choice, *, title: str 
         draw.rectangle((x - 2, y - 2, x + 10, y + 12), _OUTLINE)
         draw.text((x + 4, y + 5), str(number), _DARK, tiny, "mm")
     heading = f"Chosen for {choice.gram} similarity; AUC of the product of each cue and those above it"
-    rows = [(heading, ("calibration", "held-out half"), _FAINT)]
+    rows = [(heading, ("calibration", "held-out half"), FAINT)]
     rated = [
-        (f"{number}  {step.cue.name}{'  (1 - m)' if step.cue.inverted else ''}", step.rating, _TEXT)
+        (f"{number}  {step.cue.name}{'  (1 - m)' if step.cue.inverted else ''}", step.rating, TEXT)
         for number, step in enumerate(choice.steps, 1)
     ]
-    for name, (calibration, held_out), ink in (*rated, ("default table", choice.table, _FAINT)):
+    for name, (calibration, held_out), ink in (*rated, ("default table", choice.table, FAINT)):
         rows.append((name, (f"{calibration:.3f}", f"{held_out:.3f}"), ink))
     for number, (name, values, ink) in enumerate(rows):
         for text, x in zip((name, *values), _COLUMNS, strict=True):
@@ -85,5 +85,5 @@ def _draw_legend(sheet: Image.Image, draw: ImageDraw.ImageDraw, font, reach: flo
     sheet.paste(Image.fromarray(_COLORS[None]).resize(_LEGEND), (x, y))
     for share, anchor in ((0, "la"), (0.5, "ma"), (1, "ra")):
         text = f"{0.5 + (share - 0.5) * 2 * reach:.2f}"
-        draw.text((x + share * _LEGEND[0], y + _LEGEND[1] + 4), text, _FAINT, font, anchor)
-    draw.text((x + _LEGEND[0], y + _LEGEND[1] + 24), "below 0.5 the inverted map, 1 - m, tells it", _FAINT, font, "ra")
+        draw.text((x + share * _LEGEND[0], y + _LEGEND[1] + 4), text, FAINT, font, anchor)
+    draw.text((x + _LEGEND[0], y + _LEGEND[1] + 24), "below 0.5 the inverted map, 1 - m, tells it", FAINT, font, "ra")

@@ -9,13 +9,12 @@ from PIL import Image, ImageDraw, ImageFont
 from vggtjax.evaluation.depth import median_scale
 from vggtjax.evaluation.trajectory import centres, moves, umeyama_sim3
 from vggtjax.evaluation.truth import Truth
-from vggtjax.results.previews import color_depth, inverse_depth_range, overlay
+from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_depth, inverse_depth_range, overlay
 from vggtjax.results.reconstruction import Reconstruction
 
 _FRAMES = 6
 _SIDE = 220  # of a picture, in pixels
 _MARGIN, _GAP, _LABEL, _PLOT = 24, 6, 130, 460
-_BACKGROUND, _TEXT, _FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)
 _TRUE, _FOUND = (120, 200, 255), (255, 150, 60)
 
 
@@ -31,16 +30,16 @@ def truth_sheet(result: Reconstruction, truth: Truth) -> UInt8[np.ndarray, "heig
     left, top = _MARGIN + _LABEL, _MARGIN + 40
     plot_left = left + len(shown) * (size[0] + _GAP) + 2 * _MARGIN
     height = top + len(rows) * (size[1] + _GAP) + _MARGIN
-    sheet = Image.new("RGB", (plot_left + _PLOT + _MARGIN, max(height, top + _PLOT + 80)), _BACKGROUND)
+    sheet = Image.new("RGB", (plot_left + _PLOT + _MARGIN, max(height, top + _PLOT + 80)), BACKGROUND)
     draw, font, small = ImageDraw.Draw(sheet), ImageFont.load_default(22), ImageFont.load_default(15)
-    draw.text((_MARGIN, _MARGIN - 6), f"{result.method}  ·  {result.model_name}  ·  against the truth", _TEXT, font)
+    draw.text((_MARGIN, _MARGIN - 6), f"{result.method}  ·  {result.model_name}  ·  against the truth", TEXT, font)
 
     everywhere = np.ones(result.depth.shape, bool)
     true_depth = np.asarray(truth.depth, np.float32)
     found_depth = (result.depth * median_scale(result.depth, true_depth)).astype(np.float32)
     inverse_range = inverse_depth_range(true_depth, everywhere)
     for row, label in enumerate(rows):
-        draw.text((_MARGIN, top + row * (size[1] + _GAP)), label, _TEXT, small)
+        draw.text((_MARGIN, top + row * (size[1] + _GAP)), label, TEXT, small)
     for column, frame in enumerate(shown):
         image = result.images[frame]
         pictures = (
@@ -72,7 +71,7 @@ def _draw_cameras(
     flat = {name: ((way - origin) @ true_rotation.T)[:, [0, 2]] for name, (way, _) in ways.items()}
     points = np.concatenate(list(flat.values()))
     middle, span = (points.max(0) + points.min(0)) / 2, max(np.ptp(points, axis=0).max(), 1e-9)
-    draw.text(corner, "Cameras from above", _TEXT, font)
+    draw.text(corner, "Cameras from above", TEXT, font)
     for i, (name, way) in enumerate(flat.items()):
         colour = ways[name][1]
         draw.text((corner[0] + 90 * i, corner[1] + 22), name, colour, font)
@@ -82,4 +81,4 @@ def _draw_cameras(
             draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=colour)
         x, y = pixels[0]
         draw.ellipse((x - 8, y - 8, x + 8, y + 8), outline=colour, width=2)
-    draw.text((corner[0], corner[1] + _PLOT + 30), f"square of {span:.2f} m; ring: first frame", _FAINT, font)
+    draw.text((corner[0], corner[1] + _PLOT + 30), f"square of {span:.2f} m; ring: first frame", FAINT, font)

@@ -30,8 +30,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from scipy.spatial.transform import Rotation
 
-from vggtjax.errors import OutputError
-from vggtjax.files import staging, writing
+from vggtjax.files import check_free, staging, writing
 from vggtjax.results import point_cloud, previews
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.reconstruction import ARCHIVE_NAME, Reconstruction, is_result
@@ -70,17 +69,7 @@ def check_folder(folder: Path) -> None:
     Raises OutputError where the folder cannot be made or written, or holds files of our names that are not an earlier
     result.
     """
-    taken = [name for name in (ARCHIVE_NAME, *_NAMES) if os.path.lexists(folder / name)]
-    if taken and not is_result(folder / ARCHIVE_NAME):
-        raise OutputError(
-            f"{folder / taken[0]} exists and is not part of an earlier result, so it is not replaced; "
-            "choose another folder or move it away"
-        )
-    new = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
-    with staging(folder):
-        pass
-    for parent in new:
-        parent.rmdir()
+    check_free(folder, (ARCHIVE_NAME, *_NAMES), replaced=is_result(folder / ARCHIVE_NAME), what="result")
 
 
 def _install(staged: Path, folder: Path) -> None:

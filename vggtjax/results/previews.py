@@ -22,7 +22,7 @@ _SHEET_WIDTH = 1800  # pixels that the columns share
 _TITLE_WIDTH = 700  # pixels that the title has at least
 _THUMBNAIL = (480, 300)  # widest and highest
 _MARGIN, _GAP, _LABEL_WIDTH, _LEGEND_WIDTH, _HEADER_HEIGHT = 24, 6, 150, 120, 88
-_BACKGROUND, _TEXT, _FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)
+BACKGROUND, TEXT, FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)  # of every sheet
 
 
 def inverse_depth_range(depth: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]) -> tuple[float, float]:
@@ -63,29 +63,29 @@ def contact_sheet(reconstruction: Reconstruction) -> UInt8[np.ndarray, "height w
     left, top = _MARGIN + _LABEL_WIDTH, _MARGIN + _HEADER_HEIGHT
 
     sheet_width = max(left + len(shown) * step_x - _GAP, _TITLE_WIDTH) + _MARGIN
-    sheet = Image.new("RGB", (sheet_width, top + 4 * step_y - _GAP + _MARGIN), _BACKGROUND)
+    sheet = Image.new("RGB", (sheet_width, top + 4 * step_y - _GAP + _MARGIN), BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     large, small = ImageFont.load_default(22), ImageFont.load_default(15)
-    draw.text((_MARGIN, _MARGIN), f"{reconstruction.method}  ·  {reconstruction.model_name}", _TEXT, large)
+    draw.text((_MARGIN, _MARGIN), f"{reconstruction.method}  ·  {reconstruction.model_name}", TEXT, large)
     count = f"{frames} frame{'s' if frames > 1 else ''} of {width} x {height} pixels"
-    draw.text((_MARGIN, _MARGIN + 30), count, _FAINT, small)
+    draw.text((_MARGIN, _MARGIN + 30), count, FAINT, small)
 
     share = f"{reconstruction.dynamic_mask.mean():.1%} of pixels"
     for row, label in enumerate(("Picture", "Depth", "Saliency", "Dynamic")):
-        draw.text((_MARGIN, top + row * step_y), label, _TEXT, small)
-    draw.text((_MARGIN, top + 3 * step_y + 22), share, _FAINT, small)
+        draw.text((_MARGIN, top + row * step_y), label, TEXT, small)
+    draw.text((_MARGIN, top + 3 * step_y + 22), share, FAINT, small)
     for row, colors, lowest, highest in ((1, _DEPTH_COLORS, "far", "near"), (2, _SALIENCY_COLORS, "0", "1")):
         y = top + row * step_y
         sheet.paste(Image.fromarray(colors[None]).resize((_LEGEND_WIDTH, 10)), (_MARGIN, y + 24))
-        draw.text((_MARGIN, y + 38), lowest, _FAINT, small)
-        draw.text((_MARGIN + _LEGEND_WIDTH, y + 38), highest, _FAINT, small, "ra")
+        draw.text((_MARGIN, y + 38), lowest, FAINT, small)
+        draw.text((_MARGIN + _LEGEND_WIDTH, y + 38), highest, FAINT, small, "ra")
 
     valid = valid_pixels(reconstruction)
     inverse_range = inverse_depth_range(reconstruction.depth, valid)
     for column, frame in enumerate(shown):
         x = left + column * step_x
         time = "" if reconstruction.timestamps is None else f"  ·  {reconstruction.timestamps[frame]:.2f} s"
-        draw.text((x, top - 24), f"frame {frame}{time}", _FAINT, small)
+        draw.text((x, top - 24), f"frame {frame}{time}", FAINT, small)
         depth = color_depth(reconstruction.depth[frame], valid[frame], inverse_range)
         for row, thumbnail in enumerate(_thumbnails(reconstruction, int(frame), depth, size)):
             sheet.paste(thumbnail, (x, top + row * step_y))

@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from vggtjax.results.previews import color_depth, inverse_depth_range, overlay
+from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_depth, inverse_depth_range, overlay
 
 _MOST_ROWS = 8
 _THUMBNAIL = (260, 200)  # widest and highest
 _MARGIN, _GAP, _HEADER, _LABEL = 24, 6, 76, 108
-_BACKGROUND, _TEXT, _FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)
 _REST = np.array([48, 48, 54], np.uint8)
 _COLUMNS = ("first", "middle", "last", "depth", "dynamic", "parts", "flow")
 _UNMIXED = ("parts", "flow")  # colours that say nothing when they are mixed
@@ -38,16 +37,16 @@ def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
     sheet = Image.new(
         "RGB",
         (left + len(_COLUMNS) * step_x - _GAP + _MARGIN, top + len(rows) * step_y - _GAP + _MARGIN),
-        _BACKGROUND,
+        BACKGROUND,
     )
     draw = ImageDraw.Draw(sheet)
     large, small = ImageFont.load_default(22), ImageFont.load_default(15)
-    draw.text((_MARGIN, _MARGIN), title, _TEXT, large)
+    draw.text((_MARGIN, _MARGIN), title, TEXT, large)
     for column, name in enumerate(_COLUMNS):
-        draw.text((left + column * step_x, top - 24), name, _FAINT, small)
+        draw.text((left + column * step_x, top - 24), name, FAINT, small)
     for row, (scene, pictures) in enumerate(zip(chosen, rows, strict=True)):
         y = top + row * step_y
-        draw.text((_MARGIN, y), scene.name, _TEXT, small)
+        draw.text((_MARGIN, y), scene.name, TEXT, small)
         for column, picture in enumerate(pictures):
             filtering = Image.Resampling.NEAREST if _COLUMNS[column] in _UNMIXED else Image.Resampling.LANCZOS
             sheet.paste(Image.fromarray(picture).resize(size, filtering), (left + column * step_x, y))
