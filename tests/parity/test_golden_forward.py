@@ -56,6 +56,19 @@ def test_plain_pass(case):
     assert np.allclose(intrinsic, case.arrays["plain/intrinsic"], rtol=1e-4)
 
 
+@pytest.mark.parametrize("name", ["frames4", "batch2"])
+def test_tracks(golden, seeded_params, config, name):
+    case = Case(golden / f"forward_{name}.npz", seeded_params, config)
+    queries = case.arrays["queries"]
+    made = _forward(case.params, case.images, case.config, outputs=("tracks",), query_points=queries)
+    for value, key, tolerance in (
+        (made.tracks, "track", 2e-3),  # pixels
+        (made.track_visibility, "vis", 2e-4),
+        (made.track_confidence, "conf", 2e-4),
+    ):
+        assert np.abs(np.asarray(value) - case.arrays[f"plain/{key}"]).max() <= tolerance
+
+
 @pytest.mark.parametrize("suppress", ["drop", "zero"])
 def test_mask_aware_pass(case, suppress):
     made = _forward(case.params, case.images, case.config, dynamic_tokens=case.tokens, suppress=suppress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -139,20 +140,29 @@ def predict_dense(
         x = add_positions(resize_aligned(features, (h * p, w * p)), aspect=w / h)
         return apply(Regression(CHANNELS[kind]), params["regression"], x)
 
-    # Frames share the batch axis of the convolutions, and small maps need no loop: mapped one by one, or inside a loop,
-    # the gradient by a kernel is a convolution for which XLA has but a plain implementation on a CPU.
-    frames = [tap.reshape(B * S, *tap.shape[2:]) for tap in taps]
-    most = max(PIXELS_AT_ONCE // (h * p * w * p), 1)
-    if most >= B * S:
-        out = some_frames(frames)
-    else:
-        at_once = max(n for n in range(1, most + 1) if B * S % n == 0)  # no remainder: it is compiled apart
-        out = jax.lax.map(some_frames, [tap.reshape(-1, at_once, *tap.shape[1:]) for tap in frames])
+    out = frames_at_once(some_frames, taps, (h * p) * (w * p))
     out = out.reshape(B, S, h * p, w * p, CHANNELS[kind])
     values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
     if kind == "depth":
         return jnp.exp(values), confidence
     return jnp.sign(values) * jnp.expm1(jnp.abs(values)), confidence
+
+
+def frames_at_once(
+    some_frames: Callable[[list[Array]], Array], taps: list[Float[Array, "B S P F"]], pixels: int
+) -> Float[Array, "BS ..."]:
+    """Map `some_frames` over the frames of all clips, as many at a time as `pixels` of each allow.
+
+    Frames share the batch axis of the convolutions, and small maps need no loop: mapped one by one, or inside a loop,
+    the gradient by a kernel is a convolution for which XLA has but a plain implementation on a CPU.
+    """
+    frames = [tap.reshape(-1, *tap.shape[2:]) for tap in taps]
+    count, most = frames[0].shape[0], max(PIXELS_AT_ONCE // pixels, 1)
+    if most >= count:
+        return some_frames(frames)
+    at_once = max(n for n in range(1, most + 1) if count % n == 0)  # no remainder: it is compiled apart
+    out = jax.lax.map(some_frames, [tap.reshape(-1, at_once, *tap.shape[1:]) for tap in frames])
+    return out.reshape(count, *out.shape[2:])
 
 
 def declare_dense_head(config: VGGTConfig, kind: str) -> Params:

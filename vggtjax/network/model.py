@@ -1,4 +1,4 @@
-"""The whole network as one pure function: images and patch tokens -> pose encoding, depth, points."""
+"""The whole network as one pure function: images and patch tokens -> pose encoding, depth, points, tracks."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict
 from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_tap
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import full_precision
-from vggtjax.network.track_head import declare_track_head
+from vggtjax.network.track_head import declare_track_head, predict_tracks, smallest_side
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
-OUTPUTS = ("camera", *DENSE_HEADS)
 HEADS = {"camera": "camera_head", **DENSE_HEADS, "tracks": "track_head"}
+OUTPUTS = tuple(HEADS)
 
 
 class Predictions(NamedTuple):
@@ -34,6 +34,9 @@ class Predictions(NamedTuple):
     depth_confidence: Float[Array, "B S H W"] | None = None
     world_points: Float[Array, "B S H W 3"] | None = None
     world_points_confidence: Float[Array, "B S H W"] | None = None
+    tracks: Float[Array, "B S Q 2"] | None = None
+    track_visibility: Float[Array, "B S Q"] | None = None
+    track_confidence: Float[Array, "B S Q"] | None = None
     cue_sums: Sums | None = None
 
 
@@ -48,6 +51,7 @@ def forward(
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
     outputs: Sequence[str] = ("camera", "depth"),
+    query_points: Float[Array, "B Q 2"] | None = None,
     cues: GramCues | None = None,
     stop_camera_gradient: bool = True,
     compute_dtype: str = "float32",
@@ -64,7 +68,8 @@ def forward(
         dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs; None for the plain pass.
         suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value leave the softmax, VGGT4D).
         mask_pairs: number of pairs in which keys are suppressed (L_mask of the paper).
-        outputs: any of "camera", "depth", "points".
+        outputs: any of "camera", "depth", "points", "tracks".
+        query_points: x, y in pixels of the first frame, the points to track; given with "tracks" and only then.
         cues: motion cues to accumulate on the way, into `.cue_sums`.
         stop_camera_gradient: whether the camera head's iterations see the previous estimate as a constant.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
@@ -74,14 +79,16 @@ def forward(
     """
     grid = patch_grid(images, config)
     _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pairs, outputs, compute_dtype)
+    _check_queries(images, config, outputs, query_points)
     if patch_tokens is None:
         patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
     dense = [name for name in outputs if name in DENSE_HEADS]
+    tapped = [HEADS[name] for name in outputs if name != "camera"]
 
     def capture(slot: int):
         def kept(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
             patches = tokens[:, :, -grid[0] * grid[1] :]
-            return {name: project_tap(params[DENSE_HEADS[name]], patches, slot, config) for name in dense}
+            return {head: project_tap(params[head], patches, slot, config) for head in tapped}
 
         return kept
 
@@ -101,12 +108,20 @@ def forward(
     if "camera" in outputs:
         found["pose_encoding"] = predict_pose(params, camera_tokens, config, stop_gradient=stop_camera_gradient)
     for name in dense:
-        head_taps = [tap[name] for tap in taps]
-        values, confidence = predict_dense(params[DENSE_HEADS[name]], head_taps, config, grid, name)
+        head = DENSE_HEADS[name]
+        values, confidence = predict_dense(params[head], [tap[head] for tap in taps], config, grid, name)
         if name == "depth":
             found |= {"depth": values[..., 0], "depth_confidence": confidence}
         else:
             found |= {"world_points": values, "world_points_confidence": confidence}
+    if query_points is not None:
+        head = HEADS["tracks"]
+        tracks = predict_tracks(params[head], [tap[head] for tap in taps], query_points, config, grid)
+        found |= {
+            "tracks": tracks.positions,
+            "track_visibility": tracks.visibility,
+            "track_confidence": tracks.confidence,
+        }
     return Predictions(**found)
 
 
@@ -131,7 +146,8 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
 
     Values are drawn on the host, leaf by leaf: compiling jax's generator for every shape takes a minute, this a second.
     Kernels have variance 1 / fan-in, tables 0.02^2; LayerScale starts as in VGGT (1 in the backbone, 0.01 elsewhere),
-    the camera head near no motion and a field of view of 1 rad, the dense heads near depth 1 and confidence 2.
+    the camera head near no motion and a field of view of 1 rad, the dense heads near depth 1 and confidence 2, the
+    track head near no motion too.
     """
     generator = np.random.default_rng(seed)
 
@@ -156,6 +172,7 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
     pose |= {"kernel": 0.1 * pose["kernel"], "bias": jnp.asarray(start, jnp.float32)}
     for name in DENSE_HEADS.values():  # exp of what comes in at full size would overflow
         params[name]["regression"]["conv2"]["kernel"] *= 0.01
+    params["track_head"]["flow_projection"]["kernel"] *= 0.01  # tracks start by standing still
     return params
 
 
@@ -176,3 +193,20 @@ def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pa
         raise InputError(f"suppress is {suppress!r}; expected 'zero' or 'drop'")
     if compute_dtype not in ("float32", "bfloat16"):
         raise InputError(f"compute_dtype is {compute_dtype!r}; expected 'float32' or 'bfloat16'")
+
+
+def _check_queries(images, config: VGGTConfig, outputs: Sequence[str], query_points) -> None:
+    B, _, H, W, _ = images.shape
+    if ("tracks" in outputs) != (query_points is not None):
+        raise InputError("query_points and 'tracks' in outputs go together; give both or neither")
+    if query_points is None:
+        return
+    if len(query_points.shape) != 3 or query_points.shape[0] != B or query_points.shape[2] != 2:
+        raise InputError(f"query_points have shape {tuple(query_points.shape)}; expected {(B, 'Q', 2)}")
+    if query_points.shape[1] < 1:
+        raise InputError("query_points are empty; give at least one point")
+    if min(H, W) < smallest_side(config):
+        raise InputError(
+            f"tracks need frames of at least {smallest_side(config)} pixels a side; these have {H} x {W}: "
+            f"the pyramid has {config.track_corr_levels} levels"
+        )

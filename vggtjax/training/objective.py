@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS, aggregate
@@ -23,7 +23,7 @@ from vggtjax.training.matching import MatchLoss
 from vggtjax.training.truth import Matches, Targets, matches, targets
 
 PATCH_PROBE = 6  # position in the first frame (2), logarithm of depth (1), point in the first camera's frame (3)
-CAMERA_PROBE = 7  # translation (3), quaternion (4)
+CAMERA_PROBE = 7 + 10  # translation (3), quaternion (4), moments of the flow from the first frame
 CONFIDENCE = 0.2  # weight of the logarithm of confidence, as in VGGT
 
 
@@ -36,7 +36,8 @@ class LossWeights:
         huber: half width of the quadratic zone of the camera loss; 0 for L1.
         depth, points: confidence-weighted L1 of the dense heads; `gradient` is the share of the gradient term.
         match: cross-entropy of attention in `match_layers` against true matches.
-        probe: linear read-outs of the tapped tokens (positions, depths, points, poses), which serve training alone.
+        probe: linear read-outs of the tapped tokens (of patches: positions, depths, points; of camera tokens: poses,
+            moments of the flow), which serve training alone.
     """
 
     translation: float = 1.0
@@ -204,13 +205,37 @@ def _probe_terms(taps, truth: Targets, paired: Matches, patch_size: int) -> dict
     points = truth.points[:, :, middle, middle].reshape(B, S, -1, 3)
     position = paired.position[:, :, 0]  # [B, R, P, 2]
     seen = paired.visible[:, :, 0][..., None]
-    found: dict[str, Array] = {name: jnp.zeros(()) for name in ("position", "depth", "points", "camera")}
+    own = paired.position[:, :1, 0]  # of the first frame's patches in itself: where patches are
+    moments, known = _flow_moments(position - own, own, jnp.exp(-depth), seen)
+    found: dict[str, Array] = {name: jnp.zeros(()) for name in ("position", "depth", "points", "camera", "moments")}
     for tap in taps:
         patch, camera = tap["patch_probe"], tap["camera_probe"]
         away = jnp.abs(patch[..., :2] - position) * seen
         found["position"] += away.sum() / jnp.maximum(2 * seen.sum(), 1)
         found["depth"] += jnp.abs(patch[..., 2] - depth).mean()
         found["points"] += jnp.abs(patch[..., 3:] - points).mean()
-        off = jnp.abs(camera - truth.pose_encoding[..., :7])
+        off = jnp.abs(camera[..., :7] - truth.pose_encoding[..., :7])
         found["camera"] += off[..., :3].mean() + 5 * off[..., 3:].mean()
+        found["moments"] += (jnp.abs(camera[..., 7:] - moments).mean(axis=-1) * known).mean()
     return {name: value / len(taps) for name, value in found.items()}
+
+
+def _flow_moments(
+    flow: Float[Array, "B S P 2"],
+    place: Float[Array, "B 1 P 2"],
+    inverse_depth: Float[Array, "B S P"],
+    seen: Bool[Array, "B S P 1"],
+) -> tuple[Float[Array, "B S 10"], Bool[Array, "B S"]]:
+    """Return what a camera's motion can be solved from, and where enough is seen to.
+
+    To first order the flow of a static scene is w A t + B r: linear in translation t and rotation r, with inverse depth
+    w and matrices of the position alone (Longuet-Higgins and Prazdny 1980). Its least squares need means over patches
+    of the flow, by itself and times inverse depth and position. Turn and travel can cancel in the mean flow, so a
+    camera token that knows no more than that knows neither.
+    """
+    w = jnp.minimum(inverse_depth, 4.0)[..., None]
+    factors = jnp.concatenate([jnp.ones_like(w), w, jnp.broadcast_to(place, flow.shape)], axis=-1)  # [B, S, P, 4]
+    products = (flow[..., None, :] * factors[..., None]).reshape(*w.shape[:3], 8)
+    values = jnp.concatenate([products, w, w**2], axis=-1)
+    count = seen.sum(axis=(2, 3))
+    return (values * seen).sum(axis=2) / jnp.maximum(count, 1)[..., None], count >= 3
