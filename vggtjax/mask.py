@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from vggtjax.clustering import kmeans
+from vggtjax.motion import normalise
 
 BINS = 256
+MOST_CLASSES = 4  # of multi-Otsu
 CONSTANT = 1e-6  # a clip whose saliency spans less than this has nothing that moves
 
 
@@ -46,6 +51,57 @@ def dynamic_pixels(saliency: Float[Array, "B S h w"], size: tuple[int, int]) -> 
         return (pixels >= otsu_threshold(pixels)) & varies
 
     return jax.vmap(one_clip)(upsample(saliency, size))
+
+
+def smooth_by_clusters(
+    saliency: Float[Array, "B S h w"], patch_tokens: Float[Array, "B S P C"], clusters: int, *, seed: int = 0
+) -> Float[Array, "B S h w"]:
+    """Give every token the mean saliency of its cluster, min-max normalised per frame again (VGGT4D).
+
+    Args:
+        saliency: of every patch, in [0, 1].
+        patch_tokens: the backbone's features, which all frames of a clip are clustered by together.
+        clusters: number of clusters.
+        seed: of k-means.
+    """
+
+    def one_clip(clip: tuple[Array, Array]) -> Float[Array, "S h w"]:
+        values, features = clip
+        labels = kmeans(jax.random.key(seed), features.reshape(-1, features.shape[-1]), clusters).labels
+        return cluster_means(values, labels.reshape(values.shape), clusters)
+
+    return jax.lax.map(one_clip, (saliency, patch_tokens.astype(jnp.float32)))
+
+
+def cluster_means(saliency: Float[Array, "S h w"], labels: Int[Array, "S h w"], clusters: int) -> Float[Array, "S h w"]:
+    """Return every token's mean over its cluster, min-max normalised per frame."""
+    flat = labels.ravel()
+    total = jnp.zeros(clusters).at[flat].add(saliency.ravel())
+    count = jnp.zeros(clusters).at[flat].add(1)
+    mean = (total / jnp.maximum(count, 1))[flat]
+    return normalise(mean.reshape(1, len(saliency), -1))[0].reshape(saliency.shape)
+
+
+def multi_otsu_threshold(values: np.ndarray) -> float:
+    """Return the highest threshold of Otsu's best partition into two to four classes (VGGT4D), on the host.
+
+    The number of classes is that of the largest variance of the classes' means over the root of the number. Constant
+    values give that value; fewer distinct values than classes rule a number out.
+    """
+    from skimage.filters import threshold_multiotsu
+
+    values = np.asarray(values, np.float32)
+    best, best_score = float(values.max()), -np.inf
+    distinct = np.count_nonzero(np.histogram(values, BINS)[0])
+    for classes in range(2, min(MOST_CLASSES, distinct) + 1):
+        thresholds = threshold_multiotsu(values, classes=classes, nbins=BINS)
+        regions = np.digitize(values, bins=thresholds)
+        if len(np.unique(regions)) < classes:
+            continue
+        score = np.var([values[regions == i].mean() for i in range(classes)]) / classes**0.5
+        if score > best_score:
+            best, best_score = float(thresholds[-1]), score
+    return best
 
 
 def dynamic_tokens(mask: Bool[Array, "B S H W"], patch_size: int) -> Bool[Array, "B S h w"]:

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.seeded import seeded_images
 from vggtjax import forward
-from vggtjax.mask import upsample
+from vggtjax.mask import cluster_means, multi_otsu_threshold, upsample
 from vggtjax.motion import GramCues
 
 TOLERANCE = 1e-4  # absolute, of maps in [0, 1]; measured: 4e-6
@@ -36,3 +36,21 @@ def test_upsampling(arrays):
     golden = arrays["upsampled_saliency"]
     made = upsample(arrays["clustered_saliency"][None], golden.shape[1:])
     assert np.abs(np.asarray(made)[0] - golden).max() <= 1e-6
+
+
+def test_clustered_saliency(arrays):
+    made = cluster_means(arrays["dot/saliency"], arrays["cluster_labels"], int(arrays["n_clusters"]))
+    assert np.abs(np.asarray(made) - arrays["clustered_saliency"]).max() <= 1e-5
+
+
+def test_multi_otsu(arrays):
+    threshold = multi_otsu_threshold(arrays["upsampled_saliency"])
+    assert threshold == pytest.approx(float(arrays["multiotsu_threshold"]), abs=1e-5)
+    wrong = (arrays["upsampled_saliency"] > threshold) != arrays["coarse_masks"]
+    assert wrong.mean() <= 1e-4
+
+
+@pytest.mark.parametrize("classes", [2, 3, 4])
+def test_multi_otsu_where_so_many_classes_win(arrays, classes):
+    made = multi_otsu_threshold(arrays[f"multiotsu/{classes}_input"])
+    assert made == pytest.approx(float(arrays[f"multiotsu/{classes}_threshold"]), abs=1e-5)

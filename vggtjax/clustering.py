@@ -1,0 +1,111 @@
+"""k-means on the device: greedy k-means++ seeds, then Lloyd's iterations; with weights, so that points can be left out.
+
+The seeding draws several candidates for every centre and keeps the best, as scikit-learn does (Arthur and
+Vassilvitskii, 2007; the greedy variant of their conclusion).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from vggtjax.network.precision import full_precision
+
+ITERATIONS = 300
+TOLERANCE = 1e-4  # squared movement of all centres, over the points' mean variance, at which the iterations end
+
+
+class Clusters(NamedTuple):
+    """A partition of points: each belongs to its nearest centre."""
+
+    labels: Int[Array, " N"]
+    centres: Float[Array, "K C"]
+    inertia: Float[Array, ""]  # sum of weighted squared distances to the nearest centre
+
+
+@full_precision
+def kmeans(
+    key: Array,
+    points: Float[Array, "N C"],
+    clusters: int,
+    weights: Float[Array, " N"] | None = None,
+    *,
+    restarts: int = 1,
+) -> Clusters:
+    """Partition points into `clusters` groups of small squared distance to their mean.
+
+    Pure: works under jit and vmap (`clusters` and `restarts` are static). A cluster that loses all its points keeps its
+    centre.
+
+    Args:
+        key: a JAX random key, of the seeds.
+        points: any number of them, fewer than `clusters` too.
+        clusters: number of centres.
+        weights: at least 0; a point of weight 0 moves no centre but is labelled too. 1 if None.
+        restarts: partitions from different seeds, of which the one of least inertia is returned.
+    """
+    weights = jnp.ones(points.shape[0]) if weights is None else weights.astype(jnp.float32)
+    total = jnp.maximum(weights.sum(), 1e-30)
+    mean = jnp.einsum("n,nc->c", weights, points) / total
+    points = points - mean[None]  # squares of what is far from the origin would cancel
+    variance = jnp.einsum("n,nc->c", weights, points**2).mean() / total
+    keys = jax.random.split(key, restarts)
+    found = jax.lax.map(lambda key: _lloyd(_seeds(key, points, clusters, weights), points, weights, variance), keys)
+    best = jax.tree.map(lambda leaf: leaf[jnp.argmin(found.inertia)], found)
+    return best._replace(centres=best.centres + mean[None])
+
+
+def _lloyd(centres: Array, points: Array, weights: Array, variance: Array) -> Clusters:
+    clusters = len(centres)
+
+    def moving(state):
+        _, shift, count = state
+        return (shift > TOLERANCE * variance) & (count < ITERATIONS)
+
+    def moved(state):
+        centres, _, count = state
+        labels = jnp.argmin(_distances(points, centres), axis=1)
+        member = jax.nn.one_hot(labels, clusters) * weights[:, None]
+        mass = member.sum(axis=0)[:, None]
+        means = jnp.einsum("nk,nc->kc", member, points) / jnp.maximum(mass, 1e-30)
+        means = jnp.where(mass > 0, means, centres)
+        return means, jnp.sum((means - centres) ** 2), count + 1
+
+    centres, _, _ = jax.lax.while_loop(moving, moved, (centres, jnp.inf, 0))
+    distances = _distances(points, centres)
+    inertia = (weights * jnp.maximum(distances.min(axis=1), 0)).sum()
+    return Clusters(jnp.argmin(distances, axis=1).astype(jnp.int32), centres, inertia)
+
+
+def _seeds(key: Array, points: Float[Array, "N C"], clusters: int, weights: Float[Array, " N"]) -> Array:
+    """Draw centres among the points, each as likely as it is far from those before; the best of a few every time."""
+    trials = 2 + int(math.log(clusters))
+    keys = jax.random.split(key, clusters)
+
+    def drawn(key: Array, mass: Float[Array, " N"], count: int) -> Int[Array, " T"]:
+        cumulative = jnp.cumsum(mass)
+        return jnp.searchsorted(cumulative, jax.random.uniform(key, (count,)) * cumulative[-1])
+
+    first = points[jnp.minimum(drawn(keys[0], weights, 1)[0], len(points) - 1)]
+    centres = jnp.zeros((clusters, points.shape[1])).at[:].set(first[None])
+
+    def added(i, state):
+        centres, nearest = state
+        candidates = points[jnp.minimum(drawn(keys[i], weights * nearest, trials), len(points) - 1)]
+        distances = jnp.minimum(nearest[:, None], jnp.maximum(_distances(points, candidates), 0))  # [N, T]
+        best = jnp.argmin(jnp.einsum("n,nt->t", weights, distances))
+        return centres.at[i].set(candidates[best]), distances[:, best]
+
+    nearest = jnp.maximum(_distances(points, first[None])[:, 0], 0)
+    centres, _ = jax.lax.fori_loop(1, clusters, added, (centres, nearest))
+    return centres
+
+
+def _distances(points: Float[Array, "N C"], centres: Float[Array, "K C"]) -> Float[Array, "N K"]:
+    """Squared distances, up to rounding that can take them a little below 0."""
+    squares = jnp.sum(points**2, axis=1)[:, None] + jnp.sum(centres**2, axis=1)[None]
+    return squares - 2 * points @ centres.T
