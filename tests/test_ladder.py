@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.seeded import seeded_images
 from tests.tiny import tiny_config
-from vggtjax import METHODS, Model, Passes, assemble, infer, init_params
+from vggtjax import Model, Passes, assemble, infer, init_params
 from vggtjax.errors import InputError
 from vggtjax.evaluation.depth import depth_errors, median_scale
 from vggtjax.evaluation.ladder import LadderRow, ladder
@@ -17,6 +17,7 @@ from vggtjax.evaluation.masks import auc, jaccard
 from vggtjax.evaluation.trajectory import centre_error, rotation_error
 from vggtjax.evaluation.truth import Truth
 from vggtjax.mask import upsample
+from vggtjax.methods import LADDER
 
 CLIPS, FRAMES, SIZE = 3, 4, (42, 56)
 SETTING = ("method", "mask_source", "mask_pairs", "suppress")
@@ -81,7 +82,7 @@ def close(a: LadderRow, b: LadderRow, rel=1e-3) -> bool:
 
 
 def test_every_setting_has_a_row(rows):
-    masked = [name for name in METHODS if name != "vggt"]
+    masked = [name for name in LADDER if name != "vggt"]
     settings = [("vggt", None, None, None)] + [
         (method, source, pairs, suppress)
         for source in ("mined", "true")
@@ -95,7 +96,7 @@ def test_every_setting_has_a_row(rows):
     assert not any(row.failure for row in rows)
 
 
-@pytest.mark.parametrize("method", list(METHODS))
+@pytest.mark.parametrize("method", LADDER)
 def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
     settings = {} if method == "vggt" else {"mask_source": "mined", "mask_pairs": 2, "suppress": "zero"}
     row = only(rows, clip=1, method=method, **settings)

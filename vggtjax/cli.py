@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
@@ -19,6 +19,11 @@ from vggtjax.methods import MethodName
 from vggtjax.report import Report
 from vggtjax.scenes.command import scenes
 from vggtjax.training.command import train
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from vggtjax.clips.clip import Clip
 
 
 def reconstruct(
@@ -39,6 +44,10 @@ def reconstruct(
     suppress: Suppress | None = None,
     mask_pairs: int = 5,
     align_scale: bool = False,
+    masks: Path | None = None,
+    no_masks: tyro.conf.FlagCreatePairsOff[bool] = False,
+    refine_mask: bool = False,
+    tracks: str | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
     confidence_percentile: float = 20.0,
 ) -> None:
@@ -60,11 +69,18 @@ def reconstruct(
         suppress: what becomes of the keys of dynamic tokens; the method's own by default.
         mask_pairs: number of pairs of blocks in which they are suppressed.
         align_scale: bring the second pass to the first one's scale before fusing (not in the paper).
+        masks: folder of pictures, bright where something moves, one per frame; mined from the clip by default.
+        no_masks: nothing moves; one pass is enough.
+        refine_mask: take out of the mask what agrees with other frames (VGGT4D).
+        tracks: points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and, if
+            wanted, frame, in pixels of the source.
         dtype: of the blocks' matrix products.
         confidence_percentile: leave so many percent of the pixels, the least confident, out of the point clouds.
     """
     if not source:
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
+    if masks is not None and no_masks:
+        raise InputError("--masks and --no-masks are opposites; give one of them")
     frames = source[0] if len(source) == 1 else list(source)
     report = Report()
     with report.running():
@@ -84,6 +100,12 @@ def reconstruct(
                 max_frames=max_frames,
                 progress=progress,
             )
+            given = _given_masks(clip, masks, no_masks)
+            queries = None
+            if tracks is not None:
+                from vggtjax.tracking import parse_queries
+
+                queries = parse_queries(tracks, clip)
         from vggtjax.pipeline import reconstruct as run
 
         result = run(
@@ -91,6 +113,9 @@ def reconstruct(
             clip,
             method=method,
             size=size,
+            masks=given,
+            refine_mask=refine_mask,
+            tracks=queries,
             gram=gram,
             suppress=suppress,
             mask_pairs=mask_pairs,
@@ -235,6 +260,18 @@ def _check_folder(out: Path) -> None:
     from vggtjax.results.export import check_folder
 
     check_folder(out)
+
+
+def _given_masks(clip: Clip, folder: Path | None, none: bool) -> np.ndarray | None:
+    if folder is not None:
+        from vggtjax.clips.masks import load_masks
+
+        return load_masks(folder, clip)
+    if none:
+        import numpy as np
+
+        return np.zeros(clip.images.shape[:3], bool)
+    return None
 
 
 def _load_model(report: Report, name: str, config: Path | None):

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.clustering import kmeans
+from vggtjax.methods import Threshold
 from vggtjax.motion import normalise
 
 BINS = 256
@@ -40,17 +41,41 @@ def otsu_threshold(values: Float[Array, ...], bins: int = BINS) -> Float[Array, 
     return jnp.where(width > 0, centres[jnp.argmax(between)], low)
 
 
-def dynamic_pixels(saliency: Float[Array, "B S h w"], size: tuple[int, int]) -> Bool[Array, "B S H W"]:
-    """Return the dynamic pixels of every clip: at or above Otsu's threshold over all its pixels.
+def dynamic_pixels(
+    saliency: Float[Array, "B S h w"], size: tuple[int, int], *, threshold: Threshold = "otsu"
+) -> Bool[Array, "B S H W"]:
+    """Return the dynamic pixels of every clip, cut at one threshold over all its pixels.
 
     A clip of constant saliency (one frame, or nothing moves) has none.
+
+    Args:
+        saliency: of every patch, in [0, 1].
+        size: height and width of the frames in pixels.
+        threshold: "otsu" (at or above, 4DVGGT-D) or "multi-otsu" (above, VGGT4D), which is computed on the host.
     """
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
         varies = pixels.max() - pixels.min() >= CONSTANT
-        return (pixels >= otsu_threshold(pixels)) & varies
+        if threshold == "otsu":
+            return (pixels >= otsu_threshold(pixels)) & varies
+        scalar = jax.ShapeDtypeStruct((), jnp.float32)
+        return (pixels > jax.pure_callback(_multi_otsu, scalar, pixels, vmap_method="sequential")) & varies
 
     return jax.vmap(one_clip)(upsample(saliency, size))
+
+
+def mine_mask(
+    saliency: Float[Array, "B S h w"],
+    patch_tokens: Float[Array, "B S P C"],
+    size: tuple[int, int],
+    *,
+    clusters: int = 0,
+    threshold: Threshold = "otsu",
+) -> Bool[Array, "B S H W"]:
+    """Return a method's dynamic pixels: the saliency, averaged within clusters if there are any, cut at a threshold."""
+    if clusters:
+        saliency = smooth_by_clusters(saliency, patch_tokens, clusters)
+    return dynamic_pixels(saliency, size, threshold=threshold)
 
 
 def smooth_by_clusters(
@@ -102,6 +127,10 @@ def multi_otsu_threshold(values: np.ndarray) -> float:
         if score > best_score:
             best, best_score = float(thresholds[-1]), score
     return best
+
+
+def _multi_otsu(values: np.ndarray) -> np.ndarray:
+    return np.float32(multi_otsu_threshold(np.asarray(values)))
 
 
 def dynamic_tokens(mask: Bool[Array, "B S H W"], patch_size: int) -> Bool[Array, "B S h w"]:

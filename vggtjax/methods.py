@@ -1,4 +1,4 @@
-"""The methods, as a table: which pass gives what (the ladder of 4DVGGT-D, table 2). Does not import jax."""
+"""The methods, as a table: how motion is mined, which pass gives what (4DVGGT-D, table 2). Does not import jax."""
 
 from __future__ import annotations
 
@@ -9,18 +9,25 @@ from vggtjax.config import Gram, Suppress
 from vggtjax.errors import InputError
 
 Pass = Literal["first", "second"]
-MethodName = Literal["vggt", "pose-decoupling", "hard-replacement", "4dvggt-d"]
+Threshold = Literal["otsu", "multi-otsu"]
+MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d"]
 
 
 @dataclass(frozen=True)
 class Method:
-    """Where a method takes its depth (and confidence) and its cameras from, and how it masks the second pass."""
+    """Where a method takes its depth (and confidence) and its cameras from, and how it masks the second pass.
+
+    `clusters` is the number of groups of patch features within which the saliency is averaged before it is cut at the
+    `threshold`; 0 for none.
+    """
 
     depth: Literal["first", "second", "replaced", "fused"]
     extrinsics: Pass
     intrinsics: Pass
     gram: Gram = "cosine"
     suppress: Suppress = "zero"
+    clusters: int = 0
+    threshold: Threshold = "otsu"
 
     @property
     def needs_second_pass(self) -> bool:
@@ -29,10 +36,13 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "vggt": Method("first", "first", "first"),
+    "vggt4d": Method("first", "second", "first", "dot", "drop", clusters=64, threshold="multi-otsu"),
     "pose-decoupling": Method("second", "second", "second"),
     "hard-replacement": Method("replaced", "second", "second"),
     "4dvggt-d": Method("fused", "second", "second"),
 }
+
+LADDER = ("vggt", "pose-decoupling", "hard-replacement", "4dvggt-d")  # what one run of both passes gives
 
 
 def find_method(name: str) -> Method:

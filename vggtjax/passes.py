@@ -5,18 +5,19 @@ from __future__ import annotations
 from typing import NamedTuple, TypeVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.fusion import fuse_depth, replace_depth, scale_between
-from vggtjax.mask import dynamic_pixels, dynamic_tokens
-from vggtjax.methods import find_method
+from vggtjax.mask import dynamic_tokens, mine_mask
+from vggtjax.methods import Threshold, find_method
 from vggtjax.motion import GramCues
 from vggtjax.network.backbone import encode
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions, forward
 from vggtjax.network.pose import decode_pose
+from vggtjax.network.track_head import Tracks
 
 _Value = TypeVar("_Value")
 
@@ -62,14 +63,22 @@ def first_pass(
     gram: Gram = "cosine",
     motion: MotionConfig | None = None,
     outputs: tuple[str, ...] = ("camera", "depth"),
+    query_points: Float[Array, "B Q 2"] | None = None,
     compute_dtype: str = "float32",
 ) -> tuple[Predictions, Float[Array, "B S h w"]]:
-    """Run the plain pass and mine the motion saliency on the way."""
+    """Run the plain pass and mine the motion saliency on the way; with `query_points`, track them too."""
     if gram not in ("cosine", "dot"):
         raise InputError(f"gram is {gram!r}; expected 'cosine' or 'dot'")
     cues = GramCues(motion or config.motion, config.depth, gram)
     predictions = forward(
-        params, images, config, patch_tokens=patch_tokens, outputs=outputs, cues=cues, compute_dtype=compute_dtype
+        params,
+        images,
+        config,
+        patch_tokens=patch_tokens,
+        outputs=outputs if query_points is None else (*outputs, "tracks"),
+        query_points=query_points,
+        cues=cues,
+        compute_dtype=compute_dtype,
     )
     h, w = (side // config.patch_size for side in images.shape[2:4])
     saliency = cues.saliency(_present(predictions.cue_sums)).reshape(*images.shape[:2], h, w)
@@ -98,6 +107,39 @@ def second_pass(
         mask_pairs=mask_pairs,
         compute_dtype=compute_dtype,
     )
+
+
+def track_from(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    patch_tokens: Float[Array, "B S P C"],
+    query_points: Float[Array, "B Q 2"],
+    frame: Int[Array, ""],
+    config: VGGTConfig,
+    *,
+    compute_dtype: str = "float32",
+) -> Tracks:
+    """Track points of any frame: the clip is rolled so that the frame comes first, and its tracks are rolled back.
+
+    Args:
+        params: the model's parameter tree.
+        images, patch_tokens: of the clips, in their order.
+        query_points: x, y in pixels of the frame.
+        frame: its index (may be traced: one compilation serves all).
+        config: the model's configuration.
+        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
+    """
+    made = forward(
+        params,
+        jnp.roll(images, -frame, axis=1),
+        config,
+        patch_tokens=jnp.roll(patch_tokens, -frame, axis=1),
+        outputs=("tracks",),
+        query_points=query_points,
+        compute_dtype=compute_dtype,
+    )
+    tracks = (made.tracks, made.track_visibility, made.track_confidence)
+    return Tracks(*(jnp.roll(_present(value), frame, axis=1) for value in tracks))
 
 
 def motion_saliency(
@@ -130,6 +172,8 @@ def run_passes(
     mask_pairs: int = 5,
     motion: MotionConfig | None = None,
     compute_dtype: str = "float32",
+    clusters: int = 0,
+    threshold: Threshold = "otsu",
     second: bool = True,
 ) -> Passes:
     """Run both passes once, sharing the backbone's features; `assemble` makes every method's result of them.
@@ -143,13 +187,15 @@ def run_passes(
         mask_pairs: number of pairs in which they are.
         motion: the table of cues; the configuration's own if None.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
+        clusters, threshold: how the mask is made of the saliency, as for `mine_mask`.
         second: whether to run the second pass at all.
     """
     patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
     first, saliency = first_pass(
         params, images, patch_tokens, config, gram=gram, motion=motion, compute_dtype=compute_dtype
     )
-    mask = dynamic_pixels(saliency, (images.shape[2], images.shape[3]))
+    size = (images.shape[2], images.shape[3])
+    mask = mine_mask(saliency, patch_tokens, size, clusters=clusters, threshold=threshold)
     if not second:
         return Passes(first, None, saliency, mask)
     masking = {"suppress": suppress, "mask_pairs": mask_pairs, "compute_dtype": compute_dtype}

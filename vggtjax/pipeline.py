@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
@@ -10,18 +11,20 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
-from vggtjax.errors import DeviceMemoryError
-from vggtjax.mask import dynamic_pixels
+from vggtjax.errors import DeviceMemoryError, InputError
+from vggtjax.mask import mine_mask
 from vggtjax.methods import find_method
 from vggtjax.network.backbone import encode
 from vggtjax.network.layers import Params
-from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass
+from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass, track_from
+from vggtjax.refinement import refine_masks
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.tracking import Queries
 
 OnStage = Callable[[str], AbstractContextManager[Any]]
 
@@ -42,8 +45,16 @@ def _assemble(first, second, saliency, dynamic_mask, *, method: str, align_scale
 
 _encode = jax.jit(encode, static_argnames=("config", "compute_dtype"))
 _first_pass = jax.jit(first_pass, static_argnames=("config", "gram", "motion", "outputs", "compute_dtype"))
-_dynamic_pixels = jax.jit(dynamic_pixels, static_argnames=("size",))
+_mine_mask = jax.jit(mine_mask, static_argnames=("size", "clusters", "threshold"))
 _second_pass = jax.jit(second_pass, static_argnames=("config", "suppress", "mask_pairs", "compute_dtype"))
+_first_pass_with_tracks = jax.jit(
+    lambda params, images, patch_tokens, query_points, **options: first_pass(
+        params, images, patch_tokens, query_points=query_points, **options
+    ),
+    static_argnames=("config", "gram", "motion", "outputs", "compute_dtype"),
+)
+_track_from = jax.jit(track_from, static_argnames=("config", "compute_dtype"))
+_same = jax.jit(lambda predictions: predictions)
 _assembled = jax.jit(_assemble, static_argnames=("method", "align_scale"))
 
 
@@ -90,6 +101,8 @@ def infer(
         mask_pairs=mask_pairs,
         motion=motion,
         compute_dtype=compute_dtype,
+        clusters=row.clusters,
+        threshold=row.threshold,
         second=row.needs_second_pass,
     )
     return assemble(passes, method, align_scale=align_scale), passes
@@ -105,6 +118,9 @@ def reconstruct(
     suppress: Suppress | None = None,
     mask_pairs: int = 5,
     align_scale: bool = False,
+    masks: Bool[np.ndarray, "S H W"] | None = None,
+    refine_mask: bool = False,
+    tracks: Queries | None = None,
     compute_dtype: str = "float32",
     keep_passes: bool = False,
     on_stage: OnStage | None = None,
@@ -119,12 +135,17 @@ def reconstruct(
         gram, suppress: override the method's own similarity and suppression.
         mask_pairs: number of pairs in which the keys of dynamic tokens are suppressed (L_mask of the paper).
         align_scale: bring the second pass to the first one's scale before it is used (not in the paper).
+        masks: what moves, in place of what is mined; without a moving pixel the second pass is the first.
+        refine_mask: take out of the mask what agrees with other frames, by the method's depth and cameras (VGGT4D).
+        tracks: points to follow through the clip. Those of the first frame come with the first pass; every other frame
+            that has some costs a pass of its own, over the clip rolled so that this frame comes first.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
         keep_passes: keep both passes on the result, as `.passes`.
         on_stage: called with the name of each stage, returns a context in which it runs; for progress and timing.
 
     Raises:
-        InputError: an unknown method, or a size that is not a multiple of the patch size.
+        InputError: an unknown method, masks of another shape than the frames, or a size that is not a multiple of the
+            patch size.
         DeviceMemoryError: the clip does not fit.
     """
     row = find_method(method)
@@ -142,7 +163,25 @@ def reconstruct(
         "compute_dtype": compute_dtype,
     }
     stages = _stages(config, method, clip.images.shape[1:3], **settings)
+    if tracks is not None:
+        tracks.check(*clip.images.shape[:3])
     arrays: dict[str, Any] = {"params": model.params, "images": jnp.asarray(clip.images)[None], "second": None}
+    if masks is not None:
+        arrays["dynamic_mask"] = jnp.asarray(_checked(masks, clip))[None]
+        stages = [stage for stage in stages if stage.name != "dynamic mask"]
+        if not masks.any():
+            same = Stage("second pass", ("first",), ("second",), _same, {})
+            stages = [same if stage.name == same.name else stage for stage in stages]
+    for frame in [] if tracks is None else np.unique(tracks.frames).tolist():
+        points = jnp.asarray(tracks.points[tracks.frames == frame])[None]
+        if frame == 0:
+            arrays["query_points"] = points
+            stages = [_with_queries(stage) if stage.name == "first pass" else stage for stage in stages]
+        else:
+            arrays |= {f"points {frame}": points, f"frame {frame}": jnp.int32(frame)}
+            reads = ("params", "images", "patch_tokens", f"points {frame}", f"frame {frame}")
+            options = {"config": config, "compute_dtype": compute_dtype}
+            stages.append(Stage("tracks", reads, (f"tracks {frame}",), _track_from, options))
     try:
         with on_stage("compile"):
             _compile(stages, arrays)
@@ -163,7 +202,8 @@ def reconstruct(
     focal = intrinsics[:, [0, 1], [0, 1]]
     intrinsics[:, [0, 1], [0, 1]] = np.where(fields > np.pi, -np.abs(focal), focal)  # beyond 2 pi the tangent repeats
     passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
-    return Reconstruction(
+    followed = {} if tracks is None else _joined_tracks(tracks, arrays)
+    result = Reconstruction(
         depth=depth,
         depth_confidence=confidence,
         saliency=np.asarray(passes.saliency[0]),
@@ -175,13 +215,58 @@ def reconstruct(
         timestamps=clip.timestamps,
         method=method,
         model_name=model.name,
-        settings=settings | {"mode": clip.mode, "size": clip.size, "patch": clip.patch},
+        settings=settings
+        | {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
+        | {"masks": "mined" if masks is None else "given", "refine_mask": refine_mask},
         source_size=clip.source_size,
         source_scale=clip.source_scale,
         source_offset=clip.source_offset,
         valid_box=clip.valid_box,
+        **followed,
         passes=jax.tree.map(np.asarray, passes) if keep_passes else None,
     )
+    if refine_mask:
+        with on_stage("refine mask") as progress:
+            result = _refined(result, progress)
+    return result
+
+
+def _with_queries(stage: Stage) -> Stage:
+    return stage._replace(reads=(*stage.reads, "query_points"), function=_first_pass_with_tracks)
+
+
+def _joined_tracks(queries: Queries, arrays: dict[str, Any]) -> dict[str, np.ndarray]:
+    """Return the tracks of all query frames in the order of the queries, as fields of a Reconstruction."""
+    S, Q = arrays["images"].shape[1], len(queries.frames)
+    fields = {
+        "track_positions": np.zeros((S, Q, 2), np.float32),
+        "track_visibility": np.zeros((S, Q), np.float32),
+        "track_confidence": np.zeros((S, Q), np.float32),
+    }
+    for frame in np.unique(queries.frames).tolist():
+        first = arrays["first"]
+        made = arrays[f"tracks {frame}"] if frame else (first.tracks, first.track_visibility, first.track_confidence)
+        for field, value in zip(fields.values(), made, strict=True):
+            field[:, queries.frames == frame] = value[0]
+    return fields | {"track_frames": queries.frames}
+
+
+def _checked(masks: Bool[np.ndarray, "S H W"], clip: Clip) -> Bool[np.ndarray, "S H W"]:
+    if masks.shape != clip.images.shape[:3] or masks.dtype != bool:
+        raise InputError(f"masks are {masks.dtype} {masks.shape}; expected bool {clip.images.shape[:3]}, as the frames")
+    return masks
+
+
+def _refined(result: Reconstruction, progress: Callable[[int, int], object] | None) -> Reconstruction:
+    mask = refine_masks(
+        result.images / np.float32(255),
+        result.depth,
+        result.dynamic_mask,
+        result.camera_from_world,
+        result.intrinsics,
+        progress=progress,
+    )
+    return dataclasses.replace(result, dynamic_mask=mask)
 
 
 def _stages(
@@ -198,15 +283,17 @@ def _stages(
     network = {"config": config, "compute_dtype": compute_dtype}
     masking = {"suppress": suppress, "mask_pairs": mask_pairs}
     making = {"method": method, "align_scale": align_scale}
+    row = find_method(method)
+    mining = {"size": size, "clusters": row.clusters, "threshold": row.threshold}
     seen = ("params", "images", "patch_tokens")
     stages = [
         Stage("image features", ("params", "images"), ("patch_tokens",), _encode, network),
         Stage("first pass", seen, ("first", "saliency"), _first_pass, network | {"gram": gram}),
-        Stage("dynamic mask", ("saliency",), ("dynamic_mask",), _dynamic_pixels, {"size": size}),
+        Stage("dynamic mask", ("saliency", "patch_tokens"), ("dynamic_mask",), _mine_mask, mining),
         Stage("second pass", (*seen, "dynamic_mask"), ("second",), _second_pass, network | masking),
         Stage("assemble", ("first", "second", "saliency", "dynamic_mask"), ("assembly",), _assembled, making),
     ]
-    return [stage for stage in stages if stage.name != "second pass" or find_method(method).needs_second_pass]
+    return [stage for stage in stages if stage.name != "second pass" or row.needs_second_pass]
 
 
 def _compile(stages: list[Stage], arrays: dict[str, Any]) -> None:

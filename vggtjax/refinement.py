@@ -86,6 +86,7 @@ def refine_masks(
     count = min(-(-most // _BUCKET) * _BUCKET, depth[0].size)
     index, weight = _packed(inside, count)
     chosen = np.take_along_axis(points.reshape(S, -1, 3), index[..., None], axis=1)
+    chosen[~weight] = 0  # where there is nothing, depth may not even be a number
     labels = cluster_points(jax.random.key(seed), chosen, weight, clusters)
     losses = cluster_losses(images, depth, dynamic_mask, camera_from_world, intrinsics, index, weight, labels, clusters)
     static = np.asarray(losses.total <= MOST_LOSS)  # [S, K]
@@ -96,11 +97,18 @@ def refine_masks(
 
 
 def statistical_outliers(points: Float[np.ndarray, "H W 3"]) -> Bool[np.ndarray, "H W"]:
-    """Return the points whose mean distance to their nearest neighbours is 2.5 standard deviations above the mean."""
+    """Return the points whose mean distance to their nearest neighbours is 2.5 standard deviations above the mean.
+
+    Points that are not finite are outliers too, and nobody's neighbours.
+    """
     flat = points.reshape(-1, 3)
-    neighbours = min(NEIGHBOURS, len(flat))
-    distance = cKDTree(flat).query(flat, k=neighbours, workers=-1)[0].reshape(len(flat), -1).mean(axis=1)
-    return (distance > distance.mean() + OUTLIER_SIGMA * distance.std()).reshape(points.shape[:2])
+    outlier = ~np.isfinite(flat).all(axis=1)
+    known = flat[~outlier]
+    if len(known):
+        neighbours = min(NEIGHBOURS, len(known))
+        distance = cKDTree(known).query(known, k=neighbours, workers=-1)[0].reshape(len(known), -1).mean(axis=1)
+        outlier[~outlier] = distance > distance.mean() + OUTLIER_SIGMA * distance.std()
+    return outlier.reshape(points.shape[:2])
 
 
 @partial(jax.jit, static_argnames="clusters")
@@ -169,7 +177,8 @@ def cluster_losses(
             u, v = jnp.where(inside, u, 0), jnp.where(inside, v, 0)
             sampled_depth = _nearest(seen_depth, u, v)
             sampled = _bilinear(shown, u, v)
-            counts = inside & (seen[:, 2] - OCCLUSION < sampled_depth) & (sampled[:, 3] <= 0.5) & (number != frame)
+            counts = inside & (seen[:, 2] - OCCLUSION < sampled_depth) & (sampled_depth < jnp.inf)
+            counts &= (sampled[:, 3] <= 0.5) & (number != frame)
             off = jnp.abs(sampled_depth - seen[:, 2])
             faded = jnp.abs(sampled[:, :3] - colour).sum(axis=-1)
             values = jnp.stack([jnp.ones_like(off), off, faded], axis=-1)

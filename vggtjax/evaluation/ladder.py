@@ -20,7 +20,7 @@ from vggtjax.evaluation.masks import auc, jaccard
 from vggtjax.evaluation.trajectory import centre_error, rotation_error
 from vggtjax.evaluation.truth import ClipTruth, Truth, batched_truth
 from vggtjax.mask import dynamic_pixels, upsample
-from vggtjax.methods import METHODS, find_method
+from vggtjax.methods import LADDER, find_method
 from vggtjax.network.backbone import encode
 from vggtjax.passes import Passes, assemble, first_pass, second_pass
 
@@ -82,7 +82,7 @@ def ladder(
     model: Model,
     truth: ClipTruth,
     *,
-    methods: Sequence[str] = tuple(METHODS),
+    methods: Sequence[str] = LADDER,
     masks: Sequence[MaskSource] = ("mined", "true"),
     mask_pairs: Sequence[int] = (5,),
     suppress: Sequence[Suppress] = ("zero",),
@@ -97,7 +97,7 @@ def ladder(
     Args:
         model: the network.
         truth: clips with exact truth, [S, ...] or [B, S, ...]; height and width are multiples of the patch size.
-        methods: names of `METHODS`. One without a second pass gives one row per clip, any other one for each
+        methods: names of `LADDER`. One without a second pass gives one row per clip, any other one for each
             combination of the three that follow.
         masks: "mined" from the first pass, or "true": the truth's own, which bounds what any mining can reach.
         mask_pairs: numbers of pairs in which the keys of dynamic tokens are suppressed.
@@ -115,6 +115,8 @@ def ladder(
     """
     truth = batched_truth(truth)
     rows = [find_method(method) for method in methods]
+    if foreign := [method for method in methods if method not in LADDER]:
+        raise InputError(f"methods has {foreign}, which mine their masks in another way; expected some of {LADDER}")
     if unknown := [source for source in masks if source not in ("mined", "true")]:
         raise InputError(f"masks has {unknown}; expected 'mined' or 'true'")
     if unknown := [how for how in suppress if how not in ("zero", "drop")]:

@@ -13,6 +13,12 @@ In the folder, with a frame's number as its file name:
     static.ply              what stands still, from all frames
     frames/                 .ply of everything that a frame shows
     scene.glb               the clouds and the cameras for a viewer, y up
+
+and where points were tracked
+
+    tracks.npz              positions [S, Q, 2] in pixels of the source, visibility, confidence [S, Q], frames [Q]
+    preview/tracks.png      the tracks over some of the frames
+    preview/tracks.mp4      over all of them, where PyAV is installed
 """
 
 from __future__ import annotations
@@ -31,12 +37,13 @@ from PIL.PngImagePlugin import PngInfo
 from scipy.spatial.transform import Rotation
 
 from vggtjax.files import check_free, staging, writing
-from vggtjax.results import point_cloud, previews
+from vggtjax.results import archive, point_cloud, previews, tracks
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.reconstruction import ARCHIVE_NAME, Reconstruction, is_result
 from vggtjax.results.scene import build_scene
 
 _NAMES = ("depth", "mask", "preview", "frames", "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb")
+_SOMETIMES = ("tracks.npz",)
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
 _WORKERS = 8
 
@@ -69,7 +76,7 @@ def check_folder(folder: Path) -> None:
     Raises OutputError where the folder cannot be made or written, or holds files of our names that are not an earlier
     result.
     """
-    check_free(folder, (ARCHIVE_NAME, *_NAMES), replaced=is_result(folder / ARCHIVE_NAME), what="result")
+    check_free(folder, (ARCHIVE_NAME, *_NAMES, *_SOMETIMES), replaced=is_result(folder / ARCHIVE_NAME), what="result")
 
 
 def _install(staged: Path, folder: Path) -> None:
@@ -79,9 +86,9 @@ def _install(staged: Path, folder: Path) -> None:
     """
     previous = staged / "previous"
     previous.mkdir()
-    old = [name for name in (ARCHIVE_NAME, *_NAMES) if os.path.lexists(folder / name)]
+    old = [name for name in (ARCHIVE_NAME, *_NAMES, *_SOMETIMES) if os.path.lexists(folder / name)]
     moves = [(folder / name, previous / name) for name in old]
-    moves += [(staged / name, folder / name) for name in (*_NAMES, ARCHIVE_NAME)]
+    moves += [(staged / name, folder / name) for name in (*_written(staged), ARCHIVE_NAME)]
     done: list[tuple[Path, Path]] = []
     try:
         for source, target in moves:
@@ -91,6 +98,10 @@ def _install(staged: Path, folder: Path) -> None:
         for source, target in reversed(done):
             target.rename(source)
         raise
+
+
+def _written(staged: Path) -> list[str]:
+    return [*_NAMES, *(name for name in _SOMETIMES if (staged / name).exists())]
 
 
 def _write_files(
@@ -106,6 +117,8 @@ def _write_files(
     build_scene(reconstruction, static, point_cloud.dynamic_clouds(reconstruction, pixels)).export(folder / "scene.glb")
     advance()
     _write_png(folder / "preview/sheet.png", previews.contact_sheet(reconstruction))
+    if reconstruction.track_positions is not None:
+        _write_tracks(reconstruction, folder)
     advance()
     with writing(folder / ARCHIVE_NAME) as path:
         reconstruction.save_archive(path)
@@ -143,6 +156,19 @@ def _write_frames(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+
+
+def _write_tracks(reconstruction: Reconstruction, folder: Path) -> None:
+    scale, offset = reconstruction.source_scale[:, None], reconstruction.source_offset[:, None]
+    arrays = {
+        "positions": (reconstruction.track_positions * scale + offset).astype(np.float32),
+        "visibility": reconstruction.track_visibility,
+        "confidence": reconstruction.track_confidence,
+        "frames": reconstruction.track_frames,
+    }
+    archive.write_arrays(folder / "tracks.npz", arrays)
+    _write_png(folder / "preview/tracks.png", tracks.track_strip(reconstruction))
+    tracks.write_track_video(folder / "preview/tracks.mp4", reconstruction)
 
 
 def depth_scale(depth: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]) -> float:

@@ -18,7 +18,7 @@ from vggtjax.results import archive, geometry
 ARCHIVE_NAME = "reconstruction.npz"
 _FORMAT_VERSION = 1
 
-# Arrays: type and dimensions. depth binds S, H, W and saliency binds h, w; the others must agree.
+# Arrays: type and dimensions. depth binds S, H, W, saliency h, w and track_frames Q; the others must agree.
 _ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "depth": (np.float32, ("S", "H", "W")),
     "depth_confidence": (np.float32, ("S", "H", "W")),
@@ -32,7 +32,13 @@ _ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "source_offset": (np.float64, ("S", 2)),
     "valid_box": (np.int64, ("S", 4)),
     "timestamps": (np.float64, ("S",)),
+    "track_positions": (np.float32, ("S", "Q", 2)),
+    "track_visibility": (np.float32, ("S", "Q")),
+    "track_confidence": (np.float32, ("S", "Q")),
+    "track_frames": (np.int64, ("Q",)),
 }
+_TRACKS = frozenset(name for name in _ARRAYS if name.startswith("track_"))  # all there, or none
+_OPTIONAL = _TRACKS | {"timestamps"}
 _STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": (), "model_name": (), "settings": ()}
 
 
@@ -64,11 +70,15 @@ class Reconstruction:
     source_scale: Float64[np.ndarray, "S 2"]  # source (x, y) = scale * (x, y) + offset; pixel edges at integers
     source_offset: Float64[np.ndarray, "S 2"]
     valid_box: Int64[np.ndarray, "S 4"]  # left, top, right, bottom; pixels outside are padding
+    track_positions: Float32[np.ndarray, "S Q 2"] | None = None  # x, y in pixels of H x W
+    track_visibility: Float32[np.ndarray, "S Q"] | None = None  # probabilities
+    track_confidence: Float32[np.ndarray, "S Q"] | None = None
+    track_frames: Int64[np.ndarray, " Q"] | None = None  # in which each point was asked for
     passes: Any = None  # what the network computed on the way; in memory only, never saved
 
     def __post_init__(self) -> None:
         for name, (dtype, _) in _ARRAYS.items():
-            if name != "timestamps" or self.timestamps is not None:
+            if name not in _OPTIONAL or getattr(self, name) is not None:
                 object.__setattr__(self, name, _cast(name, getattr(self, name), dtype))
         object.__setattr__(self, "frame_names", tuple(self.frame_names))
         object.__setattr__(self, "settings", _json_values(self.settings))
@@ -98,7 +108,7 @@ class Reconstruction:
                 f"camera_from_world of frame {np.argmin(rigid)} is not a finite rotation and translation; "
                 "check the weights for NaN"
             )
-        for name in ("intrinsics", "timestamps", "source_scale", "source_offset"):
+        for name in ("intrinsics", "timestamps", "source_scale", "source_offset", *sorted(_TRACKS)):
             value = getattr(self, name)
             if value is not None and not np.isfinite(value).all():
                 raise ResultError(f"{name} holds {value[~np.isfinite(value)][0]}; expected finite numbers")
@@ -201,7 +211,8 @@ def _check_headers(headers: Mapping[str, archive.Header]) -> None:
     if version is None or version != (np.dtype(np.int64), ()):
         raise ResultError("it has no format version")
     expected = {"format_version", *_ARRAYS, *_STRINGS}
-    wrong = sorted((expected - {"timestamps"} - set(headers)) | (set(headers) - expected))
+    optional = {"timestamps"} if _TRACKS & set(headers) else _OPTIONAL
+    wrong = sorted((expected - optional - set(headers)) | (set(headers) - expected))
     if wrong:
         raise ResultError(f"arrays are missing or unknown: {', '.join(wrong)}")
     for name, header in headers.items():
@@ -219,6 +230,12 @@ def _check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:
             raise ResultError(f"{name} has shape {shapes[name]}; expected (frames, rows, columns), none of them 0")
     sizes: dict[str | int, int] = dict(zip("SHW", shapes["depth"], strict=True))
     sizes |= dict(zip("hw", shapes["saliency"][1:], strict=True))
+    if there := _TRACKS & set(shapes):
+        if missing := sorted(_TRACKS - there):
+            raise ResultError(f"tracks lack {', '.join(missing)}")
+        if len(shapes["track_frames"]) != 1:
+            raise ResultError(f"track_frames has shape {shapes['track_frames']}; expected one number per track")
+        sizes["Q"] = shapes["track_frames"][0]
     for name, shape in shapes.items():
         dimensions = _ARRAYS[name][1] if name in _ARRAYS else _STRINGS[name]
         expected = tuple(sizes.get(dimension, dimension) for dimension in dimensions)

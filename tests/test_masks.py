@@ -1,0 +1,93 @@
+"""Masks that a user brings: names, order, crop and padding, and what the pipeline does with them."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.seeded import seeded_images
+from vggtjax import Model, load_clip, reconstruct
+from vggtjax.clips.masks import load_masks
+from vggtjax.errors import ClipError, InputError
+
+WIDE, TALL = (90, 160), (160, 90)  # height, width
+
+
+def written(folder, pictures, names):
+    folder.mkdir()
+    for picture, name in zip(pictures, names, strict=True):
+        Image.fromarray(picture).save(folder / name)
+    return folder
+
+
+def pictures(count, size, generator) -> list[np.ndarray]:
+    """Frames that are white in a box and black elsewhere, so that a frame is its own mask."""
+    found = []
+    for _ in range(count):
+        frame = np.zeros((*size, 3), np.uint8)
+        top, left = generator.integers(5, size[0] // 2), generator.integers(5, size[1] // 2)
+        frame[top : top + size[0] // 3, left : left + size[1] // 3] = 255
+        found.append(frame)
+    return found
+
+
+@pytest.mark.parametrize("size", [WIDE, TALL])
+@pytest.mark.parametrize("mode", ["crop", "pad"])
+def test_masks_land_where_the_frames_do(tmp_path, size, mode):
+    frames = pictures(3, size, np.random.default_rng(0))
+    names = ["a_10.png", "a_2.png", "a_1.png"]
+    clip = load_clip(str(written(tmp_path / "frames", frames, names)), size=70, patch=14, mode=mode)
+    masks = load_masks(written(tmp_path / "masks", [f[..., 0] for f in frames], names), clip)
+    bright = clip.images.mean(axis=-1) > 0.5
+    for mask, frame, (left, top, right, bottom) in zip(masks, bright, clip.valid_box, strict=True):
+        assert (mask[top:bottom, left:right] == frame[top:bottom, left:right]).mean() > 0.97
+        mask = mask.copy()
+        mask[top:bottom, left:right] = False
+        assert not mask.any()
+
+
+def test_masks_of_half_the_size_in_the_same_order(tmp_path):
+    frames = pictures(2, WIDE, np.random.default_rng(1))
+    clip = load_clip(np.stack(frames), size=70, patch=14)
+    halves = [frame[::2, ::2, 0] for frame in frames]
+    masks = load_masks(written(tmp_path / "masks", halves, ["0.png", "1.png"]), clip)
+    assert (masks == (clip.images.mean(axis=-1) > 0.5)).mean() > 0.95
+
+
+def test_masks_that_fit_no_frames(tmp_path):
+    frames = pictures(3, WIDE, np.random.default_rng(2))
+    clip = load_clip(np.stack(frames), size=70, patch=14)
+    two = written(tmp_path / "two", [f[..., 0] for f in frames[:2]], ["x.png", "y.png"])
+    with pytest.raises(ClipError, match="2 pictures for 3 frames"):
+        load_masks(two, clip)
+    turned = written(tmp_path / "turned", [f[..., 0].T for f in frames], ["x.png", "y.png", "z.png"])
+    with pytest.raises(ClipError, match="expected the same shape"):
+        load_masks(turned, clip)
+    with pytest.raises(ClipError, match=r"none|does not exist|nothing"):
+        load_masks(tmp_path / "missing", clip)
+
+
+@pytest.mark.filterwarnings("ignore:the field of view")  # seeded weights give odd cameras
+def test_given_masks_replace_the_mined_ones(params, config):
+    images = seeded_images(3, 56, 56, seed=4).transpose(0, 2, 3, 1)
+    clip, model = load_clip(images, size=56), Model(config, params, "tiny")
+    masks = np.zeros(clip.images.shape[:3], bool)
+    masks[:, 10:30, 20:40] = True
+    made = reconstruct(model, clip, size=56, masks=masks, keep_passes=True)
+    assert np.array_equal(made.dynamic_mask, masks)
+    assert made.settings["masks"] == "given"
+    still = reconstruct(model, clip, size=56, masks=np.zeros_like(masks), keep_passes=True)
+    assert np.array_equal(still.passes.first.depth, still.passes.second.depth)
+    assert np.allclose(still.depth, still.passes.first.depth[0], rtol=1e-5)
+    assert np.array_equal(made.passes.first.depth, still.passes.first.depth)
+    assert not np.allclose(made.camera_from_world, still.camera_from_world, atol=1e-4)
+    with pytest.raises(InputError, match="expected bool"):
+        reconstruct(model, clip, size=56, masks=masks[:2])
+
+
+@pytest.mark.filterwarnings("ignore:the field of view")
+def test_refinement_of_odd_cameras_is_still_a_mask(params, config):
+    images = seeded_images(3, 56, 56, seed=4).transpose(0, 2, 3, 1)
+    clip, model = load_clip(images, size=56), Model(config, params, "tiny")
+    made = reconstruct(model, clip, size=56, method="vggt4d", refine_mask=True)
+    assert made.dynamic_mask.shape == (3, 56, 56)
+    assert made.settings["refine_mask"] is True

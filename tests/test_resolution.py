@@ -1,0 +1,105 @@
+"""Results at the source's size: the same cameras, masks and depth, with crop and padding undone."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vggtjax import Clip, Reconstruction, load_clip
+from vggtjax.errors import InputError
+from vggtjax.results.resolution import SAME_SURFACE, enlarged_depth, source_frame
+
+
+def result_of(clip: Clip) -> Reconstruction:
+    """A tilted plane of depth and a moving box, seen by a camera that is turned and off the origin."""
+    S, H, W = clip.images.shape[:3]
+    depth = (2 + np.linspace(0, 1, W)[None, None] + 0.5 * np.linspace(0, 1, H)[None, :, None]) * np.ones((S, 1, 1))
+    mask = np.zeros((S, H, W), bool)
+    mask[:, H // 4 : H // 2, W // 4 : W // 2] = True
+    turn = np.array([[0.8, 0, 0.6, 0.1], [0, 1, 0, -0.2], [-0.6, 0, 0.8, 0.3]])
+    return Reconstruction(
+        depth=depth.astype(np.float32),
+        depth_confidence=np.ones_like(depth, np.float32),
+        saliency=np.zeros((S, H // clip.patch, W // clip.patch), np.float32),
+        dynamic_mask=mask,
+        camera_from_world=np.stack([turn] * S).astype(np.float32),
+        intrinsics=np.stack([[[60.0, 0, W / 2], [0, 55.0, H / 2], [0, 0, 1]]] * S).astype(np.float32),
+        images=(255 * clip.images).astype(np.uint8),
+        frame_names=tuple(clip.frame_names),
+        timestamps=None,
+        method="vggt",
+        model_name="none",
+        settings={},
+        source_size=clip.source_size,
+        source_scale=clip.source_scale,
+        source_offset=clip.source_offset,
+        valid_box=clip.valid_box,
+    )
+
+
+CASES = [((90, 160), "crop"), ((160, 90), "crop"), ((90, 160), "pad"), ((160, 90), "pad"), ((30, 40), "crop")]
+
+
+@pytest.mark.parametrize(("size", "mode"), CASES)
+def test_points_project_to_the_same_pixels_through_both(size, mode):
+    clip = load_clip(np.zeros((2, *size, 3), np.uint8), size=56, mode=mode)
+    result = result_of(clip)
+    frame = source_frame(result, 1)
+    points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], size=(50, 3))
+    local = points @ result.camera_from_world[1, :, :3].T + result.camera_from_world[1, :, 3]
+    small, large = ((local @ K.T)[:, :2] / local[:, 2:] for K in (result.intrinsics[1].astype(float), frame.intrinsics))
+    assert np.abs(clip.to_source(1, small) - large).max() < 1e-4
+
+
+@pytest.mark.parametrize(("size", "mode"), CASES)
+def test_depth_and_masks_lie_where_they_belong(size, mode):
+    clip = load_clip(np.zeros((2, *size, 3), np.uint8), size=56, mode=mode)
+    result = result_of(clip)
+    frame = source_frame(result, 0)
+    assert frame.depth.shape == frame.dynamic_mask.shape == frame.seen.shape == size
+    y, x = np.nonzero(frame.seen)
+    places = clip.from_source(0, np.stack([x + 0.5, y + 0.5], axis=-1))
+    left, top, right, bottom = clip.valid_box[0]
+    assert (places >= [left, top]).all()
+    assert (places <= [right, bottom]).all()
+    H, W = result.depth.shape[1:]
+    column, row = np.clip(np.floor(places).astype(int), 0, [W - 1, H - 1]).T
+    assert np.array_equal(frame.dynamic_mask[y, x], result.dynamic_mask[0, row, column])
+    plane = 2 + (places[:, 0] - 0.5) / (W - 1) + 0.5 * (places[:, 1] - 0.5) / (H - 1)
+    inside = ((places > [left + 0.5, top + 0.5]) & (places < [right - 0.5, bottom - 0.5])).all(axis=1)
+    assert np.abs(frame.depth[y, x] - plane)[inside].max() < 2e-3
+    assert not frame.depth[~frame.seen].any()
+    if mode == "pad":
+        assert frame.seen.all()
+
+
+def test_points_are_those_of_the_small_result():
+    clip = load_clip(np.zeros((1, 90, 160, 3), np.uint8), size=56)
+    result = dataclasses.replace(result_of(clip), depth=np.full((1, *clip.images.shape[1:3]), 3, np.float32))
+    points = source_frame(result, 0).world_points()
+    small = result.world_points()[0]
+    scale, offset = clip.source_scale[0], clip.source_offset[0]
+    for row, column in ((4, 7), (20, 30)):
+        x, y = np.array([column + 0.5, row + 0.5]) * scale + offset
+        near = points[int(y), int(x)]
+        assert np.abs(near - small[row, column]).max() < 3 / 55  # a pixel at that depth
+
+
+@given(st.integers(2, 9), st.integers(1, 40), st.integers(0, 10**6))
+@settings(deadline=None, max_examples=40)
+def test_no_depth_is_invented_between_surfaces(side, count, seed):
+    generator = np.random.default_rng(seed)
+    depth = generator.choice([1.0, 1.02, 2.0, 0.0, np.inf], size=(side, side))
+    position = generator.uniform(0, side, size=count)
+    made = enlarged_depth(depth, position, position)
+    known = np.unique(depth)
+    for value in made.ravel():
+        assert any(abs(value - one) <= SAME_SURFACE * one for one in known[np.isfinite(known)]) or np.isinf(value)
+
+
+def test_a_frame_that_is_not_there():
+    clip = load_clip(np.zeros((2, 56, 56, 3), np.uint8), size=56)
+    with pytest.raises(InputError, match="frame is 2; expected 0 to 1"):
+        source_frame(result_of(clip), 2)

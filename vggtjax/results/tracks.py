@@ -1,0 +1,100 @@
+"""Tracks for people: drawn over the frames as a strip of pictures and as a video."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from cmap import Colormap
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from vggtjax.results.previews import BACKGROUND, FAINT, TEXT
+from vggtjax.results.reconstruction import Reconstruction
+
+SEEN = 0.5  # visibility from which a point is drawn filled
+_COLORS = (Colormap("gist_rainbow").lut(256)[:, :3] * 255).round().astype(int)
+_TAIL = 8  # frames that a point's past is drawn over
+_STRIP_FRAMES, _STRIP_WIDTH = 6, 1800
+_VIDEO_SIDE = 720  # pixels of the video's longer side, at least; frames are enlarged by whole numbers
+_FRAMES_PER_SECOND = 10
+_MARGIN, _GAP = 24, 6
+
+logger = logging.getLogger(__name__)
+
+
+def track_strip(result: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
+    """Draw up to six frames, evenly spread, with every track: its place, and where it came from."""
+    S, H, W = result.depth.shape
+    shown = np.linspace(0, S - 1, min(S, _STRIP_FRAMES)).round().astype(int)
+    scale = max(_STRIP_WIDTH / len(shown) / W, 1e-3)
+    width, height = max(round(W * scale), 1), max(round(H * scale), 1)
+    strip = Image.new("RGB", (2 * _MARGIN + len(shown) * (width + _GAP) - _GAP, height + 2 * _MARGIN + 60), BACKGROUND)
+    draw = ImageDraw.Draw(strip)
+    count = _present(result.track_frames).size
+    draw.text((_MARGIN, _MARGIN), f"{count} track{'s' if count > 1 else ''}", TEXT, ImageFont.load_default(22))
+    for column, frame in enumerate(shown):
+        x = _MARGIN + column * (width + _GAP)
+        draw.text((x, _MARGIN + 32), f"frame {frame}", FAINT, ImageFont.load_default(15))
+        strip.paste(_drawn(result, int(frame), (width, height)), (x, _MARGIN + 60))
+    return np.asarray(strip)
+
+
+def write_track_video(path: Path, result: Reconstruction) -> bool:
+    """Write the clip with its tracks as an mp4 (H.264); return False, with a note logged, where PyAV is missing."""
+    try:
+        import av
+    except ImportError:
+        logger.info("tracks are drawn as pictures only; for a video, install the extra: pip install 'vggtjax[video]'")
+        return False
+    _, H, W = result.depth.shape
+    factor = max(1, -(-_VIDEO_SIDE // max(H, W)))
+    size = (W * factor // 2 * 2, H * factor // 2 * 2)  # H.264 wants even sides
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=_FRAMES_PER_SECOND)
+        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+        for picture in _pictures(result, size):
+            container.mux(stream.encode(av.VideoFrame.from_image(picture)))
+        container.mux(stream.encode())
+    return True
+
+
+def _pictures(result: Reconstruction, size: tuple[int, int]) -> Iterator[Image.Image]:
+    for frame in range(len(result.depth)):
+        yield _drawn(result, frame, size)
+
+
+def _drawn(result: Reconstruction, frame: int, size: tuple[int, int]) -> Image.Image:
+    """Return a frame, greyed and enlarged, with the tracks over it; points that are hidden are rings."""
+    positions, visibility = _present(result.track_positions), _present(result.track_visibility)
+    _, H, W = result.depth.shape
+    scale = np.array(size) / (W, H)
+    picture = Image.fromarray(result.images[frame]).resize(size, Image.Resampling.LANCZOS)
+    picture = Image.blend(picture, picture.convert("L").convert("RGB"), 0.6)
+    draw = ImageDraw.Draw(picture)
+    places = np.nan_to_num(positions * scale).clip(-1e4, 1e4)
+    radius = max(2.0, min(size) / 150)
+    for track, color in enumerate(_colors(result)):
+        past = places[max(0, frame - _TAIL) : frame + 1, track]
+        if len(past) > 1:
+            draw.line([tuple(point) for point in past.tolist()], fill=color, width=max(1, round(radius / 2)))
+        x, y = past[-1]
+        box = (x - radius, y - radius, x + radius, y + radius)
+        draw.ellipse(box, fill=color if visibility[frame, track] >= SEEN else None, outline=color)
+    return picture
+
+
+def _colors(result: Reconstruction) -> list[tuple[int, int, int]]:
+    """Return a colour per track by the direction in which it lies from the middle of the first frame."""
+    _, H, W = result.depth.shape
+    x, y = (_present(result.track_positions)[0] - [W / 2, H / 2]).T
+    angle = (np.arctan2(y, x) / (2 * np.pi)) % 1
+    return [tuple(_COLORS[i].tolist()) for i in np.minimum((angle * 256).astype(int), 255)]
+
+
+def _present(value: np.ndarray | None) -> np.ndarray:
+    if value is None:
+        raise ValueError("this result has no tracks")
+    return value

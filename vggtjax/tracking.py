@@ -1,0 +1,109 @@
+"""Points to track, asked for at any frame, and their tracks through the whole clip."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float32, Int64
+
+from vggtjax.errors import InputError
+
+if TYPE_CHECKING:
+    from vggtjax.clips.clip import Clip
+
+MOST_QUERIES = 100_000
+_MOST_FILE_BYTES = 1 << 24
+
+
+@dataclass(frozen=True, eq=False)
+class Queries:
+    """Points to track: x, y in pixels of the clip's frames, pixel edges at whole numbers; each in a frame of its own.
+
+    Raises InputError for shapes that do not fit, no points, or more than MOST_QUERIES.
+    """
+
+    points: Float32[np.ndarray, "Q 2"]
+    frames: Int64[np.ndarray, " Q"]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", np.asarray(self.points, np.float32))
+        object.__setattr__(self, "frames", np.asarray(self.frames, np.int64))
+        count = len(self.frames)
+        if self.points.shape != (count, 2) or self.frames.ndim != 1:
+            raise InputError(
+                f"points have shape {self.points.shape} and frames {self.frames.shape}; expected (Q, 2) and (Q,)"
+            )
+        if not 1 <= count <= MOST_QUERIES:
+            raise InputError(f"there are {count} points to track; expected 1 to {MOST_QUERIES}")
+
+    def check(self, frames: int, height: int, width: int) -> None:
+        """Raise InputError unless every point lies in one of so many frames of that size."""
+        inside = (self.points >= 0).all(axis=1) & (self.points <= [width, height]).all(axis=1)
+        inside &= (self.frames >= 0) & (self.frames < frames)
+        if not inside.all():
+            first = int(np.argmin(inside))
+            x, y = self.points[first]
+            raise InputError(
+                f"point {first} is at ({x:g}, {y:g}) in frame {self.frames[first]}; expected a place in frames 0 to "
+                f"{frames - 1} of {width} x {height} pixels"
+            )
+
+
+def parse_queries(text: str, clip: Clip) -> Queries:
+    """Return the points that a command line asks for.
+
+    Args:
+        text: "grid:N" for N x N points spread over the first frame, or a CSV file with columns x, y and, if wanted,
+            frame (counted in frames of the clip, 0 by default), in pixels of the source.
+        clip: where they lie.
+
+    Raises:
+        InputError: neither of these, or points outside the frames.
+    """
+    S, H, W = clip.images.shape[:3]
+    queries = _grid(text, clip) if text.startswith("grid:") else _read(Path(text), clip)
+    queries.check(S, H, W)
+    return queries
+
+
+def _grid(text: str, clip: Clip) -> Queries:
+    number = text.removeprefix("grid:")
+    if not number.isascii() or not number.isdigit() or not 1 <= int(number) <= int(MOST_QUERIES**0.5):
+        raise InputError(f"tracks is {text!r}; expected grid:N with N from 1 to {int(MOST_QUERIES**0.5)}")
+    left, top, right, bottom = clip.valid_box[0]
+    share = (np.arange(int(number)) + 0.5) / int(number)
+    x, y = np.meshgrid(left + share * (right - left), top + share * (bottom - top))
+    points = np.stack([x.ravel(), y.ravel()], axis=-1)
+    return Queries(points.astype(np.float32), np.zeros(len(points), np.int64))
+
+
+def _read(path: Path, clip: Clip) -> Queries:
+    try:
+        if path.stat().st_size > _MOST_FILE_BYTES:
+            raise InputError(f"{path} is {path.stat().st_size} bytes; expected a CSV file with x, y and frame")
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except OSError as error:
+        raise InputError(
+            f"tracks is {str(path)!r}, which cannot be read ({error.strerror}); expected grid:N or a CSV file"
+        ) from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} is no CSV file: {error}") from None
+    points, frames = [], []
+    for line, row in enumerate(rows, start=2):
+        try:
+            frame = int(row.get("frame") or 0)
+            place = np.array([float(row["x"]), float(row["y"])])
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"{path} line {line} is {row}; expected columns x, y and, if wanted, frame") from None
+        if not 0 <= frame < len(clip) or not np.isfinite(place).all():
+            raise InputError(f"{path} line {line} is {row}; expected numbers, and a frame from 0 to {len(clip) - 1}")
+        points.append(clip.from_source(frame, place))
+        frames.append(frame)
+    if not points:
+        raise InputError(f"{path} holds no points; expected a line x,y,frame and then one line per point")
+    return Queries(np.array(points, np.float32), np.array(frames, np.int64))
