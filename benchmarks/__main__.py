@@ -10,9 +10,15 @@ import tyro
 from benchmarks.demo_model import demo_model
 from benchmarks.embed import embed
 from benchmarks.make_checkpoint import main as make_checkpoint
+from benchmarks.refinement import refinement
 from vggtjax.errors import VggtjaxError
 
-COMMANDS = {"demo-model": demo_model, "embed": embed, "make-checkpoint": make_checkpoint}
+COMMANDS = {
+    "demo-model": demo_model,
+    "embed": embed,
+    "make-checkpoint": make_checkpoint,
+    "refinement": refinement,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -8,6 +8,7 @@ from .config import VGGTConfig as VGGTConfig
 from .config import vggt_1b as vggt_1b
 from .errors import VggtjaxError as VggtjaxError
 from .fusion import fuse_depth as fuse_depth
+from .methods import LADDER as LADDER
 from .methods import METHODS as METHODS
 from .network.backbone import encode as encode
 from .network.model import Predictions as Predictions
@@ -22,6 +23,8 @@ from .passes import motion_saliency as motion_saliency
 from .passes import run_passes as run_passes
 from .pipeline import infer as infer
 from .pipeline import reconstruct as reconstruct
+from .refinement import refine_masks as refine_masks
 from .results.reconstruction import Reconstruction as Reconstruction
+from .tracking import Queries as Queries
 
 __version__: str

@@ -126,6 +126,8 @@ def reconstruct(
         with report.stage("write") as progress:
             result.save(out, confidence_percentile=confidence_percentile, progress=progress)
     report.summary(result, out, trained=loaded.trained)
+    if tracks is not None and model == "demo":
+        report.line("The track head of the embedded model is untrained: its tracks show that everything runs, no more.")
 
 
 def convert(

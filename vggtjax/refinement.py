@@ -65,7 +65,7 @@ def refine_masks(
 
     Args:
         images: RGB in [0, 1].
-        depth: z in the camera.
+        depth: z in the camera, in VGGT's unit: scenes are about 1 away, and the thresholds are lengths.
         dynamic_mask: the coarse mask; an empty one stays empty.
         camera_from_world, intrinsics: OpenCV cameras, as steady as can be had; intrinsics in pixels.
         clusters: groups per frame.
