@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.filters import threshold_otsu
 
-from vggtjax.mask import dynamic_pixels, dynamic_tokens, otsu_threshold, upsample
+from vggtjax.mask import dynamic_pixels, dynamic_tokens, multi_otsu_threshold, otsu_threshold, upsample
 
 _otsu = jax.jit(otsu_threshold)
 
@@ -37,6 +37,29 @@ def test_otsu_by_hand():
 @pytest.mark.parametrize("value", [0.0, 0.7])
 def test_constant_saliency_has_no_dynamic_pixels(value):
     assert not dynamic_pixels(jnp.full((1, 3, 2, 2), value), (28, 28)).any()
+
+
+@pytest.mark.parametrize("saliency", [np.full((1, 3, 2, 2), 0.4), np.zeros((1, 1, 4, 4))])
+def test_multi_otsu_of_constant_saliency_has_no_dynamic_pixels(saliency):
+    assert not dynamic_pixels(jnp.asarray(saliency), (28, 28), threshold="multi-otsu").any()
+
+
+def test_multi_otsu_cuts_every_clip_at_its_own_threshold():
+    saliency = np.zeros((2, 2, 4, 4), np.float32)
+    saliency[0, :, :2] = 1.0  # two values alone
+    saliency[1] = np.random.default_rng(0).uniform(0, 0.1, size=(2, 4, 4))
+    saliency[1, :, 0] += 0.5
+    run = jax.jit(dynamic_pixels, static_argnames=("size", "threshold"))
+    mask = np.asarray(run(jnp.asarray(saliency), (16, 16), threshold="multi-otsu"))
+    pixels = np.asarray(upsample(jnp.asarray(saliency), (16, 16)))
+    for one, values in zip(mask, pixels, strict=True):
+        assert np.array_equal(one, values > multi_otsu_threshold(values))
+        assert 0 < one.mean() < 0.7
+
+
+def test_saliency_that_is_no_number_moves_nothing():
+    values = jnp.full((1, 2, 2, 2), jnp.nan)
+    assert not dynamic_pixels(values, (8, 8), threshold="multi-otsu").any()
 
 
 def test_dynamic_pixels_are_at_or_above_the_threshold_of_their_own_clip():

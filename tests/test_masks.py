@@ -66,6 +66,33 @@ def test_masks_that_fit_no_frames(tmp_path):
         load_masks(tmp_path / "missing", clip)
 
 
+def test_palettes_are_labels_and_transparency_is_static(tmp_path):
+    frames = pictures(2, WIDE, np.random.default_rng(3))
+    clip = load_clip(np.stack(frames), size=70, patch=14)
+    bright = clip.images.mean(axis=-1) > 0.5
+    (tmp_path / "palette").mkdir()
+    (tmp_path / "clear").mkdir()
+    for i, frame in enumerate(frames):
+        labels = Image.fromarray((frame[..., 0] > 0).astype(np.uint8) * 8, mode="P")
+        labels.putpalette([0] * 24 + [64, 0, 0] + [0] * 741)  # object 8 of DAVIS is nearly black
+        labels.save(tmp_path / f"palette/{i}.png")
+        Image.fromarray(np.dstack([np.full_like(frame, 255), frame[..., :1]])).save(tmp_path / f"clear/{i}.png")
+    for folder in ("palette", "clear"):
+        assert (load_masks(tmp_path / folder, clip) == bright).mean() > 0.97
+
+
+def test_masks_that_cannot_be_told_apart(tmp_path):
+    frames = pictures(2, WIDE, np.random.default_rng(4))
+    clip = load_clip(str(written(tmp_path / "frames", frames, ["00.png", "01.png"])), size=70, patch=14)
+    flat = [frame[..., 0] for frame in frames]
+    with pytest.raises(ClipError, match="none is named 00"):  # shifted by one
+        load_masks(written(tmp_path / "shifted", flat, ["01.png", "02.png"]), clip)
+    with pytest.raises(ClipError, match="2 pictures named 00"):
+        load_masks(written(tmp_path / "twice", [*flat, flat[0]], ["00.png", "01.png", "00.bmp"]), clip)
+    with pytest.raises(ClipError, match="1 of 255 at its brightest"):
+        load_masks(written(tmp_path / "dark", [f // 255 for f in flat], ["00.png", "01.png"]), clip)
+
+
 @pytest.mark.filterwarnings("ignore:the field of view")  # seeded weights give odd cameras
 def test_given_masks_replace_the_mined_ones(params, config):
     images = seeded_images(3, 56, 56, seed=4).transpose(0, 2, 3, 1)

@@ -12,6 +12,7 @@ from vggtjax import (
     Model,
     assemble,
     decode_pose,
+    encode,
     forward,
     fuse_depth,
     infer,
@@ -22,7 +23,7 @@ from vggtjax import (
 )
 from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.fusion import scale_between
-from vggtjax.mask import dynamic_pixels, dynamic_tokens
+from vggtjax.mask import dynamic_pixels, dynamic_tokens, mine_mask
 from vggtjax.results.reconstruction import FieldOfViewWarning
 
 FRAMES, SIZE = 4, (140, 140)
@@ -178,3 +179,25 @@ def test_fields_of_view_beyond_a_full_turn_are_clamped_and_named(params, config,
     with pytest.warns(FieldOfViewWarning, match="frames 0, 1, 2, 3 "):
         made = reconstruct(Model(config, wide), load_clip(images[0], size=140))
     assert np.allclose(2 * np.arctan(70 / made.intrinsics[:, [0, 1], [0, 1]]), 3.1, atol=1e-4)
+
+
+def test_the_row_of_vggt4d_is_what_is_run(params, config, images, inferred):
+    _, passes = infer(params, images, config, method="vggt4d")
+    saliency = jax.jit(motion_saliency, static_argnames=("config", "gram"))(params, images, config, gram="dot")
+    assert np.allclose(passes.saliency, saliency, atol=1e-4)
+    tokens = jax.jit(encode, static_argnames="config")(params, images, config)
+    mask = mine_mask(saliency, tokens, SIZE, clusters=64, threshold="multi-otsu")
+    assert (np.asarray(passes.dynamic_mask) == np.asarray(mask)).mean() > 0.99
+    patches = dynamic_tokens(passes.dynamic_mask, config.patch_size)
+    run = jax.jit(forward, static_argnames=("config", "suppress"))
+    made = run(params, images, config, dynamic_tokens=patches, suppress="drop")
+    assert np.abs(np.asarray(passes.second.pose_encoding - made.pose_encoding)).max() < 1e-4
+
+
+def test_gradients_pass_by_the_mask_of_vggt4d(params, config, images):
+    def loss(images):
+        return infer(params, images, config, method="vggt4d")[0].depth.mean()
+
+    gradient = jax.grad(loss)(images[:, :2, :56, :56])
+    assert np.isfinite(gradient).all()
+    assert float(np.abs(gradient).max()) > 0

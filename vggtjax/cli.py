@@ -46,7 +46,8 @@ def reconstruct(
     align_scale: bool = False,
     masks: Path | None = None,
     no_masks: tyro.conf.FlagCreatePairsOff[bool] = False,
-    refine_mask: bool = False,
+    refine_mask: tyro.conf.FlagCreatePairsOff[bool] = False,
+    no_refine_mask: tyro.conf.FlagCreatePairsOff[bool] = False,
     tracks: str | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
     confidence_percentile: float = 20.0,
@@ -71,7 +72,8 @@ def reconstruct(
         align_scale: bring the second pass to the first one's scale before fusing (not in the paper).
         masks: folder of pictures, bright where something moves, one per frame; mined from the clip by default.
         no_masks: nothing moves; one pass is enough.
-        refine_mask: take out of the mask what agrees with other frames (VGGT4D).
+        refine_mask: take out of the mask what agrees with other frames, as vggt4d does.
+        no_refine_mask: leave the mask as it was mined, with vggt4d too.
         tracks: points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and, if
             wanted, frame, in pixels of the source.
         dtype: of the blocks' matrix products.
@@ -81,10 +83,12 @@ def reconstruct(
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
     if masks is not None and no_masks:
         raise InputError("--masks and --no-masks are opposites; give one of them")
+    if refine_mask and no_refine_mask:
+        raise InputError("--refine-mask and --no-refine-mask are opposites; give one of them")
     frames = source[0] if len(source) == 1 else list(source)
     report = Report()
     with report.running():
-        _check_early(frames, (start, stride, fps, max_frames), confidence_percentile, out)
+        _check_early(frames, (start, stride, fps, max_frames), confidence_percentile, out, masks, tracks)
         loaded = _load_model(report, model, config)
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import load_clip
@@ -114,7 +118,7 @@ def reconstruct(
             method=method,
             size=size,
             masks=given,
-            refine_mask=refine_mask,
+            refine_mask=True if refine_mask else False if no_refine_mask else None,
             tracks=queries,
             gram=gram,
             suppress=suppress,
@@ -155,7 +159,7 @@ def convert(
 
 
 def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-d") -> None:
-    """Reconstruct the embedded clip with the embedded model, and measure every method against the clip's truth.
+    """Reconstruct the embedded clip with the embedded model, and measure the ladder of methods against its truth.
 
     Args:
         out: folder for the results.
@@ -246,14 +250,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _check_early(frames: str | list[str], sampling: tuple, confidence_percentile: float, out: Path) -> None:
+def _check_early(
+    frames: str | list[str],
+    sampling: tuple,
+    confidence_percentile: float,
+    out: Path,
+    masks: Path | None,
+    tracks: str | None,
+) -> None:
     """Raise now what would otherwise be raised after minutes of work."""
     from vggtjax.clips.sampling import Sampling
     from vggtjax.clips.sources import open_source
     from vggtjax.results.point_cloud import check_percentile
+    from vggtjax.tracking import check_words
 
     Sampling(*sampling)
     open_source(frames)
+    if masks is not None:
+        open_source(str(masks))
+    if tracks is not None:
+        check_words(tracks)
     check_percentile(confidence_percentile)
     _check_folder(out)
 

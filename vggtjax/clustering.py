@@ -105,6 +105,12 @@ def _seeds(key: Array, points: Float[Array, "N C"], clusters: int, weights: Floa
     return centres
 
 
+def nearest_centre(points: Float[Array, "N C"], centres: Float[Array, "K C"]) -> Int[Array, " N"]:
+    """Return the centre that each point is nearest to."""
+    middle = centres.mean(axis=0)[None]  # squares of what is far from the origin would cancel
+    return jnp.argmin(_distances(points - middle, centres - middle), axis=1).astype(jnp.int32)
+
+
 def _distances(points: Float[Array, "N C"], centres: Float[Array, "K C"]) -> Float[Array, "N K"]:
     """Squared distances, up to rounding that can take them a little below 0."""
     squares = jnp.sum(points**2, axis=1)[:, None] + jnp.sum(centres**2, axis=1)[None]

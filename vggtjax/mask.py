@@ -72,7 +72,11 @@ def mine_mask(
     clusters: int = 0,
     threshold: Threshold = "otsu",
 ) -> Bool[Array, "B S H W"]:
-    """Return a method's dynamic pixels: the saliency, averaged within clusters if there are any, cut at a threshold."""
+    """Return a method's dynamic pixels: the saliency, averaged within clusters if there are any, cut at a threshold.
+
+    No gradient passes: a mask is a decision.
+    """
+    saliency, patch_tokens = jax.lax.stop_gradient((saliency, patch_tokens))
     if clusters:
         saliency = smooth_by_clusters(saliency, patch_tokens, clusters)
     return dynamic_pixels(saliency, size, threshold=threshold)
@@ -130,7 +134,8 @@ def multi_otsu_threshold(values: np.ndarray) -> float:
 
 
 def _multi_otsu(values: np.ndarray) -> np.ndarray:
-    return np.float32(multi_otsu_threshold(np.asarray(values)))
+    values = np.asarray(values)
+    return np.float32(multi_otsu_threshold(values) if np.isfinite(values).all() else np.nan)  # above NaN is nothing
 
 
 def dynamic_tokens(mask: Bool[Array, "B S H W"], patch_size: int) -> Bool[Array, "B S h w"]:

@@ -18,7 +18,7 @@ class Method:
     """Where a method takes its depth (and confidence) and its cameras from, and how it masks the second pass.
 
     `clusters` is the number of groups of patch features within which the saliency is averaged before it is cut at the
-    `threshold`; 0 for none.
+    `threshold`; 0 for none. `refine` says whether the mask is refined at the end, by the method's depth and cameras.
     """
 
     depth: Literal["first", "second", "replaced", "fused"]
@@ -28,6 +28,7 @@ class Method:
     suppress: Suppress = "zero"
     clusters: int = 0
     threshold: Threshold = "otsu"
+    refine: bool = False
 
     @property
     def needs_second_pass(self) -> bool:
@@ -36,7 +37,7 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "vggt": Method("first", "first", "first"),
-    "vggt4d": Method("first", "second", "first", "dot", "drop", clusters=64, threshold="multi-otsu"),
+    "vggt4d": Method("first", "second", "first", "dot", "drop", clusters=64, threshold="multi-otsu", refine=True),
     "pose-decoupling": Method("second", "second", "second"),
     "hard-replacement": Method("replaced", "second", "second"),
     "4dvggt-d": Method("fused", "second", "second"),

@@ -125,7 +125,7 @@ def track_from(
         params: the model's parameter tree.
         images, patch_tokens: of the clips, in their order.
         query_points: x, y in pixels of the frame.
-        frame: its index (may be traced: one compilation serves all).
+        frame: its index (may be traced: one compilation serves all frames with as many points).
         config: the model's configuration.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
     """
@@ -176,7 +176,10 @@ def run_passes(
     threshold: Threshold = "otsu",
     second: bool = True,
 ) -> Passes:
-    """Run both passes once, sharing the backbone's features; `assemble` makes every method's result of them.
+    """Run both passes once, sharing the backbone's features; `assemble` makes a method's result of them.
+
+    The defaults serve all methods of `LADDER` at once; "vggt4d" wants passes of its own, made as its row of `METHODS`
+    says (`infer` does).
 
     Args:
         params: the model's parameter tree.
@@ -203,10 +206,10 @@ def run_passes(
 
 
 def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False) -> Assembly:
-    """Make a method's depth, confidence and cameras of two passes; several methods share one run of them.
+    """Make a method's depth, confidence and cameras of two passes; the methods of `LADDER` share one run of them.
 
     Args:
-        passes: what `run_passes` returned.
+        passes: what `run_passes` returned for cues, suppression and mask as the method has them, which is not checked.
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
             pixels before it is used. Not in the paper.

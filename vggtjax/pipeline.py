@@ -23,6 +23,7 @@ from vggtjax.network.backbone import encode
 from vggtjax.network.layers import Params
 from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass, track_from
 from vggtjax.refinement import refine_masks
+from vggtjax.results.point_cloud import inside_pictures
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.tracking import Queries
 
@@ -119,7 +120,7 @@ def reconstruct(
     mask_pairs: int = 5,
     align_scale: bool = False,
     masks: Bool[np.ndarray, "S H W"] | None = None,
-    refine_mask: bool = False,
+    refine_mask: bool | None = None,
     tracks: Queries | None = None,
     compute_dtype: str = "float32",
     keep_passes: bool = False,
@@ -136,9 +137,11 @@ def reconstruct(
         mask_pairs: number of pairs in which the keys of dynamic tokens are suppressed (L_mask of the paper).
         align_scale: bring the second pass to the first one's scale before it is used (not in the paper).
         masks: what moves, in place of what is mined; without a moving pixel the second pass is the first.
-        refine_mask: take out of the mask what agrees with other frames, by the method's depth and cameras (VGGT4D).
-        tracks: points to follow through the clip. Those of the first frame come with the first pass; every other frame
-            that has some costs a pass of its own, over the clip rolled so that this frame comes first.
+        refine_mask: take out of the mask what agrees with other frames, by the method's depth and cameras (VGGT4D); the
+            method's own choice if None.
+        tracks: points to follow through the clip, in pixels of its frames as they are given. Those of the first frame
+            come with the first pass; every other frame that has some costs a pass of its own, over the clip rolled so
+            that this frame comes first.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
         keep_passes: keep both passes on the result, as `.passes`.
         on_stage: called with the name of each stage, returns a context in which it runs; for progress and timing.
@@ -152,9 +155,13 @@ def reconstruct(
     config = model.config
     on_stage = on_stage or (lambda name: nullcontext())
     size = config.image_size if size is None else size
+    refine_mask = row.refine if refine_mask is None else refine_mask
+    if tracks is not None:
+        tracks.check(*clip.images.shape[:3])
     if (clip.size, clip.patch) != (size, config.patch_size):
         with on_stage("fit clip to model"):
-            clip = clip.refit(size, config.patch_size)
+            given, clip = clip, clip.refit(size, config.patch_size)
+            tracks = None if tracks is None else tracks.moved(given, clip)
     settings = {
         "gram": gram or row.gram,
         "suppress": suppress or row.suppress,
@@ -163,8 +170,6 @@ def reconstruct(
         "compute_dtype": compute_dtype,
     }
     stages = _stages(config, method, clip.images.shape[1:3], **settings)
-    if tracks is not None:
-        tracks.check(*clip.images.shape[:3])
     arrays: dict[str, Any] = {"params": model.params, "images": jnp.asarray(clip.images)[None], "second": None}
     if masks is not None:
         arrays["dynamic_mask"] = jnp.asarray(_checked(masks, clip))[None]
@@ -195,7 +200,7 @@ def reconstruct(
         S, H, W = clip.images.shape[:3]
         raise DeviceMemoryError(
             f"{S} frames of {W} x {H} pixels do not fit in the memory of the device; take fewer frames "
-            "(max_frames, stride, fps), a smaller size, or bfloat16"
+            "(max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
         ) from error
     depth, confidence, camera_from_world, intrinsics = (np.array(x[0]) for x in jax.tree.leaves(arrays["assembly"]))
     fields = np.asarray(arrays[row.intrinsics].pose_encoding[0])[:, [8, 7]]  # of width and height
@@ -264,6 +269,7 @@ def _refined(result: Reconstruction, progress: Callable[[int, int], object] | No
         result.dynamic_mask,
         result.camera_from_world,
         result.intrinsics,
+        valid=inside_pictures(result),
         progress=progress,
     )
     return dataclasses.replace(result, dynamic_mask=mask)

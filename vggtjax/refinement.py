@@ -17,12 +17,14 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from vggtjax.clustering import kmeans
+from vggtjax.clustering import kmeans, nearest_centre
+from vggtjax.errors import InputError
 from vggtjax.network.precision import full_precision
 from vggtjax.results.geometry import unproject
 
 CLUSTERS = 30
 RESTARTS = 4  # of k-means
+FITTED = 8192  # points of a frame, evenly drawn, that the centres of its clusters are fitted to; all are labelled
 NEIGHBOURS = 20  # of a point, itself among them
 OUTLIER_SIGMA = 2.5
 LEAST_SHARE = 0.05  # of a group's projections that must count
@@ -57,6 +59,7 @@ def refine_masks(
     camera_from_world: Float[np.ndarray, "S 3 4"],
     intrinsics: Float[np.ndarray, "S 3 3"],
     *,
+    valid: Bool[np.ndarray, "S H W"] | None = None,
     clusters: int = CLUSTERS,
     seed: int = 0,
     progress: Callable[[int, int], object] | None = None,
@@ -68,41 +71,54 @@ def refine_masks(
         depth: z in the camera, in VGGT's unit: scenes are about 1 away, and the thresholds are lengths.
         dynamic_mask: the coarse mask; an empty one stays empty.
         camera_from_world, intrinsics: OpenCV cameras, as steady as can be had; intrinsics in pixels.
+        valid: False on padding, which is neither compared nor dynamic; None for none.
         clusters: groups per frame.
         seed: of k-means.
         progress: called with frames done and frames in all, while outliers are looked for.
+
+    Raises:
+        InputError: arrays whose shapes or types do not fit together.
     """
+    _check(images, depth, dynamic_mask, camera_from_world, intrinsics, valid)
     S = len(depth)
+    valid = np.ones_like(dynamic_mask) if valid is None else valid
+    dynamic_mask = dynamic_mask & valid
     if S < 2 or not dynamic_mask.any():
-        return dynamic_mask.copy()
+        return dynamic_mask
     points = unproject(depth, intrinsics, camera_from_world, pixel_offset=0.5)
     inside = np.zeros_like(dynamic_mask)
     for frame in range(S):
         if dynamic_mask[frame].any():
-            inside[frame] = dynamic_mask[frame] & ~statistical_outliers(points[frame])
+            inside[frame] = dynamic_mask[frame] & ~statistical_outliers(points[frame], valid[frame])
         if progress is not None:
             progress(frame + 1, S)
+    if not inside.any():
+        return inside
     most = int(inside.sum(axis=(1, 2)).max())
     count = min(-(-most // _BUCKET) * _BUCKET, depth[0].size)
     index, weight = _packed(inside, count)
     chosen = np.take_along_axis(points.reshape(S, -1, 3), index[..., None], axis=1)
     chosen[~weight] = 0  # where there is nothing, depth may not even be a number
     labels = cluster_points(jax.random.key(seed), chosen, weight, clusters)
-    losses = cluster_losses(images, depth, dynamic_mask, camera_from_world, intrinsics, index, weight, labels, clusters)
+    hidden = dynamic_mask | ~valid
+    losses = cluster_losses(images, depth, hidden, camera_from_world, intrinsics, index, weight, labels, clusters)
     static = np.asarray(losses.total <= MOST_LOSS)  # [S, K]
     moves = ~np.take_along_axis(static, np.asarray(labels), axis=1) & weight
     refined = np.zeros((S, depth[0].size), bool)
     np.put_along_axis(refined, index, moves, axis=1)
-    return np.stack([_smoothed(mask) for mask in refined.reshape(depth.shape)])
+    return np.stack([_smoothed(mask) for mask in refined.reshape(depth.shape)]) & valid
 
 
-def statistical_outliers(points: Float[np.ndarray, "H W 3"]) -> Bool[np.ndarray, "H W"]:
+def statistical_outliers(
+    points: Float[np.ndarray, "H W 3"], valid: Bool[np.ndarray, "H W"] | None = None
+) -> Bool[np.ndarray, "H W"]:
     """Return the points whose mean distance to their nearest neighbours is 2.5 standard deviations above the mean.
 
-    Points that are not finite are outliers too, and nobody's neighbours.
+    Points that are not finite, or not `valid`, are outliers too, and nobody's neighbours.
     """
     flat = points.reshape(-1, 3)
     outlier = ~np.isfinite(flat).all(axis=1)
+    outlier |= False if valid is None else ~valid.ravel()
     known = flat[~outlier]
     if len(known):
         neighbours = min(NEIGHBOURS, len(known))
@@ -117,9 +133,14 @@ def cluster_points(
 ) -> Int[Array, "S N"]:
     """Group every frame's points by k-means, frame by frame; those of weight 0 are labelled but move nothing."""
     keys = jax.random.split(key, points.shape[0])
+    fitted = min(FITTED, points.shape[1])
 
     def one_frame(frame: tuple[Array, Array, Array]) -> Int[Array, " N"]:
-        return kmeans(frame[0], frame[1], clusters, frame[2], restarts=RESTARTS).labels
+        key, points, there = frame
+        count = jnp.maximum(there.sum(), 1)  # those that are there come first
+        drawn = jnp.where(count > fitted, (jnp.arange(fitted) * (count / fitted)).astype(jnp.int32), jnp.arange(fitted))
+        centres = kmeans(key, points[drawn], clusters, there[drawn], restarts=RESTARTS).centres
+        return nearest_centre(points, centres)
 
     return jax.lax.map(one_frame, (keys, points, weight))
 
@@ -208,6 +229,22 @@ def _bilinear(image: Float[Array, "H W C"], u: Float[Array, " N"], v: Float[Arra
     top = padded[row, column] * (1 - x) + padded[row, column + 1] * x
     bottom = padded[row + 1, column] * (1 - x) + padded[row + 1, column + 1] * x
     return top * (1 - y) + bottom * y
+
+
+def _check(images, depth, dynamic_mask, camera_from_world, intrinsics, valid) -> None:
+    S, H, W = depth.shape if depth.ndim == 3 else (0, 0, 0)
+    shapes = {
+        "images": (images, (S, H, W, 3)),
+        "depth": (depth, (S, H, W)),
+        "dynamic_mask": (dynamic_mask, (S, H, W)),
+        "camera_from_world": (camera_from_world, (S, 3, 4)),
+        "intrinsics": (intrinsics, (S, 3, 3)),
+        "valid": (dynamic_mask if valid is None else valid, (S, H, W)),
+    }
+    for name, (array, shape) in shapes.items():
+        kind = "bool" if name in ("dynamic_mask", "valid") else "floating point"
+        if array.shape != shape or (array.dtype != bool if kind == "bool" else array.dtype.kind != "f"):
+            raise InputError(f"{name} is {array.dtype} {array.shape}; expected {kind} {shape}")
 
 
 def _packed(inside: Bool[np.ndarray, "S H W"], count: int) -> tuple[np.ndarray, np.ndarray]:

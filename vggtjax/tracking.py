@@ -15,7 +15,7 @@ from vggtjax.errors import InputError
 if TYPE_CHECKING:
     from vggtjax.clips.clip import Clip
 
-MOST_QUERIES = 100_000
+MOST_QUERIES = 10_000
 _MOST_FILE_BYTES = 1 << 24
 
 
@@ -52,6 +52,22 @@ class Queries:
                 f"{frames - 1} of {width} x {height} pixels"
             )
 
+    def moved(self, given: Clip, clip: Clip) -> Queries:
+        """Return the same places of the source in the frames of another clip of the same source."""
+        points = [
+            clip.from_source(frame, given.to_source(frame, point))
+            for frame, point in zip(self.frames.tolist(), self.points, strict=True)
+        ]
+        return Queries(np.array(points, np.float32), self.frames)
+
+
+def check_words(text: str) -> None:
+    """Raise InputError now for words that `parse_queries` would refuse whatever the clip."""
+    if text.startswith("grid:"):
+        _grid_side(text)
+    elif not Path(text).is_file():
+        raise InputError(f"tracks is {text[:200]!r}, and there is no such file; expected grid:N or a CSV file")
+
 
 def parse_queries(text: str, clip: Clip) -> Queries:
     """Return the points that a command line asks for.
@@ -64,21 +80,23 @@ def parse_queries(text: str, clip: Clip) -> Queries:
     Raises:
         InputError: neither of these, or points outside the frames.
     """
-    S, H, W = clip.images.shape[:3]
-    queries = _grid(text, clip) if text.startswith("grid:") else _read(Path(text), clip)
-    queries.check(S, H, W)
-    return queries
+    return _grid(text, clip) if text.startswith("grid:") else _read(Path(text), clip)
 
 
 def _grid(text: str, clip: Clip) -> Queries:
-    number = text.removeprefix("grid:")
-    if not number.isascii() or not number.isdigit() or not 1 <= int(number) <= int(MOST_QUERIES**0.5):
-        raise InputError(f"tracks is {text!r}; expected grid:N with N from 1 to {int(MOST_QUERIES**0.5)}")
+    number = _grid_side(text)
     left, top, right, bottom = clip.valid_box[0]
-    share = (np.arange(int(number)) + 0.5) / int(number)
+    share = (np.arange(number) + 0.5) / number
     x, y = np.meshgrid(left + share * (right - left), top + share * (bottom - top))
     points = np.stack([x.ravel(), y.ravel()], axis=-1)
     return Queries(points.astype(np.float32), np.zeros(len(points), np.int64))
+
+
+def _grid_side(text: str) -> int:
+    number, most = text.removeprefix("grid:"), int(MOST_QUERIES**0.5)
+    if not (number.isascii() and number.isdigit() and len(number) < 10 and 1 <= int(number) <= most):
+        raise InputError(f"tracks is {text[:40]!r}; expected grid:N with N from 1 to {most}")
+    return int(number)
 
 
 def _read(path: Path, clip: Clip) -> Queries:
@@ -102,7 +120,15 @@ def _read(path: Path, clip: Clip) -> Queries:
             raise InputError(f"{path} line {line} is {row}; expected columns x, y and, if wanted, frame") from None
         if not 0 <= frame < len(clip) or not np.isfinite(place).all():
             raise InputError(f"{path} line {line} is {row}; expected numbers, and a frame from 0 to {len(clip) - 1}")
-        points.append(clip.from_source(frame, place))
+        point = clip.from_source(frame, place)
+        left, top, right, bottom = clip.valid_box[frame]
+        if not (left <= point[0] <= right and top <= point[1] <= bottom):
+            height, width = clip.source_size[frame]
+            raise InputError(
+                f"{path} line {line}: ({place[0]:g}, {place[1]:g}) lies outside what the model sees of frame {frame}, "
+                f"a picture of {width} x {height}; expected a place inside (mode 'crop' cuts tall pictures)"
+            )
+        points.append(point)
         frames.append(frame)
     if not points:
         raise InputError(f"{path} holds no points; expected a line x,y,frame and then one line per point")

@@ -2,51 +2,61 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
+from PIL import Image
 
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.images import ImageFiles, read_image
 from vggtjax.clips.sources import open_source
 from vggtjax.errors import ClipError
 
-_WHITE = 127  # above it, a pixel moves
+_WHITE = 127  # above it, a pixel of a picture in grey or colour moves
+_LABELS = ("P", "1")  # modes whose values are numbers of objects, not brightness
 
 
 def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
-    """Load pictures that are bright where something moves, and bring them to the clip's frames.
+    """Load pictures of what moves, and bring them to the clip's frames.
 
-    Crop, scale and padding are those of the frames: every pixel takes the value at the place in the source that its
-    centre shows, and padding is static.
+    A pixel moves where a grey or coloured picture is bright and not transparent, or where a picture with a palette, as
+    DAVIS has them, holds an object (any value but 0). Crop, scale and padding are those of the frames: every pixel
+    takes the value at the place in the source that its centre shows, and padding is static.
 
     Args:
-        folder: a picture per frame. Names decide which is whose, where every frame's is there (`frame_3.png` for
-            `frame_3.jpg`); else there must be as many as frames, in the same order.
+        folder: a picture per frame. Names decide which is whose (`frame_3.png` for `frame_3.jpg`); where no name is
+            that of a frame, there must be as many as frames, in the same order.
         clip: what `load_clip` returned.
 
     Raises:
-        ClipError: a folder without pictures, pictures that cannot be told to frames, or of another shape than theirs.
+        ClipError: a folder without pictures, pictures that cannot be told to frames, of another shape than theirs, or
+            too dark to be a mask.
     """
     source = open_source(str(folder))
     if not isinstance(source, ImageFiles):
         raise ClipError(f"{folder} is no folder of pictures; masks need one picture per frame")
+    names = Counter(path.stem for path in source.paths)
     by_name = {path.stem: path for path in source.paths}
-    paths = [by_name.get(name) for name in clip.frame_names]
-    if None in paths:
-        missing = clip.frame_names[paths.index(None)]
-        if len(source.paths) != len(clip):
-            raise ClipError(
-                f"{folder} has {len(source.paths)} pictures for {len(clip)} frames, and none is named {missing}; "
-                "expected a picture for every frame, named like it or in the same order"
-            )
+    there = [name for name in clip.frame_names if name in by_name]
+    if len(there) == len(clip):
+        if twice := [name for name in clip.frame_names if names[name] > 1]:
+            raise ClipError(f"{folder} has {names[twice[0]]} pictures named {twice[0]}; expected one for each frame")
+        paths = [by_name[name] for name in clip.frame_names]
+    elif there or len(source.paths) != len(clip):
+        missing = next(name for name in clip.frame_names if name not in by_name)
+        raise ClipError(
+            f"{folder} has {len(source.paths)} pictures for {len(clip)} frames, and none is named {missing}; "
+            "expected a picture for every frame, named like it or, with other names throughout, in the same order"
+        )
+    else:
         paths = list(source.paths)
-    return np.stack([_mask(path, clip, frame) for frame, path in enumerate(paths) if path is not None])
+    return np.stack([_mask(path, clip, frame) for frame, path in enumerate(paths)])
 
 
 def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:
-    picture = np.asarray(read_image(path)).max(axis=-1) > _WHITE
+    picture = _moving(path)
     height, width = clip.source_size[frame]
     if abs(picture.shape[0] * width - picture.shape[1] * height) > max(picture.shape):  # half a pixel is no other shape
         raise ClipError(
@@ -60,3 +70,19 @@ def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:
     places = clip.to_source(frame, np.stack([columns, rows], axis=-1)) / [width, height]  # in [0, 1]
     x, y = (np.clip(places[..., i] * picture.shape[1 - i], 0, picture.shape[1 - i] - 1).astype(int) for i in (0, 1))
     return picture[y, x] & inside
+
+
+def _moving(path: Path) -> Bool[np.ndarray, "h w"]:
+    shown = read_image(path)  # says what is wrong with a file that is no picture
+    with Image.open(path) as picture:
+        if picture.mode in _LABELS and picture.size == shown.size and not picture.has_transparency_data:
+            return np.asarray(picture) > 0
+        opaque = np.asarray(picture.convert("RGBA"))[..., 3] > _WHITE if picture.has_transparency_data else None
+    bright = np.asarray(shown).max(axis=-1)
+    if opaque is not None and opaque.shape == bright.shape:
+        bright = np.where(opaque, bright, 0)
+    if 0 < bright.max() <= _WHITE:
+        raise ClipError(
+            f"mask {path.name} is {bright.max()} of 255 at its brightest; expected black and white, or a palette"
+        )
+    return bright > _WHITE

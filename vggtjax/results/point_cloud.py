@@ -23,12 +23,16 @@ class PointCloud:
         return len(self.points)
 
 
+def inside_pictures(reconstruction: Reconstruction) -> Bool[np.ndarray, "S H W"]:
+    """Return the pixels that are not padding."""
+    rows, columns = np.arange(reconstruction.depth.shape[1])[:, None], np.arange(reconstruction.depth.shape[2])
+    left, top, right, bottom = reconstruction.valid_box.T[:, :, None, None]
+    return (left <= columns) & (columns < right) & (top <= rows) & (rows < bottom)
+
+
 def valid_pixels(reconstruction: Reconstruction) -> Bool[np.ndarray, "S H W"]:
     """Return the pixels that show a point: not padding, with a finite depth above 0 and a finite confidence."""
-    depth = reconstruction.depth
-    rows, columns = np.arange(depth.shape[1])[:, None], np.arange(depth.shape[2])
-    left, top, right, bottom = reconstruction.valid_box.T[:, :, None, None]
-    inside = (left <= columns) & (columns < right) & (top <= rows) & (rows < bottom)
+    depth, inside = reconstruction.depth, inside_pictures(reconstruction)
     return inside & np.isfinite(depth) & (depth > 0) & np.isfinite(reconstruction.depth_confidence)
 
 

@@ -112,6 +112,16 @@ class Reconstruction:
             value = getattr(self, name)
             if value is not None and not np.isfinite(value).all():
                 raise ResultError(f"{name} holds {value[~np.isfinite(value)][0]}; expected finite numbers")
+        sides, most = self.source_size, 1 << 20
+        if (sides < 1).any() or (sides > most).any() or (self.source_scale <= 0).any():
+            raise ResultError(
+                f"source_size or source_scale is out of range; expected sides of 1 to {most}, scales above 0"
+            )
+        if (
+            self.track_frames is not None
+            and not ((self.track_frames >= 0) & (self.track_frames < len(self.depth))).all()
+        ):
+            raise ResultError(f"track_frames holds {self.track_frames.max()}; expected 0 to {len(self.depth) - 1}")
         left, top, right, bottom = self.valid_box.T
         inside = (left >= 0) & (left < right) & (right <= width) & (top >= 0) & (top < bottom) & (bottom <= height)
         if not inside.all():

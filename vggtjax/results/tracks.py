@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -43,7 +42,7 @@ def track_strip(result: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def write_track_video(path: Path, result: Reconstruction) -> bool:
-    """Write the clip with its tracks as an mp4 (H.264); return False, with a note logged, where PyAV is missing."""
+    """Write the clip with its tracks as an mp4; return False, with a note logged, where PyAV or an encoder is missing."""
     try:
         import av
     except ImportError:
@@ -52,18 +51,17 @@ def write_track_video(path: Path, result: Reconstruction) -> bool:
     _, H, W = result.depth.shape
     factor = max(1, -(-_VIDEO_SIDE // max(H, W)))
     size = (W * factor // 2 * 2, H * factor // 2 * 2)  # H.264 wants even sides
+    codec = next((name for name in ("libx264", "mpeg4") if name in av.codecs_available), None)
+    if codec is None:
+        logger.info("tracks are drawn as pictures only; this PyAV has no encoder for an mp4")
+        return False
     with av.open(str(path), "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=_FRAMES_PER_SECOND)
+        stream = container.add_stream(codec, rate=_FRAMES_PER_SECOND)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        for picture in _pictures(result, size):
-            container.mux(stream.encode(av.VideoFrame.from_image(picture)))
+        for frame in range(len(result.depth)):
+            container.mux(stream.encode(av.VideoFrame.from_image(_drawn(result, frame, size))))
         container.mux(stream.encode())
     return True
-
-
-def _pictures(result: Reconstruction, size: tuple[int, int]) -> Iterator[Image.Image]:
-    for frame in range(len(result.depth)):
-        yield _drawn(result, frame, size)
 
 
 def _drawn(result: Reconstruction, frame: int, size: tuple[int, int]) -> Image.Image:

@@ -36,8 +36,8 @@ class LossWeights:
         huber: half width of the quadratic zone of the camera loss; 0 for L1.
         depth, points: confidence-weighted L1 of the dense heads; `gradient` is the share of the gradient term.
         match: cross-entropy of attention in `match_layers` against true matches.
-        probe: linear read-outs of the tapped tokens (of patches: positions, depths, points; of camera tokens: poses,
-            moments of the flow), which serve training alone.
+        probe: linear read-outs of the tapped tokens (positions, depths, points, poses), which serve training alone.
+        moments: another one of the camera tokens: means of the flow from which their camera's motion can be solved.
     """
 
     translation: float = 1.0
@@ -50,6 +50,7 @@ class LossWeights:
     match: float = 0.0
     match_layers: tuple[int, ...] = (1, 2, 3)
     probe: float = 0.0
+    moments: float = 0.0
 
 
 def init_probes(seed: int, config: VGGTConfig) -> Params:
@@ -95,7 +96,7 @@ def objective(
         def kept(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
             patches = tokens[:, :, SPECIAL_TOKENS:]
             found = {name: project_tap(model[DENSE_HEADS[name]], patches, slot, config) for name in dense}
-            if weights.probe:
+            if weights.probe or weights.moments:
                 found |= {
                     "patch_probe": _probe(probes["patch"], slot, patches),
                     "camera_probe": _probe(probes["camera"], slot, tokens[:, :, 0]),
@@ -131,10 +132,11 @@ def objective(
     if weights.match:
         terms["match"] = weights.match * sums.loss
         metrics["match_accuracy"] = sums.accuracy
-    if weights.probe:
+    if weights.probe or weights.moments:
         found = _probe_terms(taps, truth, paired, config.patch_size)
-        terms["probe"] = weights.probe * sum(found.values(), start=jnp.zeros(()))
         metrics |= {f"probe_{name}": value for name, value in found.items()}
+        terms["moments"] = weights.moments * found.pop("moments")
+        terms["probe"] = weights.probe * sum(found.values(), start=jnp.zeros(()))
     loss = sum(terms.values(), start=jnp.zeros(()))
     return loss, {"loss": loss} | {f"loss_{name}": value for name, value in terms.items()} | metrics
 
@@ -226,12 +228,13 @@ def _flow_moments(
     inverse_depth: Float[Array, "B S P"],
     seen: Bool[Array, "B S P 1"],
 ) -> tuple[Float[Array, "B S 10"], Bool[Array, "B S"]]:
-    """Return what a camera's motion can be solved from, and where enough is seen to.
+    """Return means over patches that tell a camera's turn from its travel, and where enough is seen for them.
 
     To first order the flow of a static scene is w A t + B r: linear in translation t and rotation r, with inverse depth
-    w and matrices of the position alone (Longuet-Higgins and Prazdny 1980). Its least squares need means over patches
-    of the flow, by itself and times inverse depth and position. Turn and travel can cancel in the mean flow, so a
-    camera token that knows no more than that knows neither.
+    w and matrices of the position alone (Longuet-Higgins and Prazdny 1980). Its normal equations are made of means of
+    products of flow, inverse depth and position; these are those of lowest order: the flow by itself, times inverse
+    depth and times position, and inverse depth and its square. Turn and travel can cancel in the mean flow, so a camera
+    token that knows no more than that knows neither. Things that move are among the patches.
     """
     w = jnp.minimum(inverse_depth, 4.0)[..., None]
     factors = jnp.concatenate([jnp.ones_like(w), w, jnp.broadcast_to(place, flow.shape)], axis=-1)  # [B, S, P, 4]
