@@ -103,11 +103,10 @@ def test_large_masks_are_grouped_by_a_part_of_their_points(clip, monkeypatch):
 
 @pytest.mark.parametrize("name", ["images", "depth", "camera_from_world", "mask"])
 def test_arrays_that_do_not_fit(clip, name):
+    mask = clip.dynamic_mask.astype(np.uint8) * 255 if name == "mask" else clip.dynamic_mask
+    changes = {} if name == "mask" else {name: getattr(clip, name)[:2]}
     with pytest.raises(InputError, match="expected"):
-        if name == "mask":
-            refined(clip, clip.dynamic_mask.astype(np.uint8) * 255)
-        else:
-            refined(clip, clip.dynamic_mask, **{name: getattr(clip, name)[:2]})
+        refined(clip, mask, **changes)
 
 
 def test_points_without_number_are_outliers():

@@ -42,7 +42,7 @@ def track_strip(result: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def write_track_video(path: Path, result: Reconstruction) -> bool:
-    """Write the clip with its tracks as an mp4; return False, with a note logged, where PyAV or an encoder is missing."""
+    """Write the clip with its tracks as an mp4; return False, with a note logged, where PyAV or its encoder lacks."""
     try:
         import av
     except ImportError:
