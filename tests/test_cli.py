@@ -70,9 +70,39 @@ def test_reconstruct_with_a_converted_model(tmp_path, capsys, frames, golden, mo
     assert result.method == "pose-decoupling"
 
 
+def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for i in range(3):
+        Image.fromarray(np.pad(np.full((30, 40), 255, np.uint8), ((10, 50), (20, 60)))).save(masks / f"frame_{i}.png")
+    (tmp_path / "points.csv").write_text("x,y,frame\n60,45,0\n30,20,1\n", encoding="utf-8")
+    code, out, err = run(
+        capsys, "reconstruct", frames, "--out", tmp_path / "out", "--masks", masks, "--refine-mask", "--tracks",
+        tmp_path / "points.csv", "--method", "vggt4d",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "track head of the embedded model is untrained" in out
+    result = Reconstruction.load(tmp_path / "out")
+    assert (result.settings["masks"], result.settings["refine_mask"]) == ("given", True)
+    assert result.track_frames.tolist() == [0, 1]
+    assert (tmp_path / "out/preview/tracks.png").stat().st_size > 1000
+
+    code, _, err = run(capsys, "reconstruct", frames, "--out", tmp_path / "still", "--no-masks", "--tracks", "grid:2")
+    assert code == 0, err
+    still = Reconstruction.load(tmp_path / "still")
+    assert not still.dynamic_mask.any()
+    assert still.settings["refine_mask"] is False
+    assert still.track_positions.shape == (3, 4, 2)
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--masks", "{tmp}/none"], "none"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--masks", "{frames}", "--no-masks"], "opposites"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--refine-mask", "--no-refine-mask"], "opposites"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--tracks", "grid:0"], "grid:N"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--tracks", "{tmp}/none.csv"], "none.csv"),
         (["reconstruct", "{tmp}/nothing", "--out", "{tmp}/out"], "does not exist"),
         (["reconstruct", "--out", "{tmp}/out"], "no input"),
         (["reconstruct", "{tmp}", "--out", "{tmp}/out"], "no images"),

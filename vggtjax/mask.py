@@ -121,6 +121,8 @@ def multi_otsu_threshold(values: np.ndarray) -> float:
 
     values = np.asarray(values, np.float32)
     best, best_score = float(values.max()), -np.inf
+    if best - values.min() < CONSTANT:
+        return best
     distinct = np.count_nonzero(np.histogram(values, BINS)[0])
     for classes in range(2, min(MOST_CLASSES, distinct) + 1):
         thresholds = threshold_multiotsu(values, classes=classes, nbins=BINS)
