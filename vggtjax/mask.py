@@ -137,7 +137,8 @@ def multi_otsu_threshold(values: np.ndarray) -> float:
 
 def _multi_otsu(values: np.ndarray) -> np.ndarray:
     values = np.asarray(values)
-    return np.float32(multi_otsu_threshold(values) if np.isfinite(values).all() else np.nan)  # above NaN is nothing
+    threshold = multi_otsu_threshold(values) if np.isfinite(values).all() else np.nan  # above NaN is nothing
+    return np.asarray(threshold, np.float32)
 
 
 def dynamic_tokens(mask: Bool[Array, "B S H W"], patch_size: int) -> Bool[Array, "B S h w"]:

@@ -177,16 +177,8 @@ def reconstruct(
         if not masks.any():
             same = Stage("second pass", ("first",), ("second",), _same, {})
             stages = [same if stage.name == same.name else stage for stage in stages]
-    for frame in [] if tracks is None else np.unique(tracks.frames).tolist():
-        points = jnp.asarray(tracks.points[tracks.frames == frame])[None]
-        if frame == 0:
-            arrays["query_points"] = points
-            stages = [_with_queries(stage) if stage.name == "first pass" else stage for stage in stages]
-        else:
-            arrays |= {f"points {frame}": points, f"frame {frame}": jnp.int32(frame)}
-            reads = ("params", "images", "patch_tokens", f"points {frame}", f"frame {frame}")
-            options = {"config": config, "compute_dtype": compute_dtype}
-            stages.append(Stage("tracks", reads, (f"tracks {frame}",), _track_from, options))
+    if tracks is not None:
+        stages = _tracking_stages(stages, tracks, arrays, {"config": config, "compute_dtype": compute_dtype})
     try:
         with on_stage("compile"):
             _compile(stages, arrays)
@@ -236,8 +228,26 @@ def reconstruct(
     return result
 
 
-def _with_queries(stage: Stage) -> Stage:
-    return stage._replace(reads=(*stage.reads, "query_points"), function=_first_pass_with_tracks)
+def _tracking_stages(
+    stages: list[Stage], queries: Queries, arrays: dict[str, Any], network: dict[str, Any]
+) -> list[Stage]:
+    """Return the stages with tracks: of the first frame's points by the first pass, then of every other frame's.
+
+    The points are put into `arrays`.
+    """
+    stages = list(stages)
+    for frame in np.unique(queries.frames).tolist():
+        points = jnp.asarray(queries.points[queries.frames == frame])[None]
+        if frame == 0:
+            arrays["query_points"] = points
+            index = next(i for i, stage in enumerate(stages) if stage.name == "first pass")
+            reads = (*stages[index].reads, "query_points")
+            stages[index] = stages[index]._replace(reads=reads, function=_first_pass_with_tracks)
+        else:
+            arrays |= {f"points {frame}": points, f"frame {frame}": jnp.int32(frame)}
+            reads = ("params", "images", "patch_tokens", f"points {frame}", f"frame {frame}")
+            stages.append(Stage("tracks", reads, (f"tracks {frame}",), _track_from, network))
+    return stages
 
 
 def _joined_tracks(queries: Queries, arrays: dict[str, Any]) -> dict[str, np.ndarray]:

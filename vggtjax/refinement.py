@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy import ndimage
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vggtjax.clustering import kmeans, nearest_centre
 from vggtjax.errors import InputError
@@ -117,12 +117,13 @@ def statistical_outliers(
     Points that are not finite, or not `valid`, are outliers too, and nobody's neighbours.
     """
     flat = points.reshape(-1, 3)
-    outlier = ~np.isfinite(flat).all(axis=1)
-    outlier |= False if valid is None else ~valid.ravel()
+    outlier: np.ndarray = ~np.isfinite(flat).all(axis=1)
+    if valid is not None:
+        outlier |= ~valid.ravel()
     known = flat[~outlier]
     if len(known):
         neighbours = min(NEIGHBOURS, len(known))
-        distance = cKDTree(known).query(known, k=neighbours, workers=-1)[0].reshape(len(known), -1).mean(axis=1)
+        distance = KDTree(known).query(known, k=neighbours, workers=-1)[0].reshape(len(known), -1).mean(axis=1)
         outlier[~outlier] = distance > distance.mean() + OUTLIER_SIGMA * distance.std()
     return outlier.reshape(points.shape[:2])
 

@@ -247,12 +247,12 @@ def _block(params: Params, x: Float[Array, "B G T C"], context: Float[Array, "B 
     """Attention and MLP; attention is to `context` if there is one. The skip starts after the first norm."""
     B, G, T, C = x.shape
     x = apply(LayerNorm(), params["norm1"], x)
-    context = x if context is None else apply(LayerNorm(), params["norm_context"], context)
+    seen: Array = x if context is None else apply(LayerNorm(), params["norm_context"], context)
     kernels = jnp.split(params["attention"]["qkv"]["kernel"], 3, axis=1)
     biases = jnp.split(params["attention"]["qkv"]["bias"], 3)
     q, k, v = (
         (part @ kernel + bias[None, None, None]).reshape(B * G, -1, HEADS, C // HEADS)
-        for part, kernel, bias in zip((x, context, context), kernels, biases, strict=True)
+        for part, kernel, bias in zip((x, seen, seen), kernels, biases, strict=True)
     )
     out = attention(q, k, v).reshape(B, G, T, C)
     x = x + apply(nn.Dense(C), params["attention"]["projection"], out)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from cmap import Colormap
@@ -56,7 +57,7 @@ def write_track_video(path: Path, result: Reconstruction) -> bool:
         logger.info("tracks are drawn as pictures only; this PyAV has no encoder for an mp4")
         return False
     with av.open(str(path), "w", format="mp4") as container:
-        stream = container.add_stream(codec, rate=_FRAMES_PER_SECOND)
+        stream: Any = container.add_stream(codec, rate=_FRAMES_PER_SECOND)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         for frame in range(len(result.depth)):
             container.mux(stream.encode(av.VideoFrame.from_image(_drawn(result, frame, size))))
