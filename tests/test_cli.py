@@ -84,7 +84,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     assert "track head of the embedded model is untrained" in out
     result = Reconstruction.load(tmp_path / "out")
     assert (result.settings["masks"], result.settings["refine_mask"]) == ("given", True)
-    assert result.track_frames.tolist() == [0, 1]
+    assert np.asarray(result.track_frames).tolist() == [0, 1]
     assert (tmp_path / "out/preview/tracks.png").stat().st_size > 1000
 
     code, _, err = run(capsys, "reconstruct", frames, "--out", tmp_path / "still", "--no-masks", "--tracks", "grid:2")
@@ -92,7 +92,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     still = Reconstruction.load(tmp_path / "still")
     assert not still.dynamic_mask.any()
     assert still.settings["refine_mask"] is False
-    assert still.track_positions.shape == (3, 4, 2)
+    assert np.asarray(still.track_positions).shape == (3, 4, 2)
 
 
 @pytest.mark.parametrize(

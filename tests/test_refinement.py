@@ -1,5 +1,7 @@
 """Mask refinement on generated scenes with exact depth and cameras; golden numbers are in parity/."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
@@ -23,11 +25,11 @@ def clip():
     return clip._replace(depth=clip.depth / unit)
 
 
-def refined(clip, mask, **changes):
-    values = {name: getattr(clip, name) for name in ("images", "depth", "camera_from_world", "intrinsics")} | changes
-    return refine_masks(
-        values["images"], values["depth"], mask, values["camera_from_world"], values["intrinsics"], seed=0
+def refined(clip, mask, *, valid=None, **changes):
+    images, depth, poses, intrinsics = (
+        changes.get(name, getattr(clip, name)) for name in ("images", "depth", "camera_from_world", "intrinsics")
     )
+    return refine_masks(images, depth, mask, poses, intrinsics, valid=valid, seed=0)
 
 
 def test_what_stands_still_leaves_the_mask_and_what_moves_stays(clip):
@@ -41,16 +43,16 @@ def test_what_stands_still_leaves_the_mask_and_what_moves_stays(clip):
 
 def test_a_right_mask_grows_by_a_pixel_or_two_at_most(clip):
     made = refined(clip, clip.dynamic_mask)
-    near = np.stack([ndimage.binary_dilation(mask, np.ones((7, 7))) for mask in clip.dynamic_mask])
-    assert not (made & ~near).any()
+    for mask, one in zip(clip.dynamic_mask, made, strict=True):
+        near = ndimage.binary_dilation(mask, np.ones((7, 7)))
+        assert not one[np.logical_not(near)].any()
 
 
 def test_empty_masks_and_single_frames_stay_as_they_are(clip):
     empty = np.zeros_like(clip.dynamic_mask)
     assert not refined(clip, empty).any()
-    one = refine_masks(*(getattr(clip, name)[:1] for name in ("images", "depth")), clip.dynamic_mask[:1],
-                       clip.camera_from_world[:1], clip.intrinsics[:1])  # fmt: skip
-    assert np.array_equal(one, clip.dynamic_mask[:1])
+    first = jax.tree.map(lambda leaf: leaf[:1], clip)
+    assert np.array_equal(refined(first, first.dynamic_mask), first.dynamic_mask)
 
 
 def test_masks_of_a_few_pixels_in_one_frame(clip):
@@ -82,22 +84,22 @@ def test_padding_is_no_witness(clip):
     valid[:, :, :20] = False
     depth, images = clip.depth.copy(), clip.images.copy()
     depth[~valid], images[~valid] = 0.5, 1.0  # what padding says must not matter
-    scene = (clip.camera_from_world, clip.intrinsics)
     coarse = clip.dynamic_mask.copy()
     coarse[:, 8:40, 10:40] = True
-    made = refine_masks(images, depth, coarse, *scene, valid=valid)
+    made = refined(clip, coarse, images=images, depth=depth, valid=valid)
     assert not made[~valid].any()
-    assert np.array_equal(made, refine_masks(clip.images, clip.depth, coarse, *scene, valid=valid))
+    assert np.array_equal(made, refined(clip, coarse, valid=valid))
 
 
 def test_large_masks_are_grouped_by_a_part_of_their_points(clip, monkeypatch):
     coarse = clip.dynamic_mask.copy()
     coarse[:, 8:60, 8:60] = True
     whole = refined(clip, coarse)
+    jitted: Any = refinement.cluster_points
     monkeypatch.setattr(refinement, "FITTED", 500)
-    refinement.cluster_points.clear_cache()
+    jitted.clear_cache()
     part = refined(clip, coarse)
-    refinement.cluster_points.clear_cache()
+    jitted.clear_cache()
     assert (whole & part).sum() / (whole | part).sum() > 0.7
 
 

@@ -1,5 +1,7 @@
 """The track head: golden numbers of the public code are in parity/; here chunks, edges, gradients and bad input."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -45,7 +47,7 @@ def test_correlations_against_samples_written_out(config, monkeypatch):
             x, y = (0 if side == 1 else at for side, at in ((image.shape[1], x), (image.shape[0], y)))
             if abs(x) < 1000 and abs(y) < 1000:
                 expected[s, q, k, i, j] = sampled(image, x, y) @ features[s, q] / F**0.5
-    run = jax.jit(track_head._correlations, static_argnums=(3, 4))
+    run: Any = jax.jit(track_head._correlations, static_argnums=(3, 4))
     for floats in (1 << 24, 3 * S * (2 * r + 2) ** 2 * F):  # all at once; three queries at a time, of seven
         monkeypatch.setattr(track_head, "FLOATS_AT_ONCE", floats)
         run.clear_cache()

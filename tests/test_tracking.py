@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
@@ -30,8 +31,9 @@ def test_points_of_any_frame(params, config, clip, tracked):
     for frame in (0, 2):
         chosen = POINTS.frames == frame
         images = np.roll(clip.images, -frame, axis=0)[None]
-        made = forward(params, images, config, outputs=("tracks",), query_points=POINTS.points[chosen][None])
-        back = np.roll(np.asarray(made.tracks[0]), frame, axis=0)
+        points = jnp.asarray(POINTS.points[chosen])[None]
+        made = forward(params, jnp.asarray(images), config, outputs=("tracks",), query_points=points)
+        back = np.roll(np.asarray(made.tracks)[0], frame, axis=0)
         assert np.abs(tracked.track_positions[:, chosen] - back).max() < 2e-2  # sines of a thousand times the flow
         assert np.array_equal(tracked.track_positions[frame, chosen], POINTS.points[chosen])
     assert np.array_equal(tracked.track_frames, POINTS.frames)
@@ -43,7 +45,7 @@ def test_points_move_with_a_clip_that_is_refitted(params, config):
     points = Queries(np.array([[20, 24], [80, 60]]), np.zeros(2))
     clip = load_clip(images, size=112)
     made = reconstruct(Model(config, params, "tiny"), clip, size=56, method="vggt", tracks=points)
-    assert np.allclose(made.track_positions[0], [[10, 12], [40, 30]], atol=1e-4)
+    assert np.allclose(np.asarray(made.track_positions)[0], [[10, 12], [40, 30]], atol=1e-4)
 
 
 def test_tracks_survive_a_round_trip(tmp_path, tracked, clip):

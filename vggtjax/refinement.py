@@ -117,7 +117,7 @@ def statistical_outliers(
     Points that are not finite, or not `valid`, are outliers too, and nobody's neighbours.
     """
     flat = points.reshape(-1, 3)
-    outlier: np.ndarray = ~np.isfinite(flat).all(axis=1)
+    outlier = np.logical_not(np.isfinite(flat).all(axis=1, keepdims=True))[:, 0]
     if valid is not None:
         outlier |= ~valid.ravel()
     known = flat[~outlier]
