@@ -11,6 +11,7 @@ from benchmarks.demo_model import demo_model
 from benchmarks.embed import embed
 from benchmarks.make_checkpoint import main as make_checkpoint
 from benchmarks.refinement import refinement
+from benchmarks.second_pass import second_pass
 from vggtjax.errors import VggtjaxError
 
 COMMANDS = {
@@ -18,6 +19,7 @@ COMMANDS = {
     "embed": embed,
     "make-checkpoint": make_checkpoint,
     "refinement": refinement,
+    "second-pass": second_pass,
 }
 
 

@@ -144,3 +144,15 @@ def test_a_standing_camera_is_not_hard():
 def test_bad_input_is_one_sentence(arguments, says):
     with pytest.raises(InputError, match=says):
         held_out_scenes(*arguments)
+
+
+def test_frozen_scenes_are_twins_of_those_that_move():
+    config = SceneConfig(height=24, width=24, frames=12, noise=0.0)
+    moving = held_out_scenes("dynamic", 2, config)
+    frozen = held_out_scenes("dynamic", 2, dataclasses.replace(config, frozen=True))
+    assert np.array_equal(moving.camera_from_world, frozen.camera_from_world)
+    assert np.abs(frozen.scene_flow).max() < 1e-5
+    assert np.abs(moving.scene_flow).max() > 1e-2
+    still = ~(moving.dynamic_mask | frozen.dynamic_mask)
+    assert np.abs(moving.depth - frozen.depth)[still].max() < 1e-3
+    assert frozen.dynamic_mask.any()

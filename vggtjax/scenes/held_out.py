@@ -61,7 +61,8 @@ def held_out_scenes(
         kind: "static", or "dynamic" where things move.
         count: number of scenes; a larger count begins with the scenes of a smaller one.
         config: size and frames; 12 frames of 112 x 112 pixels by default. Its `dynamic` follows from `kind`. Which
-            scenes are taken depends on the seed, the kind and the number of frames, not on the image size.
+            scenes are taken depends on the seed, the kind and the number of frames, not on the image size nor on
+            whether they are frozen.
         seed: of a set; different seeds share no scene.
         progress: called with the number of scenes found and wanted.
 
@@ -121,7 +122,7 @@ def _layers(part_ids: np.ndarray, depth: np.ndarray) -> int:
 
 def _hard_keys(kind: Kind, count: int, config: SceneConfig, seed: int, textures: Textures, progress):
     """Return the first `count` keys of the seed whose scenes are hard, judged at a small size."""
-    small = dataclasses.replace(config, height=SIZE, width=SIZE, samples=1, exposures=1)
+    small = dataclasses.replace(config, height=SIZE, width=SIZE, samples=1, exposures=1, frozen=False)
     stream = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), STREAM), get_args(Kind).index(kind))
     kept, candidate = [], 0
     while len(kept) < count:

@@ -35,6 +35,7 @@ class SceneConfig:
         shutter: share of the time between frames that the shutter is open (motion blur), in `exposures` steps.
         noise: largest standard deviation of the sensor's noise.
         flicker: standard deviation of the logarithm of the exposure from frame to frame.
+        frozen: what moves stands where it is in the middle of the clip; masks still name it.
     """
 
     height: int = 64
@@ -52,6 +53,7 @@ class SceneConfig:
     exposures: int = 1
     noise: float = 0.02
     flicker: float = 0.08
+    frozen: bool = False
 
     def __post_init__(self) -> None:
         for name in ("motion", "field_of_view"):
@@ -86,6 +88,9 @@ class SceneConfig:
             numbers = all(isinstance(v, int | float) and low <= v <= high for v in values)
             if not numbers or sorted(values) != [*values]:
                 raise InputError(f"{name} is {value!r}; expected {low} to {high}, of two numbers the smaller first")
+
+        if type(self.frozen) is not bool:
+            raise InputError(f"frozen is {self.frozen!r}; expected true or false")
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -277,6 +282,7 @@ def sample_scene(key: Array, tiles: int, config: SceneConfig) -> Scene:
 def part_poses(scene: Scene, config: SceneConfig, time: Float[Array, ""]) -> tuple[Array, Array]:
     """Return rotation [K, 3, 3] and centre [K, 3] of every part in the world at a time; the clip lasts from 0 to 1."""
     objects = np.asarray(config.objects)
+    time = jnp.float32(0.5) if config.frozen else time
     moved = scene.path.at(time)  # [O, 4]
     heading = _rotation_y(scene.heading + moved[:, 3])[objects]
     swing = _rotation_x(scene.swing.at(time)[:, 0])
