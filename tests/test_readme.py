@@ -1,5 +1,6 @@
-"""The Python of the README runs as it stands."""
+"""The Python of the README runs as it stands; links lead somewhere."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -25,3 +26,10 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     assert (names["again"].depth == names["result"].depth).all()
     assert set(names["ablation"]) == {"vggt", "pose-decoupling", "hard-replacement", "4dvggt-d"}
     assert names["ablation"]["4dvggt-d"].depth.shape == names["images"].shape[:4]
+
+
+@pytest.mark.parametrize("page", [README, *sorted((README.parent / "docs").glob("*.md"))], ids=lambda page: page.name)
+def test_every_link_to_a_file_leads_somewhere(page):
+    links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
+    missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]
+    assert not missing
