@@ -8,7 +8,7 @@ frozen one what it does where there is nothing to repair, and with another scene
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from vggtjax.evaluation.trajectory import centre_error, rotation_error
 from vggtjax.mask import dynamic_tokens
 from vggtjax.network.model import forward
 from vggtjax.network.pose import decode_pose
-from vggtjax.scenes import SceneConfig, held_out_scenes
+from vggtjax.scenes import SceneConfig, SyntheticClip, held_out_scenes
 
 _forward = jax.jit(forward, static_argnames=("config", "suppress", "outputs"))
 _AT_ONCE = 4
@@ -59,7 +59,8 @@ def second_pass(
         moving = held_out_scenes("dynamic", scenes, wanted, seed=seed)
         frozen = held_out_scenes("dynamic", scenes, dataclasses.replace(wanted, frozen=True), seed=seed)
     lent = np.roll(moving.dynamic_mask, 1, axis=0)
-    runs = {("moving", "none", 0): (moving, None), ("frozen", "none", 0): (frozen, None)}
+    runs: dict[tuple[str, str, int], tuple[SyntheticClip, Any]] = {}
+    runs["moving", "none", 0], runs["frozen", "none", 0] = (moving, None), (frozen, None)
     for count in pairs:
         runs["moving", "true", count] = (moving, moving.dynamic_mask)
         runs["moving", "another scene's", count] = (moving, lent)
