@@ -5,11 +5,22 @@ import pytest
 from PIL import Image
 
 from benchmarks.seeded import seeded_images
-from vggtjax import Model, load_clip, reconstruct
+from tests.tiny import tiny_config
+from vggtjax import Model, init_params, load_clip, reconstruct
 from vggtjax.clips.masks import load_masks
 from vggtjax.errors import ClipError, InputError
 
 WIDE, TALL = (90, 160), (160, 90)  # height, width
+
+
+@pytest.fixture(scope="module")
+def config():
+    return tiny_config()
+
+
+@pytest.fixture(scope="module")
+def params(config):
+    return init_params(0, config)
 
 
 def written(folder, pictures, names):

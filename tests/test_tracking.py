@@ -8,13 +8,24 @@ import pytest
 from PIL import Image
 
 from benchmarks.seeded import seeded_images
-from vggtjax import Model, Reconstruction, forward, load_clip, reconstruct
+from tests.tiny import tiny_config
+from vggtjax import Model, Reconstruction, forward, init_params, load_clip, reconstruct
 from vggtjax.errors import InputError, ResultError
 from vggtjax.tracking import Queries, check_words, parse_queries
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")  # seeded weights give odd cameras
 
 POINTS = Queries(np.array([[10, 12], [40, 30], [5.5, 50], [33, 33]]), np.array([0, 2, 0, 2]))
+
+
+@pytest.fixture(scope="module")
+def config():
+    return tiny_config(track_features=16, track_hidden=48, track_corr_levels=4, track_corr_radius=2)
+
+
+@pytest.fixture(scope="module")
+def params(config):
+    return init_params(0, config)
 
 
 @pytest.fixture(scope="module")
