@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.seeded import seeded_images
+from tests.tiny import tiny_config
 from vggtjax import (
     METHODS,
     Model,
@@ -16,6 +17,7 @@ from vggtjax import (
     forward,
     fuse_depth,
     infer,
+    init_params,
     load_clip,
     motion_saliency,
     pipeline,
@@ -194,7 +196,10 @@ def test_the_row_of_vggt4d_is_what_is_run(params, config, images, inferred):
     assert np.abs(np.asarray(passes.second.pose_encoding - made.pose_encoding)).max() < 1e-4
 
 
-def test_gradients_pass_by_the_mask_of_vggt4d(params, config, images):
+def test_gradients_pass_by_the_mask_of_vggt4d(images):
+    config = tiny_config()
+    params = init_params(0, config)
+
     def loss(images):
         return infer(params, images, config, method="vggt4d")[0].depth.mean()
 
