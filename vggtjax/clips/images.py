@@ -66,7 +66,7 @@ def read_image(path: Path) -> Image.Image:
         ClipError: the file is missing, is not an image, is truncated or corrupt, or is absurdly large.
     """
     try:
-        with Image.open(path, formats=_formats()) as image:
+        with Image.open(path, formats=known_formats()) as image:
             return to_rgb(ImageOps.exif_transpose(image), path.name)
     except ClipError:
         raise
@@ -95,7 +95,8 @@ def to_rgb(image: Image.Image, name: str) -> Image.Image:
 
 
 @functools.cache
-def _formats() -> tuple[str, ...]:
+def known_formats() -> tuple[str, ...]:
+    """Return those of FORMATS that this Pillow can read: what files of strangers may be opened as."""
     Image.init()
     return tuple(name for name in FORMATS if name in Image.OPEN)
 

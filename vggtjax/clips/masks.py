@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from PIL import Image
 
 from vggtjax.clips.clip import Clip
-from vggtjax.clips.images import ImageFiles, read_image
+from vggtjax.clips.images import ImageFiles, known_formats, read_image
 from vggtjax.clips.sources import open_source
 from vggtjax.errors import ClipError
 
@@ -74,7 +74,7 @@ def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:
 
 def _moving(path: Path) -> Bool[np.ndarray, "h w"]:
     shown = read_image(path)  # says what is wrong with a file that is no picture
-    with Image.open(path) as picture:
+    with Image.open(path, formats=known_formats()) as picture:
         if picture.mode in _LABELS and picture.size == shown.size and not picture.has_transparency_data:
             return np.asarray(picture) > 0
         opaque = np.asarray(picture.convert("RGBA"))[..., 3] > _WHITE if picture.has_transparency_data else None

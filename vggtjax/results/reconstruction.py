@@ -117,11 +117,9 @@ class Reconstruction:
             raise ResultError(
                 f"source_size or source_scale is out of range; expected sides of 1 to {most}, scales above 0"
             )
-        if (
-            self.track_frames is not None
-            and not ((self.track_frames >= 0) & (self.track_frames < len(self.depth))).all()
-        ):
-            raise ResultError(f"track_frames holds {self.track_frames.max()}; expected 0 to {len(self.depth) - 1}")
+        frames, last = self.track_frames, len(self.depth) - 1
+        if frames is not None and ((frames < 0) | (frames > last)).any():
+            raise ResultError(f"track_frames holds {frames[(frames < 0) | (frames > last)][0]}; expected 0 to {last}")
         left, top, right, bottom = self.valid_box.T
         inside = (left >= 0) & (left < right) & (right <= width) & (top >= 0) & (top < bottom) & (bottom <= height)
         if not inside.all():

@@ -29,7 +29,7 @@ CONFIDENCE = 0.2  # weight of the logarithm of confidence, as in VGGT
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the terms; a term of weight 0 is not computed.
+    """Weights of the terms; a term of weight 0 does not count.
 
     Attributes:
         translation, rotation, field_of_view: L1 or Huber distance of the pose encoding's parts.
@@ -135,8 +135,11 @@ def objective(
     if weights.probe or weights.moments:
         found = _probe_terms(taps, truth, paired, config.patch_size)
         metrics |= {f"probe_{name}": value for name, value in found.items()}
-        terms["moments"] = weights.moments * found.pop("moments")
-        terms["probe"] = weights.probe * sum(found.values(), start=jnp.zeros(()))
+        moments = found.pop("moments")
+        if weights.moments:
+            terms["moments"] = weights.moments * moments
+        if weights.probe:
+            terms["probe"] = weights.probe * sum(found.values(), start=jnp.zeros(()))
     loss = sum(terms.values(), start=jnp.zeros(()))
     return loss, {"loss": loss} | {f"loss_{name}": value for name, value in terms.items()} | metrics
 
