@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from vggtjax.errors import InputError
 from vggtjax.refinement import refine_masks, statistical_outliers
 from vggtjax.results.geometry import unproject
 from vggtjax.scenes import load_textures
@@ -28,6 +29,9 @@ def refinement(*, frames: int = 32, height: int = 294, width: int = 518, grow: i
     """
     from scipy.ndimage import binary_dilation
 
+    for name, value in (("grow", grow), ("repeats", repeats)):
+        if value < 1:
+            raise InputError(f"{name} is {value}; expected at least 1")
     config = SceneConfig(height=height, width=width, frames=frames, dynamic=1.0, static_camera=0.0)
     clip = jax.tree.map(
         np.asarray, jax.jit(generate, static_argnums=2)(jax.random.key(0), load_textures("test"), config)
