@@ -1,5 +1,5 @@
 """Foreign checkpoints -> parameter trees of vggtjax."""
 
-from converters.torch_to_flax import convert, convert_state_dict
+from converters.torch_to_flax import Conversion, convert, convert_state_dict
 
-__all__ = ["convert", "convert_state_dict"]
+__all__ = ["Conversion", "convert", "convert_state_dict"]

@@ -8,10 +8,10 @@ from converters.sources import choose_file, weight_files
 from vggtjax.errors import CheckpointError, MissingExtraError
 
 
-def download(hub_id: str) -> Path:
+def download(hub_id: str, file: str | None = None) -> Path:
     """Return the file of weights of a hub repository in the hub's cache, downloaded if it is not there.
 
-    A cached copy does without the network. Of several formats safetensors comes first, see `choose_file`.
+    A cached copy does without the network. Unless `file` names one, safetensors comes first, see `choose_file`.
 
     Raises:
         CheckpointError: the repository is missing, gated, out of reach, or holds no weights.
@@ -24,7 +24,7 @@ def download(hub_id: str) -> Path:
         raise MissingExtraError(f"downloading '{hub_id}'", "hub") from error
 
     try:
-        return _download(hub_id)
+        return _download(hub_id, file)
     except CheckpointError:
         raise
     except errors.GatedRepoError as error:
@@ -43,7 +43,7 @@ def download(hub_id: str) -> Path:
         ) from error
 
 
-def _download(hub_id: str) -> Path:
+def _download(hub_id: str, file: str | None) -> Path:
     from huggingface_hub import HfApi
     from huggingface_hub.errors import (
         HTTPError,  # pyright: ignore[reportPrivateImportUsage]: of httpx or httpx2
@@ -61,7 +61,10 @@ def _download(hub_id: str) -> Path:
             raise error from None
         names = [entry.name for entry in folder.iterdir()]
         cached = True
-    name = choose_file(names, f"the hub's '{hub_id}'")
+    if file is not None and file not in names:
+        listed = ", ".join(sorted(names)[:10])
+        raise CheckpointError(f"the hub's '{hub_id}' has no file {file}; expected one of {listed}")
+    name = file or choose_file(names, f"the hub's '{hub_id}'")
     path = Path(hub.hf_hub_download(hub_id, name, local_files_only=cached))
     for shard in weight_files(path)[1:]:
         if Path(hub.hf_hub_download(hub_id, shard.name, local_files_only=cached)) != shard:

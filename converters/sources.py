@@ -10,13 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from converters.strangers import refuse_strangers
 from vggtjax.checkpoint import problems_sentence
 from vggtjax.errors import CheckpointError
 from vggtjax.tensor_file import StoredTensor, is_tensor_file, read_tensors
 
 _INDEX = ".safetensors.index.json"
 _SUFFIXES = (".safetensors", _INDEX, ".pt", ".pth")
-_HUB_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95}", re.ASCII)
+_HUB_ID = re.compile(r"([A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})(?:/([A-Za-z0-9][\w.-]{0,200}))?", re.ASCII)
 _MOST_INDEX_BYTES = 2**24
 
 Tensor = np.ndarray | StoredTensor
@@ -52,13 +53,17 @@ def locate(source: str | Path) -> Weights:
             return Weights(path, path.name.removesuffix(_INDEX).removesuffix(path.suffix))
     except OSError as error:
         raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
-    if isinstance(source, str) and _HUB_ID.fullmatch(source) and not source.endswith(_SUFFIXES):
-        from converters.hub import download
+    if isinstance(source, str) and (match := _HUB_ID.fullmatch(source)):
+        hub_id, file = match.groups()
+        if (not hub_id.endswith(_SUFFIXES)) if file is None else file.endswith(_SUFFIXES):
+            from converters.hub import download
 
-        return Weights(download(source), source)
+            refuse_strangers(source)
+            return Weights(download(hub_id, file), source)
     raise CheckpointError(
         f"there are no weights at {source}; expected a file (.safetensors, .pt, .pth), the index or folder of sharded "
-        ".safetensors, a hub id such as 'facebook/VGGT-1B', or, to load rather than convert, 'demo'"
+        ".safetensors, a hub id such as 'facebook/VGGT-1B', with '/' and a file if it has several, or, to load rather "
+        "than convert, 'demo'"
     )
 
 

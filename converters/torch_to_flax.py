@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import count
+from math import prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,14 +16,45 @@ import numpy as np
 from flax.traverse_util import unflatten_dict
 
 from converters.rules import IGNORED, RULES, Rule, Transform
-from converters.sources import Tensor, Weights, locate, read_state_dict
+from converters.sources import Tensor, Weights, locate, read_state_dict, weight_files
+from converters.strangers import refuse_strangers
 from vggtjax.checkpoint import DType, Progress, flat_shapes, numpy_dtype, problems_sentence, write_checkpoint
-from vggtjax.config import VGGTConfig, vggt_1b
+from vggtjax.config import HEAD_NAMES, VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.tensor_file import Spec
 
 _STACKED = {rule.path for rule in RULES if rule.stacked}
 _FLOATS = tuple(np.dtype(kind) for kind in (np.float32, ml_dtypes.bfloat16, np.float16, np.float64))
+
+
+_DIGEST_BLOCK = 2**20  # bytes of a source that count as a step of progress
+
+
+class Conversion(NamedTuple):
+    """What a conversion read and wrote."""
+
+    path: Path  # of the file written
+    config: VGGTConfig
+    tensors: int  # of the source, that were converted
+    left_out: tuple[str, ...]  # names of the source's other tensors: of heads not asked for, of DINOv2's pre-training
+    parameters: int
+    bytes: int  # of the file written
+    dtype: str
+    sha256: Mapping[str, str]  # of the source's files, by name
+
+    def summary(self) -> dict[str, Any]:
+        """Return what a person asks about a conversion, as plain values."""
+        heads = sorted({name.split(".")[0] for name in self.left_out if name not in IGNORED})
+        return {
+            "wrote": str(self.path),
+            "tensors": f"{self.tensors} converted, {len(self.left_out)} left out"
+            + (f" ({', '.join(heads)})" if heads else ""),
+            "parameters": self.parameters,
+            "bytes": self.bytes,
+            "dtype": self.dtype,
+            "heads": list(self.config.heads),
+            **{f"sha256 of {name}": digest for name, digest in self.sha256.items()},
+        }
 
 
 class Piece(NamedTuple):
@@ -52,8 +86,10 @@ def convert_state_dict(state_dict: Mapping[str, np.ndarray], config: VGGTConfig)
         config: the model's configuration.
 
     Raises:
-        CheckpointError: lists every unknown, missing, duplicate and mis-shaped key, and types other than float.
+        CheckpointError: lists every unknown, missing, duplicate and mis-shaped key, and types other than float; or says
+            which relative of VGGT the state dict is of.
     """
+    refuse_strangers("the state dict", state_dict)
     tensors = {name: np.asarray(value) for name, value in state_dict.items()}
     targets = plan_conversion(tensors, config)
     flat = {path: np.concatenate(list(target.parts(tensors))) for path, target in targets.items()}
@@ -66,9 +102,10 @@ def convert(
     *,
     dtype: DType = "float32",
     config: VGGTConfig | None = None,
+    heads: Sequence[str] | None = None,
     progress: Progress | None = None,
-) -> Path:
-    """Write the checkpoint of a PyTorch VGGT as one file of this library; return its path.
+) -> Conversion:
+    """Write the checkpoint of a PyTorch VGGT as one file of this library; say what was read and written.
 
     One source tensor is in memory at a time.
 
@@ -77,14 +114,22 @@ def convert(
         destination: the file to write; one that is there is replaced.
         dtype: of the parameters in the file.
         config: the model's configuration; None for VGGT-1B. Head counts cannot be read off the weights.
-        progress: called with the tensors converted and their number.
+        heads: those to convert, in any order; None for all that the configuration has. The source may lack the others.
+        progress: called with the steps done and their number: tensors, and blocks of the source whose sum is taken.
 
     Raises:
-        CheckpointError: the source cannot be read, or does not fit the configuration; all problems at once.
+        CheckpointError: the source cannot be read, does not fit the configuration (all problems at once), or is of a
+            relative of VGGT.
+        InputError: a head that there is not.
         OutputError: the destination cannot be written.
         MissingExtraError: the source needs torch or huggingface_hub, which is not installed.
     """
-    return convert_weights(locate(source), destination, dtype=dtype, config=config or vggt_1b(), progress=progress)
+    config = config or vggt_1b()
+    if heads is not None:
+        if unknown := [name for name in heads if name not in config.heads]:
+            raise InputError(f"heads has {unknown}; expected some of {config.heads}")
+        config = dataclasses.replace(config, heads=tuple(name for name in config.heads if name in heads))
+    return convert_weights(locate(source), destination, dtype=dtype, config=config, progress=progress)
 
 
 def convert_weights(
@@ -94,25 +139,43 @@ def convert_weights(
     dtype: DType,
     config: VGGTConfig,
     progress: Progress | None = None,
-) -> Path:
+) -> Conversion:
     """Do what `convert` does with weights that are located."""
     kind = numpy_dtype(dtype)
     destination = Path(destination).expanduser()
     if os.path.isfile(destination) and os.path.samefile(destination, weights.path):  # noqa: PTH113, PTH121
         raise InputError(f"the destination {destination} is the source itself; choose another name")
     tensors, problems = read_state_dict(weights.path)
+    refuse_strangers(weights.name, tensors)
     targets = plan_conversion(tensors, config, problems)
-    total = sum(len(target.pieces) for target in targets.values())
+    files = weight_files(weights.path)
+    used = {piece.source for target in targets.values() for piece in target.pieces}
+    total = len(used) + sum(-(-file.stat().st_size // _DIGEST_BLOCK) for file in files)
     done = count(1)
+
+    def advance() -> None:
+        if progress is not None:
+            progress(next(done), total)
 
     def parts(path: str) -> Iterator[np.ndarray]:
         for part in targets[path].parts(tensors):
             yield part
-            if progress is not None:
-                progress(next(done), total)
+            advance()
 
+    sha256 = {file.name: _digest(file, advance) for file in files}
+    refuse_strangers(weights.name, sha256=sha256)
     specs = {path: Spec(target.shape, kind) for path, target in targets.items()}
-    return write_checkpoint(destination, specs, parts, config, name=weights.name)
+    path = write_checkpoint(destination, specs, parts, config, name=weights.name, origin=sha256)
+    return Conversion(
+        path,
+        config,
+        tensors=len(used),
+        left_out=tuple(name for name in tensors if name not in used),
+        parameters=sum(prod(spec.shape) for spec in specs.values()),
+        bytes=path.stat().st_size,
+        dtype=dtype,
+        sha256=sha256,
+    )
 
 
 def plan_conversion(
@@ -131,11 +194,11 @@ def plan_conversion(
     shapes = flat_shapes(config)
     problems = list(problems)
     targets: dict[str, Target] = {}
-    known = set(IGNORED)
+    known = IGNORED | _keys_of_other_heads(config)
     for path, keys in _expected(shapes).items():
         pieces = []
         for key in keys:
-            known.update(key.names)
+            known |= set(key.names)
             found = [name for name in key.names if name in tensors]
             if not found:
                 problems.append(f"missing key {key.names[0]}")
@@ -150,7 +213,9 @@ def plan_conversion(
         targets[path] = Target(shapes[path], pieces, stacked=path in _STACKED)
     problems += [f"unknown key {name}" for name in tensors if name not in known]
     if problems:
-        raise CheckpointError(problems_sentence("the checkpoint does not fit the configuration", problems))
+        raise CheckpointError(
+            problems_sentence("the checkpoint does not fit the configuration" + _hint(tensors, config), problems)
+        )
     return targets
 
 
@@ -158,6 +223,35 @@ def source_shapes(config: VGGTConfig) -> dict[str, tuple[int, ...]]:
     """Return the PyTorch state dict's names -> shapes of a model, as published and without the ignored ones."""
     expected = (key for keys in _expected(flat_shapes(config)).values() for key in keys)
     return {key.names[0]: key.shape for key in expected}
+
+
+def _keys_of_other_heads(config: VGGTConfig) -> set[str]:
+    """Return the names of the tensors that a model with all heads has and this one has not."""
+    whole = flat_shapes(dataclasses.replace(config, heads=HEAD_NAMES))
+    absent = {path: shape for path, shape in whole.items() if path not in flat_shapes(config)}
+    return {name for keys in _expected(absent).values() for key in keys for name in key.names}
+
+
+def _hint(tensors: Mapping[str, Tensor], config: VGGTConfig) -> str:
+    """Return what to do about heads that the source lacks altogether."""
+    modules = {name.split(".")[0] for name in tensors}
+    expected = dict.fromkeys(name.split(".")[0] for name in source_shapes(config))
+    absent = [name for name in expected if name not in modules]
+    if not modules & set(expected) or not absent:
+        return ""
+    return f" (it has no {', '.join(absent)}: leave their heads out, see --heads)"
+
+
+def _digest(file: Path, advance: Callable[[], None]) -> str:
+    digest = hashlib.sha256()
+    try:
+        with file.open("rb") as opened:
+            while block := opened.read(_DIGEST_BLOCK):
+                digest.update(block)
+                advance()
+    except OSError as error:
+        raise CheckpointError(f"cannot read {file}: {error.strerror or error}") from error
+    return digest.hexdigest()
 
 
 class _Key(NamedTuple):

@@ -229,7 +229,7 @@ def test_torch_weights_are_converted_once(shapes, tree, config, tmp_path, cache,
     assert model.name == "weights"
     assert [model.path] == list(cache.iterdir())
     assert f"converting {source} to {model.path}" in caplog.text
-    assert calls[-1] == (1502, 1502)
+    assert calls[-1] == (1502 + 8, 1502 + 8)  # tensors, and blocks of the source
 
     with monkeypatch.context() as patch:
         patch.setattr(converters.torch_to_flax, "convert_weights", None)

@@ -81,7 +81,7 @@ def refusal(path, function=read_state_dict) -> str:
 
 
 def assert_converts(source, config, expected, tmp_path):
-    made = load_model(convert(source, tmp_path / "converted.safetensors", config=config)).params
+    made = load_model(convert(source, tmp_path / "converted.safetensors", config=config).path).params
     assert jax.tree.all(jax.tree.map(np.array_equal, made, expected))
 
 

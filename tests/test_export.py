@@ -3,15 +3,14 @@ import errno
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from PIL import Image
-from scipy.spatial.transform import Rotation
 
 from tests.room import make_room
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results import export, point_cloud
+from vggtjax.results.frames import frame_of
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.trajectory import read_trajectory
 
 FILES = {
     "reconstruction.npz",
@@ -26,6 +25,7 @@ FRAME_FILES = (
     "depth/{}.npy",
     "depth/{}.png",
     "mask/{}.png",
+    "instances/{}.png",
     "preview/depth/{}.png",
     "preview/overlay/{}.png",
     "frames/{}.ply",
@@ -83,38 +83,22 @@ def test_masks_and_previews(saved):
     for frame, mask in enumerate(make_room().dynamic_mask):
         with Image.open(saved / f"mask/{frame:06d}.png") as picture:
             np.testing.assert_array_equal(np.asarray(picture), mask * 255)
+        with Image.open(saved / f"instances/{frame:06d}.png") as picture:
+            assert picture.mode == "P"
+            np.testing.assert_array_equal(np.asarray(picture), make_room().instances[frame])
         for name in ("depth", "overlay"):
             with Image.open(saved / f"preview/{name}/{frame:06d}.png") as picture:
                 assert (picture.mode, picture.size) == ("RGB", (42, 28))
 
 
-def test_trajectory_by_hand(tmp_path):
-    # A quarter turn about z (x to y) at (1, 2, 3): q = (0, 0, sin 45, cos 45).
-    camera_from_world = np.array([[[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3]]])
-    times = np.array([1305031102.175304])
-    export.write_trajectory(tmp_path / "t", make_room(1, camera_from_world=camera_from_world, timestamps=times))
-    header, line = (tmp_path / "t").read_text().splitlines()
-    assert header == "# timestamp tx ty tz qx qy qz qw (world-from-camera)"
-    assert line.split()[0] == "1305031102.175304"
-    np.testing.assert_allclose(np.array(line.split()[1:], float), [1, 2, 3, 0, 0, 0.5**0.5, 0.5**0.5], atol=1e-7)
-
-
-def test_frame_numbers_stand_for_unknown_times(tmp_path):
-    export.write_trajectory(tmp_path / "t", make_room(timestamps=None))
-    np.testing.assert_array_equal(np.loadtxt(tmp_path / "t")[:, 0], [0, 1, 2])
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(turn=st.tuples(*[st.floats(-4, 4)] * 3), centre=st.tuples(*[st.floats(-1e3, 1e3)] * 3))
-def test_trajectory_gives_the_poses_back(tmp_path, turn, centre):
-    rotation = Rotation.from_rotvec(turn).as_matrix().T
-    camera_from_world = np.concatenate([rotation, -rotation @ np.array(centre)[:, None]], axis=1)[None]
-    room = make_room(1, camera_from_world=camera_from_world)
-    export.write_trajectory(tmp_path / "t", room)
-    row = np.loadtxt(tmp_path / "t")
-    assert row[7] >= 0
-    np.testing.assert_allclose(row[1:4], room.camera_centres[0], rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(Rotation.from_quat(row[4:]).as_matrix(), room.world_from_camera[0, :3, :3], atol=1e-5)
+def test_trajectory_has_the_clips_times_or_else_frame_numbers(saved, tmp_path):
+    room = make_room()
+    assert room.timestamps is not None
+    times, poses = read_trajectory(saved / "trajectory.txt")
+    np.testing.assert_allclose(times, room.timestamps, atol=1e-6)
+    np.testing.assert_allclose(poses, room.world_from_camera, atol=1e-5)
+    make_room(timestamps=None).save(tmp_path)
+    np.testing.assert_array_equal(np.loadtxt(tmp_path / "trajectory.txt")[:, 0], [0, 1, 2])
 
 
 def test_intrinsics_by_hand(saved):
@@ -124,7 +108,7 @@ def test_intrinsics_by_hand(saved):
 
 def test_clouds(saved):
     room = make_room()
-    pixels = point_cloud.confident_pixels(room, 20)
+    pixels = room.depth_confidence >= np.percentile(room.depth_confidence, 20)
     static = read_ply(saved / "static.ply")
     assert len(static.vertices) == (pixels & ~room.dynamic_mask).sum()
     for frame in range(3):
@@ -132,6 +116,61 @@ def test_clouds(saved):
         np.testing.assert_array_equal(cloud.colors[:, :3], room.images[frame][pixels[frame]])
         expected = room.world_points()[frame][pixels[frame]]
         np.testing.assert_allclose(cloud.vertices, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_original_resolution(tmp_path):
+    room = make_room()  # its source has twice as many pixels a side
+    pictures = [np.full((56, 84, 3), 50 * frame, np.uint8) for frame in range(3)]
+    room.save(tmp_path, resolution="original", pictures=iter(pictures), confidence_percentile=0)
+    assert set(files(tmp_path)) == expected_files(3)
+    for frame in range(3):
+        expected = frame_of(room, frame, "original", picture=pictures[frame])
+        np.testing.assert_array_equal(np.load(tmp_path / f"depth/{frame:06d}.npy"), expected.depth)
+        with Image.open(tmp_path / f"mask/{frame:06d}.png") as picture:
+            np.testing.assert_array_equal(np.asarray(picture) > 0, expected.dynamic_mask)
+        with Image.open(tmp_path / f"preview/overlay/{frame:06d}.png") as picture:
+            assert picture.size == (84, 56)
+        cloud = read_ply(tmp_path / f"frames/{frame:06d}.ply")
+        np.testing.assert_allclose(cloud.vertices, expected.world_points().reshape(-1, 3), rtol=1e-5, atol=1e-6)
+        assert (cloud.colors[:, :3] == 50 * frame).all()
+    assert (tmp_path / "intrinsics.txt").read_text().startswith("# fx fy cx cy in pixels of 84 x 56\n")
+    np.testing.assert_allclose(np.loadtxt(tmp_path / "intrinsics.txt"), [[75.6, 75.6, 42, 28]] * 3, rtol=1e-6)
+    static = sum(frame_of(room, frame, "original").valid.sum() for frame in range(3)) - 4 * room.dynamic_mask.sum()
+    assert len(read_ply(tmp_path / "static.ply").vertices) == static
+    np.testing.assert_array_equal(Reconstruction.load(tmp_path).depth, room.depth)
+
+
+def test_pictures_that_do_not_fit(tmp_path):
+    room, picture = make_room(), np.zeros((56, 84, 3), np.uint8)
+    with pytest.raises(InputError, match="there are 2 pictures for 3 frames"):
+        room.save(tmp_path / "a", resolution="original", pictures=[picture, picture])
+    with pytest.raises(InputError, match="the picture of frame 0 is"):
+        room.save(tmp_path / "b", resolution="original", pictures=[picture[1:]] * 3)
+    with pytest.raises(InputError, match="resolution is 'full'; expected one of"):
+        room.save(tmp_path / "c", resolution="full")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="layout is 'cut3r'; expected one of"):
+        room.save(tmp_path / "d", layout="cut3r")  # pyright: ignore[reportArgumentType]
+    assert not any(files(tmp_path))
+
+
+@pytest.mark.parametrize("resolution", ["model", "original"])
+def test_layout_of_vggt4d(tmp_path, resolution):
+    room = make_room()
+    room.save(tmp_path, layout="vggt4d", resolution=resolution)
+    names = ("frame_{}.png", "frame_{}.npy", "conf_{}.npy", "dynamic_mask_{}.png")
+    theirs = {f"vggt4d/{name.format(f'{frame:04d}')}" for frame in range(3) for name in names}
+    assert set(files(tmp_path)) == expected_files(3) | theirs | {"vggt4d/pred_intrinsics.txt", "vggt4d/pred_traj.txt"}
+    frame = frame_of(room, 2, resolution)
+    np.testing.assert_array_equal(np.load(tmp_path / "vggt4d/frame_0002.npy"), frame.depth)
+    np.testing.assert_array_equal(np.load(tmp_path / "vggt4d/conf_0002.npy"), frame.confidence)
+    with Image.open(tmp_path / "vggt4d/dynamic_mask_0002.png") as picture:
+        np.testing.assert_array_equal(np.asarray(picture), frame.dynamic_mask * 255)
+    again = Reconstruction.load(tmp_path / "vggt4d", layout="vggt4d", quaternion="xyzw")
+    np.testing.assert_allclose(again.camera_from_world, room.camera_from_world, atol=1e-6)
+    np.testing.assert_allclose(again.intrinsics[2], frame.intrinsics, rtol=1e-6)
+    np.testing.assert_array_equal(again.images[2], frame.image)
+    room.save(tmp_path)
+    assert set(files(tmp_path)) == expected_files(3)  # the folder was part of the earlier result
 
 
 def test_ply_by_hand(tmp_path):
@@ -232,7 +271,7 @@ def test_full_disk_leaves_the_earlier_result_untouched(tmp_path, monkeypatch, wr
     assert {path.name for path in folder.iterdir()} == {name.split("/")[0] for name in files(folder)}
 
 
-@pytest.mark.parametrize("failing", range(0, 18, 3))
+@pytest.mark.parametrize("failing", range(0, 20, 3))
 def test_failure_while_swapping_is_undone(tmp_path, monkeypatch, failing):
     make_room(2).save(tmp_path)
     before = files(tmp_path)
@@ -261,7 +300,7 @@ def test_the_archive_leaves_first_and_arrives_last(tmp_path, monkeypatch):
 
     monkeypatch.setattr(type(tmp_path), "rename", watch)
     make_room(1).save(tmp_path)
-    assert seen == [False] * 17 + [True]
+    assert seen == [False] * 19 + [True]
 
 
 def test_error_of_the_callback_leaves_nothing_behind(tmp_path):

@@ -127,7 +127,7 @@ def test_single_file_is_downloaded_and_converted_once(hub, repository, shapes, e
 
 def test_shards(hub, repository, shapes, expected, config, tmp_path):
     make_checkpoint(repository, shapes, shards=2)
-    assert_equal(load_model(convert("maker/tiny", tmp_path / "out.safetensors", config=config)), expected)
+    assert_equal(load_model(convert("maker/tiny", tmp_path / "out.safetensors", config=config).path), expected)
 
 
 def test_torch_file_where_there_is_nothing_better(hub, repository, shapes, expected, config):
@@ -171,3 +171,13 @@ def test_hub_is_an_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'vggtjax\[hub\]'"):
         locate("maker/tiny")
+
+
+def test_one_of_several_files(hub, repository, shapes, expected, config):
+    for name in ("a_e20.pt", "a_e30.pt"):
+        make_checkpoint(repository / name, shapes, format="pt")
+    assert "holds 2 files of weights (a_e20.pt, a_e30.pt)" in refusal("maker/tiny")
+    model = load_model("maker/tiny/a_e20.pt", config=config)
+    assert_equal(model, expected)
+    assert model.name == "maker/tiny/a_e20.pt"
+    assert "has no file a_e10.pt; expected one of README.md, a_e20.pt, a_e30.pt" in refusal("maker/tiny/a_e10.pt")

@@ -8,7 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.filters import threshold_otsu
 
-from vggtjax.mask import dynamic_pixels, dynamic_tokens, multi_otsu_threshold, otsu_threshold, upsample
+from vggtjax.errors import InputError
+from vggtjax.mask import (
+    dynamic_pixels,
+    dynamic_tokens,
+    mine_mask,
+    multi_otsu_threshold,
+    otsu_threshold,
+    smooth_over_time,
+    upsample,
+)
 
 _otsu = jax.jit(otsu_threshold)
 
@@ -85,3 +94,28 @@ def test_a_token_is_dynamic_if_any_of_its_pixels_is():
     mask = np.zeros((1, 1, 28, 42), bool)
     mask[0, 0, 13, 14] = True
     assert np.asarray(dynamic_tokens(jnp.asarray(mask), 14)).tolist() == [[[[False, True, False], [False] * 3]]]
+
+
+def test_smoothing_over_time_by_hand():
+    saliency = jnp.array([0.0, 3, 0, 0, 9])[None, :, None, None]
+    smoothed = smooth_over_time(saliency, 3)
+    np.testing.assert_allclose(smoothed[0, :, 0, 0], [1.5, 1, 1, 3, 4.5], rtol=1e-6)
+    assert smooth_over_time(saliency, 1) is saliency
+    np.testing.assert_allclose(smooth_over_time(saliency, 99)[0, :, 0, 0], [2.4] * 5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("frames", [0, 2, -3, 1.5])
+def test_smoothing_takes_odd_numbers(frames):
+    with pytest.raises(InputError, match=r"smooth_frames is .*; expected an odd number"):
+        smooth_over_time(jnp.zeros((1, 2, 3, 4)), frames)
+
+
+def test_a_flicker_is_smoothed_away():
+    saliency = np.zeros((1, 7, 2, 2), np.float32)
+    saliency[0, :, 0, 0] = 1
+    saliency[0, 3] = [[0.4, 1], [0, 0]]  # for one frame, the wrong patch
+    tokens = jnp.zeros((1, 7, 4, 3))
+    rough, smooth = (mine_mask(jnp.asarray(saliency), tokens, (28, 28), smooth_frames=n) for n in (1, 5))
+    assert rough[0, 3, 4, 20]
+    assert not smooth[0, 3, 4, 20]
+    assert smooth[0, 3, 4, 4]

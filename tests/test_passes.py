@@ -143,6 +143,7 @@ def test_a_single_frame_is_all_static(params, config, images):
     clip = load_clip(images[0, :1], size=140)
     made = reconstruct(model, clip)
     assert not made.dynamic_mask.any()
+    assert made.saliency is not None
     assert not made.saliency.any()
     assert np.isfinite(made.depth).all()
 

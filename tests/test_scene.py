@@ -6,14 +6,19 @@ import trimesh
 
 from tests.room import WALL, make_room
 from vggtjax.results import point_cloud
+from vggtjax.results.frames import frame_of
 from vggtjax.results.scene import build_scene
 
 
 def load_scene(room, percentile=0.0, **options):
     """Return the scene of a result, through a GLB file."""
-    pixels = point_cloud.confident_pixels(room, percentile)
-    clouds = point_cloud.static_cloud(room, pixels), point_cloud.dynamic_clouds(room, pixels)
-    glb = build_scene(room, *clouds, **options).export(file_type="glb")
+    least = point_cloud.least_confidence(room, percentile)
+    frames = [frame_of(room, number) for number in range(len(room.depth))]
+    static, dynamic = (
+        [point_cloud.frame_cloud(f, f.valid & (f.confidence >= least) & (f.dynamic_mask == own)) for f in frames]
+        for own in (False, True)
+    )
+    glb = build_scene(room, point_cloud.joined(static), dynamic, **options).export(file_type="glb")
     assert isinstance(glb, bytes)
     return trimesh.load_scene(io.BytesIO(glb), file_type="glb")
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import errno
+import hashlib
 import json
 import math
 import tracemalloc
@@ -9,6 +10,7 @@ from itertools import pairwise
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import ml_dtypes
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from converters.torch_to_flax import source_shapes
 from vggtjax import VGGTConfig, forward, load_model, vggt_1b
 from vggtjax.checkpoint import flat_shapes
 from vggtjax.errors import CheckpointError, InputError, OutputError
+from vggtjax.network.model import HEADS
 
 VIRTUAL_TRACKS = "track_head.tracker.updateformer.virual_tracks"
 BIAS = "camera_head.pose_branch.fc1.bias"
@@ -138,22 +141,60 @@ def test_many_problems_make_one_short_message(config, state_dict):
 
 def test_convert_streams_the_same_arrays(state_dict, source, config, tmp_path):
     calls = []
-    out = convert(source, tmp_path / "out" / "ours.safetensors", config=config, progress=lambda *c: calls.append(c))
+    done = convert(source, tmp_path / "out" / "ours.safetensors", config=config, progress=lambda *c: calls.append(c))
+    out, digest = done.path, hashlib.sha256(source.read_bytes()).hexdigest()
     expected: dict[str, Any] = flatten_dict(convert_state_dict(state_dict, config), sep=".")
     with safe_open(out, framework="numpy") as file:
-        assert file.metadata() == {"format": "vggtjax", "version": "1", "config": config.to_json(), "name": "tiny"}
+        known = {"format": "vggtjax", "version": "1", "config": config.to_json(), "name": "tiny"}
+        assert file.metadata() == known | {"origin": json.dumps({"tiny.safetensors": digest})}
         assert set(file.keys()) == set(expected)
         for name, array in expected.items():
             made = file.get_tensor(name)
             assert made.dtype == np.float32
             assert np.array_equal(made, array)
     tensors = len(state_dict) - len(IGNORED)
-    assert calls == [(done, tensors) for done in range(1, tensors + 1)]
+    steps = tensors + -(-source.stat().st_size // 2**20)
+    assert calls == [(step, steps) for step in range(1, steps + 1)]
+    assert done.tensors == tensors
+    assert done.left_out == tuple(IGNORED)
+    assert done.parameters == sum(array.size for array in expected.values())
+    assert (done.bytes, done.dtype, done.sha256) == (out.stat().st_size, "float32", {"tiny.safetensors": digest})
+    assert load_model(out).summary()["sha256 of tiny.safetensors"] == digest
     assert [path.name for path in out.parent.iterdir()] == ["ours.safetensors"]
 
 
+@pytest.mark.parametrize("heads", [("depth", "camera"), ("camera",), ("points", "tracks")])
+def test_convert_some_heads(state_dict, source, config, tmp_path, heads):
+    done = convert(source, tmp_path / "part.safetensors", config=config, heads=heads)
+    model = load_model(done.path)
+    assert set(model.heads) == set(heads)
+    whole = convert_state_dict(state_dict, config)
+    modules = {"backbone", "aggregator", *(HEADS[name] for name in heads)}
+    assert set(model.params) == modules
+    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, {name: whole[name] for name in modules}))
+    prefixes = {"camera": "camera_head", "depth": "depth_head", "points": "point_head", "tracks": "track_head"}
+    absent = {prefix for name, prefix in prefixes.items() if name not in heads}
+    assert {name.split(".")[0] for name in set(done.left_out) - IGNORED} == absent
+    assert done.tensors + len(done.left_out) == len(state_dict)
+
+
+def test_some_heads_of_a_source_that_has_no_others(state_dict, config, tmp_path):
+    camera = {name: value for name, value in state_dict.items() if not name.startswith(("depth", "point_", "track"))}
+    save_file(camera, tmp_path / "camera.safetensors")
+    model = load_model(convert(tmp_path / "camera.safetensors", tmp_path / "x", config=config, heads=["camera"]).path)
+    assert model.heads == ("camera",)
+    with pytest.raises(InputError, match=r"outputs has \['depth'\], and this model has the heads \('camera',\) alone"):
+        forward(model.params, jnp.zeros((1, 2, 56, 56, 3)), model.config)
+    with pytest.raises(CheckpointError, match="it has no depth_head, point_head, track_head: leave their heads out"):
+        convert(tmp_path / "camera.safetensors", tmp_path / "y", config=config)
+    with pytest.raises(InputError, match=r"heads has \['depht'\]; expected some of \('camera'"):
+        convert(tmp_path / "camera.safetensors", tmp_path / "y", config=config, heads=["depht"])
+    with pytest.raises(CheckpointError, match=r"unknown key depth_head\.extra"):  # strict about what is left out, too
+        convert_state_dict(camera | {"depth_head.extra": np.ones(3)}, dataclasses.replace(config, heads=("camera",)))
+
+
 def test_convert_rounds_to_bfloat16(state_dict, source, config, tmp_path):
-    model = load_model(convert(source, tmp_path / "half.safetensors", config=config, dtype="bfloat16"))
+    model = load_model(convert(source, tmp_path / "half.safetensors", config=config, dtype="bfloat16").path)
     expected = convert_state_dict(state_dict, config)
     same = jax.tree.map(lambda a, b: np.array_equal(a, b.astype(ml_dtypes.bfloat16)), model.params, expected)
     assert jax.tree.all(same)
@@ -161,7 +202,7 @@ def test_convert_rounds_to_bfloat16(state_dict, source, config, tmp_path):
 
 
 def test_large_arrays_are_aligned_for_memory_maps(source, config, tmp_path):
-    out = convert(source, tmp_path / "ours.safetensors", config=config)
+    out = convert(source, tmp_path / "ours.safetensors", config=config).path
     content = out.read_bytes()
     length = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + length])
@@ -178,7 +219,7 @@ def test_convert_holds_one_tensor_at_a_time(config, tmp_path):
     save_file({name: np.zeros(shape, np.float32) for name, shape in source_shapes(wide).items()}, source)
     tracemalloc.start()
     try:
-        out = convert(source, tmp_path / "ours.safetensors", config=wide)
+        out = convert(source, tmp_path / "ours.safetensors", config=wide).path
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -220,7 +261,7 @@ def test_golden_forward_through_a_file(golden, shapes, tmp_path):
     meta = json.loads(str(arrays["meta"]))
     config = VGGTConfig(**json.loads((golden / "config.json").read_text()))
     save_file(seeded_state_dict(shapes, meta["seed"]), tmp_path / "torch.safetensors")
-    model = load_model(convert(tmp_path / "torch.safetensors", tmp_path / "ours.safetensors", config=config))
+    model = load_model(convert(tmp_path / "torch.safetensors", tmp_path / "ours.safetensors", config=config).path)
     images = seeded_images(meta["frames"], meta["height"], meta["width"], meta["seed"]).transpose(0, 2, 3, 1)[None]
     made = jax.jit(forward, static_argnames="config")(model.params, images, model.config)
     for name, key in (("pose_encoding", "pose_enc"), ("depth", "depth"), ("depth_confidence", "depth_conf")):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import os
 import re
@@ -21,7 +22,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from vggtjax.config import VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.network.layers import Params
-from vggtjax.network.model import HEADS, parameter_shapes
+from vggtjax.network.model import parameter_shapes
 from vggtjax.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
 
 DType = Literal["float32", "bfloat16"]
@@ -47,6 +48,7 @@ class Model:
     name: str = ""
     path: Path | None = None  # the file that the parameters are in
     trained: bool = True  # False: random parameters, whose results mean nothing
+    origin: Mapping[str, str] = field(default_factory=dict)  # files that it was converted from -> their sha256
 
     @property
     def parameter_count(self) -> int:
@@ -69,7 +71,7 @@ class Model:
     @property
     def heads(self) -> tuple[str, ...]:
         """Names of the heads that the parameters hold."""
-        return tuple(name for name, key in HEADS.items() if key in self.params)
+        return self.config.heads
 
     def summary(self) -> dict[str, Any]:
         """Return what a person asks about a model, as plain values."""
@@ -81,6 +83,7 @@ class Model:
             "bytes": self.parameter_bytes,
             "dtype": self.dtype,
             "heads": list(self.heads),
+            **{f"sha256 of {file}": digest for file, digest in self.origin.items()},
             "pairs": self.config.depth,
             "embed_dim": self.config.embed_dim,
             "num_heads": self.config.num_heads,
@@ -161,6 +164,7 @@ def read_model(path: str | Path, *, dtype: DType | None = None) -> Model:
         unflatten_dict(flat, sep="."),
         name if name.isprintable() and 0 < len(name) <= _MOST_NAME_LETTERS else path.stem,
         path,
+        origin=_origin(metadata.get("origin", "{}")),
     )
 
 
@@ -190,10 +194,16 @@ def write_checkpoint(
     config: VGGTConfig,
     *,
     name: str | None = None,
+    origin: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write a file of this library piece by piece, as `write_tensors` does; return its path."""
+    """Write a file of this library piece by piece, as `write_tensors` does; return its path.
+
+    `origin` names the files that the parameters were converted from and their sha256.
+    """
     path = Path(path)
     metadata = {"format": FORMAT, "version": VERSION, "config": config.to_json(), "name": name or path.stem}
+    if origin:
+        metadata["origin"] = json.dumps(origin)
     write_tensors(path, specs, pieces, metadata)
     return path
 
@@ -247,6 +257,17 @@ def _config(path: Path, metadata: Mapping[str, str]) -> VGGTConfig:
         return VGGTConfig.from_json(text)
     except InputError as error:
         raise CheckpointError(f"{path} cannot be used: its {error}") from error
+
+
+def _origin(text: str) -> dict[str, str]:
+    """Return the sha256 of the files that a model was made of; nothing where the text is not what we write."""
+    try:
+        origin = json.loads(text) if len(text) <= _MOST_CONFIG_LETTERS else {}
+    except (ValueError, RecursionError):
+        return {}
+    pairs = origin.items() if isinstance(origin, dict) else ()
+    known = all(name.isprintable() and re.fullmatch("[0-9a-f]{64}", str(digest)) for name, digest in pairs)
+    return dict(pairs) if known else {}
 
 
 def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:

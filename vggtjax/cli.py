@@ -7,7 +7,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -44,6 +44,7 @@ def reconstruct(
     suppress: Suppress | None = None,
     mask_pairs: int = 5,
     align_scale: bool = False,
+    smooth_frames: int = 1,
     masks: Path | None = None,
     no_masks: tyro.conf.FlagCreatePairsOff[bool] = False,
     refine_mask: tyro.conf.FlagCreatePairsOff[bool] = False,
@@ -51,6 +52,8 @@ def reconstruct(
     tracks: str | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
     confidence_percentile: float = 20.0,
+    resolution: Literal["model", "original"] = "model",
+    layout: Annotated[Literal["vggtjax", "vggt4d"], tyro.conf.arg(name="format")] = "vggtjax",
 ) -> None:
     """Cameras, depth, dynamic masks and a 4-D point cloud of a clip.
 
@@ -70,6 +73,7 @@ def reconstruct(
         suppress: what becomes of the keys of dynamic tokens; the method's own by default.
         mask_pairs: number of pairs of blocks in which they are suppressed.
         align_scale: bring the second pass to the first one's scale before fusing (not in the paper).
+        smooth_frames: odd number of frames that the saliency is averaged over before it is cut (not in the papers).
         masks: folder of pictures, bright where something moves, one per frame; mined from the clip by default.
         no_masks: nothing moves; one pass is enough.
         refine_mask: take out of the mask what agrees with other frames, as vggt4d does.
@@ -78,6 +82,8 @@ def reconstruct(
             wanted, frame, in pixels of the source.
         dtype: of the blocks' matrix products.
         confidence_percentile: leave so many percent of the pixels, the least confident, out of the point clouds.
+        resolution: of the files: the model's, or the source's own, with crop, scale and padding undone.
+        layout: "vggt4d" writes, beside our own files, the folder vggt4d/ in the layout of VGGT4D and MonST3R.
     """
     if not source:
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
@@ -89,6 +95,7 @@ def reconstruct(
     report = Report()
     with report.running():
         _check_early(frames, (start, stride, fps, max_frames), confidence_percentile, out, masks, tracks)
+        _check_odd(smooth_frames)
         loaded = _load_model(report, model, config)
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import load_clip
@@ -124,11 +131,19 @@ def reconstruct(
             suppress=suppress,
             mask_pairs=mask_pairs,
             align_scale=align_scale,
+            smooth_frames=smooth_frames,
             compute_dtype=dtype,
             on_stage=report.stage,
         )
         with report.stage("write") as progress:
-            result.save(out, confidence_percentile=confidence_percentile, progress=progress)
+            result.save(
+                out,
+                confidence_percentile=confidence_percentile,
+                resolution=resolution,
+                layout=layout,
+                pictures=clip.pictures() if resolution == "original" else None,
+                progress=progress,
+            )
     report.summary(result, out, trained=loaded.trained)
     if tracks is not None and model == "demo":
         report.line("The track head of the embedded model is untrained: its tracks show that everything runs, no more.")
@@ -140,22 +155,57 @@ def convert(
     /,
     *,
     config: Path | None = None,
+    heads: str | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
 ) -> None:
-    """Convert a PyTorch VGGT checkpoint to one .safetensors with Flax names.
+    """Convert a PyTorch VGGT checkpoint to one .safetensors with Flax names, and say what was read and written.
 
     Args:
         source: a .safetensors file, a sharded one (its index or folder), a .pt or .pth file, or a hub id.
         destination: the .safetensors file to write.
         config: JSON file with the configuration; VGGT-1B by default.
+        heads: those to convert, such as camera,depth; all of camera,depth,points,tracks by default.
         dtype: of the written weights.
     """
     report = Report()
     with report.running(), report.stage("convert") as progress:
         from converters import convert as run
 
-        run(source, destination, dtype=dtype, config=_read_config(config), progress=progress)
-    report.line(f"wrote {destination} ({destination.stat().st_size / 1e6:.1f} MB)")
+        names = None if heads is None else [name.strip() for name in heads.split(",")]
+        done = run(source, destination, dtype=dtype, config=_read_config(config), heads=names, progress=progress)
+    report.table(done.summary())
+
+
+def import_result(
+    source: tyro.conf.Positional[Path],
+    /,
+    out: Path,
+    *,
+    layout: Annotated[Literal["vggt4d", "monst3r", "cut3r", "da3"], tyro.conf.arg(name="format")],
+    quaternion: Literal["xyzw", "wxyz"] | None = None,
+    confidence_percentile: float = 20.0,
+) -> None:
+    """Read the result folder of another project, and write it as ours: pictures, clouds, a scene to look at.
+
+    Args:
+        source: the folder.
+        out: folder for our files; an earlier result in it is replaced.
+        layout: whose it is.
+        quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw.
+        confidence_percentile: leave so many percent of the pixels, the least confident, out of the point clouds.
+    """
+    report = Report()
+    with report.running():
+        from vggtjax.results.point_cloud import check_percentile
+        from vggtjax.results.reconstruction import Reconstruction
+
+        check_percentile(confidence_percentile)
+        _check_folder(out)
+        with report.stage("read"):
+            result = Reconstruction.load(source, layout=layout, quaternion=quaternion)
+        with report.stage("write") as progress:
+            result.save(out, confidence_percentile=confidence_percentile, progress=progress)
+    report.summary(result, out, trained=True)
 
 
 def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-d") -> None:
@@ -213,6 +263,7 @@ def info(model: tyro.conf.Positional[str] = "demo", /, *, config: Path | None = 
 COMMANDS = {
     "reconstruct": reconstruct,
     "convert": convert,
+    "import": import_result,
     "demo": demo,
     "info": info,
     "train": train,
@@ -272,6 +323,11 @@ def _check_early(
         check_words(tracks)
     check_percentile(confidence_percentile)
     _check_folder(out)
+
+
+def _check_odd(smooth_frames: int) -> None:
+    if smooth_frames < 1 or smooth_frames % 2 == 0:
+        raise InputError(f"--smooth-frames is {smooth_frames}; expected an odd number of frames, such as 3")
 
 
 def _check_folder(out: Path) -> None:

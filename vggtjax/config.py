@@ -12,6 +12,7 @@ from vggtjax.errors import InputError
 
 Gram = Literal["cosine", "dot"]
 Suppress = Literal["zero", "drop"]
+HEAD_NAMES = ("camera", "depth", "points", "tracks")
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ class VGGTConfig:
     track_corr_levels: int = 7
     track_corr_radius: int = 4
     track_position_embedding: bool = False
+    heads: tuple[str, ...] = HEAD_NAMES  # that the model has; a conversion can leave some out
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def __post_init__(self) -> None:
@@ -103,6 +105,9 @@ class VGGTConfig:
             object.__setattr__(self, name, value)
             if len(value) != 4:
                 raise InputError(f"{name} is {value}; expected four numbers")
+        object.__setattr__(self, "heads", tuple(self.heads))
+        if not self.heads or self.heads != tuple(name for name in HEAD_NAMES if name in self.heads):
+            raise InputError(f"heads is {self.heads}; expected at least one of {HEAD_NAMES}, in this order")
         if isinstance(self.motion, Mapping):
             object.__setattr__(self, "motion", MotionConfig(**self.motion))
         if not isinstance(self.motion, MotionConfig):
@@ -111,7 +116,7 @@ class VGGTConfig:
             value = getattr(self, field_.name)
             values = value if isinstance(value, tuple) else (value,)
             lowest = 0 if field_.name in ("taps", "track_corr_radius") else 1
-            if field_.name not in ("motion", "track_position_embedding") and not all(
+            if field_.name not in ("motion", "track_position_embedding", "heads") and not all(
                 type(v) is int and lowest <= v <= 1_000_000 for v in values
             ):
                 raise InputError(f"{field_.name} is {value!r}; expected whole numbers of at least {lowest}")

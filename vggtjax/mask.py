@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.clustering import kmeans
+from vggtjax.errors import InputError
 from vggtjax.methods import Threshold
 from vggtjax.motion import normalise
 
@@ -71,14 +72,25 @@ def mine_mask(
     *,
     clusters: int = 0,
     threshold: Threshold = "otsu",
+    smooth_frames: int = 1,
 ) -> Bool[Array, "B S H W"]:
     """Return a method's dynamic pixels: the saliency, averaged within clusters if there are any, cut at a threshold.
 
     No gradient passes: a mask is a decision.
+
+    Args:
+        saliency: of every patch, in [0, 1].
+        patch_tokens: the backbone's features.
+        size: height and width of the mask.
+        clusters: number of clusters of `smooth_by_clusters`; 0 for none.
+        threshold: "otsu" or "multi-otsu".
+        smooth_frames: frames that the saliency is averaged over before it is cut, an odd number (see
+            `smooth_over_time`; not in the papers).
     """
     saliency, patch_tokens = jax.lax.stop_gradient((saliency, patch_tokens))
     if clusters:
         saliency = smooth_by_clusters(saliency, patch_tokens, clusters)
+    saliency = smooth_over_time(saliency, smooth_frames)
     return dynamic_pixels(saliency, size, threshold=threshold)
 
 
@@ -100,6 +112,23 @@ def smooth_by_clusters(
         return cluster_means(values, labels.reshape(values.shape), clusters)
 
     return jax.lax.map(one_clip, (saliency, patch_tokens.astype(jnp.float32)))
+
+
+def smooth_over_time(saliency: Float[Array, "B S h w"], frames: int) -> Float[Array, "B S h w"]:
+    """Average every patch over so many frames, itself in the middle; at the ends, over those that there are.
+
+    Patches stay where they are in the picture: sensible where the clip is dense and the camera slow.
+
+    Raises InputError for a number that is not odd.
+    """
+    if type(frames) is not int or frames < 1 or frames % 2 == 0:
+        raise InputError(f"smooth_frames is {frames!r}; expected an odd number of frames, such as 3")
+    if frames == 1:
+        return saliency
+    S, reach = saliency.shape[1], frames // 2
+    near = jnp.abs(jnp.arange(S)[:, None] - jnp.arange(S)[None]) <= reach
+    weights = near / near.sum(axis=1, keepdims=True)
+    return jnp.einsum("st,bthw->bshw", weights, saliency, precision="highest")
 
 
 def cluster_means(saliency: Float[Array, "S h w"], labels: Int[Array, "S h w"], clusters: int) -> Float[Array, "S h w"]:

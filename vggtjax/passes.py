@@ -174,6 +174,7 @@ def run_passes(
     compute_dtype: str = "float32",
     clusters: int = 0,
     threshold: Threshold = "otsu",
+    smooth_frames: int = 1,
     second: bool = True,
 ) -> Passes:
     """Run both passes once, sharing the backbone's features; `assemble` makes a method's result of them.
@@ -190,7 +191,7 @@ def run_passes(
         mask_pairs: number of pairs in which they are.
         motion: the table of cues; the configuration's own if None.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
-        clusters, threshold: how the mask is made of the saliency, as for `mine_mask`.
+        clusters, threshold, smooth_frames: how the mask is made of the saliency, as for `mine_mask`.
         second: whether to run the second pass at all.
     """
     patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
@@ -198,7 +199,8 @@ def run_passes(
         params, images, patch_tokens, config, gram=gram, motion=motion, compute_dtype=compute_dtype
     )
     size = (images.shape[2], images.shape[3])
-    mask = mine_mask(saliency, patch_tokens, size, clusters=clusters, threshold=threshold)
+    mining = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames}
+    mask = mine_mask(saliency, patch_tokens, size, **mining)
     if not second:
         return Passes(first, None, saliency, mask)
     masking = {"suppress": suppress, "mask_pairs": mask_pairs, "compute_dtype": compute_dtype}

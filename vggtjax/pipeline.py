@@ -23,7 +23,7 @@ from vggtjax.network.backbone import encode
 from vggtjax.network.layers import Params
 from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass, track_from
 from vggtjax.refinement import refine_masks
-from vggtjax.results.point_cloud import inside_pictures
+from vggtjax.results.frames import inside_pictures
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.tracking import Queries
 
@@ -46,7 +46,7 @@ def _assemble(first, second, saliency, dynamic_mask, *, method: str, align_scale
 
 _encode = jax.jit(encode, static_argnames=("config", "compute_dtype"))
 _first_pass = jax.jit(first_pass, static_argnames=("config", "gram", "motion", "outputs", "compute_dtype"))
-_mine_mask = jax.jit(mine_mask, static_argnames=("size", "clusters", "threshold"))
+_mine_mask = jax.jit(mine_mask, static_argnames=("size", "clusters", "threshold", "smooth_frames"))
 _second_pass = jax.jit(second_pass, static_argnames=("config", "suppress", "mask_pairs", "compute_dtype"))
 _first_pass_with_tracks = jax.jit(
     lambda params, images, patch_tokens, query_points, **options: first_pass(
@@ -62,7 +62,7 @@ _assembled = jax.jit(_assemble, static_argnames=("method", "align_scale"))
 @partial(
     jax.jit,
     static_argnames=(
-        "config", "method", "gram", "suppress", "mask_pairs", "motion", "align_scale", "compute_dtype",
+        "config", "method", "gram", "suppress", "mask_pairs", "motion", "align_scale", "smooth_frames", "compute_dtype",
     ),
 )  # fmt: skip
 def infer(
@@ -76,6 +76,7 @@ def infer(
     mask_pairs: int = 5,
     motion: MotionConfig | None = None,
     align_scale: bool = False,
+    smooth_frames: int = 1,
     compute_dtype: str = "float32",
 ) -> tuple[Assembly, Passes]:
     """Run a method on a batch of clips as one compiled function.
@@ -88,6 +89,7 @@ def infer(
         gram, suppress: override the method's own.
         mask_pairs, motion, compute_dtype: as for `run_passes`.
         align_scale: as for `assemble`.
+        smooth_frames: as for `mine_mask`.
 
     Returns:
         The method's depth, confidence and cameras, and the passes that they were made of.
@@ -104,6 +106,7 @@ def infer(
         compute_dtype=compute_dtype,
         clusters=row.clusters,
         threshold=row.threshold,
+        smooth_frames=smooth_frames,
         second=row.needs_second_pass,
     )
     return assemble(passes, method, align_scale=align_scale), passes
@@ -119,6 +122,7 @@ def reconstruct(
     suppress: Suppress | None = None,
     mask_pairs: int = 5,
     align_scale: bool = False,
+    smooth_frames: int = 1,
     masks: Bool[np.ndarray, "S H W"] | None = None,
     refine_mask: bool | None = None,
     tracks: Queries | None = None,
@@ -136,6 +140,7 @@ def reconstruct(
         gram, suppress: override the method's own similarity and suppression.
         mask_pairs: number of pairs in which the keys of dynamic tokens are suppressed (L_mask of the paper).
         align_scale: bring the second pass to the first one's scale before it is used (not in the paper).
+        smooth_frames: odd number of frames that the saliency is averaged over before it is cut (not in the papers).
         masks: what moves, in place of what is mined; without a moving pixel the second pass is the first.
         refine_mask: take out of the mask what agrees with other frames, by the method's depth and cameras (VGGT4D); the
             method's own choice if None.
@@ -167,6 +172,7 @@ def reconstruct(
         "suppress": suppress or row.suppress,
         "mask_pairs": mask_pairs,
         "align_scale": align_scale,
+        "smooth_frames": smooth_frames,
         "compute_dtype": compute_dtype,
     }
     stages = _stages(config, method, clip.images.shape[1:3], **settings)
@@ -294,13 +300,14 @@ def _stages(
     suppress: Suppress,
     mask_pairs: int,
     align_scale: bool,
+    smooth_frames: int,
     compute_dtype: str,
 ) -> list[Stage]:
     network = {"config": config, "compute_dtype": compute_dtype}
     masking = {"suppress": suppress, "mask_pairs": mask_pairs}
     making = {"method": method, "align_scale": align_scale}
     row = find_method(method)
-    mining = {"size": size, "clusters": row.clusters, "threshold": row.threshold}
+    mining = {"size": size, "clusters": row.clusters, "threshold": row.threshold, "smooth_frames": smooth_frames}
     seen = ("params", "images", "patch_tokens")
     stages = [
         Stage("image features", ("params", "images"), ("patch_tokens",), _encode, network),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -56,6 +56,18 @@ class Clip:
     def from_source(self, frame: int, points: Float[np.ndarray, "... 2"]) -> Float64[np.ndarray, "... 2"]:
         """Return the clip coordinates (x, y) of points given in source coordinates of `frame`."""
         return (_points(points) - self.source_offset[frame]) / self.source_scale[frame]
+
+    def pictures(self) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+        """Yield the upright pictures that the frames were made of, read from the source again.
+
+        Raises ClipError where the source cannot be read any more, or gives other frames than before.
+        """
+        names = []
+        for frame in self.source.frames(self.sampling):
+            names.append(frame.name)
+            if names != self.frame_names[: len(names)]:
+                raise ClipError(f"the source of the clip gives frame {frame.name}, not as before; load the clip anew")
+            yield np.asarray(frame.image)
 
     def refit(self, size: int, patch: int, mode: Mode | None = None) -> Clip:
         """Return the same frames, read from the source again, at another size, patch or mode.

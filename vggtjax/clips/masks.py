@@ -56,7 +56,7 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
 
 
 def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:
-    picture = _moving(path)
+    picture = read_mask(path)
     height, width = clip.source_size[frame]
     if abs(picture.shape[0] * width - picture.shape[1] * height) > max(picture.shape):  # half a pixel is no other shape
         raise ClipError(
@@ -72,7 +72,11 @@ def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:
     return picture[y, x] & inside
 
 
-def _moving(path: Path) -> Bool[np.ndarray, "h w"]:
+def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
+    """Read a picture of what moves: bright and opaque, or with a palette any value but 0.
+
+    Raises ClipError for a file that is no picture, or too dark to be a mask.
+    """
     shown = read_image(path)  # says what is wrong with a file that is no picture
     with Image.open(path, formats=known_formats()) as picture:
         if picture.mode in _LABELS and picture.size == shown.size and not picture.has_transparency_data:

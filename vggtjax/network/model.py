@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.config import Suppress, VGGTConfig
+from vggtjax.config import HEAD_NAMES, Suppress, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.motion import GramCues, Sums
 from vggtjax.network.aggregator import aggregate, declare_aggregator
@@ -23,7 +24,6 @@ from vggtjax.network.track_head import declare_track_head, predict_tracks, small
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
 HEADS = {"camera": "camera_head", **DENSE_HEADS, "tracks": "track_head"}
-OUTPUTS = tuple(HEADS)
 
 
 class Predictions(NamedTuple):
@@ -128,15 +128,16 @@ def forward(
 def parameter_shapes(config: VGGTConfig) -> Params:
     """Return the parameter tree's shapes and dtypes (`jax.ShapeDtypeStruct` leaves) without making any array."""
 
+    declarations = {
+        "camera": declare_camera_head,
+        "depth": partial(declare_dense_head, kind="depth"),
+        "points": partial(declare_dense_head, kind="points"),
+        "tracks": declare_track_head,
+    }
+
     def declare() -> Params:
-        return {
-            "backbone": declare_backbone(config),
-            "aggregator": declare_aggregator(config),
-            "camera_head": declare_camera_head(config),
-            "depth_head": declare_dense_head(config, "depth"),
-            "point_head": declare_dense_head(config, "points"),
-            "track_head": declare_track_head(config),
-        }
+        trunk = {"backbone": declare_backbone(config), "aggregator": declare_aggregator(config)}
+        return trunk | {HEADS[name]: declarations[name](config) for name in config.heads}
 
     return jax.eval_shape(declare)
 
@@ -167,12 +168,14 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
         return jnp.asarray(values, leaf.dtype)
 
     params = jax.tree_util.tree_map_with_path(draw, parameter_shapes(config))
-    start = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]) / ITERATIONS  # every iteration adds it
-    pose = params["camera_head"]["pose_branch"]["fc2"]
-    pose |= {"kernel": 0.1 * pose["kernel"], "bias": jnp.asarray(start, jnp.float32)}
-    for name in DENSE_HEADS.values():  # exp of what comes in at full size would overflow
-        params[name]["regression"]["conv2"]["kernel"] *= 0.01
-    params["track_head"]["flow_projection"]["kernel"] *= 0.01  # tracks start by standing still
+    if "camera" in config.heads:
+        start = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]) / ITERATIONS  # every iteration adds it
+        pose = params["camera_head"]["pose_branch"]["fc2"]
+        pose |= {"kernel": 0.1 * pose["kernel"], "bias": jnp.asarray(start, jnp.float32)}
+    for name in DENSE_HEADS.keys() & set(config.heads):  # exp of what comes in at full size would overflow
+        params[DENSE_HEADS[name]]["regression"]["conv2"]["kernel"] *= 0.01
+    if "tracks" in config.heads:
+        params["track_head"]["flow_projection"]["kernel"] *= 0.01  # tracks start by standing still
     return params
 
 
@@ -187,8 +190,12 @@ def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pa
         raise InputError(f"dynamic_tokens have type {dynamic_tokens.dtype}; expected bool")
     if isinstance(mask_pairs, int | float) and (mask_pairs != int(mask_pairs) or mask_pairs < 0):
         raise InputError(f"mask_pairs is {mask_pairs}; expected a whole number of at least 0")
-    if unknown := [name for name in outputs if name not in OUTPUTS]:
-        raise InputError(f"outputs has {unknown}; expected some of {OUTPUTS}")
+    if unknown := [name for name in outputs if name not in HEAD_NAMES]:
+        raise InputError(f"outputs has {unknown}; expected some of {HEAD_NAMES}")
+    if absent := [name for name in outputs if name not in config.heads]:
+        raise InputError(
+            f"outputs has {absent}, and this model has the heads {config.heads} alone; convert it with them"
+        )
     if suppress not in ("zero", "drop"):
         raise InputError(f"suppress is {suppress!r}; expected 'zero' or 'drop'")
     if compute_dtype not in ("float32", "bfloat16"):

@@ -46,7 +46,23 @@ def read_headers(path: Path) -> dict[str, Header]:
     the message says "it" and leaves naming the file to the caller.
     """
     with _opened(path) as archive:
-        return {name: _read_header(file, member) for name, member, file in _members(archive)}
+        return {name: _read_header(file, member.filename, member.file_size) for name, member, file in _members(archive)}
+
+
+def read_array(path: Path) -> np.ndarray:
+    """Return the array of an .npy file; raises ResultError for what `read_headers` refuses in one of an .npz."""
+    try:
+        with path.open("rb") as file:
+            size = path.stat().st_size
+            if size > SIZE_LIMIT:
+                raise ResultError(f"{path.name} has {size} bytes; expected at most {SIZE_LIMIT}")
+            _read_header(file, path.name, size)
+            file.seek(0)
+            return np.lib.format.read_array(file, allow_pickle=False)
+    except OSError as error:
+        raise ResultError(f"{path.name} cannot be read ({error.strerror or error})") from error
+    except (*_BROKEN, MemoryError) as error:
+        raise ResultError(f"{path.name} is not a whole .npy file ({error})") from error
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -54,7 +70,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
     arrays = {}
     with _opened(path) as archive:
         for name, member, file in _members(archive):
-            _read_header(file, member)
+            _read_header(file, member.filename, member.file_size)
             file.seek(0)
             array = np.lib.format.read_array(file, allow_pickle=False)
             if array.dtype.kind == "U" and (np.atleast_1d(array).view(np.uint32) > sys.maxunicode).any():
@@ -93,21 +109,21 @@ def _members(archive: zipfile.ZipFile) -> Iterator[tuple[str, zipfile.ZipInfo, I
             yield name, member, file
 
 
-def _read_header(file: IO[bytes], member: zipfile.ZipInfo) -> Header:
+def _read_header(file: IO[bytes], name: str, length: int) -> Header:
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
-        raise ResultError(f"{member.filename} has version {version} of the array format; expected (1, 0) or (2, 0)")
+        raise ResultError(f"{name} has version {version} of the array format; expected (1, 0) or (2, 0)")
     shape, fortran_order, dtype = readers[version](file)
     if dtype.hasobject:
-        raise ResultError(f"{member.filename} holds Python objects, which are never loaded")
+        raise ResultError(f"{name} holds Python objects, which are never loaded")
     if not dtype.isnative:
-        raise ResultError(f"{member.filename} has type {dtype}, in the byte order of another machine")
+        raise ResultError(f"{name} has type {dtype}, in the byte order of another machine")
     if fortran_order and len(shape) > 1:
-        raise ResultError(f"{member.filename} is stored by columns; expected rows")
+        raise ResultError(f"{name} is stored by columns; expected rows")
     size = dtype.itemsize
-    for length in shape:
-        size *= length
-    if size != member.file_size - file.tell():
-        raise ResultError(f"{member.filename} is {member.file_size - file.tell()} bytes long; its header says {size}")
+    for side in shape:
+        size *= side
+    if size != length - file.tell():
+        raise ResultError(f"{name} is {length - file.tell()} bytes long; its header says {size}")
     return Header(dtype, shape)

@@ -5,14 +5,25 @@ In the folder, with a frame's number as its file name:
     reconstruction.npz      everything, for `Reconstruction.load`; written last, so its presence says that all is whole
     preview/sheet.png       the clip at a glance
     preview/depth/          inverse depth in colour, one range for the clip
-    preview/overlay/        the dynamic region over the frames
+    preview/overlay/        what moves over the frames, every object in a colour of its own
     depth/                  .npy float32, and 16-bit .png with the one scale of the clip that depth/scale.txt gives
     mask/                   255 where dynamic, else 0
+    instances/              .png with a palette: 0 where nothing moves, else the object's number, the same in all frames
     trajectory.txt          camera poses, TUM format: timestamp tx ty tz qx qy qz qw, world-from-camera
-    intrinsics.txt          fx fy cx cy of every frame, in pixels of the pictures above
+    intrinsics.txt          fx fy cx cy of every frame, in pixels of depth/ and mask/
     static.ply              what stands still, from all frames
     frames/                 .ply of everything that a frame shows
     scene.glb               the clouds and the cameras for a viewer, y up
+
+At the resolution "original" everything that is a file per frame, the clouds and intrinsics.txt are at the size of the
+source's pictures; the archive, the sheet and the tracks' pictures stay at the model's.
+
+With the layout "vggt4d" there is also a folder as VGGT4D and MonST3R write it, with frames from 0:
+
+    vggt4d/frame_0000.png, frame_0000.npy       picture, depth
+    vggt4d/conf_0000.npy, dynamic_mask_0000.png confidence, 255 where dynamic
+    vggt4d/pred_intrinsics.txt      3 x 3 matrices, nine numbers a line
+    vggt4d/pred_traj.txt            as trajectory.txt, with frame numbers for times. Theirs has qw before qx qy qz.
 
 and where points were tracked
 
@@ -25,25 +36,32 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple, get_args
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float32, UInt16
+from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
-from scipy.spatial.transform import Rotation
 
+from vggtjax.errors import InputError
 from vggtjax.files import check_free, staging, writing
-from vggtjax.results import archive, point_cloud, previews, tracks
+from vggtjax.results import archive, foreign, point_cloud, previews, tracks
+from vggtjax.results.frames import Frame, Resolution, frame_of, valid_pixels
 from vggtjax.results.point_cloud import PointCloud
-from vggtjax.results.reconstruction import ARCHIVE_NAME, Reconstruction, is_result
+from vggtjax.results.reconstruction import ARCHIVE_NAME, Layout, Reconstruction, is_result
 from vggtjax.results.scene import build_scene
+from vggtjax.results.trajectory import write_trajectory
 
-_NAMES = ("depth", "mask", "preview", "frames", "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb")
-_SOMETIMES = ("tracks.npz",)
+_NAMES = (
+    "depth", "mask", "instances", "preview", "frames", "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb",
+)  # fmt: skip
+_SOMETIMES = ("tracks.npz", "vggt4d")
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
 _WORKERS = 8
 
@@ -53,11 +71,20 @@ def save(
     folder: str | Path,
     *,
     confidence_percentile: float,
+    resolution: Resolution,
+    layout: Layout,
+    pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None,
     progress: Callable[[int, int], object] | None,
 ) -> None:
     """Write all files of a result; see `Reconstruction.save`."""
     folder = Path(folder)
-    pixels = point_cloud.confident_pixels(reconstruction, confidence_percentile)
+    least = point_cloud.least_confidence(reconstruction, confidence_percentile)
+    for name, value, allowed in (
+        ("resolution", resolution, get_args(Resolution)),
+        ("layout", layout, get_args(Layout)),
+    ):
+        if value not in allowed:
+            raise InputError(f"{name} is {value!r}; expected one of {allowed}")
     check_folder(folder)
     done, total = itertools.count(1), len(reconstruction.depth) + 4
 
@@ -66,8 +93,23 @@ def save(
             progress(next(done), total)
 
     with staging(folder) as staged:
-        _write_files(reconstruction, pixels, staged, advance)
+        frames = _frames(reconstruction, resolution, pictures)
+        _write_files(reconstruction, frames, least, layout, staged, advance)
         _install(staged, folder)
+
+
+def _frames(
+    reconstruction: Reconstruction, resolution: Resolution, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None
+) -> Iterator[Callable[[], Frame]]:
+    """Yield, for each frame, what makes it: pictures are read in order, the rest can be done side by side."""
+    count = len(reconstruction.depth)
+    shown = iter(pictures) if pictures is not None and resolution == "original" else itertools.repeat(None, count)
+    for number in range(count):
+        try:
+            picture = next(shown)
+        except StopIteration:
+            raise InputError(f"there are {number} pictures for {count} frames; expected one for each") from None
+        yield partial(frame_of, reconstruction, number, resolution, picture=picture)
 
 
 def check_folder(folder: Path) -> None:
@@ -105,16 +147,26 @@ def _written(staged: Path) -> list[str]:
 
 
 def _write_files(
-    reconstruction: Reconstruction, pixels: Bool[np.ndarray, "S H W"], folder: Path, advance: Callable[[], None]
+    reconstruction: Reconstruction,
+    frames: Iterator[Callable[[], Frame]],
+    least_confidence: float,
+    layout: Layout,
+    folder: Path,
+    advance: Callable[[], None],
 ) -> None:
     """Write all files into the empty `folder`; `advance` is called after each frame and each of four large files."""
-    write_trajectory(folder / "trajectory.txt", reconstruction)
-    write_intrinsics(folder / "intrinsics.txt", reconstruction)
-    _write_frames(reconstruction, pixels, folder, advance)
-    static = point_cloud.static_cloud(reconstruction, pixels)
+    times, poses = reconstruction.timestamps, reconstruction.world_from_camera
+    times = np.arange(len(poses), dtype=np.float64) if times is None else times  # frame numbers stand for them
+    write_trajectory(folder / "trajectory.txt", poses, times)
+    written = _write_frames(reconstruction, frames, least_confidence, layout, folder, advance)
+    intrinsics = [frame.intrinsics for frame in written]
+    write_intrinsics(folder / "intrinsics.txt", intrinsics, [frame.size for frame in written])
+    if layout == "vggt4d":
+        foreign.write_cameras(folder / "vggt4d", poses, intrinsics)
+    static = point_cloud.joined([frame.static for frame in written])
     write_ply(folder / "static.ply", static)
     advance()
-    build_scene(reconstruction, static, point_cloud.dynamic_clouds(reconstruction, pixels)).export(folder / "scene.glb")
+    build_scene(reconstruction, static, [frame.dynamic for frame in written]).export(folder / "scene.glb")
     advance()
     _write_png(folder / "preview/sheet.png", previews.contact_sheet(reconstruction))
     if reconstruction.track_positions is not None:
@@ -125,37 +177,70 @@ def _write_files(
     advance()
 
 
+class _Written(NamedTuple):
+    """What is left of a frame once its files are written."""
+
+    size: tuple[int, int]  # height, width
+    intrinsics: Float64[np.ndarray, "3 3"]
+    static: PointCloud
+    dynamic: PointCloud
+
+
 def _write_frames(
-    reconstruction: Reconstruction, pixels: Bool[np.ndarray, "S H W"], folder: Path, advance: Callable[[], None]
-) -> None:
+    reconstruction: Reconstruction,
+    frames: Iterator[Callable[[], Frame]],
+    least_confidence: float,
+    layout: Layout,
+    folder: Path,
+    advance: Callable[[], None],
+) -> list[_Written]:
     """Write the files that each frame has of its own, several frames at a time."""
-    for name in ("depth", "mask", "preview/depth", "preview/overlay", "frames"):
+    for name in ("depth", "mask", "instances", "preview/depth", "preview/overlay", "frames"):
         (folder / name).mkdir(parents=True)
-    valid = point_cloud.valid_pixels(reconstruction)
+    if layout == "vggt4d":
+        (folder / "vggt4d").mkdir()
+    valid = valid_pixels(reconstruction)
     scale = depth_scale(reconstruction.depth, valid)
     (folder / "depth/scale.txt").write_text(
         f"# depth = png / scale, one scale for the clip; 0 in the png: no depth\n{scale!r}\n", encoding="utf-8"
     )
     inverse_range = previews.inverse_depth_range(reconstruction.depth, valid)
 
-    def write_frame(frame: int) -> None:
-        name = f"{frame:06d}"
-        depth, mask = reconstruction.depth[frame], reconstruction.dynamic_mask[frame]
-        np.save(folder / f"depth/{name}.npy", depth, allow_pickle=False)
-        _write_png(folder / f"depth/{name}.png", encode_depth(depth, valid[frame], scale), depth_scale=repr(scale))
-        _write_png(folder / f"mask/{name}.png", mask.astype(np.uint8) * 255)
-        _write_png(folder / f"preview/depth/{name}.png", previews.color_depth(depth, valid[frame], inverse_range))
-        _write_png(folder / f"preview/overlay/{name}.png", previews.overlay(reconstruction.images[frame], mask))
-        write_ply(folder / f"frames/{name}.ply", point_cloud.frame_cloud(reconstruction, frame, pixels[frame]))
+    def write_frame(number: int, make: Callable[[], Frame]) -> _Written:
+        name, frame = f"{number:06d}", make()
+        valid, pixels = frame.valid, frame.valid & (frame.confidence >= least_confidence)
+        np.save(folder / f"depth/{name}.npy", frame.depth, allow_pickle=False)
+        _write_png(folder / f"depth/{name}.png", encode_depth(frame.depth, valid, scale), depth_scale=repr(scale))
+        _write_png(folder / f"mask/{name}.png", frame.dynamic_mask.astype(np.uint8) * 255)
+        _write_palette(folder / f"instances/{name}.png", frame.instances)
+        _write_png(folder / f"preview/depth/{name}.png", previews.color_depth(frame.depth, valid, inverse_range))
+        moving = previews.moving_ids(frame.dynamic_mask, frame.instances)
+        _write_png(folder / f"preview/overlay/{name}.png", previews.overlay(frame.image, moving))
+        write_ply(folder / f"frames/{name}.ply", point_cloud.frame_cloud(frame, pixels))
+        if layout == "vggt4d":
+            foreign.write_frame(folder / "vggt4d", number, frame)
+        static, dynamic = (
+            point_cloud.frame_cloud(frame, pixels & (frame.dynamic_mask == own)) for own in (False, True)
+        )
+        return _Written((frame.depth.shape[0], frame.depth.shape[1]), frame.intrinsics, static, dynamic)
 
-    with ThreadPoolExecutor(min(_WORKERS, os.cpu_count() or 1)) as pool:
+    written: list[_Written] = []
+    workers = min(_WORKERS, os.cpu_count() or 1)
+    with ThreadPoolExecutor(workers) as pool:
+        running: deque[Future[_Written]] = deque()
         try:
-            for written in as_completed([pool.submit(write_frame, frame) for frame in range(len(valid))]):
-                written.result()
+            for number, make in enumerate(frames):
+                running.append(pool.submit(write_frame, number, make))
+                if len(running) > workers:  # no more than so many pictures of the source at a time
+                    written.append(running.popleft().result())
+                    advance()
+            while running:
+                written.append(running.popleft().result())
                 advance()
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
+    return written
 
 
 def _write_tracks(reconstruction: Reconstruction, folder: Path) -> None:
@@ -184,27 +269,25 @@ def encode_depth(
     return np.where(valid, value.round().clip(1, 65535), 0).astype(np.uint16)
 
 
-def write_trajectory(path: Path, reconstruction: Reconstruction) -> None:
-    """Write poses in TUM format; without timestamps the frame numbers stand for them."""
-    poses = reconstruction.world_from_camera.astype(np.float64)
-    times = reconstruction.timestamps if reconstruction.timestamps is not None else np.arange(len(poses))
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)  # xyzw, w at least 0
-    header = "timestamp tx ty tz qx qy qz qw (world-from-camera)"
-    rows = np.column_stack([times, poses[:, :3, 3], quaternions])
-    np.savetxt(path, rows, fmt=["%.6f"] + ["%.9g"] * 7, header=header, encoding="utf-8")
-
-
-def write_intrinsics(path: Path, reconstruction: Reconstruction) -> None:
-    """Write one line of fx fy cx cy per frame."""
-    height, width = reconstruction.depth.shape[1:]
-    rows = reconstruction.intrinsics[:, [0, 1, 0, 1], [0, 1, 2, 2]]
-    header = f"fx fy cx cy in pixels of {width} x {height}"
-    np.savetxt(path, rows, fmt="%.9g", header=header, encoding="utf-8")
+def write_intrinsics(
+    path: Path, intrinsics: Sequence[Float[np.ndarray, "3 3"]], sizes: Sequence[tuple[int, int]]
+) -> None:
+    """Write one line of fx fy cx cy per frame; `sizes` are height and width of the pictures that they are pixels of."""
+    rows = np.stack(intrinsics)[:, [0, 1, 0, 1], [0, 1, 2, 2]]
+    height, width = sizes[0]
+    of = f"{width} x {height}" if len(set(sizes)) == 1 else "each frame's depth"
+    np.savetxt(path, rows, fmt="%.9g", header=f"fx fy cx cy in pixels of {of}", encoding="utf-8")
 
 
 def write_ply(path: Path, cloud: PointCloud) -> None:
     """Write a cloud as binary PLY with float32 positions and 8-bit colours; it may be empty."""
     trimesh.PointCloud(cloud.points, cloud.colors).export(path, file_type="ply")
+
+
+def _write_palette(path: Path, ids: UInt8[np.ndarray, "H W"]) -> None:
+    picture = Image.fromarray(ids)
+    picture.putpalette(previews.INSTANCE_COLORS.ravel().tolist())
+    picture.save(path, compress_level=_PNG_LEVEL)
 
 
 def _write_png(path: Path, pixels: np.ndarray, **texts: str) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from vggtjax.errors import InputError
-from vggtjax.results import geometry
+from vggtjax.results.frames import Frame, valid_pixels
 from vggtjax.results.reconstruction import Reconstruction
 
 
@@ -23,61 +24,32 @@ class PointCloud:
         return len(self.points)
 
 
-def inside_pictures(reconstruction: Reconstruction) -> Bool[np.ndarray, "S H W"]:
-    """Return the pixels that are not padding."""
-    rows, columns = np.arange(reconstruction.depth.shape[1])[:, None], np.arange(reconstruction.depth.shape[2])
-    left, top, right, bottom = reconstruction.valid_box.T[:, :, None, None]
-    return (left <= columns) & (columns < right) & (top <= rows) & (rows < bottom)
-
-
-def valid_pixels(reconstruction: Reconstruction) -> Bool[np.ndarray, "S H W"]:
-    """Return the pixels that show a point: not padding, with a finite depth above 0 and a finite confidence."""
-    depth, inside = reconstruction.depth, inside_pictures(reconstruction)
-    return inside & np.isfinite(depth) & (depth > 0) & np.isfinite(reconstruction.depth_confidence)
-
-
 def check_percentile(confidence_percentile: float) -> None:
     """Raise InputError for a percentile outside [0, 100)."""
     if not 0 <= confidence_percentile < 100:
         raise InputError(f"confidence_percentile is {confidence_percentile}; expected at least 0 and below 100")
 
 
-def confident_pixels(reconstruction: Reconstruction, confidence_percentile: float) -> Bool[np.ndarray, "S H W"]:
-    """Return the valid pixels less the `confidence_percentile` percent with the lowest confidence of the clip.
+def least_confidence(reconstruction: Reconstruction, confidence_percentile: float) -> float:
+    """Return the confidence that `confidence_percentile` percent of the clip's valid pixels do not reach.
 
-    The percentile is taken over the valid pixels of all frames together; pixels that equal it stay.
+    The percentile is taken over all frames together, at the model's size; 0 where no pixel is valid.
     Raises InputError for a percentile outside [0, 100).
     """
     check_percentile(confidence_percentile)
-    valid = valid_pixels(reconstruction)
-    if not valid.any():
-        return valid
-    confidence = reconstruction.depth_confidence
-    return valid & (confidence >= np.percentile(confidence[valid], confidence_percentile))
+    confidence = reconstruction.depth_confidence[valid_pixels(reconstruction)]
+    return float(np.percentile(confidence, confidence_percentile)) if confidence.size else 0.0
 
 
-def frame_cloud(reconstruction: Reconstruction, frame: int, pixels: Bool[np.ndarray, "H W"]) -> PointCloud:
-    """Return the points of the chosen pixels of one frame, less those too far away for float32."""
-    points = geometry.unproject(
-        reconstruction.depth[frame : frame + 1],
-        reconstruction.intrinsics[frame : frame + 1],
-        reconstruction.camera_from_world[frame : frame + 1],
-        pixel_offset=0.5,
-    )[0][pixels]
+def frame_cloud(frame: Frame, pixels: Bool[np.ndarray, "h w"]) -> PointCloud:
+    """Return the points of the chosen pixels of a frame, less those too far away for float32."""
+    points = frame.world_points()[pixels]
     finite = np.isfinite(points).all(axis=-1)
-    return PointCloud(points[finite], reconstruction.images[frame][pixels][finite])
+    return PointCloud(points[finite], frame.image[pixels][finite])
 
 
-def static_cloud(reconstruction: Reconstruction, pixels: Bool[np.ndarray, "S H W"]) -> PointCloud:
-    """Return the points of the chosen pixels of all frames that are not dynamic."""
-    static = pixels & ~reconstruction.dynamic_mask
-    clouds = [frame_cloud(reconstruction, frame, chosen) for frame, chosen in enumerate(static)]
+def joined(clouds: Sequence[PointCloud]) -> PointCloud:
+    """Return the points of all clouds, one after the other."""
     return PointCloud(
         np.concatenate([cloud.points for cloud in clouds]), np.concatenate([cloud.colors for cloud in clouds])
     )
-
-
-def dynamic_clouds(reconstruction: Reconstruction, pixels: Bool[np.ndarray, "S H W"]) -> list[PointCloud]:
-    """Return, for each frame, the points of the chosen pixels that are dynamic."""
-    dynamic = pixels & reconstruction.dynamic_mask
-    return [frame_cloud(reconstruction, frame, chosen) for frame, chosen in enumerate(dynamic)]

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from colorsys import hsv_to_rgb
+
 import numpy as np
 from cmap import Colormap
 from jaxtyping import Bool, Float32, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from skimage.segmentation import find_boundaries
 
-from vggtjax.results.point_cloud import valid_pixels
+from vggtjax.results.frames import valid_pixels
 from vggtjax.results.reconstruction import Reconstruction
 
 _DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm
 _SALIENCY_COLORS = (Colormap("inferno").lut(256)[:, :3] * 255).round().astype(np.uint8)
 _NO_DEPTH = np.array([40, 40, 46], np.uint8)
-_TINT = np.array([255, 40, 90], np.float32)
+# Of objects by id: hues that the golden ratio keeps apart; black for what is none.
+INSTANCE_COLORS = np.array(
+    [(0, 0, 0), (255, 40, 90)]
+    + [tuple(round(255 * c) for c in hsv_to_rgb((0.96 + 0.618034 * i) % 1, 0.84, 1)) for i in range(1, 255)],
+    np.uint8,
+)
 _OUTLINE = np.array([255, 235, 60], np.uint8)
 
 _SHEET_FRAMES = 8
@@ -45,16 +52,29 @@ def color_depth(
     return np.where(valid[..., None], _DEPTH_COLORS[(level * 255).round().astype(np.uint8)], _NO_DEPTH)
 
 
-def overlay(image: UInt8[np.ndarray, "H W 3"], mask: Bool[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Tint and outline the region of `mask`; the rest loses half of its colour, so that the tint shows on any hue."""
+def overlay(
+    image: UInt8[np.ndarray, "H W 3"],
+    moving: Bool[np.ndarray, "H W"] | UInt8[np.ndarray, "H W"],
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Tint and outline what moves, a mask or objects by id, each in a colour of its own.
+
+    The rest loses half of its colour, so that the tint shows on any hue.
+    """
     grey = image.mean(axis=-1, keepdims=True)
-    drawn = np.where(mask[..., None], 0.55 * image + 0.45 * _TINT, 0.5 * image + 0.5 * grey).round().astype(np.uint8)
-    drawn[find_boundaries(mask, mode="thick")] = _OUTLINE
+    ids = moving.astype(np.uint8)
+    tinted = 0.55 * image + 0.45 * INSTANCE_COLORS[ids]
+    drawn = np.where(ids[..., None] > 0, tinted, 0.5 * image + 0.5 * grey).round().astype(np.uint8)
+    drawn[find_boundaries(ids, mode="thick")] = _OUTLINE
     return drawn
 
 
+def moving_ids(mask: Bool[np.ndarray, ...], instances: UInt8[np.ndarray, ...]) -> UInt8[np.ndarray, ...]:
+    """Return the objects' ids, and the last of all where something moves that is too small for an object."""
+    return np.where(mask & (instances == 0), len(INSTANCE_COLORS) - 1, instances).astype(np.uint8)
+
+
 def contact_sheet(reconstruction: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw up to eight frames, evenly spread: columns of picture, depth, saliency and dynamic mask."""
+    """Draw up to eight frames, evenly spread: columns of picture, depth, saliency where known, and what moves."""
     frames, height, width = reconstruction.depth.shape
     shown = np.linspace(0, frames - 1, min(frames, _SHEET_FRAMES)).round().astype(int)
     scale = min(_THUMBNAIL[0] / width, _THUMBNAIL[1] / height, _SHEET_WIDTH / len(shown) / width)
@@ -62,23 +82,29 @@ def contact_sheet(reconstruction: Reconstruction) -> UInt8[np.ndarray, "height w
     step_x, step_y = size[0] + _GAP, size[1] + _GAP
     left, top = _MARGIN + _LABEL_WIDTH, _MARGIN + _HEADER_HEIGHT
 
+    labels = tuple(_thumbnails(reconstruction, 0, np.zeros((height, width, 3), np.uint8), size))
+
     sheet_width = max(left + len(shown) * step_x - _GAP, _TITLE_WIDTH) + _MARGIN
-    sheet = Image.new("RGB", (sheet_width, top + 4 * step_y - _GAP + _MARGIN), BACKGROUND)
+    sheet = Image.new("RGB", (sheet_width, top + len(labels) * step_y - _GAP + _MARGIN), BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     large, small = ImageFont.load_default(22), ImageFont.load_default(15)
     draw.text((_MARGIN, _MARGIN), f"{reconstruction.method}  ·  {reconstruction.model_name}", TEXT, large)
     count = f"{frames} frame{'s' if frames > 1 else ''} of {width} x {height} pixels"
     draw.text((_MARGIN, _MARGIN + 30), count, FAINT, small)
 
-    share = f"{reconstruction.dynamic_mask.mean():.1%} of pixels"
-    for row, label in enumerate(("Picture", "Depth", "Saliency", "Dynamic")):
-        draw.text((_MARGIN, top + row * step_y), label, TEXT, small)
-    draw.text((_MARGIN, top + 3 * step_y + 22), share, FAINT, small)
-    for row, colors, lowest, highest in ((1, _DEPTH_COLORS, "far", "near"), (2, _SALIENCY_COLORS, "0", "1")):
+    objects = int(reconstruction.instances.max())
+    notes = (f"{reconstruction.dynamic_mask.mean():.1%} of pixels", f"{objects} object{'' if objects == 1 else 's'}")
+    legends = {"Depth": (_DEPTH_COLORS, "far", "near"), "Saliency": (_SALIENCY_COLORS, "0", "1")}
+    for row, label in enumerate(labels):
         y = top + row * step_y
-        sheet.paste(Image.fromarray(colors[None]).resize((_LEGEND_WIDTH, 10)), (_MARGIN, y + 24))
-        draw.text((_MARGIN, y + 38), lowest, FAINT, small)
-        draw.text((_MARGIN + _LEGEND_WIDTH, y + 38), highest, FAINT, small, "ra")
+        draw.text((_MARGIN, y), label, TEXT, small)
+        if label in legends:
+            colors, lowest, highest = legends[label]
+            sheet.paste(Image.fromarray(colors[None]).resize((_LEGEND_WIDTH, 10)), (_MARGIN, y + 24))
+            draw.text((_MARGIN, y + 38), lowest, FAINT, small)
+            draw.text((_MARGIN + _LEGEND_WIDTH, y + 38), highest, FAINT, small, "ra")
+        if label == "Dynamic":
+            draw.text((_MARGIN, y + 22), "\n".join(notes), FAINT, small)
 
     valid = valid_pixels(reconstruction)
     inverse_range = inverse_depth_range(reconstruction.depth, valid)
@@ -87,22 +113,21 @@ def contact_sheet(reconstruction: Reconstruction) -> UInt8[np.ndarray, "height w
         time = "" if reconstruction.timestamps is None else f"  ·  {reconstruction.timestamps[frame]:.2f} s"
         draw.text((x, top - 24), f"frame {frame}{time}", FAINT, small)
         depth = color_depth(reconstruction.depth[frame], valid[frame], inverse_range)
-        for row, thumbnail in enumerate(_thumbnails(reconstruction, int(frame), depth, size)):
+        for row, thumbnail in enumerate(_thumbnails(reconstruction, int(frame), depth, size).values()):
             sheet.paste(thumbnail, (x, top + row * step_y))
     return np.asarray(sheet)
 
 
 def _thumbnails(
     reconstruction: Reconstruction, frame: int, depth: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]
-) -> tuple[Image.Image, ...]:
+) -> dict[str, Image.Image]:
     """Return one column of the sheet, from top to bottom."""
     picture = Image.fromarray(reconstruction.images[frame]).resize(size, Image.Resampling.LANCZOS)
-    saliency = np.nan_to_num(reconstruction.saliency[frame]).clip(0, 1)
-    saliency = np.asarray(Image.fromarray(saliency).resize(size, Image.Resampling.BILINEAR))
-    mask = np.asarray(Image.fromarray(reconstruction.dynamic_mask[frame]).resize(size, Image.Resampling.NEAREST))
-    return (
-        picture,
-        Image.fromarray(depth).resize(size, Image.Resampling.LANCZOS),
-        Image.fromarray(_SALIENCY_COLORS[(saliency * 255).round().astype(np.uint8)]),
-        Image.fromarray(overlay(np.asarray(picture), mask)),
-    )
+    column = {"Picture": picture, "Depth": Image.fromarray(depth).resize(size, Image.Resampling.LANCZOS)}
+    if reconstruction.saliency is not None:
+        saliency = np.nan_to_num(reconstruction.saliency[frame]).clip(0, 1)
+        saliency = np.asarray(Image.fromarray(saliency).resize(size, Image.Resampling.BILINEAR))
+        column["Saliency"] = Image.fromarray(_SALIENCY_COLORS[(saliency * 255).round().astype(np.uint8)])
+    moving = Image.fromarray(moving_ids(reconstruction.dynamic_mask[frame], reconstruction.instances[frame]))
+    moving = np.asarray(moving.resize(size, Image.Resampling.NEAREST))
+    return column | {"Dynamic": Image.fromarray(overlay(np.asarray(picture), moving))}

@@ -4,16 +4,23 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from vggtjax.errors import ResultError
 from vggtjax.results import archive, geometry
+
+if TYPE_CHECKING:
+    from vggtjax.results.frames import Resolution
+    from vggtjax.results.trajectory import Quaternion
+
+Layout = Literal["vggtjax", "vggt4d"]  # of a folder of files
 
 ARCHIVE_NAME = "reconstruction.npz"
 _FORMAT_VERSION = 1
@@ -38,7 +45,7 @@ _ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
     "track_frames": (np.int64, ("Q",)),
 }
 _TRACKS = frozenset(name for name in _ARRAYS if name.startswith("track_"))  # all there, or none
-_OPTIONAL = _TRACKS | {"timestamps"}
+_OPTIONAL = _TRACKS | {"timestamps", "saliency"}
 _STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": (), "model_name": (), "settings": ()}
 
 
@@ -56,7 +63,7 @@ class Reconstruction:
 
     depth: Float32[np.ndarray, "S H W"]  # z in the camera, up to scale
     depth_confidence: Float32[np.ndarray, "S H W"]  # above 0; higher is surer; compare by rank, not by value
-    saliency: Float32[np.ndarray, "S h w"]  # motion of each patch, in [0, 1]
+    saliency: Float32[np.ndarray, "S h w"] | None  # motion of each patch, in [0, 1], where known
     dynamic_mask: Bool[np.ndarray, "S H W"]
     camera_from_world: Float32[np.ndarray, "S 3 4"]  # OpenCV axes: x right, y down, z forward
     intrinsics: Float32[np.ndarray, "S 3 3"]  # pixels of H x W
@@ -129,6 +136,13 @@ class Reconstruction:
                 f"top < bottom inside {width} x {height} pixels"
             )
 
+    @cached_property
+    def instances(self) -> UInt8[np.ndarray, "S H W"]:
+        """Moving objects apart: 0 where nothing moves, else the same id in all frames; see `find_instances`."""
+        from vggtjax.instances import find_instances
+
+        return find_instances(self.dynamic_mask)
+
     @property
     def camera_centres(self) -> Float32[np.ndarray, "S 3"]:
         """Centres of the cameras in the world."""
@@ -152,6 +166,9 @@ class Reconstruction:
         folder: str | Path,
         *,
         confidence_percentile: float = 20.0,
+        resolution: Resolution = "model",
+        layout: Layout = "vggtjax",
+        pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None,
         progress: Callable[[int, int], object] | None = None,
     ) -> None:
         """Write the result into `folder`, made if missing; see vggtjax.results.export for the files.
@@ -160,12 +177,24 @@ class Reconstruction:
         stay. Point clouds leave out the `confidence_percentile` percent of pixels with the lowest confidence.
         `progress(done, total)` is called as files are written.
 
-        Raises InputError for a percentile outside [0, 100), and OutputError where the folder cannot be written or
-        holds files of the same names that are not an earlier result.
+        With `resolution="original"` the files of single frames, the clouds and the intrinsics are at the source's size,
+        in the colours of `pictures` (`Clip.pictures()`), or of the model's frames enlarged. `layout="vggt4d"` adds the
+        folder vggt4d/ with what VGGT4D and MonST3R write.
+
+        Raises InputError for a percentile outside [0, 100), an unknown name or pictures that do not fit, and
+        OutputError where the folder cannot be written or holds files of the same names that are not an earlier result.
         """
         from vggtjax.results import export
 
-        export.save(self, folder, confidence_percentile=confidence_percentile, progress=progress)
+        export.save(
+            self,
+            folder,
+            confidence_percentile=confidence_percentile,
+            resolution=resolution,
+            layout=layout,
+            pictures=pictures,
+            progress=progress,
+        )
 
     def save_archive(self, path: Path) -> None:
         """Write everything but `passes` to one compressed .npz file, which `load` reads back."""
@@ -175,18 +204,32 @@ class Reconstruction:
         archive.write_arrays(path, arrays | {"format_version": np.array(_FORMAT_VERSION)})
 
     @classmethod
-    def load(cls, path: str | Path) -> Reconstruction:
-        """Read a result back from its folder, or from its reconstruction.npz.
+    def load(cls, path: str | Path, *, layout: str = "vggtjax", quaternion: Quaternion | None = None) -> Reconstruction:
+        """Read a result back from its folder, or from its reconstruction.npz; or the folder of another project.
 
-        Raises ResultError for anything but a whole result of a known version.
+        Args:
+            path: the folder or file.
+            layout: "vggtjax", or "vggt4d", "monst3r", "cut3r", "da3"; vggtjax.results.foreign says what they are.
+                What such a folder lacks is replaced by plain values (confidence 1, nothing moves, grey pictures), with
+                a warning logged and named in `settings["missing"]`; the saliency is None.
+            quaternion: for "vggt4d" and "monst3r", the order of the quaternions in pred_traj.txt: "wxyz" as these
+                projects write it, "xyzw" as TUM and this library do.
+
+        Raises:
+            ResultError: anything but a whole result, of a known version.
+            InputError: an unknown layout, or a quaternion order that is missing or unknown.
         """
         path = Path(path)
+        if layout != "vggtjax":
+            from vggtjax.results.foreign import load_foreign
+
+            return load_foreign(path, layout, quaternion)
         file = path / ARCHIVE_NAME if path.is_dir() else path
         if not file.is_file():
             raise ResultError(f"there is no {file}; give the folder of a saved result or its {ARCHIVE_NAME}")
         try:
             _check_headers(archive.read_headers(file))
-            fields: dict[str, Any] = {"timestamps": None, **archive.read_arrays(file)}
+            fields: dict[str, Any] = {"timestamps": None, "saliency": None, **archive.read_arrays(file)}
             version = int(fields.pop("format_version"))
             if version != _FORMAT_VERSION:
                 raise ResultError(f"it has format version {version}; expected {_FORMAT_VERSION}")
@@ -219,7 +262,7 @@ def _check_headers(headers: Mapping[str, archive.Header]) -> None:
     if version is None or version != (np.dtype(np.int64), ()):
         raise ResultError("it has no format version")
     expected = {"format_version", *_ARRAYS, *_STRINGS}
-    optional = {"timestamps"} if _TRACKS & set(headers) else _OPTIONAL
+    optional = _OPTIONAL - _TRACKS if _TRACKS & set(headers) else _OPTIONAL
     wrong = sorted((expected - optional - set(headers)) | (set(headers) - expected))
     if wrong:
         raise ResultError(f"arrays are missing or unknown: {', '.join(wrong)}")
@@ -234,10 +277,11 @@ def _check_headers(headers: Mapping[str, archive.Header]) -> None:
 def _check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:
     """Raise ResultError unless every shape is as the tables say."""
     for name in ("depth", "saliency"):
-        if len(shapes[name]) != 3 or 0 in shapes[name]:
+        if name in shapes and (len(shapes[name]) != 3 or 0 in shapes[name]):
             raise ResultError(f"{name} has shape {shapes[name]}; expected (frames, rows, columns), none of them 0")
     sizes: dict[str | int, int] = dict(zip("SHW", shapes["depth"], strict=True))
-    sizes |= dict(zip("hw", shapes["saliency"][1:], strict=True))
+    if "saliency" in shapes:
+        sizes |= dict(zip("hw", shapes["saliency"][1:], strict=True))
     if there := _TRACKS & set(shapes):
         if missing := sorted(_TRACKS - there):
             raise ResultError(f"tracks lack {', '.join(missing)}")
@@ -249,7 +293,7 @@ def _check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:
         expected = tuple(sizes.get(dimension, dimension) for dimension in dimensions)
         if shape != expected:
             raise ResultError(f"{name} has shape {shape}; expected {expected} to go with depth {shapes['depth']}")
-    if sizes["H"] % sizes["h"] or sizes["W"] % sizes["w"]:
+    if "saliency" in shapes and (sizes["H"] % sizes["h"] or sizes["W"] % sizes["w"]):
         raise ResultError(
             f"saliency has {sizes['h']} x {sizes['w']} patches, which do not divide {sizes['H']} x {sizes['W']} pixels"
         )

@@ -32,8 +32,9 @@ from PIL import Image
 
 from vggtjax.errors import InputError, OutputError
 from vggtjax.files import staging, writing
-from vggtjax.results.export import encode_depth, write_intrinsics, write_trajectory
+from vggtjax.results.export import encode_depth, write_intrinsics
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.trajectory import write_trajectory
 from vggtjax.scenes.held_out import Kind
 from vggtjax.scenes.render import SyntheticClip, generate
 from vggtjax.scenes.scene import SceneConfig
@@ -204,8 +205,9 @@ def _write_index(out: Path, index: dict[str, Any]) -> None:
 def _write_scene(folder: Path, clip: SyntheticClip) -> None:
     """Write a clip [S, ...] of numpy arrays into the empty `folder`."""
     truth = _as_result(clip)
-    write_trajectory(folder / "trajectory.txt", truth)
-    write_intrinsics(folder / "intrinsics.txt", truth)
+    S, H, W = truth.depth.shape
+    write_trajectory(folder / "trajectory.txt", truth.world_from_camera, np.arange(S, dtype=np.float64))
+    write_intrinsics(folder / "intrinsics.txt", list(truth.intrinsics), [(H, W)] * S)
     np.save(folder / "part_poses.npy", clip.world_from_part.astype(np.float32), allow_pickle=False)
     for name in ("images", "depth", "mask", "parts", "flow"):
         (folder / name).mkdir()

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.room import make_room
 from vggtjax import Clip, Reconstruction, load_clip
 from vggtjax.errors import InputError
-from vggtjax.results.resolution import SAME_SURFACE, enlarged_depth, source_frame
+from vggtjax.results.frames import SAME_SURFACE, enlarged_depth, frame_of, valid_pixels
 
 
 def result_of(clip: Clip) -> Reconstruction:
@@ -46,7 +47,7 @@ CASES = [((90, 160), "crop"), ((160, 90), "crop"), ((90, 160), "pad"), ((160, 90
 def test_points_project_to_the_same_pixels_through_both(size, mode):
     clip = load_clip(np.zeros((2, *size, 3), np.uint8), size=56, mode=mode)
     result = result_of(clip)
-    frame = source_frame(result, 1)
+    frame = frame_of(result, 1, "original")
     points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], size=(50, 3))
     local = points @ result.camera_from_world[1, :, :3].T + result.camera_from_world[1, :, 3]
     small, large = ((local @ K.T)[:, :2] / local[:, 2:] for K in (result.intrinsics[1].astype(float), frame.intrinsics))
@@ -57,7 +58,7 @@ def test_points_project_to_the_same_pixels_through_both(size, mode):
 def test_depth_and_masks_lie_where_they_belong(size, mode):
     clip = load_clip(np.zeros((2, *size, 3), np.uint8), size=56, mode=mode)
     result = result_of(clip)
-    frame = source_frame(result, 0)
+    frame = frame_of(result, 0, "original")
     assert frame.depth.shape == frame.dynamic_mask.shape == frame.seen.shape == size
     y, x = np.nonzero(frame.seen)
     places = clip.from_source(0, np.stack([x + 0.5, y + 0.5], axis=-1))
@@ -78,7 +79,7 @@ def test_depth_and_masks_lie_where_they_belong(size, mode):
 def test_points_are_those_of_the_small_result():
     clip = load_clip(np.zeros((1, 90, 160, 3), np.uint8), size=56)
     result = dataclasses.replace(result_of(clip), depth=np.full((1, *clip.images.shape[1:3]), 3, np.float32))
-    points = source_frame(result, 0).world_points()
+    points = frame_of(result, 0, "original").world_points()
     small = result.world_points()[0]
     scale, offset = clip.source_scale[0], clip.source_offset[0]
     for row, column in ((4, 7), (20, 30)):
@@ -99,7 +100,48 @@ def test_no_depth_is_invented_between_surfaces(side, count, seed):
         assert any(abs(value - one) <= SAME_SURFACE * one for one in known[np.isfinite(known)]) or np.isinf(value)
 
 
+def test_valid_pixels_by_hand():
+    room = make_room()
+    depth, confidence = room.depth.copy(), room.depth_confidence.copy()
+    depth[0, 0, :4] = (np.inf, np.nan, 0, -1)
+    confidence[1, 0, :2] = (np.inf, np.nan)
+    box = room.valid_box.copy()
+    box[2] = (3, 5, 40, 27)
+    room = make_room(depth=depth, depth_confidence=confidence, valid_box=box)
+    expected = np.ones_like(room.dynamic_mask)
+    expected[0, 0, :4] = expected[1, 0, :2] = False
+    expected[2] = False
+    expected[2, 5:27, 3:40] = True
+    np.testing.assert_array_equal(valid_pixels(room), expected)
+    np.testing.assert_array_equal(np.stack([frame_of(room, number).valid for number in range(3)]), expected)
+
+
+def test_pictures_are_those_of_the_source_or_else_enlarged():
+    picture = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8).repeat(5, axis=0).repeat(5, axis=1)
+    clip = load_clip(picture[None], size=112)
+    result = result_of(clip)
+    given = next(clip.pictures())
+    np.testing.assert_array_equal(given, picture)
+    assert frame_of(result, 0, "original", picture=given).image is given
+    enlarged = frame_of(result, 0, "original").image.astype(float)
+    assert np.corrcoef(enlarged.ravel(), picture.ravel())[0, 1] > 0.9
+    for shift in (-3, 3):  # where it belongs, to a pixel or so
+        assert abs(np.roll(enlarged, shift, axis=1) - picture).mean() > abs(enlarged - picture).mean()
+    with pytest.raises(InputError, match=r"the picture of frame 0 is \(30, 40, 3\); expected \(150, 200, 3\)"):
+        frame_of(result, 0, "original", picture=picture[::5, ::5])
+
+
+def test_objects_keep_their_ids_at_the_sources_size():
+    clip = load_clip(np.zeros((2, 90, 160, 3), np.uint8), size=56)
+    result = result_of(clip)
+    frame = frame_of(result, 1, "original")
+    np.testing.assert_array_equal(frame.instances, frame.dynamic_mask.astype(np.uint8))
+
+
 def test_a_frame_that_is_not_there():
     clip = load_clip(np.zeros((2, 56, 56, 3), np.uint8), size=56)
-    with pytest.raises(InputError, match="frame is 2; expected 0 to 1"):
-        source_frame(result_of(clip), 2)
+    for resolution in ("model", "original"):
+        with pytest.raises(InputError, match="frame is 2; expected 0 to 1"):
+            frame_of(result_of(clip), 2, resolution)
+    with pytest.raises(InputError, match="resolution is 'full'; expected 'model' or 'original'"):
+        frame_of(result_of(clip), 0, "full")  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,272 @@
+"""Result folders of other projects: VGGT4D's written and read; MonST3R's, CUT3R's and Depth Anything 3's read.
+
+Where each keeps what, and in which unit, was read off their public code:
+
+    vggt4d    frame_0000.png, frame_0000.npy (depth), conf_0000.npy, dynamic_mask_0000.png, and for all frames
+              pred_intrinsics.txt (nine numbers a line), pred_traj.txt (world-from-camera)
+    monst3r   the same with conf_0.npy, dynamic_mask_0.png; the confidence is a logarithm, -inf where it was 0
+    cut3r     depth/000000.npy, conf/000000.npy, color/000000.png, camera/000000.npz (pose, which is world-from-camera,
+              and intrinsics)
+    da3       exports/npz/results.npz or exports/mini_npz/results.npz: depth, conf, extrinsics (camera-from-world),
+              intrinsics, and image in the former
+
+All have depth along z, dynamic = bright, and intrinsics in pixels of their depth. Does not import jax.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float32, UInt8
+from PIL import Image
+
+from vggtjax.clips.images import read_image
+from vggtjax.clips.masks import read_mask
+from vggtjax.errors import ClipError, InputError, ResultError
+from vggtjax.results import archive, geometry
+from vggtjax.results.frames import Frame
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.trajectory import Quaternion, read_numbers, read_trajectory, write_trajectory
+
+_GREY = 128  # of pictures that a layout does not keep
+
+logger = logging.getLogger(__name__)
+
+
+def write_frame(folder: Path, number: int, frame: Frame) -> None:
+    """Write a frame as VGGT4D does."""
+    Image.fromarray(frame.image).save(folder / f"frame_{number:04d}.png")
+    np.save(folder / f"frame_{number:04d}.npy", frame.depth, allow_pickle=False)
+    np.save(folder / f"conf_{number:04d}.npy", frame.confidence, allow_pickle=False)
+    mask = Image.fromarray(frame.dynamic_mask.astype(np.uint8) * 255)
+    mask.save(folder / f"dynamic_mask_{number:04d}.png")
+
+
+def write_cameras(
+    folder: Path, world_from_camera: Float[np.ndarray, "S 4 4"], intrinsics: Sequence[Float[np.ndarray, "3 3"]]
+) -> None:
+    """Write the cameras in VGGT4D's files, but the quaternions in TUM's order."""
+    np.savetxt(folder / "pred_intrinsics.txt", np.stack(intrinsics).reshape(-1, 9), fmt="%.9g")
+    write_trajectory(folder / "pred_traj.txt", world_from_camera, np.arange(len(world_from_camera), dtype=np.float64))
+
+
+class Cameras(NamedTuple):
+    """Cameras of S frames."""
+
+    camera_from_world: Float[np.ndarray, "S 3 4"]
+    intrinsics: Float[np.ndarray, "S 3 3"]
+
+
+class _Folder(NamedTuple):
+    """Where a layout keeps a frame's files, as patterns of their paths with the frame's number, and its cameras."""
+
+    depth: str
+    picture: str
+    confidence: str
+    mask: str | None
+    cameras: Callable[[Path, Sequence[int], Quaternion | None], Cameras]
+    logarithmic: bool = False  # confidence
+
+
+def load_foreign(path: Path, layout: str, quaternion: Quaternion | None) -> Reconstruction:
+    """Read a result folder of another project; see `Reconstruction.load`."""
+    if layout not in LAYOUTS:
+        raise InputError(f"layout is {layout!r}; expected one of vggtjax, {', '.join(LAYOUTS)}")
+    try:
+        fields = _read_da3(path) if layout == "da3" else _read_folder(path, _FOLDERS[layout], quaternion)
+    except (ClipError, ResultError) as error:
+        raise ResultError(f"{path} cannot be loaded as a result of {layout}: {error}") from error
+    depth = fields["depth"]
+    S, H, W = depth.shape
+    defaults: dict[str, Any] = {
+        "depth_confidence": np.ones((S, H, W), np.float32),
+        "dynamic_mask": np.zeros((S, H, W), bool),
+        "images": np.full((S, H, W, 3), _GREY, np.uint8),
+    }
+    if missing := [name for name in defaults if fields.get(name) is None]:
+        logger.warning("%s has no %s; plain values stand for them", path, ", ".join(missing))
+    return Reconstruction(
+        **(defaults | {name: value for name, value in fields.items() if value is not None}),
+        saliency=None,
+        frame_names=tuple(f"{number:06d}" for number in range(S)),
+        timestamps=None,
+        method=layout,
+        model_name=layout,
+        settings={"layout": layout, "quaternion": quaternion, "missing": missing},
+        source_size=np.tile([H, W], (S, 1)),
+        source_scale=np.ones((S, 2)),
+        source_offset=np.zeros((S, 2)),
+        valid_box=np.tile([0, 0, W, H], (S, 1)),
+    )
+
+
+def _read_folder(folder: Path, layout: _Folder, quaternion: Quaternion | None) -> dict[str, Any]:
+    depth_files = _numbered(folder, layout.depth)
+    if not depth_files:
+        raise ResultError(f"it has no depth; expected files {layout.depth}")
+    numbers = sorted(depth_files)
+    cameras = layout.cameras(folder, numbers, quaternion)
+    depth = _stacked(depth_files, numbers, _read_map, None)
+    shape = depth.shape[1:]
+    confidence = _stacked(_numbered(folder, layout.confidence), numbers, _read_map, shape)
+    if confidence is not None and layout.logarithmic:
+        with np.errstate(over="ignore"):
+            confidence = np.exp(confidence).clip(0, np.finfo(np.float32).max)
+    mask = None if layout.mask is None else _stacked(_numbered(folder, layout.mask), numbers, read_mask, shape)
+    return {
+        "depth": depth,
+        "depth_confidence": confidence,
+        "dynamic_mask": mask,
+        "images": _stacked(_numbered(folder, layout.picture), numbers, _read_picture, (*shape, 3)),
+        **cameras._asdict(),
+    }
+
+
+def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
+    """Return the files of a folder by the number in their names."""
+    parent, _, name = pattern.rpartition("/")
+    place = folder / parent if parent else folder
+    try:
+        found = (
+            [(re.fullmatch(name, entry.name, re.ASCII), entry) for entry in place.iterdir()] if place.is_dir() else []
+        )
+    except OSError as error:
+        raise ResultError(f"it cannot be read ({error.strerror or error})") from error
+    files: dict[int, Path] = {}
+    for match, entry in found:
+        if match:
+            number = int(match[1])
+            if number in files:
+                raise ResultError(f"{files[number].name} and {entry.name} are both of frame {number}")
+            files[number] = entry
+    return files
+
+
+def _stacked(
+    files: dict[int, Path], numbers: Sequence[int], read: Callable[[Path], np.ndarray], shape: tuple[int, ...] | None
+) -> Any:
+    """Return the files of all frames as one array, or None where there is not a single one."""
+    if not files:
+        return None
+    if missing := [number for number in numbers if number not in files]:
+        like = next(iter(files.values())).name
+        raise ResultError(f"frame {missing[0]} has depth, but no file like {like}; expected one for every frame")
+    arrays = None
+    for place, number in enumerate(numbers):
+        array = read(files[number])
+        shape = shape or array.shape
+        if array.shape != shape:
+            raise ResultError(
+                f"{files[number].name} has shape {array.shape}; expected {shape}, as the depth of frame 0"
+            )
+        if arrays is None:
+            if len(numbers) * array.nbytes > archive.SIZE_LIMIT:
+                raise ResultError(f"{len(numbers)} frames of {shape} take more than {archive.SIZE_LIMIT} bytes")
+            arrays = np.empty((len(numbers), *shape), array.dtype)
+        arrays[place] = array
+    return arrays
+
+
+def _read_map(path: Path) -> Float32[np.ndarray, "H W"]:
+    array = archive.read_array(path)
+    if array.dtype.kind != "f" or array.ndim != 2:
+        raise ResultError(f"{path.name} is {array.dtype} {array.shape}; expected floating point [H, W]")
+    return array.astype(np.float32)
+
+
+def _read_picture(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    return np.asarray(read_image(path))
+
+
+def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
+    if quaternion is None:
+        raise InputError(
+            f"{folder / 'pred_traj.txt'} does not say the order of its quaternions; give quaternion='wxyz' (what "
+            "VGGT4D, MonST3R, CUT3R and Easi3R write) or 'xyzw' (TUM's order, what vggtjax writes)"
+        )
+    poses = read_trajectory(folder / "pred_traj.txt", quaternion)[1]
+    intrinsics = read_numbers(folder / "pred_intrinsics.txt", 9).reshape(-1, 3, 3)
+    for name, array in (("pred_traj.txt", poses), ("pred_intrinsics.txt", intrinsics)):
+        if len(array) != len(numbers):
+            raise ResultError(
+                f"{name} has {len(array)} lines for {len(numbers)} frames of depth; expected one for each"
+            )
+    return Cameras(geometry.world_from_camera(poses[:, :3])[:, :3], intrinsics)  # the inverse, whichever way
+
+
+def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
+    files = _numbered(folder, r"camera/(\d+)\.npz")
+    poses, intrinsics = [], []
+    for number in numbers:
+        if number not in files:
+            raise ResultError(f"frame {number} has depth, but no camera/{number:06d}.npz")
+        arrays = archive.read_arrays(files[number])
+        for name, shape, into in (("pose", (4, 4), poses), ("intrinsics", (3, 3), intrinsics)):
+            array = arrays.get(name)
+            if array is None or array.shape != shape or array.dtype.kind != "f":
+                found = "missing" if array is None else f"{array.dtype} {array.shape}"
+                raise ResultError(f"'{name}' of {files[number].name} is {found}; expected floating point {shape}")
+            into.append(array.astype(np.float64))
+    return Cameras(geometry.world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
+
+
+def _read_da3(path: Path) -> dict[str, Any]:
+    places = [
+        path,
+        *(path / below / "results.npz" for below in ("", "exports/npz", "exports/mini_npz", "npz", "mini_npz")),
+    ]
+    file = next((place for place in places if place.is_file()), None)
+    if file is None:
+        raise ResultError("it has no results.npz; export with the format 'npz' or 'mini_npz'")
+    arrays = archive.read_arrays(file)
+    depth = arrays.get("depth")
+    if depth is None or depth.ndim != 3 or depth.dtype.kind != "f" or 0 in depth.shape:
+        found = "missing" if depth is None else f"{depth.dtype} {depth.shape}"
+        raise ResultError(f"'depth' of {file.name} is {found}; expected floating point (N, H, W)")
+    S, H, W = depth.shape
+    shapes = {
+        "extrinsics": ((S, 3, 4), (S, 4, 4)),
+        "intrinsics": ((S, 3, 3),),
+        "conf": ((S, H, W),),
+        "image": ((S, H, W, 3),),
+    }
+    for name, allowed in shapes.items():
+        array, kind = arrays.get(name), "u" if name == "image" else "f"
+        if array is None and name in ("extrinsics", "intrinsics"):
+            raise ResultError(f"{file.name} has no '{name}'; models for depth alone have no cameras to load")
+        if array is not None and (array.shape not in allowed or array.dtype.kind != kind):
+            raise ResultError(f"'{name}' of {file.name} is {array.dtype} {array.shape}; expected {allowed[0]}")
+    return {
+        "depth": depth.astype(np.float32),
+        "depth_confidence": arrays.get("conf"),
+        "images": arrays.get("image"),
+        "camera_from_world": arrays["extrinsics"][:, :3],
+        "intrinsics": arrays["intrinsics"],
+    }
+
+
+_MONST3R = _Folder(
+    depth=r"frame_(\d{1,9})\.npy",
+    picture=r"frame_(\d{1,9})\.png",
+    confidence=r"conf_(\d{1,9})\.npy",
+    mask=r"dynamic_mask_(\d{1,9})\.png",
+    cameras=_text_cameras,
+    logarithmic=True,
+)
+_FOLDERS = {
+    "vggt4d": _MONST3R._replace(logarithmic=False),
+    "monst3r": _MONST3R,
+    "cut3r": _Folder(
+        depth=r"depth/(\d{1,9})\.npy",
+        picture=r"color/(\d{1,9})\.png",
+        confidence=r"conf/(\d{1,9})\.npy",
+        mask=None,
+        cameras=_npz_cameras,
+    ),
+}
+LAYOUTS = (*_FOLDERS, "da3")
