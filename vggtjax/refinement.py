@@ -24,7 +24,7 @@ from vggtjax.results.geometry import unproject
 
 CLUSTERS = 30
 RESTARTS = 4  # of k-means
-FITTED = 8192  # points of a frame, evenly drawn, that the centres of its clusters are fitted to; all are labelled
+FITTED = 4096  # points of a frame, evenly drawn, that the centres of its clusters are fitted to; all are labelled
 NEIGHBOURS = 20  # of a point, itself among them
 OUTLIER_SIGMA = 2.5
 LEAST_SHARE = 0.05  # of a group's projections that must count
@@ -123,7 +123,7 @@ def statistical_outliers(
     known = flat[~outlier]
     if len(known):
         neighbours = min(NEIGHBOURS, len(known))
-        distance = KDTree(known).query(known, k=neighbours, workers=-1)[0].reshape(len(known), -1).mean(axis=1)
+        distance = KDTree(known, leafsize=32).query(known, k=neighbours, workers=-1)[0].reshape(len(known), -1).mean(axis=1)
         outlier[~outlier] = distance > distance.mean() + OUTLIER_SIGMA * distance.std()
     return outlier.reshape(points.shape[:2])
 
