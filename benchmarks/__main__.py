@@ -10,6 +10,7 @@ import tyro
 from benchmarks.demo_model import demo_model
 from benchmarks.embed import embed
 from benchmarks.make_checkpoint import main as make_checkpoint
+from benchmarks.masks import masks
 from benchmarks.refinement import refinement
 from benchmarks.second_pass import second_pass
 from vggtjax.errors import VggtjaxError
@@ -18,6 +19,7 @@ COMMANDS = {
     "demo-model": demo_model,
     "embed": embed,
     "make-checkpoint": make_checkpoint,
+    "masks": masks,
     "refinement": refinement,
     "second-pass": second_pass,
 }

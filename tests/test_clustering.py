@@ -7,6 +7,8 @@ import pytest
 from sklearn.cluster import KMeans
 
 from vggtjax.clustering import kmeans
+from vggtjax.demo import demo_clip, demo_model
+from vggtjax.network.backbone import encode
 
 _kmeans = jax.jit(kmeans, static_argnames=("clusters", "restarts"))
 
@@ -14,6 +16,10 @@ _kmeans = jax.jit(kmeans, static_argnames=("clusters", "restarts"))
 def features(kind: str) -> np.ndarray:
     """Points as they come up here: patch features on a low-dimensional sheet, a cloud of 3-D points far away, blobs."""
     generator = np.random.default_rng(5)
+    if kind == "backbone":  # what vggt4d clusters: all patches of a clip, here of the embedded one
+        model, clip = demo_model(), demo_clip()
+        tokens = jax.jit(encode, static_argnums=2)(model.params, jnp.asarray(clip.images[None]), model.config)
+        return np.asarray(tokens).reshape(-1, tokens.shape[-1])
     if kind == "features":
         hidden = generator.normal(size=(1500, 6)) @ generator.normal(size=(6, 32))
         return np.tanh(hidden).astype(np.float32)
@@ -22,7 +28,7 @@ def features(kind: str) -> np.ndarray:
     return (generator.integers(0, 12, size=(1000, 1)) + 0.05 * generator.normal(size=(1000, 4))).astype(np.float32)
 
 
-@pytest.mark.parametrize(("kind", "clusters"), [("features", 64), ("cloud", 30), ("blobs", 12)])
+@pytest.mark.parametrize(("kind", "clusters"), [("backbone", 64), ("features", 64), ("cloud", 30), ("blobs", 12)])
 def test_inertia_is_scikit_learns(kind, clusters):
     points = features(kind)
     fitted = [KMeans(clusters, random_state=seed).fit(points) for seed in range(3)]

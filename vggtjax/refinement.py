@@ -123,7 +123,9 @@ def statistical_outliers(
     known = flat[~outlier]
     if len(known):
         neighbours = min(NEIGHBOURS, len(known))
-        distance = KDTree(known, leafsize=32).query(known, k=neighbours, workers=-1)[0].reshape(len(known), -1).mean(axis=1)
+        distance = (
+            KDTree(known, leafsize=32).query(known, k=neighbours, workers=-1)[0].reshape(len(known), -1).mean(axis=1)
+        )
         outlier[~outlier] = distance > distance.mean() + OUTLIER_SIGMA * distance.std()
     return outlier.reshape(points.shape[:2])
 

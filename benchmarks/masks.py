@@ -1,0 +1,104 @@
+"""Which masks are right: mined, smoothed over time, refined by projection: python -m benchmarks masks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from benchmarks.real_clips import is_clip_folder, load_windows
+from vggtjax.checkpoint import Model, load_model
+from vggtjax.clips.clip import load_clip
+from vggtjax.errors import InputError
+from vggtjax.evaluation.masks import jaccard, precision_recall
+from vggtjax.evaluation.truth import Truth
+from vggtjax.pipeline import reconstruct
+from vggtjax.refinement import refine_masks
+from vggtjax.scenes import SceneConfig, held_out_scenes
+
+REFINED = {"as it is": None, "refined": "result", "refined by true geometry": "truth"}
+
+
+def masks(
+    *,
+    model: str = "demo",
+    methods: tuple[str, ...] = ("4dvggt-d", "vggt4d"),
+    scenes: int = 16,
+    frames: int = 12,
+    smooth: tuple[int, ...] = (1, 3, 5),
+    clips: Path = Path("../shared/clips/composite"),
+    seed: int = 0,
+) -> None:
+    """Measure masks against the truth, on held-out dynamic scenes and on filmed clips where they are present.
+
+    Args:
+        model: "demo", or weights as for vggtjax reconstruct.
+        methods: whose masks.
+        scenes: held-out dynamic scenes.
+        frames: of a scene, and of a window of a filmed clip.
+        smooth: numbers of frames that the saliency is averaged over.
+        clips: folder of folders with rgb/, depth/, mask/, K.txt, world_from_camera.txt.
+        seed: another seed draws other scenes.
+    """
+    if scenes < 1:
+        raise InputError(f"scenes is {scenes}; expected at least 1")
+    loaded, console = load_model(model), Console()
+    side = loaded.config.image_size
+    with console.status("scenes"):
+        wanted = SceneConfig(height=side, width=side, frames=frames)
+        generated = held_out_scenes("dynamic", scenes, wanted, seed=seed)
+    groups = {f"{scenes} generated scenes": Truth(*(np.asarray(getattr(generated, name)) for name in Truth._fields))}
+    filmed = sorted(folder for folder in clips.glob("*") if is_clip_folder(folder)) if clips.is_dir() else []
+    if filmed:
+        windows = load_windows(filmed, loaded.config, frames)
+        groups[f"{len(windows.names)} windows of {', '.join(folder.name for folder in filmed)}"] = windows.truth
+    for name, truth in groups.items():
+        table = Table(title=name, title_justify="left", box=None, pad_edge=False)
+        for heading in ("method", "smooth", "mask", "IoU", "precision", "recall", "pixels", "IoU better in"):
+            table.add_column(heading, justify="left" if heading in ("method", "mask") else "right")
+        runs = [(method, window) for method in methods for window in smooth]
+        for method, window in track(runs, description=name, console=console, transient=True):
+            _add_rows(table, loaded, truth, method, window)
+        console.print(table)
+
+
+def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int) -> None:
+    scores: dict[str, list[tuple[float, ...]]] = {name: [] for name in REFINED}
+    for clip in (Truth(*arrays) for arrays in zip(*truth, strict=True)):
+        fitted = load_clip(clip.images, size=clip.images.shape[2], patch=model.config.patch_size)
+        size = clip.images.shape[2]
+        made = reconstruct(model, fitted, method=method, size=size, smooth_frames=window, refine_mask=False)
+        geometry: dict[str | None, Any] = {
+            "result": (made.depth, made.camera_from_world, made.intrinsics),
+            "truth": _in_units(clip),
+        }
+        for name, source in REFINED.items():
+            mask = made.dynamic_mask
+            if source is not None:
+                depth, poses, intrinsics = geometry[source]
+                known = depth > 0  # filmed depth has holes, about which nothing can be said
+                mask = refine_masks(clip.images, depth, mask, poses, intrinsics, valid=known) | (mask & ~known)
+            scores[name].append(
+                (jaccard(mask, clip.dynamic_mask), *precision_recall(mask, clip.dynamic_mask), mask.mean())
+            )
+    plain = np.array(scores["as it is"])[:, 0]
+    for name, values in scores.items():
+        iou, precision, recall, share = np.mean(values, axis=0)
+        better = int((np.array(values)[:, 0] > plain).sum())
+        cells = (f"{iou:.3f}", f"{precision:.3f}", f"{recall:.3f}", f"{share:.1%}")
+        table.add_row(method, str(window), name, *cells, "" if name == "as it is" else f"{better} of {len(values)}")
+
+
+def _in_units(clip: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return true depth, 0 where it is not known, and cameras, with the scene about 1 away as VGGT has it."""
+    unit = np.median(clip.depth[clip.depth > 0])
+    poses = np.concatenate([clip.camera_from_world[..., :3], clip.camera_from_world[..., 3:] / unit], axis=-1)
+    return (
+        (np.maximum(clip.depth, 0) / unit).astype(np.float32),
+        poses.astype(np.float32),
+        clip.intrinsics.astype(np.float32),
+    )
