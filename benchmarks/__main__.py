@@ -12,6 +12,7 @@ from benchmarks.embed import embed
 from benchmarks.make_checkpoint import main as make_checkpoint
 from benchmarks.masks import masks
 from benchmarks.refinement import refinement
+from benchmarks.resolution import resolution
 from benchmarks.second_pass import second_pass
 from vggtjax.errors import VggtjaxError
 
@@ -21,6 +22,7 @@ COMMANDS = {
     "make-checkpoint": make_checkpoint,
     "masks": masks,
     "refinement": refinement,
+    "resolution": resolution,
     "second-pass": second_pass,
 }
 

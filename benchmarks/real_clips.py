@@ -70,9 +70,13 @@ def window_starts(count: int, frames: int) -> list[int]:
 
 def _window(folder: Path, config: VGGTConfig, world_from_camera: np.ndarray, start: int, frames: int) -> Truth:
     clip = load_clip(folder / "rgb", size=config.image_size, patch=config.patch_size, start=start, max_frames=frames)
-    depth = np.stack([_image(folder / "depth" / f"{name}.png") for name in clip.frame_names])
+    depth = np.stack([read_picture(folder / "depth" / f"{name}.png") for name in clip.frame_names])
     masks = folder / "mask"
-    mask = np.stack([_image(masks / f"{name}.png") > 0 for name in clip.frame_names]) if masks.is_dir() else depth < 0
+    mask = (
+        np.stack([read_picture(masks / f"{name}.png") > 0 for name in clip.frame_names])
+        if masks.is_dir()
+        else depth < 0
+    )
     poses = world_from_camera[start : start + frames]
     if len(poses) != len(clip):
         raise InputError(f"{folder} has {len(world_from_camera)} poses; expected one for each image")
@@ -93,7 +97,7 @@ def _matrices(path: Path, size: int) -> Float64[np.ndarray, "N size size"]:
         raise InputError(f"{path} cannot be read; expected rows of numbers, {size} x {size} of them a matrix") from None
 
 
-def _image(path: Path) -> UInt16[np.ndarray, "h w"]:
+def read_picture(path: Path) -> UInt16[np.ndarray, "h w"]:
     try:
         with Image.open(path) as image:
             return np.asarray(image).astype(np.uint16)

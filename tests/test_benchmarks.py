@@ -234,3 +234,30 @@ def test_checkpoints_are_a_subcommand_too(tmp_path):
     shapes.write_text(json.dumps({"a.weight": [2, 3]}))
     assert benchmarks.main(["make-checkpoint", str(tmp_path / "x.safetensors"), "--shapes", str(shapes)]) == 0
     assert (tmp_path / "x.safetensors").is_file()
+
+
+def test_depth_that_is_enlarged(tmp_path, capsys):
+    x, y = np.meshgrid(np.arange(48), np.arange(32))
+    depth = np.where(x > 20, 4000, 1000) + 10 * x + 5 * y
+    depth[:4, :4] = 0
+    (tmp_path / "clip/depth").mkdir(parents=True)
+    Image.fromarray(depth.astype(np.uint16)).save(tmp_path / "clip/depth/0.png")
+    assert benchmarks.main(["resolution", "--clips", str(tmp_path), "--factors", "4"]) == 0
+    lines = [
+        line.split() for line in capsys.readouterr().out.splitlines() if line.startswith("clip ") and "way" not in line
+    ]
+    rows = {line[1]: float(line[-1].rstrip("%")) for line in lines if line[-1].endswith("%")}
+    assert rows["edge-aware"] == rows["nearest"] < rows["bilinear"]
+    assert benchmarks.main(["resolution", "--clips", str(tmp_path / "none")]) == 2
+    assert "there are no clips below" in capsys.readouterr().err
+
+
+def test_masks_are_measured(tmp_path, capsys):
+    arguments = ["masks", "--scenes", "1", "--smooth", "1", "3", "--methods", "4dvggt-d", "--clips", str(tmp_path)]
+    code = benchmarks.main(arguments)
+    shown = capsys.readouterr()
+    assert code == 0, shown.err
+    values = [line.split() for line in shown.out.splitlines() if "as it is" in line]
+    assert [row[1] for row in values] == ["1", "3"]
+    assert all(0 < float(row[5]) <= 1 for row in values)  # IoU
+    assert benchmarks.main(["masks", "--scenes", "0"]) == 2

@@ -78,7 +78,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     (tmp_path / "points.csv").write_text("x,y,frame\n60,45,0\n30,20,1\n", encoding="utf-8")
     code, out, err = run(
         capsys, "reconstruct", frames, "--out", tmp_path / "out", "--masks", masks, "--refine-mask", "--tracks",
-        tmp_path / "points.csv", "--method", "vggt4d",
+        tmp_path / "points.csv", "--method", "vggt4d", "--resolution", "original", "--format", "vggt4d",
     )  # fmt: skip
     assert code == 0, err
     assert "track head of the embedded model is untrained" in out
@@ -86,6 +86,20 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     assert (result.settings["masks"], result.settings["refine_mask"]) == ("given", True)
     assert np.asarray(result.track_frames).tolist() == [0, 1]
     assert (tmp_path / "out/preview/tracks.png").stat().st_size > 1000
+    with Image.open(tmp_path / "out/mask/000001.png") as mask, Image.open(frames / "frame_1.png") as picture:
+        assert mask.size == picture.size
+        with Image.open(tmp_path / "out/vggt4d/frame_0001.png") as shown:
+            assert np.array_equal(np.asarray(shown), np.asarray(picture.convert("RGB")))
+
+    arguments = ("import", tmp_path / "out/vggt4d", "--format", "vggt4d", "--out", tmp_path / "again")
+    code, _, err = run(capsys, *arguments)
+    assert code == 2
+    assert "does not say the order of its quaternions" in err
+    code, _, err = run(capsys, *arguments, "--quaternion", "xyzw")
+    assert code == 0, err
+    again = Reconstruction.load(tmp_path / "again")
+    assert again.depth.shape == (3, *picture.size[::-1])
+    assert np.allclose(again.camera_from_world, result.camera_from_world, atol=1e-5)
 
     code, _, err = run(capsys, "reconstruct", frames, "--out", tmp_path / "still", "--no-masks", "--tracks", "grid:2")
     assert code == 0, err
@@ -111,7 +125,11 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--start", "7"], "start is 7"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--confidence-percentile", "150"], "is 150"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--model", "{tmp}/none.safetensors"], "none.safetensors"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--smooth-frames", "2"], "an odd number of frames"),
+        (["import", "{tmp}/none", "--format", "cut3r", "--out", "{tmp}/out"], "it has no depth"),
+        (["import", "{frames}", "--format", "da3", "--out", "{tmp}/out"], "it has no results.npz"),
         (["convert", "{tmp}/none.pt", "{tmp}/out.safetensors"], "none.pt"),
+        (["convert", "{frames}/frame_0.png", "{tmp}/out.safetensors", "--heads", "camera,nose"], "heads has ['nose']"),
         (["convert", "{frames}/frame_0.png", "{tmp}/out.safetensors"], "frame_0.png"),
         (["convert", "{tmp}/none.pt", "{tmp}/out.safetensors", "--config", "{tmp}/none.json"], "none.json"),
         (["info", "{frames}/frame_0.png"], "frame_0.png"),
