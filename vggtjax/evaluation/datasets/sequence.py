@@ -1,0 +1,60 @@
+"""A sequence of a data set: its pictures, and what is known of them, at the pictures' own pixels."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from vggtjax.errors import InputError
+
+DepthReader = Callable[[int], Float32[np.ndarray, "h w"]]
+MaskReader = Callable[[int], Bool[np.ndarray, "h w"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Sequence:
+    """Frames in order, and ground truth where the data set has it: units are metres and seconds, axes OpenCV's.
+
+    Depth and masks are read when they are asked for, by the frame's index. Intrinsics put the outer corner of the first
+    pixel at (0, 0) and its centre at (0.5, 0.5): a data set that counts from the centre is shifted when it is read.
+    """
+
+    name: str
+    pictures: tuple[Path, ...]
+    depth: DepthReader | None = None  # along z, 0 where it is not known; of the pictures' size
+    mask: MaskReader | None = None  # True where the world moves; of the pictures' size
+    world_from_camera: Float64[np.ndarray, "S 4 4"] | None = None
+    intrinsics: Float64[np.ndarray, "S 3 3"] | None = None
+    timestamps: Float64[np.ndarray, " S"] | None = None
+    notes: tuple[str, ...] = ()  # what is missing or was left out, a sentence each
+
+    def __post_init__(self) -> None:
+        if not self.pictures:
+            raise InputError(f"sequence {self.name} has no frames; expected one at least")
+        for name, shape in (("world_from_camera", (4, 4)), ("intrinsics", (3, 3)), ("timestamps", ())):
+            value = getattr(self, name)
+            if value is not None and np.shape(value) != (len(self), *shape):
+                raise InputError(f"{name} of {self.name} has shape {np.shape(value)}; expected {(len(self), *shape)}")
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    def taken(self, frames: slice) -> Sequence:
+        """Return the same sequence with some of its frames alone."""
+        index = range(len(self))[frames]
+        if not index:
+            raise InputError(f"sequence {self.name} has {len(self)} frames, and none of them in {frames}; take others")
+        changes: dict[str, Any] = {"pictures": self.pictures[frames]}
+        for name in ("depth", "mask"):
+            if (read := getattr(self, name)) is not None:
+                changes[name] = lambda i, read=read: read(index[i])
+        for name in ("world_from_camera", "intrinsics", "timestamps"):
+            if (value := getattr(self, name)) is not None:
+                changes[name] = value[frames]
+        return dataclasses.replace(self, **changes)
