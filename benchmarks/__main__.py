@@ -11,6 +11,7 @@ from benchmarks.demo_model import demo_model
 from benchmarks.embed import embed
 from benchmarks.make_checkpoint import main as make_checkpoint
 from benchmarks.masks import masks
+from benchmarks.point_clouds import point_clouds
 from benchmarks.refinement import refinement
 from benchmarks.resolution import resolution
 from benchmarks.second_pass import second_pass
@@ -21,6 +22,7 @@ COMMANDS = {
     "embed": embed,
     "make-checkpoint": make_checkpoint,
     "masks": masks,
+    "point-clouds": point_clouds,
     "refinement": refinement,
     "resolution": resolution,
     "second-pass": second_pass,

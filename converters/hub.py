@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.sources import choose_file, weight_files
+from converters.sources import SUFFIXES, choose_file, weight_files
 from vggtjax.errors import CheckpointError, MissingExtraError
 
 
@@ -62,8 +62,12 @@ def _download(hub_id: str, file: str | None) -> Path:
         names = [entry.name for entry in folder.iterdir()]
         cached = True
     if file is not None and file not in names:
-        listed = ", ".join(sorted(names)[:10])
-        raise CheckpointError(f"the hub's '{hub_id}' has no file {file}; expected one of {listed}")
+        listed = ", ".join(name for name in sorted(names) if name.endswith(SUFFIXES)) or "none"
+        if cached:
+            raise CheckpointError(
+                f"the hub is out of reach, and of '{hub_id}' its cache has no {file}, only {listed}; check the network"
+            )
+        raise CheckpointError(f"the hub's '{hub_id}' has no file {file}; its files of weights are {listed}")
     name = file or choose_file(names, f"the hub's '{hub_id}'")
     path = Path(hub.hf_hub_download(hub_id, name, local_files_only=cached))
     for shard in weight_files(path)[1:]:

@@ -16,7 +16,7 @@ from vggtjax.errors import CheckpointError
 from vggtjax.tensor_file import StoredTensor, is_tensor_file, read_tensors
 
 _INDEX = ".safetensors.index.json"
-_SUFFIXES = (".safetensors", _INDEX, ".pt", ".pth")
+SUFFIXES = (".safetensors", _INDEX, ".pt", ".pth")
 _HUB_ID = re.compile(r"([A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})(?:/([A-Za-z0-9][\w.-]{0,200}))?", re.ASCII)
 _MOST_INDEX_BYTES = 2**24
 
@@ -53,9 +53,10 @@ def locate(source: str | Path) -> Weights:
             return Weights(path, path.name.removesuffix(_INDEX).removesuffix(path.suffix))
     except OSError as error:
         raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
-    if isinstance(source, str) and (match := _HUB_ID.fullmatch(source)):
+    near = len(path.parts) > 1 and path.parent.is_dir()  # then it is a path, mistyped
+    if isinstance(source, str) and not near and (match := _HUB_ID.fullmatch(source)):
         hub_id, file = match.groups()
-        if (not hub_id.endswith(_SUFFIXES)) if file is None else file.endswith(_SUFFIXES):
+        if (not hub_id.endswith(SUFFIXES)) if file is None else file.endswith(SUFFIXES):
             from converters.hub import download
 
             refuse_strangers(source)
@@ -82,7 +83,7 @@ def choose_file(names: Sequence[str], place: str) -> str:
     found = next((group for group in groups if group), [])
     if len(found) != 1:
         said = f"{len(found)} files of weights ({', '.join(found[:5])})" if found else "no weights"
-        raise CheckpointError(f"{place} holds {said}; expected one of {', '.join('*' + s for s in _SUFFIXES)}")
+        raise CheckpointError(f"{place} holds {said}; expected one of {', '.join('*' + s for s in SUFFIXES)}")
     return found[0]
 
 

@@ -1,4 +1,5 @@
 import errno
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from tests.room import make_room
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results import export, point_cloud
 from vggtjax.results.frames import frame_of
+from vggtjax.results.ply import write_ply
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.trajectory import read_trajectory
 
@@ -22,6 +24,7 @@ FILES = {
     "preview/sheet.png",
 }
 FRAME_FILES = (
+    "confidence/{}.npy",
     "depth/{}.npy",
     "depth/{}.png",
     "mask/{}.png",
@@ -140,12 +143,35 @@ def test_original_resolution(tmp_path):
     np.testing.assert_array_equal(Reconstruction.load(tmp_path).depth, room.depth)
 
 
+def test_clouds_at_the_original_size_are_written_piece_by_piece(tmp_path):
+    frames, height, width = 12, 56, 84
+    room = make_room(
+        frames, height, width, source_size=[[480, 720]] * frames, source_scale=np.full((frames, 2), 60 / 7)
+    )
+    tracemalloc.start()
+    try:
+        room.save(tmp_path, resolution="original", confidence_percentile=0)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert (tmp_path / "static.ply").stat().st_size > 50_000_000
+    assert peak < 200_000_000  # a few frames at a time; all points together take more
+
+
 def test_pictures_that_do_not_fit(tmp_path):
     room, picture = make_room(), np.zeros((56, 84, 3), np.uint8)
     with pytest.raises(InputError, match="there are 2 pictures for 3 frames"):
         room.save(tmp_path / "a", resolution="original", pictures=[picture, picture])
-    with pytest.raises(InputError, match="the picture of frame 0 is"):
-        room.save(tmp_path / "b", resolution="original", pictures=[picture[1:]] * 3)
+    with pytest.raises(InputError, match="there are more pictures than the 3 frames"):
+        room.save(tmp_path / "a", resolution="original", pictures=[picture] * 4)
+    with pytest.raises(InputError, match="pictures are for the resolution 'original'"):
+        room.save(tmp_path / "a", pictures=[picture] * 3)
+    for wrong in (picture[1:], picture / 255, Image.fromarray(picture)):
+        with pytest.raises(InputError, match=r"the picture of frame 0 is .*; expected uint8 \(56, 84, 3\)"):
+            room.save(tmp_path / "b", resolution="original", pictures=[wrong] * 3)  # pyright: ignore[reportArgumentType]
+    mixed = make_room(source_size=[[56, 84], [84, 56], [56, 84]])
+    with pytest.raises(InputError, match="have 2 sizes, and the layout vggt4d wants one"):
+        mixed.save(tmp_path / "b", resolution="original", layout="vggt4d")
     with pytest.raises(InputError, match="resolution is 'full'; expected one of"):
         room.save(tmp_path / "c", resolution="full")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="layout is 'cut3r'; expected one of"):
@@ -172,13 +198,21 @@ def test_layout_of_vggt4d(tmp_path, resolution):
     room.save(tmp_path)
     assert set(files(tmp_path)) == expected_files(3)  # the folder was part of the earlier result
 
+    (tmp_path / "vggt4d").mkdir()
+    (tmp_path / "vggt4d/frame_0000.npy").write_text("mine")
+    room.save(tmp_path)
+    assert (tmp_path / "vggt4d/frame_0000.npy").read_text() == "mine"
+    with pytest.raises(OutputError, match="vggt4d exists and is not part of an earlier result"):
+        room.save(tmp_path, layout="vggt4d")
+
 
 def test_ply_by_hand(tmp_path):
     cloud = point_cloud.PointCloud(np.array([[1, 2, 3]], np.float32), np.array([[4, 5, 6]], np.uint8))
-    export.write_ply(tmp_path / "one.ply", cloud)
+    write_ply(tmp_path / "one.ply", [cloud, cloud])
     header, _, body = (tmp_path / "one.ply").read_bytes().partition(b"end_header\n")
-    assert b"element vertex 1\n" in header
-    assert body == np.array([1, 2, 3], "<f4").tobytes() + bytes([4, 5, 6, 255])
+    assert b"element vertex 2\n" in header
+    assert body == 2 * (np.array([1, 2, 3], "<f4").tobytes() + bytes([4, 5, 6, 255]))
+    assert [path.name for path in tmp_path.iterdir()] == ["one.ply"]
 
 
 @pytest.mark.parametrize(
@@ -253,7 +287,9 @@ def test_archives_of_others_are_never_replaced(tmp_path):
     assert set(files(tmp_path)) == {"reconstruction.npz"}
 
 
-@pytest.mark.parametrize("writer", ["write_ply", "encode_depth", "write_trajectory", "build_scene", "_write_png"])
+@pytest.mark.parametrize(
+    "writer", ["write_ply", "PlyWriter", "encode_depth", "write_trajectory", "build_scene", "_write_png"]
+)
 @pytest.mark.parametrize("earlier", [False, True])
 def test_full_disk_leaves_the_earlier_result_untouched(tmp_path, monkeypatch, writer, earlier):
     folder = tmp_path / "result"
@@ -271,7 +307,7 @@ def test_full_disk_leaves_the_earlier_result_untouched(tmp_path, monkeypatch, wr
     assert {path.name for path in folder.iterdir()} == {name.split("/")[0] for name in files(folder)}
 
 
-@pytest.mark.parametrize("failing", range(0, 20, 3))
+@pytest.mark.parametrize("failing", range(0, 22, 3))
 def test_failure_while_swapping_is_undone(tmp_path, monkeypatch, failing):
     make_room(2).save(tmp_path)
     before = files(tmp_path)
@@ -300,7 +336,7 @@ def test_the_archive_leaves_first_and_arrives_last(tmp_path, monkeypatch):
 
     monkeypatch.setattr(type(tmp_path), "rename", watch)
     make_room(1).save(tmp_path)
-    assert seen == [False] * 19 + [True]
+    assert seen == [False] * 21 + [True]
 
 
 def test_error_of_the_callback_leaves_nothing_behind(tmp_path):

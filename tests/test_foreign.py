@@ -1,6 +1,7 @@
 """Result folders of other projects, written here as their public code writes them."""
 
 import logging
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -153,6 +154,45 @@ def test_what_is_broken_is_named(tmp_path, change, message):
     assert "\n" not in str(raised.value)
 
 
+def test_what_is_large_is_never_read(tmp_path):
+    write_cut3r(tmp_path)
+    junk = np.zeros(40_000_000, np.float32)  # 160 MB in a file of 160 kB
+    pose, intrinsics = ROOM.world_from_camera[1], ROOM.intrinsics[1]
+    np.savez_compressed(tmp_path / "camera/000001.npz", pose=pose, intrinsics=intrinsics, junk=junk)
+    tracemalloc.start()
+    try:
+        Reconstruction.load(tmp_path, layout="cut3r")
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 20_000_000
+
+
+def test_poses_that_are_no_rotations_are_named_with_their_folder(tmp_path):
+    write_cut3r(tmp_path)
+    np.savez(tmp_path / "camera/000001.npz", pose=2 * np.eye(4), intrinsics=np.eye(3))
+    with pytest.raises(
+        ResultError, match=r"as a result of cut3r: camera_from_world of frame 1 is not a finite rotation"
+    ):
+        Reconstruction.load(tmp_path, layout="cut3r")
+
+
+def test_exports_of_vggt4d_are_not_taken_for_monst3rs(tmp_path):
+    WRITERS["vggt4d"](tmp_path / "x")
+    with pytest.raises(ResultError, match=r"conf_0000\.npy is numbered as VGGT4D does"):
+        Reconstruction.load(tmp_path / "x", layout="monst3r", quaternion="wxyz")
+
+
+def test_pictures_of_da3_are_bytes(tmp_path):
+    write_da3(tmp_path)
+    arrays = dict(np.load(tmp_path / "exports/npz/results.npz"))
+    np.savez(
+        tmp_path / "exports/npz/results.npz", allow_pickle=True, **arrays | {"image": arrays["image"].astype(np.uint16)}
+    )
+    with pytest.raises(ResultError, match=r"'image' of results.npz is uint16 .* expected uint8"):
+        Reconstruction.load(tmp_path, layout="da3")
+
+
 def test_broken_cameras_of_cut3r(tmp_path):
     write_cut3r(tmp_path)
     np.savez(tmp_path / "camera/000001.npz", pose=np.eye(3), intrinsics=np.eye(3))
@@ -166,16 +206,16 @@ def test_broken_cameras_of_cut3r(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "message"),
     [
-        ({"depth": np.ones((2, 3, 4), np.float32)}, "has no 'extrinsics'; models for depth alone have no cameras"),
+        ({"depth": np.ones((2, 3, 4), np.float32)}, "has no 'extrinsics'; expected floating point"),
         ({"depths": np.ones((2, 3, 4), np.float32)}, "'depth' of results.npz is missing"),
-        ({"depth": np.ones((3, 4), np.float32)}, r"'depth' of results.npz is float32 \(3, 4\)"),
+        ({"depth": np.ones((3, 4), np.float32)}, r"'depth' of results.npz is missing or has shape \(3, 4\)"),
         (
             {
                 "depth": np.ones((2, 3, 4), np.float32),
                 "extrinsics": np.ones((1, 3, 4)),
                 "intrinsics": np.ones((2, 3, 3)),
             },
-            r"'extrinsics' of results.npz is float64 \(1, 3, 4\); expected \(2, 3, 4\)",
+            r"'extrinsics' of results.npz is float64 \(1, 3, 4\); expected floating point \(2, 3, 4\)",
         ),
     ],
 )
@@ -188,7 +228,11 @@ def test_broken_files_of_da3(tmp_path, arrays, message):
 def test_what_is_not_there(tmp_path):
     with pytest.raises(InputError, match="layout is 'dust3r'; expected one of vggtjax, vggt4d, monst3r, cut3r, da3"):
         Reconstruction.load(tmp_path, layout="dust3r")
-    with pytest.raises(ResultError, match="it has no depth"):
+    with pytest.raises(ResultError, match="there is no such folder"):
         Reconstruction.load(tmp_path / "nowhere", layout="cut3r")
+    with pytest.raises(ResultError, match=r"it has no depth; expected files like depth/000000\.npy"):
+        Reconstruction.load(tmp_path, layout="cut3r")
+    with pytest.raises(InputError, match=r"quaternion is 'wxyz' for cut3r; .* none for others, which keep matrices"):
+        Reconstruction.load(tmp_path, layout="cut3r", quaternion="wxyz")
     with pytest.raises(ResultError, match=r"it has no results\.npz; export with the format 'npz'"):
         Reconstruction.load(tmp_path, layout="da3")

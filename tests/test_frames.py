@@ -127,7 +127,7 @@ def test_pictures_are_those_of_the_source_or_else_enlarged():
     assert np.corrcoef(enlarged.ravel(), picture.ravel())[0, 1] > 0.9
     for shift in (-3, 3):  # where it belongs, to a pixel or so
         assert abs(np.roll(enlarged, shift, axis=1) - picture).mean() > abs(enlarged - picture).mean()
-    with pytest.raises(InputError, match=r"the picture of frame 0 is \(30, 40, 3\); expected \(150, 200, 3\)"):
+    with pytest.raises(InputError, match=r"frame 0 is uint8 \(30, 40, 3\); expected uint8 \(150, 200, 3\)"):
         frame_of(result, 0, "original", picture=picture[::5, ::5])
 
 

@@ -180,4 +180,16 @@ def test_one_of_several_files(hub, repository, shapes, expected, config):
     model = load_model("maker/tiny/a_e20.pt", config=config)
     assert_equal(model, expected)
     assert model.name == "maker/tiny/a_e20.pt"
-    assert "has no file a_e10.pt; expected one of README.md, a_e20.pt, a_e30.pt" in refusal("maker/tiny/a_e10.pt")
+    assert "has no file a_e10.pt; its files of weights are a_e20.pt, a_e30.pt" in refusal("maker/tiny/a_e10.pt")
+    hub.repositories["maker/tiny"] = "Down"
+    assert locate("maker/tiny/a_e20.pt").path.name == "a_e20.pt"
+    message = refusal("maker/tiny/a_e30.pt")
+    assert "the hub is out of reach, and of 'maker/tiny' its cache has no a_e30.pt, only a_e20.pt" in message
+
+
+def test_a_mistyped_path_stays_here(hub, tmp_path, monkeypatch):
+    (tmp_path / "runs/vggt").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    assert "there are no weights at runs/vggt/modl.pt" in refusal("runs/vggt/modl.pt")
+    assert "there are no weights at runs/vgt" in refusal("runs/vgt")
+    assert not hub.asked

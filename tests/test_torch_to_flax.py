@@ -183,7 +183,7 @@ def test_some_heads_of_a_source_that_has_no_others(state_dict, config, tmp_path)
     save_file(camera, tmp_path / "camera.safetensors")
     model = load_model(convert(tmp_path / "camera.safetensors", tmp_path / "x", config=config, heads=["camera"]).path)
     assert model.heads == ("camera",)
-    with pytest.raises(InputError, match=r"outputs has \['depth'\], and this model has the heads \('camera',\) alone"):
+    with pytest.raises(InputError, match=r"outputs has \['depth'\], and this model has only the heads \('camera',\)"):
         forward(model.params, jnp.zeros((1, 2, 56, 56, 3)), model.config)
     with pytest.raises(CheckpointError, match="it has no depth_head, point_head, track_head: leave their heads out"):
         convert(tmp_path / "camera.safetensors", tmp_path / "y", config=config)

@@ -19,12 +19,14 @@ from vggtjax.evaluation.blind import (
 from vggtjax.evaluation.trajectory import (
     Similarity,
     align,
+    associate,
     centre_error,
     centres,
     from_first,
     point_error,
     relative_errors,
     rotation_error,
+    trajectory_errors,
     umeyama_sim3,
 )
 
@@ -217,6 +219,171 @@ def test_single_precision_does_not_count_as_motion():
     turning_in_place = cameras(np.tile([3.0, -1, 4], (9, 1)), Rotation.random(9, rng=generator)).astype(np.float32)
     with pytest.raises(InputError, match="predicted cameras do not move"):
         centre_error(turning_in_place, random_cameras(generator, 9))
+
+
+def world_from(camera_from_world) -> np.ndarray:
+    """The same poses as [S, 4, 4] from camera to world."""
+    full = np.tile(np.eye(4), (len(camera_from_world), 1, 1))
+    full[:, :3] = camera_from_world
+    return np.linalg.inv(full)
+
+
+def wandering(generator, frames=30, noise=0.05) -> tuple[np.ndarray, np.ndarray]:
+    """A smooth walk [S, 4, 4] and the same with noise on centres and rotations, in another world and scale."""
+    centres_ = np.cumsum(0.1 * generator.normal(size=(frames, 3)), axis=0)
+    turns = Rotation.from_rotvec(np.cumsum(0.1 * generator.normal(size=(frames, 3)), axis=0))
+    shaken = Rotation.from_rotvec(noise * generator.normal(size=(frames, 3))) * turns
+    truth = cameras(centres_, turns)
+    predicted = cameras(centres_ + noise * generator.normal(size=(frames, 3)), shaken)
+    return world_from(align(predicted, random_similarity(generator))), world_from(truth)
+
+
+def test_trajectory_errors_by_hand():
+    truth = cameras([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
+    pulled = cameras([[2, 0, 0], [-2, 0, 0], [0, 1, 0], [0, -1, 0]])
+    predicted, truth = world_from(pulled), world_from(truth)
+    # The best scale is 0.6: centres at +-1.2 and +-0.6 instead of +-1, errors 0.2, 0.2, 0.4, 0.4. Steps: (-2.4, 0),
+    # (1.2, 0.6), (0, -1.2) instead of (-2, 0), (1, 1), (0, -2).
+    scaled = trajectory_errors(predicted, truth)
+    assert scaled.ate == pytest.approx(np.sqrt((2 * 0.04 + 2 * 0.16) / 4))
+    assert scaled.rte == pytest.approx(np.sqrt((0.16 + 0.04 + 0.16 + 0.64) / 3))
+    assert scaled.rre == pytest.approx(0, abs=1e-9)
+    # Without scale nothing moves: errors 1, 1, 0, 0 and (-2, 0), (1, 0), (0, 0).
+    rigid = trajectory_errors(predicted, truth, "se3")
+    assert rigid[:2] == pytest.approx((np.sqrt(1 / 2), np.sqrt(5 / 3)))
+    # From the first pose on: the prediction moves by -1 along x; errors 0, 2, 1, 1.
+    first = trajectory_errors(predicted, truth, "first")
+    assert first[:2] == pytest.approx((np.sqrt(6 / 4), np.sqrt(5 / 3)))
+
+
+def test_the_first_pose_is_made_equal_by_a_rotation_too():
+    """All cameras are turned by a quarter about z; the second also by 8 degrees about its own axis."""
+    truth = world_from(cameras([[0, 0, 0], [1, 0, 0]], about(2, [0, 0])))
+    quarter = np.eye(4)
+    quarter[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
+    quarter[:3, 3] = 5, 6, 7
+    predicted = quarter @ world_from(cameras([[0, 0, 0], [1, 0.5, 0]], about(2, [0, 8])))
+    errors = trajectory_errors(predicted, truth, "first")
+    assert errors == pytest.approx((np.sqrt(0.25 / 2), 0.5, 8))
+
+
+def test_rotation_errors_in_degrees_by_hand():
+    points = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [2, 1, 0]]
+    predicted = world_from(cameras(points, about(2, [0, 3, 3, 7])))
+    errors = trajectory_errors(predicted, world_from(cameras(points)))
+    assert errors.rre == pytest.approx(np.sqrt((9 + 0 + 16) / 3))
+    assert errors.ate == pytest.approx(0, abs=1e-9)
+    assert errors.rte == pytest.approx(np.sqrt(2 / 3) * 2 * np.sin(np.radians(1.5)))
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=seeds)
+def test_the_world_of_the_prediction_does_not_matter(seed):
+    generator = np.random.default_rng(seed)
+    predicted, truth = wandering(generator)
+    errors = trajectory_errors(predicted, truth)
+    camera_from_world = np.linalg.inv(predicted)[:, :3]
+    moved = world_from(align(camera_from_world, random_similarity(generator)))
+    assert trajectory_errors(moved, truth) == pytest.approx(errors)
+    rigid = random_similarity(generator)._replace(scale=1.0)
+    moved = world_from(align(camera_from_world, rigid))
+    for how in ("se3", "first"):
+        assert trajectory_errors(moved, truth, how) == pytest.approx(trajectory_errors(predicted, truth, how))
+        assert trajectory_errors(truth, truth, how) == pytest.approx((0, 0, 0), abs=1e-5)
+    assert trajectory_errors(truth, truth) == pytest.approx((0, 0, 0), abs=1e-5)
+    assert errors.ate <= trajectory_errors(predicted, truth, "se3").ate + 1e-12
+    relative = relative_errors(camera_from_world, np.linalg.inv(truth)[:, :3])
+    assert errors == pytest.approx((centre_error(camera_from_world, np.linalg.inv(truth)[:, :3]), *relative))
+
+
+@pytest.mark.parametrize("how", ["sim3", "se3", "first"])
+@pytest.mark.parametrize("seed", range(4))
+def test_evo_agrees(seed, how):
+    """An independent program (Grupp 2017): APE and RPE of the translation, RPE of the angle, RMSE, one frame apart."""
+    metrics = pytest.importorskip("evo.core.metrics", reason="evo is a test-only cross-check")
+    trajectory = pytest.importorskip("evo.core.trajectory", reason="evo is a test-only cross-check")
+    predicted, truth = wandering(np.random.default_rng(seed), noise=0.1)
+    reference, estimate = (trajectory.PosePath3D(poses_se3=list(poses)) for poses in (truth, predicted))
+    if how == "first":
+        estimate.align_origin(reference)
+    else:
+        estimate.align(reference, correct_scale=how == "sim3")
+    relation = metrics.PoseRelation
+    wanted = []
+    for measure in (
+        metrics.APE(relation.translation_part),
+        metrics.RPE(relation.translation_part, 1, metrics.Unit.frames),
+        metrics.RPE(relation.rotation_angle_deg, 1, metrics.Unit.frames),
+    ):
+        measure.process_data((reference, estimate))
+        wanted.append(measure.get_statistic(metrics.StatisticsType.rmse))
+    assert trajectory_errors(predicted, truth, how) == pytest.approx(tuple(wanted), abs=1e-6, rel=1e-6)
+
+
+MANY, FEW, STILL = (world_from(poses) for poses in (cameras(np.eye(4, 3)), still(2), still(4)))
+
+
+@pytest.mark.parametrize(
+    ("predicted", "truth", "how", "sentence"),
+    [
+        (FEW, FEW, "sim3", "2 poses; expected at least 3"),
+        (FEW[:1], FEW[:1], "first", "1 poses; expected at least 2"),
+        (STILL, MANY, "sim3", "predicted cameras do not move"),
+        (MANY, STILL, "se3", "true cameras do not move"),
+        (MANY, FEW, "first", "4 predicted poses and 2 true ones"),
+        (MANY, MANY, "sim2", "align is 'sim2'; expected one of sim3, se3, first"),
+        (MANY[:, :3], MANY, "sim3", r"predicted poses have shape \(4, 3, 4\); expected world-from-camera \[S, 4, 4\]"),
+        (MANY, 2 * MANY, "sim3", "true poses are not rigid"),
+        (np.diag([2, 2, 2, 1]) * MANY, MANY, "sim3", "frame 0 is not a rotation"),
+        (np.full((4, 4, 4), np.nan), MANY, "sim3", "predicted poses are not rigid"),
+        (np.where(np.arange(4)[:, None] < 3, np.nan, MANY), MANY, "sim3", "not finite"),
+    ],
+)
+def test_trajectories_that_cannot_be_compared_are_one_sentence(predicted, truth, how, sentence):
+    with pytest.raises(InputError, match=sentence):
+        trajectory_errors(predicted, truth, how)
+
+
+def test_cameras_that_stand_still_have_errors_from_the_first_pose_on():
+    assert trajectory_errors(STILL, STILL, "first") == (0, 0, 0)
+
+
+def test_associate_by_hand():
+    # 1.00 could go with 1.015 and 0.99; the closer wins, and 1.015 goes with 1.03. Nothing is near 5.
+    assert associate(np.array([1.0, 1.03, 5]), np.array([0.99, 1.015])).tolist() == [[0, 0], [1, 1]]
+    # Unsorted; the pair at 2 is exact, so 2.01 stays alone.
+    assert associate(np.array([3, 2.01, 2]), np.array([2, 3.005])).tolist() == [[2, 0], [0, 1]]
+    # Closest first: 0.001 takes 0, and its neighbour is left the farther one.
+    assert associate(np.array([-0.012, 0.001]), np.array([0, 0.012])).tolist() == [[1, 0]]
+    assert associate(np.array([0.0]), np.array([0.5]), 0.5).shape == (0, 2)  # exactly as far apart
+    assert associate(np.array([]), np.array([1.0])).shape == (0, 2)
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=seeds, tolerance=st.floats(0.001, 0.1))
+def test_associate_is_greedy_over_all_pairs(seed, tolerance):
+    generator = np.random.default_rng(seed)
+    times, other = np.sort(generator.random(12)), np.sort(generator.random(9))
+    pairs = sorted((abs(a - b), i, j) for i, a in enumerate(times) for j, b in enumerate(other))
+    wanted = []
+    for apart, i, j in pairs:
+        if apart < tolerance and i not in [a for a, _ in wanted] and j not in [b for _, b in wanted]:
+            wanted.append((i, j))
+    assert associate(times, other, tolerance).tolist() == [list(pair) for pair in sorted(wanted)]
+
+
+@pytest.mark.parametrize(
+    ("times", "other", "tolerance", "sentence"),
+    [
+        (np.zeros((2, 2)), np.zeros(2), 0.02, "times has shape"),
+        (np.zeros(2), np.array([np.nan]), 0.02, "other_times has shape"),
+        (np.zeros(2), np.zeros(2), 0.0, "tolerance is 0.0"),
+        (np.zeros(5000), np.zeros(5000), 0.02, "25000000 pairs of times"),
+    ],
+)
+def test_times_that_cannot_be_paired_are_one_sentence(times, other, tolerance, sentence):
+    with pytest.raises(InputError, match=sentence):
+        associate(times, other, tolerance)
 
 
 @settings(max_examples=20, deadline=None)

@@ -8,6 +8,7 @@ from .config import VGGTConfig as VGGTConfig
 from .config import vggt_1b as vggt_1b
 from .errors import VggtjaxError as VggtjaxError
 from .fusion import fuse_depth as fuse_depth
+from .instances import find_instances as find_instances
 from .methods import LADDER as LADDER
 from .methods import METHODS as METHODS
 from .network.backbone import encode as encode
@@ -24,6 +25,7 @@ from .passes import run_passes as run_passes
 from .pipeline import infer as infer
 from .pipeline import reconstruct as reconstruct
 from .refinement import refine_masks as refine_masks
+from .results.frames import frame_of as frame_of
 from .results.reconstruction import Reconstruction as Reconstruction
 from .tracking import Queries as Queries
 

@@ -70,7 +70,7 @@ class Model:
 
     @property
     def heads(self) -> tuple[str, ...]:
-        """Names of the heads that the parameters hold."""
+        """Names of the heads that the model has."""
         return self.config.heads
 
     def summary(self) -> dict[str, Any]:
@@ -110,7 +110,7 @@ def load_model(
             sharded one's index or folder, .pt, .pth), or a hub id such as "facebook/VGGT-1B".
         config: the configuration of PyTorch weights; None for VGGT-1B. A file of this library knows its own.
         dtype: of the parameters; None keeps the file's, and makes float32 of PyTorch weights.
-        progress: called during a conversion with the tensors converted and their number.
+        progress: called during a conversion with the steps done and their number.
 
     Raises:
         CheckpointError: nothing is there, or it cannot be read, or does not fit the configuration.

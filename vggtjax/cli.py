@@ -14,8 +14,9 @@ import tyro
 from vggtjax.calibration.command import calibrate_cues
 from vggtjax.config import Gram, Suppress, VGGTConfig
 from vggtjax.errors import InputError, VggtjaxError
+from vggtjax.evaluation.command import evaluate
 from vggtjax.host_memory import keep_freed_memory
-from vggtjax.methods import MethodName
+from vggtjax.methods import MethodName, check_smooth_frames
 from vggtjax.report import Report
 from vggtjax.scenes.command import scenes
 from vggtjax.training.command import train
@@ -83,19 +84,21 @@ def reconstruct(
         dtype: of the blocks' matrix products.
         confidence_percentile: leave so many percent of the pixels, the least confident, out of the point clouds.
         resolution: of the files: the model's, or the source's own, with crop, scale and padding undone.
-        layout: "vggt4d" writes, beside our own files, the folder vggt4d/ in the layout of VGGT4D and MonST3R.
+        layout: "vggt4d" writes, beside our own files, the folder vggt4d/ as VGGT4D does.
     """
     if not source:
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
     if masks is not None and no_masks:
         raise InputError("--masks and --no-masks are opposites; give one of them")
+    if smooth_frames != 1 and (masks is not None or no_masks):
+        raise InputError("--smooth-frames is for masks that are mined; leave it out with --masks and --no-masks")
     if refine_mask and no_refine_mask:
         raise InputError("--refine-mask and --no-refine-mask are opposites; give one of them")
     frames = source[0] if len(source) == 1 else list(source)
     report = Report()
     with report.running():
         _check_early(frames, (start, stride, fps, max_frames), confidence_percentile, out, masks, tracks)
-        _check_odd(smooth_frames)
+        check_smooth_frames(smooth_frames)
         loaded = _load_model(report, model, config)
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import load_clip
@@ -267,6 +270,7 @@ COMMANDS = {
     "demo": demo,
     "info": info,
     "train": train,
+    "evaluate": evaluate,
     "calibrate-cues": calibrate_cues,
     "scenes": scenes,
 }
@@ -323,11 +327,6 @@ def _check_early(
         check_words(tracks)
     check_percentile(confidence_percentile)
     _check_folder(out)
-
-
-def _check_odd(smooth_frames: int) -> None:
-    if smooth_frames < 1 or smooth_frames % 2 == 0:
-        raise InputError(f"--smooth-frames is {smooth_frames}; expected an odd number of frames, such as 3")
 
 
 def _check_folder(out: Path) -> None:

@@ -1,34 +1,58 @@
-"""The dynamic mask as objects: connected components over space and time, with ids that stay. Does not import jax."""
+"""The dynamic mask as objects: regions of each frame, followed from frame to frame by where they should be."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float64, Int, UInt8
 from scipy import ndimage
+from scipy.optimize import linear_sum_assignment
 
 from vggtjax.errors import InputError
 
 MOST = 255  # objects: ids fit the palette of a picture
-LEAST_SHARE = 5e-4  # of a frame's pixels that an object must fill in the frame that shows most of it
+LEAST_SHARE = 5e-4  # of a frame's pixels, which a region must fill to be an object
 GAP = 1  # frames for which an object may be lost
-_NEIGHBOURS = np.ones((3, 3, 3), bool)  # of a pixel: in its frame, the one before and the one after
+_REACH = 2.0  # sizes of an object by which it may miss the place where it is expected
+_NEIGHBOURS = np.ones((3, 3), bool)
+_PART = 0.5  # of a region, which lies where an object is expected: then it is a part of that object
+
+
+@dataclass
+class _Object:
+    """What is known of an object so far."""
+
+    id: int
+    frame: int  # that it was last seen in
+    centre: Float64[np.ndarray, " 2"]
+    velocity: Float64[np.ndarray, " 2"]  # pixels a frame; 0 until it was seen twice
+    pixels: Int[np.ndarray, "N 2"]  # then
+    volume: int  # pixels of all frames
+
+    def expected(self, frame: int) -> Float64[np.ndarray, " 2"]:
+        """Return by how much it should have moved since it was last seen."""
+        return self.velocity * (frame - self.frame)
 
 
 def find_instances(
     dynamic_mask: Bool[np.ndarray, "S H W"], *, gap: int = GAP, least_share: float = LEAST_SHARE
 ) -> UInt8[np.ndarray, "S H W"]:
-    """Tell moving objects apart: regions of the mask that touch in space or from one frame to the next are one.
+    """Tell moving objects apart, with the same id in all frames.
 
-    Objects that touch anywhere in the clip are one; one that moves by more than its own width between two frames is
-    two. Sample the clip more densely where that happens.
+    The connected regions of a frame are matched one to one with the objects so far, so that the squared distances from
+    where each should be (its last place, moved on at its last speed), in sizes of the object, are least in sum. A
+    region without a match that mostly lies where a matched object should be is a part of it; any other is a new object.
+    Objects that touch are one region, which goes on as one of them. Two that look alike are told apart as long as none
+    moves by much more than its own size from one frame to the next.
 
     Args:
         dynamic_mask: True where the world moves.
-        gap: frames for which an object may vanish, and keep its id when it comes back to where it was.
-        least_share: of a frame's pixels that an object must fill somewhere; smaller ones are no objects.
+        gap: frames for which an object may vanish, and keep its id when it comes back to where it should be.
+        least_share: of a frame's pixels that a region must fill; smaller ones are no objects.
 
     Returns:
-        0 where nothing moves (and for what is too small), else the object: 1 fills most pixels of the clip, 255 fewest.
+        0 where nothing moves and for what is too small, else the object: 1 fills most pixels of the clip, 255 fewest.
 
     Raises:
         InputError: a mask that is not bool [S, H, W], or a value out of range.
@@ -37,20 +61,65 @@ def find_instances(
         raise InputError(f"dynamic_mask is {dynamic_mask.dtype} {dynamic_mask.shape}; expected bool [S, H, W]")
     if gap < 0 or not 0 <= least_share <= 1:
         raise InputError(f"gap is {gap} and least_share {least_share}; expected at least 0, and 0 to 1")
-    linked = dynamic_mask.copy()
-    for later in range(1, gap + 1):  # a pixel stays for `gap` frames, and so meets what comes back there
-        linked[later:] |= dynamic_mask[:-later]
-    labels = np.zeros(linked.shape, np.int32)
-    ndimage.label(linked, _NEIGHBOURS, output=labels)
-    labels[~dynamic_mask] = 0
-    volume, largest = np.zeros((2, labels.max() + 1), np.int64)
-    for frame in labels:
-        sizes = np.bincount(frame.ravel(), minlength=len(volume))
-        volume += sizes
-        np.maximum(largest, sizes, out=largest)
-    largest[0] = 0
-    order = np.argsort(-volume, kind="stable")
-    kept = order[largest[order] >= max(1, least_share * dynamic_mask[0].size)][:MOST]
-    ids = np.zeros(len(volume), np.uint8)
-    ids[kept] = np.arange(1, len(kept) + 1)
-    return ids[labels]
+    ids = np.zeros(dynamic_mask.shape, np.int32)
+    objects: list[_Object] = []
+    for frame, mask in enumerate(dynamic_mask):
+        regions = _regions(mask, max(1, least_share * mask.size))
+        known = [one for one in objects if frame - one.frame <= 1 + gap]
+        owners = _matched(known, regions, frame)
+        shown = {id(owner): (owner, owner.pixels + owner.expected(frame)) for owner in owners if owner is not None}
+        for number, region in enumerate(regions):
+            owner = owners[number] or _part_of(region, shown.values())
+            if owner is None:
+                objects.append(owner := _Object(len(objects) + 1, frame, region.mean(axis=0), np.zeros(2), region, 0))
+            elif owners[number] is not None:
+                centre = region.mean(axis=0)
+                owner.velocity = (centre - owner.centre) / (frame - owner.frame)
+                owner.frame, owner.centre, owner.pixels = frame, centre, region
+            owner.volume += len(region)
+            ids[frame, region[:, 0], region[:, 1]] = owner.id
+    names = np.zeros(len(objects) + 1, np.uint8)
+    for name, one in enumerate(sorted(objects, key=lambda one: -one.volume)[:MOST], 1):
+        names[one.id] = name
+    return names[ids]
+
+
+def _regions(mask: Bool[np.ndarray, "H W"], least: float) -> list[Int[np.ndarray, "N 2"]]:
+    """Return the pixels (row, column) of each connected region that is large enough, the largest first."""
+    labels = np.zeros(mask.shape, np.int32)
+    ndimage.label(mask, _NEIGHBOURS, output=labels)
+    places = np.argwhere(labels)
+    owner = labels[places[:, 0], places[:, 1]]
+    sizes = np.bincount(owner, minlength=int(labels.max()) + 1)[1:]
+    order = np.argsort(owner, kind="stable")
+    regions = np.split(places[order], np.cumsum(sizes)[:-1]) if len(sizes) else []
+    return sorted((region for region in regions if len(region) >= least), key=lambda region: -len(region))
+
+
+def _matched(known: list[_Object], regions: list[Int[np.ndarray, "N 2"]], frame: int) -> list[_Object | None]:
+    """Return the object that each region is of, None for one that is nobody's."""
+    owners: list[_Object | None] = [None] * len(regions)
+    if not known or not regions:
+        return owners
+    expected = np.stack([one.centre + one.expected(frame) for one in known])
+    centres = np.stack([region.mean(axis=0) for region in regions])
+    size = np.sqrt([[max(len(one.pixels), len(region)) for region in regions] for one in known])
+    distance = np.linalg.norm(expected[:, None] - centres[None], axis=2) / size
+    cost = np.minimum(distance, _REACH) ** 2  # too far is as dear as no match
+    for i, j in zip(*linear_sum_assignment(cost), strict=True):
+        if distance[i, j] < _REACH:
+            owners[j] = known[i]
+    return owners
+
+
+def _part_of(region: Int[np.ndarray, "N 2"], shown) -> _Object | None:
+    """Return the object whose expected pixels hold most of a region."""
+    low, high = region.min(axis=0), region.max(axis=0) + 1
+    for owner, pixels in shown:
+        places = np.rint(pixels).astype(int)
+        near = places[((places >= low) & (places < high)).all(axis=1)] - low
+        there = np.zeros(high - low, bool)
+        there[near[:, 0], near[:, 1]] = True
+        if there[region[:, 0] - low[0], region[:, 1] - low[1]].mean() > _PART:
+            return owner
+    return None

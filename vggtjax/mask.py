@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.clustering import kmeans
-from vggtjax.errors import InputError
-from vggtjax.methods import Threshold
+from vggtjax.methods import Threshold, check_smooth_frames
 from vggtjax.motion import normalise
 
 BINS = 256
@@ -121,8 +120,7 @@ def smooth_over_time(saliency: Float[Array, "B S h w"], frames: int) -> Float[Ar
 
     Raises InputError for a number that is not odd.
     """
-    if type(frames) is not int or frames < 1 or frames % 2 == 0:
-        raise InputError(f"smooth_frames is {frames!r}; expected an odd number of frames, such as 3")
+    check_smooth_frames(frames)
     if frames == 1:
         return saliency
     S, reach = saliency.shape[1], frames // 2

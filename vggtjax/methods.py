@@ -46,6 +46,12 @@ METHODS: dict[str, Method] = {
 LADDER = ("vggt", "pose-decoupling", "hard-replacement", "4dvggt-d")  # what one run of both passes gives
 
 
+def check_smooth_frames(frames: int) -> None:
+    """Raise InputError for a number of frames to average over that has no middle."""
+    if type(frames) is not int or frames < 1 or frames % 2 == 0:
+        raise InputError(f"smooth_frames is {frames!r}; expected an odd number of frames, such as 3")
+
+
 def find_method(name: str) -> Method:
     """Return the method of that name; InputError if there is none."""
     if name not in METHODS:

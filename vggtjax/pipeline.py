@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, NamedTuple
@@ -18,13 +19,14 @@ from vggtjax.clips.clip import Clip
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
 from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.mask import mine_mask
-from vggtjax.methods import find_method
+from vggtjax.methods import check_smooth_frames, find_method
 from vggtjax.network.backbone import encode
 from vggtjax.network.layers import Params
+from vggtjax.network.model import Predictions
 from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass, track_from
 from vggtjax.refinement import refine_masks
 from vggtjax.results.frames import inside_pictures
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.reconstruction import FieldOfViewWarning, Reconstruction
 from vggtjax.tracking import Queries
 
 OnStage = Callable[[str], AbstractContextManager[Any]]
@@ -177,6 +179,9 @@ def reconstruct(
     }
     stages = _stages(config, method, clip.images.shape[1:3], **settings)
     arrays: dict[str, Any] = {"params": model.params, "images": jnp.asarray(clip.images)[None], "second": None}
+    check_smooth_frames(smooth_frames)
+    if masks is not None and smooth_frames != 1:
+        raise InputError(f"smooth_frames is {smooth_frames} and masks are given; smoothing is for masks that are mined")
     if masks is not None:
         arrays["dynamic_mask"] = jnp.asarray(_checked(masks, clip))[None]
         stages = [stage for stage in stages if stage.name != "dynamic mask"]
@@ -200,19 +205,12 @@ def reconstruct(
             f"{S} frames of {W} x {H} pixels do not fit in the memory of the device; take fewer frames "
             "(max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
         ) from error
-    depth, confidence, camera_from_world, intrinsics = (np.array(x[0]) for x in jax.tree.leaves(arrays["assembly"]))
-    fields = np.asarray(arrays[row.intrinsics].pose_encoding[0])[:, [8, 7]]  # of width and height
-    focal = intrinsics[:, [0, 1], [0, 1]]
-    intrinsics[:, [0, 1], [0, 1]] = np.where(fields > np.pi, -np.abs(focal), focal)  # beyond 2 pi the tangent repeats
     passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
     followed = {} if tracks is None else _joined_tracks(tracks, arrays)
     result = Reconstruction(
-        depth=depth,
-        depth_confidence=confidence,
+        **_assembled_fields(arrays["assembly"], arrays[row.intrinsics]),
         saliency=np.asarray(passes.saliency[0]),
         dynamic_mask=np.asarray(passes.dynamic_mask[0]),
-        camera_from_world=camera_from_world,
-        intrinsics=intrinsics,
         images=np.round(clip.images * 255).astype(np.uint8),
         frame_names=tuple(clip.frame_names),
         timestamps=clip.timestamps,
@@ -232,6 +230,91 @@ def reconstruct(
         with on_stage("refine mask") as progress:
             result = _refined(result, progress)
     return result
+
+
+def reconstruct_methods(
+    model: Model,
+    clip: Clip,
+    methods: Sequence[str],
+    *,
+    size: int | None = None,
+    mask_pairs: int = 5,
+    align_scale: bool = False,
+    smooth_frames: int = 1,
+    compute_dtype: str = "float32",
+    on_stage: OnStage | None = None,
+) -> dict[str, Reconstruction]:
+    """Reconstruct a clip by several methods, each as `reconstruct` does; what they have in common is computed once.
+
+    Methods that mine and suppress alike, which those of `LADDER` do, share one run of the passes.
+
+    Args:
+        methods: names of `METHODS`.
+        model, clip, size, mask_pairs, align_scale, smooth_frames, compute_dtype, on_stage: as for `reconstruct`.
+
+    Returns:
+        The results by method, in the order of `methods`.
+
+    Raises:
+        What `reconstruct` raises.
+    """
+    alike: dict[tuple, list[str]] = {}
+    for name in methods:
+        row = find_method(name)
+        alike.setdefault((row.gram, row.suppress, row.clusters, row.threshold), []).append(name)
+    results: dict[str, Reconstruction] = {}
+    for names in alike.values():
+        made = reconstruct(
+            model,
+            clip,
+            method=next((name for name in names if find_method(name).needs_second_pass), names[0]),
+            size=size,
+            mask_pairs=mask_pairs,
+            align_scale=align_scale,
+            smooth_frames=smooth_frames,
+            refine_mask=False,
+            compute_dtype=compute_dtype,
+            keep_passes=True,
+            on_stage=on_stage,
+        )
+        for name in names:
+            results[name] = _as_method(made, name, align_scale, on_stage or (lambda name: nullcontext()))
+    return {name: results[name] for name in methods}
+
+
+def _as_method(made: Reconstruction, method: str, align_scale: bool, on_stage: OnStage) -> Reconstruction:
+    """Return what another method makes of the passes that a result keeps."""
+    row, passes = find_method(method), made.passes
+    with warnings.catch_warnings():
+        if made.method == method:  # it has said already which cameras were clamped
+            warnings.simplefilter("ignore", FieldOfViewWarning)
+        result = dataclasses.replace(
+            made,
+            **_assembled_fields(
+                _assembled(*passes, method=method, align_scale=align_scale), getattr(passes, row.intrinsics)
+            ),
+            method=method,
+            settings=made.settings | {"refine_mask": row.refine},
+            passes=None,
+        )
+    if row.refine:
+        with on_stage("refine mask") as progress:
+            result = _refined(result, progress)
+    return result
+
+
+def _assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, np.ndarray]:
+    """Return a method's depth, confidence and cameras of the first clip; its intrinsics are of the pass `source`."""
+    depth, confidence, camera_from_world, intrinsics = (np.array(x[0]) for x in jax.tree.leaves(assembly))
+    fields = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
+    focal = intrinsics[:, [0, 1], [0, 1]]
+    intrinsics[:, [0, 1], [0, 1]] = np.where(fields > np.pi, -np.abs(focal), focal)  # beyond 2 pi the tangent repeats
+    return {
+        "depth": depth,
+        "depth_confidence": confidence,
+        "camera_from_world": camera_from_world,
+        "intrinsics": intrinsics,
+    }
 
 
 def _tracking_stages(

@@ -120,6 +120,21 @@ class Report:
             "Sim(3), in median depths. Mask: mined from the first pass, or the true one."
         )
 
+    def means(self, means: Mapping[str, Mapping[str, float]]) -> None:
+        """Print the means of an evaluation as a table, a row for every metric and a column for every method."""
+        from vggtjax.evaluation.tables import ARROWS, best, cell, shown_columns
+
+        table = Table(box=None, pad_edge=False)
+        for name in ("", *means):
+            table.add_column(name, justify="right" if name else "left", no_wrap=True)
+        for column in shown_columns(means):
+            top = best(means, column)
+            cells = (
+                f"[bold]{cell(row, column)}[/]" if name in top else cell(row, column) for name, row in means.items()
+            )
+            table.add_row(f"{column.heading} {ARROWS[column.better]}", *cells)
+        self._out.print(table, soft_wrap=True)
+
     def line(self, text: str) -> None:
         """Print one line."""
         self._out.print(Text(text), soft_wrap=True)

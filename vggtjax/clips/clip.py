@@ -62,10 +62,8 @@ class Clip:
 
         Raises ClipError where the source cannot be read any more, or gives other frames than before.
         """
-        names = []
-        for frame in self.source.frames(self.sampling):
-            names.append(frame.name)
-            if names != self.frame_names[: len(names)]:
+        for number, frame in enumerate(self.source.frames(self.sampling)):
+            if number >= len(self) or frame.name != self.frame_names[number]:
                 raise ClipError(f"the source of the clip gives frame {frame.name}, not as before; load the clip anew")
             yield np.asarray(frame.image)
 

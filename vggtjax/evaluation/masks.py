@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
+from scipy.ndimage import distance_transform_edt
 from scipy.stats import rankdata
 
 from vggtjax.errors import InputError
+
+Empty = Literal["davis", "vggt4d"]
+
+_EMPTY_J = {"davis": 1.0, "vggt4d": 0.0}  # J of a frame in which neither mask has a pixel
+_RECALLED = 0.5  # a frame counts as found above this score
+_BINS = 4  # of a sequence, for the decay
+_BOUNDARY_WIDTH = 0.008  # how far boundaries may be apart, in diagonals of the frame
 
 
 class PrecisionRecall(NamedTuple):
@@ -16,6 +25,28 @@ class PrecisionRecall(NamedTuple):
 
     precision: float
     recall: float
+
+
+class MaskScores(NamedTuple):
+    """DAVIS' statistics of J (intersection over union) and F (boundaries) over frames.
+
+    Mean and recall (the share of frames above 0.5) lie in 0 to 1; the decay is the mean of the first of four bins of
+    frames minus that of the last.
+    """
+
+    j_mean: float
+    j_recall: float
+    j_decay: float
+    f_mean: float
+    f_recall: float
+    f_decay: float
+
+
+class FrameScores(NamedTuple):
+    """J and F of every frame, 0 to 1."""
+
+    j: Float64[np.ndarray, " S"]
+    f: Float64[np.ndarray, " S"]
 
 
 def auc(saliency: Float[np.ndarray, "*S H W"], mask: Bool[np.ndarray, "*S H W"]) -> float:
@@ -52,6 +83,97 @@ def precision_recall(predicted: Bool[np.ndarray, "*S H W"], truth: Bool[np.ndarr
     right = int((predicted & truth).sum())
     found, sought = int(predicted.sum()), int(truth.sum())
     return PrecisionRecall(right / found if found else 1.0, right / sought if sought else 1.0)
+
+
+def mask_scores(
+    predicted: Bool[np.ndarray, "S H W"], truth: Bool[np.ndarray, "S H W"], *, empty: Empty = "davis"
+) -> MaskScores:
+    """Return mean, recall and decay of J and F of a sequence (Perazzi et al. 2016).
+
+    Args:
+        predicted, truth: masks of the same frames, at one size. DAVIS itself leaves out the first and the last frame
+            where the first is given to the method; all that are here count.
+        empty: J of a frame in which both masks are empty: "davis" 1, "vggt4d" 0. F is 1 there with both.
+
+    Raises:
+        InputError: masks that are not bool [S, H, W] of one shape, no frame or no pixel, an unknown `empty`.
+    """
+    return _scores(frame_scores(predicted, truth, empty=empty))
+
+
+def pooled_scores(
+    sequences: Sequence[tuple[Bool[np.ndarray, "S H W"], Bool[np.ndarray, "S H W"]]], *, empty: Empty = "davis"
+) -> MaskScores:
+    """Return the scores over all frames of all sequences in a row, so that long sequences weigh more.
+
+    The decay over that row compares the first quarter of all frames with the last, and depends on the sequences'
+    order.
+
+    Args:
+        sequences: predicted and true masks of each.
+        empty: as for `mask_scores`.
+
+    Raises:
+        InputError: no sequence, or as `mask_scores`.
+    """
+    if not len(sequences):
+        raise InputError("there are no sequences to pool; expected at least 1")
+    frames = [frame_scores(predicted, truth, empty=empty) for predicted, truth in sequences]
+    return _scores(FrameScores(*(np.concatenate(values) for values in zip(*frames, strict=True))))
+
+
+def frame_scores(
+    predicted: Bool[np.ndarray, "S H W"], truth: Bool[np.ndarray, "S H W"], *, empty: Empty = "davis"
+) -> FrameScores:
+    """Return J and F of every frame; arguments and errors as for `mask_scores`."""
+    if empty not in _EMPTY_J:
+        raise InputError(f"empty is {empty!r}; expected one of {', '.join(_EMPTY_J)}")
+    predicted, truth = _masks(predicted, truth)
+    if truth.ndim != 3 or not truth.size:
+        raise InputError(f"the masks have shape {truth.shape}; expected [S, H, W] with a frame and a pixel at least")
+    union = (predicted | truth).sum(axis=(1, 2))
+    both = (predicted & truth).sum(axis=(1, 2))
+    j = np.where(union > 0, both / np.maximum(union, 1), _EMPTY_J[empty])
+    return FrameScores(j, np.array([_boundary_f(*pair) for pair in zip(predicted, truth, strict=True)]))
+
+
+def _boundary_f(predicted: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> float:
+    """Return the F-measure of the boundaries, each matched within a disk around the pixels of the other.
+
+    A mask that fills the frame has no boundary, like one that is empty.
+    """
+    radius = np.ceil(_BOUNDARY_WIDTH * np.hypot(*truth.shape))
+    found, sought = boundary(predicted), boundary(truth)
+    if not found.any() or not sought.any():
+        return float(found.any() == sought.any())
+    # A disk x^2 + y^2 <= r^2 around every pixel of a boundary covers what is at most r away from one.
+    precision = float((np.asarray(distance_transform_edt(~sought))[found] <= radius).mean())
+    recall = float((np.asarray(distance_transform_edt(~found))[sought] <= radius).mean())
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def boundary(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Return the boundary of a mask, one pixel wide, as DAVIS draws it.
+
+    A pixel belongs to it that differs from its right, its lower or its lower right neighbour: the true
+    edge, moved up and left by half a pixel. In the last row only the right neighbour counts, in the last column
+    only the lower one, and the last pixel of all is none: the frame's own edge is no boundary.
+    """
+    beyond = np.pad(_mask("mask", mask), ((0, 1), (0, 1)), mode="edge")  # what is outside never differs
+    here = beyond[:-1, :-1]
+    return (here ^ beyond[:-1, 1:]) | (here ^ beyond[1:, :-1]) | (here ^ beyond[1:, 1:])
+
+
+def _scores(frames: FrameScores) -> MaskScores:
+    return MaskScores(*_statistics(frames.j), *_statistics(frames.f))
+
+
+def _statistics(values: Float64[np.ndarray, " S"]) -> tuple[float, float, float]:
+    """Return mean, recall and decay; neighbouring bins share the frame between them, as in DAVIS."""
+    # Edges are rounded half up, 1.5 to 2; numpy rounds half to even.
+    edges = np.floor(np.linspace(1, len(values), _BINS + 1) + 0.5 + 1e-10).astype(int) - 1
+    first, last = values[: edges[1] + 1], values[edges[-2] :]
+    return float(values.mean()), float((values > _RECALLED).mean()), float(first.mean() - last.mean())
 
 
 def _masks(predicted, truth):

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int
 from scipy.spatial.transform import Rotation
 
 from vggtjax.errors import InputError
+
+Alignment = Literal["sim3", "se3", "first"]
 
 FEWEST_POSES = 3  # fewer centres can always be aligned exactly
 _NO_MOTION = 1e-6  # a spread of centres below this share of their distance from the origin is float32's rounding
 _NO_WIDTH = 1e-6  # centres whose second extent is below this share of the first are a line
 _NOT_RIGID = 1e-2  # how far R^T R may be from the identity
+_MOST_CANDIDATES = 10_000_000  # pairs of timestamps within the tolerance; 160 MB of indices
 
 
 class Similarity(NamedTuple):
@@ -35,6 +38,14 @@ class RelativeErrors(NamedTuple):
     rotation: float
 
 
+class TrajectoryErrors(NamedTuple):
+    """RMSE of the centres, and of the steps between consecutive frames; `trajectory_errors` says how."""
+
+    ate: float  # in the truth's unit
+    rte: float  # in the truth's unit
+    rre: float  # degrees
+
+
 def centres(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarray, "S 3"]:
     """Return the camera centres in the world, -R^T t."""
     poses = checked_poses(camera_from_world)
@@ -42,7 +53,11 @@ def centres(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarray
 
 
 def umeyama_sim3(
-    source: Float[np.ndarray, "N 3"], target: Float[np.ndarray, "N 3"], *, allow_line: bool = False
+    source: Float[np.ndarray, "N 3"],
+    target: Float[np.ndarray, "N 3"],
+    *,
+    allow_line: bool = False,
+    with_scale: bool = True,
 ) -> Similarity:
     """Return the similarity that takes `source` to `target` with the least squared error (Umeyama 1991).
 
@@ -50,6 +65,7 @@ def umeyama_sim3(
         source, target: corresponding points.
         allow_line: accept points on one line, around which the rotation is arbitrary: one of the equally good ones is
             returned. Scale and remaining error do not depend on it.
+        with_scale: False keeps the scale at 1: the best rotation and translation, SE(3).
 
     Raises:
         InputError: shapes that differ, values that are not finite, fewer than 3 points, points that all coincide, or
@@ -68,7 +84,7 @@ def umeyama_sim3(
             raise InputError(f"the {name} points lie on one line, around which no rotation can be found")
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
     rotation = left @ (signs[:, None] * right)
-    scale = float(values @ signs / ((source - mean_source) ** 2).sum(axis=1).mean())
+    scale = float(values @ signs / ((source - mean_source) ** 2).sum(axis=1).mean()) if with_scale else 1.0
     if scale <= 0:
         raise InputError("source and target points are not correlated: no positive scale takes one to the other")
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
@@ -125,8 +141,83 @@ def relative_errors(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarr
     """
     source, target = _pair_of_centres(predicted, truth)
     aligned = align(predicted, umeyama_sim3(source, target, allow_line=True))
-    steps = [_steps(poses) for poses in (aligned, checked_poses(truth))]
-    (rotation, translation), (true_rotation, true_translation) = steps
+    return _relative(aligned, checked_poses(truth))
+
+
+def trajectory_errors(
+    predicted: Float[np.ndarray, "S 4 4"], truth: Float[np.ndarray, "S 4 4"], align: Alignment = "sim3"
+) -> TrajectoryErrors:
+    """Return ATE, RTE and RRE of world-from-camera poses, as evo defines them.
+
+    ATE is the RMSE of ||c_i - c*_i|| over the aligned centres; RTE and RRE are the RMSE of the translation and of the
+    angle of E = (Q_i^-1 Q_i+1)^-1 (P_i^-1 P_i+1) over all consecutive pairs, P the aligned prediction, Q the truth.
+
+    Args:
+        predicted, truth: rigid transforms, world from camera, of the same frames.
+        align: what is fitted to the centres before: "sim3" rotation, translation and scale (Umeyama 1991), "se3" the
+            same without scale; or "first": the prediction is moved so that its first pose is the true one, and
+            keeps its scale.
+
+    Raises:
+        InputError: poses that are not rigid [S, 4, 4], another number of one than of the other, an unknown alignment.
+            With "sim3" and "se3" also fewer than 3 poses or cameras that do not move, with "first" fewer than 2.
+    """
+    if align not in get_args(Alignment):
+        raise InputError(f"align is {align!r}; expected one of {', '.join(get_args(Alignment))}")
+    fewest = 2 if align == "first" else FEWEST_POSES
+    source, target = _pair(_camera_from_world("predicted", predicted), _camera_from_world("true", truth), fewest)
+    aligned = _onto(source, target, align)
+    apart = centres(aligned) - centres(target)
+    relative = _relative(aligned, target)
+    return TrajectoryErrors(float(np.sqrt((apart**2).sum(axis=1).mean())), relative.translation, relative.rotation)
+
+
+def associate(
+    times: Float[np.ndarray, " N"], other_times: Float[np.ndarray, " M"], tolerance: float = 0.02
+) -> Int[np.ndarray, "K 2"]:
+    """Return which timestamps belong together, as TUM's tools for RGB-D sequences pair them.
+
+    Of all pairs that are less than `tolerance` apart the closest is taken first, then the closest of those whose
+    timestamps are both still free, and so on.
+
+    Args:
+        times, other_times: seconds, in any order.
+        tolerance: seconds; a pair that is exactly as far apart does not count.
+
+    Returns:
+        Indices into `times` and `other_times`, in the order of `times`; none where nothing is close enough.
+
+    Raises:
+        InputError: times that are not a finite row, a tolerance that is not above 0, or one so large that more than
+            ten million pairs lie within.
+    """
+    first, second = (_timestamps(name, row) for name, row in (("times", times), ("other_times", other_times)))
+    if not tolerance > 0:
+        raise InputError(f"tolerance is {tolerance}; expected seconds above 0")
+    order = np.argsort(second, kind="stable")
+    starts = np.searchsorted(second[order], first - tolerance, side="left")
+    counts = np.searchsorted(second[order], first + tolerance, side="right") - starts
+    if counts.sum() > _MOST_CANDIDATES:
+        raise InputError(f"{counts.sum()} pairs of times are within {tolerance} s; expected a smaller tolerance")
+    left = np.repeat(np.arange(len(first)), counts)
+    offsets = np.arange(len(left)) - np.repeat(counts.cumsum() - counts, counts)
+    right = order[np.repeat(starts, counts) + offsets]
+    apart = np.abs(first[left] - second[right])
+    near = np.flatnonzero(apart < tolerance)
+    near = near[np.lexsort((second[right[near]], first[left[near]], apart[near]))]
+    partner = np.full(len(first), -1)
+    taken = np.zeros(len(second), bool)
+    for i, j in zip(left[near].tolist(), right[near].tolist(), strict=True):
+        if partner[i] < 0 and not taken[j]:
+            partner[i], taken[j] = j, True
+    found = np.flatnonzero(partner >= 0)
+    found = found[np.argsort(first[found], kind="stable")]
+    return np.stack([found, partner[found]], axis=1)
+
+
+def _relative(aligned: Float64[np.ndarray, "S 3 4"], truth: Float64[np.ndarray, "S 3 4"]) -> RelativeErrors:
+    """Return the errors of the steps of camera-from-world poses that share a world."""
+    (rotation, translation), (true_rotation, true_translation) = _steps(aligned), _steps(truth)
     apart = true_rotation.inv().apply(translation - true_translation)
     angles = (true_rotation.inv() * rotation).magnitude()
     return RelativeErrors(float(np.sqrt((apart**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((angles**2).mean()))))
@@ -144,6 +235,33 @@ def checked_poses(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.n
     if (wrong := np.flatnonzero(skewed | (np.linalg.det(rotation) < 0))).size:
         raise InputError(f"the camera pose of frame {wrong[0]} is not a rotation and a translation")
     return poses
+
+
+def _camera_from_world(name: str, world_from_camera) -> Float64[np.ndarray, "S 3 4"]:
+    """Return inverted poses [S, 3, 4], rotations made exact."""
+    poses = np.asarray(world_from_camera, np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise InputError(f"the {name} poses have shape {poses.shape}; expected world-from-camera [S, 4, 4]")
+    if not np.allclose(poses[:, 3], [0, 0, 0, 1]):
+        raise InputError(f"the {name} poses are not rigid: expected their last rows to be 0, 0, 0, 1")
+    inverse = _rotations(checked_poses(poses[:, :3])).inv()
+    return np.concatenate([inverse.as_matrix(), -inverse.apply(poses[:, :3, 3])[:, :, None]], axis=2)
+
+
+def _onto(predicted: Float64[np.ndarray, "S 3 4"], truth: Float64[np.ndarray, "S 3 4"], how: Alignment):
+    """Return the predicted camera-from-world poses in the world of the true ones."""
+    if how != "first":
+        pair = _pair_of_centres(predicted, truth)
+        return align(predicted, umeyama_sim3(*pair, allow_line=True, with_scale=how == "sim3"))
+    rotation = truth[0, :, :3].T @ predicted[0, :, :3]
+    return align(predicted, Similarity(1.0, rotation, centres(truth)[0] - rotation @ centres(predicted)[0]))
+
+
+def _timestamps(name: str, times) -> Float64[np.ndarray, " N"]:
+    times = np.asarray(times, np.float64)
+    if times.ndim != 1 or not np.isfinite(times).all():
+        raise InputError(f"{name} has shape {times.shape}; expected a row of finite seconds")
+    return times
 
 
 def _pair(predicted, truth, fewest: int) -> tuple[Float64[np.ndarray, "S 3 4"], Float64[np.ndarray, "S 3 4"]]:

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Float, Float64, Shaped
 
-from vggtjax.clips.clip import Clip
 from vggtjax.errors import InputError
 
 
@@ -58,7 +57,26 @@ def batched_truth(truth: ClipTruth) -> Truth:
     return arrays
 
 
-def at_clip_pixels(clip: Clip, maps: Shaped[np.ndarray, "S h w"]) -> Shaped[np.ndarray, "S H W"]:
+class Placed(Protocol):
+    """Frames with their place in the source's pictures: a `Clip` is one, and a `Reconstruction`."""
+
+    @property
+    def images(self) -> np.ndarray: ...  # [S, H, W, 3]
+
+    @property
+    def source_size(self) -> np.ndarray: ...  # [S, 2], height and width
+
+    @property
+    def source_scale(self) -> np.ndarray: ...  # [S, 2], source (x, y) = scale * (x, y) + offset
+
+    @property
+    def source_offset(self) -> np.ndarray: ...  # [S, 2]
+
+    @property
+    def valid_box(self) -> np.ndarray: ...  # [S, 4], left, top, right, bottom
+
+
+def at_clip_pixels(clip: Placed, maps: Shaped[np.ndarray, "S h w"]) -> Shaped[np.ndarray, "S H W"]:
     """Return maps of the source's frames at the pixels of the clip, through the very resize and crop of its images.
 
     Each clip pixel takes the value of the source pixel in which its centre lies: depth is never averaged across an
@@ -69,27 +87,28 @@ def at_clip_pixels(clip: Clip, maps: Shaped[np.ndarray, "S h w"]) -> Shaped[np.n
     """
     maps = np.asarray(maps)
     sizes = {(int(height), int(width)) for height, width in clip.source_size}
-    if sizes != {maps.shape[1:]} or len(maps) != len(clip):
+    frames, height, width = clip.images.shape[:3]
+    if sizes != {maps.shape[1:]} or len(maps) != frames:
         raise InputError(
-            f"maps have shape {maps.shape}; expected {len(clip)} of the source's size {' and '.join(map(str, sizes))}"
+            f"maps have shape {maps.shape}; expected {frames} of the source's size {' and '.join(map(str, sizes))}"
         )
-    height, width = clip.images.shape[1:3]
-    result = np.zeros((len(clip), height, width), maps.dtype)
+    result = np.zeros((frames, height, width), maps.dtype)
     for frame, (left, top, right, bottom) in enumerate(clip.valid_box):
         pixels = np.stack(np.meshgrid(np.arange(left, right), np.arange(top, bottom)), axis=-1)
-        x, y = np.moveaxis(np.floor(clip.to_source(frame, pixels + 0.5)).astype(int), -1, 0)
+        places = (pixels + 0.5) * clip.source_scale[frame] + clip.source_offset[frame]
+        x, y = np.moveaxis(np.floor(places).astype(int), -1, 0)
         result[frame, top:bottom, left:right] = maps[frame, y, x]
     return result
 
 
 def intrinsics_at_clip_pixels(
-    clip: Clip, intrinsics: Float[np.ndarray, "3 3"] | Float[np.ndarray, "S 3 3"]
+    clip: Placed, intrinsics: Float[np.ndarray, "3 3"] | Float[np.ndarray, "S 3 3"]
 ) -> Float64[np.ndarray, "S 3 3"]:
     """Return intrinsics of the source's pixels in pixels of the clip: focal lengths, skew and principal point.
 
     Both count from the outer corner of the first pixel, whose centre is (0.5, 0.5).
     """
-    wanted = (len(clip), 3, 3)
+    wanted = (len(clip.images), 3, 3)
     intrinsics = np.asarray(intrinsics, np.float64)
     if intrinsics.shape not in (wanted, wanted[1:]):
         raise InputError(f"intrinsics have shape {intrinsics.shape}; expected {wanted} or {wanted[1:]}")

@@ -193,9 +193,7 @@ def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pa
     if unknown := [name for name in outputs if name not in HEAD_NAMES]:
         raise InputError(f"outputs has {unknown}; expected some of {HEAD_NAMES}")
     if absent := [name for name in outputs if name not in config.heads]:
-        raise InputError(
-            f"outputs has {absent}, and this model has the heads {config.heads} alone; convert it with them"
-        )
+        raise InputError(f"outputs has {absent}, and this model has only the heads {config.heads}")
     if suppress not in ("zero", "drop"):
         raise InputError(f"suppress is {suppress!r}; expected 'zero' or 'drop'")
     if compute_dtype not in ("float32", "bfloat16"):

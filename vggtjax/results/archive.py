@@ -6,7 +6,7 @@ import struct
 import sys
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tokenize import TokenError
@@ -65,11 +65,16 @@ def read_array(path: Path) -> np.ndarray:
         raise ResultError(f"{path.name} is not a whole .npy file ({error})") from error
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file; raises what `read_headers` raises."""
+def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+    """Return the arrays of an .npz file, or those of these names; raises what `read_headers` raises.
+
+    For a file of a stranger look at the headers first: a small file can hold arrays of any size.
+    """
     arrays = {}
     with _opened(path) as archive:
         for name, member, file in _members(archive):
+            if names is not None and name not in names:
+                continue
             _read_header(file, member.filename, member.file_size)
             file.seek(0)
             array = np.lib.format.read_array(file, allow_pickle=False)

@@ -6,6 +6,7 @@ In the folder, with a frame's number as its file name:
     preview/sheet.png       the clip at a glance
     preview/depth/          inverse depth in colour, one range for the clip
     preview/overlay/        what moves over the frames, every object in a colour of its own
+    confidence/             .npy float32
     depth/                  .npy float32, and 16-bit .png with the one scale of the clip that depth/scale.txt gives
     mask/                   255 where dynamic, else 0
     instances/              .png with a palette: 0 where nothing moves, else the object's number, the same in all frames
@@ -18,7 +19,7 @@ In the folder, with a frame's number as its file name:
 At the resolution "original" everything that is a file per frame, the clouds and intrinsics.txt are at the size of the
 source's pictures; the archive, the sheet and the tracks' pictures stay at the model's.
 
-With the layout "vggt4d" there is also a folder as VGGT4D and MonST3R write it, with frames from 0:
+With the layout "vggt4d" there is also a folder as VGGT4D writes it, with frames from 0:
 
     vggt4d/frame_0000.png, frame_0000.npy       picture, depth
     vggt4d/conf_0000.npy, dynamic_mask_0000.png confidence, 255 where dynamic
@@ -53,15 +54,16 @@ from vggtjax.errors import InputError
 from vggtjax.files import check_free, staging, writing
 from vggtjax.results import archive, foreign, point_cloud, previews, tracks
 from vggtjax.results.frames import Frame, Resolution, frame_of, valid_pixels
+from vggtjax.results.ply import PlyWriter, write_ply
 from vggtjax.results.point_cloud import PointCloud
-from vggtjax.results.reconstruction import ARCHIVE_NAME, Layout, Reconstruction, is_result
+from vggtjax.results.reconstruction import ARCHIVE_NAME, Layout, Reconstruction, is_result, saved_files
 from vggtjax.results.scene import build_scene
 from vggtjax.results.trajectory import write_trajectory
 
 _NAMES = (
-    "depth", "mask", "instances", "preview", "frames", "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb",
+    "confidence", "depth", "mask", "instances", "preview", "frames",
+    "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb",
 )  # fmt: skip
-_SOMETIMES = ("tracks.npz", "vggt4d")
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
 _WORKERS = 8
 
@@ -85,7 +87,15 @@ def save(
     ):
         if value not in allowed:
             raise InputError(f"{name} is {value!r}; expected one of {allowed}")
-    check_folder(folder)
+    if pictures is not None and resolution != "original":
+        raise InputError("pictures are for the resolution 'original'; at the model's size they are not looked at")
+    sizes = {tuple(size) for size in reconstruction.source_size.tolist()}
+    if layout == "vggt4d" and resolution == "original" and len(sizes) > 1:
+        raise InputError(
+            f"the source's pictures have {len(sizes)} sizes, and the layout vggt4d wants one; save without it"
+        )
+    sometimes = optional_files(tracks=reconstruction.track_positions is not None, layout=layout)
+    check_folder(folder, sometimes)
     done, total = itertools.count(1), len(reconstruction.depth) + 4
 
     def advance() -> None:
@@ -95,7 +105,15 @@ def save(
     with staging(folder) as staged:
         frames = _frames(reconstruction, resolution, pictures)
         _write_files(reconstruction, frames, least, layout, staged, advance)
-        _install(staged, folder)
+        with writing(staged / ARCHIVE_NAME) as path:
+            reconstruction.save_archive(path, files=sometimes)
+        advance()
+        _install(staged, folder, sometimes)
+
+
+def optional_files(*, tracks: bool, layout: Layout) -> tuple[str, ...]:
+    """Return what a result has besides the files that every result has."""
+    return tuple(name for name, there in (("tracks.npz", tracks), ("vggt4d", layout == "vggt4d")) if there)
 
 
 def _frames(
@@ -110,27 +128,37 @@ def _frames(
         except StopIteration:
             raise InputError(f"there are {number} pictures for {count} frames; expected one for each") from None
         yield partial(frame_of, reconstruction, number, resolution, picture=picture)
+    if pictures is not None and next(shown, None) is not None:
+        raise InputError(f"there are more pictures than the {count} frames; expected one for each")
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(folder: Path, sometimes: Sequence[str] = ()) -> None:
     """Make sure that a result can be saved in `folder`, before hours are spent on one.
 
-    Raises OutputError where the folder cannot be made or written, or holds files of our names that are not an earlier
-    result.
+    Args:
+        folder: need not be there.
+        sometimes: what `optional_files` says of the result.
+
+    Raises OutputError where the folder cannot be made or written, or holds files of our names that are not part of an
+    earlier result.
     """
-    check_free(folder, (ARCHIVE_NAME, *_NAMES, *_SOMETIMES), replaced=is_result(folder / ARCHIVE_NAME), what="result")
+    archive_path = folder / ARCHIVE_NAME
+    check_free(folder, (ARCHIVE_NAME, *_NAMES), replaced=is_result(archive_path), what="result")
+    strange = [name for name in sometimes if name not in saved_files(archive_path)]
+    check_free(folder, strange, replaced=False, what="result")
 
 
-def _install(staged: Path, folder: Path) -> None:
+def _install(staged: Path, folder: Path, sometimes: Sequence[str]) -> None:
     """Swap the staged files for those of an earlier result; undo everything if a step fails.
 
     The archive leaves first and arrives last: whenever it is there, the files around it are its own.
     """
     previous = staged / "previous"
     previous.mkdir()
-    old = [name for name in (ARCHIVE_NAME, *_NAMES, *_SOMETIMES) if os.path.lexists(folder / name)]
+    earlier = (ARCHIVE_NAME, *_NAMES, *saved_files(folder / ARCHIVE_NAME))
+    old = [name for name in earlier if os.path.lexists(folder / name)]
     moves = [(folder / name, previous / name) for name in old]
-    moves += [(staged / name, folder / name) for name in (*_written(staged), ARCHIVE_NAME)]
+    moves += [(staged / name, folder / name) for name in (*_NAMES, *sometimes, ARCHIVE_NAME)]
     done: list[tuple[Path, Path]] = []
     try:
         for source, target in moves:
@@ -142,10 +170,6 @@ def _install(staged: Path, folder: Path) -> None:
         raise
 
 
-def _written(staged: Path) -> list[str]:
-    return [*_NAMES, *(name for name in _SOMETIMES if (staged / name).exists())]
-
-
 def _write_files(
     reconstruction: Reconstruction,
     frames: Iterator[Callable[[], Frame]],
@@ -154,27 +178,33 @@ def _write_files(
     folder: Path,
     advance: Callable[[], None],
 ) -> None:
-    """Write all files into the empty `folder`; `advance` is called after each frame and each of four large files."""
+    """Write all files but the archive into the empty `folder`; `advance` is called after each frame and large file."""
     times, poses = reconstruction.timestamps, reconstruction.world_from_camera
     times = np.arange(len(poses), dtype=np.float64) if times is None else times  # frame numbers stand for them
     write_trajectory(folder / "trajectory.txt", poses, times)
     written = _write_frames(reconstruction, frames, least_confidence, layout, folder, advance)
+    advance()
     intrinsics = [frame.intrinsics for frame in written]
     write_intrinsics(folder / "intrinsics.txt", intrinsics, [frame.size for frame in written])
     if layout == "vggt4d":
         foreign.write_cameras(folder / "vggt4d", poses, intrinsics)
-    static = point_cloud.joined([frame.static for frame in written])
-    write_ply(folder / "static.ply", static)
-    advance()
-    build_scene(reconstruction, static, [frame.dynamic for frame in written]).export(folder / "scene.glb")
+    _build_scene(reconstruction, least_confidence).export(folder / "scene.glb")
     advance()
     _write_png(folder / "preview/sheet.png", previews.contact_sheet(reconstruction))
     if reconstruction.track_positions is not None:
         _write_tracks(reconstruction, folder)
     advance()
-    with writing(folder / ARCHIVE_NAME) as path:
-        reconstruction.save_archive(path)
-    advance()
+
+
+def _build_scene(reconstruction: Reconstruction, least_confidence: float) -> trimesh.Scene:
+    """Return the scene for viewers, at the model's size: they show no more points than that."""
+    static, dynamic = [], []
+    for number in range(len(reconstruction.depth)):
+        frame = frame_of(reconstruction, number)
+        sure = frame.valid & (frame.confidence >= least_confidence)
+        static.append(point_cloud.frame_cloud(frame, sure & ~frame.dynamic_mask))
+        dynamic.append(point_cloud.frame_cloud(frame, sure & frame.dynamic_mask))
+    return build_scene(reconstruction, point_cloud.joined(static), dynamic)
 
 
 class _Written(NamedTuple):
@@ -182,8 +212,6 @@ class _Written(NamedTuple):
 
     size: tuple[int, int]  # height, width
     intrinsics: Float64[np.ndarray, "3 3"]
-    static: PointCloud
-    dynamic: PointCloud
 
 
 def _write_frames(
@@ -194,8 +222,8 @@ def _write_frames(
     folder: Path,
     advance: Callable[[], None],
 ) -> list[_Written]:
-    """Write the files that each frame has of its own, several frames at a time."""
-    for name in ("depth", "mask", "instances", "preview/depth", "preview/overlay", "frames"):
+    """Write the files that each frame has of its own, several frames at a time, and the cloud of what stands still."""
+    for name in ("confidence", "depth", "mask", "instances", "preview/depth", "preview/overlay", "frames"):
         (folder / name).mkdir(parents=True)
     if layout == "vggt4d":
         (folder / "vggt4d").mkdir()
@@ -206,9 +234,10 @@ def _write_frames(
     )
     inverse_range = previews.inverse_depth_range(reconstruction.depth, valid)
 
-    def write_frame(number: int, make: Callable[[], Frame]) -> _Written:
+    def write_frame(number: int, make: Callable[[], Frame]) -> tuple[_Written, PointCloud]:
         name, frame = f"{number:06d}", make()
         valid, pixels = frame.valid, frame.valid & (frame.confidence >= least_confidence)
+        np.save(folder / f"confidence/{name}.npy", frame.confidence, allow_pickle=False)
         np.save(folder / f"depth/{name}.npy", frame.depth, allow_pickle=False)
         _write_png(folder / f"depth/{name}.png", encode_depth(frame.depth, valid, scale), depth_scale=repr(scale))
         _write_png(folder / f"mask/{name}.png", frame.dynamic_mask.astype(np.uint8) * 255)
@@ -216,27 +245,31 @@ def _write_frames(
         _write_png(folder / f"preview/depth/{name}.png", previews.color_depth(frame.depth, valid, inverse_range))
         moving = previews.moving_ids(frame.dynamic_mask, frame.instances)
         _write_png(folder / f"preview/overlay/{name}.png", previews.overlay(frame.image, moving))
-        write_ply(folder / f"frames/{name}.ply", point_cloud.frame_cloud(frame, pixels))
+        write_ply(folder / f"frames/{name}.ply", [point_cloud.frame_cloud(frame, pixels)])
         if layout == "vggt4d":
             foreign.write_frame(folder / "vggt4d", number, frame)
-        static, dynamic = (
-            point_cloud.frame_cloud(frame, pixels & (frame.dynamic_mask == own)) for own in (False, True)
-        )
-        return _Written((frame.depth.shape[0], frame.depth.shape[1]), frame.intrinsics, static, dynamic)
+        size = (frame.depth.shape[0], frame.depth.shape[1])
+        return _Written(size, frame.intrinsics), point_cloud.frame_cloud(frame, pixels & ~frame.dynamic_mask)
 
+    _ = reconstruction.instances  # computed here, once, and not by each thread
     written: list[_Written] = []
     workers = min(_WORKERS, os.cpu_count() or 1)
-    with ThreadPoolExecutor(workers) as pool:
-        running: deque[Future[_Written]] = deque()
+    with PlyWriter(folder / "static.ply") as static, ThreadPoolExecutor(workers) as pool:
+        running: deque[Future[tuple[_Written, PointCloud]]] = deque()
+
+        def finish() -> None:
+            frame, cloud = running.popleft().result()
+            written.append(frame)
+            static.add(cloud)
+            advance()
+
         try:
             for number, make in enumerate(frames):
                 running.append(pool.submit(write_frame, number, make))
                 if len(running) > workers:  # no more than so many pictures of the source at a time
-                    written.append(running.popleft().result())
-                    advance()
+                    finish()
             while running:
-                written.append(running.popleft().result())
-                advance()
+                finish()
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -277,11 +310,6 @@ def write_intrinsics(
     height, width = sizes[0]
     of = f"{width} x {height}" if len(set(sizes)) == 1 else "each frame's depth"
     np.savetxt(path, rows, fmt="%.9g", header=f"fx fy cx cy in pixels of {of}", encoding="utf-8")
-
-
-def write_ply(path: Path, cloud: PointCloud) -> None:
-    """Write a cloud as binary PLY with float32 positions and 8-bit colours; it may be empty."""
-    trimesh.PointCloud(cloud.points, cloud.colors).export(path, file_type="ply")
 
 
 def _write_palette(path: Path, ids: UInt8[np.ndarray, "H W"]) -> None:

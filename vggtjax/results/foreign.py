@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -65,6 +65,7 @@ class Cameras(NamedTuple):
 class _Folder(NamedTuple):
     """Where a layout keeps a frame's files, as patterns of their paths with the frame's number, and its cameras."""
 
+    example: str  # of a depth file
     depth: str
     picture: str
     confidence: str
@@ -77,44 +78,56 @@ def load_foreign(path: Path, layout: str, quaternion: Quaternion | None) -> Reco
     """Read a result folder of another project; see `Reconstruction.load`."""
     if layout not in LAYOUTS:
         raise InputError(f"layout is {layout!r}; expected one of vggtjax, {', '.join(LAYOUTS)}")
+    if quaternion is not None and (quaternion not in get_args(Quaternion) or layout not in _WITH_TRAJECTORY):
+        raise InputError(
+            f"quaternion is {quaternion!r} for {layout}; expected 'xyzw' or 'wxyz' for "
+            f"{' and '.join(_WITH_TRAJECTORY)}, and none for others, which keep matrices"
+        )
     try:
+        if not path.exists() or (layout != "da3" and not path.is_dir()):
+            raise ResultError("there is no such folder")
         fields = _read_da3(path) if layout == "da3" else _read_folder(path, _FOLDERS[layout], quaternion)
+        S, H, W = fields["depth"].shape
+        plain: dict[str, Any] = {
+            "depth_confidence": np.ones((S, H, W), np.float32),
+            "dynamic_mask": np.zeros((S, H, W), bool),
+            "images": np.full((S, H, W, 3), _GREY, np.uint8),
+        }
+        missing = [name for name in plain if fields.get(name) is None]
+        result = Reconstruction(
+            **(plain | {name: value for name, value in fields.items() if value is not None}),
+            saliency=None,
+            frame_names=tuple(f"{number:06d}" for number in range(S)),
+            timestamps=None,
+            method=layout,
+            model_name=layout,
+            settings={"layout": layout, "quaternion": quaternion, "missing": missing},
+            source_size=np.tile([H, W], (S, 1)),
+            source_scale=np.ones((S, 2)),
+            source_offset=np.zeros((S, 2)),
+            valid_box=np.tile([0, 0, W, H], (S, 1)),
+        )
     except (ClipError, ResultError) as error:
         raise ResultError(f"{path} cannot be loaded as a result of {layout}: {error}") from error
-    depth = fields["depth"]
-    S, H, W = depth.shape
-    defaults: dict[str, Any] = {
-        "depth_confidence": np.ones((S, H, W), np.float32),
-        "dynamic_mask": np.zeros((S, H, W), bool),
-        "images": np.full((S, H, W, 3), _GREY, np.uint8),
-    }
-    if missing := [name for name in defaults if fields.get(name) is None]:
+    if missing:
         logger.warning("%s has no %s; plain values stand for them", path, ", ".join(missing))
-    return Reconstruction(
-        **(defaults | {name: value for name, value in fields.items() if value is not None}),
-        saliency=None,
-        frame_names=tuple(f"{number:06d}" for number in range(S)),
-        timestamps=None,
-        method=layout,
-        model_name=layout,
-        settings={"layout": layout, "quaternion": quaternion, "missing": missing},
-        source_size=np.tile([H, W], (S, 1)),
-        source_scale=np.ones((S, 2)),
-        source_offset=np.zeros((S, 2)),
-        valid_box=np.tile([0, 0, W, H], (S, 1)),
-    )
+    return result
 
 
 def _read_folder(folder: Path, layout: _Folder, quaternion: Quaternion | None) -> dict[str, Any]:
     depth_files = _numbered(folder, layout.depth)
     if not depth_files:
-        raise ResultError(f"it has no depth; expected files {layout.depth}")
+        raise ResultError(f"it has no depth; expected files like {layout.example}")
     numbers = sorted(depth_files)
     cameras = layout.cameras(folder, numbers, quaternion)
     depth = _stacked(depth_files, numbers, _read_map, None)
     shape = depth.shape[1:]
     confidence = _stacked(_numbered(folder, layout.confidence), numbers, _read_map, shape)
     if confidence is not None and layout.logarithmic:
+        if padded := sorted(path.name for path in folder.glob("conf_0[0-9]*.npy")):
+            raise ResultError(
+                f"{padded[0]} is numbered as VGGT4D does, whose confidence is no logarithm; load it as that"
+            )
         with np.errstate(over="ignore"):
             confidence = np.exp(confidence).clip(0, np.finfo(np.float32).max)
     mask = None if layout.mask is None else _stacked(_numbered(folder, layout.mask), numbers, read_mask, shape)
@@ -161,9 +174,7 @@ def _stacked(
         array = read(files[number])
         shape = shape or array.shape
         if array.shape != shape:
-            raise ResultError(
-                f"{files[number].name} has shape {array.shape}; expected {shape}, as the depth of frame 0"
-            )
+            raise ResultError(f"{files[number].name} has shape {array.shape}; expected {shape}, as frame {numbers[0]}")
         if arrays is None:
             if len(numbers) * array.nbytes > archive.SIZE_LIMIT:
                 raise ResultError(f"{len(numbers)} frames of {shape} take more than {archive.SIZE_LIMIT} bytes")
@@ -205,13 +216,9 @@ def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | 
     for number in numbers:
         if number not in files:
             raise ResultError(f"frame {number} has depth, but no camera/{number:06d}.npz")
-        arrays = archive.read_arrays(files[number])
-        for name, shape, into in (("pose", (4, 4), poses), ("intrinsics", (3, 3), intrinsics)):
-            array = arrays.get(name)
-            if array is None or array.shape != shape or array.dtype.kind != "f":
-                found = "missing" if array is None else f"{array.dtype} {array.shape}"
-                raise ResultError(f"'{name}' of {files[number].name} is {found}; expected floating point {shape}")
-            into.append(array.astype(np.float64))
+        arrays = _read_some(files[number], {"pose": ((4, 4),), "intrinsics": ((3, 3),)}, {})
+        poses.append(arrays["pose"].astype(np.float64))
+        intrinsics.append(arrays["intrinsics"].astype(np.float64))
     return Cameras(geometry.world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
 
 
@@ -223,26 +230,16 @@ def _read_da3(path: Path) -> dict[str, Any]:
     file = next((place for place in places if place.is_file()), None)
     if file is None:
         raise ResultError("it has no results.npz; export with the format 'npz' or 'mini_npz'")
-    arrays = archive.read_arrays(file)
-    depth = arrays.get("depth")
-    if depth is None or depth.ndim != 3 or depth.dtype.kind != "f" or 0 in depth.shape:
-        found = "missing" if depth is None else f"{depth.dtype} {depth.shape}"
-        raise ResultError(f"'depth' of {file.name} is {found}; expected floating point (N, H, W)")
-    S, H, W = depth.shape
-    shapes = {
-        "extrinsics": ((S, 3, 4), (S, 4, 4)),
-        "intrinsics": ((S, 3, 3),),
-        "conf": ((S, H, W),),
-        "image": ((S, H, W, 3),),
-    }
-    for name, allowed in shapes.items():
-        array, kind = arrays.get(name), "u" if name == "image" else "f"
-        if array is None and name in ("extrinsics", "intrinsics"):
-            raise ResultError(f"{file.name} has no '{name}'; models for depth alone have no cameras to load")
-        if array is not None and (array.shape not in allowed or array.dtype.kind != kind):
-            raise ResultError(f"'{name}' of {file.name} is {array.dtype} {array.shape}; expected {allowed[0]}")
+    shape = archive.read_headers(file).get("depth", archive.Header(np.dtype(float), ())).shape
+    if len(shape) != 3 or 0 in shape:
+        raise ResultError(f"'depth' of {file.name} is missing or has shape {shape}; expected (N, H, W)")
+    S, H, W = shape
+    wanted = {"depth": ((S, H, W),), "extrinsics": ((S, 3, 4), (S, 4, 4)), "intrinsics": ((S, 3, 3),)}
+    arrays = _read_some(file, wanted, {"conf": ((S, H, W),), "image": ((S, H, W, 3),)})
+    with np.errstate(over="ignore"):
+        depth = arrays["depth"].astype(np.float32)
     return {
-        "depth": depth.astype(np.float32),
+        "depth": depth,
         "depth_confidence": arrays.get("conf"),
         "images": arrays.get("image"),
         "camera_from_world": arrays["extrinsics"][:, :3],
@@ -250,7 +247,26 @@ def _read_da3(path: Path) -> dict[str, Any]:
     }
 
 
+def _read_some(
+    file: Path, needed: Mapping[str, tuple[tuple[int, ...], ...]], others: Mapping[str, tuple[tuple[int, ...], ...]]
+) -> dict[str, np.ndarray]:
+    """Return the arrays of these names, of one of the shapes given for each; `others` need not be there.
+
+    Headers are looked at first, so that nothing larger is ever read. All are floating point but `image`, 8 bits.
+    """
+    headers = archive.read_headers(file)
+    for name, shapes in {**needed, **others}.items():
+        header, kind = headers.get(name), "uint8" if name == "image" else "floating point"
+        if header is None and name in needed:
+            raise ResultError(f"{file.name} has no {name!r}; expected {kind} {shapes[0]}")
+        right = header is None or (header.dtype == np.uint8 if name == "image" else header.dtype.kind == "f")
+        if header is not None and (header.shape not in shapes or not right):
+            raise ResultError(f"{name!r} of {file.name} is {header.dtype} {header.shape}; expected {kind} {shapes[0]}")
+    return archive.read_arrays(file, {*needed, *others})
+
+
 _MONST3R = _Folder(
+    example="frame_0000.npy",
     depth=r"frame_(\d{1,9})\.npy",
     picture=r"frame_(\d{1,9})\.png",
     confidence=r"conf_(\d{1,9})\.npy",
@@ -262,6 +278,7 @@ _FOLDERS = {
     "vggt4d": _MONST3R._replace(logarithmic=False),
     "monst3r": _MONST3R,
     "cut3r": _Folder(
+        example="depth/000000.npy",
         depth=r"depth/(\d{1,9})\.npy",
         picture=r"color/(\d{1,9})\.png",
         confidence=r"conf/(\d{1,9})\.npy",
@@ -270,3 +287,4 @@ _FOLDERS = {
     ),
 }
 LAYOUTS = (*_FOLDERS, "da3")
+_WITH_TRAJECTORY = tuple(name for name, layout in _FOLDERS.items() if layout.cameras is _text_cameras)

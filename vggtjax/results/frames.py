@@ -110,10 +110,9 @@ def _source_frame(result: Reconstruction, frame: int, picture: UInt8[np.ndarray,
         small = Image.fromarray(result.images[frame])
         large = small.transform((width, height), Image.Transform.AFFINE, (a, 0, c, 0, e, f), Image.Resampling.BICUBIC)
         picture = np.asarray(large)
-    if picture.shape != (height, width, 3):
-        raise InputError(
-            f"the picture of frame {frame} is {picture.shape}; expected {(height, width, 3)}, its source's"
-        )
+    kind, shape = getattr(picture, "dtype", type(picture).__name__), getattr(picture, "shape", None)
+    if shape != (height, width, 3) or kind != np.uint8:
+        raise InputError(f"the picture of frame {frame} is {kind} {shape}; expected uint8 {(height, width, 3)}")
     x = (np.arange(width) + 0.5 - offset[0]) / scale[0]
     y = (np.arange(height) + 0.5 - offset[1]) / scale[1]
     left, top, right, bottom = (int(side) for side in result.valid_box[frame])

@@ -73,8 +73,7 @@ def clamp_field_of_view(fov: Float[np.ndarray, "S 2"]) -> tuple[Float[np.ndarray
     undefined = np.flatnonzero(np.isnan(fov).any(axis=-1))
     if undefined.size:
         raise ResultError(
-            f"the field of view of frame {undefined[0]} is not a number; "
-            f"expected radians in [{lowest}, {highest}]: check the weights for NaN"
+            f"the field of view of frame {undefined[0]} is not a number; expected radians in [{lowest}, {highest}]"
         )
     outside = (fov < lowest - _FIELD_OF_VIEW_SLACK) | (fov > highest + _FIELD_OF_VIEW_SLACK)
     frames = tuple(int(frame) for frame in np.flatnonzero(outside.any(axis=-1)))

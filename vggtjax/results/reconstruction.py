@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 Layout = Literal["vggtjax", "vggt4d"]  # of a folder of files
 
 ARCHIVE_NAME = "reconstruction.npz"
+OPTIONAL_FILES = ("tracks.npz", "vggt4d")
 _FORMAT_VERSION = 1
+_MOST_FILES = 100
+_MOST_PIXELS = 2**28  # of a source's picture
 
 # Arrays: type and dimensions. depth binds S, H, W, saliency h, w and track_frames Q; the others must agree.
 _ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
@@ -111,18 +114,17 @@ class Reconstruction:
             rigid = (error < 0.01) & (np.linalg.det(rotation) > 0)
         rigid &= np.isfinite(self.camera_from_world).all(axis=(1, 2))
         if not rigid.all():
-            raise ResultError(
-                f"camera_from_world of frame {np.argmin(rigid)} is not a finite rotation and translation; "
-                "check the weights for NaN"
-            )
+            raise ResultError(f"camera_from_world of frame {np.argmin(rigid)} is not a finite rotation and translation")
         for name in ("intrinsics", "timestamps", "source_scale", "source_offset", *sorted(_TRACKS)):
             value = getattr(self, name)
             if value is not None and not np.isfinite(value).all():
                 raise ResultError(f"{name} holds {value[~np.isfinite(value)][0]}; expected finite numbers")
         sides, most = self.source_size, 1 << 20
-        if (sides < 1).any() or (sides > most).any() or (self.source_scale <= 0).any():
+        outside = (sides < 1).any() or (sides > most).any() or (sides.prod(axis=1) > _MOST_PIXELS).any()
+        if outside or (self.source_scale <= 0).any():
             raise ResultError(
-                f"source_size or source_scale is out of range; expected sides of 1 to {most}, scales above 0"
+                f"source_size or source_scale is out of range; expected sides of 1 to {most}, at most {_MOST_PIXELS} "
+                "pixels, and scales above 0"
             )
         frames, last = self.track_frames, len(self.depth) - 1
         if frames is not None and ((frames < 0) | (frames > last)).any():
@@ -179,7 +181,7 @@ class Reconstruction:
 
         With `resolution="original"` the files of single frames, the clouds and the intrinsics are at the source's size,
         in the colours of `pictures` (`Clip.pictures()`), or of the model's frames enlarged. `layout="vggt4d"` adds the
-        folder vggt4d/ with what VGGT4D and MonST3R write.
+        folder vggt4d/ with what VGGT4D writes.
 
         Raises InputError for a percentile outside [0, 100), an unknown name or pictures that do not fit, and
         OutputError where the folder cannot be written or holds files of the same names that are not an earlier result.
@@ -196,12 +198,16 @@ class Reconstruction:
             progress=progress,
         )
 
-    def save_archive(self, path: Path) -> None:
-        """Write everything but `passes` to one compressed .npz file, which `load` reads back."""
+    def save_archive(self, path: Path, *, files: Sequence[str] = ()) -> None:
+        """Write everything but `passes` to one compressed .npz file, which `load` reads back.
+
+        `files` are names beside it that are part of this result, though not of every one.
+        """
         arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
         strings = {name: getattr(self, name) for name in _STRINGS} | {"settings": json.dumps(self.settings)}
         arrays |= {name: np.array(value, np.str_) for name, value in strings.items()}
-        archive.write_arrays(path, arrays | {"format_version": np.array(_FORMAT_VERSION)})
+        arrays |= {"format_version": np.array(_FORMAT_VERSION), "files": np.array(files, np.str_)}
+        archive.write_arrays(path, arrays)
 
     @classmethod
     def load(cls, path: str | Path, *, layout: str = "vggtjax", quaternion: Quaternion | None = None) -> Reconstruction:
@@ -231,6 +237,7 @@ class Reconstruction:
             _check_headers(archive.read_headers(file))
             fields: dict[str, Any] = {"timestamps": None, "saliency": None, **archive.read_arrays(file)}
             version = int(fields.pop("format_version"))
+            fields.pop("files", None)
             if version != _FORMAT_VERSION:
                 raise ResultError(f"it has format version {version}; expected {_FORMAT_VERSION}")
             for name in ("method", "model_name", "settings"):
@@ -250,6 +257,17 @@ def is_result(path: Path) -> bool:
         return False
 
 
+def saved_files(path: Path) -> tuple[str, ...]:
+    """Return the names beside a reconstruction.npz that its result says are part of it, though not of every one."""
+    try:
+        header = archive.read_headers(path).get("files")
+        if header is None or len(header.shape) != 1 or header.shape[0] > _MOST_FILES or header.dtype.kind != "U":
+            return ()
+        return tuple(name for name in archive.read_arrays(path, ["files"])["files"].tolist() if name in OPTIONAL_FILES)
+    except ResultError:
+        return ()
+
+
 def _cast(name: str, value: Any, dtype: type) -> np.ndarray:
     array = np.asarray(value)
     if not np.can_cast(array.dtype, dtype, "same_kind"):
@@ -261,8 +279,8 @@ def _check_headers(headers: Mapping[str, archive.Header]) -> None:
     version = headers.get("format_version")
     if version is None or version != (np.dtype(np.int64), ()):
         raise ResultError("it has no format version")
-    expected = {"format_version", *_ARRAYS, *_STRINGS}
-    optional = _OPTIONAL - _TRACKS if _TRACKS & set(headers) else _OPTIONAL
+    expected = {"format_version", "files", *_ARRAYS, *_STRINGS}
+    optional = {"files"} | (_OPTIONAL - _TRACKS if _TRACKS & set(headers) else _OPTIONAL)
     wrong = sorted((expected - optional - set(headers)) | (set(headers) - expected))
     if wrong:
         raise ResultError(f"arrays are missing or unknown: {', '.join(wrong)}")
@@ -271,7 +289,7 @@ def _check_headers(headers: Mapping[str, archive.Header]) -> None:
             raise ResultError(f"{name} has type {header.dtype}; expected {np.dtype(_ARRAYS[name][0])}")
         if name in _STRINGS and header.dtype.kind != "U":
             raise ResultError(f"{name} has type {header.dtype}; expected text")
-    _check_shapes({name: header.shape for name, header in headers.items() if name != "format_version"})
+    _check_shapes({name: header.shape for name, header in headers.items() if name not in ("format_version", "files")})
 
 
 def _check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:

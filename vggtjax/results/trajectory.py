@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +14,7 @@ from vggtjax.errors import InputError, ResultError
 
 Quaternion = Literal["xyzw", "wxyz"]
 
-_MOST_BYTES = 2**28  # of a text file; over a million poses
+_MOST_BYTES = 2**27  # of a text file; a million poses
 _UNIT = 0.01  # by which a quaternion's length may differ from 1
 
 
@@ -59,19 +60,17 @@ def read_numbers(path: str | Path, columns: int) -> Float[np.ndarray, "S columns
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ResultError(f"{path} has {path.stat().st_size} bytes; expected at most {_MOST_BYTES}")
-        lines = path.read_text(encoding="utf-8").replace(",", " ").splitlines()
-        words = [line.split("#")[0].split() for line in lines]
-        rows = [[float(word) for word in line] for line in words if line]
+        with path.open(encoding="utf-8") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it is empty, which is said below
+            array = np.loadtxt((line.replace(",", " ") for line in file), ndmin=2)
     except OSError as error:
         raise ResultError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:  # neither text nor numbers
-        raise ResultError(f"{path} is not a table of numbers ({str(error)[:100]})") from None
-    if not rows:
-        raise ResultError(f"{path} is empty; expected {columns} numbers a line")
-    for number, row in enumerate(rows):
-        if len(row) != columns:
-            raise ResultError(f"{path} has {len(row)} numbers in row {number}; expected {columns}")
-    array = np.array(rows)
+    except ValueError as error:  # neither text nor numbers, or another number of them
+        reason = str(error).split(";")[0].split("\n")[0][:100]
+        raise ResultError(f"{path} is not a table of {columns} numbers a line ({reason})") from None
+    if array.shape[1] != columns or not len(array):
+        found = f"has {array.shape[1]} numbers a line" if len(array) else "is empty"
+        raise ResultError(f"{path} {found}; expected {columns} numbers a line")
     if not np.isfinite(array).all():
         raise ResultError(f"{path} holds {array[~np.isfinite(array)][0]}; expected finite numbers")
     return array

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.model import HEADS
+from vggtjax.network.model import DENSE_HEADS, HEADS
 from vggtjax.training.objective import LossWeights
 
 _MOST_FILE_BYTES = 1 << 20
@@ -129,6 +129,12 @@ class Recipe:
         modules = ("backbone", "aggregator", *HEADS.values())
         if unknown := [name for name in self.untrained if name not in modules]:
             raise InputError(f"recipe.untrained has {unknown}; expected some of {modules}")
+        needed = ["camera", *(name for name in DENSE_HEADS if getattr(self.losses, name))]
+        if absent := [name for name in needed if name not in self.model.heads]:
+            raise InputError(
+                f"the model has no head {absent[0]!r}, only {self.model.heads}; training needs 'camera', and "
+                "those of losses.depth and losses.points unless these are 0"
+            )
         for stage in self.stages:
             if stage.height % self.model.patch_size or stage.width % self.model.patch_size:
                 raise InputError(
@@ -152,7 +158,9 @@ class Recipe:
     @property
     def frozen(self) -> tuple[str, ...]:
         """Modules of the model that stay as they are."""
-        return (*(("backbone", "aggregator") if self.trainable == "heads" else ()), *self.untrained)
+        absent = {module for name, module in HEADS.items() if name not in self.model.heads}
+        untrained = (name for name in self.untrained if name not in absent)
+        return (*(("backbone", "aggregator") if self.trainable == "heads" else ()), *untrained)
 
     @property
     def total_steps(self) -> int:

@@ -1,0 +1,287 @@
+"""DyCheck's layout with its two ground truths, and the COLMAP models of one of them."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from tests.dataset_files import camera_json, cameras_bin, images_bin, npy, opened, picture, write
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.colmap import read_views
+from vggtjax.evaluation.datasets.depth_files import read_npy
+
+FRAMES = 25
+HALF = 0.5**0.5
+QUARTER_ABOUT_Y = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
+
+
+def disparity(frame):
+    """Largest depth 1 / 0.5 in even frames and 1 / 0.25 in odd ones; in frame 20 one pixel has none."""
+    values = np.full((3, 4), 1, np.float32)
+    values[0, 0] = 0.25 if frame % 2 else 0.5
+    if frame == 20:
+        values[2, 3] = 0
+    return values
+
+
+def dycheck_folder(folder, frames=FRAMES):
+    """https://github.com/KAIR-BAIR/dycheck/blob/main/docs/DATASETS.md: rgb/<scale>x, depth/<scale>x/*.npy of (H, W, 1)
+    float32, camera/*.json, splits/train.json of frame_names, camera_ids, time_ids; flow3d_preprocessed as read by
+    flow3d/data/iphone_dataset.py of https://github.com/vye16/shape-of-motion."""
+    names = [f"0_{i:05d}" for i in range(frames)]
+    split = {"frame_names": names, "camera_ids": [0] * frames, "time_ids": list(range(frames))}
+    write(folder / "splits" / "train.json", json.dumps(split))
+    extra = folder / "flow3d_preprocessed"
+    for i, name in enumerate(names):
+        write(folder / "rgb" / "1x" / f"{name}.png", picture())
+        write(folder / "camera" / f"{name}.json", camera_json(position=[1.0, 2.0, float(i)]))
+        lidar = np.full((3, 4, 1), 1 + i, np.float32)
+        lidar[0] = 0
+        write(folder / "depth" / "1x" / f"{name}.npy", npy(lidar))
+        write(extra / "aligned_depth_anything_colmap" / "1x" / f"{name}.npy", npy(disparity(i)))
+    # PINHOLE is model 1: fx fy cx cy, of pictures of twice the size
+    write(extra / "colmap" / "sparse" / "cameras.bin", cameras_bin([(1, 1, 8, 6, [16.0, 18.0, 4.5, 3.5])]))
+    # in no order, a point list of another length each, as COLMAP leaves them
+    images = [(i + 1, (HALF, 0, HALF, 0), (i, 2.0, 3.0), 1, f"{name}.png") for i, name in enumerate(names)]
+    write(extra / "colmap" / "sparse" / "images.bin", images_bin(images[::-1]))
+    return folder
+
+
+def test_easi3r(tmp_path):
+    dycheck_folder(tmp_path / "apple")
+    (sequence,) = opened("dycheck", tmp_path)
+    assert sequence.name == "apple"
+    assert [path.stem for path in sequence.pictures] == ["0_00000", "0_00010", "0_00020"]
+    # the median of the 25 largest depths: 13 even frames, of which one reaches 1 / 1e-3, and 12 odd ones of 4
+    limit = 2.5 * 4
+    expected = np.ones((3, 4))
+    expected[0, 0] = 2
+    assert np.allclose(sequence.depth(0), expected)
+    expected[2, 3] = limit
+    assert np.allclose(sequence.depth(2), expected)
+    # COLMAP has camera-from-world: centre -R^T t of t = (20, 2, 3) is (3, -2, -20)
+    assert np.allclose(sequence.world_from_camera[2], [[0, 0, -1, 3], [0, 1, 0, -2], [1, 0, 0, -20], [0, 0, 0, 1]])
+    assert np.allclose(sequence.intrinsics[0], [[8, 0, 2.25], [0, 9, 1.75], [0, 0, 1]])  # no shift: corners count
+    assert sequence.notes[1:] == ("apple: its ground truth is easi3r",)
+
+
+def test_the_cut_of_easi3r_is_the_lower_median_over_all_frames(tmp_path):
+    dycheck_folder(tmp_path / "apple", frames=12)  # six frames of 2 metres at most, six of 4
+    path = tmp_path / "apple" / "flow3d_preprocessed" / "aligned_depth_anything_colmap" / "1x" / "0_00000.npy"
+    write(path, npy(np.full((3, 4), -1, np.float32)))  # 1 / 1e-3, so the order is 2 2 2 2 2 4 4 4 4 4 4 1000
+    (sequence,) = opened("dycheck", tmp_path)
+    assert np.allclose(sequence.depth(0), 2.5 * 4)
+    write(path, npy(np.full((3, 4), 1, np.float32)))  # 1 2 2 2 2 2 | 4 4 4 4 4 4
+    write(path.with_name("0_00010.npy"), npy(np.full((3, 4), 0, np.float32)))  # 1 2 2 2 2 | 4 4 ... 1000
+    (sequence,) = opened("dycheck", tmp_path)
+    assert np.allclose(sequence.depth(1), 2.5 * 4)
+    write(path.with_name("0_00001.npy"), npy(np.full((3, 4), 1, np.float32)))  # 1 1 2 2 2 2 | 4 4 4 4 4 1000
+    assert np.allclose(opened("dycheck", tmp_path)[0].depth(1), 2.5 * 2)
+
+
+def test_lidar(tmp_path):
+    dycheck_folder(tmp_path / "apple")
+    (sequence,) = opened("dycheck", tmp_path, gt="lidar", stride=12)
+    assert [path.stem for path in sequence.pictures] == ["0_00000", "0_00012", "0_00024"]
+    assert np.allclose(sequence.depth(2), [[0] * 4, [25] * 4, [25] * 4])
+    # the file has camera-from-world R and the centre
+    assert np.allclose(sequence.world_from_camera[1], [[0, 0, 1, 1], [0, 1, 0, 2], [-1, 0, 0, 12], [0, 0, 0, 1]])
+    assert np.allclose(sequence.intrinsics[1], [[8, 0.5, 2.25], [0, 10, 1.75], [0, 0, 1]])
+    assert sequence.notes[1:] == ("apple: its ground truth is lidar",)
+
+
+def test_intrinsics_follow_the_size_of_the_pictures(tmp_path):
+    folder = dycheck_folder(tmp_path / "apple", frames=1)
+    changes = {"image_size": [8, 6], "principal_point": [4.5, 3.5], "focal_length": 16.0, "skew": 1.0}
+    write(folder / "camera" / "0_00000.json", camera_json(radial_distortion=[0, 0.1, 0], **changes))
+    (sequence,) = opened("dycheck", tmp_path, gt="lidar")
+    assert np.allclose(sequence.intrinsics[0], [[8, 0.5, 2.25], [0, 10, 1.75], [0, 0, 1]])
+    assert "apple: lens distortion is left as it is, the intrinsics do not have it" in sequence.notes
+    write(folder / "camera" / "0_00000.json", camera_json(image_size=[8, 8]))
+    with pytest.raises(InputError, match=r"for pictures of 8 x 8 and the picture is 4 x 3"):
+        opened("dycheck", tmp_path, gt="lidar")
+
+
+def test_what_is_missing_is_noted_and_never_taken_from_the_other_truth(tmp_path):
+    folder = dycheck_folder(tmp_path / "apple")
+    extra = folder / "flow3d_preprocessed"
+    (extra / "aligned_depth_anything_colmap" / "1x" / "0_00010.npy").unlink()
+    (extra / "colmap" / "sparse" / "images.bin").unlink()
+    (folder / "camera" / "0_00020.json").unlink()
+    (sequence,) = opened("dycheck", folder)
+    assert sequence.world_from_camera is sequence.intrinsics is None
+    assert not sequence.depth(1).any()
+    assert sequence.notes[2:] == (
+        "apple: 1 of 3 frames have no depth, 0_00010 first",
+        "apple: it has no flow3d_preprocessed/colmap/sparse/images.bin, so no cameras",
+    )
+    (sequence,) = opened("dycheck", folder, gt="lidar")
+    assert sequence.world_from_camera is None
+    assert sequence.notes[2:] == ("apple: 1 of 3 frames have no camera, 0_00020 first; no cameras",)
+    images = [(1, (1, 0, 0, 0), (0, 0, 0), 1, "0_00000.png")]
+    write(extra / "colmap" / "sparse" / "images.bin", images_bin(images))
+    (sequence,) = opened("dycheck", folder)
+    assert sequence.world_from_camera is None
+    assert (
+        sequence.notes[-1]
+        == "apple: 2 of 3 frames are not in flow3d_preprocessed/colmap/sparse, 0_00010 first; no cameras"
+    )
+    for path in (folder / "depth" / "1x").iterdir():
+        path.unlink()
+    assert opened("dycheck", folder, gt="lidar")[0].depth is None
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{", "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
+        ("[]", "has no list of names"),
+        ('{"frame_names": []}', "has no list of names"),
+        ('{"frame_names": [1, 2]}', "has no list of names"),
+        ('{"frame_names": "0_00000"}', "has no list of names"),
+        ('{"frame_names": ["a", "a"]}', "names a frame twice"),
+        ('{"frame_names": ["../camera"]}', "expected a path inside"),
+        ('{"frame_names": ["/etc/passwd"]}', "expected a path inside"),
+        ('{"frame_names": ["a\\u0000"]}', "expected a path inside"),
+        ('{"frame_names": [""]}', "expected a path inside"),
+        ('{"frame_names": ["0_99999"]}', "names its frame; get the sequence whole"),
+        (b"\xff\xfe", "is not a text file"),
+    ],
+)
+def test_broken_splits_are_refused(tmp_path, content, message):
+    folder = dycheck_folder(tmp_path / "apple", frames=1)
+    write(folder / "splits" / "train.json", content)
+    with pytest.raises(InputError, match=rf"train\.json.*{message}"):
+        opened("dycheck", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("{}", "no numbers under 'orientation'"),
+        ("[1, 2]", "no numbers under 'orientation'"),
+        (camera_json(orientation=[1, 2, 3]), r"'orientation' of shape \(3,\)"),
+        (camera_json(orientation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "poses that are none"),
+        (camera_json(orientation=[[1, 0], [0]]), "no numbers under 'orientation'"),
+        (camera_json(position=["x", 0, 0]), "no numbers under 'position'"),
+        (camera_json(position=[float("nan"), 0, 0]), "'position' of shape"),
+        (camera_json(position=[10**400, 0, 0]), "no numbers under 'position'"),
+        (camera_json(focal_length=0.0), "focal lengths above 0"),
+        (camera_json(focal_length=None), "'focal_length'"),
+        (camera_json(image_size=[0, 3]), "image_size of 0 x 3"),
+        (camera_json(image_size=4), "'image_size' of shape"),
+        (camera_json(radial_distortion=[0]), "'radial_distortion' of shape"),
+    ],
+)
+def test_broken_cameras_are_refused(tmp_path, content, message):
+    folder = dycheck_folder(tmp_path / "apple", frames=1)
+    write(folder / "camera" / "0_00000.json", content)
+    with pytest.raises(InputError, match=rf"0_00000\.json.*{message}"):
+        opened("dycheck", tmp_path, gt="lidar")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\x93NUMPY",
+        npy(np.ones((3, 4), np.float32))[:-1],
+        npy(np.ones((3, 4, 2), np.float32)),
+        npy(np.ones(12, np.float32)),
+        npy(np.ones((3, 4), bool)),
+        npy(np.ones((3, 4), np.float32)).replace(b"(3, 4)", b"(9999999999, 4)"),
+        b"\x93NUMPY\x01\x00"
+        + struct.pack("<H", 59)
+        + b"{'descr': '|O', 'fortran_order': False, 'shape': (1,), }  \n"
+        + b"\x80\x04.",
+    ],
+)
+def test_arrays_that_are_no_depth_are_refused(tmp_path, content):
+    with pytest.raises(InputError, match=r"a\.npy"):
+        read_npy(write(tmp_path / "a.npy", content))
+
+
+def test_disparity_that_is_not_finite_and_depth_of_another_size(tmp_path):
+    folder = dycheck_folder(tmp_path / "apple", frames=11)
+    path = folder / "flow3d_preprocessed" / "aligned_depth_anything_colmap" / "1x" / "0_00010.npy"
+    write(path, npy(np.full((3, 4), np.nan, np.float32)))
+    (sequence,) = opened("dycheck", folder)
+    with pytest.raises(InputError, match=r"0_00010\.npy holds values that are not finite"):
+        sequence.depth(0)  # the cut is over all frames
+    write(path, npy(np.ones((4, 3), np.float32)))
+    assert sequence.depth(0).shape == (3, 4)
+    with pytest.raises(InputError, match=r"0_00010\.npy has shape \(4, 3\)"):
+        sequence.depth(1)
+
+
+def model(folder, cameras, images):
+    write(folder / "cameras.bin", cameras_bin(cameras))
+    write(folder / "images.bin", images_bin(images))
+    return folder
+
+
+IMAGE = (7, (1, 0, 0, 0), (1, 2, 3), 5, "a.png")
+
+
+@pytest.mark.parametrize(
+    ("number", "values", "focal", "distorted"),
+    [
+        (0, [5, 2, 1], (5, 5), False),  # SIMPLE_PINHOLE
+        (1, [5, 6, 2, 1], (5, 6), False),  # PINHOLE
+        (2, [5, 2, 1, 0.1], (5, 5), True),  # SIMPLE_RADIAL
+        (3, [5, 2, 1, 0, 0], (5, 5), False),  # RADIAL
+        (4, [5, 6, 2, 1, 0, 0, 0, 0.1], (5, 6), True),  # OPENCV
+        (6, [5, 6, 2, 1] + [0] * 8, (5, 6), False),  # FULL_OPENCV
+    ],
+)
+def test_colmap_models(tmp_path, number, values, focal, distorted):
+    """Numbers and parameters of camera models: https://colmap.github.io/cameras.html and its `models.h`."""
+    other = (6, 1, 100, 100, [50.0, 50.0, 50.0, 50.0])
+    views = read_views(model(tmp_path, [(5, number, 4, 3, values), other], [IMAGE, (*IMAGE[:3], 6, "b/ü.png")]))
+    view = views["a.png"]
+    assert np.array_equal(view.intrinsics, [[focal[0], 0, 2], [0, focal[1], 1], [0, 0, 1]])
+    assert (view.size, view.distorted) == ((4, 3), distorted)
+    assert np.array_equal(view.camera_from_world, np.column_stack([np.eye(3), [1, 2, 3]]))
+    assert views["b/ü.png"].size == (100, 100)
+
+
+def test_a_colmap_quaternion_has_its_scalar_first(tmp_path):
+    views = read_views(model(tmp_path, [(5, 0, 4, 3, [5, 2, 1])], [(7, (HALF, 0, HALF, 0), (0, 0, 0), 5, "a.png")]))
+    assert np.allclose(views["a.png"].camera_from_world[:, :3], QUARTER_ABOUT_Y)
+
+
+def test_broken_colmap_models_are_refused(tmp_path):
+    camera = (5, 0, 4, 3, [5, 2, 1])
+    whole = images_bin([IMAGE])
+    model(tmp_path, [camera], [IMAGE])
+    for cut in (0, 7, 20, 72, 75, 80, 100, len(whole) - 1):
+        write(tmp_path / "images.bin", whole[:cut])
+        with pytest.raises(InputError, match=r"images\.bin ends"):
+            read_views(tmp_path)
+    at = whole.index(b"a.png\0") + 6
+    for content in (whole[:at] + struct.pack("<Q", 2**63) + whole[at + 8 :], struct.pack("<Q", 2**64 - 1) + whole[8:]):
+        write(tmp_path / "images.bin", content)
+        with pytest.raises(InputError, match=r"images\.bin ends"):
+            read_views(tmp_path)
+    for images, message in (
+        ([(*IMAGE[:3], 9, "a.png")], "of camera 9, which cameras.bin does not have"),
+        ([(7, (2, 0, 0, 0), *IMAGE[2:])], "a quaternion of length 1"),
+        ([(7, (1, 0, 0, 0), (float("nan"), 0, 0), *IMAGE[3:])], "a pose of 'a.png' that is none"),
+    ):
+        model(tmp_path, [camera], images)
+        with pytest.raises(InputError, match=message):
+            read_views(tmp_path)
+    for broken, message in (
+        ((5, 5, 4, 3, [1] * 8), "a camera of kind 5"),
+        ((5, -1, 4, 3, []), "a camera of kind -1"),
+        ((5, 0, 0, 3, [5, 2, 1]), "a camera of 0 x 3 pixels"),
+        ((5, 0, 4, 3, [0, 2, 1]), "focal lengths above 0"),
+        ((5, 0, 4, 3, [5, 2]), r"cameras\.bin ends"),
+    ):
+        model(tmp_path, [broken], [IMAGE])
+        with pytest.raises(InputError, match=message):
+            read_views(tmp_path)
+    (tmp_path / "cameras.bin").unlink()
+    with pytest.raises(InputError, match=r"cannot read .*cameras\.bin"):
+        read_views(tmp_path)

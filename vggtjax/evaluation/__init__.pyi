@@ -1,0 +1,16 @@
+from .datasets import DATASETS as DATASETS
+from .datasets import open_dataset as open_dataset
+from .datasets.sequence import Sequence as Sequence
+from .masks import frame_scores as frame_scores
+from .masks import mask_scores as mask_scores
+from .masks import pooled_scores as pooled_scores
+from .point_clouds import nearest_distances as nearest_distances
+from .point_clouds import normals_of as normals_of
+from .point_clouds import paired_distance as paired_distance
+from .point_clouds import point_cloud_errors as point_cloud_errors
+from .protocol import TruthAtPixels as TruthAtPixels
+from .protocol import score as score
+from .trajectory import associate as associate
+from .trajectory import trajectory_errors as trajectory_errors
+from .uncertainty import uncertainty_scores as uncertainty_scores
+from .video_depth import video_depth_errors as video_depth_errors

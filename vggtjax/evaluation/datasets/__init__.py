@@ -1,0 +1,133 @@
+"""Data sets with ground truth: a table of what is known of each, and one way to open them. Does not import jax."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets import published
+from vggtjax.evaluation.datasets.davis import davis
+from vggtjax.evaluation.datasets.dycheck import TRUTHS, dycheck
+from vggtjax.evaluation.datasets.folders import listed
+from vggtjax.evaluation.datasets.frames import EVERY_FRAME, Frames
+from vggtjax.evaluation.datasets.kitti import kitti
+from vggtjax.evaluation.datasets.layout import Opener, Reader
+from vggtjax.evaluation.datasets.plain import plain
+from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.seven_scenes import seven_scenes
+from vggtjax.evaluation.datasets.sintel import sintel
+from vggtjax.evaluation.datasets.tum import bonn, tum
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A data set: how it is read, and which of it the published protocol takes.
+
+    `frames` are a window of frames, then every so many of them, then at most so many.
+    """
+
+    reader: Reader
+    description: str
+    truth: tuple[str, ...]  # of "depth", "poses", "intrinsics", "masks"; what a sequence lacks is in its notes
+    frames: Frames = EVERY_FRAME
+    sequences: tuple[str, ...] | None = None  # of the published protocol
+    max_depth: float | None = None  # metres; farther pixels do not count in video depth
+    gt: tuple[str, ...] = ()  # ground truths to choose from, the first one unless told
+
+    @property
+    def gt_default(self) -> str | None:
+        """The ground truth that is taken unless another is asked for; None where there is one only."""
+        return self.gt[0] if self.gt else None
+
+
+_ROOM = ("depth", "poses", "intrinsics")
+
+DATASETS: Mapping[str, Dataset] = {
+    "plain": Dataset(plain, "folders of rgb/, depth/, mask/, cameras", (*_ROOM, "masks")),
+    "composite": Dataset(plain, "filmed objects pasted into a filmed room", (*_ROOM, "masks")),
+    "hololens": Dataset(plain, "a static room, filmed in two takes", _ROOM),
+    "tum": Dataset(tum, "TUM RGB-D, moving people", _ROOM, Frames(stride=3, most=90), published.TUM),
+    "bonn": Dataset(bonn, "Bonn RGB-D Dynamic", _ROOM, Frames(slice(30, 140)), published.BONN, max_depth=70.0),
+    "dycheck": Dataset(dycheck, "DyCheck iPhone", _ROOM, Frames(stride=10), published.DYCHECK, gt=TRUTHS),
+    "sintel": Dataset(sintel, "MPI Sintel, final pass", _ROOM, sequences=published.SINTEL, max_depth=70.0),
+    "kitti": Dataset(kitti, "KITTI drives", ("depth", "intrinsics"), Frames(most=110), published.KITTI),
+    "davis": Dataset(davis, "DAVIS 2016, validation", ("masks",), sequences=published.DAVIS_2016),
+    "davis-2017": Dataset(davis, "DAVIS 2017, validation", ("masks",), sequences=published.DAVIS_2017),
+    "7scenes": Dataset(seven_scenes, "7-Scenes", _ROOM),
+}
+
+
+def open_dataset(
+    name: str,
+    root: str | Path,
+    *,
+    sequences: Iterable[str] | None = None,
+    stride: int | None = None,
+    gt: str | None = None,
+) -> list[Sequence]:
+    """Open sequences of a data set: cameras are read, pictures, depth and masks when they are asked for.
+
+    Args:
+        name: one of DATASETS.
+        root: the data set's folder; for "plain", "tum", "bonn", "dycheck" and "7scenes", one sequence's folder too.
+        sequences: names of those to open, in order. None takes the published ones that are there, or all where none
+            of them is; what that leaves out is in the notes of every sequence, and logged.
+        stride: takes every so many frames, in place of the data set's own; a window or cap of it stays.
+        gt: which ground truth, where the data set has several; None takes the first.
+
+    Raises:
+        InputError: a name, sequence or ground truth that is not known, a root without sequences, or files that are
+            missing in the middle of a sequence or do not hold what they should.
+    """
+    if name not in DATASETS:
+        raise InputError(f"data set {name!r} is not known; expected one of {', '.join(DATASETS)}")
+    dataset = DATASETS[name]
+    if gt is not None and gt not in dataset.gt:
+        raise InputError(f"gt is {gt!r}; {name} has {' and '.join(dataset.gt) or 'one ground truth, so leave it out'}")
+    if stride is not None and stride < 1:
+        raise InputError(f"stride is {stride}; expected 1 or more")
+    root = Path(root)
+    if not root.is_dir():
+        raise InputError(f"{root} is not a folder; expected that of the data set {name}")
+    found = dataset.reader(root)
+    chosen, notices = _chosen(name, root, found, sequences)
+    for notice in notices:
+        logger.warning("%s", notice)
+    frames = dataset.frames if stride is None else dataset.frames._replace(stride=stride)
+    opened = [found[sequence](frames, gt or dataset.gt_default) for sequence in chosen]
+    return [
+        dataclasses.replace(sequence, notes=(*notices, *(f"{sequence.name}: {note}" for note in sequence.notes)))
+        for sequence in opened
+    ]
+
+
+def _chosen(
+    name: str, root: Path, found: Mapping[str, Opener], sequences: Iterable[str] | None
+) -> tuple[list[str], tuple[str, ...]]:
+    """Return the names of the sequences to open, and notices on those that are left out or missing."""
+    if sequences is not None:
+        wanted = [sequences] if isinstance(sequences, str) else list(sequences)
+        if unknown := [sequence for sequence in wanted if sequence not in found]:
+            raise InputError(f"sequence {unknown[0]!r} of {name} is not in {root}; expected of {listed(list(found))}")
+        if not wanted or len(set(wanted)) < len(wanted):
+            raise InputError(f"sequences are {wanted}; expected one name at least, none twice")
+        return wanted, ()
+    published = DATASETS[name].sequences
+    if published is None:
+        return list(found), ()
+    there = [sequence for sequence in published if sequence in found]
+    if not there:
+        return list(found), (f"none of the {len(published)} published sequences of {name} is there; took all found",)
+    notices: tuple[str, ...] = ()
+    if absent := [sequence for sequence in published if sequence not in found]:
+        notices += (f"{len(absent)} of {len(published)} published sequences of {name} are not there: "
+                    f"{', '.join(absent)}",)  # fmt: skip
+    if others := [sequence for sequence in found if sequence not in published]:
+        notices += (f"left out, as the published protocol of {name} does: {listed(others)}",)
+    return there, notices

@@ -1,0 +1,73 @@
+"""Cameras of data sets in this library's conventions. Does not import jax."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from vggtjax.errors import InputError
+from vggtjax.evaluation.trajectory import checked_poses
+
+PIXEL_CENTRE = 0.5  # where the centre of the first pixel is; 0 for data sets that count from the centre
+
+
+def intrinsics_matrix(
+    fx: float, fy: float, cx: float, cy: float, *, first_pixel: float, source: Path | str
+) -> Float64[np.ndarray, "3 3"]:
+    """Return intrinsics in pixels, from those of a data set whose first pixel has its centre at `first_pixel`.
+
+    Raises InputError, which names `source`, where the numbers are not finite or a focal length is not above 0.
+    """
+    shift = PIXEL_CENTRE - first_pixel
+    matrix = np.array([[fx, 0, cx + shift], [0, fy, cy + shift], [0, 0, 1]], np.float64)
+    return checked_intrinsics(matrix, source)
+
+
+def checked_intrinsics(matrices: Float64[np.ndarray, "*S 3 3"], source: Path | str) -> Float64[np.ndarray, "*S 3 3"]:
+    """Return intrinsics, or raise InputError where they are not finite or a focal length is not above 0."""
+    focal = matrices[..., [0, 1], [0, 1]]
+    if not np.isfinite(matrices).all() or (focal <= 0).any() or not (matrices[..., 2, :] == [0, 0, 1]).all():
+        raise InputError(f"{source} has intrinsics that are none; expected focal lengths above 0 and a last row 0 0 1")
+    return matrices
+
+
+def resized_intrinsics(
+    matrix: Float64[np.ndarray, "3 3"], size: tuple[int, int], picture: tuple[int, int], source: Path
+) -> Float64[np.ndarray, "3 3"]:
+    """Return intrinsics of pictures of one (width, height) at another; raises InputError for another shape."""
+    scale = np.array(picture) / np.array(size)
+    if abs(size[0] * picture[1] - size[1] * picture[0]) > max(picture):  # a pixel is no other shape
+        raise InputError(
+            f"{source} is for pictures of {size[0]:g} x {size[1]:g} and the picture is {picture[0]} x {picture[1]}; "
+            "expected the same shape"
+        )
+    resized = matrix.copy()
+    resized[:2] *= scale[:, None]
+    return resized
+
+
+def checked_world_from_camera(poses: Float[np.ndarray, "S 4 4"], source: Path | str) -> Float64[np.ndarray, "S 4 4"]:
+    """Return poses in float64, or raise InputError, which names `source`, where they are not rigid."""
+    poses = np.asarray(poses, np.float64)
+    try:
+        checked_poses(poses[:, :3])
+    except InputError as error:
+        raise InputError(f"{source} holds poses that are none: {error}") from None
+    if not np.allclose(poses[:, 3], [0, 0, 0, 1]):
+        raise InputError(f"{source} holds poses that are none: their last row is not 0 0 0 1")
+    return poses
+
+
+def world_from_camera_of(
+    camera_from_world: Float[np.ndarray, "S 3 4"], source: Path | str
+) -> Float64[np.ndarray, "S 4 4"]:
+    """Return the inverse of poses; raises what `checked_world_from_camera` raises."""
+    poses = np.tile(np.eye(4), (len(camera_from_world), 1, 1))
+    poses[:, :3] = camera_from_world
+    checked_world_from_camera(poses, source)
+    rotation = poses[:, :3, :3].swapaxes(1, 2)
+    poses[:, :3, 3] = -np.einsum("sij,sj->si", rotation, poses[:, :3, 3])
+    poses[:, :3, :3] = rotation
+    return poses

@@ -1,0 +1,121 @@
+"""Cameras of a COLMAP model: cameras.bin and images.bin. Does not import jax.
+
+The layout is that of COLMAP's documentation (https://colmap.github.io/format.html) and of its `Reconstruction`, which
+writes the binary form: little-endian, a count of 64 bits, then the records. COLMAP puts the outer corner of the first
+pixel at (0, 0), as this library does.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.cameras import PIXEL_CENTRE, intrinsics_matrix
+from vggtjax.evaluation.datasets.folders import read_bytes
+
+
+class Model(NamedTuple):
+    """A camera model: what each of its first parameters is, and how many parameters there are."""
+
+    pinhole: str  # "f" for one focal length, "ff" for two; the principal point follows
+    parameters: int
+
+
+# By COLMAP's numbers. Fisheye models are left out: their K alone is no camera.
+_MODELS = {
+    0: Model("f", 3),  # SIMPLE_PINHOLE
+    1: Model("ff", 4),  # PINHOLE
+    2: Model("f", 4),  # SIMPLE_RADIAL
+    3: Model("f", 5),  # RADIAL
+    4: Model("ff", 8),  # OPENCV
+    6: Model("ff", 12),  # FULL_OPENCV
+}
+_POINT_BYTES = 24  # of an observation in images.bin: x, y, the point's number
+
+
+class View(NamedTuple):
+    """A registered image: its camera in pixels, the size its pixels are of, and its pose."""
+
+    intrinsics: Float64[np.ndarray, "3 3"]
+    size: tuple[int, int]  # width, height
+    distorted: bool  # the lens has a distortion that the intrinsics do not have
+    camera_from_world: Float64[np.ndarray, "3 4"]
+
+
+class _Camera(NamedTuple):
+    intrinsics: Float64[np.ndarray, "3 3"]
+    size: tuple[int, int]
+    distorted: bool
+
+
+def read_views(folder: Path) -> dict[str, View]:
+    """Return the registered images of a model by name.
+
+    Raises InputError for files that end early, cameras of another kind, or numbers that are no camera.
+    """
+    cameras = _read_cameras(folder / "cameras.bin")
+    reader = _Reader(folder / "images.bin")
+    views = {}
+    for _ in range(reader.next("<Q")[0]):
+        _, *pose, camera = reader.next("<i7di")
+        name = reader.text()
+        reader.skip(_POINT_BYTES * reader.next("<Q")[0])
+        quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
+        if camera not in cameras:
+            raise InputError(f"{reader.path} has {name!r} of camera {camera}, which cameras.bin does not have")
+        if not np.isfinite(pose).all() or abs(np.linalg.norm(quaternion) - 1) > 0.01:
+            raise InputError(f"{reader.path} has a pose of {name!r} that is none; expected a quaternion of length 1")
+        rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+        views[name] = View(*cameras[camera], np.column_stack([rotation, translation]))
+    return views
+
+
+def _read_cameras(path: Path) -> dict[int, _Camera]:
+    reader = _Reader(path)
+    cameras = {}
+    for _ in range(reader.next("<Q")[0]):
+        number, kind, width, height = reader.next("<iiQQ")
+        if kind not in _MODELS:
+            raise InputError(f"{path} has a camera of kind {kind}; expected one of {', '.join(map(str, _MODELS))}")
+        values = reader.next(f"<{_MODELS[kind].parameters}d")
+        focal = len(_MODELS[kind].pinhole)
+        fx, fy = values[0], values[focal - 1]
+        cx, cy = values[focal : focal + 2]
+        if not width or not height:
+            raise InputError(f"{path} has a camera of {width} x {height} pixels; expected sizes above 0")
+        intrinsics = intrinsics_matrix(fx, fy, cx, cy, first_pixel=PIXEL_CENTRE, source=path)
+        cameras[number] = _Camera(intrinsics, (width, height), any(values[focal + 2 :]))
+    return cameras
+
+
+class _Reader:
+    """Reads numbers from a file in turn, none past its end."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._data = read_bytes(path)
+        self._at = 0
+
+    def next(self, layout: str) -> tuple[Any, ...]:
+        start = self._at
+        self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self._data, start)
+
+    def text(self) -> str:
+        end = self._data.find(b"\0", self._at)
+        if end < 0:
+            raise InputError(f"{self.path} ends in the middle of a name; get it whole")
+        name = self._data[self._at : end].decode("utf-8", "replace")
+        self._at = end + 1
+        return name
+
+    def skip(self, count: int) -> None:
+        if count > len(self._data) - self._at:
+            raise InputError(f"{self.path} ends after {len(self._data)} bytes, in the middle of a record; get it whole")
+        self._at += count

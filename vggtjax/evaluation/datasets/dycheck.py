@@ -1,0 +1,171 @@
+"""DyCheck's iPhone sequences as Shape of Motion released them, at 1x. Does not import jax.
+
+splits/train.json names the frames; rgb/1x/<frame>.png are their pictures, camera/<frame>.json their cameras and
+depth/1x/<frame>.npy what the lidar measured. Pixels count from the outer corner of the first (DyCheck's rays pass
+through whole numbers and a half). https://github.com/KAIR-BAIR/dycheck/blob/main/docs/DATASETS.md calls the depth
+millimetres; its code, and that of Shape of Motion, takes it in the unit of the cameras' positions, which are metres.
+flow3d_preprocessed/ adds cameras refined with COLMAP (colmap/sparse) and disparity of Depth Anything aligned to them
+(aligned_depth_anything_colmap/1x), in COLMAP's unit. https://github.com/vye16/shape-of-motion
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.cameras import (
+    checked_intrinsics,
+    checked_world_from_camera,
+    resized_intrinsics,
+    world_from_camera_of,
+)
+from vggtjax.evaluation.datasets.colmap import read_views
+from vggtjax.evaluation.datasets.depth_files import read_npy
+from vggtjax.evaluation.datasets.folders import files, inside, read_text, sequence_folders
+from vggtjax.evaluation.datasets.frames import Frames
+from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.maps import depth_reader
+from vggtjax.evaluation.datasets.pictures import picture_size
+from vggtjax.evaluation.datasets.sequence import Sequence
+
+TRUTHS = ("easi3r", "lidar")
+_SPLIT = Path("splits/train.json")
+_PICTURES = Path("rgb/1x")
+_LIDAR = Path("depth/1x")
+_ALIGNED = Path("flow3d_preprocessed/aligned_depth_anything_colmap/1x")
+_MODEL = Path("flow3d_preprocessed/colmap/sparse")
+_LEAST_DISPARITY = 1e-3
+_FARTHEST = 2.5  # times the median over the frames of their largest depth
+_DISTORTION = "lens distortion is left as it is, the intrinsics do not have it"
+
+
+class _Cameras(NamedTuple):
+    world_from_camera: Float64[np.ndarray, "S 4 4"] | None
+    intrinsics: Float64[np.ndarray, "S 3 3"] | None
+    notes: tuple[str, ...]
+
+
+def dycheck(root: Path) -> dict[str, Opener]:
+    """Find sequences. Their ground truth is "easi3r", disparity aligned to COLMAP with COLMAP's cameras, or "lidar"."""
+    folders = sequence_folders(root, lambda folder: (folder / _SPLIT).is_file(), str(_SPLIT))
+    return {name: partial(_read, folder, name) for name, folder in folders.items()}
+
+
+def _read(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
+    names = _frame_names(folder / _SPLIT)
+    chosen = frames.of(names, name)
+    pictures = [inside(folder / _PICTURES, f"{frame}.png", folder / _SPLIT) for frame in chosen]
+    if absent := [path for path in pictures if not path.is_file()]:
+        raise InputError(f"{absent[0]} is not there, and {folder / _SPLIT} names its frame; get the sequence whole")
+    easi3r = gt == TRUTHS[0]
+    cameras = (_colmap_cameras if easi3r else _json_cameras)(folder, chosen, pictures)
+    there = files(folder / (_ALIGNED if easi3r else _LIDAR), ".npy")
+    read = _from_disparity([there[frame] for frame in names if frame in there]) if easi3r else read_npy
+    depth, notes = depth_reader(pictures, [there.get(frame) for frame in chosen], read)
+    return Sequence(
+        name,
+        tuple(pictures),
+        depth,
+        world_from_camera=cameras.world_from_camera,
+        intrinsics=cameras.intrinsics,
+        notes=(f"its ground truth is {gt}", *notes, *cameras.notes),
+    )
+
+
+def _frame_names(path: Path) -> list[str]:
+    split = _read_json(path)
+    names = split.get("frame_names") if isinstance(split, dict) else None
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise InputError(f"{path} has no list of names under 'frame_names'; expected the train split of a sequence")
+    for name in names:
+        inside(path.parent, name, path)
+    if len(set(names)) < len(names):
+        raise InputError(f"{path} names a frame twice; expected each once")
+    return names
+
+
+def _from_disparity(paths: list[Path]) -> Callable[[Path], Float32[np.ndarray, "h w"]]:
+    """Return a reader of depth, 1 / disparity, that cuts it as Shape of Motion does: over all frames of the split."""
+
+    @cache
+    def farthest() -> float:
+        largest = sorted(float(_inverse(path).max(initial=0)) for path in paths)
+        return _FARTHEST * largest[(len(largest) - 1) // 2]  # torch's median: the lower of the two in the middle
+
+    return lambda path: np.minimum(_inverse(path), np.float32(farthest()))
+
+
+def _inverse(path: Path) -> Float32[np.ndarray, "h w"]:
+    disparity = read_npy(path)
+    if not np.isfinite(disparity).all():
+        raise InputError(f"{path} holds values that are not finite; expected disparity")
+    return 1 / np.maximum(disparity, np.float32(_LEAST_DISPARITY))
+
+
+def _colmap_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cameras:
+    source = folder / _MODEL
+    if not (source / "images.bin").is_file():
+        return _Cameras(None, None, (f"it has no {_MODEL}/images.bin, so no cameras",))
+    views = read_views(source)
+    if missing := [frame for frame in frames if f"{frame}.png" not in views]:
+        note = f"{len(missing)} of {len(frames)} frames are not in {_MODEL}, {missing[0]} first; no cameras"
+        return _Cameras(None, None, (note,))
+    taken = [views[f"{frame}.png"] for frame in frames]
+    intrinsics = [
+        resized_intrinsics(view.intrinsics, view.size, picture_size(path), source)
+        for view, path in zip(taken, pictures, strict=True)
+    ]
+    poses = world_from_camera_of(np.stack([view.camera_from_world for view in taken]), source)
+    return _Cameras(poses, np.stack(intrinsics), (_DISTORTION,) * any(view.distorted for view in taken))
+
+
+def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cameras:
+    paths = [folder / "camera" / f"{frame}.json" for frame in frames]
+    if missing := [path.stem for path in paths if not path.is_file()]:
+        note = f"{len(missing)} of {len(frames)} frames have no camera, {missing[0]} first; no cameras"
+        return _Cameras(None, None, (note,))
+    poses, intrinsics, distorted = [], [], False
+    for path, picture in zip(paths, pictures, strict=True):
+        camera = _read_json(path)
+        pose = np.eye(4)
+        pose[:3, :3] = _numbers(camera, "orientation", (3, 3), path).T  # the file has camera-from-world
+        pose[:3, 3] = _numbers(camera, "position", (3,), path)
+        poses.append(checked_world_from_camera(pose[None], path)[0])
+        focal, skew, ratio = (
+            float(_numbers(camera, key, (), path)) for key in ("focal_length", "skew", "pixel_aspect_ratio")
+        )
+        cx, cy = _numbers(camera, "principal_point", (2,), path)
+        width, height = _numbers(camera, "image_size", (2,), path).tolist()
+        if min(width, height) < 1:
+            raise InputError(f"{path} has an image_size of {width:g} x {height:g}; expected pixels")
+        matrix = checked_intrinsics(np.array([[focal, skew, cx], [0, focal * ratio, cy], [0, 0, 1]]), path)
+        intrinsics.append(resized_intrinsics(matrix, (width, height), picture_size(picture), path))
+        for key, count in (("radial_distortion", 3), ("tangential_distortion", 2)):
+            distorted |= bool(_numbers(camera, key, (count,), path).any())
+    return _Cameras(np.stack(poses), np.stack(intrinsics), (_DISTORTION,) * distorted)
+
+
+def _numbers(camera: Any, key: str, shape: tuple[int, ...], path: Path) -> Float64[np.ndarray, ...]:
+    try:
+        value = np.asarray(camera[key], np.float64)
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
+        raise InputError(f"{path} has no numbers under '{key}'; expected a camera of DyCheck") from None
+    if value.shape != shape or not np.isfinite(value).all():
+        raise InputError(f"{path} has a '{key}' of shape {value.shape}; expected finite numbers of shape {shape}")
+    return value
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(read_text(path))
+    except (ValueError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path} is not JSON ({str(error)[:100]}); get it whole") from None

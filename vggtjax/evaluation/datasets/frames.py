@@ -1,0 +1,36 @@
+"""Which frames of a sequence a protocol takes. Does not import jax."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+from vggtjax.errors import InputError
+
+T = TypeVar("T")
+
+
+class Frames(NamedTuple):
+    """A window of frames, then every so many of them, then at most so many."""
+
+    window: slice = slice(None)
+    stride: int = 1
+    most: int | None = None
+
+    def of(self, items: Sequence[T], name: str) -> list[T]:
+        """Return those of `items`, one for each frame of the sequence `name`; raises InputError where none is left."""
+        if not items:
+            raise InputError(f"sequence {name} has no frames; expected one at least")
+        chosen = list(items[self.window][:: self.stride][: self.most])
+        if not chosen:
+            raise InputError(f"sequence {name} has {len(items)} frames, and none of them from {self.window.start} on")
+        return chosen
+
+    def shortage(self, count: int) -> tuple[str, ...]:
+        """Return a note where a sequence of `count` frames ends before the window does."""
+        if self.window.stop is None or count >= self.window.stop:
+            return ()
+        return (f"it has {count} frames; the protocol takes {self.window.start or 0} to {self.window.stop - 1}",)
+
+
+EVERY_FRAME = Frames()

@@ -1,0 +1,51 @@
+"""Pictures of a data set as they are stored: depth, labels, sizes. Does not import jax."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from PIL import Image
+
+from vggtjax.clips.images import known_formats
+from vggtjax.errors import InputError
+
+PNG = ("PNG",)
+_ORIENTATION = 0x0112  # EXIF; from 5 on, width and height change places
+_FIRST_TURNED = 5
+_BROKEN = (  # what Pillow raises on broken files
+    OSError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    IndexError,
+    KeyError,
+    RuntimeError,
+    EOFError,
+    OverflowError,
+    struct.error,
+    Image.DecompressionBombError,
+    Image.DecompressionBombWarning,
+)
+
+
+@contextmanager
+def opening(path: Path, formats: tuple[str, ...]) -> Iterator[Image.Image]:
+    """Open a picture as it is stored; raises InputError for a file that is none, then or when it is decoded."""
+    try:
+        with Image.open(path, formats=formats) as image:
+            yield image
+    except InputError:
+        raise
+    except _BROKEN as error:
+        reason = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise InputError(f"{path} cannot be read: {reason}; expected {' or '.join(formats)}, whole") from error
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Return width and height of a picture, upright; raises InputError for a file that is none."""
+    with opening(path, known_formats()) as image:
+        width, height = image.size
+        return (height, width) if image.getexif().get(_ORIENTATION, 1) >= _FIRST_TURNED else (width, height)

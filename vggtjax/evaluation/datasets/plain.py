@@ -1,0 +1,111 @@
+"""Plain folders: rgb/, and depth/, mask/, K.txt and world_from_camera.txt where they are known. Does not import jax.
+
+Depth is PNG of 16 bits in millimetres, 0 where it is not known; masks are pictures, bright where the world moves. K.txt
+has three rows of three numbers for all frames, or three rows for each; world_from_camera.txt a row of 16 numbers for
+each frame, in metres. The intrinsics pass as they are, without a shift by half a pixel: nothing says from where those
+of the HoloLens count, and half a pixel is below what its poses and depth can tell.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from vggtjax.clips.images import is_image_name
+from vggtjax.clips.masks import read_mask
+from vggtjax.clips.sources import natural_key
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.cameras import checked_intrinsics, checked_world_from_camera
+from vggtjax.evaluation.datasets.depth_files import read_png
+from vggtjax.evaluation.datasets.folders import files, sequence_folders
+from vggtjax.evaluation.datasets.frames import Frames
+from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.maps import depth_reader, mask_reader
+from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.results.trajectory import read_numbers
+
+_NEW_TAKE = 10.0  # times the median step of the camera: a jump between takes in one folder
+_PER_METRE = 1000.0
+
+
+def plain(root: Path) -> dict[str, Opener]:
+    """Find plain folders; one with several takes, between which the camera jumps, gives a sequence for each."""
+    found: dict[str, Opener] = {}
+    for name, folder in sequence_folders(root, lambda folder: (folder / "rgb").is_dir(), "a folder rgb").items():
+        poses = _poses(folder)
+        parts = [] if poses is None else takes(poses[:, :3, 3])
+        if len(parts) < 2:
+            found[name] = partial(_read, folder, name, slice(None))
+        for part in parts if len(parts) > 1 else []:
+            title = f"{name} {part.start}-{part.stop - 1}"
+            found[title] = partial(_read, folder, title, slice(part.start, part.stop))
+    return found
+
+
+def takes(centres: Float64[np.ndarray, "S 3"]) -> list[range]:
+    """Return the stretches of frames without a cut: no step ten times as long as the median one, pauses aside."""
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    moving = steps[steps > 0]
+    cuts = 1 + np.flatnonzero(steps > _NEW_TAKE * np.median(moving)) if moving.size else np.zeros(0, int)
+    return [range(start, end) for start, end in pairwise([0, *cuts.tolist(), len(centres)])]
+
+
+def _read(folder: Path, name: str, part: slice, frames: Frames, gt: str | None) -> Sequence:
+    del gt  # there is one
+    pictures = _pictures(folder)
+    poses = _poses(folder)
+    if poses is not None and len(poses) != len(pictures):
+        raise InputError(
+            f"{folder / 'world_from_camera.txt'} has {len(poses)} poses; expected {len(pictures)}, one for each picture"
+        )
+    chosen = frames.of(range(len(pictures))[part], name)
+    intrinsics = _intrinsics(folder, len(pictures))
+    taken = [pictures[frame] for frame in chosen]
+    depths, masks = files(folder / "depth", ".png"), files(folder / "mask", ".png")
+    depth, notes = depth_reader(
+        taken, [depths.get(path.stem) for path in taken], partial(read_png, per_metre=_PER_METRE)
+    )
+    mask = None
+    if masks:
+        mask, more = mask_reader(taken, [masks.get(path.stem) for path in taken], read_mask)
+        notes += more
+    notes += ("it has no world_from_camera.txt",) * (poses is None) + ("it has no K.txt",) * (intrinsics is None)
+    return Sequence(
+        name,
+        tuple(taken),
+        depth,
+        mask,
+        None if poses is None else poses[chosen],
+        None if intrinsics is None else intrinsics[chosen],
+        notes=notes,
+    )
+
+
+def _pictures(folder: Path) -> list[Path]:
+    pictures = [path for path in (folder / "rgb").iterdir() if is_image_name(path) and not path.name.startswith(".")]
+    if not pictures:
+        raise InputError(f"{folder / 'rgb'} holds no pictures; expected one for each frame")
+    if len({path.stem for path in pictures}) < len(pictures):
+        raise InputError(f"{folder / 'rgb'} holds two pictures of one name; expected one for each frame")
+    return sorted(pictures, key=natural_key)
+
+
+def _poses(folder: Path) -> Float64[np.ndarray, "S 4 4"] | None:
+    path = folder / "world_from_camera.txt"
+    if not path.is_file():
+        return None
+    return checked_world_from_camera(read_numbers(path, 16).reshape(-1, 4, 4), path)
+
+
+def _intrinsics(folder: Path, count: int) -> Float64[np.ndarray, "S 3 3"] | None:
+    path = folder / "K.txt"
+    if not path.is_file():
+        return None
+    rows = read_numbers(path, 3)
+    if len(rows) not in (3, 3 * count):
+        raise InputError(f"{path} has {len(rows)} rows; expected 3, or 3 for each of {count} pictures")
+    return np.broadcast_to(checked_intrinsics(rows.reshape(-1, 3, 3), path), (count, 3, 3))

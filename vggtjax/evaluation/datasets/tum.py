@@ -1,0 +1,232 @@
+"""The TUM RGB-D benchmark and Bonn RGB-D Dynamic, which has the same layout. Does not import jax.
+
+A folder holds rgb.txt and depth.txt, of lines "timestamp path", and groundtruth.txt, of lines "timestamp tx ty tz qx qy
+qz qw"; depth is PNG of 16 bits, 5000 to the metre, 0 where it is not known, at the pixels of the pictures. Both count
+pixels from the centre of the first (the benchmark's page takes whole numbers of pixels to points).
+TUM: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+Bonn: https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64, Int
+
+from vggtjax.clips.sources import natural_key
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.cameras import intrinsics_matrix
+from vggtjax.evaluation.datasets.depth_files import read_png
+from vggtjax.evaluation.datasets.folders import inside, read_text, sequence_folders
+from vggtjax.evaluation.datasets.frames import Frames
+from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.maps import depth_reader
+from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.results.trajectory import read_numbers, read_trajectory
+
+_PER_METRE = 5000.0
+_APART = 0.02  # seconds; from this on, two timestamps do not belong together
+_WIDER = 1.01  # than that is where partners are looked for: sums of times are rounded
+_CAMERA = re.compile(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)")
+# fx fy cx cy of the colour cameras. Those of freiburg3 are of pictures without distortion.
+_FREIBURG = {
+    "1": (517.3, 516.5, 318.6, 255.3),
+    "2": (520.9, 521.0, 325.1, 249.7),
+    "3": (535.4, 539.2, 320.1, 247.6),
+}
+_DISTORTED = ("1", "2")
+_BONN = (542.822841, 542.576870, 315.593520, 237.756098)
+# Bonn tracks markers on the camera. Its page takes a point of the camera to the world by ROS T ROS MARKERS, T what
+# groundtruth.txt says. The 3 x 3 part of MARKERS is a rotation times 1.059; the rotation alone goes into the poses.
+_ROS = np.array([[-1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+_MARKERS = np.array(
+    [
+        [1.0157, 0.1828, -0.2389, 0.0113],
+        [0.0009, -0.8431, -0.6413, -0.0098],
+        [-0.3009, 0.6147, -0.8085, 0.0111],
+        [0, 0, 0, 1],
+    ]
+)
+
+
+class Files(NamedTuple):
+    """What a list names: files, and the second each was taken in, in order of time."""
+
+    times: Float64[np.ndarray, " N"]
+    paths: list[Path]
+
+
+def tum(root: Path) -> dict[str, Opener]:
+    """Find sequences of the TUM RGB-D benchmark, named without "rgbd_dataset_".
+
+    Frames without a pose are left out before the stride and the cap, as MonST3R does. Intrinsics are those of the
+    camera that the folder's name tells (freiburg1, fr1, ...), or of a file calibration.txt: fx fy cx cy.
+    """
+    return {name: partial(_read_tum, folder, name) for name, folder in _found(root, "rgbd_dataset_").items()}
+
+
+def bonn(root: Path) -> dict[str, Opener]:
+    """Find sequences of Bonn RGB-D Dynamic, named without "rgbd_bonn_".
+
+    The window is one of all pictures, as MonST3R takes it for depth; poses are given where every frame has one.
+    """
+    return {name: partial(_read_bonn, folder, name) for name, folder in _found(root, "rgbd_bonn_").items()}
+
+
+def associate(
+    first: Float[np.ndarray, " N"], second: Float[np.ndarray, " M"], apart: float = _APART
+) -> Int[np.ndarray, " N"]:
+    """Return for each time of `first` the index of its partner in `second`, or -1: each has one partner at most.
+
+    Pairs less than `apart` seconds from each other, the closest first, as the benchmark's `associate.py` takes them.
+    """
+    order = np.argsort(second, kind="stable")
+    low, high = (np.searchsorted(second[order], first + side) for side in (-_WIDER * apart, _WIDER * apart))
+    pairs = [
+        (gap, float(first[i]), float(second[j]), i, int(j))
+        for i in range(len(first))
+        for j in order[low[i] : high[i]]
+        if (gap := abs(float(first[i]) - float(second[j]))) < apart
+    ]
+    partners = np.full(len(first), -1)
+    taken = set()
+    for _, _, _, i, j in sorted(pairs):
+        if partners[i] < 0 and j not in taken:
+            partners[i] = j
+            taken.add(j)
+    return partners
+
+
+def _found(root: Path, prefix: str) -> dict[str, Path]:
+    folders = sequence_folders(
+        root, lambda folder: (folder / "rgb.txt").is_file(), "rgb.txt, depth.txt, groundtruth.txt"
+    )
+    return {name.removeprefix(prefix): folder for name, folder in folders.items()}
+
+
+def _read_tum(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
+    del gt  # there is one
+    pictures = _listed(folder, "rgb.txt")
+    poses, partners = _poses(folder, pictures.times)
+    notes: tuple[str, ...] = ()
+    candidates = np.arange(len(pictures.paths))
+    if poses is None or (partners < 0).all():
+        notes += ("it has no groundtruth.txt" if poses is None else f"no frame has a pose within {_APART} s",)
+        poses = None
+    elif (lost := np.flatnonzero(partners < 0)).size:
+        candidates = np.flatnonzero(partners >= 0)
+        notes += (
+            f"{len(lost)} of {len(partners)} frames have no pose within {_APART} s and are left out, "
+            f"{pictures.paths[lost[0]].stem} first",
+        )
+    chosen = frames.of(candidates.tolist(), name)
+    notes += frames.shortage(len(candidates))
+    intrinsics, more = _tum_intrinsics(folder)
+    return _sequence(
+        folder, name, pictures, chosen, None if poses is None else poses[partners[chosen]], intrinsics, notes + more
+    )
+
+
+def _read_bonn(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
+    del gt  # there is one
+    pictures = _listed(folder, "rgb.txt")
+    chosen = frames.of(range(len(pictures.paths)), name)
+    notes = (*frames.shortage(len(pictures.paths)), "lens distortion is left as it is, the intrinsics do not have it")
+    poses, partners = _poses(folder, pictures.times)
+    if poses is None:
+        notes += ("it has no groundtruth.txt",)
+    elif lost := [frame for frame in chosen if partners[frame] < 0]:
+        first = pictures.paths[lost[0]].stem
+        notes += (f"{len(lost)} of {len(chosen)} frames have no pose within {_APART} s, {first} first; no poses",)
+        poses = None
+    if poses is not None:
+        left, _, right = np.linalg.svd(_MARKERS[:3, :3])
+        markers = _MARKERS.copy()
+        markers[:3, :3] = left @ right
+        poses = _ROS @ poses[partners[chosen]] @ _ROS @ markers
+        notes += ("poses are those of the markers, taken to the camera with the data set's calibration",)
+    intrinsics = intrinsics_matrix(*_BONN, first_pixel=0, source="Bonn")
+    return _sequence(folder, name, pictures, chosen, poses, intrinsics, notes)
+
+
+def _sequence(
+    folder: Path,
+    name: str,
+    pictures: Files,
+    chosen: list[int],
+    poses: Float64[np.ndarray, "S 4 4"] | None,
+    intrinsics: Float64[np.ndarray, "3 3"] | None,
+    notes: tuple[str, ...],
+) -> Sequence:
+    taken = [pictures.paths[frame] for frame in chosen]
+    maps: list[Path | None] = [None] * len(taken)
+    if (folder / "depth.txt").is_file():
+        depths = _listed(folder, "depth.txt")
+        # Partners are found among all pictures: which frames are taken does not change whose a depth map is.
+        partners = associate(pictures.times, depths.times)[chosen]
+        maps = [depths.paths[partner] if partner >= 0 else None for partner in partners]
+    for path in (*taken, *(path for path in maps if path is not None)):
+        if not path.is_file():
+            raise InputError(f"{path} is not there, and {folder / 'rgb.txt'} or depth.txt names it; get it whole")
+    depth, more = depth_reader(taken, maps, partial(read_png, per_metre=_PER_METRE))
+    return Sequence(
+        name,
+        tuple(taken),
+        depth,
+        world_from_camera=poses,
+        intrinsics=None if intrinsics is None else np.broadcast_to(intrinsics, (len(taken), 3, 3)),
+        timestamps=pictures.times[chosen],
+        notes=notes + more,
+    )
+
+
+def _listed(folder: Path, name: str) -> Files:
+    path = folder / name
+    entries = []
+    for number, line in enumerate(read_text(path).splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            time, file = float(words[0]), words[1]
+        except (ValueError, IndexError):
+            raise InputError(f"{path} has {line[:80]!r} in line {number}; expected a timestamp and a path") from None
+        if not math.isfinite(time) or len(words) != 2:
+            raise InputError(f"{path} has {line[:80]!r} in line {number}; expected a timestamp and a path")
+        entries.append((time, inside(folder, file, path)))
+    if not entries:
+        raise InputError(f"{path} names no files; expected lines of a timestamp and a path")
+    entries.sort(key=lambda entry: (entry[0], natural_key(entry[1])))
+    return Files(np.array([time for time, _ in entries]), [file for _, file in entries])
+
+
+def _poses(
+    folder: Path, times: Float64[np.ndarray, " N"]
+) -> tuple[Float64[np.ndarray, "M 4 4"] | None, Int[np.ndarray, " N"]]:
+    path = folder / "groundtruth.txt"
+    if not path.is_file():
+        return None, np.full(len(times), -1)
+    stamps, poses = read_trajectory(path)
+    return np.asarray(poses, np.float64), associate(times, stamps)
+
+
+def _tum_intrinsics(folder: Path) -> tuple[Float64[np.ndarray, "3 3"] | None, tuple[str, ...]]:
+    path = folder / "calibration.txt"
+    if path.is_file():
+        rows = read_numbers(path, 4)
+        if len(rows) != 1:
+            raise InputError(f"{path} has {len(rows)} rows; expected one: fx fy cx cy")
+        fx, fy, cx, cy = rows[0].tolist()
+        return intrinsics_matrix(fx, fy, cx, cy, first_pixel=0, source=path), ()
+    if not (match := _CAMERA.search(folder.resolve().name.lower())):
+        return None, (
+            "which camera took it is not known; name the folder after it, or put fx fy cx cy in calibration.txt",
+        )
+    camera = match[1]
+    matrix = intrinsics_matrix(*_FREIBURG[camera], first_pixel=0, source=f"freiburg{camera}")
+    return matrix, ("lens distortion is left as it is, the intrinsics do not have it",) * (camera in _DISTORTED)

@@ -1,0 +1,124 @@
+"""An evaluation as files for people and programs: results.json, results.csv, two tables, and a page with pictures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from vggtjax.errors import MissingExtraError
+from vggtjax.evaluation import tables
+from vggtjax.evaluation.plots import check_matplotlib, draw_sequence
+from vggtjax.evaluation.records import Record, Records, costs, safe_name, summary
+from vggtjax.files import writing
+
+PLOT_FOLDER = "plots"
+NAMES = ("results.json", "results.csv", "table.md", "table.tex", "index.html", PLOT_FOLDER)
+_ONE_PASS = ("image features", "first pass")
+
+
+def check_extras() -> None:
+    """Raise MissingExtraError if what draws the page is not installed."""
+    check_matplotlib()
+    try:
+        import jinja2 as _  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("writing the page of an evaluation", "evaluate") from error
+
+
+def write_report(
+    out: Path, records: Sequence[Record], store: Records, settings: Mapping[str, Any], *, warnings: Sequence[str] = ()
+) -> None:
+    """Write all files of an evaluation into `out`.
+
+    Args:
+        out: folder.
+        records: one per sequence and method.
+        store: where their curves are.
+        settings: what the numbers depend on.
+        warnings: what a reader must know first.
+    """
+    means = summary(records)
+    values = {
+        "settings": dict(settings),
+        "sequences": [
+            {"name": r.name, "method": r.method, "status": r.status, "reason": r.reason, "frames": r.frames}
+            | {"metrics": r.metrics, "notes": list(r.notes), "seconds": r.seconds, "settings": r.settings}
+            for r in records
+        ],
+        "mean": means,
+        "seconds": costs(records),
+    }
+    _write(out / "results.json", json.dumps(values, indent=2) + "\n")
+    _write(out / "results.csv", tables.comma_separated(records))
+    _write(out / "table.md", tables.markdown(means))
+    _write(out / "table.tex", tables.latex(means))
+    sequences = [
+        _section(out, [r for r in records if r.name == name], store) for name in dict.fromkeys(r.name for r in records)
+    ]
+    _write(out / "index.html", _page(sequences, means, costs(records), settings, warnings))
+
+
+def _section(out: Path, records: Sequence[Record], store: Records) -> dict[str, Any]:
+    name = records[0].name
+    good = [record for record in records if record.status == "ok"]
+    folder = f"{PLOT_FOLDER}/{safe_name(name)}"
+    plots = draw_sequence(out / folder, {record.method: store.curves(record) for record in good})
+    rows = {record.method: record.metrics for record in good}
+    return {
+        "name": name,
+        "frames": records[0].frames,
+        "failures": [record for record in records if record.status == "failed"],
+        "notes": list(dict.fromkeys(note for record in good for note in record.notes)),
+        "rows": rows,
+        "columns": tables.shown_columns(rows),
+        "plots": [{"file": f"{folder}/{file}", "title": title} for file, title in plots],
+    }
+
+
+def _page(
+    sequences: Sequence[Mapping[str, Any]],
+    means: Mapping[str, Mapping[str, float]],
+    seconds: Mapping[str, float],
+    settings: Mapping[str, Any],
+    warnings: Sequence[str],
+) -> str:
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup, escape
+
+    def table(columns: Sequence[tables.Column], rows: Mapping[str, Mapping[str, float]]) -> Markup:
+        heads = "".join(f"<th>{escape(c.heading)} {tables.ARROWS[c.better]}</th>" for c in columns)
+        body = ""
+        for method, row in rows.items():
+            cells = (
+                f'<td class="best">{tables.cell(row, c)}</td>'
+                if method in tables.best(rows, c)
+                else f"<td>{tables.cell(row, c)}</td>"
+                for c in columns
+            )
+            body += f"<tr><td>{escape(method)}</td>{''.join(cells)}</tr>"
+        return Markup(f"<table><thead><tr><th>method</th>{heads}</tr></thead><tbody>{body}</tbody></table>")
+
+    one = sum(seconds.get(stage, 0.0) for stage in _ONE_PASS)
+    environment = Environment(autoescape=True, undefined=StrictUndefined)
+    template = environment.from_string(files("vggtjax.evaluation").joinpath("page.html").read_text(encoding="utf-8"))
+    return template.render(
+        title=f"{settings['dataset']}: {', '.join(means)}",
+        sequences=sequences,
+        frames=sum(sequence["frames"] for sequence in sequences),
+        means=means,
+        columns=tables.shown_columns(means),
+        costs=seconds,
+        ratio=(one + seconds["second pass"]) / one if one and "second pass" in seconds else None,
+        settings=settings,
+        warnings=warnings,
+        table=table,
+        grouped=tables.grouped,
+    )
+
+
+def _write(path: Path, text: str) -> None:
+    with writing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,173 @@
+"""Pictures of a sequence's scores, with matplotlib: paths, error maps, masks, histograms, calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vggtjax.errors import MissingExtraError
+from vggtjax.files import writing
+from vggtjax.results.previews import color_depth, inverse_depth_range, overlay
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Curves = Mapping[str, Mapping[str, np.ndarray]]  # by method
+_ERROR_SHOWN = 0.5  # relative error of depth at full colour
+_DPI = 110
+_UNKNOWN = "#6f7480"  # where there is no true depth
+
+
+def check_matplotlib() -> None:
+    """Raise MissingExtraError if there is no matplotlib, before hours are spent."""
+    try:
+        import matplotlib as _  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("drawing an evaluation", "evaluate") from error
+
+
+def draw_sequence(folder: Path, curves: Curves) -> list[tuple[str, str]]:
+    """Draw what the curves of a sequence's methods allow; return names of the files in `folder`, and their titles."""
+    drawn = []
+    for name, (title, needs, draw) in PLOTS.items():
+        there = {method: own for method, own in curves.items() if needs <= set(own)}
+        if there:
+            with writing(folder / f"{name}.png") as path:
+                draw(there).savefig(path, dpi=_DPI)
+            drawn.append((f"{name}.png", title))
+    return drawn
+
+
+def _figure(width: float, height: float) -> Figure:
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _paths(curves: Curves) -> Figure:
+    """Draw the camera centres from above and from the side, in the plane of their greatest spread."""
+    true = next(iter(curves.values()))["true_centres"]
+    middle = true.mean(axis=0)
+    axes = np.linalg.svd(true - middle)[2]  # first along the path, last across it
+    figure = _figure(9, 4)
+    for place, (across, labels) in enumerate(((1, ("first", "second")), (2, ("first", "third")))):
+        axis = figure.add_subplot(1, 2, place + 1)
+        ways = {"truth": true} | {method: own["centres"] for method, own in curves.items()}
+        for method, centres in ways.items():
+            x, y = (centres - middle) @ axes[0], (centres - middle) @ axes[across]
+            style: dict[str, Any] = {"color": "black", "linewidth": 2.5} if method == "truth" else {"linewidth": 1.2}
+            axis.plot(x, y, marker=".", label=method, **style)
+        axis.set_aspect("equal", adjustable="datalim")
+        axis.set_xlabel(f"{labels[0]} principal axis (m)")
+        axis.set_ylabel(f"{labels[1]} (m)")
+        axis.grid(alpha=0.3)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
+    return figure
+
+
+def _error_maps(curves: Curves) -> Figure:
+    """Draw picture, true depth and, for every method, the relative error of its depth."""
+    first = next(iter(curves.values()))
+    shown, true = first["shown"], first["true_depth"]
+    known = true > 0
+    inverse_range = inverse_depth_range(true, known)
+    rows: dict[str, Any] = {
+        "picture": list(first["images"]),
+        "true depth": [color_depth(d, k, inverse_range) for d, k in zip(true, known, strict=True)],
+    }
+    rows |= {method: list(own["error_maps"].astype(np.float32)) for method, own in curves.items()}
+    height, width = true.shape[1:]
+    figure = _figure(2.6 * len(shown) + 1.2, 2.6 * height / width * len(rows) + 0.4)
+    grid = figure.subplots(len(rows), len(shown), squeeze=False)
+    image: Any = None
+    for row, (axes, (name, pictures)) in enumerate(zip(grid, rows.items(), strict=True)):
+        for axis, picture, frame in zip(axes, pictures, shown, strict=True):
+            drawn = axis.imshow(
+                picture, **({} if picture.ndim == 3 else {"vmin": 0, "vmax": _ERROR_SHOWN, "cmap": "magma"})
+            )
+            image = drawn if picture.ndim == 2 else image
+            axis.set_xticks([])
+            axis.set_yticks([])
+            axis.set_facecolor(_UNKNOWN)
+            if row == 0:
+                axis.set_title(f"frame {frame}", fontsize=9)
+        axes[0].set_ylabel(name, fontsize=9)
+    figure.colorbar(image, ax=grid[2:], label="relative error", shrink=0.8)
+    return figure
+
+
+def _masks(curves: Curves) -> Figure:
+    """Draw J of every frame, and below it true and predicted masks over some of the pictures."""
+    first = next(iter(curves.values()))
+    shown = first["shown"]
+    rows = {"truth": first["true_masks"]} | {method: own["masks"] for method, own in curves.items()}
+    height, width = first["true_masks"].shape[1:]
+    figure = _figure(2.6 * len(shown) + 0.8, 2.4 + 2.6 * height / width * len(rows))
+    halves: Any = figure.subfigures(2, 1, height_ratios=[2.4, 2.6 * height / width * len(rows)])
+    top, bottom = halves
+    axis = top.subplots()
+    for method, own in curves.items():
+        axis.plot(own["j"], marker=".", label=f"{method}")
+    axis.set(xlabel="frame", ylabel="J", ylim=(0, 1))
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8, ncols=3, frameon=False)
+    grid = bottom.subplots(len(rows), len(shown), squeeze=False)
+    for row, (axes, (name, masks)) in enumerate(zip(grid, rows.items(), strict=True)):
+        for axis, image, mask, frame in zip(axes, first["images"], masks, shown, strict=True):
+            axis.imshow(overlay(image, mask))
+            axis.set_xticks([])
+            axis.set_yticks([])
+            if row == 0:
+                axis.set_title(f"frame {frame}", fontsize=9)
+        axes[0].set_ylabel(name, fontsize=9)
+    return figure
+
+
+def _distances(curves: Curves) -> Figure:
+    """Draw how far points are from the nearest ones of the other cloud."""
+    figure = _figure(9, 3.4)
+    for place, (kind, title) in enumerate(
+        (("accuracy", "accuracy: predicted to true"), ("completeness", "completeness: true to predicted"))
+    ):
+        axis = figure.add_subplot(1, 2, place + 1)
+        for method, own in curves.items():
+            axis.stairs(own[kind] / max(own[kind].sum(), 1), own["distance_bins"], label=method)
+        axis.set(xscale="log", xlabel="distance (m)", ylabel="share of points", title=title)
+        axis.grid(alpha=0.3)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    return figure
+
+
+def _calibration(curves: Curves) -> Figure:
+    """Draw whether confidence tells errors apart (sparsification), and whether it states their size (reliability)."""
+    figure = _figure(9, 3.8)
+    left, right = figure.subplots(1, 2)
+    for number, (method, own) in enumerate(curves.items()):
+        removed, kept, oracle = own["sparsification"]
+        left.plot(removed, kept, color=f"C{number}", label=method)
+        left.plot(removed, oracle, color=f"C{number}", linestyle=":", linewidth=1)
+        levels, plain, calibrated = own["reliability"]
+        right.plot(levels, calibrated, color=f"C{number}", label=method)
+        right.plot(levels, plain, color=f"C{number}", linestyle=":", linewidth=1)
+    left.set(xlabel="share of least confident pixels removed", ylabel="mean error of the rest", ylim=(0, None))
+    left.set_title("sparsification (dotted: by true error)", fontsize=10)
+    right.plot([0, 1], [0, 1], color="black", linewidth=1)
+    right.set(xlabel="stated probability", ylabel="share of errors within", xlim=(0, 1), ylim=(0, 1))
+    right.set_title("reliability after one scale (dotted: before)", fontsize=10)
+    for axis in (left, right):
+        axis.grid(alpha=0.3)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    return figure
+
+
+# File name -> title, the curves that it needs, and what draws it.
+PLOTS: dict[str, tuple[str, set[str], Callable[[Curves], Figure]]] = {
+    "paths": ("Camera paths after Sim(3)", {"centres", "true_centres"}, _paths),
+    "depth": ("Depth", {"error_maps", "true_depth", "images", "shown"}, _error_maps),
+    "masks": ("Dynamic masks", {"j", "masks", "true_masks", "images", "shown"}, _masks),
+    "distances": ("Distances between point clouds", {"distance_bins", "accuracy", "completeness"}, _distances),
+    "calibration": ("Confidence", {"sparsification", "reliability"}, _calibration),
+}

@@ -1,0 +1,130 @@
+"""What an evaluation keeps of every sequence and method: a JSON file with the numbers, an npz with the curves."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from vggtjax.errors import ResultError
+from vggtjax.files import writing
+from vggtjax.results import archive
+
+FOLDER = "sequences"
+_MOST_BYTES = 2**24  # of a record's JSON
+
+
+@dataclass(frozen=True)
+class Record:
+    """How one method did on one sequence, with the settings that it was made with."""
+
+    name: str  # of the sequence
+    method: str
+    status: Literal["ok", "failed"]
+    settings: dict[str, Any]
+    metrics: dict[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()  # what the ground truth lacks, and why a metric is not there
+    reason: str = ""  # of a failure
+    frames: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)  # of the stages; shared by methods that share passes
+
+
+class Records:
+    """The records in an output folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / FOLDER
+
+    def kept(self, name: str, method: str, settings: Mapping[str, Any]) -> Record | None:
+        """Return the record of an earlier run, if it succeeded with the very same settings; else None."""
+        path = self._path(name, method, "json")
+        try:
+            if path.stat().st_size > _MOST_BYTES:
+                return None
+            values = json.loads(path.read_text(encoding="utf-8"))
+            record = Record(**{**values, "notes": tuple(values["notes"])})
+        except (OSError, ValueError, TypeError, KeyError):  # not there, not whole, or of another version
+            return None
+        good = record.status == "ok" and self._path(name, method, "npz").is_file()
+        return record if good and record.settings == _plain(settings) and record.name == name else None
+
+    def keep(self, record: Record, curves: Mapping[str, np.ndarray]) -> None:
+        """Write a record; the JSON comes last, so that where it is, all of it is."""
+        if record.status == "ok":
+            with writing(self._path(record.name, record.method, "npz")) as path:
+                archive.write_arrays(path, curves)
+        with writing(self._path(record.name, record.method, "json")) as path:
+            path.write_text(json.dumps(_plain(asdict(record)), indent=2) + "\n", encoding="utf-8")
+
+    def curves(self, record: Record) -> dict[str, np.ndarray]:
+        """Return the curves of a record; empty for one that failed.
+
+        Raises ResultError where the file is broken.
+        """
+        if record.status != "ok":
+            return {}
+        path = self._path(record.name, record.method, "npz")
+        try:
+            return archive.read_arrays(path)
+        except ResultError as error:
+            raise ResultError(f"{path} cannot be read: {error}; delete it and run again") from error
+
+    def _path(self, name: str, method: str, suffix: str) -> Path:
+        return self.folder / safe_name(name) / f"{safe_name(method)}.{suffix}"
+
+
+def safe_name(name: str) -> str:
+    """Return a file name for any text: itself where it is plain, else with a digest that keeps different ones apart."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name)[:80]
+    return plain if plain and plain == name else f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+def summary(records: Sequence[Record]) -> dict[str, dict[str, float]]:
+    """Return the means of every method over its sequences.
+
+    Sequences weigh the same, as the protocols have it, but for video depth, where they weigh as they have valid pixels.
+    `sequences` and `failed` count; what a sequence could not be scored for does not count in that metric's mean.
+    """
+    means: dict[str, dict[str, float]] = {}
+    for method in dict.fromkeys(record.method for record in records):
+        own = [record for record in records if record.method == method]
+        good = [record for record in own if record.status == "ok"]
+        row: dict[str, float] = {"sequences": len(good), "failed": len(own) - len(good)}
+        for metric in dict.fromkeys(metric for record in good for metric in record.metrics):
+            if metric == "depth_pixels":
+                continue
+            values = [(record.metrics[metric], _weight(record, metric)) for record in good if metric in record.metrics]
+            row[metric] = math.fsum(v * w for v, w in values) / math.fsum(w for _, w in values)
+        for metric, pooled in (("j_mean", "j_pooled"), ("f_mean", "f_pooled")):  # over the frames of all sequences
+            values = [(record.metrics[metric], record.frames) for record in good if metric in record.metrics]
+            if values:
+                row[pooled] = math.fsum(v * w for v, w in values) / sum(w for _, w in values)
+        means[method] = row
+    return means
+
+
+VIDEO_DEPTH = ("abs_rel", "rmse", "delta1", "delta2", "delta3")
+
+
+def _weight(record: Record, metric: str) -> float:
+    return record.metrics.get("depth_pixels", 1.0) if metric in VIDEO_DEPTH else 1.0
+
+
+def costs(records: Iterable[Record]) -> dict[str, float]:
+    """Return the mean seconds of each stage over sequences, counting passes that methods shared once."""
+    stages: dict[str, dict[str, float]] = {}
+    for record in records:
+        for stage, seconds in record.seconds.items():
+            stages.setdefault(stage, {})[record.name] = seconds
+    return {stage: float(np.mean(list(each.values()))) for stage, each in stages.items()}
+
+
+def _plain(values: Any) -> Any:
+    return json.loads(json.dumps(values))
