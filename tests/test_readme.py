@@ -19,7 +19,7 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     for i, frame in enumerate(moving_ball(6)):
         Image.fromarray((255 * frame).astype(np.uint8)).save(f"frames/{i}.png")
     blocks = [part.split("```")[0] for part in README.read_text().split("```python\n")[1:]]
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     names = {}
     for block in blocks:
         exec(compile(block, str(README), "exec"), names)
