@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from tests.dataset_files import SINTEL_TAG, cam, depth_png, dpt, opened, picture, write
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.depth_files import read_dpt
-from vggtjax.evaluation.datasets.tum import associate
+from vggtjax.evaluation.datasets.tum import partners
 from vggtjax.evaluation.trajectory import checked_poses
 
 QUARTER_ABOUT_Y = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
@@ -141,13 +141,13 @@ seconds = st.lists(st.integers(0, 60).map(lambda n: n / 200), min_size=1, max_si
 @settings(max_examples=200, deadline=None)
 @given(first=seconds, second=seconds)
 def test_association_is_that_of_all_pairs(first, second):
-    assert associate(np.array(first), np.array(second), 0.02).tolist() == slow_associate(first, second, 0.02)
+    assert partners(np.array(first), np.array(second)).tolist() == slow_associate(first, second, 0.02)
 
 
 def test_association_by_hand():
     # 0.03 is nearer to 0.02 than 0.0 is, so 0.0 is left without
-    assert associate(np.array([0.005, 0.03, 1]), np.array([0.02]), 0.02).tolist() == [-1, 0, -1]
-    assert associate(np.array([1.0, 2.0]), np.array([2.02, 1.019]), 0.02).tolist() == [1, -1]  # less than, not up to
+    assert partners(np.array([0.005, 0.03, 1]), np.array([0.02])).tolist() == [-1, 0, -1]
+    assert partners(np.array([1.0, 2.0]), np.array([2.02, 1.019])).tolist() == [1, -1]  # less than, not up to
 
 
 def test_bonn(tmp_path):

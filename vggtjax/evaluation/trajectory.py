@@ -16,6 +16,7 @@ FEWEST_POSES = 3  # fewer centres can always be aligned exactly
 _NO_MOTION = 1e-6  # a spread of centres below this share of their distance from the origin is float32's rounding
 _NO_WIDTH = 1e-6  # centres whose second extent is below this share of the first are a line
 _NOT_RIGID = 1e-2  # how far R^T R may be from the identity
+_WIDER = 1.01  # than the tolerance is where partners are looked for: sums of times are rounded
 _MOST_CANDIDATES = 10_000_000  # pairs of timestamps within the tolerance; 160 MB of indices
 
 
@@ -195,8 +196,8 @@ def associate(
     if not tolerance > 0:
         raise InputError(f"tolerance is {tolerance}; expected seconds above 0")
     order = np.argsort(second, kind="stable")
-    starts = np.searchsorted(second[order], first - tolerance, side="left")
-    counts = np.searchsorted(second[order], first + tolerance, side="right") - starts
+    starts = np.searchsorted(second[order], first - _WIDER * tolerance, side="left")
+    counts = np.searchsorted(second[order], first + _WIDER * tolerance, side="right") - starts
     if counts.sum() > _MOST_CANDIDATES:
         raise InputError(f"{counts.sum()} pairs of times are within {tolerance} s; expected a smaller tolerance")
     left = np.repeat(np.arange(len(first)), counts)

@@ -27,11 +27,11 @@ from vggtjax.evaluation.datasets.frames import Frames
 from vggtjax.evaluation.datasets.layout import Opener
 from vggtjax.evaluation.datasets.maps import depth_reader
 from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.trajectory import associate
 from vggtjax.results.trajectory import read_numbers, read_trajectory
 
 _PER_METRE = 5000.0
 _APART = 0.02  # seconds; from this on, two timestamps do not belong together
-_WIDER = 1.01  # than that is where partners are looked for: sums of times are rounded
 _CAMERA = re.compile(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)")
 # fx fy cx cy of the colour cameras. Those of freiburg3 are of pictures without distortion.
 _FREIBURG = {
@@ -78,28 +78,12 @@ def bonn(root: Path) -> dict[str, Opener]:
     return {name: partial(_read_bonn, folder, name) for name, folder in _found(root, "rgbd_bonn_").items()}
 
 
-def associate(
-    first: Float[np.ndarray, " N"], second: Float[np.ndarray, " M"], apart: float = _APART
-) -> Int[np.ndarray, " N"]:
-    """Return for each time of `first` the index of its partner in `second`, or -1: each has one partner at most.
-
-    Pairs less than `apart` seconds from each other, the closest first, as the benchmark's `associate.py` takes them.
-    """
-    order = np.argsort(second, kind="stable")
-    low, high = (np.searchsorted(second[order], first + side) for side in (-_WIDER * apart, _WIDER * apart))
-    pairs = [
-        (gap, float(first[i]), float(second[j]), i, int(j))
-        for i in range(len(first))
-        for j in order[low[i] : high[i]]
-        if (gap := abs(float(first[i]) - float(second[j]))) < apart
-    ]
-    partners = np.full(len(first), -1)
-    taken = set()
-    for _, _, _, i, j in sorted(pairs):
-        if partners[i] < 0 and j not in taken:
-            partners[i] = j
-            taken.add(j)
-    return partners
+def partners(first: Float[np.ndarray, " N"], second: Float[np.ndarray, " M"]) -> Int[np.ndarray, " N"]:
+    """Return for each time of `first` the index of its partner in `second` by the benchmark's rule, or -1."""
+    found = np.full(len(first), -1)
+    pairs = associate(first, second, _APART)
+    found[pairs[:, 0]] = pairs[:, 1]
+    return found
 
 
 def _found(root: Path, prefix: str) -> dict[str, Path]:
@@ -112,23 +96,23 @@ def _found(root: Path, prefix: str) -> dict[str, Path]:
 def _read_tum(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
     del gt  # there is one
     pictures = _listed(folder, "rgb.txt")
-    poses, partners = _poses(folder, pictures.times)
+    poses, posed = _poses(folder, pictures.times)
     notes: tuple[str, ...] = ()
     candidates = np.arange(len(pictures.paths))
-    if poses is None or (partners < 0).all():
+    if poses is None or (posed < 0).all():
         notes += ("it has no groundtruth.txt" if poses is None else f"no frame has a pose within {_APART} s",)
         poses = None
-    elif (lost := np.flatnonzero(partners < 0)).size:
-        candidates = np.flatnonzero(partners >= 0)
+    elif (lost := np.flatnonzero(posed < 0)).size:
+        candidates = np.flatnonzero(posed >= 0)
         notes += (
-            f"{len(lost)} of {len(partners)} frames have no pose within {_APART} s and are left out, "
+            f"{len(lost)} of {len(posed)} frames have no pose within {_APART} s and are left out, "
             f"{pictures.paths[lost[0]].stem} first",
         )
     chosen = frames.of(candidates.tolist(), name)
     notes += frames.shortage(len(candidates))
     intrinsics, more = _tum_intrinsics(folder)
     return _sequence(
-        folder, name, pictures, chosen, None if poses is None else poses[partners[chosen]], intrinsics, notes + more
+        folder, name, pictures, chosen, None if poses is None else poses[posed[chosen]], intrinsics, notes + more
     )
 
 
@@ -137,10 +121,10 @@ def _read_bonn(folder: Path, name: str, frames: Frames, gt: str | None) -> Seque
     pictures = _listed(folder, "rgb.txt")
     chosen = frames.of(range(len(pictures.paths)), name)
     notes = (*frames.shortage(len(pictures.paths)), "lens distortion is left as it is, the intrinsics do not have it")
-    poses, partners = _poses(folder, pictures.times)
+    poses, posed = _poses(folder, pictures.times)
     if poses is None:
         notes += ("it has no groundtruth.txt",)
-    elif lost := [frame for frame in chosen if partners[frame] < 0]:
+    elif lost := [frame for frame in chosen if posed[frame] < 0]:
         first = pictures.paths[lost[0]].stem
         notes += (f"{len(lost)} of {len(chosen)} frames have no pose within {_APART} s, {first} first; no poses",)
         poses = None
@@ -148,7 +132,7 @@ def _read_bonn(folder: Path, name: str, frames: Frames, gt: str | None) -> Seque
         left, _, right = np.linalg.svd(_MARKERS[:3, :3])
         markers = _MARKERS.copy()
         markers[:3, :3] = left @ right
-        poses = _ROS @ poses[partners[chosen]] @ _ROS @ markers
+        poses = _ROS @ poses[posed[chosen]] @ _ROS @ markers
         notes += ("poses are those of the markers, taken to the camera with the data set's calibration",)
     intrinsics = intrinsics_matrix(*_BONN, first_pixel=0, source="Bonn")
     return _sequence(folder, name, pictures, chosen, poses, intrinsics, notes)
@@ -168,8 +152,8 @@ def _sequence(
     if (folder / "depth.txt").is_file():
         depths = _listed(folder, "depth.txt")
         # Partners are found among all pictures: which frames are taken does not change whose a depth map is.
-        partners = associate(pictures.times, depths.times)[chosen]
-        maps = [depths.paths[partner] if partner >= 0 else None for partner in partners]
+        owners = partners(pictures.times, depths.times)[chosen]
+        maps = [depths.paths[owner] if owner >= 0 else None for owner in owners]
     for path in (*taken, *(path for path in maps if path is not None)):
         if not path.is_file():
             raise InputError(f"{path} is not there, and {folder / 'rgb.txt'} or depth.txt names it; get it whole")
@@ -212,7 +196,7 @@ def _poses(
     if not path.is_file():
         return None, np.full(len(times), -1)
     stamps, poses = read_trajectory(path)
-    return np.asarray(poses, np.float64), associate(times, stamps)
+    return np.asarray(poses, np.float64), partners(times, stamps)
 
 
 def _tum_intrinsics(folder: Path) -> tuple[Float64[np.ndarray, "3 3"] | None, tuple[str, ...]]:
