@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,9 +12,8 @@ from PIL import Image
 from vggtjax.clips.clip import load_clip
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.plain import takes
 from vggtjax.evaluation.truth import Truth, at_clip_pixels, intrinsics_at_clip_pixels
-
-_NEW_TAKE = 10.0  # times the median step of the camera: a jump between takes in one folder
 
 
 class Windows(NamedTuple):
@@ -52,14 +50,6 @@ def load_windows(folders: list[Path], config: VGGTConfig, frames: int) -> Window
         return Windows(names, Truth(*(np.stack(arrays) for arrays in zip(*truths, strict=True))))
     except ValueError:
         raise InputError(f"the clips {', '.join(str(folder) for folder in folders)} differ in size") from None
-
-
-def takes(centres: Float64[np.ndarray, "S 3"]) -> list[range]:
-    """Return the stretches of frames without a cut: no step ten times as long as the median one."""
-    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
-    cuts = 1 + np.flatnonzero(steps > _NEW_TAKE * np.median(steps)) if len(steps) else np.zeros(0, int)
-    edges = [0, *cuts.tolist(), len(centres)]
-    return [range(start, end) for start, end in pairwise(edges)]
 
 
 def window_starts(count: int, frames: int) -> list[int]:
