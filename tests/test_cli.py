@@ -126,7 +126,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--confidence-percentile", "150"], "is 150"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--model", "{tmp}/none.safetensors"], "none.safetensors"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--smooth-frames", "2"], "an odd number of frames"),
-        (["import", "{tmp}/none", "--format", "cut3r", "--out", "{tmp}/out"], "it has no depth"),
+        (["import", "{tmp}/none", "--format", "cut3r", "--out", "{tmp}/out"], "there is no such folder"),
         (["import", "{frames}", "--format", "da3", "--out", "{tmp}/out"], "it has no results.npz"),
         (["convert", "{tmp}/none.pt", "{tmp}/out.safetensors"], "none.pt"),
         (["convert", "{frames}/frame_0.png", "{tmp}/out.safetensors", "--heads", "camera,nose"], "heads has ['nose']"),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,6 +18,7 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
+from vggtjax.cache import cache_folder
 from vggtjax.config import VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.network.layers import Params
@@ -278,17 +278,9 @@ def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress
     stats = [(file.resolve(), file.stat()) for file in weight_files(path)]
     facts = [VERSION, dtype, config.to_json(), *(f"{file} {stat.st_size} {stat.st_mtime_ns}" for file, stat in stats)]
     key = hashlib.sha256("\n".join(facts).encode("utf-8", "surrogateescape")).hexdigest()[:16]
-    destination = _cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', name)[:80]}-{key}.safetensors"
+    destination = cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', name)[:80]}-{key}.safetensors"
     if not destination.exists():
         logger.info("converting %s to %s, this once", path, destination)
         convert_weights(Weights(path, name), destination, dtype=dtype, config=config, progress=progress)
     logger.info("loading %s", destination)
     return destination
-
-
-def _cache_folder() -> Path:
-    if folder := os.environ.get("VGGTJAX_CACHE"):
-        return Path(folder).expanduser()
-    import platformdirs
-
-    return platformdirs.user_cache_path("vggtjax")

@@ -135,6 +135,10 @@ class Report:
             table.add_row(f"{column.heading} {ARROWS[column.better]}", *cells)
         self._out.print(table, soft_wrap=True)
 
+    def note(self, text: str) -> None:
+        """Print one line among the stages, on standard error."""
+        self._console.print(Text(text), soft_wrap=True)
+
     def line(self, text: str) -> None:
         """Print one line."""
         self._out.print(Text(text), soft_wrap=True)

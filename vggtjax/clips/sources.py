@@ -57,6 +57,41 @@ def open_source(source: ClipSource) -> Source:
     )
 
 
+def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
+    """Return the clips that paths name, by the name of each: folders of images and videos, or folders of such.
+
+    A clip is named after its folder, or its video without the ending.
+
+    Raises:
+        ClipError: nothing is there, or two clips have the same name.
+    """
+    found: dict[str, str] = {}
+    for given in paths:
+        path = Path(given)
+        try:
+            entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
+            whole = not path.is_dir() or any(is_image_name(entry) for entry in entries)
+        except OSError as error:
+            raise ClipError(f"cannot look for clips in {path}: {error.strerror}; check the path") from error
+        clips = [path] if whole else [entry for entry in entries if _may_be_clip(entry)]
+        if not clips or not path.exists():
+            raise ClipError(
+                f"{path} is no clip and holds none; expected folders of images, videos, or a folder of such"
+            )
+        for clip in clips:
+            name = clip.resolve().name if clip.is_dir() else clip.stem
+            if name in found:
+                raise ClipError(f"two clips are named {name}: {found[name]} and {clip}; rename one of them")
+            found[name] = str(clip)
+    if not found:
+        raise ClipError("no clips; name folders of images, videos, or a folder of such")
+    return found
+
+
+def _may_be_clip(path: Path) -> bool:
+    return not path.name.startswith(".") and (path.is_dir() or is_video_name(path))
+
+
 def natural_key(path: Path) -> list[list[str | int]]:
     """Return the key that sorts frame_2 before frame_10: runs of digits in each part of the path are numbers."""
     return [

@@ -1,0 +1,38 @@
+"""The user's cache folder: converted weights, and what jax compiles. Does not import jax."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+COMPILED_BYTES = 2 * 2**30  # of compiled programs that are kept; the ones that were not used for longest go first
+_SHORTEST = 0.5  # seconds of compilation from which a program is kept
+
+
+def cache_folder() -> Path:
+    """Return the folder that VGGTJAX_CACHE names, or else the user's cache of this library; it need not be there."""
+    if folder := os.environ.get("VGGTJAX_CACHE"):
+        return Path(folder).expanduser()
+    import platformdirs
+
+    return platformdirs.user_cache_path("vggtjax")
+
+
+def keep_compilations() -> bool:
+    """Tell jax to keep what it compiles in the user's cache, so that the next process need not compile it again.
+
+    A setting of the whole process, by jax's own environment variables, which win where they are set already: commands
+    make it before they import jax, the library never does. Returns False where jax was imported before, and nothing
+    is changed.
+    """
+    if "jax" in sys.modules:
+        return False
+    settings = {
+        "JAX_COMPILATION_CACHE_DIR": str(cache_folder() / "compiled"),
+        "JAX_COMPILATION_CACHE_MAX_SIZE": str(COMPILED_BYTES),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(_SHORTEST),
+    }
+    for name, value in settings.items():
+        os.environ.setdefault(name, value)
+    return True
