@@ -1,3 +1,4 @@
+from .batch import reconstruct_many as reconstruct_many
 from .checkpoint import Model as Model
 from .checkpoint import load_model as load_model
 from .clips.clip import Clip as Clip

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 COMPILED_BYTES = 2 * 2**30  # of compiled programs that are kept; the ones that were not used for longest go first
-_SHORTEST = 0.5  # seconds of compilation from which a program is kept
+_SHORTEST = 0.05  # seconds of compilation from which a program is kept
 
 
 def cache_folder() -> Path:
