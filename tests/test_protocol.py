@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.scored_room import room_and_truth
 from vggtjax.evaluation.protocol import TruthAtPixels, depth_at_source, score
+from vggtjax.evaluation.video_depth import Align
 from vggtjax.results import geometry
 
 POINTS = [
@@ -92,19 +93,107 @@ def test_what_the_truth_lacks_is_said():
     assert not {"ate", "accuracy_mean", "j_mean"} & set(scores.metrics)
     assert scores.notes == (
         "trajectory: the sequence has no camera poses",
-        "point clouds: the sequence has no depth with cameras",
+        "point clouds: the sequence has no camera poses",
         "masks: the sequence has no masks",
     )
+    assert scores.problems == ()
 
 
-def test_cameras_that_stand_still_are_a_note_and_not_a_number():
+def test_cameras_that_stand_still_are_a_problem_and_not_a_number():
     room, sequence = room_and_truth()
     still = np.tile(room.camera_from_world[:1], (len(room.depth), 1, 1))
     scores = score(dataclasses.replace(room, camera_from_world=still), TruthAtPixels(sequence, room))
     assert "ate" not in scores.metrics
     assert "accuracy_mean" not in scores.metrics
-    assert {note.split(":")[0] for note in scores.notes} == {"trajectory", "point clouds", "uncertainty"}
+    assert {problem.split(":")[0] for problem in scores.problems} == {"trajectory", "point clouds"}
     assert "j_mean" in scores.metrics
+
+
+def test_true_cameras_that_stand_still_are_a_note():
+    room, sequence = room_and_truth()
+    poses = np.tile(np.eye(4), (len(room.depth), 1, 1))
+    _, sequence = room_and_truth(world_from_camera=poses)
+    scores = score(room, TruthAtPixels(sequence, room))
+    assert scores.problems == ()
+    assert {note.split(":")[0] for note in scores.notes} == {"trajectory", "point clouds", "uncertainty"}
+
+
+def test_predictions_that_are_no_numbers_are_problems():
+    room, sequence = room_and_truth()
+    depth = room.depth.copy()
+    depth[:, ::7] = np.nan
+    scores = score(dataclasses.replace(room, depth=depth), TruthAtPixels(sequence, room))
+    assert {problem.split(":")[0] for problem in scores.problems} == {"point clouds", "video depth", "uncertainty"}
+
+
+def test_what_was_never_predicted_is_not_scored():
+    room, sequence = room_and_truth()
+    room = dataclasses.replace(noisy(room), settings={"missing": ["dynamic_mask", "depth_confidence"]})
+    scores = score(room, TruthAtPixels(sequence, room))
+    assert scores.notes == ("masks: the result has no masks", "uncertainty: the result has no confidence")
+    assert not {"j_mean", "ause"} & set(scores.metrics)
+
+
+def test_depth_that_is_too_far_counts_nowhere():
+    room, sequence = room_and_truth()
+    near = sequence.depth
+    assert near is not None
+
+    def with_sky(frame):
+        depth = near(frame).copy()
+        depth[:8] = 1e4
+        return depth
+
+    worse = noisy(room)
+    _, sky = room_and_truth(depth=with_sky)
+    _, holes = room_and_truth(depth=lambda frame: np.where(with_sky(frame) > 100, 0, with_sky(frame)))
+    made = score(worse, TruthAtPixels(sky, room, max_depth=70.0)).metrics
+    expected = score(worse, TruthAtPixels(holes, room)).metrics
+    assert made == pytest.approx(expected)
+
+
+def test_padding_is_no_part_of_the_picture():
+    room, sequence = room_and_truth()
+    worse = noisy(room)
+    plain = score(worse, TruthAtPixels(sequence, room)).metrics
+
+    def padded(array, value):
+        return np.pad(array, ((0, 0), (14, 0), (0, 0)) + ((0, 0),) * (array.ndim - 3), constant_values=value)
+
+    offset = room.source_offset - [0, 14 * 2]
+    box = np.add(room.valid_box, [0, 14, 0, 14])
+    assert worse.saliency is not None
+    large = dataclasses.replace(
+        worse,
+        depth=padded(worse.depth, 1),
+        depth_confidence=padded(worse.depth_confidence, 9),
+        dynamic_mask=padded(worse.dynamic_mask, True),
+        saliency=np.pad(worse.saliency, ((0, 0), (1, 0), (0, 0)), constant_values=1),
+        images=padded(worse.images, 255),
+        source_offset=offset,
+        valid_box=box,
+    )
+    made = score(large, TruthAtPixels(sequence, large)).metrics
+    for name in ("j_mean", "f_mean", "saliency_auc", "ause", "abs_rel"):
+        assert made[name] == pytest.approx(plain[name]), name
+
+
+def test_pictures_of_two_sizes_are_a_problem():
+    room, _ = room_and_truth()
+    _, sequence = room_and_truth(mask=lambda frame: np.zeros((56 + frame, 84), bool))
+    scores = score(room, TruthAtPixels(sequence, room))
+    assert [problem.split(":")[0] for problem in scores.problems] == ["masks"]
+    assert "have 4 sizes" in scores.problems[0]
+
+
+def test_error_maps_are_those_of_the_alignment_that_is_scored():
+    room, sequence = room_and_truth()
+    half = dataclasses.replace(room, depth=room.depth / 2)
+    cases: dict[Align, float] = {"metric": 0.5, "scale": 0.0}
+    for align, error in cases.items():
+        scores = score(half, TruthAtPixels(sequence, room), depth_align=align)
+        assert np.nanmedian(scores.curves["error_maps"]) == pytest.approx(error, abs=2e-3)
+        assert scores.metrics["abs_rel"] == pytest.approx(error, abs=0.02)
 
 
 def test_depth_at_the_source_is_a_bilinear_resize_where_nothing_is_cut():

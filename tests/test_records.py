@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from contextlib import contextmanager
 from typing import Literal
 
@@ -9,11 +10,11 @@ import numpy as np
 import pytest
 
 from tests.scored_room import room_and_truth
-from vggtjax.errors import ClipError, ResultError
+from vggtjax.errors import ClipError, InputError, ResultError
 from vggtjax.evaluation import tables
-from vggtjax.evaluation.page import write_report
-from vggtjax.evaluation.records import Record, Records, costs, safe_name, summary
-from vggtjax.evaluation.run import evaluate
+from vggtjax.evaluation.page import is_report, write_report
+from vggtjax.evaluation.records import BOTH_OVER_ONE, Record, Records, costs, safe_name, summary
+from vggtjax.evaluation.run import Scoring, evaluate
 from vggtjax.results.reconstruction import Reconstruction
 
 SETTINGS = {"version": "0", "dataset": "room"}
@@ -24,69 +25,151 @@ def stage(name):
     yield None
 
 
-class Reconstructor:
-    """Returns the perfect result by every method, and counts what it was asked for."""
+class Perfect:
+    """Returns the same result by every method, and remembers what it was asked for."""
 
-    def __init__(self, result, failing=()):
+    def __init__(self, result, *groups, failing=(), sum_of="1"):
         self.result: Reconstruction = result
-        self.failing, self.calls = failing, []
+        self.groups, self.failing, self.calls, self.sum = groups, failing, [], sum_of
+        self.names = [name for group in groups for name in group]
 
-    def __call__(self, sequence, methods, on_stage):
-        self.calls.append((sequence.name, tuple(methods)))
+    def identity(self, name, sequence):
+        return self.sum
+
+    def make(self, names, sequence, on_stage):
+        self.calls.append((sequence.name, tuple(names)))
         if sequence.name in self.failing:
             raise ClipError(f"{sequence.name} cannot be read")
         with on_stage("first pass"):
             pass
-        return dict.fromkeys(methods, self.result)
+        return dict.fromkeys(names, self.result)
+
+
+def opened(sequences):
+    return {sequence.name: (lambda sequence=sequence: sequence) for sequence in sequences}
+
+
+def run(sequences, results, store, settings=SETTINGS):
+    return evaluate(opened(sequences), results, store, settings, Scoring(), on_stage=stage)
 
 
 @pytest.fixture
-def three():
+def three(tmp_path):
+    pictures = [tmp_path / "pictures" / f"{i}.png" for i in range(4)]
+    pictures[0].parent.mkdir()
+    for picture in pictures:
+        picture.write_bytes(b"a picture")
     room, _ = room_and_truth()
     errors = np.random.default_rng(0).uniform(0.9, 1.1, room.depth.shape).astype(np.float32)
     room = dataclasses.replace(room, depth=room.depth * errors)
-    return room, [room_and_truth(name=name)[1] for name in ("a", "b", "../c <i>")]
+    return room, [room_and_truth(name=name, pictures=tuple(pictures))[1] for name in ("a", "b", "../c <i>")]
 
 
 def test_what_is_finished_is_not_done_again(tmp_path, three):
     room, sequences = three
-    store = Records(tmp_path)
-    first = Reconstructor(room, failing=("b",))
-    records = evaluate(sequences, ["vggt", "4dvggt-d"], first, store, SETTINGS, on_stage=stage)
+    store = Records(tmp_path / "out")
+    records = run(sequences, Perfect(room, ["vggt", "4dvggt-d"], failing=("b",)), store)
     assert [(r.name, r.method, r.status) for r in records] == [
         ("a", "vggt", "ok"), ("a", "4dvggt-d", "ok"), ("b", "vggt", "failed"), ("b", "4dvggt-d", "failed"),
         ("../c <i>", "vggt", "ok"), ("../c <i>", "4dvggt-d", "ok"),
     ]  # fmt: skip
     assert records[2].reason == "b cannot be read"
-    assert not list(tmp_path.parent.glob("c*"))  # names stay inside
+    assert not list(tmp_path.glob("c*"))  # names stay inside
 
-    again = Reconstructor(room)
-    after = evaluate(sequences, ["vggt", "4dvggt-d", "vggt4d"], again, store, SETTINGS, on_stage=stage)
-    assert again.calls == [("a", ("vggt4d",)), ("b", ("vggt", "4dvggt-d", "vggt4d")), ("../c <i>", ("vggt4d",))]
+    again = Perfect(room, ["vggt", "4dvggt-d"], ["vggt4d"])
+    after = run(sequences, again, store)
+    assert again.calls == [
+        ("a", ("vggt4d",)), ("b", ("vggt", "4dvggt-d")), ("b", ("vggt4d",)), ("../c <i>", ("vggt4d",)),
+    ]  # fmt: skip
     assert [r.status for r in after] == ["ok"] * 9
+    assert [r.method for r in after[:3]] == ["vggt", "4dvggt-d", "vggt4d"]
     assert after[0].metrics == records[0].metrics
 
-    changed = Reconstructor(room)
-    evaluate(sequences[:1], ["vggt"], changed, store, SETTINGS | {"stride": 2}, on_stage=stage)
-    assert changed.calls == [("a", ("vggt",))]  # other settings are another evaluation
+
+def test_what_has_changed_is_done_again(tmp_path, three):
+    room, (sequence, *_) = three
+    store = Records(tmp_path / "out")
+
+    def redone(sequence, results, settings=SETTINGS):
+        run([sequence], results, store, settings)
+        return bool(results.calls)
+
+    assert redone(sequence, Perfect(room, ["vggt"]))
+    assert not redone(sequence, Perfect(room, ["vggt"]))
+    assert redone(sequence, Perfect(room, ["vggt"]), SETTINGS | {"stride": 2})  # other settings
+    assert redone(sequence, Perfect(room, ["vggt"]))
+    assert redone(sequence, Perfect(room, ["vggt"], sum_of="2"))  # another result
+    near = sequence.depth
+    assert near is not None
+    doubled = dataclasses.replace(sequence, depth=lambda frame: 2 * near(frame))
+    assert redone(doubled, Perfect(room, ["vggt"], sum_of="2"))  # other ground truth
+    os.utime(sequence.pictures[2], (1, 1))
+    assert redone(doubled, Perfect(room, ["vggt"], sum_of="2"))  # other pictures
+
+
+def test_a_sequence_that_cannot_be_opened_is_a_row(tmp_path, three):
+    room, (sequence, *_) = three
+
+    def broken():
+        raise InputError("camera.json is not JSON")
+
+    missing = dataclasses.replace(sequence, name="gone", pictures=(tmp_path / "none.png",) * 4)
+    openers = {"broken": broken, "a": lambda: sequence, "gone": lambda: missing}
+    store = Records(tmp_path / "out")
+    records = evaluate(openers, Perfect(room, ["vggt"]), store, SETTINGS, Scoring(), on_stage=stage)
+    assert [(r.name, r.status) for r in records] == [("broken", "failed"), ("a", "ok"), ("gone", "failed")]
+    assert records[0].reason == "camera.json is not JSON"
+    assert "none.png cannot be looked at" in records[2].reason
+
+
+def test_what_could_not_be_scored_is_a_failure_and_not_kept(tmp_path, three):
+    room, (sequence, *_) = three
+    depth = room.depth.copy()
+    depth[0, 0] = np.nan
+    store = Records(tmp_path / "out")
+    (record,) = run([sequence], Perfect(dataclasses.replace(room, depth=depth), ["vggt"]), store)
+    assert record.status == "failed"
+    assert "point clouds: " in record.reason
+    assert "j_mean" in record.metrics
+    assert summary([record])["vggt"] == {"sequences": 0, "failed": 1}
+    again = Perfect(room, ["vggt"])
+    run([sequence], again, store)
+    assert again.calls
+
+
+def test_a_record_leaves_before_its_curves_change(tmp_path, three, monkeypatch):
+    room, (sequence, *_) = three
+    store = Records(tmp_path / "out")
+    run([sequence], Perfect(room, ["vggt"]), store)
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vggtjax.evaluation.records.archive.write_arrays", killed)
+    with pytest.raises(KeyboardInterrupt):
+        run([sequence], Perfect(room, ["vggt"], sum_of="2"), store)
+    monkeypatch.undo()
+    again = Perfect(room, ["vggt"])
+    run([sequence], again, store)
+    assert again.calls
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"name": 1}', '{"name": "a", "method": "vggt", "status": "ok"}'])
 def test_a_broken_record_is_made_again(tmp_path, three, content):
     room, sequences = three
-    store = Records(tmp_path)
-    evaluate(sequences[:1], ["vggt"], Reconstructor(room), store, SETTINGS, on_stage=stage)
-    (tmp_path / "sequences/a/vggt.json").write_text(content)
-    again = Reconstructor(room)
-    assert evaluate(sequences[:1], ["vggt"], again, store, SETTINGS, on_stage=stage)[0].status == "ok"
+    store = Records(tmp_path / "out")
+    run(sequences[:1], Perfect(room, ["vggt"]), store)
+    (tmp_path / "out/sequences/a/vggt.json").write_text(content)
+    again = Perfect(room, ["vggt"])
+    assert run(sequences[:1], again, store)[0].status == "ok"
     assert again.calls
 
 
 def test_broken_curves_are_named(tmp_path, three):
     room, sequences = three
-    store = Records(tmp_path)
-    records = evaluate(sequences[:1], ["vggt"], Reconstructor(room), store, SETTINGS, on_stage=stage)
-    (tmp_path / "sequences/a/vggt.npz").write_bytes(b"nothing")
+    store = Records(tmp_path / "out")
+    records = run(sequences[:1], Perfect(room, ["vggt"]), store)
+    (tmp_path / "out/sequences/a/vggt.npz").write_bytes(b"nothing")
     with pytest.raises(ResultError, match=r"vggt\.npz cannot be read: .* delete it and run again"):
         store.curves(records[0])
 
@@ -111,9 +194,13 @@ def test_means_by_hand():
     assert "depth_pixels" not in means
 
 
-def test_shared_passes_cost_once():
-    records = [record("a", "x"), record("a", "y"), record("b", "x")]
-    assert costs(records) == {"first pass": 2.0}
+def test_costs_by_hand():
+    seconds = {"image features": 1.0, "first pass": 3.0, "second pass": 2.0}
+    records = [dataclasses.replace(record("a", "x"), seconds=seconds), record("b", "x"), record("a", "y")]
+    assert costs(records) == {
+        "x": {"image features": 0.5, "first pass": 2.5, "second pass": 1.0, BOTH_OVER_ONE: pytest.approx(4 / 3)},
+        "y": {"first pass": 2.0},
+    }
 
 
 MEANS = {
@@ -128,8 +215,8 @@ def test_tables_by_hand():
     assert lines[2] == "| vggt | 0.123 | **0.200** | 0.500 | 0 of 2 |"  # equal by the digits shown: neither is best
     assert lines[3] == r"| a_b\|<c> | 0.123 | 0.300 | - | 1 of 2 |"
     latex = tables.latex(MEANS)
-    assert r"vggt & 0.123 & \textbf{0.200} & 0.500 \\" in latex
-    assert r"a\_b|$<$c$>$ & 0.123 & 0.300 & - \\" in latex
+    assert r"vggt & 0.123 & \textbf{0.200} & 0.500 & 0 of 2 \\" in latex
+    assert r"a\_b|$<$c$>$ & 0.123 & 0.300 & - & 1 of 2 \\" in latex
 
 
 def test_lines_of_the_csv_are_inert():
@@ -146,22 +233,26 @@ def test_names_of_files():
 
 def test_all_files_of_a_report(tmp_path, three):
     room, sequences = three
-    store = Records(tmp_path)
-    reconstruct = Reconstructor(room, failing=("b",))
-    records = evaluate(sequences, ["vggt", "4dvggt-d"], reconstruct, store, SETTINGS, on_stage=stage)
-    write_report(tmp_path, records, store, SETTINGS, warnings=["<b>mind</b>"])
-    values = json.loads((tmp_path / "results.json").read_text())
+    store = Records(tmp_path / "out")
+    records = run(sequences, Perfect(room, ["vggt", "4dvggt-d"], failing=("b",)), store)
+    out = tmp_path / "out"
+    write_report(out, records, store, SETTINGS, warnings=["<b>mind</b>"])
+    values = json.loads((out / "results.json").read_text())
     assert values["settings"] == SETTINGS
     assert {entry["status"] for entry in values["sequences"]} == {"ok", "failed"}
     assert set(values["sequences"][0]) >= {"name", "method", "status", "metrics"}
     assert values["mean"]["vggt"]["j_mean"] == 1
-    page = (tmp_path / "index.html").read_text()
+    page = (out / "index.html").read_text()
     assert "<i>" not in page
     assert "../c &lt;i&gt;" in page
     assert "&lt;b&gt;mind" in page
     assert "b cannot be read" in page
     for picture in ("paths", "depth", "masks", "distances", "calibration"):
-        assert (tmp_path / f"plots/a/{picture}.png").stat().st_size > 2000
+        assert (out / f"plots/a/{picture}.png").stat().st_size > 2000
         assert f"plots/a/{picture}.png" in page
     assert "http" not in page  # nothing is loaded from elsewhere
     assert np.isfinite(values["mean"]["vggt"]["ate"])
+    assert "<b>vggt</b> failed on 1 of 3" in page
+    assert is_report(out / "results.json")
+    (out / "results.json").write_text('{"mine": 1}')
+    assert not is_report(out / "results.json")

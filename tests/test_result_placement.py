@@ -25,17 +25,27 @@ def of_size(width, height, frames=2):
 
 
 def test_our_own_know_by_themselves():
-    room = make_room(2)  # from pictures of twice the size
-    assert placed(room, "vggtjax", [(84, 56)] * 2) is room
+    room = make_room(2, frame_names=("a", "b"))  # from pictures of twice the size
+    assert placed(room, "vggtjax", [(84, 56)] * 2, ["a", "b"]) is room
     with pytest.raises(InputError, match=r"frame 1 of the result was 84 x 56, the sequence's picture is \(80, 56\)"):
-        placed(room, "vggtjax", [(84, 56), (80, 56)])
+        placed(room, "vggtjax", [(84, 56), (80, 56)], ["a", "b"])
+    with pytest.raises(InputError, match=r"the result is of frames a, b, \.\.\. and the sequence has b, c"):
+        placed(room, "vggtjax", [(84, 56)] * 2, ["b", "c"])
+
+
+@pytest.mark.parametrize("layout", ["vggt4d", "monst3r", "cut3r", "da3"])
+@pytest.mark.parametrize("size", [(854, 480), (720, 960)])
+def test_frames_of_the_pictures_own_size_are_those(layout, size):
+    made = placed(of_size(*size), layout, [size] * 2, ["a", "b"])
+    np.testing.assert_array_equal(made.source_scale, np.ones((2, 2)))
+    assert not made.source_offset.any()
 
 
 @pytest.mark.parametrize(("width", "height"), [(854, 480), (480, 854), (640, 480), (518, 518)])
 def test_vggt4d_does_as_load_clip(width, height):
     clip = load_clip(np.zeros((2, height, width, 3), np.uint8), size=518)
     H, W = clip.images.shape[1:3]
-    made = placed(of_size(W, H), "vggt4d", [(width, height)] * 2)
+    made = placed(of_size(W, H), "vggt4d", [(width, height)] * 2, ["a", "b"])
     np.testing.assert_array_equal(made.source_size, clip.source_size)
     np.testing.assert_allclose(made.source_scale, clip.source_scale)
     np.testing.assert_allclose(made.source_offset, clip.source_offset)
@@ -51,13 +61,13 @@ def test_vggt4d_does_as_load_clip(width, height):
     ],
 )
 def test_monst3r_cuts_about_the_middle(picture, frame, scale, offset):
-    made = placed(of_size(*frame), "monst3r", [picture] * 2)
+    made = placed(of_size(*frame), "monst3r", [picture] * 2, ["a", "b"])
     np.testing.assert_allclose(made.source_scale[0], scale, rtol=2e-3)
     np.testing.assert_allclose(made.source_offset[0], offset, atol=1e-9)
 
 
 def test_depth_anything_3_stretches():
-    made = placed(of_size(504, 280), "da3", [(1920, 1080)] * 2)
+    made = placed(of_size(504, 280), "da3", [(1920, 1080)] * 2, ["a", "b"])
     np.testing.assert_allclose(made.source_scale[0], [1920 / 504, 1080 / 280])
     assert not made.source_offset.any()
 
@@ -65,9 +75,9 @@ def test_depth_anything_3_stretches():
 @pytest.mark.parametrize("layout", ["vggt4d", "monst3r", "cut3r", "da3"])
 def test_frames_that_cannot_come_from_these_pictures(layout):
     with pytest.raises(InputError, match=rf"frames of 518 x 294 do not come from pictures of 480 x 854 as {layout}"):
-        placed(of_size(518, 294), layout, [(480, 854)] * 2)
+        placed(of_size(518, 294), layout, [(480, 854)] * 2, ["a", "b"])
 
 
 def test_another_number_of_frames():
     with pytest.raises(InputError, match="the result has 2 frames and the sequence 3; expected a result for every"):
-        placed(of_size(512, 384), "cut3r", [(640, 480)] * 3)
+        placed(of_size(512, 384), "cut3r", [(640, 480)] * 3, ["a", "b", "c"])

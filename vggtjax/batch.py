@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -41,7 +41,7 @@ def reconstruct_many(
     sampling: Mapping[str, Any] | None = None,
     options: Mapping[str, Any] | None = None,
     saving: Mapping[str, Any] | None = None,
-) -> Iterator[Outcome]:
+) -> Generator[Outcome]:
     """Reconstruct clips, each into a folder of its own, and yield what became of each as it is finished.
 
     Clips of one shape share a compilation. A clip that fails does not stop the others. Run again with the same

@@ -67,9 +67,9 @@ def find_instances(
         regions = _regions(mask, max(1, least_share * mask.size))
         known = [one for one in objects if frame - one.frame <= 1 + gap]
         owners = _matched(known, regions, frame)
-        shown = {id(owner): (owner, owner.pixels + owner.expected(frame)) for owner in owners if owner is not None}
+        expected = _painted([owner for owner in owners if owner is not None], frame, mask.shape)
         for number, region in enumerate(regions):
-            owner = owners[number] or _part_of(region, shown.values())
+            owner = owners[number] or _part_of(region, expected, objects)
             if owner is None:
                 objects.append(owner := _Object(len(objects) + 1, frame, region.mean(axis=0), np.zeros(2), region, 0))
             elif owners[number] is not None:
@@ -112,14 +112,21 @@ def _matched(known: list[_Object], regions: list[Int[np.ndarray, "N 2"]], frame:
     return owners
 
 
-def _part_of(region: Int[np.ndarray, "N 2"], shown) -> _Object | None:
-    """Return the object whose expected pixels hold most of a region."""
-    low, high = region.min(axis=0), region.max(axis=0) + 1
-    for owner, pixels in shown:
-        places = np.rint(pixels).astype(int)
-        near = places[((places >= low) & (places < high)).all(axis=1)] - low
-        there = np.zeros(high - low, bool)
-        there[near[:, 0], near[:, 1]] = True
-        if there[region[:, 0] - low[0], region[:, 1] - low[1]].mean() > _PART:
-            return owner
-    return None
+def _painted(owners: list[_Object], frame: int, size: tuple[int, ...]) -> Int[np.ndarray, "H W"]:
+    """Return the ids of objects at the pixels where they should be, 0 elsewhere; small ones lie over large ones."""
+    ids = np.zeros(size, np.int32)
+    for owner in sorted(owners, key=lambda one: -len(one.pixels)):
+        places = np.rint(owner.pixels + owner.expected(frame)).astype(int)
+        places = places[((places >= 0) & (places < size)).all(axis=1)]
+        ids[places[:, 0], places[:, 1]] = owner.id
+    return ids
+
+
+def _part_of(
+    region: Int[np.ndarray, "N 2"], expected: Int[np.ndarray, "H W"], objects: list[_Object]
+) -> _Object | None:
+    """Return the object that should be at most of a region's pixels."""
+    counts = np.bincount(expected[region[:, 0], region[:, 1]])
+    counts[0] = 0
+    most = int(counts.argmax())
+    return objects[most - 1] if counts[most] > _PART * len(region) else None

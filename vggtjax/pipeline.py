@@ -258,12 +258,8 @@ def reconstruct_methods(
     Raises:
         What `reconstruct` raises.
     """
-    alike: dict[tuple, list[str]] = {}
-    for name in methods:
-        row = find_method(name)
-        alike.setdefault((row.gram, row.suppress, row.clusters, row.threshold), []).append(name)
     results: dict[str, Reconstruction] = {}
-    for names in alike.values():
+    for names in groups_of_methods(methods):
         made = reconstruct(
             model,
             clip,
@@ -280,6 +276,15 @@ def reconstruct_methods(
         for name in names:
             results[name] = _as_method(made, name, align_scale, on_stage or (lambda name: nullcontext()))
     return {name: results[name] for name in methods}
+
+
+def groups_of_methods(methods: Sequence[str]) -> list[list[str]]:
+    """Return methods in groups that mine and suppress alike: the passes are run once for each."""
+    alike: dict[tuple, list[str]] = {}
+    for name in methods:
+        row = find_method(name)
+        alike.setdefault((row.gram, row.suppress, row.clusters, row.threshold), []).append(name)
+    return list(alike.values())
 
 
 def _as_method(made: Reconstruction, method: str, align_scale: bool, on_stage: OnStage) -> Reconstruction:

@@ -15,8 +15,19 @@ from vggtjax.evaluation.records import Record, Records, costs, safe_name, summar
 from vggtjax.files import writing
 
 PLOT_FOLDER = "plots"
+_MOST_BYTES = 2**28
 NAMES = ("results.json", "results.csv", "table.md", "table.tex", "index.html", PLOT_FOLDER)
-_ONE_PASS = ("image features", "first pass")
+
+
+def is_report(path: Path) -> bool:
+    """Return whether a file is the results.json of an evaluation."""
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            return False
+        values = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(values, dict) and {"settings", "sequences", "mean"} <= set(values)
 
 
 def check_extras() -> None:
@@ -81,7 +92,7 @@ def _section(out: Path, records: Sequence[Record], store: Records) -> dict[str, 
 def _page(
     sequences: Sequence[Mapping[str, Any]],
     means: Mapping[str, Mapping[str, float]],
-    seconds: Mapping[str, float],
+    seconds: Mapping[str, Mapping[str, float]],
     settings: Mapping[str, Any],
     warnings: Sequence[str],
 ) -> str:
@@ -101,7 +112,6 @@ def _page(
             body += f"<tr><td>{escape(method)}</td>{''.join(cells)}</tr>"
         return Markup(f"<table><thead><tr><th>method</th>{heads}</tr></thead><tbody>{body}</tbody></table>")
 
-    one = sum(seconds.get(stage, 0.0) for stage in _ONE_PASS)
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     template = environment.from_string(files("vggtjax.evaluation").joinpath("page.html").read_text(encoding="utf-8"))
     return template.render(
@@ -111,7 +121,8 @@ def _page(
         means=means,
         columns=tables.shown_columns(means),
         costs=seconds,
-        ratio=(one + seconds["second pass"]) / one if one and "second pass" in seconds else None,
+        stages=list(dict.fromkeys(stage for row in seconds.values() for stage in row)),
+        failed={method: tables.failed(row) for method, row in means.items() if row["failed"]},
         settings=settings,
         warnings=warnings,
         table=table,

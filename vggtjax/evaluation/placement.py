@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -12,10 +12,13 @@ from vggtjax.errors import ClipError, InputError
 from vggtjax.results.reconstruction import Reconstruction
 
 Place = tuple[tuple[float, float], tuple[float, float]]  # scale and offset: source (x, y) = scale * (x, y) + offset
+_SAME: Place = ((1.0, 1.0), (0.0, 0.0))
 _MULTIPLE = 16  # of sides, to which MonST3R and CUT3R cut their frames
 
 
-def placed(result: Reconstruction, layout: str, sizes: list[tuple[int, int]]) -> Reconstruction:
+def placed(
+    result: Reconstruction, layout: str, sizes: Sequence[tuple[int, int]], names: Sequence[str]
+) -> Reconstruction:
     """Return a result that knows how its frames lie in pictures of these sizes.
 
     Each project has its own way from picture to frame, which its folder does not tell: VGGT4D resizes to a width and
@@ -26,6 +29,7 @@ def placed(result: Reconstruction, layout: str, sizes: list[tuple[int, int]]) ->
         result: as it was loaded.
         layout: whose it is.
         sizes: width and height of each picture.
+        names: of the pictures, without endings; our own results remember theirs.
 
     Raises:
         InputError: another number of pictures than frames, or frames that do not come from such pictures in this way.
@@ -34,6 +38,11 @@ def placed(result: Reconstruction, layout: str, sizes: list[tuple[int, int]]) ->
     if len(sizes) != S:
         raise InputError(f"the result has {S} frames and the sequence {len(sizes)}; expected a result for every frame")
     if layout == "vggtjax":
+        if result.frame_names != tuple(names):
+            raise InputError(
+                f"the result is of frames {', '.join(result.frame_names[:3])}, ... and the sequence has "
+                f"{', '.join(names[:3])}, ...; expected a result of these very pictures"
+            )
         if wrong := [i for i, (w, h) in enumerate(sizes) if tuple(result.source_size[i]) != (h, w)]:
             height, width = result.source_size[wrong[0]]
             raise InputError(
@@ -41,7 +50,7 @@ def placed(result: Reconstruction, layout: str, sizes: list[tuple[int, int]]) ->
                 "expected a result of these very pictures"
             )
         return result
-    places = [_WAYS[layout](width, height, W, H) for width, height in sizes]
+    places = [_SAME if size == (W, H) else _WAYS[layout](*size, W, H) for size in sizes]
     for place, (width, height) in zip(places, sizes, strict=True):
         if place is None:
             raise InputError(

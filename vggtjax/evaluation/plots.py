@@ -61,8 +61,8 @@ def _paths(curves: Curves) -> Figure:
             style: dict[str, Any] = {"color": "black", "linewidth": 2.5} if method == "truth" else {"linewidth": 1.2}
             axis.plot(x, y, marker=".", label=method, **style)
         axis.set_aspect("equal", adjustable="datalim")
-        axis.set_xlabel(f"{labels[0]} principal axis (m)")
-        axis.set_ylabel(f"{labels[1]} (m)")
+        axis.set_xlabel(f"{labels[0]} principal axis")
+        axis.set_ylabel(labels[1])
         axis.grid(alpha=0.3)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
     return figure
@@ -135,7 +135,7 @@ def _distances(curves: Curves) -> Figure:
         axis = figure.add_subplot(1, 2, place + 1)
         for method, own in curves.items():
             axis.stairs(own[kind] / max(own[kind].sum(), 1), own["distance_bins"], label=method)
-        axis.set(xscale="log", xlabel="distance (m)", ylabel="share of points", title=title)
+        axis.set(xscale="log", xlabel="distance", ylabel="share of points", title=title)
         axis.grid(alpha=0.3)
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
     return figure

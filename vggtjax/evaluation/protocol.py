@@ -7,23 +7,25 @@ from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64
 from scipy.ndimage import map_coordinates
 
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.sequence import Sequence
-from vggtjax.evaluation.masks import auc, frame_scores, mask_scores
+from vggtjax.evaluation.masks import Empty, auc, frame_scores, mask_scores
 from vggtjax.evaluation.point_clouds import nearest_distances, paired_distance, statistics
-from vggtjax.evaluation.trajectory import Similarity, centres, trajectory_errors, umeyama_sim3
+from vggtjax.evaluation.trajectory import FEWEST_POSES, Similarity, centres, moves, trajectory_errors, umeyama_sim3
 from vggtjax.evaluation.truth import Placed, at_clip_pixels, intrinsics_at_clip_pixels
 from vggtjax.evaluation.uncertainty import reliability_curve, sparsification_curve, uncertainty_scores
 from vggtjax.evaluation.video_depth import Align, depth_alignment, video_depth_errors
 from vggtjax.results import geometry
+from vggtjax.results.frames import inside_pictures
 from vggtjax.results.reconstruction import Reconstruction
 
 PIXEL_OFFSET = 0.0  # of points: the protocol lifts whole pixel numbers, predicted and true ones alike
 _HISTOGRAM = np.geomspace(1e-3, 10, 41)  # metres, bins of point distances
 _SHOWN = 4  # frames whose maps are kept for pictures
+_AT_ONCE = 1 << 20  # points that are moved at a time
 
 Progress = Callable[[int, int], object]
 _Found = tuple[dict[str, float], dict[str, np.ndarray]]
@@ -33,45 +35,100 @@ class Scores(NamedTuple):
     """What a result scores on a sequence."""
 
     metrics: dict[str, float]
-    notes: tuple[str, ...]  # why some metric is not there, a sentence each
+    notes: tuple[str, ...]  # what there is no truth, or no prediction, for: a sentence each
+    problems: tuple[str, ...]  # what should have been scored and could not be
     curves: dict[str, np.ndarray]  # what plots are drawn from
 
 
-class TruthAtPixels:
-    """A sequence's ground truth at the pixels of results that are placed alike; read once, when asked for."""
+class _AbsentError(InputError):
+    """What a protocol compares is not part of the sequence or of the result: no failure, and no number."""
 
-    def __init__(self, sequence: Sequence, placed: Placed) -> None:
+
+class TruthAtPixels:
+    """A sequence's ground truth at the pixels of results that are placed alike; read once, when asked for.
+
+    Depth beyond `max_depth` metres counts as unknown.
+    """
+
+    def __init__(self, sequence: Sequence, placed: Placed, *, max_depth: float | None = None) -> None:
         self.sequence = sequence
+        self.max_depth = max_depth
         self._placed = placed
 
+    def fits(self, placed: Placed) -> bool:
+        """Return whether another result lies at the very same places."""
+        names = ("source_size", "source_scale", "source_offset", "valid_box")
+        same = (np.array_equal(getattr(self._placed, name), getattr(placed, name)) for name in names)
+        return self._placed.images.shape == placed.images.shape and all(same)
+
     @cached_property
-    def depth_at_source(self) -> Float32[np.ndarray, "S h w"] | None:
+    def depth_at_source(self) -> Float32[np.ndarray, "S h w"]:
         """Metres, 0 where unknown, at the size of the pictures."""
-        read = self.sequence.depth
-        return None if read is None else np.stack([read(i).astype(np.float32) for i in range(len(self.sequence))])
+        if (read := self.sequence.depth) is None:
+            raise _AbsentError("the sequence has no depth")
+        depth = _stacked("depth", [read(i).astype(np.float32) for i in range(len(self.sequence))])
+        if self.max_depth is not None:
+            depth[depth >= self.max_depth] = 0
+        return depth
 
     @cached_property
-    def depth(self) -> Float32[np.ndarray, "S H W"] | None:
+    def depth(self) -> Float32[np.ndarray, "S H W"]:
         """The same at the pixels of the result: every one takes the depth in which its centre lies."""
-        return None if self.depth_at_source is None else at_clip_pixels(self._placed, self.depth_at_source)
+        depth = at_clip_pixels(self._placed, self.depth_at_source)
+        if not (depth > 0).any():
+            raise _AbsentError("no pixel of the sequence has a true depth")
+        return depth
 
     @cached_property
-    def mask(self) -> Bool[np.ndarray, "S H W"] | None:
+    def mask(self) -> Bool[np.ndarray, "S H W"]:
         """What moves, at the pixels of the result."""
-        read = self.sequence.mask
-        masks = None if read is None else np.stack([read(i) for i in range(len(self.sequence))])
-        return None if masks is None else at_clip_pixels(self._placed, masks)
+        if (read := self.sequence.mask) is None:
+            raise _AbsentError("the sequence has no masks")
+        return at_clip_pixels(self._placed, _stacked("masks", [read(i) for i in range(len(self.sequence))]))
+
+    @property
+    def poses(self) -> Float64[np.ndarray, "S 4 4"]:
+        """Cameras, world from camera."""
+        poses = self.sequence.world_from_camera
+        if poses is None:
+            raise _AbsentError("the sequence has no camera poses")
+        if len(poses) < FEWEST_POSES or not moves(poses[:, :3, 3]):
+            raise _AbsentError(f"the {len(poses)} true cameras do not move; there is nothing to align by")
+        return poses
 
     @cached_property
-    def points(self) -> Float32[np.ndarray, "S H W 3"] | None:
-        """Points in the true world; those of unknown depth are at the camera's centre."""
-        sequence = self.sequence
-        if self.depth is None or sequence.world_from_camera is None or sequence.intrinsics is None:
-            return None
-        intrinsics = intrinsics_at_clip_pixels(self._placed, sequence.intrinsics)
-        return geometry.unproject(
-            self.depth, intrinsics, _inverse(sequence.world_from_camera), pixel_offset=PIXEL_OFFSET
+    def points(self) -> Float32[np.ndarray, "N 3"]:
+        """Points in the true world, of all pixels with a true depth."""
+        if self.sequence.intrinsics is None:
+            raise _AbsentError("the sequence has no intrinsics")
+        intrinsics = intrinsics_at_clip_pixels(self._placed, self.sequence.intrinsics)
+        return known_points(self.depth, intrinsics, _inverse(self.poses), self.depth > 0)
+
+
+def _stacked(what: str, maps: list[np.ndarray]) -> np.ndarray:
+    sizes = {one.shape for one in maps}
+    if len(sizes) > 1:
+        raise InputError(f"{what} of the sequence have {len(sizes)} sizes, {sorted(sizes)[:3]}; expected one for all")
+    return np.stack(maps)
+
+
+def known_points(
+    depth: Float[np.ndarray, "S H W"],
+    intrinsics: Float[np.ndarray, "S 3 3"],
+    camera_from_world: Float[np.ndarray, "S 3 4"],
+    known: Bool[np.ndarray, "S H W"],
+) -> Float32[np.ndarray, "N 3"]:
+    """Lift the pixels that are known to their points, frame by frame: no more than one frame is in float64."""
+    points = np.empty((int(known.sum()), 3), np.float32)
+    end = 0
+    for one in range(len(depth)):
+        here = slice(one, one + 1)
+        lifted = geometry.unproject(
+            depth[here].astype(np.float64), intrinsics[here], camera_from_world[here], pixel_offset=PIXEL_OFFSET
         )
+        start, end = end, end + int(known[one].sum())
+        points[start:end] = lifted[0][known[one]]
+    return points
 
 
 def score(
@@ -79,7 +136,7 @@ def score(
     truth: TruthAtPixels,
     *,
     depth_align: Align = "scale",
-    max_depth: float | None = None,
+    empty: Empty = "davis",
     progress: Progress | None = None,
 ) -> Scores:
     """Score a result by every protocol that the sequence has ground truth for (docs/evaluation.md states them).
@@ -88,41 +145,44 @@ def score(
         result: of the sequence's frames, in their order.
         truth: of the sequence, at the pixels of this result.
         depth_align: how video depth is brought to the truth's unit.
-        max_depth: metres beyond which true depth does not count for video depth; None for all.
+        empty: J of a frame in which neither mask has a pixel: 1 ("davis") or 0 ("vggt4d").
         progress: called while point clouds are compared.
 
     Returns:
-        The metrics that could be computed; notes say why others could not.
+        The metrics that could be computed; notes and problems say why others could not.
     """
     metrics: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {}
     notes: list[str] = []
+    problems: list[str] = []
     protocols: dict[str, Callable[[Reconstruction, TruthAtPixels], _Found]] = {
         "trajectory": _trajectory,
         "point clouds": partial(_point_clouds, progress=progress),
-        "masks": _masks,
-        "video depth": partial(_video_depth, align=depth_align, max_depth=max_depth),
+        "masks": partial(_masks, empty=empty),
+        "video depth": partial(_video_depth, align=depth_align),
         "uncertainty": _uncertainty,
     }
     for name, protocol in protocols.items():
         try:
             found, drawn = protocol(result, truth)
+        except _AbsentError as reason:
+            notes.append(f"{name}: {reason}")
         except InputError as error:
-            notes.append(f"{name}: {error}")
-            continue
-        metrics |= {key: float(value) for key, value in found.items()}
-        curves |= drawn
-    return Scores(metrics, tuple(notes), curves)
+            problems.append(f"{name}: {error}")
+        else:
+            metrics |= {key: float(value) for key, value in found.items()}
+            curves |= drawn
+    return Scores(metrics, tuple(notes), tuple(problems), curves)
 
 
-def _missing(what: str) -> InputError:
-    return InputError(f"the sequence has no {what}")
+def _predicted(result: Reconstruction, field: str, what: str) -> None:
+    """Raise _AbsentError if a field of a result was never predicted, and plain values stand for it."""
+    if field in result.settings.get("missing", ()):
+        raise _AbsentError(f"the result has no {what}")
 
 
 def _trajectory(result: Reconstruction, truth: TruthAtPixels) -> _Found:
-    poses = truth.sequence.world_from_camera
-    if poses is None:
-        raise _missing("camera poses")
+    poses = truth.poses
     errors = trajectory_errors(result.world_from_camera, poses)
     similarity = _alignment(result, poses, allow_line=True)
     curves = {
@@ -137,17 +197,14 @@ def _alignment(result: Reconstruction, poses: Float64[np.ndarray, "S 4 4"], *, a
 
 
 def _point_clouds(result: Reconstruction, truth: TruthAtPixels, *, progress: Progress | None) -> _Found:
-    poses = truth.sequence.world_from_camera
-    if poses is None or truth.points is None or truth.depth is None:
-        raise _missing("depth with cameras")
-    known = truth.depth > 0
-    if not known.any():
-        raise InputError("no pixel of the sequence has a true depth")
-    predicted = result.world_points(pixel_offset=PIXEL_OFFSET)[known]
+    true, known = truth.points, truth.depth > 0
+    intrinsics = result.intrinsics.astype(np.float64)
+    predicted = known_points(result.depth, intrinsics, result.camera_from_world.astype(np.float64), known)
     if not np.isfinite(predicted).all():
         raise InputError(f"{int((~np.isfinite(predicted).all(axis=1)).sum())} predicted points are not finite")
-    predicted = _alignment(result, poses).apply(predicted).astype(np.float32)
-    true = truth.points[known]
+    similarity = _alignment(result, truth.poses)
+    for start in range(0, len(predicted), _AT_ONCE):
+        predicted[start : start + _AT_ONCE] = similarity.apply(predicted[start : start + _AT_ONCE])
     paired = paired_distance(predicted, true)
     ways = {"accuracy": (predicted, true), "completeness": (true, predicted)}
     metrics: dict[str, float] = {}
@@ -166,59 +223,50 @@ def _half(progress: Progress | None, part: int) -> Progress | None:
     return None if progress is None else lambda done, total: progress(done + part * total, 2 * total)
 
 
-def _masks(result: Reconstruction, truth: TruthAtPixels) -> _Found:
-    if truth.mask is None:
-        raise _missing("masks")
-    scores = mask_scores(result.dynamic_mask, truth.mask)
-    metrics = dict(scores._asdict())
-    if result.saliency is not None and truth.mask.any() and not truth.mask.all():
-        factors = (
-            1,
-            *(big // small for big, small in zip(truth.mask.shape[1:], result.saliency.shape[1:], strict=True)),
-        )
-        metrics["saliency_auc"] = auc(np.kron(result.saliency, np.ones(factors, np.float32)), truth.mask)
-    region, boundary = frame_scores(result.dynamic_mask, truth.mask)
-    shown = _shown(len(truth.mask))
-    pictures = {"masks": result.dynamic_mask[shown], "true_masks": truth.mask[shown]}
+def _masks(result: Reconstruction, truth: TruthAtPixels, *, empty: Empty) -> _Found:
+    true = truth.mask
+    _predicted(result, "dynamic_mask", "masks")
+    inside = inside_pictures(result)
+    predicted = result.dynamic_mask & inside
+    rows, columns = (np.flatnonzero(inside.any(axis=axes)) for axes in ((0, 2), (0, 1)))
+    window = np.s_[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]  # padding is no part of the picture
+    metrics = dict(mask_scores(predicted[window], true[window], empty=empty)._asdict())
+    if result.saliency is not None and true.any() and not true[inside].all():
+        factors = (1, *(big // small for big, small in zip(true.shape[1:], result.saliency.shape[1:], strict=True)))
+        saliency = np.kron(result.saliency, np.ones(factors, np.float32))
+        metrics["saliency_auc"] = auc(saliency[inside], true[inside])
+    region, boundary = frame_scores(predicted[window], true[window], empty=empty)
+    shown = _shown(len(true))
+    pictures = {"masks": predicted[shown], "true_masks": true[shown]}
     return metrics, {"j": region, "f": boundary, "images": result.images[shown], "shown": shown, **pictures}
 
 
-def _video_depth(result: Reconstruction, truth: TruthAtPixels, *, align: Align, max_depth: float | None) -> _Found:
+def _video_depth(result: Reconstruction, truth: TruthAtPixels, *, align: Align) -> _Found:
     true = truth.depth_at_source
-    if true is None:
-        raise _missing("depth")
     predicted, seen = depth_at_source(result)
-    errors = video_depth_errors(predicted, np.where(seen, true, 0), align, max_depth=max_depth)
+    true = np.where(seen, true, 0)
+    if not (true > 0).any():
+        raise _AbsentError("no pixel of the sequence has a true depth")
+    errors = video_depth_errors(predicted, true, align)
+    scale, shift = depth_alignment(predicted[true > 0], true[true > 0], align)
     metrics = {f"depth_{key}" if key == "pixels" else key: value for key, value in errors._asdict().items()}
-    return metrics, _depth_maps(result, truth)
+    return metrics, _depth_maps(result, truth, scale, shift)
 
 
-def _depth_maps(result: Reconstruction, truth: TruthAtPixels) -> dict[str, np.ndarray]:
+def _depth_maps(result: Reconstruction, truth: TruthAtPixels, scale: float, shift: float) -> dict[str, np.ndarray]:
     """Return aligned depth of some frames at the result's pixels, the true one, and the relative error."""
-    _, _, scale = _known_depth(result, truth)
     shown = _shown(len(result.depth))
-    true_maps = _present(truth.depth)[shown]
-    maps = (scale * result.depth[shown].astype(np.float64)).astype(np.float32)
+    true = truth.depth[shown]
+    maps = (scale * result.depth[shown].astype(np.float64) + shift).astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
-        errors = np.where(true_maps > 0, np.abs(maps - true_maps) / true_maps, np.nan)
+        errors = np.where(true > 0, np.abs(maps - true) / true, np.nan)
     return {
         "error_maps": errors.clip(max=100).astype(np.float16),
-        "true_depth": true_maps,
+        "true_depth": true,
         "depth": maps,
         "images": result.images[shown],
         "shown": shown,
     }
-
-
-def _known_depth(
-    result: Reconstruction, truth: TruthAtPixels
-) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"], float]:
-    """Return predicted and true depth where the truth is known, and the scale that takes one to the other."""
-    known = _present(truth.depth) > 0
-    if not known.any():
-        raise InputError("no pixel of the sequence has a true depth")
-    predicted, true = result.depth[known].astype(np.float64), _present(truth.depth)[known].astype(np.float64)
-    return predicted, true, depth_alignment(predicted, true, "scale")[0]
 
 
 def depth_at_source(
@@ -249,9 +297,13 @@ def depth_at_source(
 
 
 def _uncertainty(result: Reconstruction, truth: TruthAtPixels) -> _Found:
-    predicted, true, scale = _known_depth(result, truth)
-    precision = result.depth_confidence[_present(truth.depth) > 0].astype(np.float64)
-    true /= scale  # in the unit of the prediction, which the precision is of
+    known = truth.depth > 0
+    _predicted(result, "depth_confidence", "confidence")
+    predicted, true = result.depth[known].astype(np.float64), truth.depth[known].astype(np.float64)
+    precision = result.depth_confidence[known].astype(np.float64)
+    true /= depth_alignment(predicted, true, "scale")[0]  # in the unit of the prediction, which the precision is of
+    if np.array_equal(predicted, true):
+        raise _AbsentError("all errors are 0; there is nothing that a confidence could be about")
     scores = uncertainty_scores(predicted, true, precision)
     removed, kept, oracle = sparsification_curve(np.abs(predicted - true), precision)
     levels, shares = reliability_curve(predicted - true, precision, 1.0)
@@ -261,12 +313,6 @@ def _uncertainty(result: Reconstruction, truth: TruthAtPixels) -> _Found:
         "reliability": np.stack([levels, shares, calibrated]),
     }
     return {f"uncertainty_{key}" if key == "scale" else key: value for key, value in scores._asdict().items()}, curves
-
-
-def _present(depth: np.ndarray | None) -> np.ndarray:
-    if depth is None:
-        raise _missing("depth")
-    return depth
 
 
 def _shown(frames: int) -> np.ndarray:

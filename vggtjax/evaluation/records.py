@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -18,6 +18,8 @@ from vggtjax.files import writing
 from vggtjax.results import archive
 
 FOLDER = "sequences"
+BOTH_OVER_ONE = "both passes over one"
+_MARK = "evaluation.json"  # in that folder: it is ours
 _MOST_BYTES = 2**24  # of a record's JSON
 
 
@@ -33,7 +35,7 @@ class Record:
     notes: tuple[str, ...] = ()  # what the ground truth lacks, and why a metric is not there
     reason: str = ""  # of a failure
     frames: int = 0
-    seconds: dict[str, float] = field(default_factory=dict)  # of the stages; shared by methods that share passes
+    seconds: dict[str, float] = field(default_factory=dict)  # of the stages of its group of methods
 
 
 class Records:
@@ -41,6 +43,15 @@ class Records:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / FOLDER
+
+    def is_there(self) -> bool:
+        """Return whether the folder holds records of an evaluation."""
+        return (self.folder / _MARK).is_file()
+
+    def begin(self) -> None:
+        """Make the folder, with a mark that it is one of records."""
+        with writing(self.folder / _MARK) as path:
+            path.write_text('{"format": "records of vggtjax evaluate"}\n', encoding="utf-8")
 
     def kept(self, name: str, method: str, settings: Mapping[str, Any]) -> Record | None:
         """Return the record of an earlier run, if it succeeded with the very same settings; else None."""
@@ -56,20 +67,15 @@ class Records:
         return record if good and record.settings == _plain(settings) and record.name == name else None
 
     def keep(self, record: Record, curves: Mapping[str, np.ndarray]) -> None:
-        """Write a record; the JSON comes last, so that where it is, all of it is."""
-        if record.status == "ok":
-            with writing(self._path(record.name, record.method, "npz")) as path:
-                archive.write_arrays(path, curves)
+        """Write a record; the JSON leaves first and comes last, so that where it is, all of it is."""
+        self._path(record.name, record.method, "json").unlink(missing_ok=True)
+        with writing(self._path(record.name, record.method, "npz")) as path:
+            archive.write_arrays(path, curves)
         with writing(self._path(record.name, record.method, "json")) as path:
             path.write_text(json.dumps(_plain(asdict(record)), indent=2) + "\n", encoding="utf-8")
 
     def curves(self, record: Record) -> dict[str, np.ndarray]:
-        """Return the curves of a record; empty for one that failed.
-
-        Raises ResultError where the file is broken.
-        """
-        if record.status != "ok":
-            return {}
+        """Return the curves of a record; raises ResultError where the file is broken."""
         path = self._path(record.name, record.method, "npz")
         try:
             return archive.read_arrays(path)
@@ -87,10 +93,10 @@ def safe_name(name: str) -> str:
 
 
 def summary(records: Sequence[Record]) -> dict[str, dict[str, float]]:
-    """Return the means of every method over its sequences.
+    """Return the means of every method over the sequences that it did not fail on.
 
     Sequences weigh the same, as the protocols have it, but for video depth, where they weigh as they have valid pixels.
-    `sequences` and `failed` count; what a sequence could not be scored for does not count in that metric's mean.
+    `sequences` counts them, `failed` the others. A metric's mean is over the sequences that have the ground truth.
     """
     means: dict[str, dict[str, float]] = {}
     for method in dict.fromkeys(record.method for record in records):
@@ -117,13 +123,22 @@ def _weight(record: Record, metric: str) -> float:
     return record.metrics.get("depth_pixels", 1.0) if metric in VIDEO_DEPTH else 1.0
 
 
-def costs(records: Iterable[Record]) -> dict[str, float]:
-    """Return the mean seconds of each stage over sequences, counting passes that methods shared once."""
-    stages: dict[str, dict[str, float]] = {}
-    for record in records:
-        for stage, seconds in record.seconds.items():
-            stages.setdefault(stage, {})[record.name] = seconds
-    return {stage: float(np.mean(list(each.values()))) for stage, each in stages.items()}
+def costs(records: Sequence[Record]) -> dict[str, dict[str, float]]:
+    """Return the mean seconds of each stage by method; what methods share is in the time of each of them.
+
+    `both passes over one` is the time of image features and both passes over that of features and the first one.
+    """
+    found: dict[str, dict[str, float]] = {}
+    for method in dict.fromkeys(record.method for record in records):
+        own = [record.seconds for record in records if record.method == method and record.seconds]
+        stages = dict.fromkeys(stage for seconds in own for stage in seconds)
+        row = {stage: float(np.mean([seconds.get(stage, 0.0) for seconds in own])) for stage in stages}
+        one = row.get("image features", 0.0) + row.get("first pass", 0.0)
+        if one and "second pass" in row:
+            row[BOTH_OVER_ONE] = (one + row["second pass"]) / one
+        if row:
+            found[method] = row
+    return found
 
 
 def _plain(values: Any) -> Any:

@@ -88,7 +88,7 @@ def markdown(means: Mapping[str, Mapping[str, float]]) -> str:
     ]
     for method, row in means.items():
         cells = [f"**{cell(row, c)}**" if method in best(means, c) else cell(row, c) for c in columns]
-        lines.append(f"| {_plain(method)} | " + " | ".join(cells) + f" | {_failed(row)} |")
+        lines.append(f"| {_plain(method)} | " + " | ".join(cells) + f" | {failed(row)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -96,14 +96,14 @@ def latex(means: Mapping[str, Mapping[str, float]]) -> str:
     """Return the means as a LaTeX tabular (booktabs), the best of each column in bold."""
     columns = shown_columns(means)
     lines = [
-        r"\begin{tabular}{l" + "c" * len(columns) + "}",
+        r"\begin{tabular}{l" + "c" * (len(columns) + 1) + "}",
         r"\toprule",
-        "Method & " + " & ".join(_tex(c.heading) + _LATEX_ARROWS[c.better] for c in columns) + r" \\",
+        "Method & " + " & ".join(_tex(c.heading) + _LATEX_ARROWS[c.better] for c in columns) + r" & Failed \\",
         r"\midrule",
     ]
     for method, row in means.items():
         cells = [rf"\textbf{{{cell(row, c)}}}" if method in best(means, c) else cell(row, c) for c in columns]
-        lines.append(" & ".join([_tex(method), *cells]) + r" \\")
+        lines.append(" & ".join([_tex(method), *cells, failed(row)]) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"]) + "\n"
 
 
@@ -120,7 +120,8 @@ def comma_separated(records: Sequence[Record]) -> str:
     return text.getvalue()
 
 
-def _failed(row: Mapping[str, float]) -> str:
+def failed(row: Mapping[str, float]) -> str:
+    """Return on how many sequences of how many a method failed."""
     return f"{int(row['failed'])} of {int(row['sequences'] + row['failed'])}"
 
 

@@ -78,11 +78,7 @@ def load_foreign(path: Path, layout: str, quaternion: Quaternion | None) -> Reco
     """Read a result folder of another project; see `Reconstruction.load`."""
     if layout not in LAYOUTS:
         raise InputError(f"layout is {layout!r}; expected one of vggtjax, {', '.join(LAYOUTS)}")
-    if quaternion is not None and (quaternion not in get_args(Quaternion) or layout not in _WITH_TRAJECTORY):
-        raise InputError(
-            f"quaternion is {quaternion!r} for {layout}; expected 'xyzw' or 'wxyz' for "
-            f"{' and '.join(_WITH_TRAJECTORY)}, and none for others, which keep matrices"
-        )
+    check_quaternion(layout, quaternion)
     try:
         if not path.exists() or (layout != "da3" and not path.is_dir()):
             raise ResultError("there is no such folder")
@@ -112,6 +108,20 @@ def load_foreign(path: Path, layout: str, quaternion: Quaternion | None) -> Reco
     if missing:
         logger.warning("%s has no %s; plain values stand for them", path, ", ".join(missing))
     return result
+
+
+def check_quaternion(layout: str, quaternion: str | None) -> None:
+    """Raise InputError where a layout needs the order of its quaternions, or has none."""
+    if quaternion is None and layout in _WITH_TRAJECTORY:
+        raise InputError(
+            f"pred_traj.txt of {layout} does not say the order of its quaternions; give quaternion='wxyz' (what "
+            "VGGT4D, MonST3R, CUT3R and Easi3R write) or 'xyzw' (TUM's order, what vggtjax writes)"
+        )
+    if quaternion is not None and (quaternion not in get_args(Quaternion) or layout not in _WITH_TRAJECTORY):
+        raise InputError(
+            f"quaternion is {quaternion!r} for {layout}; expected 'xyzw' or 'wxyz' for "
+            f"{' and '.join(_WITH_TRAJECTORY)}, and none for others, which keep matrices"
+        )
 
 
 def _read_folder(folder: Path, layout: _Folder, quaternion: Quaternion | None) -> dict[str, Any]:
@@ -196,10 +206,7 @@ def _read_picture(path: Path) -> UInt8[np.ndarray, "H W 3"]:
 
 def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
     if quaternion is None:
-        raise InputError(
-            f"{folder / 'pred_traj.txt'} does not say the order of its quaternions; give quaternion='wxyz' (what "
-            "VGGT4D, MonST3R, CUT3R and Easi3R write) or 'xyzw' (TUM's order, what vggtjax writes)"
-        )
+        raise InputError("quaternion is None; expected 'xyzw' or 'wxyz'")
     poses = read_trajectory(folder / "pred_traj.txt", quaternion)[1]
     intrinsics = read_numbers(folder / "pred_intrinsics.txt", 9).reshape(-1, 3, 3)
     for name, array in (("pred_traj.txt", poses), ("pred_intrinsics.txt", intrinsics)):

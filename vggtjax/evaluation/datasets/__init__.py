@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from vggtjax.errors import InputError
@@ -63,15 +64,15 @@ DATASETS: Mapping[str, Dataset] = {
 }
 
 
-def open_dataset(
+def find_sequences(
     name: str,
     root: str | Path,
     *,
     sequences: Iterable[str] | None = None,
     stride: int | None = None,
     gt: str | None = None,
-) -> list[Sequence]:
-    """Open sequences of a data set: cameras are read, pictures, depth and masks when they are asked for.
+) -> dict[str, Callable[[], Sequence]]:
+    """Find sequences of a data set, each to be opened by a call: what is wrong with one shows only then.
 
     Args:
         name: one of DATASETS.
@@ -82,8 +83,8 @@ def open_dataset(
         gt: which ground truth, where the data set has several; None takes the first.
 
     Raises:
-        InputError: a name, sequence or ground truth that is not known, a root without sequences, or files that are
-            missing in the middle of a sequence or do not hold what they should.
+        InputError: a name, sequence or ground truth that is not known, or a root without sequences; and from the calls,
+            files that are missing in the middle of a sequence or do not hold what they should.
     """
     if name not in DATASETS:
         raise InputError(f"data set {name!r} is not known; expected one of {', '.join(DATASETS)}")
@@ -100,11 +101,28 @@ def open_dataset(
     for notice in notices:
         logger.warning("%s", notice)
     frames = dataset.frames if stride is None else dataset.frames._replace(stride=stride)
-    opened = [found[sequence](frames, gt or dataset.gt_default) for sequence in chosen]
-    return [
-        dataclasses.replace(sequence, notes=(*notices, *(f"{sequence.name}: {note}" for note in sequence.notes)))
-        for sequence in opened
-    ]
+
+    def opened(sequence: str) -> Sequence:
+        made = found[sequence](frames, gt or dataset.gt_default)
+        return dataclasses.replace(made, notes=(*notices, *(f"{made.name}: {note}" for note in made.notes)))
+
+    return {sequence: partial(opened, sequence) for sequence in chosen}
+
+
+def open_dataset(
+    name: str,
+    root: str | Path,
+    *,
+    sequences: Iterable[str] | None = None,
+    stride: int | None = None,
+    gt: str | None = None,
+) -> list[Sequence]:
+    """Open sequences of a data set: cameras are read, pictures, depth and masks when they are asked for.
+
+    Arguments and errors are those of `find_sequences`.
+    """
+    found = find_sequences(name, root, sequences=sequences, stride=stride, gt=gt)
+    return [opener() for opener in found.values()]
 
 
 def _chosen(
