@@ -15,6 +15,7 @@ from benchmarks.point_clouds import point_clouds
 from benchmarks.refinement import refinement
 from benchmarks.resolution import resolution
 from benchmarks.second_pass import second_pass
+from benchmarks.speed import speed
 from vggtjax.errors import VggtjaxError
 
 COMMANDS = {
@@ -26,6 +27,7 @@ COMMANDS = {
     "refinement": refinement,
     "resolution": resolution,
     "second-pass": second_pass,
+    "speed": speed,
 }
 
 

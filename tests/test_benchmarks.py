@@ -10,6 +10,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from benchmarks import __main__ as benchmarks
+from benchmarks import speed
 from benchmarks.blind_guesses import Prior, compare, guesses, training_prior
 from benchmarks.real_clips import load_windows, takes, window_starts
 from benchmarks.summaries import comparison_table, ladder_table, saliency_auc, spread, summarise
@@ -261,3 +262,15 @@ def test_masks_are_measured(tmp_path, capsys):
     assert [row[1] for row in values] == ["1", "3"]
     assert all(0 < float(row[5]) <= 1 for row in values)  # IoU
     assert benchmarks.main(["masks", "--scenes", "0"]) == 2
+
+
+def test_how_far_outputs_are_apart():
+    theirs = {"depth": np.array([1.0, 3.0]), "pose": np.array([0.0, 2.0])}
+    ours = {"depth": np.array([1.0, 3.1]), "pose": np.array([0.0, 2.0])}
+    assert speed._apart(ours, theirs) == pytest.approx(0.1)
+
+
+def test_a_comparison_without_the_others_code_is_one_sentence(tmp_path, capsys):
+    arguments = ["--weights", tmp_path / "a", "--converted", tmp_path / "b", "--peer", tmp_path]
+    assert benchmarks.main(["speed", *map(str, arguments)]) == 2
+    assert "a does not exist" in capsys.readouterr().err
