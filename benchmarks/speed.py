@@ -40,7 +40,7 @@ class Worker:
     def _answer(self) -> dict[str, float]:
         line = self._process.stdout.readline()
         if not line:
-            raise InputError(f"the process of {self._process.args[4]} ended; what it said is above")
+            raise InputError(f"the process of {self._process.args[3]!r} ended; what it said is above")
         return json.loads(line)
 
 

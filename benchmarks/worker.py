@@ -61,19 +61,11 @@ def peer(weights: Path, checkout: Path) -> Run:
     torch.set_num_threads(os.cpu_count() or 1)
     from vggt.models.vggt import VGGT  # pyright: ignore[reportMissingImports]: the user's checkout
 
-    with torch.device("meta"):
-        model = VGGT(enable_point=False, enable_track=False)
+    model = VGGT(enable_point=False, enable_track=False)
     names = set(model.state_dict())
     tensors = {name: value for name, value in load_file(weights).items() if name in names}
     model.load_state_dict(tensors, assign=True, strict=True)
-    for module in model.modules():  # what is no parameter was made on the meta device
-        for name, value in list(module.__dict__.items()):
-            if isinstance(value, torch.Tensor) and value.is_meta:
-                raise SystemExit(f"{type(module).__name__}.{name} was not made")
-        for name, value in list(module._buffers.items()):
-            if value is not None and value.is_meta:
-                mean = {"_resnet_mean": [0.485, 0.456, 0.406], "_resnet_std": [0.229, 0.224, 0.225]}[name]
-                module._buffers[name] = torch.tensor(mean).view(1, 1, 3, 1, 1)
+    del tensors
     model.eval()
 
     def run(images: np.ndarray) -> Outputs:
@@ -111,7 +103,7 @@ def main(side: str, weights: str, *rest: str) -> None:
 
 
 def peak_bytes() -> int:
-    """Return the most memory that this process has had, of its own: files that are mapped do not count."""
+    """Return the most memory that this process has had, with the weights that it has mapped or read."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith("VmHWM"):
             return int(line.split()[1]) * 1024
