@@ -30,7 +30,7 @@ def masks(
     scenes: int = 16,
     frames: int = 12,
     smooth: tuple[int, ...] = (1, 3, 5),
-    clips: Path = Path("../shared/clips/composite"),
+    clips: Path | None = None,
     seed: int = 0,
 ) -> None:
     """Measure masks against the truth, on held-out dynamic scenes and on filmed clips where they are present.
@@ -41,9 +41,11 @@ def masks(
         scenes: held-out dynamic scenes.
         frames: of a scene, and of a window of a filmed clip.
         smooth: numbers of frames that the saliency is averaged over.
-        clips: folder of folders with rgb/, depth/, mask/, K.txt, world_from_camera.txt.
+        clips: folder of folders with rgb/, depth/, mask/, K.txt, world_from_camera.txt; none by default.
         seed: another seed draws other scenes.
     """
+    if clips is not None and not clips.is_dir():
+        raise InputError(f"{clips} is no folder; name one of folders with rgb/, depth/, mask/ and cameras")
     if scenes < 1:
         raise InputError(f"scenes is {scenes}; expected at least 1")
     loaded, console = load_model(model), Console()
@@ -52,7 +54,7 @@ def masks(
         wanted = SceneConfig(height=side, width=side, frames=frames)
         generated = held_out_scenes("dynamic", scenes, wanted, seed=seed)
     groups = {f"{scenes} generated scenes": Truth(*(np.asarray(getattr(generated, name)) for name in Truth._fields))}
-    filmed = sorted(folder for folder in clips.glob("*") if is_clip_folder(folder)) if clips.is_dir() else []
+    filmed = sorted(folder for folder in clips.glob("*") if is_clip_folder(folder)) if clips else []
     if filmed:
         windows = load_windows(filmed, loaded.config, frames)
         groups[f"{len(windows.names)} windows of {', '.join(folder.name for folder in filmed)}"] = windows.truth

@@ -18,9 +18,7 @@ _OFF = 0.05  # relative error from which a pixel counts as misplaced
 Axis = Float[np.ndarray, " n"]
 
 
-def resolution(
-    *, clips: Path = Path("../shared/clips"), factors: tuple[float, ...] = (1.24, 1.65, 1.85, 3.7), every: int = 4
-) -> None:
+def resolution(*, clips: Path, factors: tuple[float, ...] = (1.24, 1.65, 1.85, 3.7), every: int = 4) -> None:
     """Shrink measured depth to the pixels of a smaller picture, enlarge it again, and compare with what was measured.
 
     Args:

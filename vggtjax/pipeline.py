@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any, NamedTuple
@@ -26,7 +25,7 @@ from vggtjax.network.model import Predictions
 from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass, track_from
 from vggtjax.refinement import refine_masks
 from vggtjax.results.frames import inside_pictures
-from vggtjax.results.reconstruction import FieldOfViewWarning, Reconstruction
+from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.tracking import Queries
 
 OnStage = Callable[[str], AbstractContextManager[Any]]
@@ -58,7 +57,7 @@ _first_pass_with_tracks = jax.jit(
 )
 _track_from = jax.jit(track_from, static_argnames=("config", "compute_dtype"))
 _same = jax.jit(lambda predictions: predictions)
-_assembled = jax.jit(_assemble, static_argnames=("method", "align_scale"))
+assembled = jax.jit(_assemble, static_argnames=("method", "align_scale"))
 
 
 @partial(
@@ -208,7 +207,7 @@ def reconstruct(
     passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
     followed = {} if tracks is None else _joined_tracks(tracks, arrays)
     result = Reconstruction(
-        **_assembled_fields(arrays["assembly"], arrays[row.intrinsics]),
+        **assembled_fields(arrays["assembly"], arrays[row.intrinsics]),
         saliency=np.asarray(passes.saliency[0]),
         dynamic_mask=np.asarray(passes.dynamic_mask[0]),
         images=np.round(clip.images * 255).astype(np.uint8),
@@ -228,87 +227,11 @@ def reconstruct(
     )
     if refine_mask:
         with on_stage("refine mask") as progress:
-            result = _refined(result, progress)
+            result = refined(result, progress)
     return result
 
 
-def reconstruct_methods(
-    model: Model,
-    clip: Clip,
-    methods: Sequence[str],
-    *,
-    size: int | None = None,
-    mask_pairs: int = 5,
-    align_scale: bool = False,
-    smooth_frames: int = 1,
-    compute_dtype: str = "float32",
-    on_stage: OnStage | None = None,
-) -> dict[str, Reconstruction]:
-    """Reconstruct a clip by several methods, each as `reconstruct` does; what they have in common is computed once.
-
-    Methods that mine and suppress alike, which those of `LADDER` do, share one run of the passes.
-
-    Args:
-        methods: names of `METHODS`.
-        model, clip, size, mask_pairs, align_scale, smooth_frames, compute_dtype, on_stage: as for `reconstruct`.
-
-    Returns:
-        The results by method, in the order of `methods`.
-
-    Raises:
-        What `reconstruct` raises.
-    """
-    results: dict[str, Reconstruction] = {}
-    for names in groups_of_methods(methods):
-        made = reconstruct(
-            model,
-            clip,
-            method=next((name for name in names if find_method(name).needs_second_pass), names[0]),
-            size=size,
-            mask_pairs=mask_pairs,
-            align_scale=align_scale,
-            smooth_frames=smooth_frames,
-            refine_mask=False,
-            compute_dtype=compute_dtype,
-            keep_passes=True,
-            on_stage=on_stage,
-        )
-        for name in names:
-            results[name] = _as_method(made, name, align_scale, on_stage or (lambda name: nullcontext()))
-    return {name: results[name] for name in methods}
-
-
-def groups_of_methods(methods: Sequence[str]) -> list[list[str]]:
-    """Return methods in groups that mine and suppress alike: the passes are run once for each."""
-    alike: dict[tuple, list[str]] = {}
-    for name in methods:
-        row = find_method(name)
-        alike.setdefault((row.gram, row.suppress, row.clusters, row.threshold), []).append(name)
-    return list(alike.values())
-
-
-def _as_method(made: Reconstruction, method: str, align_scale: bool, on_stage: OnStage) -> Reconstruction:
-    """Return what another method makes of the passes that a result keeps."""
-    row, passes = find_method(method), made.passes
-    with warnings.catch_warnings():
-        if made.method == method:  # it has said already which cameras were clamped
-            warnings.simplefilter("ignore", FieldOfViewWarning)
-        result = dataclasses.replace(
-            made,
-            **_assembled_fields(
-                _assembled(*passes, method=method, align_scale=align_scale), getattr(passes, row.intrinsics)
-            ),
-            method=method,
-            settings=made.settings | {"refine_mask": row.refine},
-            passes=None,
-        )
-    if row.refine:
-        with on_stage("refine mask") as progress:
-            result = _refined(result, progress)
-    return result
-
-
-def _assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, np.ndarray]:
+def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, np.ndarray]:
     """Return a method's depth, confidence and cameras of the first clip; its intrinsics are of the pass `source`."""
     depth, confidence, camera_from_world, intrinsics = (np.array(x[0]) for x in jax.tree.leaves(assembly))
     fields = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
@@ -366,7 +289,8 @@ def _checked(masks: Bool[np.ndarray, "S H W"], clip: Clip) -> Bool[np.ndarray, "
     return masks
 
 
-def _refined(result: Reconstruction, progress: Callable[[int, int], object] | None) -> Reconstruction:
+def refined(result: Reconstruction, progress: Callable[[int, int], object] | None) -> Reconstruction:
+    """Return a result whose mask lacks what agrees with other frames, by its own depth and cameras."""
     mask = refine_masks(
         result.images / np.float32(255),
         result.depth,
@@ -402,7 +326,7 @@ def _stages(
         Stage("first pass", seen, ("first", "saliency"), _first_pass, network | {"gram": gram}),
         Stage("dynamic mask", ("saliency", "patch_tokens"), ("dynamic_mask",), _mine_mask, mining),
         Stage("second pass", (*seen, "dynamic_mask"), ("second",), _second_pass, network | masking),
-        Stage("assemble", ("first", "second", "saliency", "dynamic_mask"), ("assembly",), _assembled, making),
+        Stage("assemble", ("first", "second", "saliency", "dynamic_mask"), ("assembly",), assembled, making),
     ]
     return [stage for stage in stages if stage.name != "second pass" or row.needs_second_pass]
 

@@ -19,7 +19,7 @@ from vggtjax.errors import ClipError
 FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP", "PPM", "WEBP", "TGA", "JPEG2000", "AVIF", "HEIF")
 
 # What Pillow's decoders raise on broken files; its size limit is DecompressionBombError.
-_UNREADABLE = (
+UNREADABLE = (
     OSError,
     SyntaxError,
     ValueError,
@@ -74,7 +74,7 @@ def read_image(path: Path) -> Image.Image:
         raise ClipError(f"image {path} does not exist; check the path") from error
     except UnidentifiedImageError as error:
         raise ClipError(f"{path} is not an image of a known format; expected one of {', '.join(FORMATS)}") from error
-    except _UNREADABLE as error:
+    except UNREADABLE as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise ClipError(f"cannot read image {path}: {reason}; leave it out or write it anew") from error
 

@@ -214,7 +214,7 @@ class _Methods:
     ) -> None:
         from vggtjax.clips.preprocessing import Layout
         from vggtjax.methods import check_smooth_frames
-        from vggtjax.pipeline import groups_of_methods
+        from vggtjax.several_methods import groups_of_methods
 
         Layout(mode, size, model.config.patch_size)
         check_smooth_frames(options["smooth_frames"])
@@ -232,7 +232,7 @@ class _Methods:
 
     def make(self, names: Sequence[str], sequence: Frames, on_stage: OnStage) -> Mapping[str, Reconstruction]:
         from vggtjax.clips.clip import load_clip
-        from vggtjax.pipeline import reconstruct_methods
+        from vggtjax.several_methods import reconstruct_methods
 
         if self._last is None or self._last[0] is not sequence:
             paths = [str(path) for path in sequence.pictures]

@@ -201,7 +201,7 @@ def _build_scene(reconstruction: Reconstruction, least_confidence: float) -> tri
     static, dynamic = [], []
     for number in range(len(reconstruction.depth)):
         frame = frame_of(reconstruction, number)
-        sure = frame.valid & (frame.confidence >= least_confidence)
+        sure = frame.surer_than(least_confidence)
         static.append(point_cloud.frame_cloud(frame, sure & ~frame.dynamic_mask))
         dynamic.append(point_cloud.frame_cloud(frame, sure & frame.dynamic_mask))
     return build_scene(reconstruction, point_cloud.joined(static), dynamic)
@@ -236,7 +236,7 @@ def _write_frames(
 
     def write_frame(number: int, make: Callable[[], Frame]) -> tuple[_Written, PointCloud]:
         name, frame = f"{number:06d}", make()
-        valid, pixels = frame.valid, frame.valid & (frame.confidence >= least_confidence)
+        valid, pixels = frame.valid, frame.surer_than(least_confidence)
         np.save(folder / f"confidence/{name}.npy", frame.confidence, allow_pickle=False)
         np.save(folder / f"depth/{name}.npy", frame.depth, allow_pickle=False)
         _write_png(folder / f"depth/{name}.png", encode_depth(frame.depth, valid, scale), depth_scale=repr(scale))

@@ -34,6 +34,10 @@ class Frame(NamedTuple):
         """Pixels that show a point: seen, with a finite depth above 0 and a finite confidence."""
         return self.seen & np.isfinite(self.depth) & (self.depth > 0) & np.isfinite(self.confidence)
 
+    def surer_than(self, least_confidence: float) -> Bool[np.ndarray, "h w"]:
+        """Valid pixels of at least this confidence."""
+        return self.valid & (self.confidence >= least_confidence)
+
     def world_points(self, *, pixel_offset: float = 0.5) -> Float32[np.ndarray, "h w 3"]:
         """Lift every pixel to its point in the world; those of depth 0 are at the camera's centre."""
         intrinsics = self.intrinsics[None].astype(np.float32)

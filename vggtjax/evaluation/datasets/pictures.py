@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from PIL import Image
 
-from vggtjax.clips.images import known_formats
+from vggtjax.clips.images import UNREADABLE, known_formats
 from vggtjax.errors import InputError
 
 PNG = ("PNG",)
 _ORIENTATION = 0x0112  # EXIF; from 5 on, width and height change places
 _FIRST_TURNED = 5
-_BROKEN = (  # what Pillow raises on broken files
-    OSError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    IndexError,
-    KeyError,
-    RuntimeError,
-    EOFError,
-    OverflowError,
-    struct.error,
-    Image.DecompressionBombError,
-    Image.DecompressionBombWarning,
-)
+_BROKEN = (*UNREADABLE, Image.DecompressionBombWarning)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from tests.moving_ball import moving_ball
 from tests.tiny import tiny_config
 from vggtjax import init_params, load_clip, reconstruct
 from vggtjax.checkpoint import Model
-from vggtjax.pipeline import reconstruct_methods
+from vggtjax.several_methods import reconstruct_methods
 
 METHODS = ("4dvggt-d", "vggt", "vggt4d")
 

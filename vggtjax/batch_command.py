@@ -1,0 +1,90 @@
+"""What `vggtjax batch` does: many clips, with the time that is left."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from vggtjax.methods import MethodName
+from vggtjax.report import Report
+
+
+def batch(
+    sources: tyro.conf.Positional[tuple[str, ...]],
+    /,
+    out: Path,
+    *,
+    model: str = "demo",
+    method: MethodName = "4dvggt-d",
+    mode: Literal["crop", "pad"] = "crop",
+    size: int | None = None,
+    fps: float | None = None,
+    stride: int = 1,
+    start: int = 0,
+    max_frames: int | None = None,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+    confidence_percentile: float = 20.0,
+    resolution: Literal["model", "original"] = "model",
+    layout: Annotated[Literal["vggtjax", "vggt4d"], tyro.conf.arg(name="format")] = "vggtjax",
+) -> None:
+    """Reconstruct many clips, each into a folder of its own; run it again, and it goes on where it was interrupted.
+
+    Args:
+        sources: folders of images, or videos; or one folder of such.
+        out: folder for the results, one folder for each clip, named after it.
+        model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id.
+        method: which passes give depth and cameras.
+        mode: "crop" cuts tall frames, "pad" keeps every pixel and pads to a square.
+        size: side in pixels to run at; the model's own by default.
+        fps: frames per second to take of a video.
+        stride: take every stride-th frame.
+        start: index of the first frame to take.
+        max_frames: take so many frames at most.
+        dtype: of the blocks' matrix products.
+        confidence_percentile: leave so many percent of the pixels, the least confident, out of the point clouds.
+        resolution: of the files: the model's, or the source's own.
+        layout: "vggt4d" writes, beside our own files, the folder vggt4d/ as VGGT4D does.
+    """
+    report = Report()
+    with report.running():
+        from vggtjax.clips.sampling import Sampling
+        from vggtjax.clips.sources import clips_by_name
+        from vggtjax.results.point_cloud import check_percentile
+
+        Sampling(start, stride, fps, max_frames)
+        check_percentile(confidence_percentile)
+        named = clips_by_name(sources)
+        with report.stage("load model") as progress:
+            from vggtjax.checkpoint import load_model
+
+            loaded = load_model(model, progress=progress)
+        from vggtjax.batch import reconstruct_many
+
+        outcomes = reconstruct_many(
+            loaded,
+            named,
+            out,
+            mode=mode,
+            size=size,
+            sampling={"fps": fps, "stride": stride, "start": start, "max_frames": max_frames},
+            options={"method": method, "compute_dtype": dtype},
+            saving={"confidence_percentile": confidence_percentile, "resolution": resolution, "layout": layout},
+        )
+        found = []
+        with report.stage("clips") as progress:
+            started = time.perf_counter()
+            for outcome in outcomes:
+                found.append(outcome)
+                progress(len(found), len(named))
+                new = sum(one.status != "kept" for one in found)
+                left = (time.perf_counter() - started) / max(new, 1) * (len(named) - len(found))
+                reason = f" ({outcome.reason})" if outcome.reason else ""
+                report.note(f"{len(found)}/{len(named)} {outcome.name}: {outcome.status}{reason}, {left:.0f} s left")
+    counts = {status: sum(outcome.status == status for outcome in found) for status in ("done", "kept", "failed")}
+    report.table({"clips": len(found), **counts, "results": f"{out}/"})
+    for outcome in found:
+        if outcome.status == "failed":
+            report.line(f"{outcome.name} failed: {outcome.reason}")
