@@ -85,6 +85,20 @@ def test_names_that_are_no_folders(model, tmp_path, name):
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"size": 50}, "size is 50"),
+        ({"sampling": {"stride": 0}}, "stride is 0"),
+        ({"options": {"method": "best"}}, "unknown method 'best'"),
+    ],
+)
+def test_what_is_wrong_for_all_clips_is_said_once(model, clips, tmp_path, wrong, message):
+    with pytest.raises(InputError, match=message):
+        next(reconstruct_many(model, {"a": str(clips / "clip0")}, tmp_path, **wrong))
+    assert not any(tmp_path.iterdir())
+
+
 def test_what_is_no_clip(clips, tmp_path):
     with pytest.raises(ClipError, match="is no clip and holds none"):
         clips_by_name([str(tmp_path)])

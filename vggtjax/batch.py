@@ -11,10 +11,12 @@ from typing import Any, Literal, NamedTuple
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, load_clip
-from vggtjax.clips.preprocessing import Mode
+from vggtjax.clips.preprocessing import Layout, Mode
+from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource
 from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.files import writing
+from vggtjax.methods import find_method
 from vggtjax.pipeline import reconstruct
 from vggtjax.results.reconstruction import ARCHIVE_NAME, is_result
 
@@ -57,7 +59,8 @@ def reconstruct_many(
         saving: keywords of `Reconstruction.save`, but for pictures, which are the clips' own where it wants them.
 
     Raises:
-        InputError: names that are no plain file names, or a folder with results of other settings.
+        InputError: names that are no plain file names, a size, sampling or method that is none, or a folder with
+            results of other settings.
         OutputError: the folder cannot be written.
     """
     out = Path(out)
@@ -65,7 +68,10 @@ def reconstruct_many(
         if name in ("", ".", "..") or Path(name).name != name or not name.isprintable():
             raise InputError(f"a clip is named {name!r}; expected a plain name, that of its folder")
     size = model.config.image_size if size is None else size
+    Layout(mode, size, model.config.patch_size)  # what is wrong for all clips is said once, and before any
     sampling, options, saving = dict(sampling or {}), dict(options or {}), dict(saving or {})
+    Sampling(**sampling)
+    find_method(options.get("method", "4dvggt-d"))
     _settle(out, {"model": model.name, "mode": mode, "size": size, **sampling, **options, **saving})
 
     def load(name: str) -> Clip:

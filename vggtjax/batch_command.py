@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from vggtjax.errors import InputError
 from vggtjax.methods import MethodName
 from vggtjax.report import Report
 
@@ -88,3 +89,5 @@ def batch(
     for outcome in found:
         if outcome.status == "failed":
             report.line(f"{outcome.name} failed: {outcome.reason}")
+    if counts["failed"] == len(found):
+        raise InputError("none of the clips could be reconstructed; the reasons are above")
