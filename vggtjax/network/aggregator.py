@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.motion import GramCues
 from vggtjax.network.attention import Suppression
-from vggtjax.network.layers import Block, Params, apply, declare_stacked
+from vggtjax.network.block import Block
+from vggtjax.network.layers import Params
 from vggtjax.network.precision import full_precision
 from vggtjax.network.rope import rope_table
 
@@ -58,8 +59,7 @@ def aggregate(
     T = SPECIAL_TOKENS + P
     block = _block(config, compute_dtype)
     head_dim = C // config.num_heads
-    frame_rope = rope_table(grid, SPECIAL_TOKENS, head_dim)
-    global_rope = rope_table(grid, SPECIAL_TOKENS, head_dim, repeats=S)
+    rope = rope_table(grid, SPECIAL_TOKENS, head_dim)
 
     def suppression(active: Bool[Array, ""], rows: int) -> Suppression | None:
         if dynamic_tokens is None:
@@ -70,9 +70,9 @@ def aggregate(
     def pair(carry, layer):
         x, _, taps, sums = carry
         frame_params, global_params, masked, tapped, cued = layer
-        x, _, _ = apply(block, frame_params, x.reshape(B * S, T, C), frame_rope, suppression(masked, B * S))
+        x, _, _ = block(frame_params, x.reshape(B * S, T, C), rope, suppression(masked, B * S))
         frame = x
-        x, q, k = apply(block, global_params, x.reshape(B, S * T, C), global_rope, suppression(masked, B))
+        x, q, k = block(global_params, x.reshape(B, S * T, C), rope, suppression(masked, B))
         if cues is not None:
             sums = cues.add(sums, cued, *(_patches(a, B, S, T) for a in (q, k)))
         taps = tuple(
@@ -102,7 +102,7 @@ def aggregate(
 def declare_aggregator(config: VGGTConfig) -> Params:
     """Declare the parameters of the aggregator."""
     C = config.embed_dim
-    blocks = declare_stacked(_block(config), config.depth, jnp.zeros((1, 1, C)))
+    blocks = _block(config).declare_stacked(config.depth, C)
     return {
         "camera_token": jnp.zeros((2, 1, C)),
         "register_tokens": jnp.zeros((2, REGISTERS, C)),

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtjax.config import Suppress
 
-QUERIES_AT_ONCE = 512
+QUERIES_AT_ONCE = 800
 LOGITS_AT_ONCE = 320**2  # queries times keys of a head up to which all heads go at once on a CPU
 
 

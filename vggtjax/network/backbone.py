@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.layers import Block, LayerNorm, Params, apply, declare, declare_stacked
+from vggtjax.network.block import Block
+from vggtjax.network.layers import LayerNorm, Params, apply, declare
 from vggtjax.network.precision import full_precision
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
@@ -49,7 +50,7 @@ def encode(
     special = jnp.broadcast_to(special.astype(jnp.float32), (B * S, *special.shape))
     x = jnp.concatenate([special, x], axis=1)  # [B*S, 1 + R + P, C]
     block = _block(config, compute_dtype)
-    x, _ = jax.lax.scan(lambda x, layer: (apply(block, layer, x)[0], None), x, params["blocks"])
+    x, _ = jax.lax.scan(lambda x, layer: (block(layer, x)[0], None), x, params["blocks"])
     x = apply(LayerNorm(_EPSILON), params["norm"], x)
     return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
 
@@ -74,7 +75,7 @@ def declare_backbone(config: VGGTConfig) -> Params:
         "class_token": jnp.zeros((1, C)),
         "register_tokens": jnp.zeros((REGISTERS, C)),
         "position_embedding": jnp.zeros((1 + config.grid_size**2, C)),
-        "blocks": declare_stacked(_block(config), config.dino_depth, x),
+        "blocks": _block(config).declare_stacked(config.dino_depth, C),
         "norm": declare(LayerNorm(), x),
     }
 

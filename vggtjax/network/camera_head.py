@@ -8,7 +8,8 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.layers import MLP, Block, LayerNorm, Params, apply, declare, declare_stacked
+from vggtjax.network.block import Block
+from vggtjax.network.layers import MLP, LayerNorm, Params, apply, declare
 from vggtjax.network.pose import POSE_SIZE
 from vggtjax.network.precision import full_precision
 
@@ -40,7 +41,7 @@ def predict_pose(
         modulation = apply(nn.Dense(3 * E), params["modulation"], nn.silu(embedded))
         shift, scale, gate = jnp.split(modulation, 3, axis=-1)
         x = tokens + gate * (normed * (1 + scale) + shift)
-        x, _ = jax.lax.scan(lambda x, layer: (apply(block, layer, x)[0], None), x, params["trunk"])
+        x, _ = jax.lax.scan(lambda x, layer: (block(layer, x)[0], None), x, params["trunk"])
         x = apply(LayerNorm(), params["trunk_norm"], x)
         pose = pose + apply(_branch(config), params["pose_branch"], x)
         return (pose, jax.lax.stop_gradient(pose) if stop_gradient else pose), None
@@ -58,7 +59,7 @@ def declare_camera_head(config: VGGTConfig) -> Params:
         "empty_pose": pose,
         "pose_embedding": declare(nn.Dense(E), pose),
         "modulation": declare(nn.Dense(3 * E), x),
-        "trunk": declare_stacked(Block(config.camera_num_heads), config.camera_depth, x),
+        "trunk": Block(config.camera_num_heads).declare_stacked(config.camera_depth, E),
         "trunk_norm": declare(LayerNorm(), x),
         "pose_branch": declare(_branch(config), x),
     }

@@ -18,10 +18,10 @@ class Rope(NamedTuple):
     sin: Float[Array, "T D"]
 
 
-def rope_table(grid: tuple[int, int], special_tokens: int, head_dim: int, repeats: int = 1) -> Rope:
+def rope_table(grid: tuple[int, int], special_tokens: int, head_dim: int) -> Rope:
     """Return the angles of `special_tokens` tokens at position 0 followed by a grid of patches counted from 1.
 
-    The first half of a head turns with y, the second with x. `repeats` tiles the table, for several frames.
+    The first half of a head turns with y, the second with x.
     """
     rows, columns = grid
     y, x = np.meshgrid(np.arange(1, rows + 1), np.arange(1, columns + 1), indexing="ij")
@@ -31,14 +31,13 @@ def rope_table(grid: tuple[int, int], special_tokens: int, head_dim: int, repeat
     frequencies = (1.0 / BASE ** (np.arange(0, half, 2, dtype=np.float32) / half)).astype(np.float32)
     angles = positions.astype(np.float32)[:, :, None] * frequencies  # [T, 2, D/4]
     angles = np.concatenate([angles, angles], axis=-1).reshape(len(positions), head_dim)
-    angles = np.tile(angles, (repeats, 1))
     return Rope(jnp.asarray(np.cos(angles)), jnp.asarray(np.sin(angles)))
 
 
-def apply_rope(x: Float[Array, "B T N D"], rope: Rope) -> Float[Array, "B T N D"]:
+def apply_rope(x: Float[Array, "T N D"], rope: Rope) -> Float[Array, "T N D"]:
     """Rotate the halves of each of the two sub-vectors (y, x) of every head by the token's angles."""
     parts = x.reshape(*x.shape[:-1], 2, 2, x.shape[-1] // 4)
     rotated = jnp.stack([-parts[..., 1, :], parts[..., 0, :]], axis=-2).reshape(x.shape)
-    cos = rope.cos[None, :, None, :].astype(x.dtype)
-    sin = rope.sin[None, :, None, :].astype(x.dtype)
+    cos = rope.cos[:, None, :].astype(x.dtype)
+    sin = rope.sin[:, None, :].astype(x.dtype)
     return x * cos + rotated * sin

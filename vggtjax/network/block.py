@@ -1,0 +1,98 @@
+"""The transformer block: attention and MLP, pre-norm, with LayerScale (DINOv2, VGGT)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from jaxtyping import Array, Float
+
+from vggtjax.network.attention import Suppression, suppressed_attention
+from vggtjax.network.layers import MLP, DType, LayerNorm, Params, apply, declare
+from vggtjax.network.pieces import in_pieces
+from vggtjax.network.rope import Rope, apply_rope
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block as a function of its parameters. The residual stream keeps the input's dtype.
+
+    Only attention looks at several tokens; what comes before and after it runs over pieces of them.
+    """
+
+    num_heads: int
+    qk_norm: bool = False
+    epsilon: float = 1e-5
+    dtype: DType = jnp.float32
+
+    def __call__(
+        self,
+        params: Params,
+        x: Float[Array, "B L C"],
+        rope: Rope | None = None,
+        suppression: Suppression | None = None,
+    ) -> tuple[Float[Array, "B L C"], Float[Array, "B L N D"], Float[Array, "B L N D"]]:
+        """Return the tokens after the block, and q and k after norm and rotation, which the motion cues read.
+
+        Args:
+            params: what `declare` declares.
+            x: B sequences of L tokens.
+            rope: the angles of T tokens, where L is a multiple of T; or None.
+            suppression: the keys to suppress, or None.
+        """
+        B, L, C = x.shape
+        heads = (self.num_heads, C // self.num_heads)
+        tokens = x.reshape(B * L, C)
+
+        def before(rows):
+            x, place = rows
+            y = apply(LayerNorm(self.epsilon, dtype=self.dtype), params["norm1"], x)
+            y = apply(nn.Dense(3 * C, dtype=self.dtype), params["attention"]["qkv"], y).reshape(-1, 3, *heads)
+            q, k, v = (y[:, i] for i in range(3))  # [R, N, D]
+            if self.qk_norm:
+                q = apply(LayerNorm(dtype=self.dtype), params["attention"]["q_norm"], q)
+                k = apply(LayerNorm(dtype=self.dtype), params["attention"]["k_norm"], k)
+            if rope is not None:
+                angles = Rope(rope.cos[place], rope.sin[place])
+                q, k = apply_rope(q, angles), apply_rope(k, angles)
+            return q, k, v
+
+        def after(rows):
+            x, y = rows
+            y = apply(nn.Dense(C, dtype=self.dtype), params["attention"]["projection"], y)
+            x = add(x, "scale1", y)
+            y = apply(LayerNorm(self.epsilon, dtype=self.dtype), params["norm2"], x)
+            return add(x, "scale2", apply(MLP(4 * C, C, self.dtype), params["mlp"], y))
+
+        def add(x, scale, y):
+            return x + params[scale].astype(x.dtype)[None, :] * y.astype(x.dtype)
+
+        place = jnp.arange(B * L) % (L if rope is None else rope.cos.shape[0])
+        q, k, v = (y.reshape(B, L, *heads) for y in in_pieces(before, (tokens, place)))
+        y = suppressed_attention(q, k, v, suppression).reshape(B * L, C)
+        return in_pieces(after, (tokens, y)).reshape(B, L, C), q, k
+
+    def declare(self, C: int) -> Params:
+        """Declare the parameters of a block for tokens of C channels."""
+
+        def declared(module: nn.Module, channels: int) -> Params:
+            return declare(module, jnp.zeros((1, channels)))
+
+        attention = {"qkv": declared(nn.Dense(3 * C), C), "projection": declared(nn.Dense(C), C)}
+        if self.qk_norm:
+            norm = declared(LayerNorm(), C // self.num_heads)
+            attention |= {"q_norm": norm, "k_norm": norm}
+        return {
+            "norm1": declared(LayerNorm(), C),
+            "attention": attention,
+            "scale1": jnp.ones(C),
+            "norm2": declared(LayerNorm(), C),
+            "mlp": declared(MLP(4 * C, C), C),
+            "scale2": jnp.ones(C),
+        }
+
+    def declare_stacked(self, depth: int, C: int) -> Params:
+        """Declare the parameters of `depth` blocks, stacked on axis 0."""
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (depth, *leaf.shape)), self.declare(C))
