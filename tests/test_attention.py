@@ -25,7 +25,7 @@ def test_equals_the_formula(monkeypatch, implementation, masked, at_once):
     q, k, v = (generator.normal(size=(2, 11, 3, 8)).astype(np.float32) for _ in range(3))
     kept = generator.random((2, 11)) < 0.6 if masked else np.ones((2, 11), bool)
     with jax.default_matmul_precision("highest"):
-        made = implementation(q, k, v, kept if masked else None)
+        made = implementation(*map(jnp.asarray, (q, k, v)), kept if masked else None)
     assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
 
 
@@ -49,7 +49,9 @@ def test_the_gradient_is_that_of_jaxs_own_attention(monkeypatch, at_once, masked
     kept = generator.random((2, 11)) < 0.6 if masked else None
 
     def gradient(implementation):
-        return jax.grad(lambda *x: (implementation(*x, kept) * weight).sum(), argnums=(0, 1, 2))(q, k, v)
+        return jax.grad(lambda *x: (implementation(*x, kept) * weight).sum(), argnums=(0, 1, 2))(
+            *map(jnp.asarray, (q, k, v))
+        )
 
     with jax.default_matmul_precision("highest"):
         for made, expected in zip(gradient(attention._in_chunks), gradient(attention._at_once), strict=True):

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from vggtjax.config import Cue, Gram, MotionConfig
 
+FRAMES_AT_ONCE = 4
 _EPSILON = 1e-6
 
 Sums = tuple[Array, ...]
@@ -38,27 +39,51 @@ class GramCues:
         return tuple(jnp.zeros((B, S, P) + (P,) * self._keeps_gram(cue)) for cue in self.motion.cues)
 
     def add(
-        self, sums: Sums, counts: Int[Array, " cues"], q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
+        self,
+        sums: Sums,
+        counts: Int[Array, " cues"],
+        q: Float[Array, "B S T N D"],
+        k: Float[Array, "B S T N D"],
+        frame_count: Int[Array, " B"] | None = None,
     ) -> Sums:
-        """Add one pair's q and k (after norm and rotation) to the cues whose layers it belongs to."""
-        q, k = (x.astype(jnp.float32) for x in (q, k))
-        weights = jnp.asarray(source_weights(q.shape[1], self.motion.offsets))
+        """Add one pair's q and k (after norm and rotation) to the cues whose layers it belongs to.
+
+        The patches are the last tokens of a frame; what comes before them is left out. Of clips with a `frame_count`
+        only the first so many frames are sources, and each of them must have one at the offsets.
+        """
+        B, S = q.shape[:2]
+        index, weights = sources(S, self.motion.offsets)
+        weights = jnp.broadcast_to(weights, (B, *weights.shape))
+        if frame_count is not None:
+            weights = jnp.where(index[None] < frame_count[:, None, None], weights, 0)
+            weights = weights / jnp.maximum(weights.sum(axis=-1, keepdims=True), _EPSILON)
 
         def added(cue: Cue):
-            def one_frame(rows, columns):
-                if cue.statistic == "mean":
-                    return _mean_similarity(rows, columns)
-                gram = _similarities(rows, columns)
-                return gram if self._keeps_gram(cue) else _sample_std(gram)
+            def vectors(x: Float[Array, "... T N D"]) -> Float[Array, "... P N D"]:
+                patches = x[..., -sums[0].shape[2] :, :, :].astype(jnp.float32)
+                return _unit(patches) if self.gram == "cosine" else patches
+
+            def one_clip(
+                rows: Float[Array, "S T N D"], columns: Float[Array, "S T N D"], weights: Float[Array, "S m"]
+            ) -> Float[Array, "S ..."]:
+                def mean_similarity(frame):
+                    row, index, weights = frame
+                    return _mean_similarity(vectors(row), jnp.einsum("m,mnd->nd", weights, means[index]))
+
+                def deviation(frame):
+                    row, index, weights = frame
+                    gram = _similarities(vectors(row), jnp.einsum("m,mpnd->pnd", weights, vectors(columns[index])))
+                    return gram if self._keeps_gram(cue) else _sample_std(gram)
+
+                frames = (rows, index, weights)
+                if cue.statistic == "std":
+                    return _over_frames(deviation, frames)
+                means = _over_frames(lambda column: vectors(column).mean(axis=0), columns)  # [S, N, D]
+                return _over_frames(mean_similarity, frames)
 
             def branch(total, count, q, k):
                 rows, columns = ({"q": q, "k": k}[name] for name in (cue.rows, cue.columns))
-                if self.gram == "cosine":
-                    rows, columns = _unit(rows), _unit(columns)
-                if cue.statistic == "mean":
-                    columns = columns.mean(axis=2)  # [B, S, N, D]
-                columns = jnp.einsum("rs,bs...->br...", weights, columns)  # averaged over each frame's sources
-                return total + count * jax.vmap(jax.vmap(one_frame))(rows, columns)
+                return total + count * jax.vmap(one_clip)(rows, columns, weights)
 
             return branch
 
@@ -95,16 +120,23 @@ class GramCues:
         return cue.statistic == "std" and len(set(self._layers(cue))) > 1
 
 
-def source_weights(S: int, offsets: tuple[int, ...]) -> np.ndarray:
-    """Return float32 [S, S]: row r averages the source frames r + offset that exist.
+def sources(S: int, offsets: tuple[int, ...]) -> tuple[Int[np.ndarray, "S m"], Float[np.ndarray, "S m"]]:
+    """Return the source frames of every frame and their weights: the mean over the frames r + offset that exist.
 
-    A frame for which none exists (as in clips of one to three frames) is compared with every other frame.
+    A frame for which none exists (as in clips of one to three frames) is compared with every other frame. Where a frame
+    has fewer sources than others, it is listed itself, with weight 0.
     """
-    weights = np.zeros((S, S), np.float32)
-    for r in range(S):
-        sources = [r + offset for offset in offsets if 0 <= r + offset < S] or [s for s in range(S) if s != r]
-        weights[r, sources] = 1 / max(len(sources), 1)
-    return weights
+    rows = [[r + offset for offset in offsets if 0 <= r + offset < S] for r in range(S)]
+    rows = [row or [s for s in range(S) if s != r] for r, row in enumerate(rows)]
+    most = max(1, *map(len, rows))
+    index = np.array([row + [r] * (most - len(row)) for r, row in enumerate(rows)])
+    weights = np.array([[1 / max(len(row), 1)] * len(row) + [0] * (most - len(row)) for row in rows], np.float32)
+    return index, weights
+
+
+def _over_frames(function, frames):
+    """Map a function over frames, a few of them vectorised at a time: a clip's worth of what it needs is much."""
+    return jax.lax.map(function, frames, batch_size=FRAMES_AT_ONCE)
 
 
 def normalise(values: Float[Array, "B S P"]) -> Float[Array, "B S P"]:

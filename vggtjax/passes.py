@@ -64,9 +64,13 @@ def first_pass(
     motion: MotionConfig | None = None,
     outputs: tuple[str, ...] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
+    frame_count: Int[Array, " B"] | None = None,
     compute_dtype: str = "float32",
 ) -> tuple[Predictions, Float[Array, "B S h w"]]:
-    """Run the plain pass and mine the motion saliency on the way; with `query_points`, track them too."""
+    """Run the plain pass and mine the motion saliency on the way; with `query_points`, track them too.
+
+    Of clips with a `frame_count` only the first so many frames mean anything.
+    """
     if gram not in ("cosine", "dot"):
         raise InputError(f"gram is {gram!r}; expected 'cosine' or 'dot'")
     cues = GramCues(motion or config.motion, config.depth, gram)
@@ -77,6 +81,7 @@ def first_pass(
         patch_tokens=patch_tokens,
         outputs=outputs if query_points is None else (*outputs, "tracks"),
         query_points=query_points,
+        frame_count=frame_count,
         cues=cues,
         compute_dtype=compute_dtype,
     )
@@ -94,9 +99,14 @@ def second_pass(
     *,
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
+    outputs: tuple[str, ...] = ("camera", "depth"),
+    frame_count: Int[Array, " B"] | None = None,
     compute_dtype: str = "float32",
 ) -> Predictions:
-    """Run the mask-aware pass: the keys of dynamic tokens suppressed in the first `mask_pairs` pairs."""
+    """Run the mask-aware pass: the keys of dynamic tokens suppressed in the first `mask_pairs` pairs.
+
+    Of clips with a `frame_count` only the first so many frames mean anything.
+    """
     return forward(
         params,
         images,
@@ -105,6 +115,8 @@ def second_pass(
         dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size),
         suppress=suppress,
         mask_pairs=mask_pairs,
+        outputs=outputs,
+        frame_count=frame_count,
         compute_dtype=compute_dtype,
     )
 

@@ -8,15 +8,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.motion import GramCues
-from vggtjax.network.attention import Suppression
 from vggtjax.network.block import Block
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import full_precision
 from vggtjax.network.rope import rope_table
+from vggtjax.network.suppression import Suppression
 
 REGISTERS = 4
 SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
@@ -38,6 +38,7 @@ def aggregate(
     *,
     captures: Sequence[Capture],
     cues: GramCues | None = None,
+    frame_count: Int[Array, " B"] | None = None,
     dynamic_tokens: Bool[Array, "B S h w"] | None = None,
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
@@ -52,6 +53,7 @@ def aggregate(
         captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Nothing
             else of the tapped pairs is stored, and nothing at all of the others.
         cues: the Gram cues to accumulate from q and k of the global blocks, or None.
+        frame_count: number of frames of each clip that are real, its first ones; the others change nothing in them.
         dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs, in both blocks of a pair.
     """
     params = params["aggregator"]
@@ -60,6 +62,8 @@ def aggregate(
     block = _block(config, compute_dtype)
     head_dim = C // config.num_heads
     rope = rope_table(grid, SPECIAL_TOKENS, head_dim)
+
+    there = None if frame_count is None else jnp.repeat(jnp.arange(S)[None] < frame_count[:, None], T, axis=1)
 
     def suppression(active: Bool[Array, ""], rows: int) -> Suppression | None:
         if dynamic_tokens is None:
@@ -72,9 +76,9 @@ def aggregate(
         frame_params, global_params, masked, tapped, cued = layer
         x, _, _ = block(frame_params, x.reshape(B * S, T, C), rope, suppression(masked, B * S))
         frame = x
-        x, q, k = block(global_params, x.reshape(B, S * T, C), rope, suppression(masked, B))
+        x, q, k = block(global_params, x.reshape(B, S * T, C), rope, suppression(masked, B), there)
         if cues is not None:
-            sums = cues.add(sums, cued, *(_patches(a, B, S, T) for a in (q, k)))
+            sums = cues.add(sums, cued, *(a.reshape(B, S, T, *a.shape[2:]) for a in (q, k)), frame_count)
         taps = tuple(
             jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
             for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
@@ -121,10 +125,6 @@ def _tokens(params: Params, patch_tokens: Float[Array, "B S P C"]) -> Float[Arra
     special = jnp.concatenate([params["camera_token"], params["register_tokens"]], axis=1)  # [2, 5, C]
     special = special.astype(patch_tokens.dtype)[(np.arange(S) > 0).astype(int)]  # [S, 5, C]
     return jnp.concatenate([jnp.broadcast_to(special, (B, S, SPECIAL_TOKENS, C)), patch_tokens], axis=2)
-
-
-def _patches(x: Float[Array, "B ST N D"], B: int, S: int, T: int) -> Float[Array, "B S P N D"]:
-    return x.reshape(B, S, T, *x.shape[2:])[:, :, SPECIAL_TOKENS:]
 
 
 def _captured(capture: Capture, shape: tuple[int, int, int, int]) -> Callable:

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
-from vggtjax.network.attention import Suppression, suppressed_attention
 from vggtjax.network.layers import MLP, DType, LayerNorm, Params, apply, declare
-from vggtjax.network.pieces import in_pieces
+from vggtjax.network.pieces import in_pieces, replaced_in_pieces
 from vggtjax.network.rope import Rope, apply_rope
+from vggtjax.network.suppression import Suppression, suppressed_attention
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class Block:
         x: Float[Array, "B L C"],
         rope: Rope | None = None,
         suppression: Suppression | None = None,
+        present: Bool[Array, "B L"] | None = None,
     ) -> tuple[Float[Array, "B L C"], Float[Array, "B L N D"], Float[Array, "B L N D"]]:
         """Return the tokens after the block, and q and k after norm and rotation, which the motion cues read.
 
@@ -41,6 +42,7 @@ class Block:
             x: B sequences of L tokens.
             rope: the angles of T tokens, where L is a multiple of T; or None.
             suppression: the keys to suppress, or None.
+            present: tokens that others may look at; None for all.
         """
         B, L, C = x.shape
         heads = (self.num_heads, C // self.num_heads)
@@ -59,8 +61,7 @@ class Block:
                 q, k = apply_rope(q, angles), apply_rope(k, angles)
             return q, k, v
 
-        def after(rows):
-            x, y = rows
+        def after(x, y):
             y = apply(nn.Dense(C, dtype=self.dtype), params["attention"]["projection"], y)
             x = add(x, "scale1", y)
             y = apply(LayerNorm(self.epsilon, dtype=self.dtype), params["norm2"], x)
@@ -71,8 +72,8 @@ class Block:
 
         place = jnp.arange(B * L) % (L if rope is None else rope.cos.shape[0])
         q, k, v = (y.reshape(B, L, *heads) for y in in_pieces(before, (tokens, place)))
-        y = suppressed_attention(q, k, v, suppression).reshape(B * L, C)
-        return in_pieces(after, (tokens, y)).reshape(B, L, C), q, k
+        y = suppressed_attention(q, k, v, suppression, present).reshape(B * L, C)
+        return replaced_in_pieces(after, tokens, y).reshape(B, L, C), q, k
 
     def declare(self, C: int) -> Params:
         """Declare the parameters of a block for tokens of C channels."""

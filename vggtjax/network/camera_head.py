@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.block import Block
@@ -18,7 +18,12 @@ ITERATIONS = 4
 
 @full_precision
 def predict_pose(
-    params: Params, camera_tokens: Float[Array, "B S E"], config: VGGTConfig, *, stop_gradient: bool = True
+    params: Params,
+    camera_tokens: Float[Array, "B S E"],
+    config: VGGTConfig,
+    *,
+    frame_count: Int[Array, " B"] | None = None,
+    stop_gradient: bool = True,
 ) -> Float[Array, "B S 9"]:
     """Return the pose encoding [t(3), quaternion xyzw(4), fov_h, fov_w] of every frame.
 
@@ -26,6 +31,7 @@ def predict_pose(
         params: the model's parameter tree (`camera_head` is read).
         camera_tokens: token 0 of every frame after the last pair, E = 2C.
         config: the model's configuration.
+        frame_count: number of frames of each clip that are real, its first ones; None for all.
         stop_gradient: whether each iteration sees the previous estimate as a constant, as in VGGT's training.
     """
     params = params["camera_head"]
@@ -33,6 +39,7 @@ def predict_pose(
     block = Block(config.camera_num_heads)
     tokens = apply(LayerNorm(), params["token_norm"], camera_tokens)
     normed = apply(LayerNorm(1e-6, use_bias=False, use_scale=False), {}, tokens)
+    there = None if frame_count is None else jnp.arange(tokens.shape[1])[None] < frame_count[:, None]
     empty = jnp.broadcast_to(params["empty_pose"], (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
 
     def iteration(estimates, _):
@@ -41,7 +48,7 @@ def predict_pose(
         modulation = apply(nn.Dense(3 * E), params["modulation"], nn.silu(embedded))
         shift, scale, gate = jnp.split(modulation, 3, axis=-1)
         x = tokens + gate * (normed * (1 + scale) + shift)
-        x, _ = jax.lax.scan(lambda x, layer: (block(layer, x)[0], None), x, params["trunk"])
+        x, _ = jax.lax.scan(lambda x, layer: (block(layer, x, present=there)[0], None), x, params["trunk"])
         x = apply(LayerNorm(), params["trunk_norm"], x)
         pose = pose + apply(_branch(config), params["pose_branch"], x)
         return (pose, jax.lax.stop_gradient(pose) if stop_gradient else pose), None

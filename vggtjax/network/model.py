@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import HEAD_NAMES, Suppress, VGGTConfig
 from vggtjax.errors import InputError
@@ -47,6 +47,7 @@ def forward(
     config: VGGTConfig,
     *,
     patch_tokens: Float[Array, "B S P C"] | None = None,
+    frame_count: Int[Array, " B"] | None = None,
     dynamic_tokens: Bool[Array, "B S h w"] | None = None,
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
@@ -65,6 +66,9 @@ def forward(
         images: RGB in [0, 1], any number of frames; H and W are multiples of the patch size.
         config: the model's configuration (static under jit).
         patch_tokens: what `encode` returned for these images; computed here if None.
+        frame_count: for clips of different lengths in one batch: how many of a clip's frames are real, its first ones.
+            The others change nothing in them, whatever they show. Not with "tracks"; and with `cues`, every real frame
+            must have a source at the cues' offsets (four frames do by default).
         dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs; None for the plain pass.
         suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value leave the softmax, VGGT4D).
         mask_pairs: number of pairs in which keys are suppressed (L_mask of the paper).
@@ -79,7 +83,7 @@ def forward(
     """
     grid = patch_grid(images, config)
     _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pairs, outputs, compute_dtype)
-    _check_queries(images, config, outputs, query_points)
+    _check_queries(images, config, outputs, query_points, frame_count)
     if patch_tokens is None:
         patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
     dense = [name for name in outputs if name in DENSE_HEADS]
@@ -99,6 +103,7 @@ def forward(
         grid,
         captures=[capture(slot) for slot in range(len(config.taps))],
         cues=cues,
+        frame_count=frame_count,
         dynamic_tokens=dynamic_tokens,
         suppress=suppress,
         mask_pairs=mask_pairs,
@@ -106,7 +111,9 @@ def forward(
     )
     found: dict[str, Any] = {"cue_sums": sums}
     if "camera" in outputs:
-        found["pose_encoding"] = predict_pose(params, camera_tokens, config, stop_gradient=stop_camera_gradient)
+        found["pose_encoding"] = predict_pose(
+            params, camera_tokens, config, frame_count=frame_count, stop_gradient=stop_camera_gradient
+        )
     for name in dense:
         head = DENSE_HEADS[name]
         values, confidence = predict_dense(params[head], [tap[head] for tap in taps], config, grid, name)
@@ -200,12 +207,14 @@ def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pa
         raise InputError(f"compute_dtype is {compute_dtype!r}; expected 'float32' or 'bfloat16'")
 
 
-def _check_queries(images, config: VGGTConfig, outputs: Sequence[str], query_points) -> None:
+def _check_queries(images, config: VGGTConfig, outputs: Sequence[str], query_points, frame_count) -> None:
     B, _, H, W, _ = images.shape
     if ("tracks" in outputs) != (query_points is not None):
         raise InputError("query_points and 'tracks' in outputs go together; give both or neither")
     if query_points is None:
         return
+    if frame_count is not None:
+        raise InputError("frame_count and query_points are given; tracks are of clips whose frames are all real")
     if len(query_points.shape) != 3 or query_points.shape[0] != B or query_points.shape[2] != 2:
         raise InputError(f"query_points have shape {tuple(query_points.shape)}; expected {(B, 'Q', 2)}")
     if query_points.shape[1] < 1:

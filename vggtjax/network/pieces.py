@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 ROWS_ON_CPU = 1600  # the hidden rows of an MLP (26 MB for VGGT) stay in the cache, and products are at their fastest
 ROWS_ELSEWHERE = 2**15
@@ -21,30 +22,65 @@ def in_pieces(function: Callable[[_Rows], _Made], rows: _Rows) -> _Made:
     The function must treat every row by itself. Few rows go in one call, without a loop.
     """
 
-    def mapped(most: int) -> Callable[[_Rows], _Made]:
-        return lambda rows: _mapped(function, rows, most)
+    def at_most(most: int) -> Callable[[_Rows], _Made]:
+        def made(rows):
+            if (size := piece_size(_count(rows), most)) is None:
+                return function(rows)
+            made = jax.lax.map(function, _cut(rows, size))
+            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: _count(rows)], made)
 
-    return jax.lax.platform_dependent(rows, cpu=mapped(ROWS_ON_CPU), default=mapped(ROWS_ELSEWHERE))
+        return made
+
+    return _by_platform(at_most, rows)
 
 
-def _mapped(function, rows, most: int):
-    count = jax.tree.leaves(rows)[0].shape[0]
+def replaced_in_pieces(
+    function: Callable[[Float[Array, "r C"], _Rows], Float[Array, "r C"]], x: Float[Array, "R C"], others: _Rows
+) -> Float[Array, "R C"]:
+    """Return `function(x, others)` as `in_pieces` does; each piece takes the place of what it was made of."""
+
+    def at_most(most: int):
+        def made(rows):
+            if (size := piece_size(len(x), most)) is None:
+                return function(*rows)
+            pieces, others = _cut(rows, size)
+
+            def step(pieces, index_and_others):
+                index, others = index_and_others
+                return pieces.at[index].set(function(pieces[index], others)), None
+
+            pieces, _ = jax.lax.scan(step, pieces, (jnp.arange(len(pieces)), others))
+            return pieces.reshape(-1, x.shape[1])[: len(x)]
+
+        return made
+
+    return _by_platform(at_most, (x, others))
+
+
+def piece_size(count: int, most: int) -> int | None:
+    """Return the size of equal pieces of `count` rows, or None if they need not be cut.
+
+    A divisor between `most` / 3 and `most`, which spares a padded copy, or else the size of the fewest pieces.
+    """
     if count <= most:
-        return function(rows)
-    size = piece_size(count, most)
-    padding = -count % size
-
-    def cut(x):
-        x = jnp.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1))) if padding else x
-        return x.reshape(-1, size, *x.shape[1:])
-
-    made = jax.lax.map(function, jax.tree.map(cut, rows))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], made)
-
-
-def piece_size(count: int, most: int) -> int:
-    """Return the size of equal pieces of `count` rows: a divisor between `most` / 3 and `most`, which spares a padded
-    copy, or else the size of the fewest pieces."""
+        return None
     fewest = -(-count // most)
     divisors = (count // n for n in range(fewest, 3 * fewest + 1) if count % n == 0)
     return next(divisors, -(-count // fewest))
+
+
+def _by_platform(at_most, rows):
+    return jax.lax.platform_dependent(rows, cpu=at_most(ROWS_ON_CPU), default=at_most(ROWS_ELSEWHERE))
+
+
+def _count(rows) -> int:
+    return jax.tree.leaves(rows)[0].shape[0]
+
+
+def _cut(rows, size: int):
+    def cut(x):
+        padding = -x.shape[0] % size
+        x = jnp.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1))) if padding else x
+        return x.reshape(-1, size, *x.shape[1:])
+
+    return jax.tree.map(cut, rows)
