@@ -7,8 +7,10 @@ from collections.abc import Sequence
 
 import tyro
 
+from benchmarks.batch import batch
 from benchmarks.demo_model import demo_model
 from benchmarks.embed import embed
+from benchmarks.leads import leads
 from benchmarks.make_checkpoint import main as make_checkpoint
 from benchmarks.masks import masks
 from benchmarks.point_clouds import point_clouds
@@ -16,18 +18,26 @@ from benchmarks.refinement import refinement
 from benchmarks.resolution import resolution
 from benchmarks.second_pass import second_pass
 from benchmarks.speed import speed
+from benchmarks.suite.command import suite
+from benchmarks.suite.gpu_targets import gpu_targets
+from benchmarks.suite.memory import memory
 from vggtjax.errors import VggtjaxError
 
 COMMANDS = {
+    "batch": batch,
     "demo-model": demo_model,
     "embed": embed,
+    "gpu-targets": gpu_targets,
+    "leads": leads,
     "make-checkpoint": make_checkpoint,
     "masks": masks,
+    "memory": memory,
     "point-clouds": point_clouds,
     "refinement": refinement,
     "resolution": resolution,
     "second-pass": second_pass,
     "speed": speed,
+    "suite": suite,
 }
 
 

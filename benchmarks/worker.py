@@ -1,7 +1,8 @@
-"""One side of a comparison: a process that holds a model and runs a pass whenever it is told to.
+"""One side of a comparison: a process that holds a model and runs a pass, or two, whenever it is told to.
 
 python -m benchmarks.worker ours WEIGHTS, or python -m benchmarks.worker peer WEIGHTS CHECKOUT; then a line of JSON on
-standard input for every run: {"frames", "height", "width", "keep": a file for the outputs, or null}.
+standard input for every run: {"work": "pass", "vggt4d" or "4dvggt-d", "frames", "height", "width", "keep": a file for
+the outputs or null, "mask": a file with the mask that the second pass shall have, or null}.
 """
 
 from __future__ import annotations
@@ -9,78 +10,180 @@ from __future__ import annotations
 import json
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
 from benchmarks.seeded import seeded_images
 
 Outputs = dict[str, np.ndarray]
-Run = Callable[[np.ndarray], Outputs]  # images [S, 3, H, W] in [0, 1] -> pose encoding, depth, confidence
+Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S, 3, H, W] in [0, 1], mask [S, H, W]
 
 
 def ours(weights: Path) -> Run:
-    """Return a plain pass of this library: cameras and depth."""
+    """Return this library's passes: a plain one, or a whole method."""
     from vggtjax.host_memory import keep_freed_memory
 
     keep_freed_memory()
     import jax
     import jax.numpy as jnp
 
-    from vggtjax import forward, load_model
+    from vggtjax import forward, infer, load_model
+    from vggtjax.mask import dynamic_tokens
 
     model = load_model(weights)
-    compiled: dict[tuple[int, ...], Any] = {}
+    compiled: dict[tuple, Any] = {}
 
-    def run(images: np.ndarray) -> Outputs:
-        x = jnp.asarray(images.transpose(0, 2, 3, 1)[None])
-        if x.shape not in compiled:
-            lowered = jax.jit(forward, static_argnames=("config", "outputs")).lower(
-                model.params, x, model.config, outputs=("camera", "depth")
+    def call(function, *arrays, **options):
+        key = (function, *(x.shape for x in arrays), *options.items())
+        if key not in compiled:
+            lowered = jax.jit(function, static_argnames=("config", *options)).lower(
+                model.params, arrays[0], model.config, *arrays[1:], **options
             )
-            compiled[x.shape] = lowered.compile()
-        made = jax.block_until_ready(compiled[x.shape](model.params, x))
-        return {
-            "pose_encoding": np.asarray(made.pose_encoding[0]),
-            "depth": np.asarray(made.depth[0]),
-            "confidence": np.asarray(made.depth_confidence[0]),
-        }
+            compiled[key] = lowered.compile()
+        return jax.block_until_ready(compiled[key](model.params, *arrays))
+
+    def masked(params, images, config, mask):
+        tokens = dynamic_tokens(mask, config.patch_size)
+        return forward(params, images, config, dynamic_tokens=tokens, suppress="drop", outputs=("camera",))
+
+    def run(work: str, images: np.ndarray, mask: np.ndarray | None) -> Outputs:
+        x = jnp.asarray(images.transpose(0, 2, 3, 1)[None])
+        if mask is not None:
+            return {"pose_encoding": np.asarray(call(masked, x, jnp.asarray(mask)[None]).pose_encoding[0])}
+        if work == "pass":
+            made = call(forward, x, outputs=("camera", "depth"))
+            return _outputs(made.pose_encoding, made.depth, made.depth_confidence)
+        assembly, passes = call(infer, x, method=work)
+        first = passes.first
+        if work == "vggt4d":  # what the public code has at this point
+            return {"saliency": np.asarray(passes.saliency[0]), "mask": np.asarray(passes.dynamic_mask[0])} | _outputs(
+                first.pose_encoding, first.depth, first.depth_confidence
+            )
+        return _outputs(assembly.camera_from_world, assembly.depth, assembly.confidence)
 
     return run
 
 
 def peer(weights: Path, checkout: Path) -> Run:
-    """Return a plain pass of the public PyTorch code of VGGT, from a checkout: the same heads, no others."""
+    """Return the passes of the public PyTorch code, from a checkout: VGGT's, or stages 1 and 2 of VGGT4D.
+
+    The plain pass has the same heads as ours and no others; VGGT4D runs its own model and its own functions, whose
+    one demand for CUDA is answered with the CPU.
+    """
     sys.path.insert(0, str(checkout))
     import torch
     from safetensors.torch import load_file
 
     torch.set_num_threads(os.cpu_count() or 1)
-    from vggt.models.vggt import VGGT  # pyright: ignore[reportMissingImports]: the user's checkout
+    tensors = load_file(weights)
+    models: dict[str, Any] = {}
 
-    model = VGGT(enable_point=False, enable_track=False)
-    names = set(model.state_dict())
-    tensors = {name: value for name, value in load_file(weights).items() if name in names}
-    model.load_state_dict(tensors, assign=True, strict=True)
-    del tensors
-    model.eval()
+    def model_for(work: str) -> Any:
+        if work not in models:
+            models.clear()
+            if work == "pass":
+                from vggt.models.vggt import VGGT  # pyright: ignore[reportMissingImports]: the user's checkout
 
-    def run(images: np.ndarray) -> Outputs:
+                model = VGGT(enable_point=False, enable_track=False)
+            else:
+                from vggt4d.models.vggt4d import VGGTFor4D  # pyright: ignore[reportMissingImports]
+
+                model = VGGTFor4D()
+            names = set(model.state_dict())
+            model.load_state_dict({n: t for n, t in tensors.items() if n in names}, assign=True, strict=True)
+            models[work] = model.eval()
+        return models[work]
+
+    def one_pass(images: np.ndarray) -> Outputs:
+        model, x = model_for("pass"), torch.from_numpy(images)[None]
+        tokens, start = model.aggregator(x)[:2]
+        pose = model.camera_head(tokens)[-1]
+        depth, confidence = model.depth_head(tokens, images=x, patch_start_idx=start)
+        return _outputs(pose.numpy(), depth.numpy()[..., 0], confidence.numpy())
+
+    def two_passes(images: np.ndarray, mask: np.ndarray | None) -> Outputs:
+        from vggt4d.masks import dynamic_mask as maps  # pyright: ignore[reportMissingImports]
+        from vggt4d.utils.model_utils import organize_qk_dict  # pyright: ignore[reportMissingImports]
+
+        model, x = model_for("vggt4d"), torch.from_numpy(images)
+        (S, _, H, W), to = images.shape, torch.Tensor.to
+
+        def stays(tensor, *where, **options):
+            return tensor if where == ("cuda",) else to(tensor, *where, **options)
+
+        if mask is not None:
+            return {"pose_encoding": model(x, dyn_masks=torch.from_numpy(mask))[0]["pose_enc"][0].numpy()}
+        first, qk, features, tokens = model(x)
+        del tokens
+        qk = organize_qk_dict(qk, S)
+        with mock.patch.object(torch.Tensor, "to", stays):
+            saliency = maps.extract_dyn_map(qk, x)
+        features = features.reshape(S, H // 14, W // 14, -1)
+        clustered, _ = maps.cluster_attention_maps(features, saliency)
+        pixels = torch.nn.functional.interpolate(clustered[:, None], size=(H, W), mode="bilinear")[:, 0]
+        found = pixels > maps.adaptive_multiotsu_variance(pixels.numpy())
+        model(x, dyn_masks=found)
+        made = _outputs(first["pose_enc"].numpy(), first["depth"].numpy()[..., 0], first["depth_conf"].numpy())
+        return {"saliency": saliency.numpy(), "mask": found.numpy()} | made
+
+    def run(work: str, images: np.ndarray, mask: np.ndarray | None) -> Outputs:
         with torch.inference_mode():
-            x = torch.from_numpy(images)[None]
-            tokens, start = model.aggregator(x)[:2]
-            pose = model.camera_head(tokens)[-1]
-            depth, confidence = model.depth_head(tokens, images=x, patch_start_idx=start)
-        return {
-            "pose_encoding": pose[0].numpy(),
-            "depth": depth[0, ..., 0].numpy(),
-            "confidence": confidence[0].numpy(),
-        }
+            return one_pass(images) if work == "pass" else two_passes(images, mask)
 
     return run
+
+
+def _outputs(pose, depth, confidence) -> Outputs:
+    names = ("pose_encoding", "depth", "confidence")
+    return {name: np.asarray(value[0]) for name, value in zip(names, (pose, depth, confidence), strict=True)}
+
+
+class PeakMemory:
+    """The most memory that the process has held while the context lasts: sampled, what is mapped of files apart."""
+
+    def __enter__(self) -> PeakMemory:
+        self.total = self.own = 0
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while True:
+            total, own = held_bytes()
+            self.total, self.own = max(self.total, total), max(self.own, own)
+            if self._done.wait(0.02):
+                return
+
+
+def held_bytes() -> tuple[int, int]:
+    """Return the memory that this process holds, and how much of it is its own and not of a file that it maps.
+
+    Linux tells both; elsewhere they are 0.
+    """
+    path = Path("/proc/self/status")
+    lines = path.read_text().splitlines() if path.exists() else []
+    kilobytes = {
+        name: int(rest.split()[0]) for name, _, rest in (line.partition(":") for line in lines) if "kB" in rest
+    }
+    return 1024 * kilobytes.get("VmRSS", 0), 1024 * kilobytes.get("RssAnon", 0)
+
+
+def disk_reads() -> int:
+    """Return how often this process has waited for a page from a disk, as where mapped weights are driven out."""
+    import resource
+
+    return resource.getrusage(resource.RUSAGE_SELF).ru_majflt
 
 
 def main(side: str, weights: str, *rest: str) -> None:
@@ -93,21 +196,16 @@ def main(side: str, weights: str, *rest: str) -> None:
     for line in sys.stdin:
         task = json.loads(line)
         images = seeded_images(task["frames"], task["height"], task["width"])
-        began = time.perf_counter()
-        outputs = run(images)
+        mask = np.load(task["mask"])["mask"] if task["mask"] else None
+        reads, began = disk_reads(), time.perf_counter()
+        with PeakMemory() as peak:
+            outputs = run(task["work"], images, mask)
         seconds = time.perf_counter() - began
         if task["keep"]:
             np.savez(task["keep"], allow_pickle=False, **outputs)
-        answers.write(json.dumps({"seconds": seconds, "peak": peak_bytes()}) + "\n")
+        answer = {"seconds": seconds, "total": peak.total, "own": peak.own, "reads": disk_reads() - reads}
+        answers.write(json.dumps(answer) + "\n")
         answers.flush()
-
-
-def peak_bytes() -> int:
-    """Return the most memory that this process has had, with the weights that it has mapped or read."""
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmHWM"):
-            return int(line.split()[1]) * 1024
-    return 0
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.pallas import tpu
 
 from vggtjax.network import attention
 
@@ -56,3 +57,49 @@ def test_the_gradient_is_that_of_jaxs_own_attention(monkeypatch, at_once, masked
     with jax.default_matmul_precision("highest"):
         for made, expected in zip(gradient(attention._in_chunks), gradient(attention._at_once), strict=True):
             assert np.abs(made - expected).max() < 2e-6
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_packed_keys(masked):
+    """What cuDNN is given: kept keys first, and their number. Here jax's own kernel stops there."""
+    generator = np.random.default_rng(2)
+    q, k, v = (jnp.asarray(generator.normal(size=(2, 11, 3, 8)), jnp.float32) for _ in range(3))
+    kept = generator.random((2, 11)) < 0.6 if masked else np.ones((2, 11), bool)
+    with jax.default_matmul_precision("highest"):
+        made = attention._packed(q, k, v, jnp.asarray(kept) if masked else None, implementation="xla")
+    assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_kernel_for_tpus_interpreted(masked):
+    generator = np.random.default_rng(3)
+    q, k, v = (jnp.asarray(generator.normal(size=(1, 140, 2, 64)), jnp.float32) for _ in range(3))
+    kept = generator.random((1, 140)) < 0.6 if masked else np.ones((1, 140), bool)
+    with tpu.force_tpu_interpret_mode(), jax.default_matmul_precision("highest"):
+        made = attention._on_tpu(q, k, v, jnp.asarray(kept) if masked else None)
+    assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="there is an accelerator")
+def test_without_a_gpu_cudnn_does_not_work():
+    assert not attention.cudnn_works()
+
+
+@pytest.mark.parametrize("most", [10**6, 3 * 11 * 13 * 2, 100])  # all clips fit at once, two of four do, none does
+@pytest.mark.parametrize("masked", [False, True])
+def test_what_does_not_fit_at_once_is_cut(monkeypatch, most, masked):
+    monkeypatch.setattr(attention, "LOGITS_ELSEWHERE", most)
+    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", 0)
+    generator = np.random.default_rng(4)
+    q, k, v = (jnp.asarray(generator.normal(size=(4, length, 3, 8)), jnp.float32) for length in (11, 13, 13))
+    kept = generator.random((4, 13)) < 0.6 if masked else np.ones((4, 13), bool)
+    with jax.default_matmul_precision("highest"):
+        made = attention._at_once_or_in_chunks(q, k, v, jnp.asarray(kept) if masked else None)
+    assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
+
+
+def test_heads_of_any_size():
+    x = jnp.asarray(np.random.default_rng(5).normal(size=(1, 300, 1, 160)), jnp.float32)
+    with jax.default_matmul_precision("highest"):
+        made = attention.attention(x, x, x)
+    assert np.abs(np.asarray(made) - _formula(x, x, x, np.ones((1, 300), bool))).max() < 1e-5

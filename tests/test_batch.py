@@ -1,16 +1,26 @@
 """Many clips in one call: all of them, in spite of a broken one, and after an interruption."""
 
+import json
+import os
+import subprocess
+import sys
+import time
+
+import jax
 import numpy as np
 import pytest
 from PIL import Image
 
+from benchmarks import __main__ as benchmarks
 from tests.moving_ball import moving_ball
 from tests.tiny import tiny_config
 from vggtjax import Reconstruction, init_params
 from vggtjax.batch import SETTINGS_NAME, reconstruct_many
-from vggtjax.checkpoint import Model
+from vggtjax.batch_command import _Clock
+from vggtjax.checkpoint import Model, save_model
 from vggtjax.clips.sources import clips_by_name
 from vggtjax.errors import ClipError, InputError
+from vggtjax.results.reconstruction import ARCHIVE_NAME, is_result
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
 
@@ -21,15 +31,18 @@ def model():
     return Model(config, init_params(0, config), "tiny")
 
 
+def write_clip(folder, frames, rows):
+    folder.mkdir(parents=True)
+    for i, frame in enumerate((255 * moving_ball(frames)).astype(np.uint8)):
+        Image.fromarray(frame[:rows]).save(folder / f"{i}.png")
+
+
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory):
     """Six clips of two shapes; the third is corrupt."""
     root = tmp_path_factory.mktemp("clips")
     for number in range(6):
-        (root / f"clip{number}").mkdir()
-        for i, frame in enumerate((255 * moving_ball(2)).astype(np.uint8)):
-            rows = 140 if number % 2 else 70
-            Image.fromarray(frame[:rows]).save(root / f"clip{number}/{i}.png")
+        write_clip(root / f"clip{number}", frames=2, rows=140 if number % 2 else 70)
     (root / "clip2/1.png").write_bytes(b"broken")
     (root / ".hidden").mkdir()
     return root
@@ -55,12 +68,150 @@ def test_every_good_clip_is_there_once_and_the_broken_one_is_named(model, clips,
             result = Reconstruction.load(tmp_path / name)
             assert result.method == "vggt"
             assert outcome.status == "kept" or outcome.frames == 2
-    for name, time in finished.items():
-        assert (tmp_path / name / "reconstruction.npz").stat().st_mtime_ns == time
-    assert not list(tmp_path.rglob(".partial*"))
+    for name, written in finished.items():
+        assert (tmp_path / name / "reconstruction.npz").stat().st_mtime_ns == written
+    assert not list(tmp_path.rglob(".*partial*"))
 
     with pytest.raises(InputError, match=rf"{SETTINGS_NAME} has other settings than this run"):
         next(reconstruct_many(model, sources, tmp_path, options={"method": "4dvggt-d"}))
+
+
+def write_video(path, frames, rows):
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.height, stream.width = rows, moving_ball(1).shape[2]
+        stream.pix_fmt = "yuv420p"
+        for picture in (255 * moving_ball(frames)).astype(np.uint8):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture[:rows], format="rgb24")))
+        container.mux(stream.encode())
+
+
+def test_the_command_goes_on_after_it_was_killed(model, tmp_path):
+    """Twenty clips of three shapes, two of them videos and one corrupt, killed once eight are done."""
+    root, out = tmp_path / "clips", tmp_path / "out"
+    lengths = {}
+    for number in range(20):
+        name, frames, rows = f"clip{number:02}", *((2, 70), (3, 70), (2, 140))[number % 3]
+        lengths[name] = frames
+        if number in (5, 14):
+            write_video(root / f"{name}.mp4", frames, rows)
+        else:
+            write_clip(root / name, frames, rows)
+    (root / "clip03/1.png").write_bytes((root / "clip03/1.png").read_bytes()[:100])
+    save_model(tmp_path / "tiny.safetensors", model.params, model.config)
+    command = [sys.executable, "-m", "vggtjax", "batch", str(root), "--out", str(out), "--model"]
+    command += [str(tmp_path / "tiny.safetensors"), "--method", "pose-decoupling"]
+    environment = os.environ | {"VGGTJAX_CACHE": str(tmp_path / "cache"), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+
+    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as running:
+        while len(list(out.glob(f"*/{ARCHIVE_NAME}"))) < 8 and running.poll() is None:
+            time.sleep(0.01)
+        running.kill()
+        _, said = running.communicate()
+    assert running.returncode < 0, said.decode()  # by the signal
+    finished = {path.parent.name: path.stat().st_mtime_ns for path in out.glob(f"*/{ARCHIVE_NAME}")}
+    assert 8 <= len(finished) < 19
+    visible = {path.name for path in out.iterdir() if path.is_dir() and not path.name.startswith(".")}
+    assert visible == set(finished)  # what can be seen is whole
+    for name in finished:
+        assert is_result(out / name / ARCHIVE_NAME)
+        assert len(Reconstruction.load(out / name).depth) == lengths[name]
+
+    again = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    results = {path.parent.name: path.stat().st_mtime_ns for path in out.rglob(ARCHIVE_NAME)}
+    assert set(results) == set(lengths) - {"clip03"}
+    assert {path.name for path in out.iterdir()} == {*results, SETTINGS_NAME}  # once each, and nothing left over
+    for name in results:
+        assert len(Reconstruction.load(out / name).depth) == lengths[name]
+        assert (out / name / "scene.glb").stat().st_size > 1000
+    assert {name: results[name] for name in finished} == finished
+    table = dict(line.split(maxsplit=1) for line in again.stdout.splitlines()[:4])
+    assert table == {"clips": "20", "done": f"{19 - len(finished)}", "kept": f"{len(finished)}", "failed": "1"}
+    assert "clip03 failed: " in again.stdout
+    assert "1.png" in again.stdout.partition("clip03 failed: ")[2].splitlines()[0]
+    for name in set(results) - set(finished):
+        assert f"{name}: done, 0:00:" in again.stderr  # and the time that is left
+    assert all(f"{name}: kept" in again.stderr for name in finished)
+
+
+def test_what_a_killed_run_has_left_is_cleared_away(model, clips, tmp_path):
+    (tmp_path / ".clip0.partial/depth").mkdir(parents=True)
+    (tmp_path / ".clip0.partial/depth/old.npy").write_bytes(b"half")
+    sources = {"clip0": str(clips / "clip0")}
+    assert [outcome.status for outcome in reconstruct_many(model, sources, tmp_path, options={"method": "vggt"})] == [
+        "done"
+    ]
+    assert {path.name for path in tmp_path.iterdir()} == {"clip0", SETTINGS_NAME}
+    assert not list(tmp_path.rglob("old.npy"))
+
+
+def test_a_folder_that_is_there_keeps_its_files(model, clips, tmp_path):
+    (tmp_path / "clip0").mkdir()
+    (tmp_path / "clip0/mine.txt").write_text("mine")
+    (tmp_path / "clip1/depth").mkdir(parents=True)
+    sources = {name: str(clips / name) for name in ("clip0", "clip1")}
+    outcomes = list(reconstruct_many(model, sources, tmp_path, options={"method": "vggt"}))
+    assert {outcome.name: outcome.status for outcome in outcomes} == {"clip0": "done", "clip1": "failed"}
+    assert (tmp_path / "clip0/mine.txt").read_text() == "mine"
+    assert is_result(tmp_path / "clip0" / ARCHIVE_NAME)
+    assert [path.name for path in (tmp_path / "clip1").iterdir()] == ["depth"]
+
+
+def test_clips_of_one_shape_share_a_compilation(model, tmp_path):
+    for number, frames in enumerate([5, 7, 5, 7, 5]):  # lengths that no other test compiles
+        write_clip(tmp_path / f"clips/{number}", frames, 70)
+    compiled, counts = [], []
+
+    def listen(event, duration_secs, **_):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(event)
+
+    def progress(done, total):
+        counts.append(len(compiled))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        sources = clips_by_name([str(tmp_path / "clips")])
+        outcomes = reconstruct_many(model, sources, tmp_path / "out", options={"method": "vggt"}, progress=progress)
+        assert {outcome.status for outcome in outcomes} == {"done"}
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert [new > 0 for new in np.diff(counts)] == [True, True, False, False, False]
+
+
+def test_progress_counts_frames(model, tmp_path):
+    """A video counts as the mean of the others until it is read, and a clip that fails not at all."""
+    root = tmp_path / "clips"
+    write_clip(root / "a", 2, 70)
+    write_video(root / "b.mp4", 3, 70)
+    write_clip(root / "c", 8, 70)
+    (root / "c/7.png").write_bytes(b"broken")
+    write_clip(root / "d", 2, 70)
+    seen = []
+    sources = clips_by_name([str(root)]) | {"nothing": str(tmp_path / "none")}
+    outcomes = reconstruct_many(
+        model, sources, tmp_path / "out", options={"method": "vggt"}, progress=lambda *count: seen.append(count)
+    )
+    assert sum(outcome.status == "failed" for outcome in outcomes) == 2
+    assert seen == [(0, 16), (2, 16), (5, 15), (5, 7), (7, 7), (7, 7)]
+
+
+def test_the_time_that_is_left_goes_by_frames(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    shown = []
+    clock = _Clock(lambda *count: shown.append(count))
+    clock.progress(0, 40)
+    assert clock.left() == ""
+    now[0] += 100
+    clock.progress(1, 40)
+    assert clock.left() == ", 1:05:00 left"
+    clock.progress(40, 40)
+    assert clock.left() == ", 0:00:00 left"
+    assert shown == [(0, 40), (1, 40), (40, 40)]
 
 
 def test_results_are_those_of_single_runs(model, clips, tmp_path):
@@ -106,3 +257,20 @@ def test_what_is_no_clip(clips, tmp_path):
         clips_by_name([str(clips), str(clips / "clip0")])
     with pytest.raises(ClipError, match="no clips"):
         clips_by_name([])
+
+
+def test_the_benchmark_compares_both_ways(model, tmp_path, capsys):
+    path = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
+    out = tmp_path / "batch.json"
+    arguments = ["--clips", "2", "--lengths", "2", "--method", "vggt", "--repeats", "1", "--out", str(out)]
+    assert benchmarks.main(["batch", "--model", str(path), *arguments]) == 0
+    shown = capsys.readouterr().out
+    assert "1 clips of 2 frames, and a corrupt one" in shown
+    measured = json.loads(out.read_text())
+    for state in ("cold", "warm"):
+        alone, batch = (measured["seconds"][state][side][0] for side in ("one by one", "batch"))
+        assert min(alone, batch) > 0
+        assert measured["ratios"][state] == pytest.approx(alone / batch)
+        assert f"{alone / batch:.3f}" in shown
+    assert benchmarks.main(["batch", "--clips", "1"]) == 2
+    assert "clips is 1; expected at least 2" in capsys.readouterr().err

@@ -265,12 +265,19 @@ def test_masks_are_measured(tmp_path, capsys):
 
 
 def test_how_far_outputs_are_apart():
-    theirs = {"depth": np.array([1.0, 3.0]), "pose": np.array([0.0, 2.0])}
+    theirs = {"depth": np.array([1.0, 3.0]), "pose": np.array([0.0, 2.0]), "mask": np.array([True, False])}
     ours = {"depth": np.array([1.0, 3.1]), "pose": np.array([0.0, 2.0])}
-    assert speed._apart(ours, theirs) == pytest.approx(0.1)
+    assert speed._difference(ours, theirs) == pytest.approx(0.1)
 
 
 def test_a_comparison_without_the_others_code_is_one_sentence(tmp_path, capsys):
     arguments = ["--weights", tmp_path / "a", "--converted", tmp_path / "b", "--peer", tmp_path]
     assert benchmarks.main(["speed", *map(str, arguments)]) == 2
     assert "a does not exist" in capsys.readouterr().err
+
+
+def test_ways_to_do_a_pass_are_measured(capsys):
+    assert benchmarks.main(["leads", "--frames", "1", "--tokens", "20", "--repeats", "1"]) == 0
+    rows = [line for line in capsys.readouterr().out.splitlines() if "GFLOP" not in line]
+    assert sum("attention" in line for line in rows) >= 4
+    assert benchmarks.main(["leads", "--repeats", "0"]) == 2

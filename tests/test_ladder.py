@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.seeded import seeded_images
 from tests.tiny import tiny_config
-from vggtjax import Model, Passes, assemble, infer, init_params
+from vggtjax import Model, Passes, assemble, infer, init_params, load_clip, reconstruct
 from vggtjax.errors import InputError
 from vggtjax.evaluation.depth import depth_errors, median_scale
 from vggtjax.evaluation.ladder import LadderRow, ladder
@@ -18,6 +18,7 @@ from vggtjax.evaluation.trajectory import centre_error, rotation_error
 from vggtjax.evaluation.truth import Truth
 from vggtjax.mask import upsample
 from vggtjax.methods import LADDER
+from vggtjax.stages import stages_of
 
 CLIPS, FRAMES, SIZE = 3, 4, (42, 56)
 SETTING = ("method", "mask_source", "mask_pairs", "suppress")
@@ -195,3 +196,25 @@ def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):
 def test_bad_input_is_one_sentence(model, truth, options, sentence):
     with pytest.raises(InputError, match=sentence):
         ladder(model, truth, **{"batch_size": 2, **options})
+
+
+def test_a_clip_that_was_reconstructed_has_the_network_traced_already(model, truth):
+    alone = Truth(*(array[0, :3] for array in truth))  # a shape that no other test has
+    reconstruct(model, load_clip(alone.images, size=SIZE[1], patch=model.config.patch_size))
+    traced = []
+
+    def listen(event: str, duration_secs: float, **known: str | int) -> None:
+        if event == "/jax/core/compile/jaxpr_trace_duration":
+            traced.append(known.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        ladder(model, alone)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert "upsample" in traced
+    stages = stages_of(
+        model.config, "4dvggt-d", alone.images.shape[:3], gram="cosine", suppress="zero", mask_pairs=5,
+        align_scale=False, smooth_frames=1, compute_dtype="float32",
+    )  # fmt: skip
+    assert not {stage.function.__name__ for stage in stages if stage.name != "assemble"} & set(traced)

@@ -277,7 +277,8 @@ class Watched:
 
     def add(self, sums, slot, q, k):
         sums, *kept = sums
-        kept = [jnp.where(slot > 0, old.at[slot - 1].set(new), old) for old, new in zip(kept, (q, k), strict=True)]
+        new = (x[:, :, -kept[0].shape[3] :] for x in (q, k))
+        kept = [jnp.where(slot > 0, old.at[slot - 1].set(x), old) for old, x in zip(kept, new, strict=True)]
         return self.loss.add(sums, slot, q, k), *kept
 
 

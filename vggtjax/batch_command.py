@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,7 +11,7 @@ import tyro
 
 from vggtjax.errors import InputError
 from vggtjax.methods import MethodName
-from vggtjax.report import Report
+from vggtjax.report import Advance, Report
 
 
 def batch(
@@ -27,11 +28,14 @@ def batch(
     start: int = 0,
     max_frames: int | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
+    pad_frames: bool = False,
     confidence_percentile: float = 20.0,
     resolution: Literal["model", "original"] = "model",
     layout: Annotated[Literal["vggtjax", "vggt4d"], tyro.conf.arg(name="format")] = "vggtjax",
 ) -> None:
     """Reconstruct many clips, each into a folder of its own; run it again, and it goes on where it was interrupted.
+
+    A clip that fails is named and does not stop the others; the exit code is 2 only where every clip fails.
 
     Args:
         sources: folders of images, or videos; or one folder of such.
@@ -45,6 +49,8 @@ def batch(
         start: index of the first frame to take.
         max_frames: take so many frames at most.
         dtype: of the blocks' matrix products.
+        pad_frames: pad clips to one of a few lengths, so that those of similar length share a compilation: worth it for
+            many lengths on a GPU, where compiling takes longer than running.
         confidence_percentile: leave so many percent of the pixels, the least confident, out of the point clouds.
         resolution: of the files: the model's, or the source's own.
         layout: "vggt4d" writes, beside our own files, the folder vggt4d/ as VGGT4D does.
@@ -64,26 +70,23 @@ def batch(
             loaded = load_model(model, progress=progress)
         from vggtjax.batch import reconstruct_many
 
-        outcomes = reconstruct_many(
-            loaded,
-            named,
-            out,
-            mode=mode,
-            size=size,
-            sampling={"fps": fps, "stride": stride, "start": start, "max_frames": max_frames},
-            options={"method": method, "compute_dtype": dtype},
-            saving={"confidence_percentile": confidence_percentile, "resolution": resolution, "layout": layout},
-        )
         found = []
-        with report.stage("clips") as progress:
-            started = time.perf_counter()
-            for outcome in outcomes:
+        with report.stage("frames") as show:
+            clock = _Clock(show)
+            for outcome in reconstruct_many(
+                loaded,
+                named,
+                out,
+                mode=mode,
+                size=size,
+                sampling={"fps": fps, "stride": stride, "start": start, "max_frames": max_frames},
+                options={"method": method, "compute_dtype": dtype} | ({"pad_frames": True} if pad_frames else {}),
+                saving={"confidence_percentile": confidence_percentile, "resolution": resolution, "layout": layout},
+                progress=clock.progress,
+            ):
                 found.append(outcome)
-                progress(len(found), len(named))
-                new = sum(one.status != "kept" for one in found)
-                left = (time.perf_counter() - started) / max(new, 1) * (len(named) - len(found))
                 reason = f" ({outcome.reason})" if outcome.reason else ""
-                report.note(f"{len(found)}/{len(named)} {outcome.name}: {outcome.status}{reason}, {left:.0f} s left")
+                report.note(f"{len(found)}/{len(named)} {outcome.name}: {outcome.status}{reason}{clock.left()}")
     counts = {status: sum(outcome.status == status for outcome in found) for status in ("done", "kept", "failed")}
     report.table({"clips": len(found), **counts, "results": f"{out}/"})
     for outcome in found:
@@ -91,3 +94,20 @@ def batch(
             report.line(f"{outcome.name} failed: {outcome.reason}")
     if counts["failed"] == len(found):
         raise InputError("none of the clips could be reconstructed; the reasons are above")
+
+
+class _Clock:
+    """How long a batch goes on: what is left takes as long for each frame as what is done."""
+
+    def __init__(self, show: Advance) -> None:
+        self._show, self._started = show, time.perf_counter()
+        self._seconds: float | None = None
+
+    def progress(self, done: int, total: int) -> None:
+        """Take the frames done and all of them, and show them."""
+        self._show(done, total)
+        self._seconds = (time.perf_counter() - self._started) * (total / done - 1) if done else None
+
+    def left(self) -> str:
+        """Return words for the time that is left, or none while no frame is done."""
+        return "" if self._seconds is None else f", {timedelta(seconds=round(self._seconds))} left"

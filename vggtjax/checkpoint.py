@@ -73,6 +73,26 @@ class Model:
         """Names of the heads that the model has."""
         return self.config.heads
 
+    def compile(self, frames: int, height: int, width: int, **options: Any) -> dict[str, Any]:
+        """Compile ahead of time what `reconstruct` runs for a clip of this shape.
+
+        Options are those of `reconstruct` that decide it: method, gram, suppress, mask_pairs, align_scale,
+        smooth_frames, compute_dtype, pad_frames and keep_passes.
+
+        Later calls for this shape in this process start at once, and so do those of other processes where compilations
+        are kept (as the command line does).
+
+        Returns:
+            What each stage needs beside what it reads, by XLA's own analysis: `.temporary` and `.output` bytes.
+
+        Raises:
+            InputError: a shape that is none, or not of the model's patches; an option that is none.
+            DeviceMemoryError: it does not fit.
+        """
+        from vggtjax.pipeline import compile_for
+
+        return compile_for(self, frames, height, width, **options)
+
     def summary(self) -> dict[str, Any]:
         """Return what a person asks about a model, as plain values."""
         return {

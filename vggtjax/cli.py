@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import logging
 import sys
 import warnings
@@ -252,6 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, 2 for bad input or output, 130 when interrupted."""
     keep_freed_memory()
     keep_compilations()
+    atexit.register(gc.freeze)  # at the end there is nothing to collect, and a last collection takes half a second
     logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
     for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub"):
         logging.getLogger(chatty).setLevel(logging.ERROR)

@@ -34,6 +34,10 @@ class Method:
     def needs_second_pass(self) -> bool:
         return {self.depth, self.extrinsics, self.intrinsics} != {"first"}
 
+    def second_outputs(self, align_scale: bool = False) -> tuple[str, ...]:
+        """What is read of the second pass: scales are aligned by depth, and otherwise its cameras may be enough."""
+        return ("camera", "depth") if self.depth != "first" or align_scale else ("camera",)
+
 
 METHODS: dict[str, Method] = {
     "vggt": Method("first", "first", "first"),
@@ -50,6 +54,12 @@ def check_smooth_frames(frames: int) -> None:
     """Raise InputError for a number of frames to average over that has no middle."""
     if type(frames) is not int or frames < 1 or frames % 2 == 0:
         raise InputError(f"smooth_frames is {frames!r}; expected an odd number of frames, such as 3")
+
+
+def check_mask_pairs(pairs: object) -> None:
+    """Raise InputError for a number that is no number of pairs; what is traced is not looked at."""
+    if isinstance(pairs, int | float) and (pairs != int(pairs) or pairs < 0):
+        raise InputError(f"mask_pairs is {pairs}; expected a whole number of at least 0")
 
 
 def find_method(name: str) -> Method:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -97,6 +98,7 @@ def second_pass(
     dynamic_mask: Bool[Array, "B S H W"],
     config: VGGTConfig,
     *,
+    plain: Predictions | None = None,
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
     outputs: tuple[str, ...] = ("camera", "depth"),
@@ -105,20 +107,30 @@ def second_pass(
 ) -> Predictions:
     """Run the mask-aware pass: the keys of dynamic tokens suppressed in the first `mask_pairs` pairs.
 
-    Of clips with a `frame_count` only the first so many frames mean anything.
+    Where no pixel of the whole batch is dynamic, it is the plain pass: if `plain` gives what that predicted, it is
+    returned, and nothing is computed (all is, if `plain` lacks some of the outputs). Of clips with a `frame_count` only
+    the first so many frames mean anything.
     """
-    return forward(
-        params,
-        images,
-        config,
-        patch_tokens=patch_tokens,
-        dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size),
-        suppress=suppress,
-        mask_pairs=mask_pairs,
-        outputs=outputs,
-        frame_count=frame_count,
-        compute_dtype=compute_dtype,
-    )
+
+    def masked() -> Predictions:
+        return forward(
+            params,
+            images,
+            config,
+            patch_tokens=patch_tokens,
+            dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size),
+            suppress=suppress,
+            mask_pairs=mask_pairs,
+            outputs=outputs,
+            frame_count=frame_count,
+            compute_dtype=compute_dtype,
+        )
+
+    fields = {"camera": ("pose_encoding",), "depth": ("depth", "depth_confidence")}
+    wanted = {name: getattr(plain, name, None) for output in outputs for name in fields.get(output, (output,))}
+    if plain is None or any(value is None for value in wanted.values()):
+        return masked()
+    return jax.lax.cond(dynamic_mask.any(), masked, lambda: Predictions(**wanted))
 
 
 def track_from(
@@ -187,7 +199,7 @@ def run_passes(
     clusters: int = 0,
     threshold: Threshold = "otsu",
     smooth_frames: int = 1,
-    second: bool = True,
+    second: tuple[str, ...] = ("camera", "depth"),
 ) -> Passes:
     """Run both passes once, sharing the backbone's features; `assemble` makes a method's result of them.
 
@@ -204,7 +216,7 @@ def run_passes(
         motion: the table of cues; the configuration's own if None.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
         clusters, threshold, smooth_frames: how the mask is made of the saliency, as for `mine_mask`.
-        second: whether to run the second pass at all.
+        second: what the second pass shall predict; () for no second pass.
     """
     patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
     first, saliency = first_pass(
@@ -215,8 +227,9 @@ def run_passes(
     mask = mine_mask(saliency, patch_tokens, size, **mining)
     if not second:
         return Passes(first, None, saliency, mask)
-    masking = {"suppress": suppress, "mask_pairs": mask_pairs, "compute_dtype": compute_dtype}
-    return Passes(first, second_pass(params, images, patch_tokens, mask, config, **masking), saliency, mask)
+    masking = {"suppress": suppress, "mask_pairs": mask_pairs, "outputs": second, "compute_dtype": compute_dtype}
+    made = second_pass(params, images, patch_tokens, mask, config, plain=first, **masking)
+    return Passes(first, made, saliency, mask)
 
 
 def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False) -> Assembly:
@@ -235,14 +248,18 @@ def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = Fa
     scale = jnp.ones(passes.dynamic_mask.shape[0])
     if align_scale and passes.second is not None:
         scale = scale_between(_present(first.depth), _present(second.depth), passes.dynamic_mask)
-    depth1, confidence1 = _present(first.depth), _present(first.depth_confidence)
-    depth2, confidence2 = _present(second.depth) * scale[:, None, None, None], _present(second.depth_confidence)
-    both = (depth1, confidence1, depth2, confidence2, passes.dynamic_mask)
+
+    def depth_of(predictions: Predictions, scale: Array) -> tuple[Array, Array]:
+        return _present(predictions.depth) * scale[:, None, None, None], _present(predictions.depth_confidence)
+
+    def of_both() -> tuple[Array, Array, Array, Array, Array]:
+        return (*depth_of(first, jnp.ones_like(scale)), *depth_of(second, scale), passes.dynamic_mask)
+
     makers = {
-        "first": lambda: (depth1, confidence1),
-        "second": lambda: (depth2, confidence2),
-        "replaced": lambda: replace_depth(*both),
-        "fused": lambda: fuse_depth(*both),
+        "first": lambda: (_present(first.depth), _present(first.depth_confidence)),
+        "second": lambda: depth_of(second, scale),
+        "replaced": lambda: replace_depth(*of_both()),
+        "fused": lambda: fuse_depth(*of_both()),
     }
     depth, confidence = makers[row.depth]()
     size = (depth.shape[2], depth.shape[3])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,47 +17,18 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
 from vggtjax.errors import DeviceMemoryError, InputError
-from vggtjax.mask import mine_mask
-from vggtjax.methods import check_smooth_frames, find_method
-from vggtjax.network.backbone import encode
+from vggtjax.frame_padding import padded_frames
+from vggtjax.methods import find_method
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
-from vggtjax.passes import Assembly, Passes, assemble, first_pass, run_passes, second_pass, track_from
+from vggtjax.passes import Assembly, Passes, assemble, run_passes
 from vggtjax.refinement import refine_masks
 from vggtjax.results.frames import inside_pictures
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.stages import StageMemory, compile_stages, stages_of, with_masks, with_tracks
 from vggtjax.tracking import Queries
 
 OnStage = Callable[[str], AbstractContextManager[Any]]
-
-
-class Stage(NamedTuple):
-    """A jitted function, the arrays that it reads and makes (by name), and its static options."""
-
-    name: str
-    reads: tuple[str, ...]
-    makes: tuple[str, ...]
-    function: Any
-    options: dict[str, Any]
-
-
-def _assemble(first, second, saliency, dynamic_mask, *, method: str, align_scale: bool) -> Assembly:
-    return assemble(Passes(first, second, saliency, dynamic_mask), method, align_scale=align_scale)
-
-
-_encode = jax.jit(encode, static_argnames=("config", "compute_dtype"))
-_first_pass = jax.jit(first_pass, static_argnames=("config", "gram", "motion", "outputs", "compute_dtype"))
-_mine_mask = jax.jit(mine_mask, static_argnames=("size", "clusters", "threshold", "smooth_frames"))
-_second_pass = jax.jit(second_pass, static_argnames=("config", "suppress", "mask_pairs", "compute_dtype"))
-_first_pass_with_tracks = jax.jit(
-    lambda params, images, patch_tokens, query_points, **options: first_pass(
-        params, images, patch_tokens, query_points=query_points, **options
-    ),
-    static_argnames=("config", "gram", "motion", "outputs", "compute_dtype"),
-)
-_track_from = jax.jit(track_from, static_argnames=("config", "compute_dtype"))
-_same = jax.jit(lambda predictions: predictions)
-assembled = jax.jit(_assemble, static_argnames=("method", "align_scale"))
 
 
 @partial(
@@ -108,7 +79,7 @@ def infer(
         clusters=row.clusters,
         threshold=row.threshold,
         smooth_frames=smooth_frames,
-        second=row.needs_second_pass,
+        second=row.second_outputs(align_scale) if row.needs_second_pass else (),
     )
     return assemble(passes, method, align_scale=align_scale), passes
 
@@ -128,6 +99,7 @@ def reconstruct(
     refine_mask: bool | None = None,
     tracks: Queries | None = None,
     compute_dtype: str = "float32",
+    pad_frames: bool = False,
     keep_passes: bool = False,
     on_stage: OnStage | None = None,
 ) -> Reconstruction:
@@ -149,6 +121,8 @@ def reconstruct(
             come with the first pass; every other frame that has some costs a pass of its own, over the clip rolled so
             that this frame comes first.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
+        pad_frames: pad the clip to one of a few lengths (`padded_frames`), so that clips of similar length share a
+            compilation; what is returned is the same to rounding. Not for clips with tracks.
         keep_passes: keep both passes on the result, as `.passes`.
         on_stage: called with the name of each stage, returns a context in which it runs; for progress and timing.
 
@@ -176,40 +150,38 @@ def reconstruct(
         "smooth_frames": smooth_frames,
         "compute_dtype": compute_dtype,
     }
-    stages = _stages(config, method, clip.images.shape[1:3], **settings)
-    arrays: dict[str, Any] = {"params": model.params, "images": jnp.asarray(clip.images)[None], "second": None}
-    check_smooth_frames(smooth_frames)
+    stages = stages_of(config, method, clip.images.shape[:3], all_outputs=keep_passes, **settings)
+    S = len(clip)
+    room = padded_frames(S, config.motion.offsets) - S if pad_frames and tracks is None else 0
+
+    def padded(frames: np.ndarray) -> Array:
+        frames = np.pad(frames, ((0, room), *((0, 0),) * (frames.ndim - 1))) if room else frames
+        return jax.device_put(frames[None])
+
+    count = jax.device_put(np.array([S], np.int32)) if room else None
+    arrays: dict[str, Any] = {"params": model.params, "images": padded(clip.images)}
+    arrays |= {"frame_count": count, "second": None}
     if masks is not None and smooth_frames != 1:
         raise InputError(f"smooth_frames is {smooth_frames} and masks are given; smoothing is for masks that are mined")
     if masks is not None:
-        arrays["dynamic_mask"] = jnp.asarray(_checked(masks, clip))[None]
-        stages = [stage for stage in stages if stage.name != "dynamic mask"]
-        if not masks.any():
-            same = Stage("second pass", ("first",), ("second",), _same, {})
-            stages = [same if stage.name == same.name else stage for stage in stages]
+        arrays["dynamic_mask"] = padded(_checked(masks, clip))
+        stages = with_masks(stages, bool(masks.any()))
     if tracks is not None:
-        stages = _tracking_stages(stages, tracks, arrays, {"config": config, "compute_dtype": compute_dtype})
-    try:
+        stages = with_tracks(stages, tracks, arrays)
+    with _memory_errors(*clip.images.shape[:3]):
         with on_stage("compile"):
-            _compile(stages, arrays)
+            compile_stages(stages, arrays)
         for stage in stages:
             with on_stage(stage.name):
                 made = jax.block_until_ready(stage.function(*(arrays[name] for name in stage.reads), **stage.options))
                 arrays |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
-    except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        S, H, W = clip.images.shape[:3]
-        raise DeviceMemoryError(
-            f"{S} frames of {W} x {H} pixels do not fit in the memory of the device; take fewer frames "
-            "(max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
-        ) from error
     passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
+    passes = jax.tree.map(lambda x: np.asarray(x)[:, :S], passes) if room else passes
     followed = {} if tracks is None else _joined_tracks(tracks, arrays)
     result = Reconstruction(
-        **assembled_fields(arrays["assembly"], arrays[row.intrinsics]),
-        saliency=np.asarray(passes.saliency[0]),
-        dynamic_mask=np.asarray(passes.dynamic_mask[0]),
+        **assembled_fields(arrays["assembly"], getattr(passes, row.intrinsics)),
+        saliency=np.asarray(passes.saliency)[0],
+        dynamic_mask=np.asarray(passes.dynamic_mask)[0],
         images=np.round(clip.images * 255).astype(np.uint8),
         frame_names=tuple(clip.frame_names),
         timestamps=clip.timestamps,
@@ -231,9 +203,23 @@ def reconstruct(
     return result
 
 
+@contextmanager
+def _memory_errors(frames: int, height: int, width: int) -> Iterator[None]:
+    """Say in one sentence that a clip does not fit."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise DeviceMemoryError(
+            f"{frames} frames of {width} x {height} pixels do not fit in the memory of the device; take fewer frames "
+            "(max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
+        ) from error
+
+
 def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, np.ndarray]:
     """Return a method's depth, confidence and cameras of the first clip; its intrinsics are of the pass `source`."""
-    depth, confidence, camera_from_world, intrinsics = (np.array(x[0]) for x in jax.tree.leaves(assembly))
+    depth, confidence, camera_from_world, intrinsics = (np.array(x)[0] for x in jax.tree.leaves(assembly))
     fields = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
     focal = intrinsics[:, [0, 1], [0, 1]]
     intrinsics[:, [0, 1], [0, 1]] = np.where(fields > np.pi, -np.abs(focal), focal)  # beyond 2 pi the tangent repeats
@@ -243,28 +229,6 @@ def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, np.nd
         "camera_from_world": camera_from_world,
         "intrinsics": intrinsics,
     }
-
-
-def _tracking_stages(
-    stages: list[Stage], queries: Queries, arrays: dict[str, Any], network: dict[str, Any]
-) -> list[Stage]:
-    """Return the stages with tracks: of the first frame's points by the first pass, then of every other frame's.
-
-    The points are put into `arrays`.
-    """
-    stages = list(stages)
-    for frame in np.unique(queries.frames).tolist():
-        points = jnp.asarray(queries.points[queries.frames == frame])[None]
-        if frame == 0:
-            arrays["query_points"] = points
-            index = next(i for i, stage in enumerate(stages) if stage.name == "first pass")
-            reads = (*stages[index].reads, "query_points")
-            stages[index] = stages[index]._replace(reads=reads, function=_first_pass_with_tracks)
-        else:
-            arrays |= {f"points {frame}": points, f"frame {frame}": jnp.int32(frame)}
-            reads = ("params", "images", "patch_tokens", f"points {frame}", f"frame {frame}")
-            stages.append(Stage("tracks", reads, (f"tracks {frame}",), _track_from, network))
-    return stages
 
 
 def _joined_tracks(queries: Queries, arrays: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -303,39 +267,47 @@ def refined(result: Reconstruction, progress: Callable[[int, int], object] | Non
     return dataclasses.replace(result, dynamic_mask=mask)
 
 
-def _stages(
-    config: VGGTConfig,
-    method: str,
-    size: tuple[int, int],
+def compile_for(
+    model: Model,
+    frames: int,
+    height: int,
+    width: int,
     *,
-    gram: Gram,
-    suppress: Suppress,
-    mask_pairs: int,
-    align_scale: bool,
-    smooth_frames: int,
-    compute_dtype: str,
-) -> list[Stage]:
-    network = {"config": config, "compute_dtype": compute_dtype}
-    masking = {"suppress": suppress, "mask_pairs": mask_pairs}
-    making = {"method": method, "align_scale": align_scale}
-    row = find_method(method)
-    mining = {"size": size, "clusters": row.clusters, "threshold": row.threshold, "smooth_frames": smooth_frames}
-    seen = ("params", "images", "patch_tokens")
-    stages = [
-        Stage("image features", ("params", "images"), ("patch_tokens",), _encode, network),
-        Stage("first pass", seen, ("first", "saliency"), _first_pass, network | {"gram": gram}),
-        Stage("dynamic mask", ("saliency", "patch_tokens"), ("dynamic_mask",), _mine_mask, mining),
-        Stage("second pass", (*seen, "dynamic_mask"), ("second",), _second_pass, network | masking),
-        Stage("assemble", ("first", "second", "saliency", "dynamic_mask"), ("assembly",), assembled, making),
-    ]
-    return [stage for stage in stages if stage.name != "second pass" or row.needs_second_pass]
+    method: str = "4dvggt-d",
+    gram: Gram | None = None,
+    suppress: Suppress | None = None,
+    mask_pairs: int = 5,
+    align_scale: bool = False,
+    smooth_frames: int = 1,
+    compute_dtype: str = "float32",
+    pad_frames: bool = False,
+    keep_passes: bool = False,
+) -> dict[str, StageMemory]:
+    """Compile what `reconstruct` runs with these options for clips of this shape; see `Model.compile`.
 
-
-def _compile(stages: list[Stage], arrays: dict[str, Any]) -> None:
-    """Compile every stage for the shapes that it will see; the calls that follow find the result in jit's cache."""
-    shapes = dict(arrays)
-    for stage in stages:
-        lowered = stage.function.lower(*(shapes[name] for name in stage.reads), **stage.options)
-        lowered.compile()
-        made = lowered.out_info
-        shapes |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
+    Raises InputError for a shape that is none, or not of the model's patches.
+    """
+    row, patch = find_method(method), model.config.patch_size
+    if frames < 1 or min(height, width) < patch or height % patch or width % patch:
+        raise InputError(
+            f"{frames} frames of {width} x {height} pixels; expected at least one, with sides that are multiples of "
+            f"the patch size {patch}"
+        )
+    stages = stages_of(
+        model.config,
+        method,
+        (frames, height, width),
+        gram=gram or row.gram,
+        suppress=suppress or row.suppress,
+        mask_pairs=mask_pairs,
+        align_scale=align_scale,
+        smooth_frames=smooth_frames,
+        compute_dtype=compute_dtype,
+        all_outputs=keep_passes,
+    )
+    length = padded_frames(frames, model.config.motion.offsets) if pad_frames else frames
+    images = jax.ShapeDtypeStruct((1, length, height, width, 3), jnp.float32)
+    count = None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32)
+    arrays = {"params": model.params, "images": images, "frame_count": count, "second": None}
+    with _memory_errors(frames, height, width):
+        return compile_stages(stages, arrays)

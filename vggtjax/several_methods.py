@@ -10,8 +10,9 @@ from contextlib import nullcontext
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.methods import find_method
-from vggtjax.pipeline import OnStage, assembled, assembled_fields, reconstruct, refined
+from vggtjax.pipeline import OnStage, assembled_fields, reconstruct, refined
 from vggtjax.results.reconstruction import FieldOfViewWarning, Reconstruction
+from vggtjax.stages import assembled
 
 
 def reconstruct_methods(
@@ -72,14 +73,13 @@ def groups_of_methods(methods: Sequence[str]) -> list[list[str]]:
 def _as_method(made: Reconstruction, method: str, align_scale: bool, on_stage: OnStage) -> Reconstruction:
     """Return what another method makes of the passes that a result keeps."""
     row, passes = find_method(method), made.passes
+    making = {"frames": len(made.depth), "method": method, "align_scale": align_scale}
     with warnings.catch_warnings():
         if made.method == method:  # it has said already which cameras were clamped
             warnings.simplefilter("ignore", FieldOfViewWarning)
         result = dataclasses.replace(
             made,
-            **assembled_fields(
-                assembled(*passes, method=method, align_scale=align_scale), getattr(passes, row.intrinsics)
-            ),
+            **assembled_fields(assembled(*passes, **making), getattr(passes, row.intrinsics)),
             method=method,
             settings=made.settings | {"refine_mask": row.refine},
             passes=None,

@@ -78,20 +78,25 @@ class SweepCues(GramCues):
         return (jnp.zeros((), jnp.int32), every, *tables)
 
     def add(
-        self, sums: Sums, counts: Int[Array, " cues"], q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
+        self,
+        sums: Sums,
+        counts: Int[Array, " cues"],
+        q: Float[Array, "B S T N D"],
+        k: Float[Array, "B S T N D"],
+        frame_count: Int[Array, " B"] | None = None,
     ) -> Sums:
         """Put the maps of the next pair in their place, and add it to the table's sums."""
         pair, every, *_ = sums
         single = MotionConfig(KINDS, self.motion.offsets, reference_depth=1)
         made = [
-            jnp.stack(cues.add(cues.zeros(*q.shape[:3]), jnp.ones(len(KINDS), int), q, k))
+            jnp.stack(cues.add(cues.zeros(*every.shape[3:]), jnp.ones(len(KINDS), int), q, k, frame_count))
             for cues in (GramCues(single, 1, gram) for gram in GRAMS)
         ]
         every = every.at[:, :, pair].set(jnp.stack(made))
         tables = [
             total
             for cues, totals in zip(self._tables(), self._split(sums), strict=True)
-            for total in cues.add(totals, counts, q, k)
+            for total in cues.add(totals, counts, q, k, frame_count)
         ]
         return (pair + 1, every, *tables)
 

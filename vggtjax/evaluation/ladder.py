@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any, Literal, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -19,10 +19,10 @@ from vggtjax.evaluation.depth import depth_errors, measured, median_scale
 from vggtjax.evaluation.masks import auc, jaccard
 from vggtjax.evaluation.trajectory import centre_error, rotation_error
 from vggtjax.evaluation.truth import ClipTruth, Truth, batched_truth
-from vggtjax.mask import dynamic_pixels, upsample
+from vggtjax.mask import upsample
 from vggtjax.methods import LADDER, find_method
-from vggtjax.network.backbone import encode
-from vggtjax.passes import Passes, assemble, first_pass, second_pass
+from vggtjax.passes import Assembly, Passes, assemble
+from vggtjax.stages import Stage, stages_of
 
 MaskSource = Literal["mined", "true"]
 Progress = Callable[[int, int], object]
@@ -70,12 +70,12 @@ class _Setting(NamedTuple):
     suppress: Suppress | None = None
 
 
-_encode = jax.jit(encode, static_argnames=("config", "compute_dtype"))
-_first_pass = jax.jit(first_pass, static_argnames=("config", "gram", "motion", "compute_dtype"))
-_second_pass = jax.jit(second_pass, static_argnames=("config", "suppress", "compute_dtype"))  # one for all mask_pairs
-_dynamic_pixels = jax.jit(dynamic_pixels, static_argnames=("size",))
+@partial(jax.jit, static_argnames=("methods",))
+def _assemble(passes: Passes, methods: tuple[str, ...]) -> list[Assembly]:
+    return [assemble(passes, method) for method in methods]
+
+
 _upsample = jax.jit(upsample, static_argnames=("size",))
-_assemble = jax.jit(assemble, static_argnames=("method",))
 
 
 def ladder(
@@ -125,12 +125,20 @@ def ladder(
         raise InputError(f"mask_pairs has {wrong}; expected whole numbers of at least 0")
     if batch_size < 1:
         raise InputError(f"batch_size is {batch_size}; expected at least 1")
-    plain = [name for name, row in zip(methods, rows, strict=True) if not row.needs_second_pass]
-    masked = [name for name, row in zip(methods, rows, strict=True) if row.needs_second_pass]
+    plain = tuple(name for name, row in zip(methods, rows, strict=True) if not row.needs_second_pass)
+    masked = tuple(name for name, row in zip(methods, rows, strict=True) if row.needs_second_pass)
     settings = list(product(masks, mask_pairs, suppress)) if masked else []
 
-    config, size = model.config, truth.images.shape[2:4]
-    network = {"config": config, "compute_dtype": compute_dtype}
+    shape = truth.images.shape[1:4]
+
+    def stages(pairs: int = 0, how: Suppress = "zero") -> dict[str, Stage]:
+        same = {"gram": gram, "align_scale": False, "smooth_frames": 1, "compute_dtype": compute_dtype}
+        table = stages_of(model.config, LADDER[-1], shape, suppress=how, mask_pairs=pairs, **same)
+        return {stage.name: stage for stage in table}
+
+    shared = [stages()[name] for name in ("image features", "first pass", "dynamic mask")]
+    if motion is not None:
+        shared[1] = shared[1]._replace(options=shared[1].options | {"motion": motion})
     found: list[LadderRow] = []
     batches = list(_batches(len(truth.images), batch_size))
     done, total = 0, len(batches) * (1 + len(settings))
@@ -142,20 +150,21 @@ def ladder(
             progress(done, total)
 
     for clips, padded in batches:
-        images = jnp.asarray(truth.images[padded], jnp.float32)
-        patch_tokens = _encode(model.params, images, **network)
-        first, saliency = _first_pass(model.params, images, patch_tokens, gram=gram, motion=motion, **network)
-        dynamic = {"mined": _dynamic_pixels(saliency, size), "true": jnp.asarray(truth.dynamic_mask[padded])}
-        pixels = np.asarray(_upsample(saliency, size))
+        images = jax.device_put(truth.images[padded].astype(np.float32, copy=False))
+        arrays = {"params": model.params, "images": images, "frame_count": None}
+        for stage in shared:
+            arrays |= _made(stage, arrays)
+        first, saliency = arrays["first"], arrays["saliency"]
+        dynamic = {"mined": arrays["dynamic_mask"], "true": jax.device_put(truth.dynamic_mask[padded])}
+        pixels = np.asarray(_upsample(saliency, shape[1:]))
         scenes = [_Scene(clip, Truth(*(a[clip] for a in truth)), pixels[i]) for i, clip in enumerate(clips)]
         passes = Passes(first, None, saliency, dynamic["mined"])
         found += _scored(passes, plain, scenes, _Setting())
         advance()
         for source, pairs, how in settings:
             mask = dynamic[source]
-            masking = {"suppress": how, "mask_pairs": pairs}
-            second = _second_pass(model.params, images, patch_tokens, mask, **masking, **network)
-            both = passes._replace(second=second, dynamic_mask=mask)
+            second = _made(stages(pairs, how)["second pass"], arrays | {"dynamic_mask": mask})
+            both = passes._replace(**second, dynamic_mask=mask)
             found += _scored(both, masked, scenes, _Setting(source, pairs, how))
             advance()
     return sorted(found, key=lambda row: row.clip)
@@ -169,10 +178,16 @@ def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         yield indices[indices < count], np.minimum(indices, count - 1)
 
 
-def _scored(passes: Passes, methods: Sequence[str], scenes: list[_Scene], setting: _Setting) -> Iterator[LadderRow]:
+def _made(stage: Stage, arrays: dict[str, Any]) -> dict[str, Any]:
+    """Return what a stage makes, by name."""
+    made = stage.function(*(arrays[name] for name in stage.reads), **stage.options)
+    return dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
+
+
+def _scored(passes: Passes, methods: tuple[str, ...], scenes: list[_Scene], setting: _Setting) -> Iterator[LadderRow]:
     mask = np.asarray(passes.dynamic_mask)
-    for method in methods:
-        depth, _, cameras, _ = (np.asarray(leaf) for leaf in jax.tree.leaves(_assemble(passes, method)))
+    for method, made in zip(methods, _assemble(passes, methods), strict=True):
+        depth, cameras = np.asarray(made.depth), np.asarray(made.camera_from_world)
         for i, scene in enumerate(scenes):
             yield _row(scene, method, setting, depth[i], cameras[i], mask[i])
 

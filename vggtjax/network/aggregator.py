@@ -53,7 +53,8 @@ def aggregate(
         captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Nothing
             else of the tapped pairs is stored, and nothing at all of the others.
         cues: the Gram cues to accumulate from q and k of the global blocks, or None.
-        frame_count: number of frames of each clip that are real, its first ones; the others change nothing in them.
+        frame_count: number of frames of each clip that are real, its first ones, one at least; the others change
+            nothing in them.
         dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs, in both blocks of a pair.
     """
     params = params["aggregator"]
@@ -64,6 +65,8 @@ def aggregate(
     rope = rope_table(grid, SPECIAL_TOKENS, head_dim)
 
     there = None if frame_count is None else jnp.repeat(jnp.arange(S)[None] < frame_count[:, None], T, axis=1)
+
+    real = {} if frame_count is None else {"frame_count": frame_count}
 
     def suppression(active: Bool[Array, ""], rows: int) -> Suppression | None:
         if dynamic_tokens is None:
@@ -78,7 +81,7 @@ def aggregate(
         frame = x
         x, q, k = block(global_params, x.reshape(B, S * T, C), rope, suppression(masked, B), there)
         if cues is not None:
-            sums = cues.add(sums, cued, *(a.reshape(B, S, T, *a.shape[2:]) for a in (q, k)), frame_count)
+            sums = cues.add(sums, cued, *(a.reshape(B, S, T, *a.shape[2:]) for a in (q, k)), **real)
         taps = tuple(
             jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
             for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
@@ -97,6 +100,8 @@ def aggregate(
     )
     taps = tuple(_empty(capture, (B, S, T, 2 * C)) for capture in captures)
     sums = None if cues is None else cues.zeros(B, S, P)
+    if there is not None:  # what is not a number would count even with weight 0
+        patch_tokens = jnp.where(there.reshape(B, S, T)[:, :, :1, None], patch_tokens, 0)
     tokens = _tokens(params, patch_tokens.astype(jnp.float32))
     camera = jnp.zeros((B, S, 2 * C))
     (_, camera, taps, sums), _ = jax.lax.scan(pair, (tokens, camera, taps, sums), layers)

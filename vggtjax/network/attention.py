@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -27,31 +28,41 @@ def attention(
     and needs little memory. NVIDIA GPUs take cuDNN's flash attention for bfloat16 and TPUs jax's own kernel; float32
     on a GPU is computed at once where it fits, and in chunks where it would not.
     """
-    branches = {"cpu": _in_chunks, "tpu": _on_tpu, "default": _at_once_or_in_chunks}
-    if q.dtype == jnp.bfloat16 and q.shape[-1] % 8 == 0 and q.shape[-1] <= 128 and cudnn_works():
+    branches: dict[str, Any] = {"cpu": _in_chunks, "default": _at_once_or_in_chunks}
+    D = q.shape[-1]
+    if q.dtype == jnp.bfloat16 and D % 8 == 0 and D <= 128 and cudnn_works():
         branches["cuda"] = functools.partial(_packed, implementation="cudnn")
+    if jax.default_backend() == "tpu" and jax.device_count() == 1 and (D <= 128 or D % 128 == 0):
+        branches["tpu"] = _on_tpu  # of several devices, jax cannot divide the kernel's work
     return jax.lax.platform_dependent(q, k, v, kept, **branches)
 
 
 @functools.cache
 def cudnn_works() -> bool:
-    """Return whether cuDNN's attention runs here; tried once, on the first NVIDIA GPU if there is one."""
+    """Return whether cuDNN's attention runs here, with its gradient; tried once, on the first NVIDIA GPU if any."""
     try:
-        device = jax.devices("cuda")[0]
+        device = jax.local_devices(backend="cuda")[0]
     except RuntimeError:
         return False
     with jax.ensure_compile_time_eval(), jax.default_device(device):
         try:
-            x = jnp.ones((1, 64, 1, 64), jnp.bfloat16)
-            jax.block_until_ready(jax.nn.dot_product_attention(x, x, x, implementation="cudnn"))
+            x, kept = jnp.ones((2, 13, 1, 64), jnp.bfloat16), jnp.ones((2, 13), bool)
+            gradient = jax.grad(lambda x: _packed(x, x, x, kept, implementation="cudnn").sum())
+            jax.block_until_ready(gradient(x))
         except (RuntimeError, NotImplementedError, ValueError):  # no cuDNN, too old a one, or too old a GPU
             return False
     return True
 
 
 def _at_once_or_in_chunks(q, k, v, kept):
-    fits = q.shape[0] * q.shape[2] * q.shape[1] * k.shape[1] <= LOGITS_ELSEWHERE
-    return (_at_once if fits else _in_chunks)(q, k, v, kept)
+    clips = LOGITS_ELSEWHERE // (q.shape[2] * q.shape[1] * k.shape[1])  # as many fit at once
+    if clips >= q.shape[0]:
+        return _at_once(q, k, v, kept)
+    if clips == 0:
+        return _in_chunks(q, k, v, kept)
+    clips = max(n for n in range(1, clips + 1) if q.shape[0] % n == 0)
+    pieces = jax.tree.map(lambda x: x.reshape(-1, clips, *x.shape[1:]), (q, k, v, kept))
+    return jax.lax.map(lambda some: _at_once(*some), pieces).reshape(q.shape)
 
 
 def _at_once(q, k, v, kept):
@@ -65,7 +76,14 @@ def _packed(q, k, v, kept, *, implementation):
     order = jnp.argsort(~kept, axis=1, stable=True)[:, :, None, None]
     k, v = (jnp.take_along_axis(x, order, axis=1) for x in (k, v))
     lengths = kept.sum(axis=1, dtype=jnp.int32)
-    return jax.nn.dot_product_attention(q, k, v, key_value_seq_lengths=lengths, implementation=implementation)
+    return jax.nn.dot_product_attention(
+        q,
+        k,
+        v,
+        query_seq_lengths=lengths * 0 + q.shape[1],  # made of the others, so that vmap sees both
+        key_value_seq_lengths=lengths,
+        implementation=implementation,
+    )
 
 
 def _on_tpu(q, k, v, kept):
@@ -80,28 +98,71 @@ def _on_tpu(q, k, v, kept):
     queries, keys, values = (padded(x).swapaxes(1, 2) for x in (q, k, v))
     there = padded(jnp.ones((len(k), K), jnp.int32) if kept is None else kept.astype(jnp.int32))
     segments = SegmentIds(jnp.ones((len(q), queries.shape[2]), jnp.int32), there)
-    out = flash_attention(queries, keys, values, segment_ids=segments, sm_scale=q.shape[-1] ** -0.5)
+    exact = "highest" if q.dtype == jnp.float32 else "default"  # there are no products of bfloat16 beyond the default
+    with jax.default_matmul_precision(exact):
+        out = flash_attention(queries, keys, values, segment_ids=segments, sm_scale=q.shape[-1] ** -0.5)
     return out.swapaxes(1, 2)[:, :T]
 
 
 def _in_chunks(q, k, v, kept):
-    B, T, N, D = q.shape
+    T, D = q.shape[1], q.shape[-1]
     bias = None if kept is None else jnp.where(kept, 0.0, -jnp.inf)  # [B, K]
     if T * k.shape[1] <= LOGITS_AT_ONCE:  # short clips: a loop over heads would cost more than it saves
         queries, keys, values = (x.swapaxes(1, 2) for x in (q * D**-0.5, k, v))
         return _attended(queries, keys, values, None if bias is None else bias[:, None]).swapaxes(1, 2)
-    chunks = math.ceil(T / QUERIES_AT_ONCE)
-    padding = -T % chunks
+    return _head_by_head(q, k, v, bias)
+
+
+@jax.custom_vjp
+def _head_by_head(q, k, v, bias):
+    B, T, N, D = q.shape
 
     def one_head(out, index):  # what a head attended to takes the place of its queries: nothing is laid out anew
         clip, head = index // N, index % N
         queries, keys, values = (x[clip, :, head] for x in (out, k, v))
-        queries = jnp.pad(queries * D**-0.5, ((0, padding), (0, 0))).reshape(chunks, -1, D)
         mine = None if bias is None else bias[clip]
-        made = jax.lax.map(lambda some: _attended(some, keys, values, mine), queries).reshape(-1, D)[:T]
-        return out.at[clip, :, head].set(made), None
+        made = jax.lax.map(lambda some: _attended(some, keys, values, mine), _chunks(queries * D**-0.5))
+        return out.at[clip, :, head].set(made.reshape(-1, D)[:T]), None
 
     return jax.lax.scan(one_head, q, jnp.arange(B * N))[0]
+
+
+def _head_by_head_forward(q, k, v, bias):
+    out = _head_by_head(q, k, v, bias)
+    return out, (q, k, v, bias, out)
+
+
+def _head_by_head_backward(residuals, gradient):
+    q, k, v, bias, out = residuals
+    B, T, N, D = q.shape
+
+    def by_head(x: Float[Array, "B L N D"]) -> Float[Array, "BN L D"]:
+        return x.swapaxes(1, 2).reshape(B * N, -1, D)
+
+    def one_head(head):
+        q, k, v, bias, out, gradient = head
+
+        def some(sums, chunk):
+            to_queries, *more, _ = _backward((chunk[0], k, v, bias, chunk[1]), chunk[2])
+            return [total + part for total, part in zip(sums, more, strict=True)], to_queries
+
+        chunks = tuple(_chunks(x) for x in (q * D**-0.5, out, gradient))
+        (to_k, to_v), to_q = jax.lax.scan(some, [jnp.zeros_like(k), jnp.zeros_like(v)], chunks)
+        return to_q.reshape(-1, D)[:T] * D**-0.5, to_k, to_v
+
+    mine = None if bias is None else jnp.repeat(bias, N, axis=0)
+    heads = jax.lax.map(one_head, (by_head(q), by_head(k), by_head(v), mine, by_head(out), by_head(gradient)))
+    to_q, to_k, to_v = (x.reshape(B, N, -1, D).swapaxes(1, 2) for x in heads)
+    return to_q, to_k, to_v, None if bias is None else jnp.zeros_like(bias)
+
+
+_head_by_head.defvjp(_head_by_head_forward, _head_by_head_backward)
+
+
+def _chunks(x: Float[Array, "T D"]) -> Float[Array, "c R D"]:
+    """Cut the queries of a head, or what belongs to them, into chunks; zeros fill the last."""
+    chunks = math.ceil(len(x) / QUERIES_AT_ONCE)
+    return jnp.pad(x, ((0, -len(x) % chunks), (0, 0))).reshape(chunks, -1, x.shape[1])
 
 
 @jax.custom_vjp

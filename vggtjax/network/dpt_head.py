@@ -234,11 +234,10 @@ def add_positions(x: Float[Array, "F h w C"], aspect: float, weight: float = 0.1
         angles = position[:, None] * frequencies
         return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)
 
-    across, down = waves(u), waves(v)  # [w, C/2], [h, C/2]
-    embedding = np.concatenate(
-        [np.broadcast_to(across[None], (h, w, C // 2)), np.broadcast_to(down[:, None], (h, w, C // 2))], axis=-1
-    )
-    return x + jnp.asarray(weight * embedding, x.dtype)[None]
+    none = np.zeros((1, C // 2))  # a constant of the map's own size would be hundreds of megabytes in the program
+    across = np.concatenate([waves(u), np.repeat(none, w, axis=0)], axis=-1)  # [w, C]
+    down = np.concatenate([np.repeat(none, h, axis=0), waves(v)], axis=-1)  # [h, C]
+    return x + jnp.asarray(weight * across, x.dtype)[None, None] + jnp.asarray(weight * down, x.dtype)[None, :, None]
 
 
 def _features(config: VGGTConfig) -> DPTFeatures:

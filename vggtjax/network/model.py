@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import HEAD_NAMES, Suppress, VGGTConfig
 from vggtjax.errors import InputError
+from vggtjax.methods import check_mask_pairs
 from vggtjax.motion import GramCues, Sums
 from vggtjax.network.aggregator import aggregate, declare_aggregator
 from vggtjax.network.backbone import declare_backbone, encode, patch_grid
@@ -66,7 +67,8 @@ def forward(
         images: RGB in [0, 1], any number of frames; H and W are multiples of the patch size.
         config: the model's configuration (static under jit).
         patch_tokens: what `encode` returned for these images; computed here if None.
-        frame_count: for clips of different lengths in one batch: how many of a clip's frames are real, its first ones.
+        frame_count: for clips of different lengths in one batch: how many of a clip's frames are real: its first ones,
+            one at least.
             The others change nothing in them, whatever they show. Not with "tracks"; and with `cues`, every real frame
             must have a source at the cues' offsets (four frames do by default).
         dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs; None for the plain pass.
@@ -195,8 +197,7 @@ def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pa
         raise InputError(f"dynamic_tokens have shape {tuple(dynamic_tokens.shape)}; expected {(B, S, *grid)}")
     if dynamic_tokens is not None and dynamic_tokens.dtype != bool:
         raise InputError(f"dynamic_tokens have type {dynamic_tokens.dtype}; expected bool")
-    if isinstance(mask_pairs, int | float) and (mask_pairs != int(mask_pairs) or mask_pairs < 0):
-        raise InputError(f"mask_pairs is {mask_pairs}; expected a whole number of at least 0")
+    check_mask_pairs(mask_pairs)
     if unknown := [name for name in outputs if name not in HEAD_NAMES]:
         raise InputError(f"outputs has {unknown}; expected some of {HEAD_NAMES}")
     if absent := [name for name in outputs if name not in config.heads]:

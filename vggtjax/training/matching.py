@@ -40,13 +40,17 @@ class MatchLoss:
         return MatchSums(jnp.zeros(()), jnp.zeros(()))
 
     def add(
-        self, sums: MatchSums, supervised: Int[Array, ""], q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
+        self, sums: MatchSums, supervised: Int[Array, ""], q: Float[Array, "B S T N D"], k: Float[Array, "B S T N D"]
     ) -> MatchSums:
-        """Add a layer's loss if it is supervised; a real branch, so that other layers cost nothing."""
+        """Add a layer's loss if it is supervised; a real branch, so that other layers cost nothing.
+
+        The patches are the last tokens of a frame.
+        """
+        P = self._matches.patch.shape[-1]
 
         @jax.checkpoint  # else the scan keeps room for the logits of every layer
         def layer(sums: MatchSums, q: Array, k: Array) -> MatchSums:
-            loss, accuracy = match_loss(self._matches, q, k)
+            loss, accuracy = match_loss(self._matches, q[:, :, -P:], k[:, :, -P:])
             return MatchSums(sums.loss + loss / len(self._layers), sums.accuracy + accuracy / len(self._layers))
 
         return jax.lax.cond(supervised > 0, layer, lambda sums, q, k: sums, sums, q, k)

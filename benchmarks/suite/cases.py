@@ -1,0 +1,98 @@
+"""The models that are measured, and what they are given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from benchmarks.seeded import seeded_images
+from benchmarks.suite.work import Grid
+from vggtjax.checkpoint import load_model
+from vggtjax.config import VGGTConfig
+from vggtjax.demo import demo_model
+from vggtjax.errors import InputError
+from vggtjax.network.layers import Params
+from vggtjax.network.model import init_params
+
+Size = Literal["tiny", "demo", "full"]
+DType = Literal["float32", "bfloat16"]
+
+TINY = VGGTConfig(
+    image_size=56, embed_dim=16, depth=4, num_heads=2, dino_depth=1, dino_num_heads=2, camera_depth=1,
+    camera_num_heads=2, dpt_features=8, dpt_channels=(8, 8, 8, 8), taps=(0, 1, 2, 3), track_features=8,
+    track_hidden=16, track_corr_levels=3, track_corr_radius=2,
+)  # fmt: skip
+_FULL_FRAME = (294, 518)
+_PAGE = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A model and the shape of a clip."""
+
+    size: Size
+    config: VGGTConfig
+    params: Params = field(repr=False)
+    frames: int
+    height: int
+    width: int
+    dtype: DType
+
+    @property
+    def grid(self) -> Grid:
+        """Rows and columns of patches."""
+        return self.height // self.config.patch_size, self.width // self.config.patch_size
+
+    def images(self) -> Float[Array, "1 S H W 3"]:
+        """Draw a clip."""
+        return jnp.asarray(seeded_images(self.frames, self.height, self.width).transpose(0, 2, 3, 1)[None])
+
+    def drawn(self, *shape: int) -> Array:
+        """Draw numbers on the device."""
+        return jax.random.normal(jax.random.key(0), shape)
+
+
+def config_of(size: Size) -> VGGTConfig:
+    """Return the configuration of a size, without weights."""
+    return {"tiny": lambda: TINY, "demo": lambda: demo_model().config, "full": VGGTConfig}[size]()
+
+
+def load(size: Size, weights: Path | None = None) -> tuple[VGGTConfig, Params]:
+    """Return a model: the embedded one, a converted file's, or one that is drawn; every page of it is in memory."""
+    if weights is not None:
+        if not weights.is_file():
+            raise InputError(f"{weights} is not there; expected a .safetensors file as vggtjax convert writes it")
+        model = load_model(weights)
+    elif size == "demo":
+        model = demo_model()
+    else:
+        config = config_of(size)
+        return config, init_params(0, config)
+    if jax.default_backend() == "cpu":
+        for leaf in jax.tree.leaves(model.params):  # mapped files are read when they are first looked at
+            np.asarray(leaf).reshape(-1).view(np.uint8)[::_PAGE].sum()
+    return model.config, model.params
+
+
+def frame_size(size: Size, config: VGGTConfig, height: int | None, width: int | None) -> tuple[int, int]:
+    """Return height and width in pixels: those given, or else the size's own."""
+    own = _FULL_FRAME if size == "full" else (config.image_size, config.image_size)
+    sides = (own[0] if height is None else height, own[1] if width is None else width)
+    for name, side in zip(("height", "width"), sides, strict=True):
+        if side < config.patch_size or side % config.patch_size:
+            raise InputError(f"{name} is {side}; expected a multiple of {config.patch_size}, the patch of {size}")
+    return sides
+
+
+def check_counts(frames: tuple[int, ...], repeats: int = 1) -> None:
+    """Raise InputError for numbers of frames or of runs that cannot be."""
+    if not frames or min(frames) < 1:
+        raise InputError(f"frames is {list(frames)}; expected numbers of at least 1")
+    if repeats < 1:
+        raise InputError(f"repeats is {repeats}; expected at least 1")

@@ -1,0 +1,101 @@
+"""What this machine does at best of each kind of work, at the shapes that the network gives it."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from benchmarks.suite.measure import sustained
+from benchmarks.suite.work import Grid
+from vggtjax.config import VGGTConfig
+
+_IN_A_ROW = 16  # exponentials of the same array, and products with the same weights
+
+
+def measure_ceilings(config: VGGTConfig, grid: Grid, dtype: str) -> dict[str, float]:
+    """Return FLOP, exponentials and bytes per second, by kind of work.
+
+    Small shapes are made so many that what a call costs does not count.
+
+    Args:
+        config: the model whose channels are taken.
+        grid: rows and columns of patches, of which the convolution's map is four times as large.
+        dtype: of products in the blocks; heads are float32.
+    """
+    small = jax.default_backend() == "cpu"  # as much at a time as stays in the cache; elsewhere, enough for all cores
+    rows, queries, keys, values, pixels = (
+        (1600, 800, 1600, 2**20, 2**14) if small else (2**15, 4096, 4096, 2**26, 2**17)
+    )
+    D = config.embed_dim // config.num_heads
+    linear = {name: _linear(rows, config.embed_dim, name) for name in {dtype, "float32"}}
+    return {
+        "linear": linear[dtype],
+        "linear, float32": linear["float32"],
+        "attention": _attention(config.num_heads, queries, keys, D, dtype, loop=small),
+        "exp": _exponentials(values),
+        "convolution": _convolution(pixels, (4 * grid[0], 4 * grid[1]), config.dpt_features),
+        "weights": _reading(12 * config.camera_depth, config.camera_dim),
+    }
+
+
+def _linear(rows: int, C: int, dtype: str) -> float:
+    """The four products of a block: q, k and v, projection, and both of the MLP."""
+    shapes = ((C, 3 * C), (C, C), (C, 4 * C), (4 * C, C))
+    inputs = [_drawn((rows, shape[0]), dtype) for shape in shapes]
+    kernels = [_drawn(shape, dtype) for shape in shapes]
+
+    def products(inputs, kernels):
+        return [jnp.matmul(x, w, preferred_element_type=jnp.float32) for x, w in zip(inputs, kernels, strict=True)]
+
+    return 2 * rows * sum(map(math.prod, shapes)) / sustained(products, (inputs, kernels))
+
+
+def _attention(heads: int, queries: int, keys: int, D: int, dtype: str, *, loop: bool) -> float:
+    """Both products of attention, without the softmax between them."""
+
+    def one_head(inputs):
+        q, k, v = inputs
+        weights = jnp.matmul(q, k.T, preferred_element_type=jnp.float32).astype(q.dtype)
+        return jnp.matmul(jax.lax.optimization_barrier(weights), v, preferred_element_type=jnp.float32)
+
+    def products(inputs):
+        return jax.lax.map(one_head, inputs) if loop else jax.vmap(one_head)(inputs)
+
+    inputs = tuple(_drawn((heads, length, D), dtype) for length in (queries, keys, keys))
+    return 4 * heads * queries * keys * D / sustained(products, (inputs,))
+
+
+def _exponentials(count: int) -> float:
+    def repeated(x):
+        return jax.lax.fori_loop(0, _IN_A_ROW, lambda _, x: jnp.exp(-x), x)
+
+    return _IN_A_ROW * count / sustained(repeated, (_drawn((count,)),))
+
+
+def _convolution(pixels: int, size: tuple[int, int], F: int) -> float:
+    """A 3 x 3 convolution of as many maps of this size as have about so many pixels, one at least."""
+    frames = max(pixels // math.prod(size), 1)
+
+    def convolved(x, kernel):
+        return jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+
+    arguments = (_drawn((frames, *size, F)), _drawn((3, 3, F, F)))
+    return 18 * frames * math.prod(size) * F**2 / sustained(convolved, arguments)
+
+
+def _reading(matrices: int, E: int) -> float:
+    """Bytes per second of a product with a vector, over as many weights as the camera head's blocks have."""
+    weights = _drawn((matrices * E, E))
+
+    def products(weights, x):
+        return jax.lax.fori_loop(0, _IN_A_ROW, lambda _, x: (weights @ x)[:E], x)
+
+    return _IN_A_ROW * weights.nbytes / sustained(products, (weights, _drawn((E,))))
+
+
+def _drawn(shape: tuple[int, ...], dtype: str = "float32") -> Array:
+    return jnp.asarray(0.1 * np.random.default_rng(0).standard_normal(shape, np.float32), dtype)

@@ -1,0 +1,122 @@
+"""How long everything takes, and how near that is to what the machine could do: python -m benchmarks suite."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.progress import Progress
+
+from benchmarks.plots import check_matplotlib
+from benchmarks.suite import report
+from benchmarks.suite.cases import Case, DType, Size, check_counts, frame_size, load
+from benchmarks.suite.ceilings import measure_ceilings
+from benchmarks.suite.measure import compiling_anew, without_memory
+from benchmarks.suite.report import Row
+from benchmarks.suite.work import floor_by_kind, flop
+from benchmarks.suite.workloads import WORKLOADS, Workload
+from vggtjax.errors import InputError
+from vggtjax.files import writing
+from vggtjax.host_memory import keep_freed_memory
+
+
+def suite(
+    *,
+    workloads: tuple[str, ...] = tuple(WORKLOADS),
+    sizes: tuple[Size, ...] = ("demo",),
+    weights: Path | None = None,
+    frames: tuple[int, ...] = (2, 8),
+    height: int | None = None,
+    width: int | None = None,
+    dtype: DType = "float32",
+    repeats: int = 3,
+    out: Path | None = None,
+    markdown: Path | None = None,
+    against: Path | None = None,
+    plots: Path | None = None,
+) -> None:
+    """Time named workloads beside a floor: their work over what this machine does at best of each kind of work.
+
+    Args:
+        workloads: their names; all by default.
+        sizes: of the model. tiny: for trying this out. demo: the embedded model. full: VGGT-1B with drawn weights.
+        weights: a converted checkpoint to take for full.
+        frames: numbers of frames.
+        height: of a frame, in pixels; 56, 64 and 294 for the three sizes by default.
+        width: of a frame, in pixels; 56, 64 and 518 by default.
+        dtype: of the products in the blocks.
+        repeats: timed runs of each, after one that warms up.
+        out: JSON file for the results.
+        markdown: the same tables in a file.
+        against: JSON file of an earlier run, to compare the medians with.
+        plots: folder for roofline.png and scaling.png.
+    """
+    if unknown := [name for name in workloads if name not in WORKLOADS]:
+        raise InputError(f"workloads has {unknown}; expected some of {list(WORKLOADS)}")
+    if weights is not None and "full" not in sizes:
+        raise InputError(f"weights is {weights} and sizes has no full, which they are for; add it, or leave them out")
+    check_counts(frames, repeats)
+    stored = None if against is None else report.read_stored(against)
+    if plots is not None:
+        check_matplotlib()
+    keep_freed_memory()
+    rows: list[Row] = []
+    sheets: list[report.Sheet] = []
+    ceilings: dict[str, dict[str, float]] = {}
+    screen = report.console()
+
+    def run(size: Size, progress: Progress) -> None:
+        task = progress.add_task(f"{size}: weights", total=None)
+        config, params = load(size, weights if size == "full" else None)
+        shape = frame_size(size, config, height, width)
+        cases = [Case(size, config, params, count, *shape, dtype) for count in frames]
+        progress.update(task, description=f"{size}: ceilings")
+        ceilings[size] = measure_ceilings(config, cases[0].grid, dtype)
+        wanted = [name for name in workloads if WORKLOADS[name].scope != "process" or size == sizes[0]]
+        runs = [(name, case) for name in wanted for case in cases[: None if WORKLOADS[name].scope == "clip" else 1]]
+        progress.update(task, total=len(runs))
+        found: list[Row] = []
+        for name, case in runs:
+            progress.update(task, description=f"{size}: {name}, {case.frames} frames")
+            found.extend(measured_rows(name, WORKLOADS[name], case, repeats, ceilings[size]))
+            progress.advance(task)
+        rows.extend(found)
+        title = f"{size}, {shape[1]} x {shape[0]} pixels, {dtype}"
+        sheets.extend(
+            [report.ceiling_sheet(title, ceilings[size]), report.row_sheet(f"{title}, {repeats} runs", found)]
+        )
+
+    with compiling_anew(), Progress(console=screen, transient=True) as progress:
+        for size in dict.fromkeys(sizes):
+            run(size, progress)
+    here = report.describe(report.machine())
+    if stored is not None and against is not None:
+        sheets.append(report.comparison_sheet(rows, stored, against))
+    for sheet in sheets:
+        sheet.show(screen)
+    screen.print(here, highlight=False)
+    if out is not None:
+        report.write_rows(out, rows, ceilings=ceilings, repeats=repeats)
+    if markdown is not None:
+        with writing(markdown) as temporary:
+            temporary.write_text("\n".join([here + "\n", *(sheet.markdown() for sheet in sheets)]), encoding="utf-8")
+    if plots is not None:
+        from benchmarks.suite.pictures import plot_roofline, plot_scaling
+
+        plot_roofline(plots / "roofline.png", rows, here)
+        plot_scaling(plots / "scaling.png", rows, here)
+
+
+def measured_rows(
+    name: str, workload: Workload, case: Case, repeats: int, ceilings: dict[str, float] | None = None
+) -> list[Row]:
+    """Measure a workload; return a row for each of its results, with its floor if it has one."""
+    parts = workload.parts(case) if workload.parts else []
+    floor = floor_by_kind(parts, ceilings) if ceilings else {}
+    size = None if workload.scope == "process" else case.size
+    shape = (case.frames, case.height, case.width) if workload.scope == "clip" else (None, None, None)
+    results = without_memory(lambda: workload.measure(case, repeats))
+    names = [f"{name}: {result}" if result else name for result in results]
+    return [
+        Row(full, size, *shape, case.dtype, measured, flop(parts) or None, floor)
+        for full, measured in zip(names, results.values(), strict=True)
+    ]

@@ -1,0 +1,150 @@
+"""Timing, and memory: XLA's own analysis, the process's high water, and the device's."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from vggtjax.network.precision import full_precision
+
+_PROCESS = Path("/proc/self")
+_RESET_HIGH_WATER = "5"  # of Linux's clear_refs
+_SUSTAINED = 0.05  # seconds
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a run took; None where that is not known here."""
+
+    seconds: tuple[float, ...] = ()  # of the timed runs
+    compile_seconds: float | None = None
+    temp_bytes: int | None = None  # by XLA's analysis
+    output_bytes: int | None = None
+    host_bytes: int | None = None  # most that the process took in a run beyond what it had, its weights included
+    device_bytes: int | None = None  # the same of the device; None too where an earlier run took more
+    failure: str = ""
+
+    @property
+    def median(self) -> float | None:
+        return float(np.median(self.seconds)) if self.seconds else None
+
+    @property
+    def xla_bytes(self) -> int | None:
+        """Working memory and outputs."""
+        return None if self.temp_bytes is None or self.output_bytes is None else self.temp_bytes + self.output_bytes
+
+
+def measure_program(function: Callable[..., Any], arguments: tuple, repeats: int) -> Measured:
+    """Compile a function of arrays, run it once for its memory, then time it."""
+    (compiled,), compile_seconds = timed(lambda: (jax.jit(function).lower(*arguments).compile(),))
+    temp, output = analysed(compiled)
+
+    def run() -> None:
+        jax.block_until_ready(compiled(*arguments))
+
+    host, device = memory_of(run)
+    return Measured(tuple(timed(run)[1] for _ in range(repeats)), compile_seconds, temp, output, host, device)
+
+
+def measure_calls(call: Callable[[], object], repeats: int, *, compiles: bool = False) -> Measured:
+    """Call once to warm up, once for its memory, then time it; if it `compiles`, the first takes that much longer."""
+    first = timed(call)[1]
+    host, device = memory_of(call)
+    seconds = tuple(timed(call)[1] for _ in range(repeats))
+    compiling = max(first - float(np.median(seconds)), 0.0) if compiles else None
+    return Measured(seconds, compiling, host_bytes=host, device_bytes=device)
+
+
+def timed(call: Callable[[], Any]) -> tuple[Any, float]:
+    """Return what a call returns, and its seconds."""
+    began = time.perf_counter()
+    made = call()
+    return made, time.perf_counter() - began
+
+
+def sustained(function: Callable[..., Any], arguments: tuple, repeats: int = 5) -> float:
+    """Return the least seconds of a run out of several series of runs, each long enough for the clock."""
+    compiled = jax.jit(full_precision(function)).lower(*arguments).compile()
+
+    def series(count: int) -> float:
+        return timed(lambda: jax.block_until_ready([compiled(*arguments) for _ in range(count)][-1]))[1] / count
+
+    series(1)
+    count = min(max(math.ceil(_SUSTAINED / series(1)), 1), 1000)
+    return min(series(count) for _ in range(repeats))
+
+
+def analysed(compiled: Any) -> tuple[int | None, int | None]:
+    """Return the temporary and output bytes of a compiled program, by XLA's own analysis."""
+    analysis = compiled.memory_analysis()
+    return (None, None) if analysis is None else (analysis.temp_size_in_bytes, analysis.output_size_in_bytes)
+
+
+def memory_of(run: Callable[[], object]) -> tuple[int | None, int | None]:
+    """Run; return the most bytes that the process and the device had meanwhile, beyond what they had before."""
+    gc.collect()
+    _give_back()
+    had, device_had = _reset_high_water(), _device_memory()
+    run()
+    device_has = _device_memory()
+    host = None if had is None else max(_process_memory("VmHWM") - had, 0)
+    rose = device_has.get("peak_bytes_in_use", 0) > device_had.get("peak_bytes_in_use", 0)
+    return host, device_has["peak_bytes_in_use"] - device_had["bytes_in_use"] if rose else None
+
+
+def without_memory(call: Callable[[], dict[str, Measured]]) -> dict[str, Measured]:
+    """Return what a call returns, or one failure where the memory does not suffice."""
+    try:
+        return call()
+    except MemoryError:
+        pass
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+    return {"": Measured(failure="out of memory")}
+
+
+@contextmanager
+def compiling_anew() -> Iterator[None]:
+    """Keep jax from finding programs in a cache on disk, where one is set."""
+    before = jax.config.values["jax_enable_compilation_cache"]
+    jax.config.update("jax_enable_compilation_cache", False)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_compilation_cache", before)
+
+
+def _give_back() -> None:
+    """Have glibc return what is freed, so that the next run's memory shows."""
+    if sys.platform.startswith("linux") and hasattr(ctypes.CDLL(None), "malloc_trim"):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def _reset_high_water() -> int | None:
+    """Set the process's high water to what it has now, and return that; None where there is no such thing."""
+    try:
+        (_PROCESS / "clear_refs").write_text(_RESET_HIGH_WATER)
+        return _process_memory("VmRSS")
+    except (OSError, LookupError):
+        return None
+
+
+def _process_memory(name: str) -> int:
+    lines = dict(line.split(":", 1) for line in (_PROCESS / "status").read_text().splitlines())
+    return int(lines[name].split()[0]) * 1024
+
+
+def _device_memory() -> dict[str, int]:
+    return jax.local_devices()[0].memory_stats() or {}

@@ -1,0 +1,223 @@
+"""What is measured, by name."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.make_checkpoint import make_checkpoint
+from benchmarks.suite import work
+from benchmarks.suite.cases import Case
+from benchmarks.suite.measure import Measured, measure_calls, measure_program, timed
+from converters.torch_to_flax import convert, source_shapes
+from vggtjax.errors import InputError
+from vggtjax.motion import GramCues
+from vggtjax.network.aggregator import aggregate
+from vggtjax.network.backbone import encode
+from vggtjax.network.dpt_head import predict_dense, project_tap
+from vggtjax.network.model import forward
+from vggtjax.network.track_head import predict_tracks
+from vggtjax.pipeline import infer
+from vggtjax.refinement import refine_masks
+from vggtjax.scenes import SceneConfig, load_textures
+from vggtjax.scenes.render import generate
+
+Program = tuple[Callable[..., Any], tuple]  # a function of arrays, and those arrays
+
+TRACKED = 64  # points
+_GROWN = 4  # pixels by which the mask to refine is larger than the truth
+DEMO = ("-m", "vggtjax", "demo")
+_STEPS = ("trace", "lower", "XLA")
+_IMPORTED = "import sys, atexit; atexit.register(lambda: sys.stderr.write(str('jax' in sys.modules))); "
+_STARTS = {
+    "import vggtjax": "import vggtjax",
+    "vggtjax --help": "from vggtjax.cli import main; sys.exit(main(['--help']))",
+}
+
+
+class Workload(NamedTuple):
+    """How to measure something, and how much work it is. Several results have names of their own."""
+
+    about: str
+    measure: Callable[[Case, int], dict[str, Measured]]  # a case and a number of timed runs -> results by name
+    parts: Callable[[Case], list[work.Work]] | None = None
+    scope: Literal["clip", "model", "process"] = "clip"  # what it depends on
+
+
+def aggregator(case: Case) -> Program:
+    """DINOv2 and the alternating blocks, no heads."""
+
+    def run(params, images):
+        tokens = encode(params, images, case.config, compute_dtype=case.dtype)
+        return aggregate(params, tokens, case.config, case.grid, captures=(), compute_dtype=case.dtype)[0]
+
+    return run, (case.params, case.images())
+
+
+def plain_pass(case: Case) -> Program:
+    """Cameras and depth of images."""
+
+    def run(params, images):
+        return forward(params, images, case.config, compute_dtype=case.dtype)
+
+    return run, (case.params, case.images())
+
+
+def cue_sums(case: Case) -> Program:
+    """The cues of every layer that has some, all on the same q and k."""
+    cues = GramCues(case.config.motion, case.config.depth)
+    counts = cues.layer_counts()
+    S, P, N = case.frames, case.grid[0] * case.grid[1], case.config.num_heads
+
+    def run(counts, q, k):
+        return jax.lax.scan(lambda sums, row: (cues.add(sums, row, q, k), None), cues.zeros(1, S, P), counts)[0]
+
+    q, k = case.drawn(2, 1, S, P, N, case.config.embed_dim // N).astype(case.dtype)
+    return run, (jnp.asarray(counts[counts.any(axis=1)]), q, k)
+
+
+def two_passes(case: Case) -> Program:
+    """The whole method, images to fused depth and cameras."""
+
+    def run(params, images):
+        return infer(params, images, case.config, compute_dtype=case.dtype)
+
+    return run, (case.params, case.images())
+
+
+def depth_head(case: Case) -> Program:
+    """Depth and confidence of what four pairs of blocks put out."""
+
+    def run(params, tokens, shifts):
+        return predict_dense(params, _taps(params, tokens, shifts, case), case.config, case.grid, "depth")
+
+    return run, (case.params["depth_head"], *_tapped(case))
+
+
+def tracks(case: Case) -> Program:
+    """Tracks of points of the first frame, of what four pairs of blocks put out."""
+
+    def run(params, tokens, shifts, points):
+        return predict_tracks(params, _taps(params, tokens, shifts, case), points, case.config, case.grid)
+
+    x, y = np.meshgrid(*(np.linspace(0.1, 0.9, int(TRACKED**0.5)) * side for side in (case.width, case.height)))
+    points = jnp.asarray(np.stack([x, y], axis=-1).reshape(1, -1, 2), jnp.float32)
+    return run, (case.params["track_head"], *_tapped(case), points)
+
+
+def _tapped(case: Case) -> tuple[Any, Any]:
+    tokens = case.drawn(1, case.frames, case.grid[0] * case.grid[1], case.config.camera_dim)
+    return tokens, jnp.arange(4) / 10
+
+
+def _taps(params, tokens, shifts, case: Case) -> list[Any]:
+    """Four taps of one array, made different, so that the compiler does not share their norm."""
+    return [project_tap(params, tokens + shifts[slot], slot, case.config) for slot in range(4)]
+
+
+def _conversion(case: Case, repeats: int) -> dict[str, Measured]:
+    with tempfile.TemporaryDirectory() as folder:
+        source, made = Path(folder) / "torch.safetensors", Path(folder) / "flax.safetensors"
+        make_checkpoint(source, source_shapes(case.config))
+        return {"": measure_calls(lambda: convert(source, made, config=case.config), repeats)}
+
+
+def _refinement(case: Case, repeats: int) -> dict[str, Measured]:
+    from scipy.ndimage import binary_dilation
+
+    scene = SceneConfig(case.height, case.width, case.frames, dynamic=1.0, static_camera=0.0)
+    key = jax.random.key(0)
+    clip = jax.tree.map(np.asarray, jax.jit(generate, static_argnums=2)(key, load_textures("test"), scene))
+    unit = np.median(clip.depth)
+    pose = np.concatenate([clip.camera_from_world[..., :3], clip.camera_from_world[..., 3:] / unit], axis=-1)
+    mask = np.stack([binary_dilation(one, iterations=_GROWN) for one in clip.dynamic_mask])
+
+    def refine():
+        return refine_masks(clip.images, clip.depth / unit, mask, pose, clip.intrinsics)
+
+    return {"": measure_calls(refine, repeats, compiles=True)}
+
+
+def _start_up(case: Case, repeats: int) -> dict[str, Measured]:
+    """Fresh processes: what must not import jax, and the demo before and after its programs are in the cache."""
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_COMPILATION")}
+        environment |= {"VGGTJAX_CACHE": f"{folder}/cache"}
+
+        def start(*arguments: str) -> str:
+            command = [sys.executable, *arguments]
+            done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+            if done.returncode:
+                raise InputError(f"{' '.join(command)} failed: {done.stderr.strip().splitlines()[-1:]}")
+            return done.stderr
+
+        for name, code in _STARTS.items():
+            runs = [timed(lambda code=code: start("-c", _IMPORTED + code)) for _ in range(1 + repeats)][1:]
+            jax_too = any(said.endswith("True") for said, _ in runs)
+            seconds = tuple(seconds for _, seconds in runs)
+            found[f"{name}, {'jax' if jax_too else 'no jax'}"] = Measured(seconds)
+        for name in ("first", "second"):
+            _, seconds = timed(lambda: start(*DEMO, "--out", f"{folder}/out"))
+            found[f"vggtjax demo, {name} run"] = Measured((seconds,))
+    return found
+
+
+def _compile_steps(case: Case, repeats: int) -> dict[str, Measured]:
+    function, arguments = two_passes(case)
+    seconds = []
+    for _ in range(repeats):
+        jax.clear_caches()
+        traced, tracing = timed(lambda: jax.jit(function).trace(*arguments))
+        lowered, lowering = timed(traced.lower)
+        seconds.append((tracing, lowering, timed(lowered.compile)[1]))
+    return {name: Measured(tuple(column)) for name, column in zip(_STEPS, zip(*seconds, strict=True), strict=True)}
+
+
+def _program(about: str, build: Callable[[Case], Program], parts: Callable[[Case], list[work.Work]]) -> Workload:
+    return Workload(about, lambda case, repeats: {"": measure_program(*build(case), repeats)}, parts)
+
+
+def _trunk(case: Case) -> list[work.Work]:
+    shape = (case.config, case.frames, case.grid)
+    return work.backbone(*shape) + work.alternating(*shape)
+
+
+def _heads(case: Case) -> list[work.Work]:
+    return work.camera_head(case.config, case.frames) + work.depth_head(case.config, case.frames, case.grid)
+
+
+def _both(case: Case) -> list[work.Work]:
+    shape = (case.config, case.frames, case.grid)
+    return work.backbone(*shape) + work.cues(*shape) + 2 * (work.alternating(*shape) + _heads(case))
+
+
+WORKLOADS = {
+    "aggregator": _program("DINOv2 and the alternating blocks", aggregator, _trunk),
+    "pass": _program("a plain pass: cameras and depth", plain_pass, lambda case: _trunk(case) + _heads(case)),
+    "cues": _program(
+        "the motion cues' sums alone", cue_sums, lambda case: work.cues(case.config, case.frames, case.grid)
+    ),
+    "two-passes": _program("4dvggt-d, images to fused depth and cameras", two_passes, _both),
+    "depth-head": _program(
+        "the depth head alone", depth_head, lambda case: work.depth_head(case.config, case.frames, case.grid)
+    ),
+    "tracks": _program(
+        f"the track head alone, {TRACKED} points",
+        tracks,
+        lambda case: work.track_head(case.config, case.frames, case.grid, TRACKED),
+    ),
+    "refinement": Workload("mask refinement of a generated clip", _refinement),
+    "compile": Workload("tracing, lowering and compiling both passes, with no cache", _compile_steps),
+    "conversion": Workload("a PyTorch checkpoint to a file of this library", _conversion, scope="model"),
+    "start-up": Workload("fresh processes, with an empty cache of their own", _start_up, scope="process"),
+}

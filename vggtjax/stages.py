@@ -1,0 +1,152 @@
+"""The stages that reconstruct a clip, as a table of jitted functions, and their compilation ahead of the first run."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from vggtjax.config import Gram, Suppress, VGGTConfig
+from vggtjax.mask import mine_mask
+from vggtjax.methods import check_mask_pairs, check_smooth_frames, find_method
+from vggtjax.network.backbone import encode
+from vggtjax.network.model import Predictions
+from vggtjax.passes import Assembly, Passes, assemble, first_pass, second_pass, track_from
+from vggtjax.tracking import Queries
+
+
+class Stage(NamedTuple):
+    """A jitted function, the arrays that it reads and makes (by name), and its static options."""
+
+    name: str
+    reads: tuple[str, ...]
+    makes: tuple[str, ...]
+    function: Any
+    options: dict[str, Any]
+
+
+class StageMemory(NamedTuple):
+    """What a compiled stage needs beside what it reads, by XLA's own analysis, in bytes."""
+
+    temporary: int
+    output: int
+
+
+def _first(params, images, patch_tokens, frame_count, query_points=None, **options):
+    given = {"frame_count": frame_count, "query_points": query_points}
+    return first_pass(params, images, patch_tokens, **given, **options)
+
+
+def _second(params, images, patch_tokens, frame_count, dynamic_mask, first, **options):
+    return second_pass(params, images, patch_tokens, dynamic_mask, plain=first, frame_count=frame_count, **options)
+
+
+def _mine(
+    saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"], *, frames: int, **options
+) -> Bool[Array, "B F H W"]:
+    """Mine the mask of the first `frames` frames; nothing moves in the others."""
+    mask = mine_mask(saliency[:, :frames], patch_tokens[:, :frames], **options)
+    return jnp.pad(mask, ((0, 0), (0, saliency.shape[1] - frames), (0, 0), (0, 0)))
+
+
+def _assemble(
+    first: Predictions, second: Predictions | None, saliency, dynamic_mask, *, frames: int, **options
+) -> Assembly:
+    passes = jax.tree.map(lambda x: x[:, :frames], Passes(first, second, saliency, dynamic_mask))
+    return assemble(passes, **options)
+
+
+_encode = jax.jit(encode, static_argnames=("config", "compute_dtype"))
+_first_pass = jax.jit(_first, static_argnames=("config", "gram", "motion", "outputs", "compute_dtype"))
+_mine_mask = jax.jit(_mine, static_argnames=("frames", "size", "clusters", "threshold", "smooth_frames"))
+_second_pass = jax.jit(
+    _second, static_argnames=("config", "suppress", "outputs", "compute_dtype")
+)  # one for all mask_pairs
+_track_from = jax.jit(track_from, static_argnames=("config", "compute_dtype"))
+_same = jax.jit(lambda predictions: predictions)
+assembled = jax.jit(_assemble, static_argnames=("frames", "method", "align_scale"))
+
+
+def stages_of(
+    config: VGGTConfig,
+    method: str,
+    shape: tuple[int, int, int],
+    *,
+    gram: Gram,
+    suppress: Suppress,
+    mask_pairs: int,
+    align_scale: bool,
+    smooth_frames: int,
+    compute_dtype: str,
+    all_outputs: bool = False,
+) -> list[Stage]:
+    """Return the stages of a method for clips of this shape (frames, height, width).
+
+    They begin with "params", "images" and "frame_count", which is None where every frame is real, and "second", None.
+    With `all_outputs` the second pass predicts depth even if the method does not read it. Raises InputError for
+    settings that are none.
+    """
+    check_mask_pairs(mask_pairs)
+    check_smooth_frames(smooth_frames)
+    row = find_method(method)
+    frames, *size = shape
+    network = {"config": config, "compute_dtype": compute_dtype}
+    outputs = ("camera", "depth") if all_outputs else row.second_outputs(align_scale)
+    masking = {"suppress": suppress, "mask_pairs": mask_pairs, "outputs": outputs}
+    making = {"frames": frames, "method": method, "align_scale": align_scale}
+    mining = {"clusters": row.clusters, "threshold": row.threshold, "smooth_frames": smooth_frames}
+    mining |= {"frames": frames, "size": tuple(size)}
+    seen = ("params", "images", "patch_tokens", "frame_count")
+    stages = [
+        Stage("image features", ("params", "images"), ("patch_tokens",), _encode, network),
+        Stage("first pass", seen, ("first", "saliency"), _first_pass, network | {"gram": gram}),
+        Stage("dynamic mask", ("saliency", "patch_tokens"), ("dynamic_mask",), _mine_mask, mining),
+        Stage("second pass", (*seen, "dynamic_mask", "first"), ("second",), _second_pass, network | masking),
+        Stage("assemble", ("first", "second", "saliency", "dynamic_mask"), ("assembly",), assembled, making),
+    ]
+    return [stage for stage in stages if stage.name != "second pass" or row.needs_second_pass]
+
+
+def with_masks(stages: list[Stage], moving: bool) -> list[Stage]:
+    """Return the stages with masks that are given; if nothing moves, the second pass is the first."""
+    stages = [stage for stage in stages if stage.name != "dynamic mask"]
+    if moving:
+        return stages
+    same = Stage("second pass", ("first",), ("second",), _same, {})
+    return [same if stage.name == same.name else stage for stage in stages]
+
+
+def with_tracks(stages: list[Stage], queries: Queries, arrays: dict[str, Any]) -> list[Stage]:
+    """Return the stages with tracks: of the first frame's points by the first pass, then of every other frame's.
+
+    The points are put into `arrays`.
+    """
+    stages = list(stages)
+    network = {name: stages[0].options[name] for name in ("config", "compute_dtype")}
+    for frame in np.unique(queries.frames).tolist():
+        points = jnp.asarray(queries.points[queries.frames == frame])[None]
+        if frame == 0:
+            arrays["query_points"] = points
+            index = next(i for i, stage in enumerate(stages) if stage.name == "first pass")
+            stages[index] = stages[index]._replace(reads=(*stages[index].reads, "query_points"))
+        else:
+            arrays |= {f"points {frame}": points, f"frame {frame}": jnp.int32(frame)}
+            reads = ("params", "images", "patch_tokens", f"points {frame}", f"frame {frame}")
+            stages.append(Stage("tracks", reads, (f"tracks {frame}",), _track_from, network))
+    return stages
+
+
+def compile_stages(stages: list[Stage], arrays: dict[str, Any]) -> dict[str, StageMemory]:
+    """Compile every stage for the shapes that it will see; the calls that follow find the result in jit's cache."""
+    shapes, needs = dict(arrays), {}
+    for stage in stages:
+        lowered = stage.function.lower(*(shapes[name] for name in stage.reads), **stage.options)
+        memory = lowered.compile().memory_analysis()
+        if memory is not None:  # not every platform tells
+            needs[stage.name] = StageMemory(memory.temp_size_in_bytes, memory.output_size_in_bytes)
+        made = lowered.out_info
+        shapes |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
+    return needs
