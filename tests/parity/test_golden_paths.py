@@ -12,7 +12,7 @@ from vggtjax import forward
 from vggtjax.config import Suppress
 from vggtjax.network import attention, pieces, suppression
 
-BFLOAT16 = {"pose_enc": 0.5, "depth": 0.5, "depth_conf": 0.5}  # of each array's deviation
+BFLOAT16 = {"pose_enc": 0.06, "depth": 0.25, "depth_conf": 0.15}  # of each array's deviation; measured: half of it
 
 IMPLEMENTATIONS = {
     "in chunks": attention._in_chunks,
@@ -58,23 +58,21 @@ def test_attention_of_each_platform(case, implementation):
         assert_golden(case, name, made)
 
 
-@pytest.mark.parametrize("most", [50, 64])  # a divisor of the tokens is found, and none
-def test_pieces(case, monkeypatch, most):
-    monkeypatch.setattr(pieces, "ROWS_ON_CPU", most)
+def test_pieces(case, monkeypatch):
+    monkeypatch.setattr(pieces, "ROWS_ON_CPU", 64)
     for name, made in passes(case):
         assert_golden(case, name, made)
 
 
-@pytest.mark.parametrize("more", [1, 4])
-def test_padded_clips(case, implementation, more):
-    rest = ((0, 0), (0, more))
+def test_padded_clips(case):
+    rest = ((0, 0), (0, 3))
     images = np.pad(case.images, (*rest, *((0, 0),) * 3), mode="edge")
     tokens = np.pad(case.tokens, (*rest, (0, 0), (0, 0)), mode="edge")
     for name, made in passes(case, images, tokens, frame_count=jnp.full(len(images), case.images.shape[1])):
         assert_golden(case, name, made, slice(case.images.shape[1]))
 
 
-def test_bfloat16_stays_within_its_bound(case, implementation):
+def test_bfloat16_stays_within_its_bound(case):
     for name, made in passes(case, compute_dtype="bfloat16"):
         for value, key in (
             (made.pose_encoding, "pose_enc"),
@@ -83,4 +81,4 @@ def test_bfloat16_stays_within_its_bound(case, implementation):
         ):
             golden = case.arrays[f"{name}/{key}"]
             error = np.abs(np.asarray(value).reshape(golden.shape) - golden).max() / golden.std()
-            assert error <= BFLOAT16[key]
+            assert error <= BFLOAT16[key], (name, key, error)

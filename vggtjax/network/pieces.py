@@ -22,6 +22,9 @@ def in_pieces(function: Callable[[_Rows], _Made], rows: _Rows) -> _Made:
     The function must treat every row by itself. Few rows go in one call, without a loop.
     """
 
+    if _count(rows) <= ROWS_ON_CPU:  # what follows is traced for every platform
+        return function(rows)
+
     def at_most(most: int) -> Callable[[_Rows], _Made]:
         def made(rows):
             if (size := piece_size(_count(rows), most)) is None:
@@ -38,6 +41,9 @@ def replaced_in_pieces(
     function: Callable[[Float[Array, "r C"], _Rows], Float[Array, "r C"]], x: Float[Array, "R C"], others: _Rows
 ) -> Float[Array, "R C"]:
     """Return `function(x, others)` as `in_pieces` does; each piece takes the place of what it was made of."""
+
+    if len(x) <= ROWS_ON_CPU:
+        return function(x, others)
 
     def at_most(most: int):
         def made(rows):
