@@ -19,6 +19,7 @@ from unittest import mock
 
 import numpy as np
 
+from benchmarks.process_memory import process_bytes
 from benchmarks.seeded import seeded_images
 
 Outputs = dict[str, np.ndarray]
@@ -145,7 +146,9 @@ def _outputs(pose, depth, confidence) -> Outputs:
 
 
 class PeakMemory:
-    """The most memory that the process has held while the context lasts: sampled, what is mapped of files apart."""
+    """The most memory that the process holds while the context lasts, sampled; `own` leaves out what files it maps.
+
+    Both are 0 where that is not known."""
 
     def __enter__(self) -> PeakMemory:
         self.total = self.own = 0
@@ -160,23 +163,10 @@ class PeakMemory:
 
     def _watch(self) -> None:
         while True:
-            total, own = held_bytes()
-            self.total, self.own = max(self.total, total), max(self.own, own)
+            self.total = max(self.total, process_bytes("VmRSS") or 0)
+            self.own = max(self.own, process_bytes("RssAnon") or 0)
             if self._done.wait(0.02):
                 return
-
-
-def held_bytes() -> tuple[int, int]:
-    """Return the memory that this process holds, and how much of it is its own and not of a file that it maps.
-
-    Linux tells both; elsewhere they are 0.
-    """
-    path = Path("/proc/self/status")
-    lines = path.read_text().splitlines() if path.exists() else []
-    kilobytes = {
-        name: int(rest.split()[0]) for name, _, rest in (line.partition(":") for line in lines) if "kB" in rest
-    }
-    return 1024 * kilobytes.get("VmRSS", 0), 1024 * kilobytes.get("RssAnon", 0)
 
 
 def disk_reads() -> int:

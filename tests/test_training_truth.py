@@ -275,7 +275,7 @@ class Watched:
         kept = jnp.zeros((len(self.layers), B, S, P, heads, CONFIG.embed_dim // heads))
         return self.loss.zeros(B, S, P), kept, kept
 
-    def add(self, sums, slot, q, k):
+    def add(self, sums, slot, q, k, frame_count=None):
         sums, *kept = sums
         new = (x[:, :, -kept[0].shape[3] :] for x in (q, k))
         kept = [jnp.where(slot > 0, old.at[slot - 1].set(x), old) for old, x in zip(kept, new, strict=True)]

@@ -173,8 +173,7 @@ def reconstruct(
             compile_stages(stages, arrays)
         for stage in stages:
             with on_stage(stage.name):
-                made = jax.block_until_ready(stage.function(*(arrays[name] for name in stage.reads), **stage.options))
-                arrays |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
+                arrays |= jax.block_until_ready(stage.run(arrays))
     passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
     passes = jax.tree.map(lambda x: np.asarray(x)[:, :S], passes) if room else passes
     followed = {} if tracks is None else _joined_tracks(tracks, arrays)

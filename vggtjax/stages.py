@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +27,14 @@ class Stage(NamedTuple):
     makes: tuple[str, ...]
     function: Any
     options: dict[str, Any]
+
+    def run(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the stage makes of what it reads, by name."""
+        return self.named(self.function(*(arrays[name] for name in self.reads), **self.options))
+
+    def named(self, made: Any) -> dict[str, Any]:
+        """Return what the function has returned, by name."""
+        return dict(zip(self.makes, made if len(self.makes) > 1 else (made,), strict=True))
 
 
 class StageMemory(NamedTuple):
@@ -147,6 +156,5 @@ def compile_stages(stages: list[Stage], arrays: dict[str, Any]) -> dict[str, Sta
         memory = lowered.compile().memory_analysis()
         if memory is not None:  # not every platform tells
             needs[stage.name] = StageMemory(memory.temp_size_in_bytes, memory.output_size_in_bytes)
-        made = lowered.out_info
-        shapes |= dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
+        shapes |= stage.named(lowered.out_info)
     return needs

@@ -10,16 +10,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
+from benchmarks.process_memory import process_bytes, reset_high_water
 from vggtjax.network.precision import full_precision
 
-_PROCESS = Path("/proc/self")
-_RESET_HIGH_WATER = "5"  # of Linux's clear_refs
 _SUSTAINED = 0.05  # seconds
 
 
@@ -95,10 +93,10 @@ def memory_of(run: Callable[[], object]) -> tuple[int | None, int | None]:
     """Run; return the most bytes that the process and the device had meanwhile, beyond what they had before."""
     gc.collect()
     _give_back()
-    had, device_had = _reset_high_water(), _device_memory()
+    had, device_had = reset_high_water(), _device_memory()
     run()
-    device_has = _device_memory()
-    host = None if had is None else max(_process_memory("VmHWM") - had, 0)
+    device_has, has = _device_memory(), process_bytes("VmHWM")
+    host = None if had is None or has is None else max(has - had, 0)
     rose = device_has.get("peak_bytes_in_use", 0) > device_had.get("peak_bytes_in_use", 0)
     return host, device_has["peak_bytes_in_use"] - device_had["bytes_in_use"] if rose else None
 
@@ -130,20 +128,6 @@ def _give_back() -> None:
     """Have glibc return what is freed, so that the next run's memory shows."""
     if sys.platform.startswith("linux") and hasattr(ctypes.CDLL(None), "malloc_trim"):
         ctypes.CDLL(None).malloc_trim(0)
-
-
-def _reset_high_water() -> int | None:
-    """Set the process's high water to what it has now, and return that; None where there is no such thing."""
-    try:
-        (_PROCESS / "clear_refs").write_text(_RESET_HIGH_WATER)
-        return _process_memory("VmRSS")
-    except (OSError, LookupError):
-        return None
-
-
-def _process_memory(name: str) -> int:
-    lines = dict(line.split(":", 1) for line in (_PROCESS / "status").read_text().splitlines())
-    return int(lines[name].split()[0]) * 1024
 
 
 def _device_memory() -> dict[str, int]:

@@ -153,7 +153,7 @@ def ladder(
         images = jax.device_put(truth.images[padded].astype(np.float32, copy=False))
         arrays = {"params": model.params, "images": images, "frame_count": None}
         for stage in shared:
-            arrays |= _made(stage, arrays)
+            arrays |= stage.run(arrays)
         first, saliency = arrays["first"], arrays["saliency"]
         dynamic = {"mined": arrays["dynamic_mask"], "true": jax.device_put(truth.dynamic_mask[padded])}
         pixels = np.asarray(_upsample(saliency, shape[1:]))
@@ -163,7 +163,7 @@ def ladder(
         advance()
         for source, pairs, how in settings:
             mask = dynamic[source]
-            second = _made(stages(pairs, how)["second pass"], arrays | {"dynamic_mask": mask})
+            second = stages(pairs, how)["second pass"].run(arrays | {"dynamic_mask": mask})
             both = passes._replace(**second, dynamic_mask=mask)
             found += _scored(both, masked, scenes, _Setting(source, pairs, how))
             advance()
@@ -176,12 +176,6 @@ def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     for start in range(0, count, size):
         indices = np.arange(start, start + size)
         yield indices[indices < count], np.minimum(indices, count - 1)
-
-
-def _made(stage: Stage, arrays: dict[str, Any]) -> dict[str, Any]:
-    """Return what a stage makes, by name."""
-    made = stage.function(*(arrays[name] for name in stage.reads), **stage.options)
-    return dict(zip(stage.makes, made if len(stage.makes) > 1 else (made,), strict=True))
 
 
 def _scored(passes: Passes, methods: tuple[str, ...], scenes: list[_Scene], setting: _Setting) -> Iterator[LadderRow]:

@@ -66,8 +66,6 @@ def aggregate(
 
     there = None if frame_count is None else jnp.repeat(jnp.arange(S)[None] < frame_count[:, None], T, axis=1)
 
-    real = {} if frame_count is None else {"frame_count": frame_count}
-
     def suppression(active: Bool[Array, ""], rows: int) -> Suppression | None:
         if dynamic_tokens is None:
             return None
@@ -81,7 +79,8 @@ def aggregate(
         frame = x
         x, q, k = block(global_params, x.reshape(B, S * T, C), rope, suppression(masked, B), there)
         if cues is not None:
-            sums = cues.add(sums, cued, *(a.reshape(B, S, T, *a.shape[2:]) for a in (q, k)), **real)
+            q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
+            sums = cues.add(sums, cued, q, k, frame_count)
         taps = tuple(
             jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
             for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))

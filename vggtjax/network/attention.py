@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from vggtjax.network.pieces import largest_divisor
+
 QUERIES_AT_ONCE = 800
 LOGITS_AT_ONCE = 320**2  # queries times keys of a head up to which all heads go at once on a CPU
 LOGITS_ELSEWHERE = 2**28  # logits of all clips and heads up to which they are held at once on other platforms
@@ -60,7 +62,7 @@ def _at_once_or_in_chunks(q, k, v, kept):
         return _at_once(q, k, v, kept)
     if clips == 0:
         return _in_chunks(q, k, v, kept)
-    clips = max(n for n in range(1, clips + 1) if q.shape[0] % n == 0)
+    clips = largest_divisor(q.shape[0], clips)
     pieces = jax.tree.map(lambda x: x.reshape(-1, clips, *x.shape[1:]), (q, k, v, kept))
     return jax.lax.map(lambda some: _at_once(*some), pieces).reshape(q.shape)
 

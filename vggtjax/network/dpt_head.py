@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.layers import LayerNorm, Params, apply, declare
+from vggtjax.network.pieces import largest_divisor
 from vggtjax.network.precision import full_precision
 
 HIDDEN = 32
@@ -160,7 +161,7 @@ def frames_at_once(
     count, most = frames[0].shape[0], max(PIXELS_AT_ONCE // pixels, 1)
     if most >= count:
         return some_frames(frames)
-    at_once = max(n for n in range(1, most + 1) if count % n == 0)  # no remainder: it is compiled apart
+    at_once = largest_divisor(count, most)
     out = jax.lax.map(some_frames, [tap.reshape(-1, at_once, *tap.shape[1:]) for tap in frames])
     return out.reshape(count, *out.shape[2:])
 

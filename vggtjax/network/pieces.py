@@ -63,6 +63,11 @@ def replaced_in_pieces(
     return _by_platform(at_most, (x, others))
 
 
+def largest_divisor(count: int, most: int) -> int:
+    """Return the largest divisor of `count` up to `most`: so many at a time leave no remainder to compile apart."""
+    return max(n for n in range(1, min(count, most) + 1) if count % n == 0)
+
+
 def piece_size(count: int, most: int) -> int | None:
     """Return the size of equal pieces of `count` rows, or None if they need not be cut.
 

@@ -40,12 +40,18 @@ class MatchLoss:
         return MatchSums(jnp.zeros(()), jnp.zeros(()))
 
     def add(
-        self, sums: MatchSums, supervised: Int[Array, ""], q: Float[Array, "B S T N D"], k: Float[Array, "B S T N D"]
+        self,
+        sums: MatchSums,
+        supervised: Int[Array, ""],
+        q: Float[Array, "B S T N D"],
+        k: Float[Array, "B S T N D"],
+        frame_count: Int[Array, " B"] | None = None,
     ) -> MatchSums:
         """Add a layer's loss if it is supervised; a real branch, so that other layers cost nothing.
 
-        The patches are the last tokens of a frame.
+        The patches are the last tokens of a frame. Frames that are not real have no matches that are visible.
         """
+        del frame_count
         P = self._matches.patch.shape[-1]
 
         @jax.checkpoint  # else the scan keeps room for the logits of every layer
