@@ -118,6 +118,8 @@ def test_what_is_compiled_ahead_is_not_compiled_again(model):
     assert compilations(lambda: reconstruct(model, clip)) == 0
     with pytest.raises(InputError, match="multiples of the patch size 14"):
         model.compile(2, 20, 70)
+    with pytest.raises(InputError, match="expected 'float32' or 'bfloat16'"):
+        model.compile(2, SIDE, SIDE, compute_dtype="float16")
 
 
 def test_clips_of_similar_length_share_a_compilation(model):

@@ -11,7 +11,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.block import Block
 from vggtjax.network.layers import LayerNorm, Params, apply, declare
-from vggtjax.network.precision import full_precision
+from vggtjax.network.precision import check_compute_dtype, full_precision
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -35,8 +35,9 @@ def encode(
         Tokens in row-major patch order, float32. They are the same for both passes: compute them once.
 
     Raises:
-        InputError: images of a shape that does not fit.
+        InputError: images of a shape that does not fit, or an unknown compute_dtype.
     """
+    check_compute_dtype(compute_dtype)
     params = params["backbone"]
     grid = patch_grid(images, config)
     B, S, H, W, _ = images.shape

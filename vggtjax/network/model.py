@@ -20,7 +20,7 @@ from vggtjax.network.backbone import declare_backbone, encode, patch_grid
 from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict_pose
 from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_tap
 from vggtjax.network.layers import Params
-from vggtjax.network.precision import full_precision
+from vggtjax.network.precision import check_compute_dtype, full_precision
 from vggtjax.network.track_head import declare_track_head, predict_tracks, smallest_side
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
@@ -204,8 +204,7 @@ def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pa
         raise InputError(f"outputs has {absent}, and this model has only the heads {config.heads}")
     if suppress not in ("zero", "drop"):
         raise InputError(f"suppress is {suppress!r}; expected 'zero' or 'drop'")
-    if compute_dtype not in ("float32", "bfloat16"):
-        raise InputError(f"compute_dtype is {compute_dtype!r}; expected 'float32' or 'bfloat16'")
+    check_compute_dtype(compute_dtype)
 
 
 def _check_queries(images, config: VGGTConfig, outputs: Sequence[str], query_points, frame_count) -> None:

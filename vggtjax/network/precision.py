@@ -8,8 +8,16 @@ from typing import ParamSpec, TypeVar
 
 import jax
 
+from vggtjax.errors import InputError
+
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
+
+
+def check_compute_dtype(name: str) -> None:
+    """Raise InputError for a type that the blocks do not compute in."""
+    if name not in ("float32", "bfloat16"):
+        raise InputError(f"compute_dtype is {name!r}; expected 'float32' or 'bfloat16'")
 
 
 def full_precision(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
