@@ -10,6 +10,7 @@ import tyro
 from benchmarks.batch import batch
 from benchmarks.demo_model import demo_model
 from benchmarks.embed import embed
+from benchmarks.gradient import gradient
 from benchmarks.leads import leads
 from benchmarks.make_checkpoint import main as make_checkpoint
 from benchmarks.masks import masks
@@ -28,6 +29,7 @@ COMMANDS = {
     "demo-model": demo_model,
     "embed": embed,
     "gpu-targets": gpu_targets,
+    "gradient": gradient,
     "leads": leads,
     "make-checkpoint": make_checkpoint,
     "masks": masks,

@@ -19,6 +19,7 @@ from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, OutputError, VggtjaxError
 from vggtjax.files import writing
+from vggtjax.learning.apply import fusion_digest
 from vggtjax.methods import find_method
 from vggtjax.pipeline import reconstruct
 from vggtjax.results.reconstruction import ARCHIVE_NAME, is_result
@@ -79,7 +80,10 @@ def reconstruct_many(
     sampling, options, saving = dict(sampling or {}), dict(options or {}), dict(saving or {})
     frames_taken = Sampling(**sampling)
     find_method(options.get("method", "4dvggt-d"))
-    _settle(out, {"model": model.name, "mode": mode, "size": size, **sampling, **options, **saving})
+    settings = {"model": model.name, "mode": mode, "size": size, **sampling, **options, **saving}
+    if options.get("fusion") is not None:
+        settings["fusion"] = fusion_digest(options["fusion"])
+    _settle(out, settings)
 
     def load(name: str) -> Clip:
         return load_clip(sources[name], mode=mode, size=size, patch=model.config.patch_size, **sampling)

@@ -27,6 +27,7 @@ def batch(
     stride: int = 1,
     start: int = 0,
     max_frames: int | None = None,
+    fusion: Path | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
     pad_frames: bool = False,
     confidence_percentile: float = 20.0,
@@ -48,6 +49,7 @@ def batch(
         stride: take every stride-th frame.
         start: index of the first frame to take.
         max_frames: take so many frames at most.
+        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default.
         dtype: of the blocks' matrix products.
         pad_frames: pad clips to one of a few lengths, so that those of similar length share a compilation: worth it for
             many lengths on a GPU, where compiling takes longer than running.
@@ -64,6 +66,12 @@ def batch(
         Sampling(start, stride, fps, max_frames)
         check_percentile(confidence_percentile)
         named = clips_by_name(sources)
+        options: dict[str, object] = {"method": method, "compute_dtype": dtype}
+        options |= {"pad_frames": True} if pad_frames else {}
+        if fusion is not None:
+            from vggtjax.learning.apply import read_fusion
+
+            options["fusion"] = read_fusion(fusion, method)
         with report.stage("load model") as progress:
             from vggtjax.checkpoint import load_model
 
@@ -80,7 +88,7 @@ def batch(
                 mode=mode,
                 size=size,
                 sampling={"fps": fps, "stride": stride, "start": start, "max_frames": max_frames},
-                options={"method": method, "compute_dtype": dtype} | ({"pad_frames": True} if pad_frames else {}),
+                options=options,
                 saving={"confidence_percentile": confidence_percentile, "resolution": resolution, "layout": layout},
                 progress=clock.progress,
             ):

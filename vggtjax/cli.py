@@ -20,6 +20,7 @@ from vggtjax.config import Gram, Suppress, VGGTConfig
 from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.evaluation.command import evaluate
 from vggtjax.host_memory import keep_freed_memory
+from vggtjax.learning.command import fit_fusion
 from vggtjax.methods import MethodName, check_smooth_frames
 from vggtjax.report import Report
 from vggtjax.results.command import import_result
@@ -56,6 +57,7 @@ def reconstruct(
     refine_mask: tyro.conf.FlagCreatePairsOff[bool] = False,
     no_refine_mask: tyro.conf.FlagCreatePairsOff[bool] = False,
     tracks: str | None = None,
+    fusion: Path | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
     confidence_percentile: float = 20.0,
     resolution: Literal["model", "original"] = "model",
@@ -86,6 +88,7 @@ def reconstruct(
         no_refine_mask: leave the mask as it was mined, with vggt4d too.
         tracks: points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and, if
             wanted, frame, in pixels of the source.
+        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default.
         dtype: of the blocks' matrix products.
         confidence_percentile: leave so many percent of the pixels, the least confident, out of the point clouds.
         resolution: of the files: the model's, or the source's own, with crop, scale and padding undone.
@@ -104,6 +107,11 @@ def reconstruct(
     with report.running():
         _check_early(frames, (start, stride, fps, max_frames), confidence_percentile, out, masks, tracks)
         check_smooth_frames(smooth_frames)
+        fitted = None
+        if fusion is not None:
+            from vggtjax.learning.apply import read_fusion
+
+            fitted = read_fusion(fusion, method)
         loaded = _load_model(report, model, config)
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import load_clip
@@ -135,6 +143,7 @@ def reconstruct(
             masks=given,
             refine_mask=True if refine_mask else False if no_refine_mask else None,
             tracks=queries,
+            fusion=fitted,
             gram=gram,
             suppress=suppress,
             mask_pairs=mask_pairs,
@@ -246,6 +255,7 @@ COMMANDS = {
     "train": train,
     "evaluate": evaluate,
     "calibrate-cues": calibrate_cues,
+    "fit-fusion": fit_fusion,
     "scenes": scenes,
 }
 

@@ -168,7 +168,9 @@ def _multi_otsu(values: np.ndarray) -> np.ndarray:
     return np.asarray(threshold, np.float32)
 
 
-def dynamic_tokens(mask: Bool[Array, "B S H W"], patch_size: int) -> Bool[Array, "B S h w"]:
-    """Return the tokens any pixel of which is dynamic."""
+def dynamic_tokens(
+    mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"], patch_size: int
+) -> Bool[Array, "B S h w"] | Float[Array, "B S h w"]:
+    """Return the tokens any pixel of which is dynamic; of shares in [0, 1], the largest of each token's pixels."""
     B, S, H, W = mask.shape
-    return mask.reshape(B, S, H // patch_size, patch_size, W // patch_size, patch_size).any(axis=(3, 5))
+    return mask.reshape(B, S, H // patch_size, patch_size, W // patch_size, patch_size).max(axis=(3, 5))

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtjax.config import Cue, Gram, MotionConfig
+from vggtjax.network.precision import widened
 
 FRAMES_AT_ONCE = 4
 _EPSILON = 1e-6
@@ -60,7 +61,7 @@ class GramCues:
 
         def added(cue: Cue):
             def vectors(x: Float[Array, "... T N D"]) -> Float[Array, "... P N D"]:
-                patches = x[..., -sums[0].shape[2] :, :, :].astype(jnp.float32)
+                patches = widened(x[..., -sums[0].shape[2] :, :, :])
                 return _unit(patches) if self.gram == "cosine" else patches
 
             def one_clip(
@@ -100,17 +101,19 @@ class GramCues:
             result[cue.name] = normalise(_sample_std(average) if self._keeps_gram(cue) else average)
         return result
 
-    def saliency(self, sums: Sums) -> Float[Array, "B S P"]:
+    def saliency(self, sums: Sums, exponents: Float[Array, " cues"] | None = None) -> Float[Array, "B S P"]:
         """Return the product of the cues' maps, inverted where the table says so, min-max normalised per frame.
 
-        A single frame has nothing to compare with and gets saliency 0.
+        A single frame has nothing to compare with and gets saliency 0. Every map, inverted or not, can be raised to an
+        exponent of its own (1 in the papers).
         """
         maps = self.maps(sums)
         product = jnp.ones_like(next(iter(maps.values())))
         if product.shape[1] == 1:
             return jnp.zeros_like(product)
-        for cue in self.motion.cues:
-            product = product * (1 - maps[cue.name] if cue.inverted else maps[cue.name])
+        for i, cue in enumerate(self.motion.cues):
+            factor = 1 - maps[cue.name] if cue.inverted else maps[cue.name]
+            product = product * (factor if exponents is None else _power(factor, exponents[i]))
         return normalise(product)
 
     def _layers(self, cue: Cue) -> tuple[int, ...]:
@@ -155,6 +158,11 @@ def _similarities(rows: Float[Array, "P N D"], columns: Float[Array, "J N D"]) -
 
 def _unit(x: Float[Array, "... D"]) -> Float[Array, "... D"]:
     return x * jax.lax.rsqrt(jnp.maximum(jnp.sum(x * x, axis=-1, keepdims=True), 1e-24))
+
+
+def _power(x: Float[Array, "B S P"], exponent: Float[Array, ""]) -> Float[Array, "B S P"]:
+    """x ** exponent for x in [0, 1]; next to 0, where the slope has no bound, it is x itself."""
+    return jnp.where(x > _EPSILON, jnp.maximum(x, _EPSILON) ** exponent, x)
 
 
 def _sample_std(x: Float[Array, "... J"]) -> Float[Array, ...]:

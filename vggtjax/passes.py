@@ -66,11 +66,13 @@ def first_pass(
     outputs: tuple[str, ...] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
     frame_count: Int[Array, " B"] | None = None,
+    exponents: Float[Array, " cues"] | None = None,
     compute_dtype: str = "float32",
+    remat: bool = False,
 ) -> tuple[Predictions, Float[Array, "B S h w"]]:
     """Run the plain pass and mine the motion saliency on the way; with `query_points`, track them too.
 
-    Of clips with a `frame_count` only the first so many frames mean anything.
+    Of clips with a `frame_count` only the first so many frames mean anything. `exponents` are those of the cues.
     """
     if gram not in ("cosine", "dot"):
         raise InputError(f"gram is {gram!r}; expected 'cosine' or 'dot'")
@@ -85,9 +87,10 @@ def first_pass(
         frame_count=frame_count,
         cues=cues,
         compute_dtype=compute_dtype,
+        remat=remat,
     )
     h, w = (side // config.patch_size for side in images.shape[2:4])
-    saliency = cues.saliency(_present(predictions.cue_sums)).reshape(*images.shape[:2], h, w)
+    saliency = cues.saliency(_present(predictions.cue_sums), exponents).reshape(*images.shape[:2], h, w)
     return predictions._replace(cue_sums=None), saliency
 
 
@@ -95,21 +98,24 @@ def second_pass(
     params: Params,
     images: Float[Array, "B S H W 3"],
     patch_tokens: Float[Array, "B S P C"],
-    dynamic_mask: Bool[Array, "B S H W"],
+    dynamic_mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"],
     config: VGGTConfig,
     *,
     plain: Predictions | None = None,
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
+    strength: Float[Array, " depth"] | None = None,
     outputs: tuple[str, ...] = ("camera", "depth"),
     frame_count: Int[Array, " B"] | None = None,
+    stop_camera_gradient: bool = True,
     compute_dtype: str = "float32",
+    remat: bool = False,
 ) -> Predictions:
     """Run the mask-aware pass: the keys of dynamic tokens suppressed in the first `mask_pairs` pairs.
 
     Where no pixel of the whole batch is dynamic, it is the plain pass: if `plain` gives what that predicted, it is
     returned, and nothing is computed (all is, if `plain` lacks some of the outputs). Of clips with a `frame_count` only
-    the first so many frames mean anything.
+    the first so many frames mean anything. A mask of shares in [0, 1] and a `strength` are as `forward` takes them.
     """
 
     def masked() -> Predictions:
@@ -121,14 +127,17 @@ def second_pass(
             dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size),
             suppress=suppress,
             mask_pairs=mask_pairs,
+            strength=strength,
             outputs=outputs,
             frame_count=frame_count,
+            stop_camera_gradient=stop_camera_gradient,
             compute_dtype=compute_dtype,
+            remat=remat,
         )
 
     fields = {"camera": ("pose_encoding",), "depth": ("depth", "depth_confidence")}
     wanted = {name: getattr(plain, name, None) for output in outputs for name in fields.get(output, (output,))}
-    if plain is None or any(value is None for value in wanted.values()):
+    if plain is None or any(value is None for value in wanted.values()) or dynamic_mask.dtype != bool:
         return masked()
     return jax.lax.cond(dynamic_mask.any(), masked, lambda: Predictions(**wanted))
 

@@ -18,6 +18,8 @@ from vggtjax.clips.clip import Clip
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
 from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.frame_padding import padded_frames
+from vggtjax.learning.apply import check_fuses, fusion_digest
+from vggtjax.learning.family import FusionParams
 from vggtjax.methods import find_method
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
@@ -98,6 +100,7 @@ def reconstruct(
     masks: Bool[np.ndarray, "S H W"] | None = None,
     refine_mask: bool | None = None,
     tracks: Queries | None = None,
+    fusion: FusionParams | None = None,
     compute_dtype: str = "float32",
     pad_frames: bool = False,
     keep_passes: bool = False,
@@ -120,6 +123,8 @@ def reconstruct(
         tracks: points to follow through the clip, in pixels of its frames as they are given. Those of the first frame
             come with the first pass; every other frame that has some costs a pass of its own, over the clip rolled so
             that this frame comes first.
+        fusion: how the passes are fused, as `load_fusion` returns it; the paper's rule if None. The confidence is then
+            the fused precision.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
         pad_frames: pad the clip to one of a few lengths (`padded_frames`), so that clips of similar length share a
             compilation; what is returned is the same to rounding. Not for clips with tracks.
@@ -150,6 +155,8 @@ def reconstruct(
         "smooth_frames": smooth_frames,
         "compute_dtype": compute_dtype,
     }
+    if fusion is not None:
+        check_fuses(method)
     stages = stages_of(config, method, clip.images.shape[:3], all_outputs=keep_passes, **settings)
     S = len(clip)
     room = padded_frames(S, config.motion.offsets) - S if pad_frames and tracks is None else 0
@@ -160,7 +167,7 @@ def reconstruct(
 
     count = jax.device_put(np.array([S], np.int32)) if room else None
     arrays: dict[str, Any] = {"params": model.params, "images": padded(clip.images)}
-    arrays |= {"frame_count": count, "second": None}
+    arrays |= {"frame_count": count, "second": None, "fusion": fusion}
     if masks is not None and smooth_frames != 1:
         raise InputError(f"smooth_frames is {smooth_frames} and masks are given; smoothing is for masks that are mined")
     if masks is not None:
@@ -188,7 +195,8 @@ def reconstruct(
         model_name=model.name,
         settings=settings
         | {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
-        | {"masks": "mined" if masks is None else "given", "refine_mask": refine_mask},
+        | {"masks": "mined" if masks is None else "given", "refine_mask": refine_mask}
+        | ({} if fusion is None else {"fusion": fusion_digest(fusion)}),
         source_size=clip.source_size,
         source_scale=clip.source_scale,
         source_offset=clip.source_offset,
@@ -307,6 +315,6 @@ def compile_for(
     length = padded_frames(frames, model.config.motion.offsets) if pad_frames else frames
     images = jax.ShapeDtypeStruct((1, length, height, width, 3), jnp.float32)
     count = None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32)
-    arrays = {"params": model.params, "images": images, "frame_count": count, "second": None}
+    arrays = {"params": model.params, "images": images, "frame_count": count, "second": None, "fusion": None}
     with _memory_errors(frames, height, width):
         return compile_stages(stages, arrays)

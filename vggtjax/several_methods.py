@@ -9,6 +9,8 @@ from contextlib import nullcontext
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
+from vggtjax.learning.apply import check_fuses, fusion_digest
+from vggtjax.learning.family import FusionParams
 from vggtjax.methods import find_method
 from vggtjax.pipeline import OnStage, assembled_fields, reconstruct, refined
 from vggtjax.results.reconstruction import FieldOfViewWarning, Reconstruction
@@ -24,6 +26,7 @@ def reconstruct_methods(
     mask_pairs: int = 5,
     align_scale: bool = False,
     smooth_frames: int = 1,
+    fusion: FusionParams | None = None,
     compute_dtype: str = "float32",
     on_stage: OnStage | None = None,
 ) -> dict[str, Reconstruction]:
@@ -33,6 +36,7 @@ def reconstruct_methods(
 
     Args:
         methods: names of `METHODS`.
+        fusion: how those that fuse do it; one of them must.
         model, clip, size, mask_pairs, align_scale, smooth_frames, compute_dtype, on_stage: as for `reconstruct`.
 
     Returns:
@@ -41,6 +45,8 @@ def reconstruct_methods(
     Raises:
         What `reconstruct` raises.
     """
+    if fusion is not None and all(find_method(name).depth != "fused" for name in methods):
+        check_fuses(methods[0])
     results: dict[str, Reconstruction] = {}
     for names in groups_of_methods(methods):
         made = reconstruct(
@@ -57,7 +63,9 @@ def reconstruct_methods(
             on_stage=on_stage,
         )
         for name in names:
-            results[name] = _as_method(made, name, align_scale, on_stage or (lambda name: nullcontext()))
+            results[name] = _as_method(
+                made, name, align_scale, model.config.patch_size, fusion, on_stage or (lambda name: nullcontext())
+            )
     return {name: results[name] for name in methods}
 
 
@@ -70,18 +78,28 @@ def groups_of_methods(methods: Sequence[str]) -> list[list[str]]:
     return list(alike.values())
 
 
-def _as_method(made: Reconstruction, method: str, align_scale: bool, on_stage: OnStage) -> Reconstruction:
+def _as_method(
+    made: Reconstruction,
+    method: str,
+    align_scale: bool,
+    patch_size: int,
+    fusion: FusionParams | None,
+    on_stage: OnStage,
+) -> Reconstruction:
     """Return what another method makes of the passes that a result keeps."""
     row, passes = find_method(method), made.passes
-    making = {"frames": len(made.depth), "method": method, "align_scale": align_scale}
+    making = {"frames": len(made.depth), "method": method, "align_scale": align_scale, "patch_size": patch_size}
+    fusion = fusion if row.depth == "fused" else None
     with warnings.catch_warnings():
         if made.method == method:  # it has said already which cameras were clamped
             warnings.simplefilter("ignore", FieldOfViewWarning)
         result = dataclasses.replace(
             made,
-            **assembled_fields(assembled(*passes, **making), getattr(passes, row.intrinsics)),
+            **assembled_fields(assembled(*passes, fusion, **making), getattr(passes, row.intrinsics)),
             method=method,
-            settings=made.settings | {"refine_mask": row.refine},
+            settings=made.settings
+            | {"refine_mask": row.refine}
+            | ({} if fusion is None else {"fusion": fusion_digest(fusion)}),
             passes=None,
         )
     if row.refine:

@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.config import Gram, Suppress, VGGTConfig
+from vggtjax.learning.apply import refused
+from vggtjax.learning.family import FusionParams
 from vggtjax.mask import mine_mask
 from vggtjax.methods import check_mask_pairs, check_smooth_frames, find_method
 from vggtjax.network.backbone import encode
@@ -62,10 +64,20 @@ def _mine(
 
 
 def _assemble(
-    first: Predictions, second: Predictions | None, saliency, dynamic_mask, *, frames: int, **options
+    first: Predictions,
+    second: Predictions | None,
+    saliency,
+    dynamic_mask,
+    fusion: FusionParams | None = None,
+    *,
+    frames: int,
+    method: str,
+    align_scale: bool,
+    patch_size: int,
 ) -> Assembly:
     passes = jax.tree.map(lambda x: x[:, :frames], Passes(first, second, saliency, dynamic_mask))
-    return assemble(passes, **options)
+    made = assemble(passes, method, align_scale=align_scale)
+    return made if fusion is None else refused(made, passes, fusion, patch_size, align_scale=align_scale)
 
 
 _encode = jax.jit(encode, static_argnames=("config", "compute_dtype"))
@@ -76,7 +88,7 @@ _second_pass = jax.jit(
 )  # one for all mask_pairs
 _track_from = jax.jit(track_from, static_argnames=("config", "compute_dtype"))
 _same = jax.jit(lambda predictions: predictions)
-assembled = jax.jit(_assemble, static_argnames=("frames", "method", "align_scale"))
+assembled = jax.jit(_assemble, static_argnames=("frames", "method", "align_scale", "patch_size"))
 
 
 def stages_of(
@@ -94,7 +106,8 @@ def stages_of(
 ) -> list[Stage]:
     """Return the stages of a method for clips of this shape (frames, height, width).
 
-    They begin with "params", "images" and "frame_count", which is None where every frame is real, and "second", None.
+    They begin with "params", "images" and "frame_count", which is None where every frame is real, "second", None, and
+    "fusion", None for the method's own rule.
     With `all_outputs` the second pass predicts depth even if the method does not read it. Raises InputError for
     settings that are none.
     """
@@ -105,7 +118,7 @@ def stages_of(
     network = {"config": config, "compute_dtype": compute_dtype}
     outputs = ("camera", "depth") if all_outputs else row.second_outputs(align_scale)
     masking = {"suppress": suppress, "mask_pairs": mask_pairs, "outputs": outputs}
-    making = {"frames": frames, "method": method, "align_scale": align_scale}
+    making = {"frames": frames, "method": method, "align_scale": align_scale, "patch_size": config.patch_size}
     mining = {"clusters": row.clusters, "threshold": row.threshold, "smooth_frames": smooth_frames}
     mining |= {"frames": frames, "size": tuple(size)}
     seen = ("params", "images", "patch_tokens", "frame_count")
@@ -114,7 +127,7 @@ def stages_of(
         Stage("first pass", seen, ("first", "saliency"), _first_pass, network | {"gram": gram}),
         Stage("dynamic mask", ("saliency", "patch_tokens"), ("dynamic_mask",), _mine_mask, mining),
         Stage("second pass", (*seen, "dynamic_mask", "first"), ("second",), _second_pass, network | masking),
-        Stage("assemble", ("first", "second", "saliency", "dynamic_mask"), ("assembly",), assembled, making),
+        Stage("assemble", ("first", "second", "saliency", "dynamic_mask", "fusion"), ("assembly",), assembled, making),
     ]
     return [stage for stage in stages if stage.name != "second pass" or row.needs_second_pass]
 

@@ -47,6 +47,7 @@ def evaluate(
     mask_pairs: int = 5,
     align_scale: bool = False,
     smooth_frames: int = 1,
+    fusion: Path | None = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
 ) -> None:
     """Score methods on a data set with ground truth: cameras, point clouds, masks, depth, uncertainty.
@@ -74,6 +75,7 @@ def evaluate(
         mask_pairs: number of pairs in which the keys of dynamic tokens are suppressed.
         align_scale: bring the second pass to the first one's scale before fusing (not in the paper).
         smooth_frames: odd number of frames that the saliency is averaged over (not in the papers).
+        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default.
         dtype: of the blocks' matrix products.
     """
     report = Report()
@@ -115,6 +117,8 @@ def evaluate(
         }
         warnings: list[str] = []
         if folders:
+            if fusion is not None:
+                raise InputError("--fusion and --results are given; results are made already, give one of them")
             settings |= {"format": layout or "vggtjax", "quaternion": quaternion}
             source: Any = _Folders(folders, layout or "vggtjax", quaternion)
         else:
@@ -125,8 +129,19 @@ def evaluate(
                 "smooth_frames": smooth_frames,
                 "compute_dtype": dtype,
             }
+            if fusion is not None:
+                from vggtjax.learning.apply import check_fuses
+                from vggtjax.learning.fusion_file import load_fusion
+
+                if "4dvggt-d" not in names:
+                    check_fuses(names[0])
+                options["fusion"] = load_fusion(fusion)
             source = _Methods(loaded, names, mode, loaded.config.image_size if size is None else size, options)
             settings |= {"model": _identity(loaded), "mode": mode, "size": source.size, **options}
+            if fusion is not None:
+                from vggtjax.learning.apply import fusion_digest
+
+                settings["fusion"] = fusion_digest(options["fusion"])
             if not loaded.trained:
                 warnings.append(_UNTRAINED)
         store.begin()

@@ -14,7 +14,7 @@ from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.motion import GramCues
 from vggtjax.network.block import Block
 from vggtjax.network.layers import Params
-from vggtjax.network.precision import full_precision
+from vggtjax.network.precision import full_precision, widened
 from vggtjax.network.rope import rope_table
 from vggtjax.network.suppression import Suppression
 
@@ -39,10 +39,12 @@ def aggregate(
     captures: Sequence[Capture],
     cues: GramCues | None = None,
     frame_count: Int[Array, " B"] | None = None,
-    dynamic_tokens: Bool[Array, "B S h w"] | None = None,
+    dynamic_tokens: Bool[Array, "B S h w"] | Float[Array, "B S h w"] | None = None,
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
+    strength: Float[Array, " depth"] | None = None,
     compute_dtype: str = "float32",
+    remat: bool = False,
 ) -> tuple[Float[Array, "B S E"], tuple[Any, ...], Any]:
     """Run the alternating blocks; return the last pair's camera tokens, the captured taps, and the cues' sums.
 
@@ -55,7 +57,11 @@ def aggregate(
         cues: the Gram cues to accumulate from q and k of the global blocks, or None.
         frame_count: number of frames of each clip that are real, its first ones, one at least; the others change
             nothing in them.
-        dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs, in both blocks of a pair.
+        dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs, in both blocks of a pair;
+            bool, or how much of each key is, in [0, 1].
+        suppress, mask_pairs, compute_dtype: as for `forward`.
+        strength: share of the suppression in every pair, in place of `mask_pairs`.
+        remat: keep one pair's input for the gradient, and compute what is inside again.
     """
     params = params["aggregator"]
     B, S, P, C = patch_tokens.shape
@@ -66,7 +72,10 @@ def aggregate(
 
     there = None if frame_count is None else jnp.repeat(jnp.arange(S)[None] < frame_count[:, None], T, axis=1)
 
-    def suppression(active: Bool[Array, ""], rows: int) -> Suppression | None:
+    if strength is not None and dynamic_tokens is not None:
+        dynamic_tokens = dynamic_tokens.astype(jnp.promote_types(dynamic_tokens.dtype, strength.dtype))
+
+    def suppression(active: Array, rows: int) -> Suppression | None:
         if dynamic_tokens is None:
             return None
         keys = jnp.pad(dynamic_tokens.reshape(B, S, P), ((0, 0), (0, 0), (SPECIAL_TOKENS, 0)))  # [B, S, T]
@@ -90,20 +99,24 @@ def aggregate(
         return (x, camera, taps, sums), None
 
     index = np.arange(config.depth)
+    masked = jnp.asarray(index) < mask_pairs
+    if dynamic_tokens is not None and dynamic_tokens.dtype != bool:
+        masked = masked.astype(dynamic_tokens.dtype) if strength is None else strength
     layers = (
         params["frame_blocks"],
         params["global_blocks"],
-        jnp.asarray(index) < mask_pairs,
+        masked,
         jnp.asarray(index[:, None] == np.asarray(config.taps)[None]),
         None if cues is None else jnp.asarray(cues.layer_counts()),
     )
-    taps = tuple(_empty(capture, (B, S, T, 2 * C)) for capture in captures)
     sums = None if cues is None else cues.zeros(B, S, P)
     if there is not None:  # what is not a number would count even with weight 0
         patch_tokens = jnp.where(there.reshape(B, S, T)[:, :, :1, None], patch_tokens, 0)
-    tokens = _tokens(params, patch_tokens.astype(jnp.float32))
-    camera = jnp.zeros((B, S, 2 * C))
-    (_, camera, taps, sums), _ = jax.lax.scan(pair, (tokens, camera, taps, sums), layers)
+    tokens = _tokens(params, widened(patch_tokens))
+    camera = jnp.zeros((B, S, 2 * C), tokens.dtype)
+    taps = tuple(_empty(capture, (B, S, T, 2 * C), tokens.dtype) for capture in captures)
+    step = jax.checkpoint(pair, prevent_cse=False) if remat else pair
+    (_, camera, taps, sums), _ = jax.lax.scan(step, (tokens, camera, taps, sums), layers)
     return camera, taps, sums
 
 
@@ -141,6 +154,6 @@ def _captured(capture: Capture, shape: tuple[int, int, int, int]) -> Callable:
     return branch
 
 
-def _empty(capture: Capture, shape: tuple[int, ...]) -> Any:
-    kept = jax.eval_shape(capture, jax.ShapeDtypeStruct(shape, jnp.float32))
+def _empty(capture: Capture, shape: tuple[int, ...], dtype: Any) -> Any:
+    kept = jax.eval_shape(capture, jax.ShapeDtypeStruct(shape, dtype))
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), kept)

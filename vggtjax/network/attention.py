@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.network.pieces import largest_divisor
+from vggtjax.network.precision import widened
 
 QUERIES_AT_ONCE = 800
 LOGITS_AT_ONCE = 320**2  # queries times keys of a head up to which all heads go at once on a CPU
@@ -175,13 +176,14 @@ def _attended(
     bias: Float[Array, "... K"] | None,
 ) -> Float[Array, "... R D"]:
     weights = _weights(queries, keys, bias)
-    out = jnp.matmul(weights.astype(values.dtype), values, preferred_element_type=jnp.float32)
+    out = jnp.matmul(weights.astype(values.dtype), values, preferred_element_type=weights.dtype)
     return (out / weights.sum(axis=-1, keepdims=True)).astype(values.dtype)
 
 
 def _weights(queries, keys, bias):
     """Attention weights up to their sum over the keys."""
-    logits = jnp.matmul(queries, keys.swapaxes(-1, -2), preferred_element_type=jnp.float32)
+    wide = jnp.promote_types(queries.dtype, jnp.float32)
+    logits = jnp.matmul(queries, keys.swapaxes(-1, -2), preferred_element_type=wide)
     logits = logits if bias is None else logits + bias[..., None, :]
     return jnp.exp(logits - logits.max(axis=-1, keepdims=True))
 
@@ -196,9 +198,9 @@ def _backward(residuals, gradient):
     queries, keys, values, bias, out = residuals
     weights = _weights(queries, keys, bias)
     weights = weights / weights.sum(axis=-1, keepdims=True)
-    upstream = gradient.astype(jnp.float32)
+    upstream = widened(gradient)
     inner = jnp.sum(out * upstream, axis=-1, keepdims=True)
-    logits = weights * (upstream @ values.swapaxes(-1, -2).astype(jnp.float32) - inner)
+    logits = weights * (upstream @ widened(values).swapaxes(-1, -2) - inner)
     to_queries = (logits @ keys).astype(queries.dtype)
     to_keys = (logits.swapaxes(-1, -2) @ queries).astype(keys.dtype)
     to_values = (weights.swapaxes(-1, -2) @ upstream).astype(values.dtype)

@@ -11,7 +11,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.block import Block
 from vggtjax.network.layers import LayerNorm, Params, apply, declare
-from vggtjax.network.precision import check_compute_dtype, full_precision
+from vggtjax.network.precision import check_compute_dtype, full_precision, widened
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -21,7 +21,12 @@ _EPSILON = 1e-6
 
 @full_precision
 def encode(
-    params: Params, images: Float[Array, "B S H W 3"], config: VGGTConfig, *, compute_dtype: str = "float32"
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    config: VGGTConfig,
+    *,
+    compute_dtype: str = "float32",
+    remat: bool = False,
 ) -> Float[Array, "B S P C"]:
     """Return the backbone's normalised patch tokens.
 
@@ -30,9 +35,11 @@ def encode(
         images: RGB in [0, 1]; H and W are multiples of the patch size.
         config: the model's configuration.
         compute_dtype: dtype of matrix products; the residual stream and norms stay float32.
+        remat: keep one block's input for the gradient, and compute what is inside again.
 
     Returns:
-        Tokens in row-major patch order, float32. They are the same for both passes: compute them once.
+        Tokens in row-major patch order, float32 (float64 if they were computed in it). They are the same
+        for both passes: compute them once.
 
     Raises:
         InputError: images of a shape that does not fit, or an unknown compute_dtype.
@@ -44,14 +51,18 @@ def encode(
     C = config.embed_dim
     x = (images - jnp.asarray(IMAGE_MEAN)[(None,) * 4]) / jnp.asarray(IMAGE_STD)[(None,) * 4]
     x = apply(_patch_embedding(config, compute_dtype), params["patch_embedding"], x.reshape(B * S, H, W, 3))
-    x = x.astype(jnp.float32).reshape(B * S, grid[0] * grid[1], C)
-    positions = params["position_embedding"].astype(jnp.float32)
+    x = widened(x).reshape(B * S, grid[0] * grid[1], C)
+    positions = params["position_embedding"].astype(x.dtype)
     x = x + patch_positions(positions[1:], config.grid_size, grid)[None]
     special = jnp.concatenate([params["class_token"] + positions[:1], params["register_tokens"]])  # [1 + R, C]
-    special = jnp.broadcast_to(special.astype(jnp.float32), (B * S, *special.shape))
+    special = jnp.broadcast_to(special.astype(x.dtype), (B * S, *special.shape))
     x = jnp.concatenate([special, x], axis=1)  # [B*S, 1 + R + P, C]
     block = _block(config, compute_dtype)
-    x, _ = jax.lax.scan(lambda x, layer: (block(layer, x)[0], None), x, params["blocks"])
+
+    def step(x, layer):
+        return block(layer, x)[0], None
+
+    x, _ = jax.lax.scan(jax.checkpoint(step, prevent_cse=False) if remat else step, x, params["blocks"])
     x = apply(LayerNorm(_EPSILON), params["norm"], x)
     return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
 

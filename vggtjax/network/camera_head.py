@@ -36,7 +36,7 @@ def predict_pose(
     """
     params = params["camera_head"]
     E = config.camera_dim
-    block = Block(config.camera_num_heads)
+    block = Block(config.camera_num_heads, dtype=camera_tokens.dtype)
     tokens = apply(LayerNorm(), params["token_norm"], camera_tokens)
     normed = apply(LayerNorm(1e-6, use_bias=False, use_scale=False), {}, tokens)
     there = None if frame_count is None else jnp.arange(tokens.shape[1])[None] < frame_count[:, None]

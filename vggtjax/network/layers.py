@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
@@ -25,7 +24,7 @@ class MLP(nn.Module):
 
     hidden: int
     features: int
-    dtype: DType = jnp.float32
+    dtype: DType = None  # that of what comes in, and of the parameters if that is wider
 
     @nn.compact
     def __call__(self, x: Float[Array, "... C"]) -> Float[Array, "... F"]:

@@ -49,14 +49,16 @@ def forward(
     *,
     patch_tokens: Float[Array, "B S P C"] | None = None,
     frame_count: Int[Array, " B"] | None = None,
-    dynamic_tokens: Bool[Array, "B S h w"] | None = None,
+    dynamic_tokens: Bool[Array, "B S h w"] | Float[Array, "B S h w"] | None = None,
     suppress: Suppress = "zero",
     mask_pairs: int = 5,
+    strength: Float[Array, " depth"] | None = None,
     outputs: Sequence[str] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
     cues: GramCues | None = None,
     stop_camera_gradient: bool = True,
     compute_dtype: str = "float32",
+    remat: bool = False,
 ) -> Predictions:
     """Run VGGT on clips, optionally with the keys of dynamic tokens suppressed.
 
@@ -72,22 +74,29 @@ def forward(
             The others change nothing in them, whatever they show. Not with "tracks"; and with `cues`, every real frame
             must have a source at the cues' offsets (four frames do by default).
         dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs; None for the plain pass.
-        suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value leave the softmax, VGGT4D).
+            Shares m in [0, 1] in place of booleans leave k (1 - m) of a key, with a gradient by m.
+        suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value leave the softmax, VGGT4D; not for
+            shares).
         mask_pairs: number of pairs in which keys are suppressed (L_mask of the paper).
+        strength: in place of `mask_pairs`, how much of the suppression every pair takes, in [0, 1]: a key keeps
+            k (1 - strength m).
         outputs: any of "camera", "depth", "points", "tracks".
         query_points: x, y in pixels of the first frame, the points to track; given with "tracks" and only then.
         cues: motion cues to accumulate on the way, into `.cue_sums`.
         stop_camera_gradient: whether the camera head's iterations see the previous estimate as a constant.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
+            "float64", with parameters and images of it and jax.enable_x64, is for checks of gradients.
+        remat: compute activations of blocks and dense heads again in the backward pass: less memory, more time.
 
     Raises:
         InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing.
     """
     grid = patch_grid(images, config)
     _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pairs, outputs, compute_dtype)
+    _check_strength(config, dynamic_tokens, suppress, strength)
     _check_queries(images, config, outputs, query_points, frame_count)
     if patch_tokens is None:
-        patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
+        patch_tokens = encode(params, images, config, compute_dtype=compute_dtype, remat=remat)
     dense = [name for name in outputs if name in DENSE_HEADS]
     tapped = [HEADS[name] for name in outputs if name != "camera"]
 
@@ -109,16 +118,19 @@ def forward(
         dynamic_tokens=dynamic_tokens,
         suppress=suppress,
         mask_pairs=mask_pairs,
+        strength=strength,
         compute_dtype=compute_dtype,
+        remat=remat,
     )
     found: dict[str, Any] = {"cue_sums": sums}
     if "camera" in outputs:
         found["pose_encoding"] = predict_pose(
             params, camera_tokens, config, frame_count=frame_count, stop_gradient=stop_camera_gradient
         )
+    densely = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4)) if remat else predict_dense
     for name in dense:
         head = DENSE_HEADS[name]
-        values, confidence = predict_dense(params[head], [tap[head] for tap in taps], config, grid, name)
+        values, confidence = densely(params[head], [tap[head] for tap in taps], config, grid, name)
         if name == "depth":
             found |= {"depth": values[..., 0], "depth_confidence": confidence}
         else:
@@ -195,8 +207,8 @@ def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pa
         raise InputError(f"patch_tokens have shape {tuple(patch_tokens.shape)}; expected {tokens_shape}")
     if dynamic_tokens is not None and tuple(dynamic_tokens.shape) != (B, S, *grid):
         raise InputError(f"dynamic_tokens have shape {tuple(dynamic_tokens.shape)}; expected {(B, S, *grid)}")
-    if dynamic_tokens is not None and dynamic_tokens.dtype != bool:
-        raise InputError(f"dynamic_tokens have type {dynamic_tokens.dtype}; expected bool")
+    if dynamic_tokens is not None and dynamic_tokens.dtype != bool and not _is_floating(dynamic_tokens):
+        raise InputError(f"dynamic_tokens have type {dynamic_tokens.dtype}; expected bool, or shares as floats")
     check_mask_pairs(mask_pairs)
     if unknown := [name for name in outputs if name not in HEAD_NAMES]:
         raise InputError(f"outputs has {unknown}; expected some of {HEAD_NAMES}")
@@ -205,6 +217,20 @@ def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pa
     if suppress not in ("zero", "drop"):
         raise InputError(f"suppress is {suppress!r}; expected 'zero' or 'drop'")
     check_compute_dtype(compute_dtype)
+
+
+def _check_strength(config: VGGTConfig, dynamic_tokens, suppress, strength) -> None:
+    if suppress != "zero" and (strength is not None or (dynamic_tokens is not None and _is_floating(dynamic_tokens))):
+        raise InputError(
+            f"suppress is {suppress!r} with shares of tokens or a strength; expected 'zero': a key that is dropped is "
+            "dropped whole"
+        )
+    if strength is not None and tuple(strength.shape) != (config.depth,):
+        raise InputError(f"strength has shape {tuple(strength.shape)}; expected {(config.depth,)}, one for each pair")
+
+
+def _is_floating(x: Array) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.floating)
 
 
 def _check_queries(images, config: VGGTConfig, outputs: Sequence[str], query_points, frame_count) -> None:

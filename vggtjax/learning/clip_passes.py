@@ -1,0 +1,272 @@
+"""Both passes over clips with their truth, kept on disk so that a fit takes seconds once they were made."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float32, UInt8
+
+from vggtjax.cache import cache_folder
+from vggtjax.checkpoint import Model
+from vggtjax.errors import InputError, ResultError
+from vggtjax.files import writing
+from vggtjax.learning.family import Observations
+from vggtjax.learning.fit import FitClips
+from vggtjax.learning.objectives import View
+from vggtjax.learning.observe import observe
+from vggtjax.network.model import Predictions
+from vggtjax.passes import Cameras, Passes
+from vggtjax.pipeline import OnStage, reconstruct
+from vggtjax.results import archive
+from vggtjax.results.reconstruction import Reconstruction
+
+FORMAT_VERSION = 1
+METHOD = "4dvggt-d"
+
+
+class ClipPasses(NamedTuple):
+    """One clip on the host: what its passes found, and what is true."""
+
+    depth1: Float32[np.ndarray, "S H W"]
+    confidence1: Float32[np.ndarray, "S H W"]
+    depth2: Float32[np.ndarray, "S H W"]
+    confidence2: Float32[np.ndarray, "S H W"]
+    saliency: Float32[np.ndarray, "S h w"]
+    dynamic_mask: Bool[np.ndarray, "S H W"]
+    images: UInt8[np.ndarray, "S H W 3"]
+    camera_from_world: Float32[np.ndarray, "S 3 4"]  # of the second pass
+    intrinsics: Float32[np.ndarray, "S 3 3"]
+    truth: Float32[np.ndarray, "S H W"]  # depth, 0 where it is not known
+    true_dynamic: Bool[np.ndarray, "S H W"]  # all False where it is not known
+
+
+def passes_of(
+    result: Reconstruction,
+    truth: Float32[np.ndarray, "S H W"] | None,
+    true_dynamic: Bool[np.ndarray, "S H W"] | None = None,
+) -> ClipPasses:
+    """Return the passes of a result that kept them, next to the truth at its pixels."""
+    passes = result.passes
+    if passes is None or passes.second is None:
+        raise InputError("the result has not kept both passes; reconstruct with keep_passes=True")
+    first, second = passes.first, passes.second
+    nothing = np.zeros(result.depth.shape, np.float32)
+    return ClipPasses(
+        *(np.asarray(x)[0] for x in (first.depth, first.depth_confidence, second.depth, second.depth_confidence)),
+        saliency=np.asarray(passes.saliency)[0],
+        dynamic_mask=np.asarray(passes.dynamic_mask)[0],
+        images=result.images,
+        camera_from_world=np.asarray(result.camera_from_world, np.float32),
+        intrinsics=np.asarray(result.intrinsics, np.float32),
+        truth=nothing if truth is None else np.asarray(truth, np.float32),
+        true_dynamic=nothing.astype(bool) if true_dynamic is None else np.asarray(true_dynamic, bool),
+    )
+
+
+def kept_passes(key: Mapping[str, Any], make: Callable[[], ClipPasses], folder: Path | None = None) -> ClipPasses:
+    """Return what `make` makes, or what it made before under the same key.
+
+    Args:
+        key: plain values that name model, clip and settings: all that the passes depend on.
+        make: runs the passes.
+        folder: of the kept files; the user's cache if None.
+    """
+    text = json.dumps({"version": FORMAT_VERSION, **key}, sort_keys=True)
+    folder = cache_folder() / "passes" if folder is None else folder
+    path = folder / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
+    try:
+        stored = archive.read_arrays(path)
+        if set(stored) == set(ClipPasses._fields):
+            return ClipPasses(**stored)
+    except ResultError:  # not there, or not whole
+        pass
+    made = make()
+    with writing(path) as temporary:
+        archive.write_arrays(temporary, made._asdict())
+    return made
+
+
+def generated_passes(
+    model: Model,
+    count: int,
+    *,
+    frames: int = 12,
+    size: int | None = None,
+    seed: int = 0,
+    options: Mapping[str, Any] | None = None,
+    folder: Path | None = None,
+    on_stage: OnStage | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Iterator[tuple[str, ClipPasses]]:
+    """Yield names and passes of generated test scenes in which things move, with exact truth.
+
+    Args:
+        model: what `load_model` returned.
+        count: number of scenes.
+        frames: of each, 12 at least.
+        size: side in pixels; the model's own if None.
+        seed: of the set; training draws no scene and no texture of it.
+        options: keywords of `reconstruct`.
+        folder: of kept passes; the user's cache if None.
+        progress: called with the scenes done and their number.
+    """
+    from vggtjax.clips.clip import load_clip
+    from vggtjax.scenes import SceneConfig, held_out_scenes
+
+    side = model.config.image_size if size is None else size
+    key = {"model": identity_of(model), "scenes": seed, "frames": frames, "size": side, **(options or {})}
+    drawn: list[Any] = []  # all at once, and only if one is missing
+
+    def made(scene: int) -> ClipPasses:
+        if not drawn:
+            drawn.append(held_out_scenes("dynamic", count, SceneConfig(side, side, frames), seed=seed))
+        truth = jax.tree.map(lambda x: x[scene], drawn[0])
+        clip = load_clip(truth.images, size=side, patch=model.config.patch_size)
+        result = reconstruct(
+            model, clip, method=METHOD, size=side, keep_passes=True, on_stage=on_stage, **dict(options or {})
+        )
+        return passes_of(result, truth.depth, truth.dynamic_mask)
+
+    for scene in range(count):
+        yield (
+            f"scene {seed}-{scene}",
+            kept_passes(key | {"scene": scene}, lambda scene=scene: made(scene), folder),
+        )
+        if progress is not None:
+            progress(scene + 1, count)
+
+
+def dataset_passes(
+    model: Model,
+    dataset: str,
+    root: Path,
+    *,
+    max_frames: int | None = None,
+    size: int | None = None,
+    options: Mapping[str, Any] | None = None,
+    folder: Path | None = None,
+    on_stage: OnStage | None = None,
+    progress: Callable[[int, int], object] | None = None,
+) -> Iterator[tuple[str, ClipPasses]]:
+    """Yield names and passes of a data set's sequences that have true depth; arguments as above, and as `evaluate`.
+
+    Raises InputError where no sequence has.
+    """
+    from vggtjax.clips.clip import load_clip
+    from vggtjax.evaluation.datasets import DATASETS, find_sequences
+    from vggtjax.evaluation.protocol import TruthAtPixels
+    from vggtjax.evaluation.run import fingerprint
+
+    side = model.config.image_size if size is None else size
+    found, used = find_sequences(dataset, root), 0
+    for number, (name, opener) in enumerate(found.items()):
+        sequence = opener() if max_frames is None else opener().taken(slice(max_frames))
+        if sequence.depth is not None:
+            used += 1
+            key = {"model": identity_of(model), "data": fingerprint(sequence), "size": side, **(options or {})}
+
+            def made(sequence=sequence) -> ClipPasses:
+                paths = [str(path) for path in sequence.pictures]
+                clip = load_clip(paths, size=side, patch=model.config.patch_size)
+                result = reconstruct(
+                    model, clip, method=METHOD, size=side, keep_passes=True, on_stage=on_stage, **dict(options or {})
+                )
+                truth = TruthAtPixels(sequence, result, max_depth=DATASETS[dataset].max_depth)
+                return passes_of(result, truth.depth, None if sequence.mask is None else truth.mask)
+
+            yield name, kept_passes(key, made, folder)
+        if progress is not None:
+            progress(number + 1, len(found))
+    if not used:
+        raise InputError(f"no sequence of {root} has true depth; a fusion cannot be fitted to it")
+
+
+def identity_of(model: Model) -> str:
+    """Return what tells models apart: the sum of the file, or of the parameters where there is none."""
+    digest = hashlib.sha256()
+    if model.path is not None:
+        with model.path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    for leaf in jax.tree.leaves(model.params):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def observations(clip: ClipPasses, patch_size: int) -> Observations:
+    """Return what rules of fusion see of a clip, [S, H, W]."""
+    first = Predictions(depth=jnp.asarray(clip.depth1)[None], depth_confidence=jnp.asarray(clip.confidence1)[None])
+    second = Predictions(depth=jnp.asarray(clip.depth2)[None], depth_confidence=jnp.asarray(clip.confidence2)[None])
+    passes = Passes(first, second, jnp.asarray(clip.saliency)[None], jnp.asarray(clip.dynamic_mask)[None])
+    return jax.tree.map(lambda x: x[0], _observe(passes, patch_size))
+
+
+_observe = jax.jit(observe, static_argnums=1)
+
+
+def fit_clips(
+    clips: list[ClipPasses], patch_size: int, *, pixels: int | None = None, frames: int | None = None, seed: int = 0
+) -> FitClips:
+    """Return clips stacked for a fit.
+
+    Args:
+        clips: of any sizes where `pixels` is given; else those of fewer frames or a smaller size are filled up with
+            pixels of unknown depth.
+        patch_size: of the model.
+        pixels: take so many pixels with a true depth of each clip, at random (some twice where it has fewer).
+        frames: else take so many frames of each, next to each other, from the first.
+        seed: of the choice of pixels.
+
+    Raises:
+        InputError: no clips, or one without a true depth where pixels are taken.
+    """
+    if not clips:
+        raise InputError("there are no clips to fit to; expected one at least")
+    generator = np.random.default_rng(seed)
+    stacked = [
+        _at_pixels(clip, patch_size, pixels, generator) if pixels else _whole(clip, patch_size, frames)
+        for clip in clips
+    ]
+    most = [max(sizes) for sizes in zip(*(clip.truth.shape for clip in stacked), strict=True)]
+
+    def filled(x: np.ndarray) -> np.ndarray:
+        room = [(0, whole - there) for whole, there in zip(most, x.shape, strict=False)]
+        return np.pad(x, room + [(0, 0)] * (x.ndim - 3), mode="edge")
+
+    maps = [clip._replace(seen=jax.tree.map(filled, clip.seen)) for clip in stacked]
+    maps = [
+        clip._replace(truth=np.pad(clip.truth, [(0, w - t) for w, t in zip(most, clip.truth.shape, strict=True)]))
+        for clip in maps
+    ]
+    views = [clip.view for clip in maps]
+    alike = all(view is not None and view.images.shape[:3] == tuple(most) for view in views)
+    together = [clip if alike else clip._replace(view=None) for clip in maps]
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *together)
+
+
+def _whole(clip: ClipPasses, patch_size: int, frames: int | None) -> FitClips:
+    some = slice(frames)
+    seen = jax.tree.map(lambda x: np.asarray(x)[some], observations(clip, patch_size))
+    cameras = Cameras(clip.camera_from_world[some], clip.intrinsics[some])  # pyright: ignore[reportArgumentType]
+    view = View(clip.images[some].astype(np.float32) / 255, cameras)  # pyright: ignore[reportArgumentType]
+    return FitClips(seen, clip.truth[some], view)  # pyright: ignore[reportArgumentType]
+
+
+def _at_pixels(clip: ClipPasses, patch_size: int, count: int, generator: np.random.Generator) -> FitClips:
+    known = np.flatnonzero(np.isfinite(clip.truth) & (clip.truth > 0))
+    if not len(known):
+        raise InputError("a clip has no pixel with a true depth; leave it out")
+    chosen = generator.choice(known, count, replace=len(known) < count)
+
+    def taken(x) -> np.ndarray:
+        x = np.asarray(x)
+        return x.reshape(-1, *x.shape[3:])[chosen][None, None]
+
+    seen = jax.tree.map(taken, observations(clip, patch_size))
+    return FitClips(seen, taken(clip.truth))  # pyright: ignore[reportArgumentType]

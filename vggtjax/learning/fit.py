@@ -1,0 +1,263 @@
+"""Fitting a family to clips with optax: schedule, early stopping on held-out clips, exact resume."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+from vggtjax.errors import InputError, ResultError
+from vggtjax.files import writing
+from vggtjax.learning.family import FusionParams, Observations, fuse, is_free, projected, start
+from vggtjax.learning.objectives import (
+    View,
+    geometric_loss,
+    joint_negative_log_likelihood,
+    negative_log_likelihood,
+    photometric_loss,
+)
+from vggtjax.results import archive
+
+Objective = Literal["gaussian", "laplace", "joint", "photometric", "geometric"]
+OBJECTIVES: tuple[Objective, ...] = ("gaussian", "laplace", "joint", "photometric", "geometric")
+NEEDS_FRAMES = ("photometric", "geometric")  # objectives that look at whole frames; so does the gate
+_CHUNK = 10  # steps between two looks at the held-out clips
+
+Progress = Callable[[int, int], object]
+
+
+class FitClips(NamedTuple):
+    """Clips of one shape to fit to, or to hold out: C clips; frames of scattered pixels [1, N] where that will do."""
+
+    seen: Observations  # [C, S, H, W]
+    truth: Float[Array, "C S H W"]  # depth; not above 0 where it is not known
+    view: View | None = None  # [C, S, ...], for objectives that compare frames
+
+    @property
+    def clips(self) -> int:
+        """Their number, C."""
+        return self.truth.shape[0]
+
+    def taken(self, index: Int[Array, " n"] | Int[np.ndarray, " n"]) -> FitClips:
+        """Return some of the clips."""
+        return jax.tree.map(lambda x: x[index], self)
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """How a fit goes on. Static under jit, but for the seed."""
+
+    family: tuple[str, ...] = ("scale", "power", "floor")
+    objective: Objective = "gaussian"
+    steps: int = 300
+    learning_rate: float = 0.05
+    clips_at_once: int = 8
+    patience: int = 10  # looks at the held-out clips without gain after which a fit ends
+    decay: float = 1e-4  # of the gate's weights
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.objective not in OBJECTIVES:
+            raise InputError(f"objective is {self.objective!r}; expected one of {OBJECTIVES}")
+        for name in ("steps", "clips_at_once", "patience"):
+            if type(getattr(self, name)) is not int or getattr(self, name) < 1:
+                raise InputError(f"{name} is {getattr(self, name)!r}; expected a whole number of at least 1")
+        if not 0 < self.learning_rate <= 10:
+            raise InputError(f"learning_rate is {self.learning_rate}; expected above 0, and 10 at most")
+        if not 0 <= self.decay < 1:
+            raise InputError(f"decay is {self.decay}; expected a number in [0, 1)")
+
+
+class FitState(NamedTuple):
+    """All that a fit needs to go on exactly as if it had never stopped."""
+
+    params: FusionParams
+    optimiser: Any
+    key: Array  # raw, as arrays are kept
+    step: Int[Array, ""]
+    best: FusionParams
+    best_loss: Float[Array, ""]  # on the held-out clips
+    waited: Int[Array, ""]  # looks since
+    losses: Float[Array, "L 2"]  # of the fitted and of the held-out clips at each look; NaN for those to come
+
+
+class Fit(NamedTuple):
+    """A fitted tree: the one that was best on the held-out clips."""
+
+    params: FusionParams
+    held_out_loss: float
+    losses: Float[np.ndarray, "L 3"]  # step, loss of the clips that it is fitted to, of those held out
+    stopped_early: bool
+
+
+def clip_loss(params: FusionParams, clip: FitClips, objective: Objective) -> Float[Array, ""]:
+    """Return the objective of one clip (without the axis of clips)."""
+    if objective == "joint":
+        return joint_negative_log_likelihood(params, clip.seen, clip.truth)
+    fused = fuse(params, clip.seen)
+    if objective in ("gaussian", "laplace"):
+        return negative_log_likelihood(fused, clip.truth, objective)
+    if clip.view is None:
+        raise InputError(f"objective {objective!r} compares frames; the clips have no pictures and cameras")
+    return {"photometric": photometric_loss, "geometric": geometric_loss}[objective](fused, clip.view)
+
+
+def clip_losses(params: FusionParams, clips: FitClips, objective: Objective) -> Float[Array, " C"]:
+    """Return the objective of every clip."""
+    return jax.vmap(clip_loss, in_axes=(None, 0, None))(params, clips, objective)
+
+
+def fit_fusion(
+    fitted: FitClips,
+    held_out: FitClips,
+    config: FitConfig,
+    *,
+    checkpoint: Path | None = None,
+    progress: Progress | None = None,
+) -> Fit:
+    """Fit the free parts of a family to clips; the rest stays the paper's.
+
+    Adam with a cosine schedule over `steps`; every 10 steps the held-out clips are looked at, and what was best there
+    is returned. The start, the paper's rule, is looked at first.
+
+    Args:
+        fitted, held_out: clips; both need one at least.
+        config: see there.
+        checkpoint: file that the state is kept in after every look; if it is there, and of the same fit, that goes on.
+        progress: called with the steps done and their number.
+
+    Raises:
+        InputError: no clips, nothing to fit, or a loss that is not finite at the start.
+    """
+    if not fitted.clips or not held_out.clips:
+        raise InputError(f"{fitted.clips} clips to fit to, {held_out.clips} held out; expected one of each at least")
+    if not config.family:
+        raise InputError("the family has no free part; there is nothing to fit")
+    state = _initial(config)
+    free = jax.tree.map(jnp.asarray, is_free(state.params, config.family))
+    first = _look(state, fitted, held_out, config.objective)
+    if not np.isfinite(np.asarray(first.losses[0])).all():
+        raise InputError(f"the loss is {np.asarray(first.losses[0]).tolist()} at the start; expected finite numbers")
+    state = first if checkpoint is None else _restored(checkpoint, first)
+    while int(state.step) < config.steps and int(state.waited) < config.patience:
+        at_once = min(config.clips_at_once, fitted.clips)
+        state = _advanced(state, free, fitted, config.objective, at_once, _plan(config))
+        state = _look(state, fitted, held_out, config.objective)
+        if checkpoint is not None:
+            _keep(checkpoint, state)
+        if progress is not None:
+            progress(min(int(state.step), config.steps), config.steps)
+    looks = int(state.step) // _CHUNK + 1
+    losses = np.column_stack([np.arange(looks) * _CHUNK, np.asarray(state.losses)[:looks]])
+    best = jax.tree.map(np.asarray, state.best)
+    return Fit(best, float(state.best_loss), losses, int(state.step) < config.steps)
+
+
+class _Plan(NamedTuple):
+    """What the optimiser depends on; arrays, so that fits of all plans share a compilation."""
+
+    steps: Array
+    learning_rate: Array
+    decay: Array
+
+
+def _plan(config: FitConfig) -> _Plan:
+    return _Plan(jnp.asarray(config.steps), jnp.asarray(config.learning_rate), jnp.asarray(config.decay))
+
+
+def _optimiser(plan: _Plan) -> optax.GradientTransformation:
+    """Adam with a short warm-up and half a cosine; the gate's weights decay and learn a third as fast."""
+
+    def rate(step: Array) -> Array:
+        warm = jnp.minimum(1.0, (step + 1) * 20 / plan.steps)
+        return plan.learning_rate * warm * (1 + jnp.cos(jnp.pi * jnp.minimum(step / plan.steps, 1.0))) / 2
+
+    def of_gate(tree):
+        return {name: jax.tree.map(lambda _, name=name: name == "gate", leaf) for name, leaf in tree.items()}
+
+    return optax.chain(
+        optax.clip_by_global_norm(10.0),
+        optax.scale_by_adam(),
+        optax.masked(optax.chain(optax.add_decayed_weights(plan.decay), optax.scale(0.3)), of_gate),
+        optax.scale_by_learning_rate(rate),
+    )
+
+
+def _initial(config: FitConfig) -> FitState:
+    params = start(config.family, config.seed)
+    nothing = jnp.full((-(-config.steps // _CHUNK) + 1, 2), jnp.nan)
+    return FitState(
+        params,
+        _optimiser(_plan(config)).init(params),
+        jax.random.key_data(jax.random.key(config.seed)),
+        jnp.zeros((), jnp.int32),
+        params,
+        jnp.asarray(jnp.inf),
+        jnp.zeros((), jnp.int32),
+        nothing,
+    )
+
+
+@partial(jax.jit, static_argnames=("objective", "at_once"))
+def _advanced(
+    state: FitState, free: FusionParams, clips: FitClips, objective: Objective, at_once: int, plan: _Plan
+) -> FitState:
+    optimiser = _optimiser(plan)
+
+    def step(carry, _):
+        params, optimiser_state, key = carry
+        key, drawn = jax.random.split(key)
+        batch = clips.taken(jax.random.choice(drawn, clips.clips, (at_once,), replace=False))
+        gradient = jax.grad(lambda params: clip_losses(params, batch, objective).mean())(params)
+        gradient = jax.tree.map(lambda g, free: jnp.where(free, g, 0), gradient, free)
+        updates, optimiser_state = optimiser.update(gradient, optimiser_state, params)
+        updates = jax.tree.map(lambda u, free: jnp.where(free, u, 0), updates, free)
+        moved: Any = optax.apply_updates(params, updates)
+        return (projected(moved), optimiser_state, key), None
+
+    key = jax.random.wrap_key_data(state.key)
+    (params, optimiser_state, key), _ = jax.lax.scan(step, (state.params, state.optimiser, key), length=_CHUNK)
+    key = jax.random.key_data(key)
+    return state._replace(params=params, optimiser=optimiser_state, key=key, step=state.step + _CHUNK)
+
+
+@partial(jax.jit, static_argnames=("objective",))
+def _look(state: FitState, fitted: FitClips, held_out: FitClips, objective: Objective) -> FitState:
+    """Write down how the clips are doing, and keep what was best on those held out."""
+    both = [clip_losses(state.params, clips, objective).mean() for clips in (fitted, held_out)]
+    better: Bool[Array, ""] = both[1] < state.best_loss
+    return state._replace(
+        best=jax.tree.map(lambda new, old: jnp.where(better, new, old), state.params, state.best),
+        best_loss=jnp.where(better, both[1], state.best_loss),
+        waited=jnp.where(better, 0, state.waited + 1),
+        losses=state.losses.at[state.step // _CHUNK].set(jnp.stack(both)),
+    )
+
+
+def _keep(path: Path, state: FitState) -> None:
+    with writing(path) as temporary:
+        leaves = jax.tree.leaves(state)
+        archive.write_arrays(temporary, {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)})
+
+
+def _restored(path: Path, state: FitState) -> FitState:
+    """Return the state of a file, or the one that is given where there is none of its structure."""
+    leaves, structure = jax.tree.flatten(state)
+    try:
+        stored = archive.read_arrays(path)
+    except ResultError:
+        return state
+    found = [stored.get(f"{i:04d}") for i in range(len(leaves))]
+    alike = len(stored) == len(leaves) and all(
+        new is not None and (new.shape, new.dtype) == (old.shape, old.dtype)
+        for new, old in zip(found, leaves, strict=True)
+    )
+    return jax.tree.unflatten(structure, [jnp.asarray(leaf) for leaf in found]) if alike else state

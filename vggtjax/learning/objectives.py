@@ -1,0 +1,186 @@
+"""What a fit minimises: likelihoods of true depth, and how frames of a clip agree where there is no truth."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vggtjax.learning.family import Fused, FusionParams, Observations, fuse, log_precisions
+from vggtjax.learning.soft import lift
+from vggtjax.passes import Cameras
+
+Likelihood = Literal["gaussian", "laplace"]
+_MOST = 80.0
+_FURTHEST = 1e12  # standard deviations
+_NEAREST = 1e-6  # depth that a logarithm is taken of
+_TINY = 1e-12
+_LOG_2PI = 1.8378770664093453
+_LOG_2 = 0.6931471805599453
+
+
+class View(NamedTuple):
+    """Frames that look at the same world: their pictures and cameras, beside a fused depth of the same shape."""
+
+    images: Float[Array, "S H W 3"]
+    cameras: Cameras  # [S, 3, 4] and [S, 3, 3]
+
+
+def negative_log_likelihood(
+    fused: Fused, truth: Float[Array, "*F H W"], kind: Likelihood = "gaussian"
+) -> Float[Array, ""]:
+    """Return the mean negative log likelihood of a clip's true depth, in nats a pixel.
+
+    The truth is brought to the prediction's unit by the factor of greatest likelihood (a weighted mean of squares for
+    the Gaussian, a weighted median for the Laplace distribution, through which no gradient passes: there its own is 0).
+
+    Args:
+        fused: depth and its precision, of one clip.
+        truth: depth; not above 0 or not finite where it is not known.
+        kind: "gaussian", or "laplace" with the same variance.
+    """
+    known = (truth > 0) & jnp.isfinite(truth)
+    truth = jnp.where(known, truth, 1)
+    factor = unit_factor(fused, truth, known, kind)
+    error = jnp.where(known, fused.depth - factor * truth, 0)
+    log_precision = jnp.where(known, fused.log_precision, 0)
+    if kind == "gaussian":
+        square = jnp.exp(jnp.minimum(jnp.log(error * error + _TINY**2) + log_precision, _MOST))
+        loss = (_LOG_2PI - log_precision + square) / 2
+    else:
+        log_width = -(log_precision + _LOG_2) / 2  # of a Laplace distribution with that variance
+        loss = _LOG_2 + log_width + jnp.exp(jnp.minimum(jnp.log(jnp.abs(error) + _TINY) - log_width, _MOST))
+    return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1)
+
+
+def joint_negative_log_likelihood(
+    params: FusionParams, seen: Observations, truth: Float[Array, "*F H W"]
+) -> Float[Array, ""]:
+    """Return the mean negative log likelihood of both passes' errors, jointly normal, in nats a pixel.
+
+    It is what measures their correlation: the likelihood of what is fused sees it through the fused precision alone.
+    Where something moves, pass 1 stands alone. Robust parts (inflation, distrust) do not enter. Arguments as for `fuse`
+    and `negative_log_likelihood`, whose alignment it has.
+    """
+    known = (truth > 0) & jnp.isfinite(truth)
+    truth = jnp.where(known, truth, 1)
+    fused = fuse(params, seen)
+    factor = unit_factor(fused, truth, known)
+    claims, rho = log_precisions(params, seen), params["correlation"]
+    first, second = (
+        jnp.where(known, depth - factor * truth, 0) * jnp.exp(jnp.clip(claim, -_MOST, _MOST) / 2)
+        for depth, claim in zip((seen.depth1, seen.depth2), claims, strict=True)
+    )
+    first, second = (jnp.clip(x, -_FURTHEST, _FURTHEST) for x in (first, second))
+    left = 1 - rho * rho
+    alone = (_LOG_2PI - claims[0] + first * first) / 2
+    given = second - rho * first  # of pass 2 once pass 1 is known, with variance 1 - rho^2
+    other = (_LOG_2PI - claims[1] + jnp.log(left) + given * given / left) / 2
+    loss = alone + (1 - fused.dynamic) * other
+    return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1)
+
+
+def unit_factor(
+    fused: Fused, truth: Float[Array, "*F H W"], known: Bool[Array, "*F H W"], kind: Likelihood = "gaussian"
+) -> Float[Array, ""]:
+    """Return the factor that takes true depth to the unit of a prediction: that of greatest likelihood."""
+    log_precision = jnp.where(known, fused.log_precision, -jnp.inf)
+    weight = jnp.exp(log_precision - jax.lax.stop_gradient(log_precision.max()))  # the largest is 1
+    if kind == "gaussian":
+        return jnp.sum(weight * fused.depth * truth) / jnp.maximum(jnp.sum(weight * truth * truth), _TINY)
+    ratio, weight = jax.lax.stop_gradient(((fused.depth / truth).ravel(), (jnp.sqrt(weight) * truth).ravel()))
+    order = jnp.argsort(ratio)
+    below = jnp.cumsum(weight[order])
+    return ratio[order][jnp.searchsorted(below, below[-1] / 2)]
+
+
+def photometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
+    """Return how much pictures differ when each is looked up where the fused depth of another puts its pixels.
+
+    Mean absolute difference of the colours (in [0, 1]) between frames `step` apart, both ways, over what does not move
+    and is seen by both.
+    """
+
+    def pair(depth, static, image, other, here, there):
+        place, z = _reproject(depth, here, there)
+        seen, inside = _sample(other, place)
+        weight = static * inside * (z > 0)
+        difference = jnp.abs(image - seen).mean(axis=-1)
+        return jnp.sum(weight * difference), jnp.sum(weight)
+
+    return _over_pairs(pair, fused, view, step)
+
+
+def geometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
+    """Return how unlikely the depths of frames find each other: a fit of precision without any truth.
+
+    The logarithm of the depth of a frame's pixels in another frame's camera, minus that of the other frame's own depth
+    there, has the relative variance of both; the mean of its negative log likelihood (Laplace) is over what does not
+    move, is seen by both, and is not far behind what the other frame sees. The unit of depth does not matter. Errors
+    that all frames share are not noticed.
+    """
+
+    def pair(depth, static, image, other, here, there):
+        del image
+        place, z = _reproject(depth[..., 0], here, there)
+        seen, inside = _sample(other, place)
+        valid = inside & (z > _NEAREST) & (seen[..., 0] > _NEAREST) & (z < 1.2 * seen[..., 0])
+        weight = static * valid
+        logs = [jnp.log(jnp.where(valid, value, 1)) for value in (z, seen[..., 0])]
+        log_variance = jnp.logaddexp(-depth[..., 1] - 2 * logs[0], -seen[..., 1] - 2 * logs[1])
+        log_width = (log_variance - _LOG_2) / 2
+        size = jnp.log(jnp.abs(logs[0] - logs[1]) + _TINY)
+        loss = _LOG_2 + log_width + jnp.exp(jnp.minimum(size - log_width, _MOST))
+        return jnp.sum(jnp.where(valid, weight * loss, 0)), jnp.sum(weight)
+
+    maps = jnp.stack([fused.depth, fused.log_precision], axis=-1)
+    return _over_pairs(pair, fused, View(maps, view.cameras), step, maps)
+
+
+def _over_pairs(pair, fused: Fused, view: View, step: int, depth: Array | None = None) -> Float[Array, ""]:
+    """Return the weighted mean over pairs of frames `step` apart, in both directions."""
+    depth = fused.depth if depth is None else depth
+    static = 1 - jax.lax.stop_gradient(fused.dynamic)
+    total = weight = jnp.zeros((), fused.depth.dtype)
+    for ahead in (step, -step):
+        S = len(depth) - step
+        here = slice(0, S) if ahead > 0 else slice(step, step + S)
+        there = slice(step, step + S) if ahead > 0 else slice(0, S)
+        cameras = [
+            Cameras(view.cameras.camera_from_world[part], view.cameras.intrinsics[part]) for part in (here, there)
+        ]
+        sums = jax.vmap(pair)(depth[here], static[here], view.images[here], view.images[there], *cameras)
+        total, weight = total + sums[0].sum(), weight + sums[1].sum()
+    return total / jnp.maximum(weight, 1)
+
+
+def _reproject(
+    depth: Float[Array, "H W"], here: Cameras, there: Cameras
+) -> tuple[Float[Array, "H W 2"], Float[Array, "H W"]]:
+    """Return where another camera sees a frame's pixels (x, y in pixels), and their depth in it."""
+    points = lift(depth, here)
+    pose, K = there
+    moved = points @ pose[:, :3].T + pose[:, 3][None, None]
+    z = moved[..., 2]
+    safe = jnp.where(z > 1e-6, z, 1)
+    return jnp.stack([moved[..., 0] / safe * K[0, 0] + K[0, 2], moved[..., 1] / safe * K[1, 1] + K[1, 2]], axis=-1), z
+
+
+def _sample(
+    maps: Float[Array, "H W C"], place: Float[Array, "H W 2"]
+) -> tuple[Float[Array, "H W C"], Bool[Array, "H W"]]:
+    """Return maps at places (bilinear, differentiable by both), and which places lie between pixel centres."""
+    H, W = maps.shape[:2]
+    place = jnp.where(jnp.isfinite(place), place, -1) - 0.5
+    x, y = place[..., 0], place[..., 1]
+    inside = (x >= 0) & (x <= W - 1) & (y >= 0) & (y <= H - 1)
+    x, y = jnp.where(inside, x, 0), jnp.where(inside, y, 0)
+    left = jnp.clip(jnp.floor(x), 0, max(W - 2, 0)).astype(jnp.int32)
+    top = jnp.clip(jnp.floor(y), 0, max(H - 2, 0)).astype(jnp.int32)
+    right, bottom = jnp.minimum(left + 1, W - 1), jnp.minimum(top + 1, H - 1)
+    across, down = (x - left)[..., None], (y - top)[..., None]
+    above = maps[top, left] * (1 - across) + maps[top, right] * across
+    below = maps[bottom, left] * (1 - across) + maps[bottom, right] * across
+    return above * (1 - down) + below * down, inside

@@ -1,0 +1,131 @@
+"""The whole method with soft decisions, so that gradients flow from depth, cameras and points back to all its knobs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from vggtjax.config import Gram, MotionConfig, VGGTConfig
+from vggtjax.learning.family import FusionParams, fuse, identity, soft_mask
+from vggtjax.learning.observe import observe
+from vggtjax.mask import CONSTANT, otsu_threshold, upsample
+from vggtjax.network.backbone import encode
+from vggtjax.network.layers import Params
+from vggtjax.network.pose import decode_pose
+from vggtjax.network.precision import full_precision
+from vggtjax.passes import Cameras, Passes, first_pass, second_pass
+
+
+class SoftMasking(NamedTuple):
+    """What decides on masks: all of it can be differentiated. `soft_masking` gives the paper's values."""
+
+    offset: Float[Array, ""]  # added to Otsu's threshold tau of the saliency
+    temperature: Float[Array, ""]  # T of sigmoid((saliency - tau) / T); 0 for the hard mask
+    strength: Float[Array, " depth"]  # of the suppression in every pair, in [0, 1]
+    exponents: Float[Array, " cues"]  # of the cues in their product
+
+
+class SoftReconstruction(NamedTuple):
+    """What the method makes of clips, softly."""
+
+    depth: Float[Array, "B S H W"]
+    log_precision: Float[Array, "B S H W"]
+    cameras: Cameras
+    points: Float[Array, "B S H W 3"]  # in the world, of pixel centres
+    dynamic: Float[Array, "B S H W"]  # share of each pixel that moves
+    passes: Passes
+
+
+def soft_masking(
+    config: VGGTConfig, *, temperature: float = 0.0, mask_pairs: int = 5, motion: MotionConfig | None = None
+) -> SoftMasking:
+    """Return what the paper decides: Otsu's threshold, suppression in the first pairs, the plain product of cues."""
+    return SoftMasking(
+        jnp.zeros(()),
+        jnp.asarray(temperature, float),
+        (jnp.arange(config.depth) < mask_pairs).astype(float),
+        jnp.ones(len((motion or config.motion).cues)),
+    )
+
+
+@full_precision
+def reconstruct_softly(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    config: VGGTConfig,
+    masking: SoftMasking,
+    fusion: FusionParams | None = None,
+    *,
+    gram: Gram = "cosine",
+    motion: MotionConfig | None = None,
+    stop_camera_gradient: bool = True,
+    compute_dtype: str = "float32",
+    remat: bool = False,
+) -> SoftReconstruction:
+    """Run 4dvggt-d with soft masks and a rule of fusion: at temperature 0 and the paper's rule, the method itself.
+
+    Pure: jit with `config`, `gram`, `motion` and the options static. Gradients flow to the masking, the fusion, the
+    images and the network's parameters; what is not asked for costs nothing: the gradient by `fusion` alone never goes
+    back through the network.
+
+    Args:
+        params: the model's parameter tree.
+        images: RGB in [0, 1].
+        config: the model's configuration.
+        masking: see `soft_masking`.
+        fusion: a tree of the family; the paper's rule if None. Its own offset and temperature apply on top: they blend,
+            those of the masking suppress.
+        gram, motion, compute_dtype: as for `run_passes`.
+        stop_camera_gradient, remat: as for `forward`.
+    """
+    network = {"compute_dtype": compute_dtype, "remat": remat}
+    patch_tokens = encode(params, images, config, **network)
+    mining = {"gram": gram, "motion": motion, "exponents": masking.exponents}
+    first, saliency = first_pass(params, images, patch_tokens, config, **mining, **network)
+    dynamic = soft_pixels(saliency, (images.shape[2], images.shape[3]), masking)
+    second = second_pass(
+        params,
+        images,
+        patch_tokens,
+        dynamic,
+        config,
+        strength=masking.strength,
+        stop_camera_gradient=stop_camera_gradient,
+        **network,
+    )
+    passes = Passes(first, second, saliency, dynamic)  # pyright: ignore[reportArgumentType]
+    fused = fuse(identity() if fusion is None else fusion, observe(passes, config.patch_size))
+    cameras = Cameras(*decode_pose(second.pose_encoding, (images.shape[2], images.shape[3])))  # pyright: ignore
+    return SoftReconstruction(
+        fused.depth, fused.log_precision, cameras, lift(fused.depth, cameras), fused.dynamic, passes
+    )
+
+
+def soft_pixels(
+    saliency: Float[Array, "B S h w"], size: tuple[int, int], masking: SoftMasking
+) -> Float[Array, "B S H W"]:
+    """Return the share of every pixel that moves; none of a clip of constant saliency."""
+
+    def one_clip(pixels: Float[Array, "S H W"]) -> Float[Array, "S H W"]:
+        varies = pixels.max() - pixels.min() >= CONSTANT
+        return jnp.where(varies, soft_mask(pixels - otsu_threshold(pixels) - masking.offset, masking.temperature), 0)
+
+    return jax.vmap(one_clip)(upsample(saliency, size))
+
+
+def lift(depth: Float[Array, "*F H W"], cameras: Cameras) -> Float[Array, "*F H W 3"]:
+    """Return the points in the world of all pixels, at their centres."""
+    H, W = depth.shape[-2:]
+    y, x = jnp.meshgrid(jnp.arange(H) + 0.5, jnp.arange(W) + 0.5, indexing="ij")
+
+    def one_frame(depth: Float[Array, "H W"], camera: Float[Array, "3 4"], K: Float[Array, "3 3"]):
+        rays = jnp.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], jnp.ones_like(x)], axis=-1)
+        return (depth[..., None] * rays - camera[:, 3][None, None]) @ camera[:, :3]
+
+    function = one_frame
+    for _ in range(depth.ndim - 2):
+        function = jax.vmap(function)
+    return function(depth, cameras.camera_from_world, cameras.intrinsics)
