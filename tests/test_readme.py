@@ -19,13 +19,25 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     for i, frame in enumerate(moving_ball(6)):
         Image.fromarray((255 * frame).astype(np.uint8)).save(f"frames/{i}.png")
     blocks = [part.split("```")[0] for part in README.read_text().split("```python\n")[1:]]
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     names = {}
     for block in blocks:
         exec(compile(block, str(README), "exec"), names)
     assert (names["again"].depth == names["result"].depth).all()
     assert set(names["ablation"]) == {"vggt", "pose-decoupling", "hard-replacement", "4dvggt-d"}
     assert names["ablation"]["4dvggt-d"].depth.shape == names["images"].shape[:4]
+    assert names["fused"].depth.shape == names["images"].shape[:4]
+    assert names["slopes"]["correlation"] != 0
+
+
+def test_the_python_of_the_docs_runs():
+    """Pages that show Python; gradients through the embedded model are part of it."""
+    page = (README.parent / "docs" / "fusion.md").read_text(encoding="utf-8")
+    (block,) = (part.split("```")[0] for part in page.split("```python\n")[1:])
+    names: dict = {}
+    exec(compile(block, "docs/fusion.md", "exec"), names)
+    assert names["by_masking"].temperature != 0
+    assert all(np.isfinite(leaf).all() for leaf in (*names["by_masking"], *names["by_rule"].values()))
 
 
 @pytest.mark.parametrize("page", [README, *sorted((README.parent / "docs").glob("*.md"))], ids=lambda page: page.name)

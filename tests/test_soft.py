@@ -68,26 +68,14 @@ def _second(tree, pictures, tokens, mask_pairs=5, strength=None):
 
 
 def test_shares_of_0_and_1_are_the_boolean_mask():
+    second = functools.partial(_second, params(), images())
     tokens = jnp.asarray(np.random.default_rng(0).random((1, 4, 2, 3)) < 0.4)
     for pairs in (0, 2, 5):
-        hard, soft = (
-            _second(params(), images(), tokens, pairs),
-            _second(params(), images(), tokens.astype(jnp.float32), pairs),
-        )
-        assert np.allclose(hard, soft, rtol=1e-5, atol=1e-6)
+        assert np.allclose(second(tokens, pairs), second(tokens.astype(jnp.float32), pairs), rtol=1e-5, atol=1e-6)
     ones = jnp.where(jnp.arange(4) < 2, 1.0, 0.0)
-    assert np.allclose(
-        _second(params(), images(), tokens, strength=ones), _second(params(), images(), tokens, 2), rtol=1e-5, atol=1e-6
-    )
-    assert not np.allclose(
-        _second(params(), images(), 0.5 * tokens, 2), _second(params(), images(), tokens, 2), rtol=1e-4
-    )
-    assert np.allclose(
-        _second(params(), images(), 0.5 * tokens, 2),
-        _second(params(), images(), tokens, strength=0.5 * ones),
-        rtol=1e-5,
-        atol=1e-6,
-    )
+    assert np.allclose(second(tokens, strength=ones), second(tokens, 2), rtol=1e-5, atol=1e-6)
+    assert not np.allclose(second(0.5 * tokens, 2), second(tokens, 2), rtol=1e-4)
+    assert np.allclose(second(0.5 * tokens, 2), second(tokens, strength=0.5 * ones), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize(
