@@ -19,6 +19,16 @@ def cache_folder() -> Path:
     return platformdirs.user_cache_path("vggtjax")
 
 
+def compiled_folder() -> Path:
+    """Return the folder of what jax compiles."""
+    return cache_folder() / "compiled"
+
+
+def lowered_folder() -> Path:
+    """Return the folder of programs before they are compiled."""
+    return cache_folder() / "lowered"
+
+
 def keep_compilations() -> bool:
     """Tell jax to keep what it compiles in the user's cache, so that the next process need not compile it again.
 
@@ -29,7 +39,7 @@ def keep_compilations() -> bool:
     if "jax" in sys.modules:
         return False
     settings = {
-        "JAX_COMPILATION_CACHE_DIR": str(cache_folder() / "compiled"),
+        "JAX_COMPILATION_CACHE_DIR": str(compiled_folder()),
         "JAX_COMPILATION_CACHE_MAX_SIZE": str(COMPILED_BYTES),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(_SHORTEST),
     }

@@ -23,6 +23,7 @@ from vggtjax.config import VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
+from vggtjax.programs import kept_text
 from vggtjax.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
 
 DType = Literal["float32", "bfloat16"]
@@ -231,8 +232,13 @@ def write_checkpoint(
 @lru_cache(maxsize=8)
 def flat_shapes(config: VGGTConfig) -> Mapping[str, tuple[int, ...]]:
     """Return flat dotted names -> shapes of a model's parameters."""
-    flat: dict[str, Any] = flatten_dict(parameter_shapes(config), sep=".")
-    return MappingProxyType({path: leaf.shape for path, leaf in flat.items()})
+
+    def made() -> str:
+        flat: dict[str, Any] = flatten_dict(parameter_shapes(config), sep=".")
+        return json.dumps({path: leaf.shape for path, leaf in flat.items()})
+
+    shapes = json.loads(kept_text(f"shapes {config.to_json()}", made))
+    return MappingProxyType({path: tuple(shape) for path, shape in shapes.items()})
 
 
 def numpy_dtype(dtype: DType) -> np.dtype:

@@ -17,17 +17,19 @@ from vggtjax.mask import mine_mask
 from vggtjax.methods import check_mask_pairs, check_smooth_frames, find_method
 from vggtjax.network.backbone import encode
 from vggtjax.network.model import Predictions
-from vggtjax.passes import Assembly, Passes, assemble, first_pass, second_pass, track_from
+from vggtjax.network.track_head import Tracks
+from vggtjax.passes import Assembly, Cameras, Passes, assemble, first_pass, second_pass, track_from
+from vggtjax.programs import Program, keep_type
 from vggtjax.tracking import Queries
 
 
 class Stage(NamedTuple):
-    """A jitted function, the arrays that it reads and makes (by name), and its static options."""
+    """A program, the arrays that it reads and makes (by name), and its static options."""
 
     name: str
     reads: tuple[str, ...]
     makes: tuple[str, ...]
-    function: Any
+    function: Program
     options: dict[str, Any]
 
     def run(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
@@ -80,15 +82,19 @@ def _assemble(
     return made if fusion is None else refused(made, passes, fusion, patch_size, align_scale=align_scale)
 
 
-_encode = jax.jit(encode, static_argnames=("config", "compute_dtype"))
-_first_pass = jax.jit(_first, static_argnames=("config", "gram", "motion", "outputs", "compute_dtype"))
-_mine_mask = jax.jit(_mine, static_argnames=("frames", "size", "clusters", "threshold", "smooth_frames"))
-_second_pass = jax.jit(
-    _second, static_argnames=("config", "suppress", "outputs", "compute_dtype")
-)  # one for all mask_pairs
-_track_from = jax.jit(track_from, static_argnames=("config", "compute_dtype"))
-_same = jax.jit(lambda predictions: predictions)
-assembled = jax.jit(_assemble, static_argnames=("frames", "method", "align_scale", "patch_size"))
+def _unchanged(predictions: Predictions) -> Predictions:
+    return predictions
+
+
+_encode = Program(encode, static=("config", "compute_dtype"))
+_first_pass = Program(_first, static=("config", "gram", "motion", "outputs", "compute_dtype"))
+_mine_mask = Program(_mine, static=("frames", "size", "clusters", "threshold", "smooth_frames"))
+_second_pass = Program(_second, static=("config", "suppress", "outputs", "compute_dtype"))  # one for all mask_pairs
+_track_from = Program(track_from, static=("config", "compute_dtype"))
+_same = Program(_unchanged)
+assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
+for _kind in (Predictions, Passes, Cameras, Assembly, Tracks):
+    keep_type(_kind)
 
 
 def stages_of(
@@ -165,9 +171,9 @@ def compile_stages(stages: list[Stage], arrays: dict[str, Any]) -> dict[str, Sta
     """Compile every stage for the shapes that it will see; the calls that follow find the result in jit's cache."""
     shapes, needs = dict(arrays), {}
     for stage in stages:
-        lowered = stage.function.lower(*(shapes[name] for name in stage.reads), **stage.options)
-        memory = lowered.compile().memory_analysis()
+        compiled, made = stage.function.compile(*(shapes[name] for name in stage.reads), **stage.options)
+        memory = compiled.memory_analysis()
         if memory is not None:  # not every platform tells
             needs[stage.name] = StageMemory(memory.temp_size_in_bytes, memory.output_size_in_bytes)
-        shapes |= stage.named(lowered.out_info)
+        shapes |= stage.named(made)
     return needs

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import product
 from typing import Any, Literal, NamedTuple
 
@@ -22,6 +21,7 @@ from vggtjax.evaluation.truth import ClipTruth, Truth, batched_truth
 from vggtjax.mask import upsample
 from vggtjax.methods import LADDER, find_method
 from vggtjax.passes import Assembly, Passes, assemble
+from vggtjax.programs import Program
 from vggtjax.stages import Stage, stages_of
 
 MaskSource = Literal["mined", "true"]
@@ -70,12 +70,12 @@ class _Setting(NamedTuple):
     suppress: Suppress | None = None
 
 
-@partial(jax.jit, static_argnames=("methods",))
-def _assemble(passes: Passes, methods: tuple[str, ...]) -> list[Assembly]:
+def _assemble_all(passes: Passes, methods: tuple[str, ...]) -> list[Assembly]:
     return [assemble(passes, method) for method in methods]
 
 
-_upsample = jax.jit(upsample, static_argnames=("size",))
+_assemble = Program(_assemble_all, static=("methods",))
+_upsample = Program(upsample, static=("size",))
 
 
 def ladder(
@@ -156,7 +156,7 @@ def ladder(
             arrays |= stage.run(arrays)
         first, saliency = arrays["first"], arrays["saliency"]
         dynamic = {"mined": arrays["dynamic_mask"], "true": jax.device_put(truth.dynamic_mask[padded])}
-        pixels = np.asarray(_upsample(saliency, shape[1:]))
+        pixels = np.asarray(_upsample(saliency, size=shape[1:]))
         scenes = [_Scene(clip, Truth(*(a[clip] for a in truth)), pixels[i]) for i, clip in enumerate(clips)]
         passes = Passes(first, None, saliency, dynamic["mined"])
         found += _scored(passes, plain, scenes, _Setting())
@@ -180,7 +180,7 @@ def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 def _scored(passes: Passes, methods: tuple[str, ...], scenes: list[_Scene], setting: _Setting) -> Iterator[LadderRow]:
     mask = np.asarray(passes.dynamic_mask)
-    for method, made in zip(methods, _assemble(passes, methods), strict=True):
+    for method, made in zip(methods, _assemble(passes, methods=methods), strict=True):
         depth, cameras = np.asarray(made.depth), np.asarray(made.camera_from_world)
         for i, scene in enumerate(scenes):
             yield _row(scene, method, setting, depth[i], cameras[i], mask[i])

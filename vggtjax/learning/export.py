@@ -89,7 +89,7 @@ def save_fits(
             save_fusion(folder / FAMILIES / f"{name.replace('+', '_')}.safetensors", tree, said)
         save_fusion(folder / FUSION, trees[chosen], facts | {"family": chosen})
         (staged / TABLE).write_text(markdown(table(outcomes)), encoding="utf-8")
-        draw_fits(staged, outcomes, list(clips.values()), chosen)
+        draw_fits(staged, outcomes, list(clips.values()), patch_size, chosen)
         for name in (TABLE, *PICTURES):
             (staged / name).replace(folder / name)
     with writing(folder / NUMBERS) as path:

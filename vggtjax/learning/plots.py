@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from vggtjax.errors import MissingExtraError
 from vggtjax.evaluation.video_depth import depth_alignment
 from vggtjax.files import writing
 from vggtjax.learning.ablation import PAPER, Outcome
-from vggtjax.learning.clip_passes import ClipPasses
+from vggtjax.learning.clip_passes import ClipPasses, observations
+from vggtjax.learning.family import FusionParams, log_precisions
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _BINS = 12
 _DPI = 110
+_COLUMNS = 4
+
+_claims = jax.jit(log_precisions)
 
 
 def check_matplotlib() -> None:
@@ -29,10 +34,12 @@ def check_matplotlib() -> None:
         raise MissingExtraError("drawing a fit", "train") from error
 
 
-def draw_fits(folder: Path, outcomes: Sequence[Outcome], clips: Sequence[ClipPasses], shown: str) -> list[Path]:
+def draw_fits(
+    folder: Path, outcomes: Sequence[Outcome], clips: Sequence[ClipPasses], patch_size: int, shown: str
+) -> list[Path]:
     """Draw all pictures into a folder; `shown` is the family whose precision and calibration are looked at."""
     figures = {
-        "precision.png": _precision(outcomes, clips, shown),
+        "precision.png": _precision(outcomes, clips, patch_size, shown),
         "calibration.png": _calibration(outcomes, shown),
         "scores.png": _scores(outcomes),
         "losses.png": _losses(outcomes),
@@ -43,23 +50,29 @@ def draw_fits(folder: Path, outcomes: Sequence[Outcome], clips: Sequence[ClipPas
     return [folder / name for name in figures]
 
 
-def observed_precision(clips: Sequence[ClipPasses], which: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return bins of a pass's confidence, and one over the mean squared error of depth in each of them.
+def precision_by_confidence(
+    clips: Sequence[ClipPasses], which: int, patch_size: int, trees: Sequence[FusionParams]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return bins of a pass's confidence, the precision observed in each, and the ones that trees claim there.
 
-    Bins have as many pixels each; errors are those after one scale for each clip, in the unit of the prediction.
+    Bins have as many pixels each. Observed is one over the mean squared error after one scale for each clip, in the
+    unit of the prediction; claimed is one over the mean claimed variance, [trees, bins].
     """
-    confidences, squares = [], []
+    confidences, squares, variances = [], [], []
     for clip in clips:
         known = np.isfinite(clip.truth) & (clip.truth > 0)
         depth = (clip.depth1, clip.depth2)[which][known].astype(np.float64)
         truth = clip.truth[known] / depth_alignment(depth, clip.truth[known], "scale")[0]
         confidences.append((clip.confidence1, clip.confidence2)[which][known])
         squares.append((depth - truth) ** 2)
-    confidence, square = np.concatenate(confidences), np.concatenate(squares)
+        seen = observations(clip, patch_size)
+        claims = [np.asarray(_claims(tree, seen)[which], np.float64)[known] for tree in trees]
+        variances.append(np.exp(-np.asarray(claims).reshape(len(trees), -1)))
+    confidence, square, variance = np.concatenate(confidences), np.concatenate(squares), np.concatenate(variances, 1)
     parts = np.array_split(np.argsort(confidence), _BINS)
-    means = [(np.exp(np.log(confidence[part]).mean()), 1 / square[part].mean()) for part in parts]
-    middles, observed = np.array(means).T
-    return middles, observed
+    middles = np.array([np.exp(np.log(confidence[part]).mean()) for part in parts])
+    observed = np.array([1 / square[part].mean() for part in parts])
+    return middles, observed, np.stack([1 / variance[:, part].mean(axis=1) for part in parts], axis=1)
 
 
 def _figure(width: float, height: float) -> Figure:
@@ -68,19 +81,16 @@ def _figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _precision(outcomes: Sequence[Outcome], clips: Sequence[ClipPasses], shown: str) -> Figure:
+def _precision(outcomes: Sequence[Outcome], clips: Sequence[ClipPasses], patch_size: int, shown: str) -> Figure:
     figure = _figure(9, 4)
     fits = [outcome.fit for outcome in outcomes if outcome.rule == shown and outcome.fit is not None]
     for which in (0, 1):
         axis = figure.add_subplot(1, 2, which + 1)
-        middles, observed = observed_precision(clips, which)
-        grid = np.geomspace(middles[0], middles[-1], 100)
+        middles, observed, claimed = precision_by_confidence(clips, which, patch_size, [fit.params for fit in fits])
         axis.plot(middles, observed, "o", color="black", label="observed: 1 / mean squared error")
-        axis.plot(grid, grid, color="tab:orange", label="paper: the confidence itself")
-        for i, fit in enumerate(fits):
-            scale, power, floor = (float(fit.params[name][which]) for name in ("scale", "power", "floor"))
-            learned = np.exp(scale) * grid**power + floor
-            axis.plot(grid, learned, color="tab:blue", alpha=0.6, label=f"{shown}, each seed" if not i else None)
+        axis.plot(middles, middles, color="tab:orange", label="paper: the confidence itself")
+        for i, line in enumerate(claimed):
+            axis.plot(middles, line, color="tab:blue", alpha=0.6, label=None if i else f"{shown}, each seed")
         axis.set(
             xscale="log", yscale="log", xlabel="confidence", ylabel="precision of depth", title=f"pass {which + 1}"
         )
@@ -111,7 +121,7 @@ def _scores(outcomes: Sequence[Outcome]) -> Figure:
         axis = figure.add_subplot(1, len(names), place + 1)
         for row, rule in enumerate(rules):
             values = [outcome.metrics[name] for outcome in outcomes if outcome.rule == rule]
-            color = "tab:orange" if rule == PAPER else "tab:blue" if outcomes_fit(outcomes, rule) else "tab:gray"
+            color = "tab:orange" if rule == PAPER else "tab:blue" if _is_fitted(outcomes, rule) else "tab:gray"
             axis.plot(values, [row] * len(values), "o", color=color, alpha=0.5, markersize=5)
             axis.plot([np.mean(values)], [row], "|", color=color, markersize=16, markeredgewidth=2)
         axis.set_yticks(range(len(rules)), rules if place == 0 else [""] * len(rules))
@@ -121,24 +131,25 @@ def _scores(outcomes: Sequence[Outcome]) -> Figure:
     return figure
 
 
-def outcomes_fit(outcomes: Sequence[Outcome], rule: str) -> bool:
-    """Return whether a rule was fitted."""
+def _is_fitted(outcomes: Sequence[Outcome], rule: str) -> bool:
     return any(outcome.fit is not None for outcome in outcomes if outcome.rule == rule)
 
 
 def _losses(outcomes: Sequence[Outcome]) -> Figure:
-    fitted: Mapping[str, list[Any]] = {}
+    fitted: dict[str, list[Any]] = {}
     for outcome in outcomes:
         if outcome.fit is not None:
-            fitted = {**fitted, outcome.rule: [*fitted.get(outcome.rule, []), outcome.fit]}
-    figure = _figure(max(3.0 * len(fitted), 4), 3.2)
+            fitted.setdefault(outcome.rule, []).append(outcome.fit)
+    columns = min(max(len(fitted), 1), _COLUMNS)
+    rows = -(-max(len(fitted), 1) // columns)
+    figure = _figure(3 * columns + 1, 2.4 * rows + 0.5)
     for place, (rule, fits) in enumerate(fitted.items()):
-        axis = figure.add_subplot(1, max(len(fitted), 1), place + 1)
+        axis = figure.add_subplot(rows, columns, place + 1)
         for i, fit in enumerate(fits):
             step, inside, outside = fit.losses.T
             axis.plot(step, inside, color="tab:gray", alpha=0.6, label=None if i or place else "fitted clips")
             axis.plot(step, outside, color="tab:blue", alpha=0.6, label=None if i or place else "held-out clips")
-        axis.set(title=rule, xlabel="step", ylabel="" if place else "objective")
+        axis.set(title=rule, xlabel="step", ylabel="" if place % columns else "objective")
         axis.grid(alpha=0.3)
     if fitted:
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
