@@ -1,16 +1,18 @@
 """The command `vggtjax fit-fusion`, from clips on disk to a file that --fusion takes."""
 
+import dataclasses
 import json
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax import cli
+from vggtjax import cli, load_model
 from vggtjax.demo import demo_clip
 from vggtjax.errors import InputError
-from vggtjax.learning.ablation import split_clips
-from vggtjax.learning.clip_passes import ClipPasses, fit_clips, kept_passes
+from vggtjax.learning.ablation import CHOSEN, split_clips
+from vggtjax.learning.clip_passes import ClipPasses, fit_clips, identity_of, kept_passes, observations
 from vggtjax.learning.family import identity
 from vggtjax.learning.fusion_file import load_fusion, save_fusion
 from vggtjax.results.reconstruction import Reconstruction
@@ -57,9 +59,13 @@ def fitted(dataset, cache, tmp_path_factory):
 
 def test_all_of_it(fitted, cache):
     numbers = json.loads((fitted / "fit.json").read_text())
-    rules = ["pass 1 alone", "pass 2 alone", "hard replacement", "paper", "scale", "scale+correlation"]
+    rules = ["pass 1 alone", "pass 2 alone", "hard replacement", "paper", "scale", "scale+correlation", CHOSEN]
     assert list(numbers["table"]) == rules
     assert [(o["rule"], o["seed"]) for o in numbers["outcomes"]] == [(r, s) for s in (0, 1) for r in rules]
+    for seed in (0, 1):  # the family is chosen without the clips of the scores
+        own = {o["rule"]: o for o in numbers["outcomes"] if o["seed"] == seed}
+        best = min(("scale", "scale+correlation"), key=lambda rule: own[rule]["stopping"]["nll"])
+        assert own[CHOSEN]["metrics"] == own[best]["metrics"]
     assert numbers["chosen"] in ("scale", "scale+correlation")
     assert all(np.isfinite(o["metrics"]["nll"]) for o in numbers["outcomes"])
     table = {rule: {name: mean for name, (mean, _) in row.items()} for rule, row in numbers["table"].items()}
@@ -124,6 +130,8 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
         (["--steps", "0"], "steps is 0"),
         (["--pixels", "0"], "pixels is 0"),
         (["--held-out", "1.5", "--data", "generated=3"], "held_out is 1.5"),
+        (["--max-frames", "8", "--data", "generated=3"], "generated scenes have at least 12 frames"),
+        (["--family", "soft", "--objective", "joint"], "does not see soft masks"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments, sentence, tmp_path, capsys):
@@ -155,19 +163,44 @@ def clip_of(frames: int, size: int, seed: int) -> ClipPasses:
 
 def test_clips_of_several_sizes_are_stacked():
     clips = [clip_of(2, 28, 0), clip_of(3, 42, 1)]
-    scattered = fit_clips(clips, 14, pixels=100)
+    seen = [observations(clip, 14) for clip in clips]
+    scattered = fit_clips(clips, seen, pixels=100)
     assert scattered.truth.shape == (2, 1, 1, 100)
     assert (np.asarray(scattered.truth) > 0).all()
     for own, clip in zip(np.asarray(scattered.seen.depth1), clips, strict=True):
         assert np.isin(own.ravel(), clip.depth1).all()
-    whole = fit_clips(clips, 14, frames=3)
+    whole = fit_clips(clips, seen, frames=3)
     assert whole.truth.shape == (2, 3, 42, 42)
     assert np.array_equal(np.asarray(whole.truth)[0, :2, :28, :28], clips[0].truth)
     assert not np.asarray(whole.truth)[0, 2].any()  # filled up with what is not known
     assert whole.view is None  # frames of other sizes cannot be compared
-    assert fit_clips([clips[0]] * 2, 14).view is not None
+    assert fit_clips([clips[0]] * 2, [seen[0]] * 2).view is not None
     with pytest.raises(InputError, match="no pixel with a true depth"):
-        fit_clips([clips[0]._replace(truth=np.zeros((2, 28, 28), np.float32))], 14, pixels=10)
+        fit_clips([clips[0]._replace(truth=np.zeros((2, 28, 28), np.float32))], seen[:1], pixels=10)
+
+
+def test_frames_are_taken_where_there_is_truth():
+    clip = clip_of(5, 28, 0)
+    clip.truth[:3] = 0
+    taken = fit_clips([clip], [observations(clip, 14)], frames=2)
+    assert np.array_equal(np.asarray(taken.truth)[0], clip.truth[3:])
+    assert np.array_equal(np.asarray(taken.seen.depth1)[0], clip.depth1[3:])
+
+
+def test_models_are_told_apart():
+    model = load_model("demo")
+    other = dataclasses.replace(model.config, motion=dataclasses.replace(model.config.motion, offsets=(-1, 1)))
+    halved = jax.tree.map(lambda x: x / 2, model.params)
+    names = [
+        identity_of(m)
+        for m in (
+            model,
+            load_model("demo"),
+            *(dataclasses.replace(model, config=other), dataclasses.replace(model, params=halved)),
+        )
+    ]
+    assert names[0] == names[1]
+    assert len(set(names)) == 3
 
 
 def test_kept_passes_are_made_anew_where_the_file_is_not_whole(tmp_path):

@@ -85,7 +85,12 @@ def test_likelihoods_of_extremes_have_no_nan(kind):
             assert np.isfinite(value)
             assert np.isfinite(gradient).all()
         assert float(loss(jnp.zeros((1, 1, 4)))) > 0
-    assert float(negative_log_likelihood(fused_of(depth, 0.0), jnp.zeros((1, 1, 4)), kind)) == 0  # nothing is known
+        unknown = jnp.zeros((1, 1, 4))
+        value, gradient = jax.value_and_grad(lambda x: negative_log_likelihood(fused_of(depth, x), unknown, kind))(
+            unknown
+        )
+        assert float(value) == 0
+        assert not np.asarray(gradient).any()
 
 
 def scene(index: int = 0, config=STATIC):
@@ -174,6 +179,13 @@ def test_pose_error_by_other_means():
     moved[:, :, 3] = 2.5 * (true[:, :, 3] + (true[:, :, :3] @ np.array([1, 2, 3.0])))
     error = pose_error(jnp.asarray(moved), jnp.asarray(true))
     assert max(float(error.rotation), float(error.translation)) < 2e-3
+
+
+def test_a_mirrored_path_is_wrong():
+    true = poses(0)
+    mirrored = true.copy()
+    mirrored[:, :, 3] *= -1
+    assert float(pose_error(jnp.asarray(mirrored), jnp.asarray(true)).translation) == pytest.approx(1)
 
 
 def test_pose_error_has_gradients_even_at_no_error():

@@ -29,6 +29,7 @@ from vggtjax.learning.family import (
 
 SHAPE = (2, 3, 4)
 _maps = hnp.arrays(np.float32, SHAPE, elements=st.floats(1, 100, width=32))
+_logs = hnp.arrays(np.float32, SHAPE, elements=st.floats(0, 69, width=32))
 
 
 def seen(d1: Any, c1: Any, d2: Any, c2: Any, dynamic: Any, features: Any = None) -> Observations:
@@ -39,12 +40,14 @@ def seen(d1: Any, c1: Any, d2: Any, c2: Any, dynamic: Any, features: Any = None)
 
 
 @settings(max_examples=50, deadline=None)
-@given(_maps, _maps, _maps, _maps, hnp.arrays(bool, SHAPE))
-def test_the_identity_is_the_papers_rule(d1, c1, d2, c2, dynamic):
+@given(_maps, _logs, _maps, _logs, hnp.arrays(bool, SHAPE))
+def test_the_identity_is_the_papers_rule(d1, log1, d2, log2, dynamic):
+    """For confidences from 1 to 1e30; a precision is as exact as its logarithm, which it is kept as."""
+    c1, c2 = np.exp(log1), np.exp(log2)
     depth, confidence = fuse_depth(d1, c1, d2, c2, dynamic)
     fused = fuse(identity(), seen(d1, c1, d2, c2, dynamic))
     assert np.allclose(fused.depth, depth, rtol=1e-6, atol=0)
-    assert np.allclose(fused.precision, confidence, rtol=2e-6, atol=0)
+    assert np.allclose(fused.log_precision, np.log(confidence), rtol=1e-6, atol=1e-6)
 
 
 def test_every_start_is_a_rule_near_the_papers():
@@ -74,6 +77,28 @@ def test_correlated_passes_are_joined_by_generalised_least_squares(variances, co
     scale = np.abs(inverse.sum(axis=0) / precision) @ np.abs(depths)  # weights can cancel
     assert abs(fused.depth.item() - best) < 1e-4 * scale
     assert np.isclose(fused.precision.item(), precision, rtol=2e-3)
+
+
+def test_an_offset_moves_hard_masks_too():
+    maps = seen(2.0, 1.0, 4.0, 1.0, np.zeros((1, 1, 3)))._replace(margin=jnp.asarray([[[-0.3, -0.1, 0.1]]]))
+    for temperature in (0.0, 1e-5):
+        fused = fuse(identity() | {"offset": jnp.asarray(-0.2), "temperature": jnp.asarray(temperature)}, maps)
+        assert np.allclose(fused.dynamic, [[[0, 1, 1]]], atol=1e-6)
+
+
+def test_floors_hold_however_small_the_precision():
+    for power in (-1.0, -2.0, -4.0):
+        params = identity() | {"power": jnp.full(2, power), "floor": jnp.asarray([1.0, 0.0])}
+        first, second = log_precisions(params, seen(2.0, 1e30, 2.0, 1e30, np.zeros((1, 1, 1))))
+        assert first.item() == pytest.approx(0, abs=1e-6)
+        assert second.item() == pytest.approx(power * np.log(1e30), rel=1e-6)
+
+
+def test_the_gradient_of_a_very_cold_mask_is_a_number():
+    with jax.debug_nans(True):
+        for temperature in (1e-30, 1e-20, 1e-6):
+            slope = jax.grad(lambda t: soft_mask(jnp.asarray([-0.1, 0.0, 0.1]), t).sum())(jnp.asarray(temperature))
+            assert np.isfinite(slope)
 
 
 def test_claims_by_hand():
@@ -128,7 +153,8 @@ def test_soft_regions_blend_between_their_limits():
         fused = fuse(identity() | {"temperature": jnp.asarray(temperature)}, maps)
         assert fused.dynamic.item() == pytest.approx(share, abs=1e-6)
         assert fused.depth.item() == pytest.approx(share * 2 + (1 - share) * 2.5, rel=1e-6)
-        assert fused.log_precision.item() == pytest.approx(share * np.log(3) + (1 - share) * np.log(4), rel=1e-5)
+        variance = share**2 / 3 + (1 - share**2) / 4
+        assert fused.log_precision.item() == pytest.approx(-np.log(variance), rel=1e-5)
 
 
 @pytest.mark.parametrize("family", ["full", "gate"])

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
 
 from vggtjax.errors import InputError
+from vggtjax.learning.family import soft_mask
 from vggtjax.learning.observe import REACH, edge_distance, edge_proximity, observe
 from vggtjax.network.model import Predictions
 from vggtjax.passes import Passes
@@ -67,6 +68,17 @@ def test_masks_without_an_edge(full):
     seen = observe(both._replace(dynamic_mask=jnp.full(both.dynamic_mask.shape, full)), 14)
     assert ((np.asarray(seen.margin) >= 0) == full).all()
     assert all(np.isfinite(x).all() for x in seen)
+
+
+def test_soft_masks_become_masks_that_were_given():
+    """However they came about, and where the saliency says otherwise."""
+    both = passes()
+    given = jnp.asarray(np.random.default_rng(5).random(both.dynamic_mask.shape) < 0.3)
+    for mask in (given, jnp.zeros_like(given), jnp.ones_like(given)):
+        seen = observe(both._replace(dynamic_mask=mask), 14)
+        assert ((np.asarray(seen.margin) >= 0) == np.asarray(mask)).all()
+    nothing = observe(both._replace(dynamic_mask=jnp.zeros_like(given)), 14)
+    assert np.asarray(soft_mask(nothing.margin, jnp.asarray(5.0))).max() < 1e-6
 
 
 def test_a_missing_pass_is_one_sentence():

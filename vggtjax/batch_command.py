@@ -71,7 +71,7 @@ def batch(
         if fusion is not None:
             from vggtjax.learning.apply import read_fusion
 
-            options["fusion"] = read_fusion(fusion, method)
+            options["fusion"] = read_fusion(fusion, [method], model=model, align_scale=False, mask_pairs=5)
         with report.stage("load model") as progress:
             from vggtjax.checkpoint import load_model
 

@@ -111,7 +111,7 @@ def reconstruct(
         if fusion is not None:
             from vggtjax.learning.apply import read_fusion
 
-            fitted = read_fusion(fusion, method)
+            fitted = read_fusion(fusion, [method], model=model, align_scale=align_scale, mask_pairs=mask_pairs)
         loaded = _load_model(report, model, config)
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import load_clip

@@ -11,13 +11,14 @@ import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import cache, partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 from jax import export
+from jax.core import Tracer
 
 from vggtjax.cache import compiled_folder, lowered_folder
 from vggtjax.errors import OutputError
@@ -60,7 +61,7 @@ class Program:
         if not _keeping():
             return None, traced
         leaves, structure = jax.tree.flatten((arguments, traced))
-        if any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        if any(isinstance(leaf, Tracer) for leaf in leaves):
             return None, traced
         static = tuple(sorted((name, repr(value)) for name, value in options.items() if name in self._static))
         return (static, structure, tuple((jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)), traced
@@ -79,7 +80,9 @@ class Program:
     def _kept(self, key: tuple, fixed: dict[str, Any], arguments: tuple, traced: dict[str, Any]) -> Callable[..., Any]:
         """Return the program of a file, or trace it and write the file; the jitted function if it cannot be written."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
-        text = "\n".join((_versions(), name, *map(str, key), str(jax.config.values["jax_default_matmul_precision"])))
+        text = "\n".join(
+            (source_digest(), name, *map(str, key), str(jax.config.values["jax_default_matmul_precision"]))
+        )
         path = lowered_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.bin"
         try:
             return jax.jit(export.deserialize(bytearray(path.read_bytes())).call)
@@ -114,7 +117,7 @@ def kept_text(name: str, make: Callable[[], str]) -> str:
     """Return text that follows from the sources of this package: what was made of them before, where it is kept."""
     if not _keeping():
         return make()
-    path = lowered_folder() / f"{hashlib.sha256(f'{_versions()} {name}'.encode()).hexdigest()[:32]}.txt"
+    path = lowered_folder() / f"{hashlib.sha256(f'{source_digest()} {name}'.encode()).hexdigest()[:32]}.txt"
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
@@ -130,13 +133,14 @@ def _keeping() -> bool:
 
 
 @cache
-def _versions() -> str:
-    """Return what the lowered form of a function depends on beside its arguments."""
+def source_digest() -> str:
+    """Return what the results of this package depend on beside arguments: its sources, versions, and the platform."""
     digest = hashlib.sha256()
     root = Path(__file__).parent
     for path in sorted(root.rglob("*.py")):
         digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
-    return f"{jax.__version__} {jaxlib.__version__} {jax.default_backend()} {digest.hexdigest()}"
+    versions = [version(name) for name in ("jax", "jaxlib", "flax")]
+    return f"{' '.join(versions)} {jax.default_backend()} {digest.hexdigest()}"
 
 
 def _prune(folder: Path) -> None:

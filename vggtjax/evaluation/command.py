@@ -130,12 +130,10 @@ def evaluate(
                 "compute_dtype": dtype,
             }
             if fusion is not None:
-                from vggtjax.learning.apply import check_fuses
-                from vggtjax.learning.fusion_file import load_fusion
+                from vggtjax.learning.apply import read_fusion
 
-                if "4dvggt-d" not in names:
-                    check_fuses(names[0])
-                options["fusion"] = load_fusion(fusion)
+                said = {"model": loaded.name, "align_scale": align_scale, "mask_pairs": mask_pairs}
+                options["fusion"] = read_fusion(fusion, names, **said)
             source = _Methods(loaded, names, mode, loaded.config.image_size if size is None else size, options)
             settings |= {"model": _identity(loaded), "mode": mode, "size": source.size, **options}
             if fusion is not None:

@@ -33,6 +33,7 @@ METRICS = {
     "ause": "AUSE",
 }
 PAPER = "paper"
+CHOSEN = "chosen by the clips for stopping"
 _FRAMES = 4  # of a clip, for fits that look at whole frames
 
 Rule = Callable[[Observations], Fused]
@@ -48,6 +49,7 @@ class Outcome(NamedTuple):
     metrics: dict[str, float]
     fit: Fit | None
     reliability: Float[np.ndarray, "2 K"]  # claimed levels, observed shares
+    stopping: dict[str, float]  # the metrics on the clips for early stopping, by which a family is chosen
 
 
 class Split(NamedTuple):
@@ -109,60 +111,74 @@ def ablate(
         patch_size: of the model.
         families: names that `parse_family` takes.
         config: of the fits; family and seed are filled in.
-        seeds: each splits the clips anew, and draws other pixels and other starts.
+        seeds: each splits the clips anew, and draws other pixels.
         held_out: share of the clips for the scores, and of the rest for early stopping.
         pixels: of a clip that fits look at, where they need no whole frames.
         folder: for the states of fits, so that an interrupted run goes on; none if None.
         progress: called with the fits done and their number.
 
     Returns:
-        For every seed the outcomes of the baselines, then those of the families.
+        For every seed the outcomes of the baselines, those of the families, and that of the family with the lowest NLL
+        on the clips for stopping, if there are several.
     """
     chosen = {name: parse_family(name) for name in families}
     found: list[Outcome] = []
+    seen = [observations(clip, patch_size) for clip in clips]
     total, done = len(seeds) * sum(map(bool, chosen.values())), 0
     for seed in seeds:
         split = split_clips(len(clips), seed, held_out)
-        tested = [clips[i] for i in split.test]
-        for name, rule in baselines().items():
-            metrics, reliability = score_rule(rule, tested, patch_size)
-            found.append(Outcome(name, seed, metrics, None, reliability))
+
+        def outcome(name: str, rule: Rule, fit: Fit | None = None, split=split, seed=seed) -> Outcome:
+            parts = [[(clips[i], seen[i]) for i in indices] for indices in (split.test, split.validation)]
+            (metrics, reliability), (stopping, _) = (score_rule(rule, part) for part in parts)
+            return Outcome(name, seed, metrics, fit, reliability, stopping)
+
+        found += [outcome(name, rule) for name, rule in baselines().items()]
+        fitted: list[Outcome] = []
         for name, family in chosen.items():
             if not family:
                 continue  # the paper's own: a baseline
-            fit = fit_split(clips, patch_size, split, _with(config, family, seed), pixels=pixels, folder=folder)
-            metrics, reliability = score_rule(partial(_fused, fit.params), tested, patch_size)
-            found.append(Outcome(name, seed, metrics, fit, reliability))
+            fit = fit_split(clips, seen, split, _with(config, family, seed), pixels=pixels, folder=folder)
+            fitted.append(outcome(name, partial(_fused, fit.params), fit))
             done += 1
             if progress is not None:
                 progress(done, total)
+        found += fitted
+        if len(fitted) > 1:
+            best = min(fitted, key=lambda one: one.stopping["nll"])
+            found.append(best._replace(rule=CHOSEN, fit=None))
     return found
 
 
 def fit_split(
     clips: Sequence[ClipPasses],
-    patch_size: int,
+    seen: Sequence[Observations],
     split: Split,
     config: FitConfig,
     *,
     pixels: int = 16384,
     folder: Path | None = None,
 ) -> Fit:
-    """Fit one family to the clips of a split; arguments as for `ablate`."""
+    """Fit one family to the clips of a split; `seen` is what `observations` made of each, the rest as for `ablate`.
+
+    Fits that need whole frames (the gate, photometric and geometric objectives) look at four of each clip, the others
+    at `pixels` of all.
+    """
     whole = config.objective in NEEDS_FRAMES or "gate" in config.family
     sampling: dict[str, Any] = {"frames": _FRAMES} if whole else {"pixels": pixels, "seed": config.seed}
     fitted, stopping = (
-        fit_clips([clips[i] for i in indices], patch_size, **sampling) for indices in (split.fitted, split.validation)
+        fit_clips([clips[i] for i in indices], [seen[i] for i in indices], **sampling)
+        for indices in (split.fitted, split.validation)
     )
     checkpoint = None
     if folder is not None:
-        facts = [dataclasses.asdict(config), split, sampling, _digest(clips)]
+        facts = [dataclasses.asdict(config), split, sampling]
         checkpoint = folder / f"{hashlib.sha256(json.dumps(facts).encode()).hexdigest()[:24]}.npz"
     return fit_fusion(fitted, stopping, config, checkpoint=checkpoint)
 
 
 def score_rule(
-    rule: Rule, clips: Sequence[ClipPasses], patch_size: int
+    rule: Rule, clips: Sequence[tuple[ClipPasses, Observations]]
 ) -> tuple[dict[str, float], Float[np.ndarray, "2 K"]]:
     """Return a rule's metrics and its reliability curve, means over clips, each brought to its truth by one scale.
 
@@ -170,8 +186,8 @@ def score_rule(
     """
     scores: list[dict[str, float]] = []
     curves = []
-    for clip in clips:
-        fused = rule(observations(clip, patch_size))
+    for clip, seen in clips:
+        fused = rule(seen)
         depth, precision = np.asarray(fused.depth, np.float64), np.asarray(fused.precision, np.float64)
         known = np.isfinite(clip.truth) & (clip.truth > 0)
         truth = clip.truth[known] / depth_alignment(depth[known], clip.truth[known], "scale")[0]
@@ -179,7 +195,7 @@ def score_rule(
         claimed = uncertainty_scores(depth, truth, precision[known])
         row = {"abs_rel": depth_errors(depth, truth, scale=1.0).abs_rel}
         for name, part in (("abs_rel_static", ~moves), ("abs_rel_dynamic", moves)):
-            if part.any():
+            if part.any() and clip.true_dynamic.any():
                 row[name] = depth_errors(depth[part], truth[part], scale=1.0).abs_rel
         row |= {name: getattr(claimed, name) for name in ("nll", "nll_calibrated", "ece", "ause")}
         scores.append(row)
@@ -193,7 +209,8 @@ def table(outcomes: Sequence[Outcome]) -> dict[str, dict[str, tuple[float, float
     rows: dict[str, dict[str, tuple[float, float]]] = {}
     for rule in dict.fromkeys(outcome.rule for outcome in outcomes):
         own = [outcome.metrics for outcome in outcomes if outcome.rule == rule]
-        rows[rule] = {name: _spread([m[name] for m in own if name in m]) for name in METRICS if name in own[0]}
+        present = {name: [m[name] for m in own if name in m] for name in METRICS}
+        rows[rule] = {name: _spread(values) for name, values in present.items() if values}
     return rows
 
 
@@ -223,14 +240,6 @@ def markdown(rows: Mapping[str, Mapping[str, tuple[float, float]]]) -> str:
 
 def _with(config: FitConfig, family: tuple[str, ...], seed: int) -> FitConfig:
     return dataclasses.replace(config, family=family, seed=seed)
-
-
-def _digest(clips: Sequence[ClipPasses]) -> str:
-    digest = hashlib.sha256()
-    for clip in clips:
-        for array in clip:
-            digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
 
 
 def _spread(values: Sequence[float]) -> tuple[float, float]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import logging
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -11,10 +14,12 @@ import numpy as np
 from vggtjax.errors import InputError
 from vggtjax.fusion import scale_between
 from vggtjax.learning.family import FusionParams, fuse
-from vggtjax.learning.fusion_file import load_fusion
+from vggtjax.learning.fusion_file import fusion_about, load_fusion
 from vggtjax.learning.observe import observe
 from vggtjax.methods import METHODS, find_method
 from vggtjax.passes import Assembly, Passes
+
+logger = logging.getLogger(__name__)
 
 
 def refused(
@@ -35,12 +40,18 @@ def check_fuses(method: str) -> None:
         raise InputError(f"a fusion is given, and method {method!r} does not fuse; expected {names}")
 
 
-def read_fusion(path: Path | None, method: str) -> FusionParams | None:
-    """Return the tree of a file for a method that fuses, None for None; InputError as `load_fusion`."""
-    if path is None:
-        return None
-    check_fuses(method)
-    return load_fusion(path)
+def read_fusion(path: Path, methods: Sequence[str], **settings: Any) -> FusionParams:
+    """Return the tree of a file for methods of which one fuses; InputError as `load_fusion`.
+
+    A warning is logged where it was fitted with other settings (`model`, `align_scale`, `mask_pairs`).
+    """
+    if all(find_method(method).depth != "fused" for method in methods):
+        check_fuses(methods[0])
+    fusion, about = load_fusion(path), fusion_about(path)
+    for name, value in settings.items():
+        if name in about and about[name] != value:
+            logger.warning("%s was fitted with %s %s, and is used with %s", path, name, about[name], value)
+    return fusion
 
 
 def fusion_digest(fusion: FusionParams | None) -> str | None:

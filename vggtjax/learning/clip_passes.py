@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,11 +25,15 @@ from vggtjax.learning.observe import observe
 from vggtjax.network.model import Predictions
 from vggtjax.passes import Cameras, Passes
 from vggtjax.pipeline import OnStage, reconstruct
+from vggtjax.programs import source_digest
 from vggtjax.results import archive
 from vggtjax.results.reconstruction import Reconstruction
 
-FORMAT_VERSION = 1
 METHOD = "4dvggt-d"
+_LOOKED_AT = 64  # values of every parameter that tell models apart
+
+
+logger = logging.getLogger(__name__)
 
 
 class ClipPasses(NamedTuple):
@@ -74,11 +79,12 @@ def kept_passes(key: Mapping[str, Any], make: Callable[[], ClipPasses], folder: 
     """Return what `make` makes, or what it made before under the same key.
 
     Args:
-        key: plain values that name model, clip and settings: all that the passes depend on.
+        key: plain values that name model, clip and settings: all that the passes depend on, but for the sources of this
+            package and the versions below it, which are added.
         make: runs the passes.
         folder: of the kept files; the user's cache if None.
     """
-    text = json.dumps({"version": FORMAT_VERSION, **key}, sort_keys=True)
+    text = json.dumps({"sources": source_digest(), "method": METHOD, **key}, sort_keys=True)
     folder = cache_folder() / "passes" if folder is None else folder
     path = folder / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
     try:
@@ -121,7 +127,7 @@ def generated_passes(
     from vggtjax.scenes import SceneConfig, held_out_scenes
 
     side = model.config.image_size if size is None else size
-    key = {"model": identity_of(model), "scenes": seed, "frames": frames, "size": side, **(options or {})}
+    key = {"model": identity_of(model), "scenes": seed, "frames": frames, "size": side, "options": options}
     drawn: list[Any] = []  # all at once, and only if one is missing
 
     def made(scene: int) -> ClipPasses:
@@ -157,6 +163,8 @@ def dataset_passes(
 ) -> Iterator[tuple[str, ClipPasses]]:
     """Yield names and passes of a data set's sequences that have true depth; arguments as above, and as `evaluate`.
 
+    A sequence without is left out, and said to be in the log.
+
     Raises InputError where no sequence has.
     """
     from vggtjax.clips.clip import load_clip
@@ -166,11 +174,12 @@ def dataset_passes(
 
     side = model.config.image_size if size is None else size
     found, used = find_sequences(dataset, root), 0
+    max_depth = DATASETS[dataset].max_depth
+    key = {"model": identity_of(model), "dataset": [dataset, max_depth], "size": side, "options": options}
     for number, (name, opener) in enumerate(found.items()):
         sequence = opener() if max_frames is None else opener().taken(slice(max_frames))
-        if sequence.depth is not None:
+        if sequence.depth is not None and any((sequence.depth(i) > 0).any() for i in range(len(sequence))):
             used += 1
-            key = {"model": identity_of(model), "data": fingerprint(sequence), "size": side, **(options or {})}
 
             def made(sequence=sequence) -> ClipPasses:
                 paths = [str(path) for path in sequence.pictures]
@@ -178,10 +187,12 @@ def dataset_passes(
                 result = reconstruct(
                     model, clip, method=METHOD, size=side, keep_passes=True, on_stage=on_stage, **dict(options or {})
                 )
-                truth = TruthAtPixels(sequence, result, max_depth=DATASETS[dataset].max_depth)
+                truth = TruthAtPixels(sequence, result, max_depth=max_depth)
                 return passes_of(result, truth.depth, None if sequence.mask is None else truth.mask)
 
-            yield name, kept_passes(key, made, folder)
+            yield name, kept_passes(key | {"data": fingerprint(sequence)}, made, folder)
+        else:
+            logger.warning("%s has no true depth and is left out", name)
         if progress is not None:
             progress(number + 1, len(found))
     if not used:
@@ -189,38 +200,45 @@ def dataset_passes(
 
 
 def identity_of(model: Model) -> str:
-    """Return what tells models apart: the sum of the file, or of the parameters where there is none."""
-    digest = hashlib.sha256()
+    """Return what tells models apart: the configuration, some values of every parameter, and the sum of the file."""
+    digest = hashlib.sha256(model.config.to_json().encode())
+    for leaf in jax.tree.leaves(model.params):
+        values = np.asarray(leaf).reshape(-1)
+        digest.update(f"{leaf.dtype} {leaf.shape}".encode())
+        digest.update(values[:: max(values.size // _LOOKED_AT, 1)].tobytes() if model.path else values.tobytes())
     if model.path is not None:
         with model.path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    for leaf in jax.tree.leaves(model.params):
-        digest.update(np.asarray(leaf).tobytes())
+            digest.update(hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
 
 
 def observations(clip: ClipPasses, patch_size: int) -> Observations:
-    """Return what rules of fusion see of a clip, [S, H, W]."""
+    """Return what rules of fusion see of a clip, [S, H, W], on the host."""
     first = Predictions(depth=jnp.asarray(clip.depth1)[None], depth_confidence=jnp.asarray(clip.confidence1)[None])
     second = Predictions(depth=jnp.asarray(clip.depth2)[None], depth_confidence=jnp.asarray(clip.confidence2)[None])
     passes = Passes(first, second, jnp.asarray(clip.saliency)[None], jnp.asarray(clip.dynamic_mask)[None])
-    return jax.tree.map(lambda x: x[0], _observe(passes, patch_size))
+    return jax.tree.map(lambda x: np.asarray(x)[0], _observe(passes, patch_size))
 
 
 _observe = jax.jit(observe, static_argnums=1)
 
 
 def fit_clips(
-    clips: list[ClipPasses], patch_size: int, *, pixels: int | None = None, frames: int | None = None, seed: int = 0
+    clips: Sequence[ClipPasses],
+    seen: Sequence[Observations],
+    *,
+    pixels: int | None = None,
+    frames: int | None = None,
+    seed: int = 0,
 ) -> FitClips:
     """Return clips stacked for a fit.
 
     Args:
         clips: of any sizes where `pixels` is given; else those of fewer frames or a smaller size are filled up with
             pixels of unknown depth.
-        patch_size: of the model.
+        seen: what `observations` returned for each.
         pixels: take so many pixels with a true depth of each clip, at random (some twice where it has fewer).
-        frames: else take so many frames of each, next to each other, from the first.
+        frames: else take so many frames of each, next to each other: those with the most true depth.
         seed: of the choice of pixels.
 
     Raises:
@@ -230,8 +248,8 @@ def fit_clips(
         raise InputError("there are no clips to fit to; expected one at least")
     generator = np.random.default_rng(seed)
     stacked = [
-        _at_pixels(clip, patch_size, pixels, generator) if pixels else _whole(clip, patch_size, frames)
-        for clip in clips
+        _at_pixels(clip, maps, pixels, generator) if pixels else _whole(clip, maps, frames)
+        for clip, maps in zip(clips, seen, strict=True)
     ]
     most = [max(sizes) for sizes in zip(*(clip.truth.shape for clip in stacked), strict=True)]
 
@@ -250,23 +268,25 @@ def fit_clips(
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *together)
 
 
-def _whole(clip: ClipPasses, patch_size: int, frames: int | None) -> FitClips:
-    some = slice(frames)
-    seen = jax.tree.map(lambda x: np.asarray(x)[some], observations(clip, patch_size))
+def _whole(clip: ClipPasses, seen: Observations, frames: int | None) -> FitClips:
+    S = len(clip.truth)
+    count = S if frames is None else min(frames, S)
+    known = np.cumsum([0, *(clip.truth > 0).sum(axis=(1, 2))])
+    best = int(np.argmax(known[count:] - known[: S - count + 1]))
+    some = slice(best, best + count)
+    seen = jax.tree.map(lambda x: x[some], seen)
     cameras = Cameras(clip.camera_from_world[some], clip.intrinsics[some])  # pyright: ignore[reportArgumentType]
     view = View(clip.images[some].astype(np.float32) / 255, cameras)  # pyright: ignore[reportArgumentType]
     return FitClips(seen, clip.truth[some], view)  # pyright: ignore[reportArgumentType]
 
 
-def _at_pixels(clip: ClipPasses, patch_size: int, count: int, generator: np.random.Generator) -> FitClips:
+def _at_pixels(clip: ClipPasses, seen: Observations, count: int, generator: np.random.Generator) -> FitClips:
     known = np.flatnonzero(np.isfinite(clip.truth) & (clip.truth > 0))
     if not len(known):
         raise InputError("a clip has no pixel with a true depth; leave it out")
     chosen = generator.choice(known, count, replace=len(known) < count)
 
     def taken(x) -> np.ndarray:
-        x = np.asarray(x)
         return x.reshape(-1, *x.shape[3:])[chosen][None, None]
 
-    seen = jax.tree.map(taken, observations(clip, patch_size))
-    return FitClips(seen, taken(clip.truth))  # pyright: ignore[reportArgumentType]
+    return FitClips(jax.tree.map(taken, seen), taken(clip.truth))  # pyright: ignore[reportArgumentType]

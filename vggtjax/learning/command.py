@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from vggtjax.learning.clip_passes import ClipPasses
 
 GENERATED = "generated"
+FEWEST_FRAMES = 12  # of a generated scene
 
 
 def fit_fusion(
@@ -49,13 +50,13 @@ def fit_fusion(
             scale+power+floor+correlation+inflation+distrust+saliency+depth+boundary+dynamic+offset+temperature+gate.
         objective: a likelihood of the true depth (joint: of both passes' errors, which measures their correlation), or
             how well frames agree, which needs no truth to fit (but to score).
-        seeds: of splits, pixels and starts: every family is fitted so many times.
+        seeds: of splits and pixels: every family is fitted so many times.
         steps: of the optimiser, at most.
         learning_rate: the largest of its schedule.
         patience: looks at the clips kept for stopping, one every 10 steps, after which a fit without gain ends.
         held_out: share of the clips that are kept for the scores, and of the rest for stopping.
-        pixels: of each clip that a fit looks at.
-        max_frames: take so many frames of each clip at most (12 of a generated one by default).
+        pixels: of each clip that a fit looks at; the gate and the objectives without truth look at four whole frames.
+        max_frames: take so many frames of each clip at most (a generated one has 12 by default, and at least).
         size: side in pixels to run at; the model's own by default.
         mask_pairs: number of pairs in which the keys of dynamic tokens are suppressed.
         align_scale: bring the second pass to the first one's scale before the fusion.
@@ -73,7 +74,7 @@ def fit_fusion(
     with report.running():
         from vggtjax.checkpoint import load_model
         from vggtjax.learning.ablation import ablate
-        from vggtjax.learning.export import check_folder, save_fits
+        from vggtjax.learning.export import begin, check_folder, save_fits
         from vggtjax.learning.family import parse_family
         from vggtjax.learning.fit import FitConfig
         from vggtjax.learning.plots import check_matplotlib
@@ -81,8 +82,8 @@ def fit_fusion(
         check_matplotlib()
         check_folder(out)
         for name in family:
-            parse_family(name)
-        sources = [_source(text) for text in data]
+            FitConfig(parse_family(name), objective)
+        sources = [_source(text, max_frames) for text in data]
         config = FitConfig(objective=objective, steps=steps, learning_rate=learning_rate, patience=patience)
         with report.stage("load model") as progress:
             loaded = load_model(model, progress=progress)
@@ -90,13 +91,14 @@ def fit_fusion(
         clips: dict[str, ClipPasses] = {}
         for text, source in zip(data, sources, strict=True):
             with report.stage(f"passes, {text}") as progress:
-                clips |= _passes(loaded, source, max_frames, size, options, progress)
+                made = _passes(loaded, source, max_frames, size, options, progress)
+                clips |= {f"{text}, {name}": clip for name, clip in made.items()}
         clips = {name: _aligned(clip) for name, clip in clips.items()} if align_scale else clips
         patch = loaded.config.patch_size
         with report.stage("fit") as progress:
             settings: dict[str, Any] = {"seeds": range(seeds), "held_out": held_out, "pixels": pixels}
             outcomes = ablate(
-                list(clips.values()), patch, family, config, folder=out / "states", progress=progress, **settings
+                list(clips.values()), patch, family, config, folder=begin(out), progress=progress, **settings
             )
         with report.stage("write"):
             chosen = save_fits(
@@ -114,7 +116,7 @@ def fit_fusion(
 
 
 def _say(report: Report, outcomes: list[Outcome], chosen: str, out: Path) -> None:
-    from vggtjax.learning.ablation import METRICS, PAPER, gains, table
+    from vggtjax.learning.ablation import CHOSEN, METRICS, PAPER, gains, table
 
     rows = table(outcomes)
     names = ("abs_rel", "nll", "ece", "ause")
@@ -123,18 +125,17 @@ def _say(report: Report, outcomes: list[Outcome], chosen: str, out: Path) -> Non
     for rule, row in rows.items():
         cells = (f"{row[name][0]:7.4f} ±{row[name][1]:7.4f}" for name in names)
         report.line(f"{rule:{width}}  " + "  ".join(cells))
-    apart = gains(outcomes).get(chosen)
+    apart = gains(outcomes).get(CHOSEN, gains(outcomes).get(chosen))
     if apart is not None:
         count = len({outcome.seed for outcome in outcomes})
         text = (f"{METRICS[name]} {apart[name][0]:+.4f} (lower with {apart[name][2]} of {count})" for name in names[:2])
-        report.line(f"{chosen} against {PAPER}, on clips that were not fitted to: {', '.join(text)}")
-    report.line(
-        f"For --fusion: {out / 'fusion.safetensors'} ({chosen}, the lowest objective on the clips for stopping)"
-    )
+        name = CHOSEN if CHOSEN in rows else chosen
+        report.line(f"{name} against {PAPER}, on clips that were not fitted to: {', '.join(text)}")
+    report.line(f"For --fusion: {out / 'fusion.safetensors'} ({chosen}, the lowest NLL on the clips for stopping)")
     report.line(f"Look at {out / 'scores.png'}, {out / 'precision.png'}, {out / 'calibration.png'}")
 
 
-def _source(text: str) -> tuple[str, str]:
+def _source(text: str, max_frames: int | None) -> tuple[str, str]:
     """Return the name and the place of a source of clips, checked as far as can be without reading it."""
     name, equals, place = text.partition("=")
     if not equals or not place:
@@ -142,6 +143,8 @@ def _source(text: str) -> tuple[str, str]:
     if name == GENERATED:
         if not place.isdecimal() or not 1 <= int(place) <= 10_000:
             raise InputError(f"--data has {text!r}; expected a number of scenes from 1 to 10000")
+        if max_frames is not None and max_frames < FEWEST_FRAMES:
+            raise InputError(f"max_frames is {max_frames}; generated scenes have at least {FEWEST_FRAMES} frames")
         return name, place
     from vggtjax.evaluation.datasets import DATASETS
 
@@ -166,8 +169,7 @@ def _passes(
     common: dict[str, Any] = {"size": size, "options": options, "progress": progress}
     if name == GENERATED:
         return dict(generated_passes(model, int(place), frames=max_frames or 12, **common))
-    made = dataset_passes(model, name, Path(place), max_frames=max_frames, **common)
-    return {f"{name} {sequence}": clip for sequence, clip in made}
+    return dict(dataset_passes(model, name, Path(place), max_frames=max_frames, **common))
 
 
 def _aligned(clip: ClipPasses) -> ClipPasses:

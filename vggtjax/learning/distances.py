@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from vggtjax.network.precision import full_precision
 
-QUERIES_AT_ONCE = 512
+QUERIES_AT_ONCE = 64
 _TINY = 1e-12
 
 
@@ -40,7 +40,7 @@ def pose_error(found: Float[Array, "S 3 4"], truth: Float[Array, "S 3 4"]) -> Po
     cosine = jnp.trace(difference, axis1=1, axis2=2) - 1
     angle = jnp.arctan2(jnp.sqrt(jnp.sum(sine * sine, axis=-1) + _TINY**2), cosine)
     size = jnp.sum(centres[0] * centres[0])
-    scale = jnp.sum(centres[0] * centres[1]) / jnp.maximum(size, _TINY)
+    scale = jnp.maximum(jnp.sum(centres[0] * centres[1]) / jnp.maximum(size, _TINY), 0)
     apart = jnp.sum((scale * centres[0] - centres[1]) ** 2) / jnp.maximum(jnp.sum(centres[1] ** 2), _TINY)
     return PoseError(_root(jnp.mean(angle * angle)), _root(apart))
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ import numpy as np
 
 from vggtjax.files import check_free, staging, writing
 from vggtjax.learning.ablation import PAPER, Outcome, Split, fit_split, gains, markdown, split_clips, table
-from vggtjax.learning.clip_passes import ClipPasses
+from vggtjax.learning.clip_passes import ClipPasses, observations
 from vggtjax.learning.family import identity, parse_family
 from vggtjax.learning.fit import FitConfig
 from vggtjax.learning.fusion_file import save_fusion
@@ -33,6 +34,7 @@ FORMAT = "vggtjax fits"
 VERSION = 1
 NUMBERS, FUSION, TABLE, FAMILIES, STATES = "fit.json", "fusion.safetensors", "table.md", "families", "states"
 PICTURES = ("scores.png", "precision.png", "calibration.png", "losses.png")
+_MARK = "fits.json"  # in the folder of states: it is ours
 _MOST_BYTES = 2**24
 
 
@@ -50,24 +52,22 @@ def save_fits(
     *,
     about: Mapping[str, Any],
 ) -> str:
-    """Write everything, and return the name of the chosen family: the lowest objective on the clips for stopping.
+    """Write everything, and return the name of the chosen family: the lowest mean NLL on the clips for stopping.
 
     Every family is fitted once more to all clips but a part for stopping, which the scores then do not hold for; where
     no family was fitted, the paper's rule is written.
     """
     families = list(dict.fromkeys(outcome.rule for outcome in outcomes if outcome.fit is not None))
-    objectives = {
-        name: float(np.mean([o.fit.held_out_loss for o in outcomes if o.rule == name and o.fit is not None]))
-        for name in families
-    }
-    chosen = min(objectives, key=objectives.__getitem__) if families else PAPER
+    stopping = {name: float(np.mean([o.stopping["nll"] for o in outcomes if o.rule == name])) for name in families}
+    chosen = min(stopping, key=stopping.__getitem__) if families else PAPER
     facts = dict(about) | {"clips": list(clips), "objective": config.objective}
     split = _final_split(len(clips), float(about["held_out"]))
+    all_clips = list(clips.values())
+    seen = [observations(clip, patch_size) for clip in all_clips]
     trees = {PAPER: identity()}
     for name in families:
         whole = dataclasses.replace(config, family=parse_family(name))
-        pixels = int(about["pixels"])
-        fit = fit_split(list(clips.values()), patch_size, split, whole, pixels=pixels, folder=folder / STATES)
+        fit = fit_split(all_clips, seen, split, whole, pixels=int(about["pixels"]), folder=folder / STATES)
         trees[name] = fit.params
     numbers = {
         "format": FORMAT,
@@ -75,25 +75,23 @@ def save_fits(
         "chosen": chosen,
         "about": facts,
         "config": dataclasses.asdict(config),
-        "objective_for_stopping": objectives,
+        "nll_for_stopping": stopping,
         "table": table(outcomes),
         "against_the_paper": gains(outcomes),
         "outcomes": [_plain(outcome) for outcome in outcomes],
         "fitted_to_all": {name: _values(tree) for name, tree in trees.items()},
     }
     with staging(folder) as staged:
-        (folder / NUMBERS).unlink(missing_ok=True)
         for name, tree in trees.items():
-            said = facts | {"family": name}
-            (folder / FAMILIES).mkdir(exist_ok=True)
-            save_fusion(folder / FAMILIES / f"{name.replace('+', '_')}.safetensors", tree, said)
-        save_fusion(folder / FUSION, trees[chosen], facts | {"family": chosen})
+            save_fusion(staged / FAMILIES / f"{name.replace('+', '_')}.safetensors", tree, facts | {"family": name})
+        save_fusion(staged / FUSION, trees[chosen], facts | {"family": chosen})
         (staged / TABLE).write_text(markdown(table(outcomes)), encoding="utf-8")
-        draw_fits(staged, outcomes, list(clips.values()), patch_size, chosen)
-        for name in (TABLE, *PICTURES):
+        draw_fits(staged, outcomes, all_clips, patch_size, chosen)
+        (staged / NUMBERS).write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        (folder / NUMBERS).unlink(missing_ok=True)
+        shutil.rmtree(folder / FAMILIES, ignore_errors=True)
+        for name in (FAMILIES, FUSION, TABLE, *PICTURES, NUMBERS):
             (staged / name).replace(folder / name)
-    with writing(folder / NUMBERS) as path:
-        path.write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return chosen
 
 
@@ -109,6 +107,7 @@ def _plain(outcome: Outcome) -> dict[str, Any]:
         "rule": outcome.rule,
         "seed": outcome.seed,
         "metrics": outcome.metrics,
+        "stopping": outcome.stopping,
         "reliability": outcome.reliability.tolist(),
         "fit": fit
         and {
@@ -130,9 +129,16 @@ def _values(tree: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def begin(folder: Path) -> Path:
+    """Make the folder for the states of fits, with a mark that it is one; return it."""
+    with writing(folder / STATES / _MARK) as path:
+        path.write_text(json.dumps({"format": FORMAT}) + "\n", encoding="utf-8")
+    return folder / STATES
+
+
 def _is_ours(folder: Path) -> bool:
-    if (folder / STATES).is_dir() and not (folder / NUMBERS).exists():
-        return not (folder / FUSION).exists() or (folder / FAMILIES).is_dir()  # an interrupted run's
+    if (folder / STATES / _MARK).is_file():
+        return True
     try:
         if (folder / NUMBERS).stat().st_size > _MOST_BYTES:
             return False

@@ -29,6 +29,7 @@ FusionParams = dict[str, Any]
 FEATURES = ("saliency", "depth", "boundary", "dynamic")
 _MOST = 80.0  # of exponents: exp of it is a float32 with room to spare
 _TINY = 1e-30
+_COLDEST = 1e-6
 
 
 class Observations(NamedTuple):
@@ -67,6 +68,8 @@ class Part:
     start: float | None = None  # the identity, unless that is a corner from which no gradient leads
     low: float = -math.inf
     high: float = math.inf
+    least: float | None = None  # while it is fitted: from 0 no gradient of a mask leads back
+    rate: float = 1.0  # of learning, beside other parts
 
 
 PARTS: dict[str, Part] = {
@@ -80,8 +83,10 @@ PARTS: dict[str, Part] = {
     "correlation": Part("of the two passes' errors", shape=(), low=-0.99, high=0.99),
     "inflation": Part("how far disagreement beyond the claimed variances widens the fused one", (), low=0, high=1e3),
     "distrust": Part("how far such disagreement discounts a pass", low=0, high=1e3),
-    "offset": Part("added to the threshold of the saliency, for soft masks", (), low=-1, high=1),
-    "temperature": Part("width of a soft mask's edge; 0 is the hard mask", (), start=0.1, low=0, high=10),
+    "offset": Part("added to the threshold of the saliency", (), low=-1, high=1, rate=0.1),
+    "temperature": Part(
+        "width of a soft mask's edge; 0 is the hard mask", (), start=0.1, low=0, high=10, least=1e-3, rate=0.1
+    ),
 }
 
 PRESETS: dict[str, tuple[str, ...]] = {
@@ -137,11 +142,15 @@ def start(family: tuple[str, ...], seed: int = 0, spread: float = 0.0) -> Fusion
     return projected(tree)
 
 
-def projected(params: FusionParams) -> FusionParams:
-    """Return the tree with every leaf within its range."""
+def projected(params: FusionParams, fitted: tuple[str, ...] = ()) -> FusionParams:
+    """Return the tree with every leaf within its range, or within that of a fit for parts that are fitted."""
+
+    def low(name: str) -> float:
+        part = PARTS[name]
+        return part.least if name in fitted and part.least is not None else part.low
+
     return {
-        name: leaf if name == "gate" else jnp.clip(leaf, PARTS[name].low, PARTS[name].high)
-        for name, leaf in params.items()
+        name: leaf if name == "gate" else jnp.clip(leaf, low(name), PARTS[name].high) for name, leaf in params.items()
     }
 
 
@@ -172,11 +181,19 @@ def _claims(params: FusionParams, seen: Observations) -> tuple[Float[Array, "H W
     claims = []
     for i, log_confidence in enumerate((seen.log_confidence1, seen.log_confidence2)):
         claim = params["scale"][i] + params["power"][i] * log_confidence + shifts[..., i]
-        claims.append(claim + jnp.log1p(params["floor"][i] * jnp.exp(jnp.minimum(-claim, _MOST))))
+        claims.append(_above(claim, params["floor"][i]))
     if "gate" in params:
         shift = apply_gate(params["gate"], _seen_by_gate(seen))
         claims = [claim + shift[..., i] for i, claim in enumerate(claims)]
     return claims[0], claims[1]
+
+
+def _above(log_precision: Float[Array, "H W"], floor: Float[Array, ""]) -> Float[Array, "H W"]:
+    """log(exp(log_precision) + floor); with a gradient by a floor of 0 too, unless the precision is next to nothing."""
+    near = log_precision > -_MOST
+    usual = log_precision + jnp.log1p(floor * jnp.exp(-jnp.where(near, log_precision, 0)))
+    low = jnp.where(floor > 0, jnp.logaddexp(log_precision, jnp.log(jnp.where(floor > 0, floor, 1))), log_precision)
+    return jnp.where(near, usual, low)
 
 
 def soft_mask(
@@ -184,7 +201,7 @@ def soft_mask(
 ) -> Float[Array, "*S"]:
     """Return sigmoid(margin / temperature), the share that moves; temperature 0 gives the `hard` mask (margin >= 0)."""
     hard = (margin >= 0).astype(margin.dtype) if hard is None else hard
-    soft = jax.nn.sigmoid(margin / jnp.where(temperature > 0, temperature, 1))
+    soft = jax.nn.sigmoid(margin / jnp.maximum(temperature, _COLDEST))
     return jnp.where(temperature > 0, soft, hard)
 
 
@@ -199,11 +216,21 @@ def _fuse_frame(params: FusionParams, seen: Observations) -> Fused:
     weight2 = jnp.where(first >= second, ratio * (ratio - correlation), 1 - correlation * ratio) / left
     joined = jnp.maximum(first, second) + jnp.log(left) - jnp.log1p(-correlation * correlation)
     joined = joined - jnp.log1p(params["inflation"] * excess)
-    dynamic = soft_mask(seen.margin - params["offset"], params["temperature"], seen.dynamic)
+    shifted = seen.margin - params["offset"]
+    hard = jnp.where(params["offset"] == 0, seen.dynamic, (shifted >= 0).astype(shifted.dtype))
+    dynamic = soft_mask(shifted, params["temperature"], hard)
     static = weight1 * seen.depth1 + weight2 * seen.depth2
-    return Fused(
-        dynamic * seen.depth1 + (1 - dynamic) * static, dynamic * first + (1 - dynamic) * joined, weight2, dynamic
-    )
+    depth = dynamic * seen.depth1 + (1 - dynamic) * static
+    return Fused(depth, _blended(dynamic, first, joined), weight2, dynamic)
+
+
+def _blended(
+    dynamic: Float[Array, "H W"], first: Float[Array, "H W"], joined: Float[Array, "H W"]
+) -> Float[Array, "H W"]:
+    """Log precision of m D_1 + (1 - m) D_f: its variance is m^2 v_1 + (1 - m^2) v_f, as cov(D_1, D_f) = v_f."""
+    widest = jnp.minimum(first, joined)  # log precision of the larger variance
+    variances = [jnp.exp(jnp.maximum(widest - one, -_MOST)) for one in (first, joined)]
+    return widest - jnp.log(dynamic * dynamic * variances[0] + (1 - dynamic * dynamic) * variances[1])
 
 
 def _ratio(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -16,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.errors import InputError, ResultError
 from vggtjax.files import writing
-from vggtjax.learning.family import FusionParams, Observations, fuse, is_free, projected, start
+from vggtjax.learning.family import PARTS, FusionParams, Observations, fuse, identity, is_free, projected, start
 from vggtjax.learning.objectives import (
     View,
     geometric_loss,
@@ -29,7 +30,9 @@ from vggtjax.results import archive
 Objective = Literal["gaussian", "laplace", "joint", "photometric", "geometric"]
 OBJECTIVES: tuple[Objective, ...] = ("gaussian", "laplace", "joint", "photometric", "geometric")
 NEEDS_FRAMES = ("photometric", "geometric")  # objectives that look at whole frames; so does the gate
+HARD_ONLY = ("joint", *NEEDS_FRAMES)  # objectives that would gain by marking what is badly predicted as moving
 _CHUNK = 10  # steps between two looks at the held-out clips
+_GATE_RATE = 0.3  # of learning, beside other parts
 
 Progress = Callable[[int, int], object]
 
@@ -65,6 +68,13 @@ class FitConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "family", tuple(self.family))
+        if unknown := [name for name in self.family if name not in (*PARTS, "gate")]:
+            raise InputError(
+                f"family has {unknown[0]!r}; expected parts such as parse_family returns: {', '.join(PARTS)}"
+            )
+        if self.objective in HARD_ONLY and {"offset", "temperature"} & set(self.family):
+            raise InputError(f"objective {self.objective!r} does not see soft masks; leave offset and temperature out")
         if self.objective not in OBJECTIVES:
             raise InputError(f"objective is {self.objective!r}; expected one of {OBJECTIVES}")
         for name in ("steps", "clips_at_once", "patience"):
@@ -126,16 +136,17 @@ def fit_fusion(
     """Fit the free parts of a family to clips; the rest stays the paper's.
 
     Adam with a cosine schedule over `steps`; every 10 steps the held-out clips are looked at, and what was best there
-    is returned. The start, the paper's rule, is looked at first.
+    is returned. The paper's rule is looked at first, so it is returned where nothing is better.
 
     Args:
         fitted, held_out: clips; both need one at least.
         config: see there.
-        checkpoint: file that the state is kept in after every look; if it is there, and of the same fit, that goes on.
+        checkpoint: file that the state is kept in after every look; if it is there, and of the same settings and clips,
+            that goes on.
         progress: called with the steps done and their number.
 
     Raises:
-        InputError: no clips, nothing to fit, or a loss that is not finite at the start.
+        InputError: no clips, nothing to fit, or a loss that is not finite.
     """
     if not fitted.clips or not held_out.clips:
         raise InputError(f"{fitted.clips} clips to fit to, {held_out.clips} held out; expected one of each at least")
@@ -143,22 +154,31 @@ def fit_fusion(
         raise InputError("the family has no free part; there is nothing to fit")
     state = _initial(config)
     free = jax.tree.map(jnp.asarray, is_free(state.params, config.family))
-    first = _look(state, fitted, held_out, config.objective)
-    if not np.isfinite(np.asarray(first.losses[0])).all():
-        raise InputError(f"the loss is {np.asarray(first.losses[0]).tolist()} at the start; expected finite numbers")
-    state = first if checkpoint is None else _restored(checkpoint, first)
+    paper = identity() | ({"gate": state.params["gate"]} if "gate" in state.params else {})
+    state = _look(state._replace(params=paper), fitted, held_out, config.objective)._replace(params=state.params)
+    _check_finite(state, 0)
+    digest = "" if checkpoint is None else _digest(config, fitted, held_out)
+    if checkpoint is not None:
+        state = _restored(checkpoint, state, digest)
     while int(state.step) < config.steps and int(state.waited) < config.patience:
         at_once = min(config.clips_at_once, fitted.clips)
         state = _advanced(state, free, fitted, config.objective, at_once, _plan(config))
         state = _look(state, fitted, held_out, config.objective)
+        _check_finite(state, int(state.step) // _CHUNK)
         if checkpoint is not None:
-            _keep(checkpoint, state)
+            _keep(checkpoint, state, digest)
         if progress is not None:
             progress(min(int(state.step), config.steps), config.steps)
     looks = int(state.step) // _CHUNK + 1
     losses = np.column_stack([np.arange(looks) * _CHUNK, np.asarray(state.losses)[:looks]])
     best = jax.tree.map(np.asarray, state.best)
     return Fit(best, float(state.best_loss), losses, int(state.step) < config.steps)
+
+
+def _check_finite(state: FitState, look: int) -> None:
+    losses = np.asarray(state.losses[look])
+    if not np.isfinite(losses).all():
+        raise InputError(f"the loss is {losses.tolist()} after {look * _CHUNK} steps; expected finite numbers")
 
 
 class _Plan(NamedTuple):
@@ -174,7 +194,7 @@ def _plan(config: FitConfig) -> _Plan:
 
 
 def _optimiser(plan: _Plan) -> optax.GradientTransformation:
-    """Adam with a short warm-up and half a cosine; the gate's weights decay and learn a third as fast."""
+    """Adam with a short warm-up and half a cosine; every part at a rate of its own, and the gate's weights decay."""
 
     def rate(step: Array) -> Array:
         warm = jnp.minimum(1.0, (step + 1) * 20 / plan.steps)
@@ -183,11 +203,20 @@ def _optimiser(plan: _Plan) -> optax.GradientTransformation:
     def of_gate(tree):
         return {name: jax.tree.map(lambda _, name=name: name == "gate", leaf) for name, leaf in tree.items()}
 
+    def slower(updates, params=None):
+        del params
+        return {
+            name: jax.tree.map(lambda x, name=name: x * (_GATE_RATE if name == "gate" else PARTS[name].rate), leaf)
+            for name, leaf in updates.items()
+        }
+
+    schedule: Any = rate
     return optax.chain(
         optax.clip_by_global_norm(10.0),
         optax.scale_by_adam(),
-        optax.masked(optax.chain(optax.add_decayed_weights(plan.decay), optax.scale(0.3)), of_gate),
-        optax.scale_by_learning_rate(rate),
+        optax.masked(optax.add_decayed_weights(plan.decay), of_gate),
+        optax.stateless(slower),
+        optax.scale_by_learning_rate(schedule),
     )
 
 
@@ -216,12 +245,18 @@ def _advanced(
         params, optimiser_state, key = carry
         key, drawn = jax.random.split(key)
         batch = clips.taken(jax.random.choice(drawn, clips.clips, (at_once,), replace=False))
-        gradient = jax.grad(lambda params: clip_losses(params, batch, objective).mean())(params)
-        gradient = jax.tree.map(lambda g, free: jnp.where(free, g, 0), gradient, free)
+
+        def add(total, clip):  # one clip's activations at a time
+            return jax.tree.map(jnp.add, total, jax.grad(clip_loss)(params, clip, objective)), None
+
+        gradient, _ = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), batch)
+        gradient = jax.tree.map(lambda g, free: jnp.where(free, g / at_once, 0), gradient, free)
         updates, optimiser_state = optimiser.update(gradient, optimiser_state, params)
         updates = jax.tree.map(lambda u, free: jnp.where(free, u, 0), updates, free)
         moved: Any = optax.apply_updates(params, updates)
-        return (projected(moved), optimiser_state, key), None
+        inside = [projected(moved, fitted) for fitted in ((), tuple(PARTS))]
+        params = jax.tree.map(lambda free, wide, fit: jnp.where(free, fit, wide), free, *inside)
+        return (params, optimiser_state, key), None
 
     key = jax.random.wrap_key_data(state.key)
     (params, optimiser_state, key), _ = jax.lax.scan(step, (state.params, state.optimiser, key), length=_CHUNK)
@@ -232,7 +267,9 @@ def _advanced(
 @partial(jax.jit, static_argnames=("objective",))
 def _look(state: FitState, fitted: FitClips, held_out: FitClips, objective: Objective) -> FitState:
     """Write down how the clips are doing, and keep what was best on those held out."""
-    both = [clip_losses(state.params, clips, objective).mean() for clips in (fitted, held_out)]
+    both = [
+        jax.lax.map(lambda clip: clip_loss(state.params, clip, objective), clips).mean() for clips in (fitted, held_out)
+    ]
     better: Bool[Array, ""] = both[1] < state.best_loss
     return state._replace(
         best=jax.tree.map(lambda new, old: jnp.where(better, new, old), state.params, state.best),
@@ -242,18 +279,28 @@ def _look(state: FitState, fitted: FitClips, held_out: FitClips, objective: Obje
     )
 
 
-def _keep(path: Path, state: FitState) -> None:
+def _digest(config: FitConfig, *clips: FitClips) -> str:
+    """Return what a fit depends on."""
+    digest = hashlib.sha256(repr(config).encode())
+    for leaf in jax.tree.leaves(clips):
+        digest.update(str(leaf.shape).encode() + np.asarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def _keep(path: Path, state: FitState, digest: str) -> None:
     with writing(path) as temporary:
-        leaves = jax.tree.leaves(state)
-        archive.write_arrays(temporary, {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(leaves)})
+        leaves = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
+        archive.write_arrays(temporary, leaves | {"digest": np.frombuffer(bytes.fromhex(digest), np.uint8)})
 
 
-def _restored(path: Path, state: FitState) -> FitState:
-    """Return the state of a file, or the one that is given where there is none of its structure."""
+def _restored(path: Path, state: FitState, digest: str) -> FitState:
+    """Return the state of a file, or the one that is given where there is none of the same fit."""
     leaves, structure = jax.tree.flatten(state)
     try:
         stored = archive.read_arrays(path)
     except ResultError:
+        return state
+    if stored.pop("digest", np.zeros(0, np.uint8)).tobytes() != bytes.fromhex(digest):
         return state
     found = [stored.get(f"{i:04d}") for i in range(len(leaves))]
     alike = len(stored) == len(leaves) and all(

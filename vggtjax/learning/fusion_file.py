@@ -69,6 +69,15 @@ def load_fusion(path: str | Path) -> FusionParams:
     return params
 
 
+def fusion_about(path: str | Path) -> dict[str, Any]:
+    """Return what a file says of where its tree is from; nothing where that cannot be read."""
+    try:
+        about = json.loads(read_tensors(path).metadata.get("about", ""))
+    except (CheckpointError, ValueError, RecursionError):
+        return {}
+    return about if isinstance(about, dict) else {}
+
+
 def _named(params: FusionParams) -> dict[str, Any]:
     flat, _ = jax.tree_util.tree_flatten_with_path(params)
     return {".".join(entry.key for entry in path): leaf for path, leaf in flat}

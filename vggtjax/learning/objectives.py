@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtjax.learning.family import Fused, FusionParams, Observations, fuse, log_precisions
 from vggtjax.learning.soft import lift
+from vggtjax.network.precision import full_precision
 from vggtjax.passes import Cameras
 
 Likelihood = Literal["gaussian", "laplace"]
@@ -61,8 +62,8 @@ def joint_negative_log_likelihood(
     """Return the mean negative log likelihood of both passes' errors, jointly normal, in nats a pixel.
 
     It is what measures their correlation: the likelihood of what is fused sees it through the fused precision alone.
-    Where something moves, pass 1 stands alone. Robust parts (inflation, distrust) do not enter. Arguments as for `fuse`
-    and `negative_log_likelihood`, whose alignment it has.
+    Where the mask says that something moves, pass 1 stands alone. Soft masks and robust parts (inflation, distrust) do
+    not enter. Arguments as for `fuse` and `negative_log_likelihood`, whose alignment it has.
     """
     known = (truth > 0) & jnp.isfinite(truth)
     truth = jnp.where(known, truth, 1)
@@ -78,7 +79,7 @@ def joint_negative_log_likelihood(
     alone = (_LOG_2PI - claims[0] + first * first) / 2
     given = second - rho * first  # of pass 2 once pass 1 is known, with variance 1 - rho^2
     other = (_LOG_2PI - claims[1] + jnp.log(left) + given * given / left) / 2
-    loss = alone + (1 - fused.dynamic) * other
+    loss = alone + (1 - seen.dynamic) * other
     return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1)
 
 
@@ -86,8 +87,9 @@ def unit_factor(
     fused: Fused, truth: Float[Array, "*F H W"], known: Bool[Array, "*F H W"], kind: Likelihood = "gaussian"
 ) -> Float[Array, ""]:
     """Return the factor that takes true depth to the unit of a prediction: that of greatest likelihood."""
-    log_precision = jnp.where(known, fused.log_precision, -jnp.inf)
-    weight = jnp.exp(log_precision - jax.lax.stop_gradient(log_precision.max()))  # the largest is 1
+    top = jax.lax.stop_gradient(jnp.where(known, fused.log_precision, -jnp.inf).max())
+    top = jnp.where(jnp.isfinite(top), top, 0)  # of a clip without truth
+    weight = jnp.where(known, jnp.exp(jnp.where(known, fused.log_precision, top) - top), 0)  # the largest is 1
     if kind == "gaussian":
         return jnp.sum(weight * fused.depth * truth) / jnp.maximum(jnp.sum(weight * truth * truth), _TINY)
     ratio, weight = jax.lax.stop_gradient(((fused.depth / truth).ravel(), (jnp.sqrt(weight) * truth).ravel()))
@@ -96,6 +98,7 @@ def unit_factor(
     return ratio[order][jnp.searchsorted(below, below[-1] / 2)]
 
 
+@full_precision
 def photometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
     """Return how much pictures differ when each is looked up where the fused depth of another puts its pixels.
 
@@ -113,6 +116,7 @@ def photometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""
     return _over_pairs(pair, fused, view, step)
 
 
+@full_precision
 def geometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
     """Return how unlikely the depths of frames find each other: a fit of precision without any truth.
 

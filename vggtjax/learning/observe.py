@@ -13,6 +13,7 @@ from vggtjax.passes import Passes
 
 REACH = 64  # pixels up to which distances are told apart
 _SMALLEST = 1e-6
+_STILL = -1e3  # margin of what cannot move, whatever the temperature
 
 
 def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None = None) -> Observations:
@@ -48,7 +49,7 @@ def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None
         depth2,
         _log_confidence(second.depth_confidence),
         dynamic,
-        saliency - jax.vmap(_threshold)(saliency, hard)[:, None, None, None],
+        jax.vmap(_margin)(saliency, hard),
         jnp.stack(features, axis=-1),
     )
 
@@ -84,6 +85,16 @@ def _squared_distance(there: Bool[Array, "H W"]) -> Float[Array, "H W"]:
         return jnp.minimum(best, there + ((offset - REACH) ** 2).astype(best.dtype)), None
 
     return jax.lax.scan(nearer, column, jnp.arange(2 * REACH + 1))[0]
+
+
+def _margin(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"]) -> Float[Array, "S H W"]:
+    """Return the saliency minus the threshold of the mask, on the mask's side of 0 where the two disagree.
+
+    They do where the mask was given or smoothed: such a pixel is on the edge. Where nothing moves there is no edge.
+    """
+    margin = saliency - _threshold(saliency, dynamic)
+    margin = jnp.where(dynamic, jnp.maximum(margin, 0), jnp.minimum(margin, -_SMALLEST))
+    return jnp.where(dynamic.any(), margin, _STILL)
 
 
 def _threshold(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"]) -> Float[Array, ""]:

@@ -36,9 +36,10 @@ def grid_candidates(values: Mapping[str, Sequence[float]]) -> FusionParams:
     combinations = np.asarray(list(product(*values.values())), np.float32).reshape(-1, len(values))
     trees = {name: jnp.broadcast_to(leaf, (len(combinations), *leaf.shape)) for name, leaf in identity().items()}
     for column, name in zip(combinations.T, values, strict=True):
-        part, which = (name[:-1], int(name[-1]) - 1) if name[-1] in "12" else (name, None)
+        one = name[:-1] in PARTS and name[-1] in "12" and bool(PARTS[name[:-1]].shape)
+        part, which = (name[:-1], int(name[-1]) - 1) if one else (name, None)
         _check_parts([part])
-        if PARTS[part].shape and which is not None:
+        if which is not None:
             trees[part] = trees[part].at[:, which].set(jnp.asarray(column))
         else:
             shape = (-1,) + (1,) * len(PARTS[part].shape)
@@ -90,9 +91,13 @@ def standard_errors(
     independent observations, pixels of one clip need not be, and the objective need not be the true likelihood (the
     sandwich estimator, clustered by clip). It takes more clips than free numbers, and is too small with few.
 
-    Raises InputError for too few clips, or where the objective has no minimum at the tree: a direction along which it
-    does not rise.
+    Raises InputError for too few clips, for a part at the end of its range, or where the objective has no minimum at
+    the tree: a direction along which it does not rise.
     """
+    for name in family:
+        part = PARTS.get(name)
+        if part is not None and (np.isin(np.asarray(params[name]), [part.low, part.high])).any():
+            raise InputError(f"{name} is {np.asarray(params[name]).tolist()}, at the end of its range; leave it out")
     at, tree = free_vector(params, family)
     if clips.clips <= len(at):
         raise InputError(

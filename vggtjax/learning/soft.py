@@ -116,6 +116,7 @@ def soft_pixels(
     return jax.vmap(one_clip)(upsample(saliency, size))
 
 
+@full_precision
 def lift(depth: Float[Array, "*F H W"], cameras: Cameras) -> Float[Array, "*F H W 3"]:
     """Return the points in the world of all pixels, at their centres."""
     H, W = depth.shape[-2:]
