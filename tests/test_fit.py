@@ -48,24 +48,28 @@ def test_simulated_errors_are_what_the_tree_claims():
     assert np.mean(whitened[0] * whitened[1]) == pytest.approx(0.5, abs=0.01)
 
 
-@pytest.mark.parametrize("objective", ["joint", "gaussian"])
-def test_variances_and_correlation_are_recovered(objective):
-    """Every one of five numbers within four standard errors, and those small enough to mean something."""
+@pytest.fixture(scope="module")
+def recovered():
+    """Return clips, and the fit to them that ought to find TRUE again."""
     clips = simulated(1)
-    config = FitConfig(FAMILY, objective, steps=600, learning_rate=0.05, clips_at_once=48, patience=60)
-    fit = fit_fusion(clips, clips, config)
-    errors = standard_errors(fit.params, clips, FAMILY, objective)
+    config = FitConfig(FAMILY, "joint", steps=600, learning_rate=0.05, clips_at_once=48, patience=60)
+    return clips, fit_fusion(clips, clips, config)
+
+
+def test_variances_and_correlation_are_recovered(recovered):
+    """Every one of five numbers within four standard errors, and those small enough to mean something."""
+    clips, fit = recovered
+    errors = standard_errors(fit.params, clips, FAMILY, "joint")
     for name in FAMILY:
         apart = np.abs(np.asarray(fit.params[name]) - np.asarray(TRUE[name]))
         assert (apart < 4 * np.asarray(errors[name])).all(), (name, fit.params[name], errors[name])
-        assert (np.asarray(errors[name]) < (0.05 if objective == "joint" else 0.3)).all(), (name, errors[name])
+        assert (np.asarray(errors[name]) < 0.05).all(), (name, errors[name])
     assert np.asarray(errors["floor"]).tolist() == [0, 0]
 
 
-def test_the_fused_depth_attains_the_cramer_rao_bound():
+def test_the_fused_depth_attains_the_cramer_rao_bound(recovered):
     """Its mean squared error over the bound 1 / (Fisher information) is 1 within 2 %; the paper's rule is above."""
-    fitted, fresh = simulated(1), simulated(2, 16, 20_000)
-    fit = fit_fusion(fitted, fitted, FitConfig(FAMILY, "joint", steps=300, clips_at_once=48, patience=60))
+    (_, fit), fresh = recovered, simulated(2, 16, 20_000)
     bound = np.exp(-np.asarray(fuse(TRUE, fresh.seen).log_precision, np.float64))
 
     def ratio(params) -> float:
@@ -158,11 +162,10 @@ def test_a_gate_learns_what_the_table_cannot():
     seen = Observations(*(jnp.asarray(x, jnp.float32) for x in (d1, zero, d2, zero, zero, zero - 1, features)))
     clips = FitClips(seen, jnp.asarray(depth, jnp.float32))
     fitted, held_out = clips.taken(np.arange(4)), clips.taken(np.arange(4, 6))
-    losses = {
-        family: fit_fusion(fitted, held_out, FitConfig(parse_family(family), steps=200, patience=100)).held_out_loss
-        for family in ("scale+saliency+boundary", "scale+gate")
-    }
-    assert losses["scale+gate"] < losses["scale+saliency+boundary"] - 0.1
+    fit = fit_fusion(fitted, held_out, FitConfig(("gate",), steps=200, patience=100))
+    best = 0.3**2 / (0.3**2 + np.where(bad, 1.0, 0.05)[4:] ** 2)  # the weights that are right
+    found = np.asarray(fuse(fit.params, held_out.seen).weight)
+    assert np.abs(found - best).mean() < 0.4 * np.abs(0.5 - best).mean()
 
 
 def test_a_soft_mask_is_recovered():
@@ -181,19 +184,16 @@ def test_a_soft_mask_is_recovered():
     assert float(fit.params["temperature"]) == pytest.approx(0.05, rel=0.15)
 
 
-@pytest.mark.parametrize("objective", ["photometric", "geometric"])
-def test_frames_that_agree_need_no_truth(objective):
+def test_frames_that_agree_need_no_truth():
     """The second pass is right and the first one's unit wrong: frames tell which one to trust."""
     clip = jax.tree.map(jnp.asarray, rendered(STATIC, 4))
     zero = jnp.zeros(clip.depth.shape)
     seen = Observations(1.2 * clip.depth, zero, clip.depth, zero, zero, zero - 1, jnp.zeros((*zero.shape, 4)))
     view = View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
     clips = FitClips(seen, zero, view)
-    config = FitConfig(("distrust", "scale"), objective, steps=60, learning_rate=0.1, patience=60)
-    fit = fit_fusion(clips, clips, config)
+    fit = fit_fusion(clips, clips, FitConfig(("scale",), "geometric", steps=60, learning_rate=0.1, patience=60))
     assert fit.held_out_loss < fit.losses[0, 2]
-    weight = float(fuse(fit.params, seen).weight.mean())
-    assert weight > 0.6 if objective == "photometric" else weight > 0.5
+    assert float(fuse(fit.params, seen).weight.mean()) > 0.55
 
 
 def test_candidates_in_one_call_are_one_by_one():

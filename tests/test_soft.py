@@ -131,18 +131,19 @@ def test_every_gradient_by_finite_differences():
                 tree, pictures, CONFIG, masking, fusion, stop_camera_gradient=False, compute_dtype="float64", remat=True
             )
             cameras = sum(pose_error(made.cameras.camera_from_world[0], true))
-            return {
+            outputs = {
                 "depth": jnp.mean(mix[0] * made.depth) + jnp.mean(mix[1] * made.log_precision),
                 "cameras": cameras,
                 "points": jnp.mean(mix[0][..., None] * made.points),
             }
+            return sum(outputs.values()), outputs
 
         knobs = (masking, fusion, weights["aggregator"]["camera_token"])
-        gradients = jax.jit(jax.jacrev(loss))(knobs)
+        gradient, _ = jax.jit(jax.grad(loss, has_aux=True))(knobs)
         flat, structure = jax.tree.flatten(knobs)
         names = [*SoftMasking._fields, *sorted(fusion), "camera_token"]
         assert len(names) == len(flat)
-        moved = dict.fromkeys(gradients, 0)
+        moved = dict.fromkeys(("depth", "cameras", "points"), 0)
         for leaf, name in enumerate(names):
             places = [np.unravel_index(i, flat[leaf].shape) for i in range(min(flat[leaf].size, 5))]
             for place in places:
@@ -151,11 +152,11 @@ def test_every_gradient_by_finite_differences():
                     changed = list(flat)
                     changed[leaf] = flat[leaf].at[place].add(sign * 1e-6)
                     slopes.append(loss(jax.tree.unflatten(structure, changed)))
-                for output, gradient in gradients.items():
-                    slope = float(slopes[0][output] - slopes[1][output]) / 2e-6
-                    found = float(jax.tree.leaves(gradient)[leaf][place])
-                    assert found == pytest.approx(slope, rel=2e-4, abs=2e-8), (output, name, place)
-                    moved[output] += abs(slope) > 1e-7
+                slope = float(slopes[0][0] - slopes[1][0]) / 2e-6
+                found = float(jax.tree.leaves(gradient)[leaf][place])
+                assert found == pytest.approx(slope, rel=2e-4, abs=2e-8), (name, place)
+                for output in moved:
+                    moved[output] += abs(float(slopes[0][1][output] - slopes[1][1][output])) > 2e-13
         # Masks move everything; the rule of fusion moves depth and points, and not the cameras.
         assert moved["depth"] > 20
         assert moved["points"] > 15
@@ -171,7 +172,7 @@ def test_the_fusion_gradient_does_not_go_through_the_network():
         return softly(tree, pictures, CONFIG, masking, fusion).depth.mean()
 
     def products(function) -> float:
-        analysis: Any = jax.jit(function).lower(identity()).compile().cost_analysis()
+        analysis: Any = jax.jit(function).lower(identity()).cost_analysis()
         return analysis["flops"]
 
     assert products(jax.grad(loss)) < 1.1 * products(loss)  # a way back through one pass would add 70 %
