@@ -72,7 +72,7 @@ def gradient(
                 made = without_memory(lambda f=function, a=arguments: {"": measure_program(f, a, repeats)})[""]
                 base = made if name == _FIRST else base
                 found.append({"program": name, "frames": count, **_plain(made)})
-                rows.append((count, name, *_cells(made, base)))
+                rows.append((str(count), name, *_cells(made, base)))
     here = machine()
     headings = ("frames", "program", "seconds", "ratio", "XLA (MB)", "ratio", "host (MB)", "ratio", "failure")
     Sheet(f"{size}, {shape[1]} x {shape[0]} pixels, {dtype}", headings, rows).show(screen)
