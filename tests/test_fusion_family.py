@@ -12,12 +12,12 @@ from hypothesis.extra import numpy as hnp
 
 from vggtjax import fuse_depth
 from vggtjax.errors import InputError
+from vggtjax.learning import family
 from vggtjax.learning.family import (
     FEATURES,
     PARTS,
     PRESETS,
     Observations,
-    fuse,
     identity,
     is_free,
     log_precisions,
@@ -28,6 +28,7 @@ from vggtjax.learning.family import (
 )
 
 SHAPE = (2, 3, 4)
+fuse = jax.jit(family.fuse)
 _maps = hnp.arrays(np.float32, SHAPE, elements=st.floats(1, 100, width=32))
 _logs = hnp.arrays(np.float32, SHAPE, elements=st.floats(0, 69, width=32))
 
@@ -157,12 +158,12 @@ def test_soft_regions_blend_between_their_limits():
         assert fused.log_precision.item() == pytest.approx(-np.log(variance), rel=1e-5)
 
 
-@pytest.mark.parametrize("family", ["full", "gate"])
-def test_extremes_have_no_nan(family):
+@pytest.mark.parametrize("name", ["full", "gate"])
+def test_extremes_have_no_nan(name):
     """Confidence 1 and 1e30, depth 0 and 1e6, nothing and everything moving; values and gradients."""
     grid = np.array(np.meshgrid([1, 1e30], [1, 1e30], [0, 1e6], [0, 1e6], [0, 1])).reshape(5, 1, 4, 8)
     maps = seen(grid[2], grid[0], grid[3], grid[1], grid[4], jnp.ones((1, 4, 8, len(FEATURES))))
-    params = start(parse_family(family), spread=0.1)
+    params = start(parse_family(name), spread=0.1)
     params |= {"inflation": jnp.asarray(2.0), "distrust": jnp.asarray([0.5, 3.0]), "correlation": jnp.asarray(0.99)}
 
     def total(params, maps):
@@ -182,6 +183,15 @@ def test_empty_and_full_masks(share):
         gradient = jax.jit(jax.grad(lambda params: fuse(params, maps).depth.sum()))(identity())
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(gradient))
     assert (np.asarray(gradient["scale"]) == 0).all() == bool(share)
+
+
+@jax.jit
+def _weighed(params, maps, weights):
+    fused = family.fuse(params, maps)
+    return jnp.sum(weights[0] * fused.depth) + jnp.sum(weights[1] * fused.log_precision)
+
+
+_slopes = jax.jit(jax.grad(_weighed))
 
 
 @pytest.mark.parametrize("name", sorted(PARTS))
@@ -204,10 +214,9 @@ def test_gradients_by_finite_differences(name):
         params = {part: jnp.full(PARTS[part].shape, middle.get(part, 0.1)) for part in PARTS}
 
         def loss(value):
-            fused = fuse(params | {name: value}, maps)
-            return jnp.sum(weights[0] * fused.depth) + jnp.sum(weights[1] * fused.log_precision)
+            return _weighed(params | {name: value}, maps, weights)
 
-        gradient = np.asarray(jax.grad(loss)(params[name]))
+        gradient = np.asarray(_slopes(params, maps, weights)[name])
         for place in np.ndindex(gradient.shape):
             step = np.zeros(gradient.shape)
             step[place] = 1e-6
