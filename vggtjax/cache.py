@@ -1,4 +1,4 @@
-"""The user's cache folder: converted weights, and what jax compiles. Does not import jax."""
+"""The user's cache folder: converted weights, what jax traces and compiles, passes for fits. Does not import jax."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import tempfile
@@ -10,6 +11,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from vggtjax.errors import OutputError
+
+_MOST_JSON_BYTES = 2**24
 
 
 @contextmanager
@@ -74,6 +77,17 @@ def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str)
         pass
     for parent in new:
         parent.rmdir()
+
+
+def says_format(path: Path, name: str) -> bool:
+    """Return whether a file is small JSON that says to be of this format."""
+    try:
+        if path.stat().st_size > _MOST_JSON_BYTES:
+            return False
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(values, dict) and values.get("format") == name
 
 
 @contextmanager

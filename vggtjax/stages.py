@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.config import Gram, Suppress, VGGTConfig
-from vggtjax.learning.apply import refused
+from vggtjax.learning.apply import fused_anew
 from vggtjax.learning.family import FusionParams
 from vggtjax.mask import mine_mask
 from vggtjax.methods import check_mask_pairs, check_smooth_frames, find_method
@@ -79,7 +79,7 @@ def _assemble(
 ) -> Assembly:
     passes = jax.tree.map(lambda x: x[:, :frames], Passes(first, second, saliency, dynamic_mask))
     made = assemble(passes, method, align_scale=align_scale)
-    return made if fusion is None else refused(made, passes, fusion, patch_size, align_scale=align_scale)
+    return made if fusion is None else fused_anew(made, passes, fusion, patch_size, align_scale=align_scale)
 
 
 def _unchanged(predictions: Predictions) -> Predictions:

@@ -23,12 +23,11 @@ from vggtjax.calibration.choice import Choice, Rating, Step, halves
 from vggtjax.calibration.heatmap import draw_sweep
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, UNCLEAR, Sweep
 from vggtjax.checkpoint import Model, save_model
-from vggtjax.files import check_free, staging
+from vggtjax.files import check_free, says_format, staging
 
 FORMAT = "vggtjax calibration"
 VERSION = 1
 NUMBERS, MODEL, PICTURE = "calibration.json", "model.safetensors", "sweep.png"
-_MOST_BYTES = 2**24  # of an earlier calibration.json
 
 
 def save_calibration(
@@ -63,7 +62,8 @@ def save_calibration(
 
 def check_folder(folder: Path) -> None:
     """Make sure that a calibration can be saved in `folder`, before it is made; OutputError as `save_calibration`."""
-    check_free(folder, (NUMBERS, MODEL, PICTURE), replaced=_is_calibration(folder / NUMBERS), what="calibration")
+    replaced = says_format(folder / NUMBERS, FORMAT)
+    check_free(folder, (NUMBERS, MODEL, PICTURE), replaced=replaced, what="calibration")
 
 
 def calibration_numbers(
@@ -112,13 +112,3 @@ def _rating(rating: Rating) -> dict[str, float]:
 def _counts(half: Sweep) -> dict[str, int]:
     kinds = {"dynamic_tokens": DYNAMIC, "static_tokens": STATIC, "ignored_tokens": UNCLEAR}
     return {"clips": len(half.truth)} | {name: int((half.truth == value).sum()) for name, value in kinds.items()}
-
-
-def _is_calibration(path: Path) -> bool:
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            return False
-        numbers = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(numbers, dict) and numbers.get("format") == FORMAT

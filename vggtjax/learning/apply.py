@@ -22,7 +22,7 @@ from vggtjax.passes import Assembly, Passes
 logger = logging.getLogger(__name__)
 
 
-def refused(
+def fused_anew(
     assembly: Assembly, passes: Passes, fusion: FusionParams, patch_size: int, *, align_scale: bool = False
 ) -> Assembly:
     """Return an assembly with depth and confidence by a fitted rule; the confidence is the fused precision."""

@@ -32,7 +32,6 @@ from vggtjax.results.reconstruction import Reconstruction
 METHOD = "4dvggt-d"
 _LOOKED_AT = 64  # values of every parameter that tell models apart
 
-
 logger = logging.getLogger(__name__)
 
 

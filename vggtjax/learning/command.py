@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from vggtjax.learning.clip_passes import ClipPasses
 
 GENERATED = "generated"
-FEWEST_FRAMES = 12  # of a generated scene
 
 
 def fit_fusion(
@@ -64,8 +63,6 @@ def fit_fusion(
     """
     if seeds < 1:
         raise InputError(f"seeds is {seeds}; expected at least 1")
-    if not 0 < held_out < 1:
-        raise InputError(f"held_out is {held_out}; expected a share above 0 and below 1")
     if pixels < 1:
         raise InputError(f"pixels is {pixels}; expected at least 1")
     if max_frames is not None and max_frames < 1:
@@ -73,7 +70,7 @@ def fit_fusion(
     report = Report()
     with report.running():
         from vggtjax.checkpoint import load_model
-        from vggtjax.learning.ablation import ablate
+        from vggtjax.learning.ablation import ablate, split_clips
         from vggtjax.learning.export import begin, check_folder, save_fits
         from vggtjax.learning.family import parse_family
         from vggtjax.learning.fit import FitConfig
@@ -81,6 +78,7 @@ def fit_fusion(
 
         check_matplotlib()
         check_folder(out)
+        split_clips(3, 0, held_out)  # says what is wrong with it before any pass is run
         for name in family:
             FitConfig(parse_family(name), objective)
         sources = [_source(text, max_frames) for text in data]
@@ -141,10 +139,12 @@ def _source(text: str, max_frames: int | None) -> tuple[str, str]:
     if not equals or not place:
         raise InputError(f"--data has {text!r}; expected generated=N or DATASET=FOLDER")
     if name == GENERATED:
+        from vggtjax.scenes.held_out import MIN_FRAMES
+
         if not place.isdecimal() or not 1 <= int(place) <= 10_000:
             raise InputError(f"--data has {text!r}; expected a number of scenes from 1 to 10000")
-        if max_frames is not None and max_frames < FEWEST_FRAMES:
-            raise InputError(f"max_frames is {max_frames}; generated scenes have at least {FEWEST_FRAMES} frames")
+        if max_frames is not None and max_frames < MIN_FRAMES:
+            raise InputError(f"max_frames is {max_frames}; generated scenes have at least {MIN_FRAMES} frames")
         return name, place
     from vggtjax.evaluation.datasets import DATASETS
 
@@ -168,7 +168,8 @@ def _passes(
     name, place = source
     common: dict[str, Any] = {"size": size, "options": options, "progress": progress}
     if name == GENERATED:
-        return dict(generated_passes(model, int(place), frames=max_frames or 12, **common))
+        more = {} if max_frames is None else {"frames": max_frames}
+        return dict(generated_passes(model, int(place), **more, **common))
     return dict(dataset_passes(model, name, Path(place), max_frames=max_frames, **common))
 
 

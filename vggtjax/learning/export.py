@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vggtjax.files import check_free, staging, writing
+from vggtjax.files import check_free, says_format, staging, writing
 from vggtjax.learning.ablation import PAPER, Outcome, Split, fit_split, gains, markdown, split_clips, table
 from vggtjax.learning.clip_passes import ClipPasses, observations
 from vggtjax.learning.family import identity, parse_family
@@ -35,7 +35,6 @@ VERSION = 1
 NUMBERS, FUSION, TABLE, FAMILIES, STATES = "fit.json", "fusion.safetensors", "table.md", "families", "states"
 PICTURES = ("scores.png", "precision.png", "calibration.png", "losses.png")
 _MARK = "fits.json"  # in the folder of states: it is ours
-_MOST_BYTES = 2**24
 
 
 def check_folder(folder: Path) -> None:
@@ -137,12 +136,4 @@ def begin(folder: Path) -> Path:
 
 
 def _is_ours(folder: Path) -> bool:
-    if (folder / STATES / _MARK).is_file():
-        return True
-    try:
-        if (folder / NUMBERS).stat().st_size > _MOST_BYTES:
-            return False
-        numbers = json.loads((folder / NUMBERS).read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(numbers, dict) and numbers.get("format") == FORMAT
+    return says_format(folder / STATES / _MARK, FORMAT) or says_format(folder / NUMBERS, FORMAT)

@@ -56,7 +56,7 @@ class FitClips(NamedTuple):
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How a fit goes on. Static under jit, but for the seed."""
+    """How a fit goes on."""
 
     family: tuple[str, ...] = ("scale", "power", "floor")
     objective: Objective = "gaussian"
