@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
+PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 .PHONY: demo test lint format clean
 
@@ -11,7 +12,8 @@ demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
 
 test: lint
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+	$(PYTEST) tests/parity
+	$(PYTEST) tests --ignore tests/parity --hasty
 
 lint: $(VENV)/.development
 	$(BIN)/ruff check

@@ -16,15 +16,21 @@ from rich.table import Table
 from vggtjax.errors import InputError
 from vggtjax.files import writing
 
-_COLUMNS = 140
+_COLUMNS = 200
 _AGREE = 2e-4  # of each array's spread
 _TITLES = {"pass": "camera + depth", "vggt4d": "vggt4d, both passes", "4dvggt-d": "4dvggt-d, both passes"}
+_COMPARED = {  # heading -> figure, of which run, unit
+    "s": ("seconds", "runs", 1),
+    "GB": ("total", "runs", 1e9),
+    "own": ("own", "runs", 1e9),
+    "since start": ("since start", "first", 1e9),
+}
 
 Answer = dict[str, float]
 
 
 class Worker:
-    """A process that runs passes."""
+    """A process that runs passes, until the context ends."""
 
     def __init__(self, *arguments: str) -> None:
         command = [sys.executable, "-m", "benchmarks.worker", *arguments]
@@ -32,13 +38,15 @@ class Worker:
         self._answer()
 
     def run(self, *, keep: str | None = None, mask: str | None = None, **task: Any) -> Answer:
-        """Run passes; return seconds, the most memory held (in all, and beside mapped files), and reads of a disk."""
+        """Run passes; return what main() of the worker answers: seconds, bytes of memory, reads of a disk."""
         self._process.stdin.write(json.dumps({**task, "keep": keep, "mask": mask}) + "\n")
         self._process.stdin.flush()
         return self._answer()
 
-    def close(self) -> None:
-        """End the process."""
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *error: object) -> None:
         self._process.stdin.close()
         self._process.wait()
 
@@ -68,6 +76,9 @@ def speed(
     of vggt4d predicts here what is read of it, the cameras. What both compute is compared first. Where a machine has
     little memory, put the weights on a memory file system, or what is timed is the disk; such runs are marked.
 
+    The most memory since the start is that of a process which loads its weights as its users do, `from_pretrained` in
+    the public code, and runs once. In what is timed both sides map their weights.
+
     Args:
         weights: PyTorch weights of VGGT-1B's layout, such as make-checkpoint writes.
         converted: the same weights as vggtjax convert writes them.
@@ -88,58 +99,56 @@ def speed(
         )
     if repeats < 1:
         raise InputError(f"repeats is {repeats}; expected at least 1")
-    arguments = (("ours", str(converted.resolve())), ("peer", str(weights.resolve()), str(peer.resolve())))
+    public = ("peer", str(weights.resolve()), str(peer.resolve()))
     jobs = [(("pass",), count) for count in frames] + [(("vggt4d", "4dvggt-d"), count) for count in both]
     console, rows = Console(), []
     console.width = max(console.width, _COLUMNS)  # of a file, rich assumes 80
     for works, count in jobs:
-        sides = (Worker(*arguments[0]), Worker(*arguments[1]))
         task: dict[str, Any] = {"frames": count, "height": height, "width": width}
-        with console.status(f"{_TITLES[works[0]]}, {count} frames"):
-            apart = _apart(sides, works[0], task)
-            for work in works[1:]:
-                sides[0].run(work=work, **task)
-            runs = [
-                [
-                    side.run(work=work, **task)
-                    for side, work in (*((sides[0], work) for work in works), (sides[1], works[0]))
-                ]
-                for _ in range(repeats)
-            ]
-        for side in sides:
-            side.close()
+        status = console.status(f"{_TITLES[works[0]]}, {count} frames")
+        with status, Worker("ours", str(converted.resolve())) as ours:
+            with Worker(*public) as loaded:
+                apart, firsts = _apart((ours, loaded), works[0], task)
+            firsts[1:1] = [ours.run(work=work, **task) for work in works[1:]]
+            with Worker(*public, "mapped") as mapped:
+                mapped.run(work=works[0], **task)
+                turns = [*((ours, work) for work in works), (mapped, works[0])]
+                runs = [[side.run(work=work, **task) for side, work in turns] for _ in range(repeats)]
         for index, work in enumerate(works):
-            ours, theirs = ([run[i] for run in runs] for i in (index, -1))
-            differ = None if index else apart  # the other has no 4dvggt-d
-            rows.append({"work": work, **task, "ours": ours, "public": theirs, "differ by": differ})
+            row: dict[str, Any] = {"work": work, **task, "differ by": None if index else apart}  # they lack 4dvggt-d
+            for side, i in (("ours", index), ("public", -1)):
+                row[side] = {"first": [firsts[i]], "runs": [run[i] for run in runs]}
+            rows.append(row)
     console.print(_table(rows, f"{width} x {height}, float32"))
     if out is not None:
         with writing(out) as temporary:
             temporary.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
 
 
-def _apart(sides: tuple[Worker, Worker], work: str, task: dict[str, int]) -> float:
-    """Return how far the outputs are apart at most, in standard deviations of the other's array; too far is an error.
+def _apart(sides: tuple[Worker, Worker], work: str, task: dict[str, int]) -> tuple[float, list[Answer]]:
+    """Return how far the outputs are apart at most, in standard deviations of the other's array, and the first runs.
 
+    Too far apart is an error.
     Two-pass masks come from k-means with different generators, so the second pass is compared under the other's mask.
     """
     with tempfile.TemporaryDirectory() as folder:
         files = [f"{folder}/{name}.npz" for name in ("ours", "peer")]
 
-        def compared(**more: Any) -> float:
-            for side, file in zip(sides, files, strict=True):
-                side.run(work=work, keep=file, **task, **more)
-            return _difference(*(dict(np.load(file)) for file in files))
+        def compared(**more: Any) -> tuple[float, list[Answer]]:
+            runs = [side.run(work=work, keep=file, **task, **more) for side, file in zip(sides, files, strict=True)]
+            return _difference(*(dict(np.load(file)) for file in files)), runs
 
-        apart = compared()
+        apart, firsts = compared()
         if work != "pass":
             Path(files[1]).rename(f"{folder}/mask.npz")
             if not np.load(f"{folder}/mask.npz")["mask"].any():
                 raise InputError(f"nothing moves by VGGT4D's mask of {task['frames']} frames; take another number")
-            apart = float(np.max([apart, compared(mask=f"{folder}/mask.npz")]))  # unlike max(), keeps what is no number
+            apart = float(
+                np.max([apart, compared(mask=f"{folder}/mask.npz")[0]])
+            )  # unlike max(), keeps what is no number
     if not apart <= _AGREE:
         raise InputError(f"the outputs of {work!r} differ by {apart:.1e} of their spread; expected at most {_AGREE}")
-    return apart
+    return apart, firsts
 
 
 def _difference(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> float:
@@ -151,20 +160,15 @@ def _difference(ours: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> f
 def _table(rows: list[dict[str, Any]], title: str) -> Table:
     table = Table(title=title, title_justify="left", box=None)
     table.add_column("work")
-    pairs = [f"{name}{unit}" for unit in (" (s)", " (GB)", " own (GB)") for name in ("ours", "public", "ratio")]
-    for heading in (
-        "frames",
-        *(name.split(" ")[0] if "ratio" in name else name for name in pairs),
-        "differ by",
-        "disk",
-    ):
+    pairs = [(f"ours, {unit}", f"public, {unit}", "ratio") for unit in _COMPARED]
+    for heading in ("frames", *sum(pairs, ()), "differ by", "disk"):
         table.add_column(heading, justify="right")
     for row in rows:
         cells = []
-        for key, unit, digits in (("seconds", 1, 2), ("total", 1e9, 2), ("own", 1e9, 2)):
-            ours, theirs = (float(np.median([run[key] for run in row[side]])) / unit for side in ("ours", "public"))
-            cells += [f"{ours:.{digits}f}", f"{theirs:.{digits}f}", f"{ours / theirs:.2f}" if theirs else "-"]
-        waited = "yes" if any(run["reads"] for side in ("ours", "public") for run in row[side]) else "no"
+        for key, which, unit in _COMPARED.values():
+            ours, theirs = (float(np.median([run[key] for run in row[side][which]])) for side in ("ours", "public"))
+            cells += [f"{ours / unit:.2f}", f"{theirs / unit:.2f}", f"{ours / theirs:.2f}" if theirs else "-"]
+        waited = "yes" if any(run["reads"] for side in ("ours", "public") for run in row[side]["runs"]) else "no"
         table.add_row(
             _TITLES[row["work"]],
             str(row["frames"]),
@@ -172,6 +176,9 @@ def _table(rows: list[dict[str, Any]], title: str) -> Table:
             "-" if row["differ by"] is None else f"{row['differ by']:.1e}",
             waited,
         )
-    table.caption = "own: beside mapped files, which the weights are; disk: whether a run waited for one"
+    table.caption = (
+        "GB: most memory in a run; own: of it, beside mapped files, which the weights are; "
+        "since start: most of a process that loads as its users do, and runs once; disk: whether a run waited for one"
+    )
     table.caption_justify = "left"
     return table

@@ -1,8 +1,8 @@
 """One side of a comparison: a process that holds a model and runs a pass, or two, whenever it is told to.
 
-python -m benchmarks.worker ours WEIGHTS, or python -m benchmarks.worker peer WEIGHTS CHECKOUT; then a line of JSON on
-standard input for every run: {"work": "pass", "vggt4d" or "4dvggt-d", "frames", "height", "width", "keep": a file for
-the outputs or null, "mask": a file with the mask that the second pass shall have, or null}.
+python -m benchmarks.worker ours WEIGHTS, or python -m benchmarks.worker peer WEIGHTS CHECKOUT [mapped]; then a line of
+JSON on standard input for every run: {"work": "pass", "vggt4d" or "4dvggt-d", "frames", "height", "width", "keep": a
+file for the outputs or null, "mask": a file with the mask that the second pass shall have, or null}.
 """
 
 from __future__ import annotations
@@ -71,18 +71,18 @@ def ours(weights: Path) -> Run:
     return run
 
 
-def peer(weights: Path, checkout: Path) -> Run:
+def peer(weights: Path, checkout: Path, *, mapped: bool) -> Run:
     """Return the passes of the public PyTorch code, from a checkout: VGGT's, or stages 1 and 2 of VGGT4D.
 
     The plain pass has the same heads as ours and no others; VGGT4D runs its own model and its own functions, whose
-    one demand for CUDA is answered with the CPU.
+    one demand for CUDA is answered with the CPU. The weights are loaded as `from_pretrained` does it, the public way;
+    or else mapped, as ours are, and only those of heads that run.
     """
     sys.path.insert(0, str(checkout))
     import torch
-    from safetensors.torch import load_file
+    from safetensors.torch import load_file, load_model
 
     torch.set_num_threads(os.cpu_count() or 1)
-    tensors = load_file(weights)
     models: dict[str, Any] = {}
 
     def model_for(work: str) -> Any:
@@ -91,13 +91,16 @@ def peer(weights: Path, checkout: Path) -> Run:
             if work == "pass":
                 from vggt.models.vggt import VGGT  # pyright: ignore[reportMissingImports]: the user's checkout
 
-                model = VGGT(enable_point=False, enable_track=False)
+                model = VGGT(enable_point=not mapped, enable_track=not mapped)
             else:
                 from vggt4d.models.vggt4d import VGGTFor4D  # pyright: ignore[reportMissingImports]
 
                 model = VGGTFor4D()
-            names = set(model.state_dict())
-            model.load_state_dict({n: t for n, t in tensors.items() if n in names}, assign=True, strict=True)
+            if mapped:
+                names, tensors = set(model.state_dict()), load_file(weights)
+                model.load_state_dict({n: t for n, t in tensors.items() if n in names}, assign=True, strict=True)
+            else:
+                load_model(model, weights)
             models[work] = model.eval()
         return models[work]
 
@@ -178,7 +181,7 @@ def disk_reads() -> int:
 
 def main(side: str, weights: str, *rest: str) -> None:
     """Load a model, say so, and run passes until standard input ends."""
-    run = ours(Path(weights)) if side == "ours" else peer(Path(weights), Path(rest[0]))
+    run = ours(Path(weights)) if side == "ours" else peer(Path(weights), Path(rest[0]), mapped="mapped" in rest[1:])
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # whatever else is printed is no answer
     answers.write('{"ready": true}\n')
@@ -193,7 +196,13 @@ def main(side: str, weights: str, *rest: str) -> None:
         seconds = time.perf_counter() - began
         if task["keep"]:
             np.savez(task["keep"], allow_pickle=False, **outputs)
-        answer = {"seconds": seconds, "total": peak.total, "own": peak.own, "reads": disk_reads() - reads}
+        answer = {
+            "seconds": seconds,
+            "total": peak.total,
+            "own": peak.own,
+            "since start": process_bytes("VmHWM") or 0,
+            "reads": disk_reads() - reads,
+        }
         answers.write(json.dumps(answer) + "\n")
         answers.flush()
 

@@ -1,6 +1,7 @@
 """What every test shares: strict jax settings, the tiny model of the golden files, real footage where it is present."""
 
 import json
+import os
 from pathlib import Path
 
 import jax
@@ -12,8 +13,31 @@ from vggtjax import VGGTConfig
 
 GOLDEN = Path(__file__).parent / "golden"
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
+_MAPPINGS = 2**14  # Linux allows 65530
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--hasty", action="store_true", help="compile programs quickly rather than well, and run sooner")
+
+
+def pytest_configure(config):
+    """Compiling is two thirds of the time that the tests take."""
+    if config.getoption("--hasty"):
+        flags = ["--xla_backend_optimization_level=0"]
+        if jax.__version_info__ < (0, 11):  # XLA ends a process for a flag that it does not know
+            flags.append("--xla_cpu_use_fusion_emitters=false")
+        os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_programs():
+    """Forget compiled programs before the kernel's limit on a process's mappings, of which each program takes some."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.is_file() and maps.read_bytes().count(b"\n") > _MAPPINGS:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

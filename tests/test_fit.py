@@ -34,7 +34,7 @@ TRUE = identity() | {
 FAMILY = ("scale", "power", "correlation")
 
 
-def simulated(seed: int, clips: int = 48, pixels: int = 1500, truth=TRUE) -> FitClips:
+def simulated(seed: int, clips: int = 48, pixels: int = 1000, truth=TRUE) -> FitClips:
     seen, depth = simulate(jax.random.key(seed), truth, (clips, 1, 1, pixels))
     return FitClips(seen, depth)
 
@@ -52,7 +52,7 @@ def test_simulated_errors_are_what_the_tree_claims():
 def recovered():
     """Return clips, and the fit to them that ought to find TRUE again."""
     clips = simulated(1)
-    config = FitConfig(FAMILY, "joint", steps=600, learning_rate=0.05, clips_at_once=48, patience=60)
+    config = FitConfig(FAMILY, "joint", steps=400, learning_rate=0.05, clips_at_once=48, patience=40)
     return clips, fit_fusion(clips, clips, config)
 
 

@@ -137,7 +137,7 @@ def test_workloads_run(run, capsys):
     assert code == 0, shown.err
     stored = json.loads((run / "a.json").read_text())
     assert stored["machine"]["jax"] == jax.__version__
-    assert all(value > 0 for value in stored["ceilings"]["tiny"].values())
+    assert all(min(looks) > 0 for looks in stored["ceilings"]["tiny"].values())
     rows = stored["rows"]
     assert {row["workload"].split(":")[0] for row in rows} == set(names)
     for row in rows:

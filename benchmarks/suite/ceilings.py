@@ -1,48 +1,82 @@
-"""What this machine does at best of each kind of work, at the shapes that the network gives it."""
+"""What this machine does at best of each kind of work, at the shapes that the network gives it.
+
+A machine whose cores others use as well is not equally fast all the time, so it is looked at again between the
+workloads, and the best that was seen at any time counts.
+"""
 
 from __future__ import annotations
 
 import math
+import time
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from benchmarks.suite.measure import sustained
+from benchmarks.suite.measure import Sustained
 from benchmarks.suite.work import Grid
 from vggtjax.config import VGGTConfig
 
 _IN_A_ROW = 16  # exponentials of the same array, and products with the same weights
+_SEEN_LATELY = 10.0  # seconds for which a look need not be repeated
 
 
-def measure_ceilings(config: VGGTConfig, grid: Grid, dtype: str) -> dict[str, float]:
-    """Return FLOP, exponentials and bytes per second, by kind of work.
+class Probe(NamedTuple):
+    """An amount of one kind of work, and a program that does it."""
 
-    Small shapes are made so many that what a call costs does not count.
-
-    Args:
-        config: the model whose channels are taken.
-        grid: rows and columns of patches, of which the convolution's map is four times as large.
-        dtype: of products in the blocks; heads are float32.
-    """
-    small = jax.default_backend() == "cpu"  # as much at a time as stays in the cache; elsewhere, enough for all cores
-    rows, queries, keys, values, pixels = (
-        (1600, 800, 1600, 2**20, 2**14) if small else (2**15, 4096, 4096, 2**26, 2**17)
-    )
-    D = config.embed_dim // config.num_heads
-    linear = {name: _linear(rows, config.embed_dim, name) for name in {dtype, "float32"}}
-    return {
-        "linear": linear[dtype],
-        "linear, float32": linear["float32"],
-        "attention": _attention(config.num_heads, queries, keys, D, dtype, loop=small),
-        "exp": _exponentials(values),
-        "convolution": _convolution(pixels, (4 * grid[0], 4 * grid[1]), config.dpt_features),
-        "weights": _reading(12 * config.camera_depth, config.camera_dim),
-    }
+    amount: float
+    program: Sustained
 
 
-def _linear(rows: int, C: int, dtype: str) -> float:
+class Ceilings:
+    """FLOP, exponentials and bytes per second, by kind of work: every look's, and the best of all looks."""
+
+    def __init__(self, config: VGGTConfig, grid: Grid, dtype: str) -> None:
+        """Look once. Small shapes are made so many that what a call costs does not count.
+
+        Args:
+            config: the model whose channels are taken.
+            grid: rows and columns of patches, of which the convolution's map is four times as large.
+            dtype: of products in the blocks; heads are float32.
+        """
+        small = jax.default_backend() == "cpu"  # as much as stays in the cache; elsewhere, enough for all cores
+        rows, queries, keys, values, pixels = (
+            (1600, 800, 1600, 2**20, 2**14) if small else (2**15, 4096, 4096, 2**26, 2**17)
+        )
+        D = config.embed_dim // config.num_heads
+        linear = {name: _linear(rows, config.embed_dim, name) for name in {dtype, "float32"}}
+        self._probes: dict[str, Probe] = {
+            "linear": linear[dtype],
+            "linear, float32": linear["float32"],
+            "attention": _attention(config.num_heads, queries, keys, D, dtype, loop=small),
+            "exp": _exponentials(values),
+            "convolution": _convolution(pixels, (4 * grid[0], 4 * grid[1]), config.dpt_features),
+            "weights": _reading(12 * config.camera_depth, config.camera_dim),
+        }
+        self.looks: dict[str, list[float]] = {kind: [] for kind in self._probes}
+        self.look()
+
+    def look(self) -> None:
+        """Measure all kinds of work once more."""
+        rates = {probe: probe.amount / probe.program.seconds() for probe in set(self._probes.values())}
+        for kind, probe in self._probes.items():
+            self.looks[kind].append(rates[probe])
+        self._looked = time.monotonic()
+
+    def look_again(self) -> None:
+        """Measure once more, unless that has just been done."""
+        if time.monotonic() - self._looked > _SEEN_LATELY:
+            self.look()
+
+    @property
+    def best(self) -> dict[str, float]:
+        """The highest rates of all looks."""
+        return {kind: max(rates) for kind, rates in self.looks.items()}
+
+
+def _linear(rows: int, C: int, dtype: str) -> Probe:
     """The four products of a block: q, k and v, projection, and both of the MLP."""
     shapes = ((C, 3 * C), (C, C), (C, 4 * C), (4 * C, C))
     inputs = [_drawn((rows, shape[0]), dtype) for shape in shapes]
@@ -51,10 +85,10 @@ def _linear(rows: int, C: int, dtype: str) -> float:
     def products(inputs, kernels):
         return [jnp.matmul(x, w, preferred_element_type=jnp.float32) for x, w in zip(inputs, kernels, strict=True)]
 
-    return 2 * rows * sum(map(math.prod, shapes)) / sustained(products, (inputs, kernels))
+    return Probe(2 * rows * sum(map(math.prod, shapes)), Sustained(products, (inputs, kernels)))
 
 
-def _attention(heads: int, queries: int, keys: int, D: int, dtype: str, *, loop: bool) -> float:
+def _attention(heads: int, queries: int, keys: int, D: int, dtype: str, *, loop: bool) -> Probe:
     """Both products of attention, without the softmax between them."""
 
     def one_head(inputs):
@@ -66,17 +100,17 @@ def _attention(heads: int, queries: int, keys: int, D: int, dtype: str, *, loop:
         return jax.lax.map(one_head, inputs) if loop else jax.vmap(one_head)(inputs)
 
     inputs = tuple(_drawn((heads, length, D), dtype) for length in (queries, keys, keys))
-    return 4 * heads * queries * keys * D / sustained(products, (inputs,))
+    return Probe(4 * heads * queries * keys * D, Sustained(products, (inputs,)))
 
 
-def _exponentials(count: int) -> float:
+def _exponentials(count: int) -> Probe:
     def repeated(x):
         return jax.lax.fori_loop(0, _IN_A_ROW, lambda _, x: jnp.exp(-x), x)
 
-    return _IN_A_ROW * count / sustained(repeated, (_drawn((count,)),))
+    return Probe(_IN_A_ROW * count, Sustained(repeated, (_drawn((count,)),)))
 
 
-def _convolution(pixels: int, size: tuple[int, int], F: int) -> float:
+def _convolution(pixels: int, size: tuple[int, int], F: int) -> Probe:
     """A 3 x 3 convolution of as many maps of this size as have about so many pixels, one at least."""
     frames = max(pixels // math.prod(size), 1)
 
@@ -84,17 +118,17 @@ def _convolution(pixels: int, size: tuple[int, int], F: int) -> float:
         return jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC"))
 
     arguments = (_drawn((frames, *size, F)), _drawn((3, 3, F, F)))
-    return 18 * frames * math.prod(size) * F**2 / sustained(convolved, arguments)
+    return Probe(18 * frames * math.prod(size) * F**2, Sustained(convolved, arguments))
 
 
-def _reading(matrices: int, E: int) -> float:
-    """Bytes per second of a product with a vector, over as many weights as the camera head's blocks have."""
+def _reading(matrices: int, E: int) -> Probe:
+    """A product with a vector, over as many weights as the camera head's blocks have."""
     weights = _drawn((matrices * E, E))
 
     def products(weights, x):
         return jax.lax.fori_loop(0, _IN_A_ROW, lambda _, x: (weights @ x)[:E], x)
 
-    return _IN_A_ROW * weights.nbytes / sustained(products, (weights, _drawn((E,))))
+    return Probe(_IN_A_ROW * weights.nbytes, Sustained(products, (weights, _drawn((E,)))))
 
 
 def _drawn(shape: tuple[int, ...], dtype: str = "float32") -> Array:

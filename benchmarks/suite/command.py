@@ -9,10 +9,9 @@ from rich.progress import Progress
 from benchmarks.plots import check_matplotlib
 from benchmarks.suite import report
 from benchmarks.suite.cases import Case, DType, Size, check_counts, frame_size, load
-from benchmarks.suite.ceilings import measure_ceilings
+from benchmarks.suite.ceilings import Ceilings
 from benchmarks.suite.measure import compiling_anew, without_memory
 from benchmarks.suite.report import Row
-from benchmarks.suite.work import floor_by_kind, flop
 from benchmarks.suite.workloads import WORKLOADS, Workload
 from vggtjax.errors import InputError
 from vggtjax.files import writing
@@ -61,7 +60,7 @@ def suite(
     keep_freed_memory()
     rows: list[Row] = []
     sheets: list[report.Sheet] = []
-    ceilings: dict[str, dict[str, float]] = {}
+    looks: dict[str, dict[str, list[float]]] = {}
     screen = report.console()
 
     def run(size: Size, progress: Progress) -> None:
@@ -70,20 +69,21 @@ def suite(
         shape = frame_size(size, config, height, width)
         cases = [Case(size, config, params, count, *shape, dtype) for count in frames]
         progress.update(task, description=f"{size}: ceilings")
-        ceilings[size] = measure_ceilings(config, cases[0].grid, dtype)
+        ceilings = Ceilings(config, cases[0].grid, dtype)
         wanted = [name for name in workloads if WORKLOADS[name].scope != "process" or size == sizes[0]]
         runs = [(name, case) for name in wanted for case in cases[: None if WORKLOADS[name].scope == "clip" else 1]]
         progress.update(task, total=len(runs))
-        found: list[Row] = []
+        measured: list[Row] = []
         for name, case in runs:
             progress.update(task, description=f"{size}: {name}, {case.frames} frames")
-            found.extend(measured_rows(name, WORKLOADS[name], case, repeats, ceilings[size]))
+            measured.extend(measured_rows(name, WORKLOADS[name], case, repeats))
+            ceilings.look_again()
             progress.advance(task)
+        found = [row.beside(ceilings.best) for row in measured]
         rows.extend(found)
+        looks[size] = ceilings.looks
         title = f"{size}, {shape[1]} x {shape[0]} pixels, {dtype}"
-        sheets.extend(
-            [report.ceiling_sheet(title, ceilings[size]), report.row_sheet(f"{title}, {repeats} runs", found)]
-        )
+        sheets.extend([report.ceiling_sheet(title, looks[size]), report.row_sheet(f"{title}, {repeats} runs", found)])
 
     with compiling_anew(), Progress(console=screen, transient=True) as progress:
         for size in dict.fromkeys(sizes):
@@ -95,7 +95,7 @@ def suite(
         sheet.show(screen)
     screen.print(here, highlight=False)
     if out is not None:
-        report.write_rows(out, rows, ceilings=ceilings, repeats=repeats)
+        report.write_rows(out, rows, ceilings=looks, repeats=repeats)
     if markdown is not None:
         with writing(markdown) as temporary:
             temporary.write_text("\n".join([here + "\n", *(sheet.markdown() for sheet in sheets)]), encoding="utf-8")
@@ -106,17 +106,14 @@ def suite(
         plot_scaling(plots / "scaling.png", rows, here)
 
 
-def measured_rows(
-    name: str, workload: Workload, case: Case, repeats: int, ceilings: dict[str, float] | None = None
-) -> list[Row]:
-    """Measure a workload; return a row for each of its results, with its floor if it has one."""
+def measured_rows(name: str, workload: Workload, case: Case, repeats: int) -> list[Row]:
+    """Measure a workload; return a row for each of its results, with the work it is if that is known."""
     parts = workload.parts(case) if workload.parts else []
-    floor = floor_by_kind(parts, ceilings) if ceilings else {}
     size = None if workload.scope == "process" else case.size
     shape = (case.frames, case.height, case.width) if workload.scope == "clip" else (None, None, None)
     results = without_memory(lambda: workload.measure(case, repeats))
     names = [f"{name}: {result}" if result else name for result in results]
     return [
-        Row(full, size, *shape, case.dtype, measured, flop(parts) or None, floor)
+        Row(full, size, *shape, case.dtype, measured, parts)
         for full, measured in zip(names, results.values(), strict=True)
     ]

@@ -71,16 +71,22 @@ def timed(call: Callable[[], Any]) -> tuple[Any, float]:
     return made, time.perf_counter() - began
 
 
-def sustained(function: Callable[..., Any], arguments: tuple, repeats: int = 5) -> float:
-    """Return the least seconds of a run out of several series of runs, each long enough for the clock."""
-    compiled = jax.jit(full_precision(function)).lower(*arguments).compile()
+class Sustained:
+    """A function of arrays, compiled, and run in series that are each long enough for the clock."""
 
-    def series(count: int) -> float:
-        return timed(lambda: jax.block_until_ready([compiled(*arguments) for _ in range(count)][-1]))[1] / count
+    def __init__(self, function: Callable[..., Any], arguments: tuple) -> None:
+        self._arguments = arguments
+        self._compiled = jax.jit(full_precision(function)).lower(*arguments).compile()
+        self._series(1)
+        self._count = min(max(math.ceil(_SUSTAINED / self._series(1)), 1), 1000)
 
-    series(1)
-    count = min(max(math.ceil(_SUSTAINED / series(1)), 1), 1000)
-    return min(series(count) for _ in range(repeats))
+    def seconds(self, repeats: int = 5) -> float:
+        """Return the least seconds of a run out of several series."""
+        return min(self._series(self._count) for _ in range(repeats))
+
+    def _series(self, count: int) -> float:
+        run = self._compiled
+        return timed(lambda: jax.block_until_ready([run(*self._arguments) for _ in range(count)][-1]))[1] / count
 
 
 def analysed(compiled: Any) -> tuple[int | None, int | None]:

@@ -6,19 +6,20 @@ import json
 import math
 import os
 import platform
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.suite.measure import Measured
-from benchmarks.suite.work import UNITS
+from benchmarks.suite.work import UNITS, Work, floor_by_kind, flop
 from vggtjax.errors import InputError
 from vggtjax.files import writing
 
@@ -39,13 +40,21 @@ class Row:
     width: int | None
     dtype: str
     measured: Measured
-    flop: float | None = None
+    parts: Sequence[Work] = ()  # the work that it is, if that is known
     floor: dict[str, float] = field(default_factory=dict)  # seconds by kind of work
 
     @property
     def key(self) -> Key:
         """What a row of another run must have in common to be compared."""
         return tuple(getattr(self, name) for name in _KEY)
+
+    def beside(self, ceilings: Mapping[str, float]) -> Row:
+        """Return the row with its floor at these rates."""
+        return replace(self, floor=floor_by_kind(self.parts, ceilings))
+
+    @property
+    def flop(self) -> float | None:
+        return flop(self.parts) or None
 
     @property
     def floor_seconds(self) -> float | None:
@@ -123,10 +132,13 @@ def describe(machine: dict[str, Any]) -> str:
     )
 
 
-def ceiling_sheet(title: str, ceilings: dict[str, float]) -> Sheet:
-    """Return a table of what the machine does at best."""
-    rows = [(kind, f"{value / 1e9:.4g} G{UNITS[kind]}/s") for kind, value in ceilings.items()]
-    return Sheet(f"{title}: ceilings", ("kind", "at best"), rows)
+def ceiling_sheet(title: str, looks: Mapping[str, Sequence[float]]) -> Sheet:
+    """Return a table of what the machine did at best in all looks, and in the middle one."""
+    rows = [
+        (kind, f"{max(rates) / 1e9:.4g}", f"{np.median(rates) / 1e9:.4g}", f"G{UNITS[kind]}/s", str(len(rates)))
+        for kind, rates in looks.items()
+    ]
+    return Sheet(f"{title}: ceilings", ("kind", "at best", "median", "unit", "looks"), rows)
 
 
 def row_sheet(title: str, rows: Sequence[Row]) -> Sheet:
@@ -170,10 +182,10 @@ def write_rows(path: Path, rows: Sequence[Row], **more: Any) -> None:
     """Write a run as JSON: the machine, the rows, and whatever else is given."""
 
     def plain(row: Row) -> dict[str, Any]:
-        values = {name: value for name, value in asdict(row).items() if name != "measured"}
+        values = {name: value for name, value in asdict(row).items() if name not in ("measured", "parts")}
         seconds = row.measured.seconds
         times = {"median": row.measured.median, "min": min(seconds, default=None), "max": max(seconds, default=None)}
-        derived = {name: getattr(row, name) for name in ("floor_seconds", "flop_per_second", "share_of_floor")}
+        derived = {name: getattr(row, name) for name in ("flop", "floor_seconds", "flop_per_second", "share_of_floor")}
         return values | times | asdict(row.measured) | derived
 
     write_json(path, {"machine": machine(), **more, "rows": [plain(row) for row in rows]})
