@@ -69,7 +69,7 @@ def gradient(
             base: Measured | None = None
             for name, function in programs.items():
                 arguments = (fusion, soft, params, images)
-                made = without_memory(lambda f=function, a=arguments: {"": measure_program(f, a, repeats)})[""]
+                made = without_memory(lambda f=function, a=arguments: {"": measure_program(f, a, range(repeats))})[""]
                 base = made if name == _FIRST else base
                 found.append({"program": name, "frames": count, **_plain(made)})
                 rows.append((str(count), name, *_cells(made, base)))

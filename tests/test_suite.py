@@ -10,7 +10,10 @@ from PIL import Image
 from benchmarks import __main__ as benchmarks
 from benchmarks.suite import gpu_targets, measure, work, workloads
 from benchmarks.suite.cases import TINY, Case
+from benchmarks.suite.ceilings import Ceilings, Rounds
+from benchmarks.suite.measure import Measured
 from benchmarks.suite.memory import slope
+from benchmarks.suite.report import Row
 from benchmarks.suite.workloads import WORKLOADS
 from vggtjax.config import VGGTConfig
 from vggtjax.network.model import init_params, parameter_shapes
@@ -79,6 +82,22 @@ def test_floors_by_hand():
     computing, reading = {"linear": 30.0, "exp": 4.0, "weights": 4.0}, {"linear": 10.0, "weights": 3.0}
     assert work.floor_by_kind([computing, reading], ceilings) == {"linear": 3.0, "exp": 2.0, "weights": 3.0}
     assert work.flop([computing, reading]) == 40
+
+
+def test_a_run_is_beside_the_better_of_the_looks_around_it():
+    class Looked(Ceilings):
+        def __init__(self):
+            self.rates = iter([4.0, 2.0, 1.0])
+
+        def look(self):
+            return {"linear": next(self.rates)}
+
+    rounds = Rounds(2, Looked())
+    assert list(rounds) == [0, 1]
+    assert rounds.rates == [{"linear": 4}, {"linear": 2}]
+    row = Row("pass", "tiny", 2, 56, 56, "float32", Measured((4.0, 10.0)), [{"linear": 8.0}], rounds.rates)
+    assert row.floor == {"linear": 3}
+    assert row.share_of_floor == pytest.approx((2 / 4 + 4 / 10) / 2)
 
 
 def test_slopes_by_hand():

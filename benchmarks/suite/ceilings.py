@@ -1,13 +1,13 @@
 """What this machine does at best of each kind of work, at the shapes that the network gives it.
 
-A machine whose cores others use as well is not equally fast all the time, so it is looked at again between the
-workloads, and the best that was seen at any time counts.
+A machine whose cores others use as well is not equally fast all the time, so it is looked at before and after every
+timed run, and what a run could have taken at least is told from the looks beside it.
 """
 
 from __future__ import annotations
 
 import math
-import time
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
@@ -19,8 +19,7 @@ from benchmarks.suite.measure import Sustained
 from benchmarks.suite.work import Grid
 from vggtjax.config import VGGTConfig
 
-_IN_A_ROW = 16  # exponentials of the same array, and products with the same weights
-_SEEN_LATELY = 10.0  # seconds for which a look need not be repeated
+_IN_A_ROW = 16  # functions of the same array, and products with the same weights
 
 
 class Probe(NamedTuple):
@@ -31,10 +30,10 @@ class Probe(NamedTuple):
 
 
 class Ceilings:
-    """FLOP, exponentials and bytes per second, by kind of work: every look's, and the best of all looks."""
+    """FLOP, functions of a number and bytes per second, by kind of work, of every look."""
 
     def __init__(self, config: VGGTConfig, grid: Grid, dtype: str) -> None:
-        """Look once. Small shapes are made so many that what a call costs does not count.
+        """Make ready to look. Small shapes are made so many that what a call costs does not count.
 
         Args:
             config: the model whose channels are taken.
@@ -51,29 +50,36 @@ class Ceilings:
             "linear": linear[dtype],
             "linear, float32": linear["float32"],
             "attention": _attention(config.num_heads, queries, keys, D, dtype, loop=small),
-            "exp": _exponentials(values),
+            "exp": _repeated(lambda x: jnp.exp(-x), values),
+            "GELU": _repeated(lambda x: jax.nn.gelu(x, approximate=False), values),
             "convolution": _convolution(pixels, (4 * grid[0], 4 * grid[1]), config.dpt_features),
             "weights": _reading(12 * config.camera_depth, config.camera_dim),
         }
         self.looks: dict[str, list[float]] = {kind: [] for kind in self._probes}
-        self.look()
 
-    def look(self) -> None:
-        """Measure all kinds of work once more."""
+    def look(self) -> dict[str, float]:
+        """Measure all kinds of work once more, and return that."""
         rates = {probe: probe.amount / probe.program.seconds() for probe in set(self._probes.values())}
-        for kind, probe in self._probes.items():
-            self.looks[kind].append(rates[probe])
-        self._looked = time.monotonic()
+        look = {kind: rates[probe] for kind, probe in self._probes.items()}
+        for kind, rate in look.items():
+            self.looks[kind].append(rate)
+        return look
 
-    def look_again(self) -> None:
-        """Measure once more, unless that has just been done."""
-        if time.monotonic() - self._looked > _SEEN_LATELY:
-            self.look()
 
-    @property
-    def best(self) -> dict[str, float]:
-        """The highest rates of all looks."""
-        return {kind: max(rates) for kind, rates in self.looks.items()}
+class Rounds:
+    """Numbers to loop over, one per timed run, with a look at the ceilings before the first and after each."""
+
+    def __init__(self, count: int, ceilings: Ceilings) -> None:
+        self._count, self._ceilings = count, ceilings
+        self.rates: list[dict[str, float]] = []  # the better of the looks before and after every run
+
+    def __iter__(self) -> Iterator[int]:
+        before = self._ceilings.look()
+        for number in range(self._count):
+            yield number
+            after = self._ceilings.look()
+            self.rates.append({kind: max(rate, after[kind]) for kind, rate in before.items()})
+            before = after
 
 
 def _linear(rows: int, C: int, dtype: str) -> Probe:
@@ -103,9 +109,11 @@ def _attention(heads: int, queries: int, keys: int, D: int, dtype: str, *, loop:
     return Probe(4 * heads * queries * keys * D, Sustained(products, (inputs,)))
 
 
-def _exponentials(count: int) -> Probe:
+def _repeated(function: Callable[[Array], Array], count: int) -> Probe:
+    """A function of single numbers, again and again of the same array."""
+
     def repeated(x):
-        return jax.lax.fori_loop(0, _IN_A_ROW, lambda _, x: jnp.exp(-x), x)
+        return jax.lax.fori_loop(0, _IN_A_ROW, lambda _, x: function(x), x)
 
     return Probe(_IN_A_ROW * count, Sustained(repeated, (_drawn((count,)),)))
 

@@ -9,7 +9,7 @@ from rich.progress import Progress
 from benchmarks.plots import check_matplotlib
 from benchmarks.suite import report
 from benchmarks.suite.cases import Case, DType, Size, check_counts, frame_size, load
-from benchmarks.suite.ceilings import Ceilings
+from benchmarks.suite.ceilings import Ceilings, Rounds
 from benchmarks.suite.measure import compiling_anew, without_memory
 from benchmarks.suite.report import Row
 from benchmarks.suite.workloads import WORKLOADS, Workload
@@ -73,13 +73,11 @@ def suite(
         wanted = [name for name in workloads if WORKLOADS[name].scope != "process" or size == sizes[0]]
         runs = [(name, case) for name in wanted for case in cases[: None if WORKLOADS[name].scope == "clip" else 1]]
         progress.update(task, total=len(runs))
-        measured: list[Row] = []
+        found: list[Row] = []
         for name, case in runs:
             progress.update(task, description=f"{size}: {name}, {case.frames} frames")
-            measured.extend(measured_rows(name, WORKLOADS[name], case, repeats))
-            ceilings.look_again()
+            found.extend(measured_rows(name, WORKLOADS[name], case, repeats, ceilings))
             progress.advance(task)
-        found = [row.beside(ceilings.best) for row in measured]
         rows.extend(found)
         looks[size] = ceilings.looks
         title = f"{size}, {shape[1]} x {shape[0]} pixels, {dtype}"
@@ -106,14 +104,17 @@ def suite(
         plot_scaling(plots / "scaling.png", rows, here)
 
 
-def measured_rows(name: str, workload: Workload, case: Case, repeats: int) -> list[Row]:
-    """Measure a workload; return a row for each of its results, with the work it is if that is known."""
+def measured_rows(
+    name: str, workload: Workload, case: Case, repeats: int, ceilings: Ceilings | None = None
+) -> list[Row]:
+    """Measure a workload; return a row for each of its results, beside the ceilings if its work is known."""
     parts = workload.parts(case) if workload.parts else []
+    rounds = Rounds(repeats, ceilings) if parts and ceilings else range(repeats)
     size = None if workload.scope == "process" else case.size
     shape = (case.frames, case.height, case.width) if workload.scope == "clip" else (None, None, None)
-    results = without_memory(lambda: workload.measure(case, repeats))
+    results = without_memory(lambda: workload.measure(case, rounds))
     names = [f"{name}: {result}" if result else name for result in results]
     return [
-        Row(full, size, *shape, case.dtype, measured, parts)
+        Row(full, size, *shape, case.dtype, measured, parts, rounds.rates if isinstance(rounds, Rounds) else ())
         for full, measured in zip(names, results.values(), strict=True)
     ]

@@ -7,7 +7,7 @@ import gc
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -43,8 +43,8 @@ class Measured:
         return None if self.temp_bytes is None or self.output_bytes is None else self.temp_bytes + self.output_bytes
 
 
-def measure_program(function: Callable[..., Any], arguments: tuple, repeats: int) -> Measured:
-    """Compile a function of arrays, run it once for its memory, then time it."""
+def measure_program(function: Callable[..., Any], arguments: tuple, rounds: Iterable[int]) -> Measured:
+    """Compile a function of arrays, run it once for its memory, then time it once a round."""
     (compiled,), compile_seconds = timed(lambda: (jax.jit(function).lower(*arguments).compile(),))
     temp, output = analysed(compiled)
 
@@ -52,14 +52,14 @@ def measure_program(function: Callable[..., Any], arguments: tuple, repeats: int
         jax.block_until_ready(compiled(*arguments))
 
     host, device = memory_of(run)
-    return Measured(tuple(timed(run)[1] for _ in range(repeats)), compile_seconds, temp, output, host, device)
+    return Measured(tuple(timed(run)[1] for _ in rounds), compile_seconds, temp, output, host, device)
 
 
-def measure_calls(call: Callable[[], object], repeats: int, *, compiles: bool = False) -> Measured:
+def measure_calls(call: Callable[[], object], rounds: Iterable[int], *, compiles: bool = False) -> Measured:
     """Call once to warm up, once for its memory, then time it; if it `compiles`, the first takes that much longer."""
     first = timed(call)[1]
     host, device = memory_of(call)
-    seconds = tuple(timed(call)[1] for _ in range(repeats))
+    seconds = tuple(timed(call)[1] for _ in rounds)
     compiling = max(first - float(np.median(seconds)), 0.0) if compiles else None
     return Measured(seconds, compiling, host_bytes=host, device_bytes=device)
 

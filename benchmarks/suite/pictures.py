@@ -11,7 +11,9 @@ from benchmarks.suite.report import Row
 from benchmarks.suite.work import UNITS
 from vggtjax.files import writing
 
-_COLOURS = dict(zip(UNITS, ("tab:blue", "tab:cyan", "tab:orange", "tab:red", "tab:green", "tab:purple"), strict=True))
+_COLOURS = dict(
+    zip(UNITS, ("tab:blue", "tab:cyan", "tab:orange", "tab:red", "tab:olive", "tab:green", "tab:purple"), strict=True)
+)
 _BAR = 0.32  # inches
 _MEGABYTE = 1e6
 

@@ -7,7 +7,7 @@ import math
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -41,16 +41,23 @@ class Row:
     dtype: str
     measured: Measured
     parts: Sequence[Work] = ()  # the work that it is, if that is known
-    floor: dict[str, float] = field(default_factory=dict)  # seconds by kind of work
+    rates: Sequence[Mapping[str, float]] = ()  # what the machine could do around every timed run
 
     @property
     def key(self) -> Key:
         """What a row of another run must have in common to be compared."""
         return tuple(getattr(self, name) for name in _KEY)
 
-    def beside(self, ceilings: Mapping[str, float]) -> Row:
-        """Return the row with its floor at these rates."""
-        return replace(self, floor=floor_by_kind(self.parts, ceilings))
+    @property
+    def floors(self) -> list[dict[str, float]]:
+        """What every timed run could have taken at least, in seconds by kind of work."""
+        return [floor_by_kind(self.parts, rates) for rates in self.rates]
+
+    @property
+    def floor(self) -> dict[str, float]:
+        """The same by the median of the runs."""
+        kinds = dict.fromkeys(kind for floor in self.floors for kind in floor)
+        return {kind: float(np.median([floor.get(kind, 0.0) for floor in self.floors])) for kind in kinds}
 
     @property
     def flop(self) -> float | None:
@@ -66,8 +73,10 @@ class Row:
 
     @property
     def share_of_floor(self) -> float | None:
-        """Floor over median: 1 where nothing but the counted work takes time."""
-        return _over(self.floor_seconds, self.measured.median)
+        """Floor over seconds, by the median of the runs: 1 where nothing but the counted work takes time."""
+        runs = zip(self.floors, self.measured.seconds, strict=True)
+        shares = [sum(floor.values()) / seconds for floor, seconds in runs] if self.rates else []
+        return float(np.median(shares)) if shares else None
 
 
 _KEY = ("workload", "size", "frames", "height", "width", "dtype")
@@ -145,7 +154,7 @@ def row_sheet(title: str, rows: Sequence[Row]) -> Sheet:
     """Return a table of rows."""
     headings = (
         "workload", "frames", "compile s", "median s", "min s", "max s", "temp MB", "output MB",
-        "host MB", "device MB", "GFLOP/s", "floor s", "floor/median",
+        "host MB", "device MB", "GFLOP/s", "floor s", "floor/run",
     )  # fmt: skip
     return Sheet(f"{title}; temp and output: memory by XLA's analysis", headings, [_cells(row) for row in rows])
 
@@ -182,7 +191,9 @@ def write_rows(path: Path, rows: Sequence[Row], **more: Any) -> None:
     """Write a run as JSON: the machine, the rows, and whatever else is given."""
 
     def plain(row: Row) -> dict[str, Any]:
-        values = {name: value for name, value in asdict(row).items() if name not in ("measured", "parts")}
+        values = {name: value for name, value in asdict(row).items() if name not in ("measured", "parts")} | {
+            "floor": row.floor
+        }
         seconds = row.measured.seconds
         times = {"median": row.measured.median, "min": min(seconds, default=None), "max": max(seconds, default=None)}
         derived = {name: getattr(row, name) for name in ("flop", "floor_seconds", "flop_per_second", "share_of_floor")}

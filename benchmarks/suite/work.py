@@ -1,7 +1,7 @@
 """How much work each part of the network is, counted by kind from its shapes alone: two FLOP per multiply-add.
 
-What is counted is what a product of matrices, a convolution, an exponential or the reading of weights cannot do
-without; norms, activations, resizing and copies are free here. Work over ceilings is a floor: seconds that no
+What is counted is what a product of matrices, a convolution, an exponential, a GELU or the reading of weights cannot do
+without; norms, other activations, resizing and copies are free here. Work over ceilings is a floor: seconds that no
 implementation of the same arithmetic can beat on that machine.
 """
 
@@ -18,7 +18,7 @@ from vggtjax.network.backbone import REGISTERS
 from vggtjax.network.dpt_head import CHANNELS, HIDDEN
 from vggtjax.network.pose import POSE_SIZE
 
-Work = Mapping[str, float]  # kind -> FLOP, exponentials, or bytes
+Work = Mapping[str, float]  # kind -> FLOP, functions of a number, or bytes
 Grid = tuple[int, int]  # rows and columns of patches
 
 UNITS = {  # kinds of work, and the unit of each
@@ -26,6 +26,7 @@ UNITS = {  # kinds of work, and the unit of each
     "linear, float32": "FLOP",  # those of the heads and of the cues
     "attention": "FLOP",
     "exp": "exp",
+    "GELU": "GELU",
     "convolution": "FLOP",
     "weights": "B",  # read once per use, where few tokens share them
 }
@@ -42,7 +43,7 @@ def floor_by_kind(parts: Sequence[Work], ceilings: Mapping[str, float]) -> dict[
 
 
 def flop(parts: Sequence[Work]) -> float:
-    """Return the floating point operations of all parts, exponentials not among them."""
+    """Return the floating point operations of all parts, exponentials and GELUs not among them."""
     return sum(amount for part in parts for kind, amount in part.items() if UNITS[kind] == "FLOP")
 
 
@@ -65,7 +66,7 @@ def camera_head(config: VGGTConfig, S: int) -> list[Work]:
     weights = 12 * config.camera_depth * E**2 + POSE_SIZE * E + 3 * E**2 + E * E // 2 + E // 2 * POSE_SIZE
     blocks = _blocks(config.camera_depth, 1, S, E, config.camera_num_heads)
     rest = {"linear, float32": n * 2.0 * S * weights, "weights": n * 4.0 * weights}
-    return [{kind: n * blocks[kind] for kind in ("attention", "exp")} | rest]
+    return [{kind: n * blocks[kind] for kind in ("attention", "exp", "GELU")} | rest]
 
 
 def depth_head(config: VGGTConfig, S: int, grid: Grid) -> list[Work]:
@@ -111,6 +112,7 @@ def _attended(sequences: int, queries: int, keys: int, C: int, heads: int, linea
         linear: sequences * 2.0 * C**2 * (10 * queries + 2 * keys),
         "attention": sequences * 4.0 * queries * keys * C,
         "exp": sequences * 1.0 * heads * queries * keys,
+        "GELU": sequences * 4.0 * queries * C,
     }
 
 

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -48,7 +48,7 @@ class Workload(NamedTuple):
     """How to measure something, and how much work it is. Several results have names of their own."""
 
     about: str
-    measure: Callable[[Case, int], dict[str, Measured]]  # a case and a number of timed runs -> results by name
+    measure: Callable[[Case, Iterable[int]], dict[str, Measured]]  # a case, a round per timed run -> results by name
     parts: Callable[[Case], list[work.Work]] | None = None
     scope: Literal["clip", "model", "process"] = "clip"  # what it depends on
 
@@ -124,14 +124,14 @@ def _taps(params, tokens, shifts, case: Case) -> list[Any]:
     return [project_tap(params, tokens + shifts[slot], slot, case.config) for slot in range(4)]
 
 
-def _conversion(case: Case, repeats: int) -> dict[str, Measured]:
+def _conversion(case: Case, rounds: Iterable[int]) -> dict[str, Measured]:
     with tempfile.TemporaryDirectory() as folder:
         source, made = Path(folder) / "torch.safetensors", Path(folder) / "flax.safetensors"
         make_checkpoint(source, source_shapes(case.config))
-        return {"": measure_calls(lambda: convert(source, made, config=case.config), repeats)}
+        return {"": measure_calls(lambda: convert(source, made, config=case.config), rounds)}
 
 
-def _refinement(case: Case, repeats: int) -> dict[str, Measured]:
+def _refinement(case: Case, rounds: Iterable[int]) -> dict[str, Measured]:
     from scipy.ndimage import binary_dilation
 
     scene = SceneConfig(case.height, case.width, case.frames, dynamic=1.0, static_camera=0.0)
@@ -144,10 +144,10 @@ def _refinement(case: Case, repeats: int) -> dict[str, Measured]:
     def refine():
         return refine_masks(clip.images, clip.depth / unit, mask, pose, clip.intrinsics)
 
-    return {"": measure_calls(refine, repeats, compiles=True)}
+    return {"": measure_calls(refine, rounds, compiles=True)}
 
 
-def _start_up(case: Case, repeats: int) -> dict[str, Measured]:
+def _start_up(case: Case, rounds: Iterable[int]) -> dict[str, Measured]:
     """Fresh processes: what must not import jax, and the demo before and after its programs are in the cache."""
     found = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -162,7 +162,8 @@ def _start_up(case: Case, repeats: int) -> dict[str, Measured]:
             return done.stderr
 
         for name, code in _STARTS.items():
-            runs = [timed(lambda code=code: start("-c", _IMPORTED + code)) for _ in range(1 + repeats)][1:]
+            start("-c", _IMPORTED + code)
+            runs = [timed(lambda code=code: start("-c", _IMPORTED + code)) for _ in rounds]
             jax_too = any(said.endswith("True") for said, _ in runs)
             seconds = tuple(seconds for _, seconds in runs)
             found[f"{name}, {'jax' if jax_too else 'no jax'}"] = Measured(seconds)
@@ -172,10 +173,10 @@ def _start_up(case: Case, repeats: int) -> dict[str, Measured]:
     return found
 
 
-def _compile_steps(case: Case, repeats: int) -> dict[str, Measured]:
+def _compile_steps(case: Case, rounds: Iterable[int]) -> dict[str, Measured]:
     function, arguments = two_passes(case)
     seconds = []
-    for _ in range(repeats):
+    for _ in rounds:
         jax.clear_caches()
         traced, tracing = timed(lambda: jax.jit(function).trace(*arguments))
         lowered, lowering = timed(traced.lower)
@@ -184,7 +185,7 @@ def _compile_steps(case: Case, repeats: int) -> dict[str, Measured]:
 
 
 def _program(about: str, build: Callable[[Case], Program], parts: Callable[[Case], list[work.Work]]) -> Workload:
-    return Workload(about, lambda case, repeats: {"": measure_program(*build(case), repeats)}, parts)
+    return Workload(about, lambda case, rounds: {"": measure_program(*build(case), rounds)}, parts)
 
 
 def _trunk(case: Case) -> list[work.Work]:
