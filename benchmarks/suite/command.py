@@ -81,7 +81,9 @@ def suite(
         rows.extend(found)
         looks[size] = ceilings.looks
         title = f"{size}, {shape[1]} x {shape[0]} pixels, {dtype}"
-        sheets.extend([report.ceiling_sheet(title, looks[size]), report.row_sheet(f"{title}, {repeats} runs", found)])
+        if any(ceilings.looks.values()):
+            sheets.append(report.ceiling_sheet(title, ceilings.looks))
+        sheets.append(report.row_sheet(f"{title}, {repeats} runs", found))
 
     with compiling_anew(), Progress(console=screen, transient=True) as progress:
         for size in dict.fromkeys(sizes):
