@@ -74,9 +74,9 @@ def ours(weights: Path) -> Run:
 def peer(weights: Path, checkout: Path, *, mapped: bool) -> Run:
     """Return the passes of the public PyTorch code, from a checkout: VGGT's, or stages 1 and 2 of VGGT4D.
 
-    The plain pass has the same heads as ours and no others; VGGT4D runs its own model and its own functions, whose
-    one demand for CUDA is answered with the CPU. The weights are loaded as `from_pretrained` does it, the public way;
-    or else mapped, as ours are, and only those of heads that run.
+    The plain pass runs the same heads as ours and no others; VGGT4D runs its own model and its own functions, whose
+    one demand for CUDA is answered with the CPU. The weights of all heads are loaded as `from_pretrained` does it; or
+    else mapped, as ours are, and for a plain pass only those of its heads.
     """
     sys.path.insert(0, str(checkout))
     import torch

@@ -28,7 +28,8 @@ def pytest_configure(config):
         flags = ["--xla_backend_optimization_level=0"]
         if jax.__version_info__ < (0, 11):  # XLA ends a process for a flag that it does not know
             flags.append("--xla_cpu_use_fusion_emitters=false")
-        os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags])
+        given = os.environ.get("XLA_FLAGS", "").split()  # a worker's has them already
+        os.environ["XLA_FLAGS"] = " ".join([*given, *(flag for flag in flags if flag not in given)])
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -270,6 +270,47 @@ def test_how_far_outputs_are_apart():
     assert speed._difference(ours, theirs) == pytest.approx(0.1)
 
 
+def test_every_run_is_in_the_comparison(tmp_path, capsys, monkeypatch):
+    """Stand-ins answer: the public side takes twice the time, and more memory where it does not map its weights."""
+
+    class Answering:
+        def __init__(self, side, *arguments):
+            self.of = 1 if side == "ours" else 2
+            self.first = 8 if self.of == 2 and "mapped" not in arguments else self.of
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *error):
+            pass
+
+        def run(self, *, work, frames, keep=None, mask=None, **shape):
+            if keep:
+                np.savez(keep, pose=np.array([0.0, frames]), mask=np.array([True]))
+            return {"seconds": self.of * frames, "total": 1e9, "own": 0, "since start": self.first * 1e9, "reads": 0}
+
+    monkeypatch.setattr(speed, "Worker", Answering)
+    for name in ("a", "b", "vggt", "vggt4d"):
+        (tmp_path / name).mkdir()
+    speed.speed(
+        weights=tmp_path / "a",
+        converted=tmp_path / "b",
+        peer=tmp_path,
+        frames=(3,),
+        both=(4,),
+        repeats=2,
+        out=tmp_path / "c.json",
+    )
+    rows = json.loads((tmp_path / "c.json").read_text())
+    assert [(row["work"], row["frames"]) for row in rows] == [("pass", 3), ("vggt4d", 4), ("4dvggt-d", 4)]
+    assert [len(row[side]["runs"]) for row in rows for side in ("ours", "public")] == [2] * 6
+    shown = [line.split() for line in capsys.readouterr().out.splitlines()]
+    (plain,) = (row for row in shown if row[:1] == ["camera"])
+    assert " ".join(plain[3:]) == "3 3.00 6.00 0.50 1.00 1.00 1.00 0.00 0.00 - 1.00 8.00 0.12 0.0e+00 no"
+    (last,) = (row for row in shown if row[:1] == ["4dvggt-d,"])
+    assert " ".join(last[3:]) == "4 4.00 8.00 0.50 1.00 1.00 1.00 0.00 0.00 - - - - - no"
+
+
 def test_a_comparison_without_the_others_code_is_one_sentence(tmp_path, capsys):
     arguments = ["--weights", tmp_path / "a", "--converted", tmp_path / "b", "--peer", tmp_path]
     assert benchmarks.main(["speed", *map(str, arguments)]) == 2

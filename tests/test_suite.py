@@ -11,6 +11,7 @@ from benchmarks import __main__ as benchmarks
 from benchmarks.suite import gpu_targets, measure, work, workloads
 from benchmarks.suite.cases import TINY, Case
 from benchmarks.suite.ceilings import Ceilings, Rounds
+from benchmarks.suite.command import measured_rows
 from benchmarks.suite.measure import Measured
 from benchmarks.suite.memory import slope
 from benchmarks.suite.report import Row
@@ -123,6 +124,25 @@ def test_what_does_not_fit_is_a_row_and_not_the_end():
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
 
     assert measure.without_memory(fails)[""].failure == "out of memory"
+
+    def later(case, rounds):
+        for number in rounds:
+            if number:
+                fails()
+        return {}
+
+    class Looked(Ceilings):
+        def __init__(self):
+            pass
+
+        def look(self):
+            return {"linear": 1.0}
+
+    case = Case("tiny", TINY, {}, 2, 56, 56, "float32")
+    workload = workloads.Workload("fails in its second run", later, lambda case: [{"linear": 1.0}])
+    (row,) = measured_rows("pass", workload, case, 2, Looked())
+    assert row.measured.failure == "out of memory"
+    assert row.share_of_floor is row.floor_seconds is None
 
     def breaks():
         raise jax.errors.JaxRuntimeError("INTERNAL: odd")

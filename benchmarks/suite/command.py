@@ -68,9 +68,10 @@ def suite(
         config, params = load(size, weights if size == "full" else None)
         shape = frame_size(size, config, height, width)
         cases = [Case(size, config, params, count, *shape, dtype) for count in frames]
-        progress.update(task, description=f"{size}: ceilings")
-        ceilings = Ceilings(config, cases[0].grid, dtype)
         wanted = [name for name in workloads if WORKLOADS[name].scope != "process" or size == sizes[0]]
+        progress.update(task, description=f"{size}: ceilings")
+        counted = any(WORKLOADS[name].parts for name in wanted)
+        ceilings = Ceilings(config, cases[0].grid, dtype) if counted else None
         runs = [(name, case) for name in wanted for case in cases[: None if WORKLOADS[name].scope == "clip" else 1]]
         progress.update(task, total=len(runs))
         found: list[Row] = []
@@ -79,9 +80,9 @@ def suite(
             found.extend(measured_rows(name, WORKLOADS[name], case, repeats, ceilings))
             progress.advance(task)
         rows.extend(found)
-        looks[size] = ceilings.looks
         title = f"{size}, {shape[1]} x {shape[0]} pixels, {dtype}"
-        if any(ceilings.looks.values()):
+        if ceilings is not None:
+            looks[size] = ceilings.looks
             sheets.append(report.ceiling_sheet(title, ceilings.looks))
         sheets.append(report.row_sheet(f"{title}, {repeats} runs", found))
 
@@ -115,8 +116,9 @@ def measured_rows(
     size = None if workload.scope == "process" else case.size
     shape = (case.frames, case.height, case.width) if workload.scope == "clip" else (None, None, None)
     results = without_memory(lambda: workload.measure(case, rounds))
+    rates = rounds.rates if isinstance(rounds, Rounds) else ()
     names = [f"{name}: {result}" if result else name for result in results]
     return [
-        Row(full, size, *shape, case.dtype, measured, parts, rounds.rates if isinstance(rounds, Rounds) else ())
+        Row(full, size, *shape, case.dtype, measured, parts, () if measured.failure else rates)
         for full, measured in zip(names, results.values(), strict=True)
     ]

@@ -55,7 +55,7 @@ class Row:
 
     @property
     def floor(self) -> dict[str, float]:
-        """The same by the median of the runs."""
+        """Seconds by kind of work: of each kind, the median of the runs."""
         kinds = dict.fromkeys(kind for floor in self.floors for kind in floor)
         return {kind: float(np.median([floor.get(kind, 0.0) for floor in self.floors])) for kind in kinds}
 
@@ -65,7 +65,7 @@ class Row:
 
     @property
     def floor_seconds(self) -> float | None:
-        return sum(self.floor.values()) or None
+        return float(np.median([sum(floor.values()) for floor in self.floors])) or None if self.rates else None
 
     @property
     def flop_per_second(self) -> float | None:
@@ -156,7 +156,11 @@ def row_sheet(title: str, rows: Sequence[Row]) -> Sheet:
         "workload", "frames", "compile s", "median s", "min s", "max s", "temp MB", "output MB",
         "host MB", "device MB", "GFLOP/s", "floor s", "floor/run",
     )  # fmt: skip
-    return Sheet(f"{title}; temp and output: memory by XLA's analysis", headings, [_cells(row) for row in rows])
+    return Sheet(
+        f"{title}; temp and output: memory by XLA's analysis; floor/run: the median run's",
+        headings,
+        [_cells(row) for row in rows],
+    )
 
 
 def _cells(row: Row) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 What is counted is what a product of matrices, a convolution, an exponential, a GELU or the reading of weights cannot do
 without; norms, other activations, resizing and copies are free here. Work over ceilings is a floor: seconds that no
-implementation of the same arithmetic can beat on that machine.
+implementation of the same arithmetic by the same compiler can beat on that machine.
 """
 
 from __future__ import annotations
