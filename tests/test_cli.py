@@ -101,11 +101,12 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     assert again.depth.shape == (3, *picture.size[::-1])
     assert np.allclose(again.camera_from_world, result.camera_from_world, atol=1e-5)
 
-    code, _, err = run(capsys, "reconstruct", frames, "--out", tmp_path / "still", "--no-masks", "--method", "vggt")
+    code, _, err = run(capsys, "reconstruct", frames, "--out", tmp_path / "still", "--no-masks", "--tracks", "grid:2")
     assert code == 0, err
     still = Reconstruction.load(tmp_path / "still")
     assert not still.dynamic_mask.any()
     assert still.settings["refine_mask"] is False
+    assert np.asarray(still.track_positions).shape == (3, 4, 2)
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,7 @@ def test_lengths_are_few_and_never_an_eighth_too_long():
     assert padded_frames(17, (17, -17)) == 17  # frame 0 would get one
 
 
-@pytest.mark.parametrize("method", ["4dvggt-d"])
+@pytest.mark.parametrize("method", ["vggt4d", "4dvggt-d"])
 def test_a_padded_clip_gives_the_same(model, method):
     clip = load_clip(pictures(17), size=SIDE)
     alone = reconstruct(model, clip, method=method, align_scale=True, keep_passes=True)
