@@ -18,17 +18,18 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
-from vggtjax.batch import reconstruct_many
-from vggtjax.checkpoint import Model, load_model
+from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.sources import clips_by_name
+from vggtjax.commands.process import keep_freed_memory
 from vggtjax.errors import ClipError, InputError
-from vggtjax.files import writing
-from vggtjax.host_memory import keep_freed_memory
-from vggtjax.methods import MethodName
-from vggtjax.pipeline import reconstruct
+from vggtjax.options import MethodName
+from vggtjax.pipeline.batch import reconstruct_many
+from vggtjax.pipeline.run import reconstruct
+from vggtjax.pretrained.load import load_model
 from vggtjax.results.reconstruction import ARCHIVE_NAME, is_result
 from vggtjax.scenes import SceneConfig, generate, load_textures
+from vggtjax.storage.writing import writing
 
 _SHAPES = ((1.0, 1.0), (1.0, 0.75), (0.6, 1.0))  # width and height of the pictures, in the largest side
 _ENLARGED = 2  # largest side of the pictures, in sides of the model

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float64
 
+from vggtjax.clips.truth import Truth
 from vggtjax.evaluation.blind import (
     best_angular_velocity,
     line_centre_error,
@@ -18,10 +19,9 @@ from vggtjax.evaluation.blind import (
     still_centre_error,
     turning,
 )
-from vggtjax.evaluation.depth import depth_errors, mean_depth_map
 from vggtjax.evaluation.ladder import LadderRow
-from vggtjax.evaluation.trajectory import rotation_error
-from vggtjax.evaluation.truth import Truth
+from vggtjax.evaluation.metrics.depth import depth_errors, mean_depth_map
+from vggtjax.evaluation.metrics.trajectory import rotation_error
 from vggtjax.scenes import SceneConfig, generate, load_textures
 
 Progress = Callable[[int, int], object]

@@ -16,12 +16,13 @@ from benchmarks.blind_guesses import Comparison, Guess, Prior, compare, guesses,
 from benchmarks.plots import check_matplotlib, plot_ladder, plot_rotations, plot_sweep
 from benchmarks.real_clips import is_clip_folder, load_windows
 from benchmarks.summaries import Spread, Summary, comparison_table, ladder_table, saliency_auc, summarise
-from vggtjax.checkpoint import Model, load_model
+from vggtjax.checkpoint import Model
+from vggtjax.clips.truth import Truth, batched_truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import LadderRow, ladder
-from vggtjax.evaluation.truth import Truth, batched_truth
-from vggtjax.files import staging, writing
+from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
+from vggtjax.storage.writing import staging, writing
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 SUPPRESS = ("zero", "drop")

@@ -9,13 +9,14 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from vggtjax.checkpoint import load_model, numpy_dtype, save_model
+from vggtjax.checkpoint import numpy_dtype, save_model
+from vggtjax.clips.truth import Truth
 from vggtjax.config import VGGTConfig
-from vggtjax.demo import CLIP, MODEL, SCENE_SEED, write_demo_clip
 from vggtjax.errors import InputError
-from vggtjax.evaluation.truth import Truth
 from vggtjax.network.backbone import patch_positions
 from vggtjax.network.layers import Params
+from vggtjax.pretrained.embedded import CLIP, MODEL, SCENE_SEED, write_demo_clip
+from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
 
 MOST_MODEL_BYTES = 24 << 20

@@ -14,8 +14,8 @@ import tyro
 from rich.progress import Progress
 
 from benchmarks.seeded import seeded_tensor
-from vggtjax.files import writing
-from vggtjax.tensor_file import Spec, write_tensors
+from vggtjax.storage.tensor_file import Spec, write_tensors
+from vggtjax.storage.writing import writing
 
 VGGT_1B = Path(__file__).parents[1] / "tests" / "golden" / "shapes_vggt_1b.json"
 

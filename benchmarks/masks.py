@@ -11,13 +11,14 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.real_clips import is_clip_folder, load_windows
-from vggtjax.checkpoint import Model, load_model
+from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import load_clip
+from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
-from vggtjax.evaluation.masks import jaccard, precision_recall
-from vggtjax.evaluation.truth import Truth
-from vggtjax.pipeline import reconstruct
-from vggtjax.refinement import refine_masks
+from vggtjax.evaluation.metrics.masks import jaccard, precision_recall
+from vggtjax.method.refinement import refine_masks
+from vggtjax.pipeline.run import reconstruct
+from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
 
 REFINED = {"as it is": None, "refined": "result", "refined by true geometry": "truth"}

@@ -11,7 +11,7 @@ from benchmarks.blind_guesses import Guess
 from benchmarks.summaries import AGAINST_FIRST, METRICS, Summary
 from vggtjax.errors import MissingExtraError
 from vggtjax.evaluation.ladder import LadderRow
-from vggtjax.files import writing
+from vggtjax.storage.writing import writing
 
 SHOWN = AGAINST_FIRST
 _COLOURS = {None: "0.55", "mined": "tab:blue", "true": "tab:orange"}

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from rich.table import Table
 
 from vggtjax.errors import InputError
-from vggtjax.evaluation.point_clouds import point_cloud_errors
+from vggtjax.evaluation.metrics.point_clouds import point_cloud_errors
 
 ROOM = np.array([5.0, 2.6, 7.0])  # metres: width, height, length
 PIXELS = (294, 518)  # of a frame: points come in the order of its rows, as those of a clip do

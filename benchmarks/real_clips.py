@@ -10,10 +10,10 @@ from jaxtyping import Float64, UInt16
 from PIL import Image
 
 from vggtjax.clips.clip import load_clip
+from vggtjax.clips.truth import Truth, at_clip_pixels, intrinsics_at_clip_pixels
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.plain import takes
-from vggtjax.evaluation.truth import Truth, at_clip_pixels, intrinsics_at_clip_pixels
 
 
 class Windows(NamedTuple):

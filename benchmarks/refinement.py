@@ -9,9 +9,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
-from vggtjax.refinement import refine_masks, statistical_outliers
-from vggtjax.results.geometry import unproject
+from vggtjax.method.refinement import refine_masks, statistical_outliers
 from vggtjax.scenes import load_textures
 from vggtjax.scenes.render import generate
 from vggtjax.scenes.scene import SceneConfig

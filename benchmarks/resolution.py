@@ -12,7 +12,7 @@ from rich.table import Table
 
 from benchmarks.real_clips import read_picture
 from vggtjax.errors import InputError
-from vggtjax.results.frames import enlarged_depth
+from vggtjax.results.frame import enlarged_depth
 
 _OFF = 0.05  # relative error from which a pixel counts as misplaced
 Axis = Float[np.ndarray, " n"]

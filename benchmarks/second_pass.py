@@ -17,12 +17,12 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from vggtjax.checkpoint import load_model
 from vggtjax.errors import InputError
-from vggtjax.evaluation.trajectory import centre_error, rotation_error
-from vggtjax.mask import dynamic_tokens
+from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
+from vggtjax.method.mask import dynamic_tokens
 from vggtjax.network.model import forward
 from vggtjax.network.pose import decode_pose
+from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, SyntheticClip, held_out_scenes
 
 _forward = jax.jit(forward, static_argnames=("config", "suppress", "outputs"))

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from vggtjax.errors import InputError
-from vggtjax.files import writing
+from vggtjax.storage.writing import writing
 
 _COLUMNS = 200
 _AGREE = 2e-4  # of each array's spread

@@ -28,14 +28,14 @@ Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S
 
 def ours(weights: Path) -> Run:
     """Return this library's passes: a plain one, or a whole method."""
-    from vggtjax.host_memory import keep_freed_memory
+    from vggtjax.commands.process import keep_freed_memory
 
     keep_freed_memory()
     import jax
     import jax.numpy as jnp
 
     from vggtjax import forward, infer, load_model
-    from vggtjax.mask import dynamic_tokens
+    from vggtjax.method.mask import dynamic_tokens
 
     model = load_model(weights)
     compiled: dict[tuple, Any] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from converters.sources import SUFFIXES, choose_file, weight_files
+from converters.files import SUFFIXES, choose_file, weight_files
 from vggtjax.errors import CheckpointError, MissingExtraError
 
 

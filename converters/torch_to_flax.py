@@ -15,13 +15,15 @@ import ml_dtypes
 import numpy as np
 from flax.traverse_util import unflatten_dict
 
+from converters.files import Tensor, read_state_dict, weight_files
+from converters.locate import Weights, locate
 from converters.rules import IGNORED, RULES, Rule, Transform
-from converters.sources import Tensor, Weights, locate, read_state_dict, weight_files
 from converters.strangers import refuse_strangers
-from vggtjax.checkpoint import DType, Progress, flat_shapes, numpy_dtype, problems_sentence, write_checkpoint
+from vggtjax.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
 from vggtjax.config import HEAD_NAMES, VGGTConfig, vggt_1b
-from vggtjax.errors import CheckpointError, InputError
-from vggtjax.tensor_file import Spec
+from vggtjax.errors import CheckpointError, InputError, problems_sentence
+from vggtjax.progress import Progress
+from vggtjax.storage.tensor_file import Spec
 
 _STACKED = {rule.path for rule in RULES if rule.stacked}
 _FLOATS = tuple(np.dtype(kind) for kind in (np.float32, ml_dtypes.bfloat16, np.float16, np.float64))

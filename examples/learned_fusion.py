@@ -19,10 +19,10 @@ from rich.markdown import Markdown
 from rich.progress import Progress
 
 from vggtjax import load_model
-from vggtjax.files import writing
 from vggtjax.learning import FitConfig, ablate, generated_passes
 from vggtjax.learning.ablation import gains, markdown, table
 from vggtjax.learning.plots import draw_fits
+from vggtjax.storage.writing import writing
 
 FAMILIES = ("scale", "calibrated", "correlated", "features", "robust", "soft", "full", "gate")
 

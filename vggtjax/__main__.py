@@ -2,6 +2,6 @@
 
 import sys
 
-from vggtjax.cli import main
+from vggtjax.commands.main import main
 
 sys.exit(main())

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import logging
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -18,16 +16,14 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from vggtjax.cache import cache_folder
-from vggtjax.config import VGGTConfig, vggt_1b
-from vggtjax.errors import CheckpointError, InputError
+from vggtjax.config import VGGTConfig
+from vggtjax.errors import CheckpointError, InputError, problems_sentence
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
-from vggtjax.programs import kept_text
-from vggtjax.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
+from vggtjax.storage.programs import kept_text
+from vggtjax.storage.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
 
 DType = Literal["float32", "bfloat16"]
-Progress = Callable[[int, int], object]
 
 FORMAT = "vggtjax"
 VERSION = "1"
@@ -35,9 +31,6 @@ VERSION = "1"
 _DTYPES = {name: np.dtype(jax.numpy.dtype(name)) for name in ("float32", "bfloat16")}
 _MOST_CONFIG_LETTERS = 2**16
 _MOST_NAME_LETTERS = 200
-_MOST_PROBLEMS = 20  # spelt out in one message
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,26 +67,6 @@ class Model:
         """Names of the heads that the model has."""
         return self.config.heads
 
-    def compile(self, frames: int, height: int, width: int, **options: Any) -> dict[str, Any]:
-        """Compile ahead of time what `reconstruct` runs for a clip of this shape.
-
-        Options are those of `reconstruct` that decide it: method, gram, suppress, mask_pairs, align_scale,
-        smooth_frames, compute_dtype, pad_frames and keep_passes.
-
-        Later calls for this shape in this process start at once, and so do those of other processes where compilations
-        are kept (as the command line does).
-
-        Returns:
-            What each stage needs beside what it reads, by XLA's own analysis: `.temporary` and `.output` bytes.
-
-        Raises:
-            InputError: a shape that is none, or not of the model's patches; an option that is none.
-            DeviceMemoryError: it does not fit.
-        """
-        from vggtjax.pipeline import compile_for
-
-        return compile_for(self, frames, height, width, **options)
-
     def summary(self) -> dict[str, Any]:
         """Return what a person asks about a model, as plain values."""
         return {
@@ -111,49 +84,6 @@ class Model:
             "image_size": self.config.image_size,
             "patch_size": self.config.patch_size,
         }
-
-
-def load_model(
-    name_or_path: str | Path,
-    *,
-    config: VGGTConfig | None = None,
-    dtype: DType | None = None,
-    progress: Progress | None = None,
-) -> Model:
-    """Load a model by path or name.
-
-    PyTorch weights are converted once, into the folder that VGGTJAX_CACHE names or else the user's cache; after that
-    the conversion is loaded, as long as the source does not change. On a CPU the parameters stay in the file, which is
-    mapped into memory: replace it, but never write into it, while the model is in use.
-
-    Args:
-        name_or_path: "demo" (the small model in the package), a file of this library, PyTorch weights (.safetensors, a
-            sharded one's index or folder, .pt, .pth), or a hub id such as "facebook/VGGT-1B".
-        config: the configuration of PyTorch weights; None for VGGT-1B. A file of this library knows its own.
-        dtype: of the parameters; None keeps the file's, and makes float32 of PyTorch weights.
-        progress: called during a conversion with the steps done and their number.
-
-    Raises:
-        CheckpointError: nothing is there, or it cannot be read, or does not fit the configuration.
-        MissingExtraError: the weights need torch or huggingface_hub, which is not installed.
-    """
-    from converters.sources import locate
-
-    if dtype is not None:
-        numpy_dtype(dtype)
-    if str(name_or_path) == "demo":
-        from vggtjax.demo import demo_model
-
-        model = demo_model(dtype or "float32")
-    else:
-        weights = locate(name_or_path)
-        path = weights.path
-        if not is_checkpoint(path):
-            path = _converted(path, weights.name, config or vggt_1b(), dtype or "float32", progress)
-        model = read_model(path, dtype=dtype)
-    if config not in (None, model.config):
-        raise CheckpointError(f"{name_or_path} knows its configuration, and it is not the one given; leave that out")
-    return model
 
 
 def is_checkpoint(path: str | Path) -> bool:
@@ -248,13 +178,6 @@ def numpy_dtype(dtype: DType) -> np.dtype:
     return _DTYPES[dtype]
 
 
-def problems_sentence(subject: str, problems: Sequence[str]) -> str:
-    """Return one sentence that says how many problems there are and spells out the first ones."""
-    shown = "; ".join("".join(c if c.isprintable() else "?" for c in text[:300]) for text in problems[:_MOST_PROBLEMS])
-    more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
-    return f"{subject}: {len(problems)} {'problem' if len(problems) == 1 else 'problems'}: {shown}{more}"
-
-
 def _check(subject: str, tensors: Mapping[str, Any], config: VGGTConfig) -> None:
     shapes = flat_shapes(config)
     problems = [f"missing parameter {name}" for name in shapes if name not in tensors]
@@ -294,19 +217,3 @@ def _origin(text: str) -> dict[str, str]:
     pairs = origin.items() if isinstance(origin, dict) else ()
     known = all(name.isprintable() and re.fullmatch("[0-9a-f]{64}", str(digest)) for name, digest in pairs)
     return dict(pairs) if known else {}
-
-
-def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:
-    """Return the conversion of PyTorch weights in the cache, made now if it is not there."""
-    from converters.sources import Weights, weight_files
-    from converters.torch_to_flax import convert_weights
-
-    stats = [(file.resolve(), file.stat()) for file in weight_files(path)]
-    facts = [VERSION, dtype, config.to_json(), *(f"{file} {stat.st_size} {stat.st_mtime_ns}" for file, stat in stats)]
-    key = hashlib.sha256("\n".join(facts).encode("utf-8", "surrogateescape")).hexdigest()[:16]
-    destination = cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', name)[:80]}-{key}.safetensors"
-    if not destination.exists():
-        logger.info("converting %s to %s, this once", path, destination)
-        convert_weights(Weights(path, name), destination, dtype=dtype, config=config, progress=progress)
-    logger.info("loading %s", destination)
-    return destination

@@ -1,5 +1,9 @@
 """Exceptions of the public boundary: one clear sentence each; the command line turns them into exit code 2."""
 
+from collections.abc import Sequence
+
+_MOST_PROBLEMS = 20  # spelt out in one message
+
 
 class VggtjaxError(Exception):
     """Base of everything that this library raises on purpose."""
@@ -34,3 +38,10 @@ class MissingExtraError(VggtjaxError, ImportError):
 
     def __init__(self, purpose: str, extra: str) -> None:
         super().__init__(f"{purpose} needs the extra '{extra}': pip install 'vggtjax[{extra}]'")
+
+
+def problems_sentence(subject: str, problems: Sequence[str]) -> str:
+    """Return one sentence that says how many problems there are and spells out the first ones."""
+    shown = "; ".join("".join(c if c.isprintable() else "?" for c in text[:300]) for text in problems[:_MOST_PROBLEMS])
+    more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
+    return f"{subject}: {len(problems)} {'problem' if len(problems) == 1 else 'problems'}: {shown}{more}"

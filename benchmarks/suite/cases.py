@@ -13,12 +13,12 @@ from jaxtyping import Array, Float
 
 from benchmarks.seeded import seeded_images
 from benchmarks.suite.work import Grid
-from vggtjax.checkpoint import load_model
 from vggtjax.config import VGGTConfig
-from vggtjax.demo import demo_model
 from vggtjax.errors import InputError
 from vggtjax.network.layers import Params
 from vggtjax.network.model import init_params
+from vggtjax.pretrained.embedded import demo_model
+from vggtjax.pretrained.load import load_model
 
 Size = Literal["tiny", "demo", "full"]
 DType = Literal["float32", "bfloat16"]

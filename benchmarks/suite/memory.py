@@ -17,10 +17,10 @@ from benchmarks.suite.measure import analysed, compiling_anew
 from benchmarks.suite.report import Sheet, console, describe, machine, number, write_json
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
+from vggtjax.method.passes import first_pass, run_passes
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.backbone import encode
 from vggtjax.network.model import forward, parameter_shapes
-from vggtjax.passes import first_pass, run_passes
 
 
 def _first_with_cues(params, images, config: VGGTConfig, compute_dtype: str):

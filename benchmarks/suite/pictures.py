@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.suite.report import Row
 from benchmarks.suite.work import UNITS
-from vggtjax.files import writing
+from vggtjax.storage.writing import writing
 
 _COLOURS = dict(
     zip(UNITS, ("tab:blue", "tab:cyan", "tab:orange", "tab:red", "tab:olive", "tab:green", "tab:purple"), strict=True)

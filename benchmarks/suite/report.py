@@ -21,7 +21,7 @@ from rich.table import Table
 from benchmarks.suite.measure import Measured
 from benchmarks.suite.work import UNITS, Work, floor_by_kind, flop
 from vggtjax.errors import InputError
-from vggtjax.files import writing
+from vggtjax.storage.writing import writing
 
 _MOST_BYTES = 2**24  # of a stored run that are read
 _WIDTH = 150  # of tables, in letters, where the terminal is narrower

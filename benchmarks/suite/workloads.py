@@ -20,14 +20,14 @@ from benchmarks.suite.cases import Case
 from benchmarks.suite.measure import Measured, measure_calls, measure_program, timed
 from converters.torch_to_flax import convert, source_shapes
 from vggtjax.errors import InputError
-from vggtjax.motion import GramCues
+from vggtjax.method.cues import GramCues
+from vggtjax.method.refinement import refine_masks
 from vggtjax.network.aggregator import aggregate
 from vggtjax.network.backbone import encode
 from vggtjax.network.dpt_head import predict_dense, project_tap
 from vggtjax.network.model import forward
 from vggtjax.network.track_head import predict_tracks
-from vggtjax.pipeline import infer
-from vggtjax.refinement import refine_masks
+from vggtjax.pipeline.run import infer
 from vggtjax.scenes import SceneConfig, load_textures
 from vggtjax.scenes.render import generate
 

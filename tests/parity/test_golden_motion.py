@@ -8,8 +8,8 @@ import pytest
 
 from benchmarks.seeded import seeded_images
 from vggtjax import forward
-from vggtjax.mask import cluster_means, multi_otsu_threshold, upsample
-from vggtjax.motion import GramCues
+from vggtjax.method.cues import GramCues
+from vggtjax.method.mask import cluster_means, multi_otsu_threshold, upsample
 
 TOLERANCE = 1e-4  # absolute, of maps in [0, 1]; measured: 4e-6
 

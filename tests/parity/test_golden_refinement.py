@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from vggtjax import refinement
-from vggtjax.refinement import cluster_losses, refine_masks, statistical_outliers
-from vggtjax.results.geometry import unproject
+from vggtjax.cameras import unproject
+from vggtjax.method import refinement
+from vggtjax.method.refinement import cluster_losses, refine_masks, statistical_outliers
 
 
 @pytest.fixture(scope="module")

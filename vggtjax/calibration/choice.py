@@ -13,7 +13,7 @@ from jaxtyping import Float32, Int8
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Progress, Sweep, token_auc
 from vggtjax.config import Cue, Gram, MotionConfig
 from vggtjax.errors import InputError
-from vggtjax.motion import normalise
+from vggtjax.method.cues import normalise
 
 MAX_TERMS = 5  # as many as VGGT4D's table has
 MIN_GAIN = 0.001

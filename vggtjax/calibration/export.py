@@ -23,7 +23,7 @@ from vggtjax.calibration.choice import Choice, Rating, Step, halves
 from vggtjax.calibration.heatmap import draw_sweep
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, UNCLEAR, Sweep
 from vggtjax.checkpoint import Model, save_model
-from vggtjax.files import check_free, says_format, staging
+from vggtjax.storage.writing import check_free, says_format, staging
 
 FORMAT = "vggtjax calibration"
 VERSION = 1

@@ -15,8 +15,8 @@ from jaxtyping import Array, Bool, Float, Float32, Float64, Int, Int8
 
 from vggtjax.config import Cue, Gram, MotionConfig, VGGTConfig
 from vggtjax.errors import DeviceMemoryError, InputError
-from vggtjax.evaluation.masks import auc
-from vggtjax.motion import GramCues, Sums, normalise
+from vggtjax.evaluation.metrics.masks import auc
+from vggtjax.method.cues import GramCues, Sums, normalise
 from vggtjax.network.layers import Params
 from vggtjax.network.model import forward
 

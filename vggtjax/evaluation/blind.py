@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from vggtjax.errors import InputError
-from vggtjax.evaluation.trajectory import centres, checked_poses, from_first
+from vggtjax.evaluation.metrics.trajectory import centres, checked_poses, from_first
 
 _TOLERANCE = 1e-8  # radians per frame
 _FIRST_STEP = 0.02  # radians per frame; how far from its start the search looks first

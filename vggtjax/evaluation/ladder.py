@@ -12,17 +12,17 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vggtjax.checkpoint import Model
+from vggtjax.clips.truth import ClipTruth, Truth, batched_truth
 from vggtjax.config import Gram, MotionConfig, Suppress
 from vggtjax.errors import InputError
-from vggtjax.evaluation.depth import depth_errors, measured, median_scale
-from vggtjax.evaluation.masks import auc, jaccard
-from vggtjax.evaluation.trajectory import centre_error, rotation_error
-from vggtjax.evaluation.truth import ClipTruth, Truth, batched_truth
-from vggtjax.mask import upsample
-from vggtjax.methods import LADDER, find_method
-from vggtjax.passes import Assembly, Passes, assemble
-from vggtjax.programs import Program
-from vggtjax.stages import Stage, stages_of
+from vggtjax.evaluation.metrics.depth import depth_errors, measured, median_scale
+from vggtjax.evaluation.metrics.masks import auc, jaccard
+from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
+from vggtjax.method.mask import upsample
+from vggtjax.method.passes import Assembly, Passes, assemble
+from vggtjax.options import LADDER, find_method
+from vggtjax.pipeline.stages import Stage, stages_of
+from vggtjax.storage.programs import Program
 
 MaskSource = Literal["mined", "true"]
 Progress = Callable[[int, int], object]

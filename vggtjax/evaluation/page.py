@@ -12,7 +12,7 @@ from vggtjax.errors import MissingExtraError
 from vggtjax.evaluation import tables
 from vggtjax.evaluation.plots import check_matplotlib, draw_sequence
 from vggtjax.evaluation.records import Record, Records, costs, safe_name, summary
-from vggtjax.files import writing
+from vggtjax.storage.writing import writing
 
 PLOT_FOLDER = "plots"
 _MOST_BYTES = 2**28

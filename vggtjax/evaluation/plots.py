@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vggtjax.errors import MissingExtraError
-from vggtjax.files import writing
 from vggtjax.results.previews import color_depth, inverse_depth_range, overlay
+from vggtjax.storage.writing import writing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

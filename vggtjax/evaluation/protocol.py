@@ -10,16 +10,23 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 from scipy.ndimage import map_coordinates
 
+from vggtjax import cameras as geometry
+from vggtjax.clips.truth import Placed, at_clip_pixels, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.sequence import Sequence
-from vggtjax.evaluation.masks import Empty, auc, frame_scores, mask_scores
-from vggtjax.evaluation.point_clouds import nearest_distances, paired_distance, statistics
-from vggtjax.evaluation.trajectory import FEWEST_POSES, Similarity, centres, moves, trajectory_errors, umeyama_sim3
-from vggtjax.evaluation.truth import Placed, at_clip_pixels, intrinsics_at_clip_pixels
-from vggtjax.evaluation.uncertainty import reliability_curve, sparsification_curve, uncertainty_scores
-from vggtjax.evaluation.video_depth import Align, depth_alignment, video_depth_errors
-from vggtjax.results import geometry
-from vggtjax.results.frames import inside_pictures
+from vggtjax.evaluation.metrics.masks import Empty, auc, frame_scores, mask_scores
+from vggtjax.evaluation.metrics.point_clouds import nearest_distances, paired_distance, statistics
+from vggtjax.evaluation.metrics.trajectory import (
+    FEWEST_POSES,
+    Similarity,
+    centres,
+    moves,
+    trajectory_errors,
+    umeyama_sim3,
+)
+from vggtjax.evaluation.metrics.uncertainty import reliability_curve, sparsification_curve, uncertainty_scores
+from vggtjax.evaluation.metrics.video_depth import Align, depth_alignment, video_depth_errors
+from vggtjax.results.frame import inside_pictures
 from vggtjax.results.reconstruction import Reconstruction
 
 PIXEL_OFFSET = 0.0  # of points: the protocol lifts whole pixel numbers, predicted and true ones alike

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 
 from vggtjax.errors import ResultError
-from vggtjax.files import writing
-from vggtjax.results import archive
+from vggtjax.storage import arrays as archive
+from vggtjax.storage.writing import writing
 
 FOLDER = "sequences"
 BOTH_OVER_ONE = "both passes over one"

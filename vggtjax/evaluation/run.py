@@ -14,10 +14,10 @@ import numpy as np
 
 from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.evaluation.datasets.sequence import Sequence as Clip
-from vggtjax.evaluation.masks import Empty
+from vggtjax.evaluation.metrics.masks import Empty
+from vggtjax.evaluation.metrics.video_depth import Align
 from vggtjax.evaluation.protocol import TruthAtPixels, score
 from vggtjax.evaluation.records import Record, Records
-from vggtjax.evaluation.video_depth import Align
 from vggtjax.results.reconstruction import Reconstruction
 
 OnStage = Callable[[str], AbstractContextManager[Any]]

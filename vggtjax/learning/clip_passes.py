@@ -14,20 +14,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from vggtjax.cache import cache_folder
 from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError, ResultError
-from vggtjax.files import writing
-from vggtjax.learning.family import Observations
 from vggtjax.learning.fit import FitClips
 from vggtjax.learning.objectives import View
-from vggtjax.learning.observe import observe
+from vggtjax.method.fusion_inputs import observe
+from vggtjax.method.fusion_rule import Observations
+from vggtjax.method.passes import Cameras, Passes
 from vggtjax.network.model import Predictions
-from vggtjax.passes import Cameras, Passes
-from vggtjax.pipeline import OnStage, reconstruct
-from vggtjax.programs import source_digest
-from vggtjax.results import archive
+from vggtjax.pipeline.run import reconstruct
+from vggtjax.progress import OnStage
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.storage import arrays as archive
+from vggtjax.storage.cache import cache_folder
+from vggtjax.storage.programs import source_digest
+from vggtjax.storage.writing import writing
 
 METHOD = "4dvggt-d"
 _LOOKED_AT = 64  # values of every parameter that tell models apart

@@ -22,13 +22,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from vggtjax.files import check_free, says_format, staging, writing
 from vggtjax.learning.ablation import PAPER, Outcome, Split, fit_split, gains, markdown, split_clips, table
 from vggtjax.learning.clip_passes import ClipPasses, observations
-from vggtjax.learning.family import identity, parse_family
 from vggtjax.learning.fit import FitConfig
-from vggtjax.learning.fusion_file import save_fusion
 from vggtjax.learning.plots import draw_fits
+from vggtjax.method.fusion_file import save_fusion
+from vggtjax.method.fusion_rule import identity, parse_family
+from vggtjax.storage.writing import check_free, says_format, staging, writing
 
 FORMAT = "vggtjax fits"
 VERSION = 1

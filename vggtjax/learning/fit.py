@@ -16,8 +16,6 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.errors import InputError, ResultError
-from vggtjax.files import writing
-from vggtjax.learning.family import PARTS, FusionParams, Observations, fuse, identity, is_free, projected, start
 from vggtjax.learning.objectives import (
     View,
     geometric_loss,
@@ -25,7 +23,9 @@ from vggtjax.learning.objectives import (
     negative_log_likelihood,
     photometric_loss,
 )
-from vggtjax.results import archive
+from vggtjax.method.fusion_rule import PARTS, FusionParams, Observations, fuse, identity, is_free, projected, start
+from vggtjax.storage import arrays as archive
+from vggtjax.storage.writing import writing
 
 Objective = Literal["gaussian", "laplace", "joint", "photometric", "geometric"]
 OBJECTIVES: tuple[Objective, ...] = ("gaussian", "laplace", "joint", "photometric", "geometric")

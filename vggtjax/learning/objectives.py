@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.learning.family import Fused, FusionParams, Observations, fuse, log_precisions
 from vggtjax.learning.soft import lift
+from vggtjax.method.fusion_rule import Fused, FusionParams, Observations, fuse, log_precisions
+from vggtjax.method.passes import Cameras
 from vggtjax.network.precision import full_precision
-from vggtjax.passes import Cameras
 
 Likelihood = Literal["gaussian", "laplace"]
 _MOST = 80.0

@@ -10,11 +10,11 @@ import jax
 import numpy as np
 
 from vggtjax.errors import MissingExtraError
-from vggtjax.evaluation.video_depth import depth_alignment
-from vggtjax.files import writing
+from vggtjax.evaluation.metrics.video_depth import depth_alignment
 from vggtjax.learning.ablation import PAPER, Outcome
 from vggtjax.learning.clip_passes import ClipPasses, observations
-from vggtjax.learning.family import FusionParams, log_precisions
+from vggtjax.method.fusion_rule import FusionParams, log_precisions
+from vggtjax.storage.writing import writing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -13,8 +13,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from vggtjax.errors import InputError
-from vggtjax.learning.family import PARTS, FusionParams, identity, projected
 from vggtjax.learning.fit import FitClips, Objective, clip_losses
+from vggtjax.method.fusion_rule import PARTS, FusionParams, identity, projected
 
 AT_ONCE = 16  # candidates that are vectorised together; the others wait
 

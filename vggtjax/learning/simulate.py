@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtjax.learning.family import FEATURES, FusionParams, Observations, log_precisions
+from vggtjax.method.fusion_rule import FEATURES, FusionParams, Observations, log_precisions
 
 DEEPEST, NEAREST = 3.0, 1.0
 

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vggtjax.config import Gram, MotionConfig, VGGTConfig
-from vggtjax.learning.family import FusionParams, fuse, identity, soft_mask
-from vggtjax.learning.observe import observe
-from vggtjax.mask import CONSTANT, otsu_threshold, upsample
+from vggtjax.method.fusion_inputs import observe
+from vggtjax.method.fusion_rule import FusionParams, fuse, identity, soft_mask
+from vggtjax.method.mask import CONSTANT, otsu_threshold, upsample
+from vggtjax.method.passes import Cameras, Passes, first_pass, second_pass
 from vggtjax.network.backbone import encode
 from vggtjax.network.layers import Params
 from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import full_precision
-from vggtjax.passes import Cameras, Passes, first_pass, second_pass
 
 
 class SoftMasking(NamedTuple):

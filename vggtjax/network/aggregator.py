@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress, VGGTConfig
-from vggtjax.motion import GramCues
+from vggtjax.method.cues import GramCues
 from vggtjax.network.block import Block
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import full_precision, widened

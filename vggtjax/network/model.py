@@ -13,8 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import HEAD_NAMES, Suppress, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.methods import check_mask_pairs
-from vggtjax.motion import GramCues, Sums
+from vggtjax.method.cues import GramCues, Sums
 from vggtjax.network.aggregator import aggregate, declare_aggregator
 from vggtjax.network.backbone import declare_backbone, encode, patch_grid
 from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict_pose
@@ -22,6 +21,7 @@ from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import check_compute_dtype, full_precision
 from vggtjax.network.track_head import declare_track_head, predict_tracks, smallest_side
+from vggtjax.options import check_mask_pairs
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
 HEADS = {"camera": "camera_head", **DENSE_HEADS, "tracks": "track_head"}

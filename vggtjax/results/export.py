@@ -51,14 +51,15 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from vggtjax.errors import InputError
-from vggtjax.files import check_free, staging, writing
-from vggtjax.results import archive, foreign, point_cloud, previews, tracks
-from vggtjax.results.frames import Frame, Resolution, frame_of, valid_pixels
+from vggtjax.results import foreign, point_cloud, previews, tracks
+from vggtjax.results.frame import Frame, Resolution, frame_of, valid_pixels
+from vggtjax.results.glb import build_scene
 from vggtjax.results.ply import PlyWriter, write_ply
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.reconstruction import ARCHIVE_NAME, Layout, Reconstruction, is_result, saved_files
-from vggtjax.results.scene import build_scene
-from vggtjax.results.trajectory import write_trajectory
+from vggtjax.storage import arrays as archive
+from vggtjax.storage.trajectories import write_trajectory
+from vggtjax.storage.writing import check_free, staging, writing
 
 _NAMES = (
     "confidence", "depth", "mask", "instances", "preview", "frames",

@@ -25,13 +25,14 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
+from vggtjax import cameras as geometry
 from vggtjax.clips.images import read_image
 from vggtjax.clips.masks import read_mask
 from vggtjax.errors import ClipError, InputError, ResultError
-from vggtjax.results import archive, geometry
-from vggtjax.results.frames import Frame
+from vggtjax.results.frame import Frame
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.results.trajectory import Quaternion, read_numbers, read_trajectory, write_trajectory
+from vggtjax.storage import arrays as archive
+from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory
 
 _GREY = 128  # of pictures that a layout does not keep
 

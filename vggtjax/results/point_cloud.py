@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from vggtjax.errors import InputError
-from vggtjax.results.frames import Frame, valid_pixels
+from vggtjax.results.frame import Frame, valid_pixels
 from vggtjax.results.reconstruction import Reconstruction
 
 

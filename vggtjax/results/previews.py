@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from skimage.segmentation import find_boundaries
 
-from vggtjax.results.frames import valid_pixels
+from vggtjax.results.frame import valid_pixels
 from vggtjax.results.reconstruction import Reconstruction
 
 _DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm

@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
+from vggtjax import cameras as geometry
 from vggtjax.errors import ResultError
-from vggtjax.results import archive, geometry
+from vggtjax.storage import arrays as archive
 
 if TYPE_CHECKING:
-    from vggtjax.results.frames import Resolution
-    from vggtjax.results.trajectory import Quaternion
+    from vggtjax.results.frame import Resolution
+    from vggtjax.storage.trajectories import Quaternion
 
 Layout = Literal["vggtjax", "vggt4d"]  # of a folder of files
 
@@ -141,7 +142,7 @@ class Reconstruction:
     @cached_property
     def instances(self) -> UInt8[np.ndarray, "S H W"]:
         """Moving objects apart: 0 where nothing moves, else the same id in all frames; see `find_instances`."""
-        from vggtjax.instances import find_instances
+        from vggtjax.method.instances import find_instances
 
         return find_instances(self.dynamic_mask)
 

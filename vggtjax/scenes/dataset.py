@@ -31,15 +31,15 @@ import numpy as np
 from PIL import Image
 
 from vggtjax.errors import InputError, OutputError
-from vggtjax.files import staging, writing
 from vggtjax.results.export import encode_depth, write_intrinsics
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.results.trajectory import write_trajectory
 from vggtjax.scenes.held_out import Kind
 from vggtjax.scenes.render import SyntheticClip, generate
 from vggtjax.scenes.scene import SceneConfig
 from vggtjax.scenes.sheet import draw_sheet
 from vggtjax.scenes.textures import Split, load_textures
+from vggtjax.storage.trajectories import write_trajectory
+from vggtjax.storage.writing import staging, writing
 
 INDEX, PREVIEW = "index.json", "preview.png"
 MOST = 10_000  # scenes of a set

@@ -19,10 +19,10 @@ import numpy as np
 from vggtjax.checkpoint import DType
 from vggtjax.network.layers import Params
 from vggtjax.training.data import make_batch as make_scene_batch
+from vggtjax.training.devices import placement
 from vggtjax.training.metrics import Row
 from vggtjax.training.objective import init_probes as init_scene_probes
 from vggtjax.training.objective import objective as scene_objective
-from vggtjax.training.placement import placement
 from vggtjax.training.recipe import Recipe, Stage
 from vggtjax.training.run import Run
 from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient

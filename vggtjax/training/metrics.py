@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vggtjax.errors import InputError, OutputError
-from vggtjax.files import writing
+from vggtjax.storage.writing import writing
 
 Row = dict[str, float]
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from vggtjax.checkpoint import DType, numpy_dtype, save_model
 from vggtjax.errors import CheckpointError, VggtjaxError
-from vggtjax.files import writing
 from vggtjax.network.layers import Params
+from vggtjax.storage.writing import writing
 from vggtjax.training import checkpoints
+from vggtjax.training.devices import placement
 from vggtjax.training.metrics import Averages, MetricsFile, Row, plot
-from vggtjax.training.placement import placement
 from vggtjax.training.recipe import Recipe, Stage
 from vggtjax.training.state import Metrics, exported, initial_state, state_shapes
 

@@ -8,16 +8,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from flax.traverse_util import flatten_dict
+from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float, Int
 
-from vggtjax.checkpoint import flat_shapes, problems_sentence
-from vggtjax.errors import CheckpointError
+from vggtjax.checkpoint import flat_shapes
+from vggtjax.errors import CheckpointError, problems_sentence
 from vggtjax.network.layers import Params
-from vggtjax.network.model import parameter_shapes
+from vggtjax.network.model import init_params, parameter_shapes
 from vggtjax.training.optimiser import join, make_optimiser, make_schedule, split
 from vggtjax.training.recipe import Recipe
-from vggtjax.training.start import start_params
 
 Objective = Callable[..., tuple[Float[Array, ""], dict[str, Float[Array, ""]]]]
 Metrics = dict[str, Float[Array, ""]]
@@ -162,3 +161,15 @@ def _check(params: Mapping[str, Any], recipe: Recipe) -> None:
     ]
     if problems:
         raise CheckpointError(problems_sentence("the parameters to start from do not fit the recipe's model", problems))
+
+
+def start_params(recipe: Recipe) -> Params:
+    """Return the random parameters that a recipe starts from, by its `seed` and its `start`."""
+    flat: dict[Any, Any] = flatten_dict(init_params(recipe.seed, recipe.model))
+    for path, leaf in flat.items():
+        if path[0] == "aggregator" and path[-1] in ("scale1", "scale2"):
+            flat[path] = jnp.full_like(leaf, recipe.start.layer_scale)
+        if recipe.start.tied_keys and path[:2] == ("aggregator", "global_blocks") and path[-2:] == ("qkv", "kernel"):
+            query, _, value = jnp.split(leaf, 3, axis=-1)
+            flat[path] = jnp.concatenate([query, query, value], axis=-1)
+    return unflatten_dict(flat)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from vggtjax.errors import InputError
-from vggtjax.evaluation.trajectory import checked_poses
+from vggtjax.evaluation.metrics.trajectory import checked_poses
 
 PIXEL_CENTRE = 0.5  # where the centre of the first pixel is; 0 for data sets that count from the centre
 

@@ -10,7 +10,7 @@ from jaxtyping import Float32
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import read_bytes
 from vggtjax.evaluation.datasets.pictures import PNG, opening
-from vggtjax.results.archive import read_array
+from vggtjax.storage.arrays import read_array
 
 SINTEL_TAG = b"PIEH"  # the float 202021.25, little-endian: the first bytes of .dpt and .cam
 _DPT_HEADER = 12  # bytes: the tag, width, height

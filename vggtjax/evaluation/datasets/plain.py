@@ -26,7 +26,7 @@ from vggtjax.evaluation.datasets.frames import Frames
 from vggtjax.evaluation.datasets.layout import Opener
 from vggtjax.evaluation.datasets.maps import depth_reader, mask_reader
 from vggtjax.evaluation.datasets.sequence import Sequence
-from vggtjax.results.trajectory import read_numbers
+from vggtjax.storage.trajectories import read_numbers
 
 _NEW_TAKE = 10.0  # times the median step of the camera: a jump between takes in one folder
 _PER_METRE = 1000.0

@@ -23,7 +23,7 @@ from vggtjax.evaluation.datasets.frames import Frames
 from vggtjax.evaluation.datasets.layout import Opener
 from vggtjax.evaluation.datasets.maps import depth_reader
 from vggtjax.evaluation.datasets.sequence import Sequence
-from vggtjax.results.trajectory import read_numbers
+from vggtjax.storage.trajectories import read_numbers
 
 _PER_METRE = 1000.0
 _INVALID = 65535

@@ -27,8 +27,8 @@ from vggtjax.evaluation.datasets.frames import Frames
 from vggtjax.evaluation.datasets.layout import Opener
 from vggtjax.evaluation.datasets.maps import depth_reader
 from vggtjax.evaluation.datasets.sequence import Sequence
-from vggtjax.evaluation.trajectory import associate
-from vggtjax.results.trajectory import read_numbers, read_trajectory
+from vggtjax.evaluation.metrics.trajectory import associate
+from vggtjax.storage.trajectories import read_numbers, read_trajectory
 
 _PER_METRE = 5000.0
 _APART = 0.02  # seconds; from this on, two timestamps do not belong together

@@ -1,0 +1,50 @@
+"""PyTorch weights by path or hub id."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from converters.files import INDEX, SUFFIXES, choose_file
+from converters.hub import download
+from converters.strangers import refuse_strangers
+from vggtjax.errors import CheckpointError
+
+_HUB_ID = re.compile(r"([A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})(?:/([A-Za-z0-9][\w.-]{0,200}))?", re.ASCII)
+
+
+class Weights(NamedTuple):
+    """A file of weights (for sharded ones, their index), and what to call the model."""
+
+    path: Path
+    name: str
+
+
+def locate(source: str | Path) -> Weights:
+    """Return the file that a path or hub id stands for, downloaded if need be.
+
+    Raises:
+        CheckpointError: there is no such file, or a folder or hub repository holds none, or several to choose from.
+        MissingExtraError: a hub id, and huggingface_hub is not installed.
+    """
+    path = Path(source).expanduser()
+    try:
+        if path.is_dir():
+            names = [entry.name for entry in path.iterdir() if entry.is_file()]
+            return Weights(path / choose_file(names, f"the folder {path}"), path.resolve().name)
+        if path.is_file():
+            return Weights(path, path.name.removesuffix(INDEX).removesuffix(path.suffix))
+    except OSError as error:
+        raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
+    near = len(path.parts) > 1 and path.parent.is_dir()  # then it is a path, mistyped
+    if isinstance(source, str) and not near and (match := _HUB_ID.fullmatch(source)):
+        hub_id, file = match.groups()
+        if (not hub_id.endswith(SUFFIXES)) if file is None else file.endswith(SUFFIXES):
+            refuse_strangers(source)
+            return Weights(download(hub_id, file), source)
+    raise CheckpointError(
+        f"there are no weights at {source}; expected a file (.safetensors, .pt, .pth), the index or folder of sharded "
+        ".safetensors, a hub id such as 'facebook/VGGT-1B', with '/' and a file if it has several, or, to load rather "
+        "than convert, 'demo'"
+    )

@@ -1,0 +1,348 @@
+"""The sweep against the cues that it stands for, the greedy choice on planted maps, and what is written of both."""
+
+import dataclasses
+import json
+from functools import partial
+from itertools import pairwise
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from tests.tiny import tiny_config
+from vggtjax import Cue, Model, MotionConfig, init_params, load_model, motion_saliency
+from vggtjax.calibration.choice import candidates, choose, halves
+from vggtjax.calibration.export import MODEL, NUMBERS, PICTURE, check_folder, save_calibration
+from vggtjax.calibration.heatmap import draw_sweep
+from vggtjax.calibration.sweep import (
+    DYNAMIC,
+    GRAMS,
+    KINDS,
+    STATIC,
+    UNCLEAR,
+    Sweep,
+    SweepCues,
+    kind_index,
+    sweep,
+    token_auc,
+    token_truth,
+)
+from vggtjax.checkpoint import save_model
+from vggtjax.commands import calibrate_cues as command
+from vggtjax.commands.calibrate_cues import calibrate_cues, generated_clips
+from vggtjax.errors import InputError, OutputError
+from vggtjax.method.cues import GramCues
+
+FRAMES, SIZE, CLIPS = 4, 56, 4
+
+
+@pytest.fixture(scope="module")
+def model():
+    config = tiny_config(
+        camera_depth=4,
+        camera_num_heads=4,
+        track_features=16,
+        track_hidden=48,
+        motion=MotionConfig(offsets=(-2, -1, 1, 2)),
+    )
+    return Model(config, init_params(0, config), "tiny")
+
+
+@pytest.fixture(scope="module")
+def clips():
+    """Noise, and a column of other, slightly brighter noise that moves by a patch per frame."""
+    generator = np.random.default_rng(0)
+    images = generator.uniform(0, 0.5, (CLIPS, 1, SIZE, SIZE, 3)).repeat(FRAMES, axis=1).astype(np.float32)
+    masks = np.zeros((CLIPS, FRAMES, SIZE, SIZE), bool)
+    for clip, frame in np.ndindex(CLIPS, FRAMES):
+        masks[clip, frame, 14 * (clip % 3) :, 14 * frame :][:20, :14] = True
+    images[masks] = generator.uniform(0, 0.6, (masks.sum(), 3))
+    return images, masks
+
+
+@pytest.fixture(scope="module")
+def swept(model, clips):
+    return sweep(model.params, zip(*clips, strict=True), model.config)
+
+
+@pytest.fixture(scope="module")
+def choice(swept):
+    return choose(swept, min_gain=0)
+
+
+def make_sweep(seed, truth, depth=3):
+    maps = np.random.default_rng(seed).normal(size=(len(GRAMS), len(KINDS), depth, *truth.shape)).astype(np.float32)
+    return Sweep(maps, truth, MotionConfig(), np.random.default_rng(seed).random((2, *truth.shape), np.float32))
+
+
+def random_truth(seed, shape=(4, 3, 20)):
+    return np.random.default_rng(seed).choice([STATIC, DYNAMIC, UNCLEAR], shape, p=(0.6, 0.3, 0.1)).astype(np.int8)
+
+
+@partial(jax.jit, static_argnames="cues")
+def add_all(cues, q, k):
+    def pair(sums, layer):
+        counts, q, k = layer
+        return cues.add(sums, counts, q, k), None
+
+    return jax.lax.scan(pair, cues.zeros(*q.shape[1:4]), (cues.layer_counts(), q, k))[0]
+
+
+@pytest.fixture(scope="module")
+def queries_and_keys():
+    """q and k of four pairs, two clips of four frames of six patches, two heads of eight channels."""
+    q, k = np.random.default_rng(0).normal(size=(2, 4, 2, 4, 6, 2, 8)).astype(np.float32)
+    return q, k
+
+
+@pytest.mark.parametrize("gram", GRAMS)
+def test_maps_and_table_are_those_of_the_cues(queries_and_keys, gram):
+    default = MotionConfig()
+    every, saliency = SweepCues(default, 4).measured(add_all(SweepCues(default, 4), *queries_and_keys))
+    made = Sweep(
+        np.asarray(every[..., 0, :, :])[:, :, :, None], np.zeros((1, 4, 6), np.int8), default, np.asarray(saliency)
+    )
+    cues = (*(candidates(4)[i] for i in (0, 5, 10, 15, 23)), Cue("range", "k", "k", (1, 2, 3), "mean"))
+    expected = GramCues(MotionConfig(cues, reference_depth=4), 4, gram)
+    for name, values in expected.maps(add_all(expected, *queries_and_keys)).items():
+        (cue,) = (cue for cue in cues if cue.name == name)
+        assert np.allclose(made.map(gram, cue)[0], values[0], atol=1e-5), name
+    table = GramCues(default, 4, gram)
+    assert np.allclose(saliency[GRAMS.index(gram)], table.saliency(add_all(table, *queries_and_keys)), atol=1e-5)
+
+
+def test_a_std_over_several_layers_is_no_average_of_maps(swept):
+    with pytest.raises(InputError, match="std over layers"):
+        swept.map("cosine", Cue("range", "k", "k", (1, 2), "std"))
+
+
+def test_auc_of_the_sweep(swept):
+    auc = swept.auc()
+    assert auc.shape == (2, 6, 4)
+    cue = Cue("", "k", "k", (2,), "std")
+    value = token_auc(swept.map("dot", cue), swept.truth)
+    assert auc[1, kind_index(cue), 2] == value
+    assert token_auc(1 - swept.map("dot", cue), swept.truth) == pytest.approx(1 - value, abs=1e-3)
+
+
+def test_truth_of_tokens_by_hand():
+    mask = np.zeros((1, 4, 6), bool)
+    mask[0, :2, :2] = True  # all four pixels
+    mask[0, 0, 2:4] = True  # two of four
+    mask[0, 2, 0] = True  # one of four
+    assert token_truth(mask, 2).tolist() == [[DYNAMIC, DYNAMIC, STATIC, UNCLEAR, STATIC, STATIC]]
+
+
+def test_unclear_tokens_do_not_count():
+    truth = np.array([[[DYNAMIC, STATIC, STATIC, UNCLEAR]]], np.int8)
+    assert token_auc(np.array([[[0.5, 0.1, 0.9, 1.0]]]), truth) == 0.5
+
+
+def test_candidates():
+    cues = candidates(4)
+    assert len(cues) == 6 * 4 + 3 * 3 + 3 * 2
+    assert len({cue.name for cue in cues}) == len(cues)
+    assert Cue("layer3_qk_std", "q", "k", (3,), "std") in cues
+    assert Cue("layers1to3_qq_mean", "q", "q", (1, 2, 3), "mean") in cues
+
+
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_planted_map_is_chosen_first(inverted):
+    truth = random_truth(0)
+    planted = make_sweep(1, truth)
+    planted.maps[0, 3, 1] = (-1 if inverted else 1) * (truth == DYNAMIC)  # of similarity "cosine" only
+    chosen = choose(planted)
+    assert chosen.motion.cues == (Cue("layer1_kk_std", "k", "k", (1,), "std", inverted),)
+    assert chosen.steps[0].rating == (1, 1)
+    assert chosen.motion.reference_depth == 3
+    assert choose(planted, gram="dot").motion.cues[0].name != "layer1_kk_std"
+
+
+def test_a_signal_that_neighbours_share_is_chosen_as_a_range():
+    truth = random_truth(2, (4, 4, 40))
+    planted = make_sweep(3, truth, depth=4)
+    noise = np.random.default_rng(4).normal(size=truth.shape)
+    for layer, sign in ((1, 1), (2, -1)):  # noise that cancels in the mean
+        planted.maps[0, 0, layer] = (truth == DYNAMIC) + 3 * sign * noise
+    assert choose(planted).motion.cues[0] == Cue("layers1to2_qq_mean", "q", "q", (1, 2), "mean")
+
+
+def test_two_maps_whose_product_is_the_truth():
+    generator = np.random.default_rng(5)
+    a, b = generator.random((2, 4, 3, 60)) < 0.6
+    truth = (a & b).astype(np.int8)
+    planted = make_sweep(6, truth)
+    planted.maps[0, 1, 0], planted.maps[0, 5, 2] = a, 1 - b.astype(int)
+    chosen = choose(planted)
+    assert {(cue.name, cue.inverted) for cue in chosen.motion.cues} == {
+        ("layer0_qq_std", False),
+        ("layer2_qk_std", True),
+    }
+    assert chosen.steps[-1].rating == (1, 1)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6), min_gain=st.sampled_from([0.0, 0.002, 0.05]), terms=st.integers(1, 4))
+def test_every_cue_after_the_first_gains_on_both_halves(seed, min_gain, terms):
+    made = make_sweep(seed, random_truth(seed + 1))
+    chosen = choose(made, min_gain=min_gain, max_terms=terms)
+    assert 1 <= len(chosen.steps) <= terms
+    for before, after in pairwise(chosen.steps):
+        assert after.rating.calibration > before.rating.calibration
+        assert after.rating.held_out > before.rating.held_out
+        assert after.rating.held_out - before.rating.held_out >= min_gain
+    if chosen.refused is not None:
+        assert chosen.refused.rating.held_out - chosen.steps[-1].rating.held_out <= min_gain
+    assert len({cue.name for cue in chosen.motion.cues}) == len(chosen.motion.cues)
+
+
+def test_the_choice_by_hand_on_one_half():
+    truth = np.array([[[DYNAMIC, DYNAMIC, STATIC, STATIC]], [[DYNAMIC, STATIC, STATIC, STATIC]]], np.int8)
+    made = make_sweep(0, truth, depth=1)._replace(maps=np.zeros((2, 6, 1, 2, 1, 4), np.float32))
+    made.maps[0, 0, 0, 0, 0], made.maps[0, 0, 0, 1, 0] = (3, 1, 2, 0), (9, 1, 2, 0)
+    made.maps[0, 1, 0, 0, 0], made.maps[0, 1, 0, 1, 0] = (2, 2, 1, 2), (0, 9, 9, 0)
+    # Of four pairs the first map orders three; times the second, 1 1 0 1, all four. The held-out clip loses.
+    chosen = choose(made)
+    assert [step.cue.name for step in chosen.steps] == ["layer0_qq_mean"]
+    assert chosen.steps[0].rating == (0.75, 1)
+    assert chosen.refused is not None
+    assert chosen.refused.cue.name == "layer0_qq_std"
+    assert chosen.refused.rating == pytest.approx((1, 1 / 6))
+
+
+def test_ratings_are_those_of_the_method(model, clips, swept, choice):
+    run = jax.jit(motion_saliency, static_argnames=("config", "motion"))
+    saliency = np.asarray(run(model.params, clips[0], model.config, motion=choice.motion))
+    for start, rating in enumerate(choice.steps[-1].rating):
+        values = saliency[start::2].reshape(2, FRAMES, -1)
+        assert token_auc(values, halves(swept)[start].truth) == pytest.approx(rating, abs=2e-3)
+    assert swept.table.cues == MotionConfig().cues
+    assert choice.motion.offsets == model.config.motion.offsets
+
+
+def test_a_calibrated_model_knows_its_table(tmp_path, model, swept, choice):
+    path = save_calibration(tmp_path / "out", model, swept, choice, source={"scenes": CLIPS})
+    loaded = load_model(path)
+    assert loaded.config == dataclasses.replace(model.config, motion=choice.motion)
+    assert loaded.name == "tiny"
+    assert (loaded.params["aggregator"]["camera_token"] == model.params["aggregator"]["camera_token"]).all()
+    numbers = json.loads((tmp_path / "out" / NUMBERS).read_text())
+    assert numbers["source"] == {"scenes": CLIPS}
+    assert len(numbers["choice"]["steps"]) == len(choice.steps)
+    assert MotionConfig(**numbers["choice"]["motion"]) == choice.motion
+    assert np.allclose([row["auc_of_layers"] for row in numbers["sweep"]], swept.auc().reshape(-1, 4), atol=1e-6)
+    clips = numbers["clips"]
+    assert clips["calibration"]["clips"] + clips["held_out"]["clips"] == CLIPS
+    assert sum(v for half in ("calibration", "held_out") for k, v in clips[half].items() if k.endswith("tokens")) == (
+        swept.truth.size
+    )
+    with Image.open(tmp_path / "out" / PICTURE) as picture:
+        assert picture.width > 600
+    save_calibration(tmp_path / "out", loaded, swept, choice)  # replaces the earlier one
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted((MODEL, NUMBERS, PICTURE))
+
+
+def test_another_model_is_not_replaced(tmp_path, model, swept, choice):
+    (tmp_path / MODEL).write_text("weights")
+    with pytest.raises(OutputError, match="not part of an earlier calibration"):
+        save_calibration(tmp_path, model, swept, choice)
+    (tmp_path / NUMBERS).write_text('{"format": "something else"}')
+    with pytest.raises(OutputError, match="not part of an earlier calibration"):
+        check_folder(tmp_path)
+    assert (tmp_path / MODEL).read_text() == "weights"
+
+
+def test_the_picture_outlines_what_was_chosen():
+    truth = random_truth(0)
+    planted = make_sweep(1, truth)
+    planted.maps[0, 3, 1] = truth == DYNAMIC
+    drawn = draw_sweep(planted.auc(), choose(planted), title="tiny")
+    green = np.argwhere((drawn == (30, 200, 90)).all(axis=-1))
+    (top, left), (bottom, right) = green.min(axis=0), green.max(axis=0)
+    assert (bottom - top, right - left) == (32, 48)  # a cell of 46 x 30 and two pixels of frame
+    centre = drawn[(top + bottom) // 2 + 8, (left + right) // 2 - 14].astype(int)
+    assert centre[0] > centre[2] + 50  # red: it tells what moves
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda images, masks: (images[:1], masks[:1]), "1 clips"),
+        (lambda images, masks: (images[:, :1], masks[:, :1]), "at least two frames"),
+        (lambda images, masks: (images, masks[:, :, :28]), "mask of shape"),
+        (lambda images, masks: (images, masks.astype(float)), "float64"),
+        (lambda images, masks: (images[:, :, :50], masks[:, :, :50]), "patch size 14"),
+        (lambda images, masks: ([images[0], images[1][:3]], [masks[0], masks[1][:3]]), "one shape"),
+    ],
+)
+def test_clips_that_do_not_fit(model, clips, change, sentence):
+    with pytest.raises(InputError, match=sentence):
+        sweep(model.params, zip(*change(*clips), strict=True), model.config)
+
+
+def test_a_model_without_numbers(model, clips):
+    broken = model.params | {"aggregator": model.params["aggregator"] | {"camera_token": np.full((2, 1, 16), np.nan)}}
+    with pytest.raises(InputError, match="not finite"):
+        sweep(broken, zip(*clips, strict=True), model.config)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"gram": "euclidean"}, "euclidean"),
+        ({"max_terms": 0}, "max_terms is 0"),
+        ({"min_gain": -0.1}, "min_gain is -0.1"),
+    ],
+)
+def test_a_choice_that_cannot_be(swept, arguments, sentence):
+    with pytest.raises(InputError, match=sentence):
+        choose(swept, **arguments)
+
+
+@pytest.mark.parametrize(("value", "kind"), [(STATIC, "dynamic"), (DYNAMIC, "static")])
+def test_nothing_to_tell_apart(swept, value, kind):
+    truth = swept.truth.copy()
+    truth[1::2] = value
+    with pytest.raises(InputError, match=f"held-out half have no {kind} token"):
+        choose(swept._replace(truth=truth))
+    with pytest.raises(InputError):
+        swept._replace(truth=np.full_like(truth, value)).auc()
+
+
+def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
+    wanted = []
+    monkeypatch.setattr(command, "generated_clips", lambda *a: wanted.append(a) or zip(*clips, strict=True))
+    source = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
+    calibrate_cues(str(source), tmp_path / "out", scenes=CLIPS, frames=FRAMES, max_terms=2, seed=5)
+    assert wanted == [(CLIPS, FRAMES, SIZE, 5)]
+    loaded = load_model(tmp_path / "out" / MODEL)
+    assert 1 <= len(loaded.config.motion.cues) <= 2
+    assert loaded.config.motion.reference_depth == 4
+    printed = capsys.readouterr()
+    assert loaded.config.motion.cues[0].name in printed.out
+    assert "default table" in printed.out
+    assert "sweep" in printed.err
+    with pytest.raises(InputError, match="size is 50"):
+        calibrate_cues(str(source), tmp_path / "other", size=50)
+    assert not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [({"scenes": 1}, "scenes is 1"), ({"max_terms": 0}, "max_terms is 0"), ({"seed": -1}, "seed is -1")],
+)
+def test_arguments_are_checked_before_the_model_is_loaded(tmp_path, arguments, sentence):
+    with pytest.raises(InputError, match=sentence):
+        calibrate_cues("nowhere.safetensors", tmp_path, **arguments)
+
+
+def test_scenes_of_a_seed():
+    first, second = generated_clips(2, 2, 28, seed=3)
+    again, _ = generated_clips(2, 2, 28, seed=3)
+    assert first[0].shape == (2, 28, 28, 3)
+    assert first[1].shape == (2, 28, 28)
+    assert (first[0] == again[0]).all()
+    assert not (first[0] == second[0]).all()

@@ -1,0 +1,143 @@
+"""Points to track, from the command line's words to files; the tracker itself is tested in test_track_head."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.seeded import seeded_images
+from tests.tiny import tiny_config
+from vggtjax import Model, Reconstruction, forward, init_params, load_clip, reconstruct
+from vggtjax.clips.queries import Queries, check_words, parse_queries
+from vggtjax.errors import InputError, ResultError
+
+pytestmark = pytest.mark.filterwarnings("ignore:the field of view")  # seeded weights give odd cameras
+
+POINTS = Queries(np.array([[10, 12], [40, 30], [5.5, 50], [33, 33]]), np.array([0, 2, 0, 2]))
+
+
+@pytest.fixture(scope="module")
+def config():
+    return tiny_config(track_features=16, track_hidden=48, track_corr_levels=4, track_corr_radius=2)
+
+
+@pytest.fixture(scope="module")
+def params(config):
+    return init_params(0, config)
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return load_clip(seeded_images(3, 56, 56, seed=4).transpose(0, 2, 3, 1), size=56)
+
+
+@pytest.fixture(scope="module")
+def tracked(params, config, clip) -> Reconstruction:
+    return reconstruct(Model(config, params, "tiny"), clip, size=56, method="vggt", tracks=POINTS)
+
+
+def test_points_of_any_frame(params, config, clip, tracked):
+    for frame in (0, 2):
+        chosen = POINTS.frames == frame
+        images = np.roll(clip.images, -frame, axis=0)[None]
+        points = jnp.asarray(POINTS.points[chosen])[None]
+        made = forward(params, jnp.asarray(images), config, outputs=("tracks",), query_points=points)
+        back = np.roll(np.asarray(made.tracks)[0], frame, axis=0)
+        assert np.abs(tracked.track_positions[:, chosen] - back).max() < 2e-2  # sines of a thousand times the flow
+        assert np.array_equal(tracked.track_positions[frame, chosen], POINTS.points[chosen])
+    assert np.array_equal(tracked.track_frames, POINTS.frames)
+    assert tracked.track_visibility.shape == tracked.track_confidence.shape == (3, 4)
+
+
+def test_points_move_with_a_clip_that_is_refitted(params, config):
+    images = seeded_images(2, 112, 112, seed=4).transpose(0, 2, 3, 1)
+    points = Queries(np.array([[20, 24], [80, 60]]), np.zeros(2))
+    clip = load_clip(images, size=112)
+    made = reconstruct(Model(config, params, "tiny"), clip, size=56, method="vggt", tracks=points)
+    assert np.allclose(np.asarray(made.track_positions)[0], [[10, 12], [40, 30]], atol=1e-4)
+
+
+def test_tracks_survive_a_round_trip(tmp_path, tracked, clip):
+    tracked.save(tmp_path / "out")
+    loaded = Reconstruction.load(tmp_path / "out")
+    for name in ("track_positions", "track_visibility", "track_confidence", "track_frames"):
+        assert np.array_equal(getattr(loaded, name), getattr(tracked, name))
+    with np.load(tmp_path / "out/tracks.npz") as file:
+        assert set(file) == {"positions", "visibility", "confidence", "frames"}
+        for frame in range(3):
+            there = clip.to_source(frame, tracked.track_positions[frame])
+            assert np.allclose(file["positions"][frame], there, atol=1e-3)
+    strip = np.asarray(Image.open(tmp_path / "out/preview/tracks.png"))
+    assert strip.shape[1] > 1700
+    assert strip.std() > 10
+    video = load_clip(str(tmp_path / "out/preview/tracks.mp4"), size=56)
+    assert len(video) == 3
+
+    dataclasses.replace(tracked, **dict.fromkeys(vars_of_tracks())).save(tmp_path / "out")
+    assert not (tmp_path / "out/tracks.npz").exists()
+    assert Reconstruction.load(tmp_path / "out").track_positions is None
+
+
+def vars_of_tracks():
+    return [field.name for field in dataclasses.fields(Reconstruction) if field.name.startswith("track_")]
+
+
+def test_tracks_that_are_not_whole(tracked):
+    with pytest.raises(ResultError, match="tracks lack track_visibility"):
+        dataclasses.replace(tracked, track_visibility=None)
+    with pytest.raises(ResultError, match="track_positions has shape"):
+        dataclasses.replace(tracked, track_positions=tracked.track_positions[:, :2])
+
+
+def test_a_grid_lies_inside_the_picture():
+    clip = load_clip(np.zeros((2, 90, 160, 3), np.uint8), size=56, mode="pad")
+    left, top, right, bottom = clip.valid_box[0]
+    queries = parse_queries("grid:3", clip)
+    assert len(queries.points) == 9
+    assert not queries.frames.any()
+    low, high = queries.points.min(axis=0), queries.points.max(axis=0)
+    assert np.allclose(low, [left + (right - left) / 6, top + (bottom - top) / 6])
+    assert np.allclose(high, [right - (right - left) / 6, bottom - (bottom - top) / 6])
+
+
+def test_a_file_of_points_in_pixels_of_the_source(tmp_path):
+    clip = load_clip(np.zeros((3, 90, 160, 3), np.uint8), size=56)
+    (tmp_path / "points.csv").write_text("x,y,frame\n80,45,0\n10.5,20,2\n", encoding="utf-8")
+    queries = parse_queries(str(tmp_path / "points.csv"), clip)
+    assert queries.frames.tolist() == [0, 2]
+    assert np.allclose(clip.to_source(0, queries.points), [[80, 45], [10.5, 20]], atol=1e-4)
+    (tmp_path / "plain.csv").write_text("\ufeffx,y\n80,45\n", encoding="utf-8")
+    assert parse_queries(str(tmp_path / "plain.csv"), clip).frames.tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("x,y\n", "holds no points"),
+        ("a,b\n1,2\n", "expected columns x, y"),
+        ("x,y\n1,nan\n", "expected numbers"),
+        ("x,y,frame\n1,2,9\n", "a frame from 0 to 1"),
+        ("x,y\n1000,2\n", r"line 2: \(1000, 2\) lies outside"),
+    ],
+)
+def test_bad_files_of_points(tmp_path, text, said):
+    clip = load_clip(np.zeros((2, 90, 160, 3), np.uint8), size=56)
+    (tmp_path / "points.csv").write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=said):
+        parse_queries(str(tmp_path / "points.csv"), clip)
+
+
+@pytest.mark.parametrize("text", ["grid:", "grid:0", "grid:4000", "grid:" + "9" * 5000, "grid:x", "missing.csv"])
+def test_bad_words(text):
+    clip = load_clip(np.zeros((2, 90, 160, 3), np.uint8), size=56)
+    for read in (lambda: parse_queries(text, clip), lambda: check_words(text)):
+        with pytest.raises(InputError, match="tracks is"):
+            read()
+
+
+def test_too_many_points_and_none():
+    for count in (0, 10_001):
+        with pytest.raises(InputError, match=f"there are {count} points"):
+            Queries(np.zeros((count, 2)), np.zeros(count))

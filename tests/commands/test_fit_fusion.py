@@ -1,0 +1,233 @@
+"""The command `vggtjax fit-fusion`, from clips on disk to a file that --fusion takes."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from vggtjax import load_model
+from vggtjax.commands import main as cli
+from vggtjax.errors import InputError
+from vggtjax.learning.ablation import CHOSEN, split_clips
+from vggtjax.learning.clip_passes import ClipPasses, fit_clips, identity_of, kept_passes, observations
+from vggtjax.method.fusion_file import load_fusion, save_fusion
+from vggtjax.method.fusion_rule import identity
+from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.results.reconstruction import Reconstruction
+
+FRAMES, CLIPS = 3, 4
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    """Four sequences in the plain layout: three frames each of the embedded clip."""
+    root, clip = tmp_path_factory.mktemp("data"), demo_clip()
+    for part in range(CLIPS):
+        for below in ("rgb", "depth", "mask"):
+            (root / f"clip{part}" / below).mkdir(parents=True)
+        for i in range(FRAMES * part, FRAMES * (part + 1)):
+            folder = root / f"clip{part}"
+            Image.fromarray(np.rint(255 * clip.images[i]).astype(np.uint8)).save(folder / f"rgb/{i:05d}.png")
+            Image.fromarray(np.rint(1000 * clip.depth[i]).astype(np.uint16)).save(folder / f"depth/{i:05d}.png")
+            Image.fromarray(clip.dynamic_mask[i].astype(np.uint8) * 255).save(folder / f"mask/{i:05d}.png")
+    return root
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+ARGUMENTS = ["--family", "scale", "scale+correlation", "paper", "--seeds", "2", "--steps", "20", "--pixels", "300"]
+
+
+def run(*arguments) -> int:
+    return cli.main([str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def fitted(dataset, cache, tmp_path_factory):
+    out = tmp_path_factory.mktemp("fits")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VGGTJAX_CACHE", str(cache))
+        code = run("fit-fusion", "--out", out, "--data", f"plain={dataset}", "--size", 64, *ARGUMENTS)
+    assert code == 0
+    return out
+
+
+def test_all_of_it(fitted, cache):
+    numbers = json.loads((fitted / "fit.json").read_text())
+    rules = ["pass 1 alone", "pass 2 alone", "hard replacement", "paper", "scale", "scale+correlation", CHOSEN]
+    assert list(numbers["table"]) == rules
+    assert [(o["rule"], o["seed"]) for o in numbers["outcomes"]] == [(r, s) for s in (0, 1) for r in rules]
+    for seed in (0, 1):  # the family is chosen without the clips of the scores
+        own = {o["rule"]: o for o in numbers["outcomes"] if o["seed"] == seed}
+        best = min(("scale", "scale+correlation"), key=lambda rule: own[rule]["stopping"]["nll"])
+        assert own[CHOSEN]["metrics"] == own[best]["metrics"]
+    assert numbers["chosen"] in ("scale", "scale+correlation")
+    assert all(np.isfinite(o["metrics"]["nll"]) for o in numbers["outcomes"])
+    table = {rule: {name: mean for name, (mean, _) in row.items()} for rule, row in numbers["table"].items()}
+    assert table["scale"]["nll"] < table["paper"]["nll"]  # the confidence of the demo model is not a precision
+    names = ("fusion.safetensors", "table.md", "scores.png", "precision.png", "calibration.png", "losses.png")
+    assert all((fitted / name).is_file() for name in names)
+    assert (fitted / "table.md").read_text().count("\n") == 2 + len(rules)
+    assert np.asarray(load_fusion(fitted / "families" / "scale.safetensors")["scale"]).any()
+    assert len(list((cache / "passes").iterdir())) == CLIPS
+
+
+@pytest.mark.usefixtures("fitted")
+def test_passes_and_fits_are_kept(dataset, cache, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("VGGTJAX_CACHE", str(cache))
+    monkeypatch.setattr("vggtjax.learning.clip_passes.reconstruct", None)  # would fail
+    arguments = ["--out", tmp_path, "--data", f"plain={dataset}", "--size", 64, "--family", "scale", "--seeds", 1]
+    arguments += ["--steps", 20, "--pixels", 300]
+    assert run("fit-fusion", *arguments) == 0
+    before = json.loads((tmp_path / "fit.json").read_text())
+    monkeypatch.setattr("vggtjax.learning.fit._advanced", None)  # would fail: the states are those of the end
+    assert run("fit-fusion", *arguments) == 0
+    assert json.loads((tmp_path / "fit.json").read_text()) == before
+    assert "scale against paper" in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore:the field of view")
+def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset, tmp_path, capsys):
+    frames = dataset / "clip0" / "rgb"
+    common = ["--size", 64, "--max-frames", 3]
+    results = {}
+    save_fusion(tmp_path / "paper.safetensors", identity())
+    files = {"none": [], "paper": ["--fusion", tmp_path / "paper.safetensors"]}
+    files["fitted"] = ["--fusion", fitted / "families" / "scale.safetensors"]
+    for name, option in files.items():
+        assert run("reconstruct", frames, "--out", tmp_path / name, *common, *option) == 0
+        results[name] = Reconstruction.load(tmp_path / name)
+    assert np.allclose(results["paper"].depth, results["none"].depth, rtol=2e-6)
+    assert np.allclose(results["paper"].depth_confidence, results["none"].depth_confidence, rtol=1e-5)
+    assert not np.allclose(results["fitted"].depth_confidence, results["none"].depth_confidence, rtol=1e-2)
+    assert results["fitted"].settings["fusion"] != results["paper"].settings["fusion"]
+    assert run("batch", frames, "--out", tmp_path / "batch", *common, *files["fitted"]) == 0
+    batched = Reconstruction.load(tmp_path / "batch" / "rgb")
+    assert np.allclose(batched.depth, results["fitted"].depth, rtol=1e-5)
+    arguments = ["evaluate", "plain", dataset, "--out", tmp_path / "scores", "--size", 64, "--sequences", "clip0"]
+    assert run(*arguments, "--methods", "hard-replacement,4dvggt-d", *files["fitted"]) == 0
+    capsys.readouterr()
+    assert run("reconstruct", frames, "--out", tmp_path / "x", "--method", "vggt", *files["fitted"]) == 2
+    assert "method 'vggt' does not fuse; expected 4dvggt-d" in capsys.readouterr().err
+    assert run(*arguments, "--methods", "vggt", *files["fitted"]) == 2
+    assert "does not fuse" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--data", "scenes"], "expected generated=N or DATASET=FOLDER"),
+        (["--data", "generated=many"], "expected a number of scenes"),
+        (["--data", "nothing=."], "expected generated=N, or one of"),
+        (["--data", "plain=/nowhere"], "/nowhere is no folder"),
+        (["--family", "best"], "there is no 'best'"),
+        (["--seeds", "0"], "seeds is 0"),
+        (["--steps", "0"], "steps is 0"),
+        (["--pixels", "0"], "pixels is 0"),
+        (["--held-out", "1.5", "--data", "generated=3"], "held_out is 1.5"),
+        (["--max-frames", "8", "--data", "generated=3"], "generated scenes have at least 12 frames"),
+        (["--family", "soft", "--objective", "joint"], "does not see soft masks"),
+    ],
+)
+def test_bad_input_is_one_sentence(arguments, sentence, tmp_path, capsys):
+    assert run("fit-fusion", "--out", tmp_path / "out", *arguments) == 2
+    assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_of_others_are_not_replaced(tmp_path, capsys):
+    (tmp_path / "fusion.safetensors").write_text("mine")
+    assert run("fit-fusion", "--out", tmp_path) == 2
+    assert "is not part of an earlier fit" in capsys.readouterr().err
+
+
+def clip_of(frames: int, size: int, seed: int) -> ClipPasses:
+    generator = np.random.default_rng(seed)
+    maps = [generator.uniform(1, 3, (frames, size, size)).astype(np.float32) for _ in range(5)]
+    return ClipPasses(
+        *maps[:4],
+        saliency=generator.random((frames, size // 14, size // 14)).astype(np.float32),
+        dynamic_mask=maps[0] > 2.5,
+        images=generator.integers(0, 256, (frames, size, size, 3), dtype=np.uint8),
+        camera_from_world=np.tile(np.eye(3, 4, dtype=np.float32), (frames, 1, 1)),
+        intrinsics=np.tile(np.eye(3, dtype=np.float32), (frames, 1, 1)),
+        truth=np.where(maps[4] > 1.5, maps[4], 0),
+        true_dynamic=maps[0] > 2.6,
+    )
+
+
+def test_clips_of_several_sizes_are_stacked():
+    clips = [clip_of(2, 28, 0), clip_of(3, 42, 1)]
+    seen = [observations(clip, 14) for clip in clips]
+    scattered = fit_clips(clips, seen, pixels=100)
+    assert scattered.truth.shape == (2, 1, 1, 100)
+    assert (np.asarray(scattered.truth) > 0).all()
+    for own, clip in zip(np.asarray(scattered.seen.depth1), clips, strict=True):
+        assert np.isin(own.ravel(), clip.depth1).all()
+    whole = fit_clips(clips, seen, frames=3)
+    assert whole.truth.shape == (2, 3, 42, 42)
+    assert np.array_equal(np.asarray(whole.truth)[0, :2, :28, :28], clips[0].truth)
+    assert not np.asarray(whole.truth)[0, 2].any()  # filled up with what is not known
+    assert whole.view is None  # frames of other sizes cannot be compared
+    assert fit_clips([clips[0]] * 2, [seen[0]] * 2).view is not None
+    with pytest.raises(InputError, match="no pixel with a true depth"):
+        fit_clips([clips[0]._replace(truth=np.zeros((2, 28, 28), np.float32))], seen[:1], pixels=10)
+
+
+def test_frames_are_taken_where_there_is_truth():
+    clip = clip_of(5, 28, 0)
+    clip.truth[:3] = 0
+    taken = fit_clips([clip], [observations(clip, 14)], frames=2)
+    assert np.array_equal(np.asarray(taken.truth)[0], clip.truth[3:])
+    assert np.array_equal(np.asarray(taken.seen.depth1)[0], clip.depth1[3:])
+
+
+def test_models_are_told_apart():
+    model = load_model("demo")
+    other = dataclasses.replace(model.config, motion=dataclasses.replace(model.config.motion, offsets=(-1, 1)))
+    halved = jax.tree.map(lambda x: x / 2, model.params)
+    names = [
+        identity_of(m)
+        for m in (
+            model,
+            load_model("demo"),
+            *(dataclasses.replace(model, config=other), dataclasses.replace(model, params=halved)),
+        )
+    ]
+    assert names[0] == names[1]
+    assert len(set(names)) == 3
+
+
+def test_kept_passes_are_made_anew_where_the_file_is_not_whole(tmp_path):
+    made = []
+
+    def make() -> ClipPasses:
+        made.append(1)
+        return clip_of(2, 28, 0)
+
+    for _ in range(2):
+        clip = kept_passes({"a": 1}, make, tmp_path)
+        assert np.array_equal(clip.depth1, clip_of(2, 28, 0).depth1)
+    assert len(made) == 1
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(path.read_bytes()[:200])
+    kept_passes({"a": 1}, make, tmp_path)
+    kept_passes({"a": 2}, make, tmp_path)
+    assert len(made) == 3
+
+
+def test_splits_share_no_clip_and_differ_by_seed():
+    for count in (3, 4, 16):
+        for seed in range(5):
+            split = split_clips(count, seed)
+            assert sorted([*split.fitted, *split.validation, *split.test]) == list(range(count))
+            assert min(map(len, split)) >= 1
+    assert split_clips(16, 0) != split_clips(16, 1)
+    with pytest.raises(InputError, match="expected three at least"):
+        split_clips(2, 0)

@@ -1,0 +1,189 @@
+"""The command line: what it writes, what it says, and its exit codes."""
+
+import functools
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.seeded import seeded_images, seeded_state_dict
+from vggtjax import Reconstruction
+from vggtjax.commands import main as cli
+
+README = Path(__file__).parents[2] / "README.md"
+
+pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frames")
+    for i, image in enumerate(seeded_images(3, 90, 120, seed=1).transpose(0, 2, 3, 1)):
+        Image.fromarray((255 * image).astype(np.uint8)).save(folder / f"frame_{i}.png")
+    return folder
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    code = cli.main([str(a) for a in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_demo(tmp_path, capsys):
+    code, out, _ = run(capsys, "demo", "--out", tmp_path / "result")
+    assert code == 0
+    assert "errors against the truth" in out
+    assert "peak memory" in out
+    assert (tmp_path / "result" / "preview" / "truth.png").stat().st_size > 10_000
+    result = Reconstruction.load(tmp_path / "result")
+    assert result.method == "4dvggt-d"
+    assert (tmp_path / "result" / "scene.glb").stat().st_size > 1000
+
+
+def test_reconstruct_with_a_converted_model(tmp_path, capsys, frames, golden, monkeypatch):
+    from safetensors.numpy import save_file
+
+    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path / "cache"))
+    shapes = json.loads((golden / "shapes.json").read_text())
+    save_file(seeded_state_dict(shapes, 7), tmp_path / "torch.safetensors")
+    config = golden / "config.json"
+    code, out, _ = run(
+        capsys, "convert", tmp_path / "torch.safetensors", tmp_path / "m.safetensors", "--config", config
+    )
+    assert code == 0
+    assert "wrote" in out
+    code, out, _ = run(capsys, "info", tmp_path / "m.safetensors")
+    assert code == 0
+    assert "float32" in out
+    code, out, err = run(
+        capsys, "reconstruct", frames, "--model", tmp_path / "m.safetensors", "--out", tmp_path / "out", "--max-frames",
+        2, "--method", "pose-decoupling",
+    )  # fmt: skip
+    assert code == 0, err
+    result = Reconstruction.load(tmp_path / "out")
+    assert result.depth.shape == (2, 112, 140)
+    assert result.frame_names == ("frame_0", "frame_1")
+    assert result.method == "pose-decoupling"
+
+
+def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for i in range(3):
+        Image.fromarray(np.pad(np.full((30, 40), 255, np.uint8), ((10, 50), (20, 60)))).save(masks / f"frame_{i}.png")
+    (tmp_path / "points.csv").write_text("x,y,frame\n60,45,0\n30,20,1\n", encoding="utf-8")
+    code, out, err = run(
+        capsys, "reconstruct", frames, "--out", tmp_path / "out", "--masks", masks, "--refine-mask", "--tracks",
+        tmp_path / "points.csv", "--method", "vggt4d", "--resolution", "original", "--format", "vggt4d",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "track head of the embedded model is untrained" in out
+    result = Reconstruction.load(tmp_path / "out")
+    assert (result.settings["masks"], result.settings["refine_mask"]) == ("given", True)
+    assert np.asarray(result.track_frames).tolist() == [0, 1]
+    assert (tmp_path / "out/preview/tracks.png").stat().st_size > 1000
+    with Image.open(tmp_path / "out/mask/000001.png") as mask, Image.open(frames / "frame_1.png") as picture:
+        assert mask.size == picture.size
+        with Image.open(tmp_path / "out/vggt4d/frame_0001.png") as shown:
+            assert np.array_equal(np.asarray(shown), np.asarray(picture.convert("RGB")))
+
+    arguments = ("import", tmp_path / "out/vggt4d", "--format", "vggt4d", "--out", tmp_path / "again")
+    code, _, err = run(capsys, *arguments)
+    assert code == 2
+    assert "does not say the order of its quaternions" in err
+    code, _, err = run(capsys, *arguments, "--quaternion", "xyzw")
+    assert code == 0, err
+    again = Reconstruction.load(tmp_path / "again")
+    assert again.depth.shape == (3, *picture.size[::-1])
+    assert np.allclose(again.camera_from_world, result.camera_from_world, atol=1e-5)
+
+    code, _, err = run(capsys, "reconstruct", frames, "--out", tmp_path / "still", "--no-masks", "--tracks", "grid:2")
+    assert code == 0, err
+    still = Reconstruction.load(tmp_path / "still")
+    assert not still.dynamic_mask.any()
+    assert still.settings["refine_mask"] is False
+    assert np.asarray(still.track_positions).shape == (3, 4, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--masks", "{tmp}/none"], "none"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--masks", "{frames}", "--no-masks"], "opposites"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--refine-mask", "--no-refine-mask"], "opposites"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--tracks", "grid:0"], "grid:N"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--tracks", "{tmp}/none.csv"], "none.csv"),
+        (["reconstruct", "{tmp}/nothing", "--out", "{tmp}/out"], "does not exist"),
+        (["reconstruct", "--out", "{tmp}/out"], "no input"),
+        (["reconstruct", "{tmp}", "--out", "{tmp}/out"], "no images"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--size", "100"], "100"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--stride", "0"], "stride"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--start", "7"], "start is 7"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--confidence-percentile", "150"], "is 150"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--model", "{tmp}/none.safetensors"], "none.safetensors"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--smooth-frames", "2"], "an odd number of frames"),
+        (["import", "{tmp}/none", "--format", "cut3r", "--out", "{tmp}/out"], "there is no such folder"),
+        (["import", "{frames}", "--format", "da3", "--out", "{tmp}/out"], "it has no results.npz"),
+        (["convert", "{tmp}/none.pt", "{tmp}/out.safetensors"], "none.pt"),
+        (["convert", "{frames}/frame_0.png", "{tmp}/out.safetensors", "--heads", "camera,nose"], "heads has ['nose']"),
+        (["convert", "{frames}/frame_0.png", "{tmp}/out.safetensors"], "frame_0.png"),
+        (["convert", "{tmp}/none.pt", "{tmp}/out.safetensors", "--config", "{tmp}/none.json"], "none.json"),
+        (["info", "{frames}/frame_0.png"], "frame_0.png"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, frames, arguments, sentence):
+    places = {"tmp": tmp_path, "frames": frames}
+    code, _, err = run(capsys, *(a.format(**places) for a in arguments))
+    assert code == 2
+    last = err.strip().splitlines()[-1]
+    assert last.startswith("vggtjax: ")
+    assert sentence in last
+    assert err.count("vggtjax: ") == 1
+    assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
+    assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_a_folder_that_cannot_be_written(tmp_path, capsys, frames):
+    (tmp_path / "file").write_text("")
+    code, _, err = run(capsys, "reconstruct", frames, "--out", tmp_path / "file" / "out", "--max-frames", 1)
+    assert code == 2
+    assert "cannot write" in err
+
+
+def test_an_unknown_option_is_exit_code_2():
+    made = subprocess.run(
+        [sys.executable, "-m", "vggtjax", "reconstruct", "--no-such-option"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert made.returncode == 2
+    assert "Traceback" not in made.stderr
+
+
+def _shell_lines():
+    blocks = README.read_text().split("```sh\n")[1:]
+    lines = [line for block in blocks for line in block.split("```")[0].splitlines()]
+    return [line for line in lines if line.startswith("vggtjax ")]
+
+
+def test_the_readme_has_commands():
+    assert len(_shell_lines()) >= 2
+
+
+@pytest.mark.parametrize("line", _shell_lines())
+def test_the_commands_of_the_readme_are_understood(line, monkeypatch):
+    called = []
+
+    def recorder(name, command):
+        return functools.wraps(command)(lambda *_, **__: called.append(name))
+
+    monkeypatch.setattr(cli, "COMMANDS", {name: recorder(name, command) for name, command in cli.COMMANDS.items()})
+    arguments = shlex.split(line)[1:]
+    assert cli.main(arguments) == 0
+    assert called == [arguments[0]]

@@ -1,0 +1,71 @@
+import functools
+import json
+
+import numpy as np
+import pytest
+
+from tests.training_runs import PARTS, PROBES
+from vggtjax.checkpoint import read_model, save_model
+from vggtjax.commands import train as command
+from vggtjax.errors import CheckpointError, InputError, MissingExtraError
+from vggtjax.network.model import init_params
+from vggtjax.training import loop
+from vggtjax.training.metrics import read_metrics
+
+
+@pytest.fixture
+def recipe(tmp_path, monkeypatch):
+    """A file with a recipe; the loop that the command calls runs on the tests' small parts."""
+    monkeypatch.setattr(loop, "train", functools.partial(loop.train, **PARTS))
+    path = tmp_path / "recipe.json"
+    path.write_text(PROBES.to_json())
+    return path
+
+
+def test_train(recipe, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command, "_LINE_SECONDS", 0.0)
+    out = tmp_path / "out"
+    command.train(recipe, out, log_every=2)
+    said = capsys.readouterr().out
+    assert "step 2 of 6, stage 1, loss " in said
+    assert "6 of 6" in said
+    assert str(out / "model.safetensors") in said
+    assert len(read_metrics(out / "metrics.csv")) == 3
+
+
+def test_fewer_steps_from_a_model(recipe, tmp_path, capsys):
+    params = init_params(4, PROBES.model)
+    start = save_model(tmp_path / "start.safetensors", params, PROBES.model)
+    out = tmp_path / "out"
+    command.train(recipe, out, init=str(start), steps=3, seconds=1e-9, dtype="bfloat16")
+    assert "1 of 3; the same command goes on" in capsys.readouterr().out
+    model = read_model(out / "model.safetensors")
+    assert model.dtype == "bfloat16"
+    np.testing.assert_allclose(
+        np.asarray(model.params["backbone"]["class_token"], np.float32), params["backbone"]["class_token"], rtol=0.01
+    )
+    assert json.loads((out / "recipe.json").read_text())["stages"][0]["steps"] == 2
+
+
+def test_bad_input(recipe, tmp_path, monkeypatch):
+    for values, says in (
+        ({"steps": 0}, "steps is 0"),
+        ({"seconds": 0.0}, "seconds is 0.0"),
+        ({"seconds": float("nan")}, "seconds is nan"),
+        ({"log_every": 0}, "log_every is 0"),
+        ({"checkpoint_seconds": -1.0}, "checkpoint_seconds is -1.0"),
+    ):
+        with pytest.raises(InputError, match=says):
+            command.train(recipe, tmp_path / "out", **values)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="cannot read"):
+        command.train(tmp_path / "none.json", tmp_path / "out")
+    with pytest.raises(CheckpointError):
+        command.train(recipe, tmp_path / "out", init="demo")  # another configuration
+    assert not (tmp_path / "out").exists()
+    monkeypatch.setattr(command, "find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"vggtjax\[train\]"):
+        command.train(recipe, tmp_path / "out")
+
+
+def test_durations():
+    assert [command._duration(s) for s in (4.4, 75, 3600, 7290)] == ["4 s", "1 min", "1 h 0 min", "2 h 1 min"]

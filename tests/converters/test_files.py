@@ -1,0 +1,377 @@
+"""Readers of PyTorch weights: every layout gives the same parameters, and none is trusted."""
+
+import json
+import os
+import pickle
+import shutil
+import sys
+import zipfile
+
+import jax
+import ml_dtypes
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save_file
+
+from benchmarks.make_checkpoint import make_checkpoint
+from benchmarks.seeded import seeded_state_dict
+from converters import convert, convert_state_dict
+from converters.files import choose_file, read_state_dict, weight_files
+from converters.locate import locate
+from vggtjax import load_model
+from vggtjax.checkpoint import save_model
+from vggtjax.errors import CheckpointError, MissingExtraError
+
+INDEX = "model.safetensors.index.json"
+SHARDS = [f"model-0000{number}-of-00003.safetensors" for number in (1, 2, 3)]
+KEY = "camera_head.pose_branch.fc1.bias"
+
+
+@pytest.fixture(scope="module")
+def shapes(golden):
+    return json.loads((golden / "shapes.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def state_dict(shapes):
+    return seeded_state_dict(shapes)
+
+
+@pytest.fixture(scope="module")
+def expected(state_dict, config):
+    return convert_state_dict(state_dict, config)
+
+
+@pytest.fixture(scope="module")
+def tensors(state_dict):
+    return {name: torch.from_numpy(value) for name, value in state_dict.items()}
+
+
+@pytest.fixture
+def small():
+    """A few tensors: enough for what does not look at names."""
+    return {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.ones(5, np.float16)}
+
+
+@pytest.fixture(scope="module")
+def sharded_once(shapes, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("once") / "sharded"
+    make_checkpoint(folder, shapes, shards=3)
+    return folder
+
+
+@pytest.fixture
+def sharded(sharded_once, tmp_path):
+    return shutil.copytree(sharded_once, tmp_path / "sharded")
+
+
+@pytest.fixture
+def few(tmp_path):
+    """Three tensors in three shards."""
+    make_checkpoint(tmp_path / "few", {KEY: [4], "b": [4], "c": [4]}, shards=3)
+    return tmp_path / "few"
+
+
+def refusal(path, function=read_state_dict) -> str:
+    with pytest.raises(CheckpointError) as raised:
+        function(path)
+    message = str(raised.value)
+    assert "\n" not in message
+    return message
+
+
+def assert_converts(source, config, expected, tmp_path):
+    made = load_model(convert(source, tmp_path / "converted.safetensors", config=config).path).params
+    assert jax.tree.all(jax.tree.map(np.array_equal, made, expected))
+
+
+def edit_index(folder, change):
+    path = folder / INDEX
+    index = json.loads(path.read_text())
+    change(index)
+    path.write_text(json.dumps(index))
+    return path
+
+
+# Layouts
+
+
+@pytest.mark.parametrize("name", ["model.safetensors", "mislabelled.pt"])
+def test_one_safetensors_file(shapes, config, expected, tmp_path, name):
+    make_checkpoint(tmp_path / name, shapes)
+    assert_converts(tmp_path / name, config, expected, tmp_path)
+
+
+@pytest.mark.parametrize("dtype", [ml_dtypes.bfloat16, np.float16])
+def test_other_types(state_dict, config, tmp_path, dtype):
+    cast = {name: value.astype(dtype) for name, value in state_dict.items()}
+    save_file(cast, tmp_path / "model.safetensors")
+    read = read_state_dict(tmp_path / "model.safetensors")
+    assert all(read.tensors[name].dtype == dtype and np.array_equal(read.tensors[name], cast[name]) for name in cast)
+    widened = {name: value.astype(np.float32) for name, value in cast.items()}
+    assert_converts(tmp_path / "model.safetensors", config, convert_state_dict(widened, config), tmp_path)
+
+
+@pytest.mark.parametrize("given", ["", INDEX])
+def test_shards(sharded, config, expected, tmp_path, given):
+    assert sorted(path.name for path in sharded.iterdir()) == [*SHARDS, INDEX]
+    assert_converts(sharded / given, config, expected, tmp_path)
+    assert weight_files(sharded / INDEX) == [sharded / INDEX, *(sharded / shard for shard in SHARDS)]
+
+
+@pytest.mark.parametrize("name", ["model.pt", "model.pth"])
+def test_torch_file(shapes, config, expected, tmp_path, name):
+    make_checkpoint(tmp_path / name, shapes, format="pt")
+    assert_converts(tmp_path / name, config, expected, tmp_path)
+
+
+@pytest.mark.parametrize("wrap", [("model",), ("state_dict",), ("state_dict", "model")])
+def test_training_checkpoint(tensors, config, expected, tmp_path, wrap):
+    content = tensors
+    for key in wrap:
+        content = {key: content, "epoch": 3, "optimizer": {"lr": 0.1}}
+    torch.save(content, tmp_path / "train.pt")
+    assert_converts(tmp_path / "train.pt", config, expected, tmp_path)
+
+
+def test_old_torch_file_is_read_into_memory(tensors, config, expected, tmp_path, caplog):
+    torch.save(tensors, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    assert_converts(tmp_path / "old.pt", config, expected, tmp_path)
+    assert "read into memory" in caplog.text
+
+
+def test_torch_types_and_views(tmp_path):
+    x = torch.arange(12.0).reshape(3, 4)
+    content = {"half": x.half(), "brain": x.bfloat16(), "view": x.T[1:], "parameter": torch.nn.Parameter(x)}
+    torch.save(content, tmp_path / "types.pt")
+    read = read_state_dict(tmp_path / "types.pt").tensors
+    assert read["brain"].dtype == ml_dtypes.bfloat16
+    for name, value in content.items():
+        assert np.array_equal(np.asarray(read[name]).astype(np.float32), value.detach().float().numpy())
+
+
+def test_tensors_are_mapped_not_read(small, tmp_path):
+    small |= {"scalar": np.array(3.0), "empty": np.zeros((0, 3), np.float32)}
+    save_file(small, tmp_path / "model.safetensors")
+    torch.save({name: torch.from_numpy(value) for name, value in small.items()}, tmp_path / "model.pt")
+    for name in ("model.safetensors", "model.pt"):
+        read = read_state_dict(tmp_path / name).tensors
+        assert all(np.array_equal(read[key], small[key]) and read[key].shape == small[key].shape for key in small)
+        assert not np.asarray(read["a"]).flags.owndata
+
+
+def test_torch_file_by_another_name(tmp_path):
+    (tmp_path / "number.pt").write_bytes(b"\x80\x04K\x01.")
+    assert "is not a whole torch file" in refusal(tmp_path / "number.pt")
+    torch.save({"a": torch.ones(1)}, tmp_path / "model.safetensors")
+    assert "is a torch file by its content; rename it to .pt" in refusal(tmp_path / "model.safetensors")
+
+
+# Finding
+
+
+def test_choice_among_files():
+    names = [
+        "README.md",
+        "model.pt",
+        "model.safetensors",
+        INDEX,
+        SHARDS[0],
+        ".x.partial.safetensors",
+        "sub/x.safetensors",
+    ]
+    assert choose_file(names, "here") == "model.safetensors"
+    names.remove("model.safetensors")
+    assert choose_file(names, "here") == INDEX
+    names.remove(INDEX)
+    assert choose_file(names, "here") == SHARDS[0]
+    names.remove(SHARDS[0])
+    assert choose_file(names, "here") == "model.pt"
+    names.remove("model.pt")
+    with pytest.raises(CheckpointError, match="here holds no weights; expected one of"):
+        choose_file(names, "here")
+    with pytest.raises(CheckpointError, match=r"here holds 2 files of weights \(a.pt, b.pth\)"):
+        choose_file(["a.pt", "b.pth"], "here")
+
+
+@pytest.mark.parametrize("source", ["nowhere.pt", "weights/missing.safetensors", "./a/b", "demo2", "x" * 5000, "a\0b"])
+def test_nothing_there(source, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    message = refusal(source, locate)
+    assert "there are no weights at" in message or "File name too long" in message
+
+
+def test_name_of_the_model(few, small, tmp_path):
+    assert locate(few).name == "few"
+    assert locate(few / INDEX).name == "model"
+    save_file(small, tmp_path / "my.model.safetensors")
+    assert locate(tmp_path / "my.model.safetensors").name == "my.model"
+
+
+# Damage and malice
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "is empty"),
+        (b"<!doctype html><html>", "is a web page"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "is a pointer of Git LFS"),
+        (b"\x93NUMPY\x01\x00v\x00{", "is a file that starts with"),
+        ((2**40).to_bytes(8, "little") + b"{}", "claims 1099511627776 bytes"),
+        ((2**63).to_bytes(8, "little") + b"{}", "is a file that starts with"),
+        ((500).to_bytes(8, "little") + b'{"a":', "is not a whole safetensors file"),
+        ((8).to_bytes(8, "little") + b"{not js}", "is not a whole safetensors file"),
+    ],
+)
+def test_not_weights(tmp_path, content, reason):
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(content)
+    assert reason in refusal(path)
+
+
+def test_truncated_files(small, tmp_path):
+    save_file(small, tmp_path / "model.safetensors")
+    torch.save({name: torch.from_numpy(value) for name, value in small.items()}, tmp_path / "model.pt")
+    for name, reason in (("model.safetensors", "not a whole safetensors file"), ("model.pt", "not a whole torch file")):
+        content = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(content[:-10])
+        assert reason in refusal(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    "spans",
+    [
+        {"a": [0, 8], "b": [4, 12]},  # overlap
+        {"a": [0, 8], "b": [12, 20]},  # gap
+        {"a": [0, 8], "b": [8, 2**40]},  # beyond the end
+        {"a": [0, 8], "b": [8, 12]},  # too small for the shape
+        {"a": [8, 0], "b": [8, 16]},  # backwards
+    ],
+)
+def test_places_that_lie(tmp_path, spans):
+    header = json.dumps({name: {"dtype": "F32", "shape": [2], "data_offsets": span} for name, span in spans.items()})
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(len(header).to_bytes(8, "little") + header.encode() + bytes(20))
+    assert "not a whole safetensors file" in refusal(path)
+
+
+class Code:
+    def __reduce__(self):
+        return os.mkdir, ("ran",)
+
+
+@pytest.mark.parametrize("archive", [True, False])
+def test_pickled_code_is_not_run(tmp_path, monkeypatch, archive):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"a": torch.ones(2), "b": Code()}, "evil.pt", _use_new_zipfile_serialization=archive)
+    assert "could run code and is not opened" in refusal(tmp_path / "evil.pt")
+    (tmp_path / "plain.pt").write_bytes(pickle.dumps({"b": Code()}))
+    assert "could run code and is not opened" in refusal(tmp_path / "plain.pt")
+    assert not (tmp_path / "ran").exists()
+
+
+def test_compressed_archive(tmp_path):
+    torch.save({"a": torch.zeros(1000)}, tmp_path / "model.pt")
+    source = zipfile.ZipFile(tmp_path / "model.pt")
+    with source, zipfile.ZipFile(tmp_path / "bomb.pt", "w", zipfile.ZIP_DEFLATED) as target:
+        for entry in source.infolist():
+            target.writestr(entry.filename, source.read(entry))
+    assert "is a compressed archive" in refusal(tmp_path / "bomb.pt")
+
+
+@pytest.mark.parametrize("content", [[torch.ones(1)], {}, torch.ones(1), {"model": {}}])
+def test_torch_file_without_state_dict(tmp_path, content):
+    torch.save(content, tmp_path / "model.pt")
+    assert "expected a state dict" in refusal(tmp_path / "model.pt")
+
+
+def test_entries_that_are_not_tensors(tensors, config, tmp_path):
+    strange = {"number": 3, 5: torch.ones(1), "sparse": torch.eye(2).to_sparse(), "meta": torch.ones(1, device="meta")}
+    torch.save(tensors | strange, tmp_path / "model.pt")
+    message = refusal(tmp_path / "model.pt", lambda path: convert(path, tmp_path / "x.safetensors", config=config))
+    assert "4 problems" in message
+    for name in strange:
+        assert f"entry {name!r} is not a dense tensor" in message
+
+
+def test_own_checkpoint_is_not_converted_again(expected, config, tmp_path):
+    save_model(tmp_path / "ours.safetensors", expected, config)
+    assert "is a checkpoint of this library already" in refusal(tmp_path / "ours.safetensors")
+
+
+def test_unsupported_type(tmp_path):
+    header = json.dumps({"a": {"dtype": "F4", "shape": [2], "data_offsets": [0, 1]}})
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(len(header).to_bytes(8, "little") + header.encode() + bytes(1))
+    assert "has tensors of type F4" in refusal(path)
+
+
+def test_torch_is_an_extra(tmp_path, monkeypatch):
+    torch.save({"a": torch.ones(1)}, tmp_path / "model.pt")
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'vggtjax\[convert\]'"):
+        read_state_dict(tmp_path / "model.pt")
+
+
+# Shards
+
+
+@pytest.mark.parametrize(
+    "name", ["../x.safetensors", "/etc/passwd", "a/b", "..", ".", "", "a\\b", "c:x", "a\0", 3, None]
+)
+def test_index_stays_in_its_folder(few, name):
+    (few.parent / "x.safetensors").write_bytes(b"outside")
+    path = edit_index(few, lambda index: index["weight_map"].update({KEY: name}))
+    assert "expected names of files beside it" in refusal(path)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("{", "is not JSON"),
+        ("[" * 100_000, "is not JSON"),
+        ("[]", "no weight_map"),
+        ('{"weight_map": []}', "no weight_map"),
+    ],
+)
+def test_index_that_is_none(few, content, reason):
+    (few / INDEX).write_text(content)
+    assert reason in refusal(few / INDEX)
+
+
+def test_missing_shards(few):
+    for shard in SHARDS[:2]:
+        (few / shard).unlink()
+    message = refusal(few / INDEX)
+    assert f"2 problems: missing shard {SHARDS[0]}; missing shard {SHARDS[1]}" in message
+
+
+def test_index_and_shards_disagree(sharded, config, tmp_path):
+    def change(index):
+        first = [name for name, shard in index["weight_map"].items() if shard == SHARDS[0]]
+        del index["weight_map"][first[0]]
+        index["weight_map"][first[1]] = SHARDS[1]
+        index["weight_map"]["ghost.weight"] = SHARDS[2]
+
+    edit_index(sharded, change)
+    message = refusal(sharded, lambda path: convert(path, tmp_path / "x.safetensors", config=config))
+    assert "3 problems" in message
+    assert f"is in {SHARDS[0]}, but in none by the index" in message
+    assert f"is in {SHARDS[0]}, but in {SHARDS[1]} by the index" in message
+    assert "key ghost.weight of the index is in no shard" in message
+
+
+def test_key_in_two_shards_beside_other_problems(sharded, config, tmp_path):
+    twice, unknown = "aggregator.camera_token", "extra.weight"
+    for shard in (SHARDS[0], SHARDS[2]):
+        added = {twice: np.zeros((1, 2, 1, 32), np.float32)} | ({unknown: np.ones(1)} if shard == SHARDS[0] else {})
+        held = {name: np.array(value) for name, value in read_state_dict(sharded / shard).tensors.items()}
+        save_file(held | added, tmp_path / "new")
+        (tmp_path / "new").replace(sharded / shard)
+    edit_index(sharded, lambda index: index["weight_map"].update({unknown: SHARDS[0]}))
+    message = refusal(sharded, lambda path: convert(path, tmp_path / "x.safetensors", config=config))
+    assert "2 problems" in message
+    assert f"duplicate key {twice} in {SHARDS[0]} and {SHARDS[2]}" in message
+    assert f"unknown key {unknown}" in message

@@ -1,0 +1,342 @@
+"""Opening data sets: what is taken and what is noted, plain folders, and real footage in metres."""
+
+import logging
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.dataset_files import depth_png, opened, picture, png, write
+from vggtjax.clips.images import read_image
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets import DATASETS, published
+from vggtjax.evaluation.datasets.frames import Frames
+from vggtjax.evaluation.datasets.plain import takes
+from vggtjax.evaluation.metrics.trajectory import checked_poses
+
+DAVIS_LENGTHS = {
+    "breakdance": 84,
+    "camel": 90,
+    "car-roundabout": 75,
+    "libby": 49,
+    "parkour": 100,
+    "scooter-black": 43,
+}
+EYE = " ".join(map(str, np.eye(4).ravel()))
+
+
+def plain_folder(folder, frames=3, poses=None):
+    for i in range(frames):
+        write(folder / "rgb" / f"{i:02d}.png", picture())
+        write(folder / "depth" / f"{i:02d}.png", depth_png(np.full((3, 4), 1000 * i)))
+        write(folder / "mask" / f"{i:02d}.png", png(np.eye(3, 4, dtype=np.uint8) * 255))
+    write(folder / "K.txt", "8 0 2\n0 9 1.5\n0 0 1\n")
+    write(folder / "world_from_camera.txt", "\n".join([EYE] * frames if poses is None else poses))
+    return folder
+
+
+def lifted(sequence, frame, step=4):
+    """World points [N, 3] of every step-th pixel with depth; pixels have their centres at one half."""
+    depth = sequence.depth(frame)
+    rows, columns = (part.ravel() for part in np.mgrid[: depth.shape[0] : step, : depth.shape[1] : step])
+    z = depth[rows, columns]
+    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(z))], -1) @ np.linalg.inv(sequence.intrinsics[frame]).T
+    points = (rays * z[:, None])[z > 0]
+    pose = sequence.world_from_camera[frame]
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+def depth_differences(sequence, source, target):
+    """Relative differences of the depth of one frame, seen from another, from what that one measured there."""
+    pose = np.linalg.inv(sequence.world_from_camera[target])
+    points = lifted(sequence, source) @ pose[:3, :3].T + pose[:3, 3]
+    points = points[points[:, 2] > 0.1]
+    x, y = np.floor((points @ sequence.intrinsics[target].T)[:, :2] / points[:, 2:]).astype(int).T
+    depth = sequence.depth(target)
+    seen = (x >= 0) & (y >= 0) & (x < depth.shape[1]) & (y < depth.shape[0])
+    measured, expected = depth[y[seen], x[seen]], points[seen, 2]
+    known = measured > 0
+    assert known.sum() > 500
+    return np.abs(expected - measured)[known] / measured[known]
+
+
+def test_frames_are_a_window_then_a_stride_then_a_cap():
+    assert Frames(slice(2, 9), 3, 2).of(range(20), "a") == [2, 5]
+    assert Frames(slice(30, 140)).of(range(100), "a") == list(range(30, 100))
+    assert Frames(slice(30, 140)).shortage(100) == ("it has 100 frames; the protocol takes 30 to 139",)
+    assert Frames(slice(30, 140)).shortage(140) == Frames().shortage(1) == ()
+    with pytest.raises(InputError, match="sequence a has 30 frames, and none of them from 30 on"):
+        Frames(slice(30, 140)).of(range(30), "a")
+
+
+def test_plain_folder(tmp_path):
+    folder = plain_folder(tmp_path / "clip")
+    (sequence,) = opened("plain", folder)
+    assert (sequence.name, len(sequence), sequence.notes) == ("clip", 3, ())
+    assert [path.name for path in sequence.pictures] == ["00.png", "01.png", "02.png"]
+    assert np.array_equal(sequence.depth(2), np.full((3, 4), 2, np.float32))  # metres
+    assert not sequence.depth(0).any()
+    assert np.array_equal(sequence.mask(1), np.eye(3, 4, dtype=bool))
+    assert np.array_equal(sequence.intrinsics[1], [[8, 0, 2], [0, 9, 1.5], [0, 0, 1]])  # as it is, without a shift
+    assert np.array_equal(sequence.world_from_camera, np.tile(np.eye(4), (3, 1, 1)))
+
+
+def test_a_folder_of_folders_is_in_natural_order_and_strides(tmp_path):
+    for name in ("take10", "take2"):
+        plain_folder(tmp_path / name)
+    write(tmp_path / ".hidden" / "rgb" / "0.png", picture())
+    sequences = opened("plain", tmp_path, stride=2)
+    assert [sequence.name for sequence in sequences] == ["take2", "take10"]
+    assert [path.name for path in sequences[0].pictures] == ["00.png", "02.png"]
+    assert sequences[0].depth(1).max() == 2
+    only = opened("plain", tmp_path, sequences=["take10"])
+    assert [sequence.name for sequence in only] == ["take10"]
+
+
+def test_takes_split_where_the_camera_jumps(tmp_path):
+    def pose(x):
+        return f"1 0 0 {x} 0 1 0 0 0 0 1 0 0 0 0 1"
+
+    folder = plain_folder(tmp_path / "walk", frames=5, poses=[pose(x) for x in (0, 0.1, 0.2, 9, 9.1)])
+    first, second = opened("hololens", folder)
+    assert (first.name, len(first)) == ("walk 0-2", 3)
+    assert (second.name, len(second)) == ("walk 3-4", 2)
+    assert second.world_from_camera[:, 0, 3].tolist() == [9, 9.1]
+    assert second.pictures[0].name == "03.png"
+    assert second.depth(1).max() == 4
+
+
+def test_takes_by_hand():
+    x = np.array([0, 0, 0, 0, 1, 2, 3, 3, 3, 3, 30, 31])  # pauses, steps of 1, a jump of 27
+    assert takes(np.outer(x, [1, 0, 0])) == [range(10), range(10, 12)]
+    assert takes(np.zeros((4, 3))) == [range(4)]
+    assert takes(np.zeros((1, 3))) == [range(1)]
+
+
+def test_what_is_missing_is_noted(tmp_path):
+    folder = plain_folder(tmp_path / "clip")
+    (folder / "depth" / "01.png").unlink()
+    (folder / "mask" / "02.png").unlink()
+    (folder / "K.txt").unlink()
+    (folder / "world_from_camera.txt").unlink()
+    (sequence,) = opened("plain", folder)
+    assert sequence.notes == (
+        "clip: 1 of 3 frames have no depth, 01 first",
+        "clip: 2 of 3 frames have a mask, so it has no masks",
+        "clip: it has no world_from_camera.txt",
+        "clip: it has no K.txt",
+    )
+    assert sequence.mask is sequence.world_from_camera is sequence.intrinsics is None
+    assert sequence.depth(1).shape == (3, 4)
+    assert not sequence.depth(1).any()
+    for path in (folder / "depth").iterdir():
+        path.unlink()
+    assert opened("plain", folder)[0].depth is None
+
+
+def test_depth_and_masks_of_another_size_are_refused(tmp_path):
+    folder = plain_folder(tmp_path / "clip")
+    write(folder / "depth" / "00.png", depth_png(np.ones((4, 3))))
+    write(folder / "mask" / "01.png", png(np.full((3, 5), 255, np.uint8)))
+    (sequence,) = opened("plain", folder)
+    with pytest.raises(InputError, match=r"00\.png has shape \(4, 3\); expected \(3, 4\), the size of 00\.png"):
+        sequence.depth(0)
+    with pytest.raises(InputError, match=r"01\.png has shape \(3, 5\)"):
+        sequence.mask(1)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (png(np.zeros((3, 4), np.uint8)), "expected one channel of 16 bits"),
+        (picture(), "expected one channel of 16 bits"),
+        (depth_png(np.ones((3, 4)))[:45], "cannot be read"),
+        (b"nothing", "cannot be read"),
+    ],
+)
+def test_depth_that_is_not_16_bits_is_refused(tmp_path, content, message):
+    folder = plain_folder(tmp_path / "clip")
+    write(folder / "depth" / "00.png", content)
+    with pytest.raises(InputError, match=rf"00\.png .*{message}"):
+        opened("plain", folder)[0].depth(0)
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("world_from_camera.txt", f"{EYE}\n{EYE}", "has 2 poses; expected 3"),
+        ("world_from_camera.txt", "1 2 3\n", "has 3 numbers"),
+        ("world_from_camera.txt", f"{EYE}\n{EYE}\n2{EYE[1:]}", "not a rotation"),
+        ("world_from_camera.txt", f"{EYE}\n{EYE}\n{EYE[:-3]}2.0", "last row"),
+        ("K.txt", "8 0 2\n0 9 1.5\n", "has 2 rows; expected 3"),
+        ("K.txt", "-8 0 2\n0 9 1.5\n0 0 1\n", "focal lengths above 0"),
+    ],
+)
+def test_cameras_that_are_none_are_refused(tmp_path, file, content, message):
+    folder = plain_folder(tmp_path / "clip")
+    write(folder / file, content)
+    with pytest.raises(InputError, match=rf"{file}.*{message}"):
+        opened("plain", folder)
+
+
+def test_arguments_that_cannot_work(tmp_path):
+    plain_folder(tmp_path / "clip")
+    with pytest.raises(InputError, match="'imagenet' is not known; expected one of plain, composite"):
+        opened("imagenet", tmp_path)
+    with pytest.raises(InputError, match="is not a folder"):
+        opened("plain", tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"'other' of plain is not in .*; expected of clip"):
+        opened("plain", tmp_path, sequences=["clip", "other"])
+    with pytest.raises(InputError, match="none twice"):
+        opened("plain", tmp_path, sequences=["clip", "clip"])
+    with pytest.raises(InputError, match="one name at least"):
+        opened("plain", tmp_path, sequences=[])
+    with pytest.raises(InputError, match="stride is 0"):
+        opened("plain", tmp_path, stride=0)
+    with pytest.raises(InputError, match="gt is 'lidar'; plain has one ground truth"):
+        opened("plain", tmp_path, gt="lidar")
+    with pytest.raises(InputError, match="gt is 'colmap'; dycheck has easi3r and lidar"):
+        opened("dycheck", tmp_path, gt="colmap")
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_an_empty_folder_is_refused(tmp_path, name):
+    with pytest.raises(InputError, match=r"holds no .*; expected"):
+        opened(name, tmp_path)
+
+
+def test_a_folder_without_pictures_is_refused(tmp_path):
+    (tmp_path / "rgb").mkdir()
+    with pytest.raises(InputError, match="holds no pictures"):
+        opened("plain", tmp_path)
+
+
+def test_the_table():
+    counts = {"davis": 20, "davis-2017": 30, "sintel": 14, "tum": 8, "bonn": 5, "kitti": 13, "dycheck": 12}
+    assert {name: len(set(row.sequences or ())) for name, row in DATASETS.items() if row.sequences} == counts
+    assert {name: row.max_depth for name, row in DATASETS.items() if row.max_depth} == {"bonn": 70, "sintel": 70}
+    assert {name: row.gt_default for name, row in DATASETS.items() if row.gt} == {"dycheck": "easi3r"}
+    assert DATASETS["tum"].frames.of(range(1000), "tum") == list(range(0, 270, 3))
+    assert DATASETS["bonn"].frames.of(range(1000), "bonn") == list(range(30, 140))
+    assert DATASETS["kitti"].frames.of(range(1000), "kitti") == list(range(110))
+    assert DATASETS["dycheck"].frames.of(range(35), "dycheck") == [0, 10, 20, 30]
+    assert set(published.DAVIS_2016) < set(published.DAVIS_2017)
+
+
+def davis_folder(root, *names, frames=2):
+    # DAVIS 2017: JPEGImages and Annotations/480p, PNG with a palette (davischallenge.org/davis2017/code.html)
+    for name in names:
+        for i in range(frames):
+            path = root / "JPEGImages" / "480p" / name / f"{i:05d}.jpg"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            Image.new("RGB", (4, 3)).save(path)
+            labels = np.array([[0, 1, 2, 0], [0] * 4, [0, 0, 3, 0]], np.uint8)
+            palette = [0, 0, 0, 128, 0, 0, 0, 128, 0, 0, 0, 0]  # the colour of label 3 is black too
+            write(root / "Annotations" / "480p" / name / f"{i:05d}.png", png(labels, palette))
+    return root
+
+
+def test_davis_moves_where_any_label_is(tmp_path):
+    (sequence,) = opened("davis-2017", davis_folder(tmp_path, "gold-fish"))
+    expected = np.array([[0, 1, 1, 0], [0, 0, 0, 0], [0, 0, 1, 0]], bool)
+    assert np.array_equal(sequence.mask(1), expected)
+    assert sequence.depth is sequence.world_from_camera is None
+    nothing, ones = np.zeros((3, 4), np.uint8), expected.astype(np.uint8)
+    opaque = np.stack([nothing, ones, nothing, np.full((3, 4), 255, np.uint8)], -1)
+    for pixels in (ones, opaque[..., :3], opaque):
+        write(tmp_path / "Annotations" / "480p" / "gold-fish" / "00000.png", png(pixels))  # grey, colour, opacity
+        assert np.array_equal(sequence.mask(0), expected)
+    write(tmp_path / "Annotations" / "480p" / "gold-fish" / "00000.png", png(np.zeros((4, 4), np.uint8)))
+    with pytest.raises(InputError, match=r"00000\.png has shape \(4, 4\); expected \(3, 4\)"):
+        sequence.mask(0)
+    write(tmp_path / "Annotations" / "480p" / "gold-fish" / "00001.png", b"GIF89a")
+    with pytest.raises(InputError, match="expected PNG"):
+        sequence.mask(1)
+
+
+def test_published_sequences_that_are_absent_are_named_and_logged(tmp_path, caplog):
+    davis_folder(tmp_path, "soapbox", "bear", "camel")
+    with caplog.at_level(logging.WARNING):
+        sequences = opened("davis", tmp_path)
+    assert [sequence.name for sequence in sequences] == ["camel", "soapbox"]
+    absent, left = sequences[0].notes
+    assert absent.startswith("18 of 20 published sequences of davis are not there: blackswan, bmx-trees")
+    assert absent.endswith("paragliding-launch, parkour, scooter-black")
+    assert left == "left out, as the published protocol of davis does: bear"
+    assert caplog.messages == [absent, left]
+    assert [sequence.name for sequence in opened("davis", tmp_path, sequences=["bear"])] == ["bear"]
+
+
+def test_without_published_sequences_all_are_taken(tmp_path, caplog):
+    sequences = opened("davis", davis_folder(tmp_path, "bear", "boat"))
+    assert [sequence.name for sequence in sequences] == ["bear", "boat"]
+    assert sequences[1].notes == ("none of the 20 published sequences of davis is there; took all found",)
+    assert caplog.messages == list(sequences[1].notes)
+
+
+def test_frames_without_annotation_leave_no_masks(tmp_path):
+    davis_folder(tmp_path, "camel")
+    (tmp_path / "Annotations" / "480p" / "camel" / "00001.png").unlink()
+    (sequence,) = opened("davis", tmp_path)
+    assert sequence.mask is None
+    assert "camel: 1 of 2 frames have a mask, so it has no masks" in sequence.notes
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "lengths", "farthest"),
+    [
+        ("composite", "composite", {"desk_car": 16, "kitchen_parkour": 16}, 8),
+        ("hololens", "hololens", {"hololens 0-23": 24, "hololens 24-47": 24}, 8),
+        ("tum", "tum", {"tum": 14}, 10),
+        (
+            "davis",
+            "davis",
+            DAVIS_LENGTHS,
+            None,
+        ),
+    ],
+)
+def test_real_footage(clips, name, folder, lengths, farthest):
+    sequences = opened(name, clips / folder)
+    assert {sequence.name: len(sequence) for sequence in sequences} == lengths
+    for sequence in sequences:
+        width, height = read_image(sequence.pictures[-1]).size
+        if farthest is not None:
+            depth = sequence.depth(len(sequence) - 1)
+            assert depth.shape == (height, width)
+            assert depth.dtype == np.float32
+            assert 0.2 < depth[depth > 0].min() < depth.max() < farthest
+            poses = sequence.world_from_camera
+            checked_poses(poses[:, :3])
+            assert 0.01 < np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() < 0.5
+        if name in ("composite", "davis"):
+            mask = sequence.mask(len(sequence) - 1)
+            assert mask.shape == (height, width)
+            assert 0.001 < mask.mean() < 0.5
+
+
+@pytest.mark.parametrize("take", [0, 1])
+def test_depth_poses_and_intrinsics_of_hololens_agree(clips, take):
+    sequence = opened("hololens", clips / "hololens")[take]
+    assert np.median(depth_differences(sequence, 4, 6)) < 0.006
+    turned = sequence.world_from_camera.copy()
+    turned[:, :3, :3] = turned[:, :3, :3].swapaxes(1, 2)  # what reading poses the wrong way round would do
+    wrong = type(sequence)("wrong", sequence.pictures, sequence.depth, None, turned, sequence.intrinsics)
+    assert np.median(depth_differences(wrong, 4, 6)) > 0.04
+
+
+def test_depth_poses_and_intrinsics_of_tum_agree(clips, tmp_path):
+    link = tmp_path / "rgbd_dataset_freiburg1_rpy"
+    link.mkdir()
+    for name in ("rgb", "depth", "rgb.txt", "depth.txt", "groundtruth.txt"):
+        (link / name).symlink_to(clips / "tum" / name)
+    (sequence,) = opened("tum", tmp_path, stride=1)
+    assert sequence.name == "freiburg1_rpy"
+    assert len(sequence) == 40
+    assert np.allclose(sequence.intrinsics[7], [[517.3, 0, 319.1], [0, 516.5, 255.8], [0, 0, 1]])
+    assert np.allclose(np.diff(sequence.timestamps), 1 / 30, atol=0.02)
+    assert np.median(depth_differences(sequence, 5, 12)) < 0.02
+    moved = sequence.intrinsics.copy()
+    moved[:, :2, 2] -= 60
+    wrong = type(sequence)("wrong", sequence.pictures, sequence.depth, None, sequence.world_from_camera, moved)
+    assert np.median(depth_differences(wrong, 5, 12)) > 0.025

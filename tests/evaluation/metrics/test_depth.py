@@ -1,0 +1,67 @@
+"""Depth up to scale: hand-computed values, invariance to scale, and the mean depth map."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vggtjax.errors import InputError
+from vggtjax.evaluation.metrics.depth import depth_errors, mean_depth_map, measured, median_scale
+
+TRUTH = np.array([[[2.0, 4.0], [8.0, 0.0]]])  # one frame; the last pixel is not measured
+
+
+def test_by_hand():
+    predicted = np.array([[[1.0, 2.0], [5.0, 9.0]]])
+    assert median_scale(predicted, TRUTH) == 2  # of 2, 2 and 1.6
+    errors = depth_errors(predicted, TRUTH)  # 2, 4 and 10 against 2, 4 and 8
+    assert errors.abs_rel == pytest.approx(0.25 / 3)
+    assert errors.delta1 == pytest.approx(2 / 3)  # 10 / 8 is not below 1.25
+    assert depth_errors(predicted, TRUTH, scale=1.0).abs_rel == pytest.approx((0.5 + 0.5 + 0.375) / 3)
+    assert depth_errors(predicted, TRUTH, scale=1.61).delta1 == pytest.approx(3 / 3)
+
+
+def test_only_valid_pixels_count():
+    predicted = np.array([[[1.0, np.nan], [4.0, -1.0]]])
+    valid = np.array([[[True, False], [True, True]]])
+    assert median_scale(predicted, TRUTH, valid) == 2
+    assert depth_errors(predicted, TRUTH, valid) == (0, 1)
+    assert measured(np.array([0, -1, np.nan, np.inf, 3])).tolist() == [False, False, False, False, True]
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), scale=st.floats(1e-3, 1e3))
+def test_scale_does_not_matter(seed, scale):
+    generator = np.random.default_rng(seed)
+    truth, predicted = np.exp(generator.normal(size=(2, 3, 4, 5)))
+    errors, scaled = depth_errors(predicted, truth), depth_errors(scale * predicted, truth)
+    assert errors.abs_rel == pytest.approx(scaled.abs_rel)
+    assert median_scale(scale * predicted, truth) * scale == pytest.approx(median_scale(predicted, truth))
+    assert errors.abs_rel > 0
+    assert 0 <= errors.delta1 <= 1
+    assert depth_errors(scale * truth, truth).abs_rel == pytest.approx(0, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("predicted", "valid", "sentence"),
+    [
+        (np.ones((1, 2, 3)), None, "expected the same"),
+        (np.array([[[1.0, np.inf], [0.0, 1.0]]]), None, "2 predicted depths are not finite and above 0"),
+        (np.ones((1, 2, 2)), np.zeros((1, 2, 2), bool), "no pixel has a true depth"),
+        (np.ones((1, 2, 2)), np.ones((1, 2, 2)), "of bool"),
+        (np.ones((1, 2, 2)), np.ones((2, 2), bool), "expected .1, 2, 2. of bool"),
+    ],
+)
+def test_bad_input_is_one_sentence(predicted, valid, sentence):
+    for function in (median_scale, depth_errors):
+        with pytest.raises(InputError, match=sentence):
+            function(predicted, TRUTH, valid)
+
+
+def test_the_mean_map_leaves_out_what_is_not_measured():
+    clips = np.array([[[[1.0, 0.0]], [[3.0, 4.0]]], [[[5.0, 8.0]], [[7.0, np.nan]]]])  # 2 clips, 2 frames, 1 x 2 pixels
+    assert mean_depth_map(clips).tolist() == [[4.0, 6.0]]
+    with pytest.raises(InputError, match="1 pixels have no depth"):
+        mean_depth_map(clips * [1, 0])
+    with pytest.raises(InputError, match=r"expected clips \[N, S, H, W\]"):
+        mean_depth_map(clips[0])

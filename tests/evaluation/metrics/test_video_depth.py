@@ -1,0 +1,210 @@
+"""Depth of a sequence: hand-computed values, invariances, other optimisers on the same objectives."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linprog, minimize_scalar
+
+from vggtjax.errors import InputError
+from vggtjax.evaluation.metrics.video_depth import depth_alignment, resized_depth, video_depth_errors
+
+TRUTH = np.array([[[2.0, 4.0]], [[8.0, 0.0]]])  # two frames of two pixels; the last is not measured
+seeds = st.integers(0, 2**32 - 1)
+
+
+def depths(seed, shape=(3, 6, 7)) -> tuple[np.ndarray, np.ndarray]:
+    """A prediction off by scale, shift and heavy-tailed noise, and a truth with holes."""
+    generator = np.random.default_rng(seed)
+    truth = np.exp(0.5 * generator.normal(size=shape)) + 1
+    noise = np.clip(0.1 * generator.standard_t(2, size=shape), -0.9, 3)
+    predicted = np.maximum((truth * (1 + noise) + 0.5) * np.exp(generator.normal()), 0.01)
+    return predicted, np.where(generator.random(shape) < 0.2, 0, truth)
+
+
+def test_errors_by_hand():
+    predicted = np.array([[[2.0, 5.0]], [[4.0, np.nan]]])
+    errors = video_depth_errors(predicted, TRUTH, "metric")
+    assert errors.abs_rel == pytest.approx((0 + 0.25 + 0.5) / 3)
+    assert errors.rmse == pytest.approx(np.sqrt((0 + 1 + 16) / 3))
+    assert errors.delta1 == pytest.approx(1 / 3)  # 5 / 4 is not below 1.25
+    assert errors.delta2 == pytest.approx(2 / 3)
+    assert errors.delta3 == pytest.approx(2 / 3)  # 1.25^3 is 1.953: 2 is above
+    assert errors.pixels == 3
+    assert video_depth_errors(1.03 * predicted, TRUTH, "metric").delta3 == 1
+    near = video_depth_errors(predicted, TRUTH, "metric", max_depth=8)
+    assert near == pytest.approx((0.125, np.sqrt(0.5), 0.5, 1, 1, 2))
+
+
+def test_alignments_by_hand():
+    predicted = np.array([[[1.0, 2.0]], [[6.0, 1.0]]])
+    # Medians 2 and 4: scale 2, so 2, 4, 12.
+    assert video_depth_errors(predicted, TRUTH, "median").abs_rel == pytest.approx(0.5 / 3)
+    assert depth_alignment(predicted, TRUTH, "median") == (2, 0)
+    assert depth_alignment(predicted.ravel(), TRUTH.ravel(), "median", max_depth=8) == (2, 0)  # 1.5 and 3
+    assert depth_alignment(predicted, TRUTH, "metric") == (1, 0)
+    # |s - 2| + |2 s - 4| + |6 s - 8| is least at 4 / 3, where the deepest is exact; the rest is 4 / 3 and 8 / 3.
+    scaled = video_depth_errors(predicted, TRUTH, "scale")
+    assert depth_alignment(predicted, TRUTH) == pytest.approx((4 / 3, 0), rel=1e-3)
+    assert scaled.abs_rel == pytest.approx(2 / 9, rel=1e-3)
+    assert scaled.rmse == pytest.approx(np.sqrt((4 / 9 + 16 / 9) / 3), rel=1e-3)
+
+
+def test_ten_rounds_by_hand():
+    """Two pixels of depth 1 in the prediction, 1 and 3 in the truth: the start, 2, is where all rounds stay."""
+    errors = video_depth_errors(np.ones((1, 1, 2)), np.array([[[1.0, 3.0]]]), "scale")
+    assert errors.abs_rel == pytest.approx((1 + 1 / 3) / 2)
+
+
+def test_scale_and_shift_by_hand():
+    """Four of five pixels are on the line 2 d + 1; least squares would follow the fifth."""
+    predicted = np.array([[[1.0, 2.0, 3.0, 4.0, 5.0]]])
+    truth = np.array([[[3.0, 5.0, 7.0, 9.0, 31.0]]])
+    errors = video_depth_errors(predicted, truth, "scale-shift")
+    assert errors.abs_rel == pytest.approx(20 / 31 / 5, rel=1e-3)
+    assert depth_alignment(predicted, truth, "scale-shift") == pytest.approx((2, 1), rel=1e-3)
+    assert errors.delta1 == pytest.approx(0.8)
+
+
+def test_a_depth_behind_the_camera_is_close_to_nothing():
+    errors = video_depth_errors(np.array([[[-3.0, 0.0, 2.0]]]), np.full((1, 1, 3), 2.0), "metric")
+    assert errors[2:] == pytest.approx((1 / 3, 1 / 3, 1 / 3, 3))
+    assert errors.abs_rel == pytest.approx((2.5 + 1 + 0) / 3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=seeds, scale=st.floats(1e-2, 1e2), shift=st.floats(-3, 3))
+def test_what_the_alignment_finds_does_not_matter(seed, scale, shift):
+    predicted, truth = depths(seed)
+    for align in ("scale", "median", "scale-shift"):
+        errors = video_depth_errors(predicted, truth, align)
+        assert video_depth_errors(scale * predicted, truth, align) == pytest.approx(errors, rel=1e-5)
+        perfect = video_depth_errors(scale * np.where(truth > 0, truth, 5), truth, align)
+        assert perfect == pytest.approx((0, 0, 1, 1, 1, errors.pixels), abs=1e-9)
+    moved = video_depth_errors(predicted + shift, truth, "scale-shift")
+    assert moved == pytest.approx(video_depth_errors(predicted, truth, "scale-shift"), rel=1e-5)
+    assert video_depth_errors(truth, truth, "metric") == (0, 0, 1, 1, 1, (truth > 0).sum())
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_scale_is_that_of_another_optimiser(seed):
+    predicted, truth = depths(seed, (4, 20, 20))
+    g, d = truth[truth > 0], predicted[truth > 0]
+
+    def error(scale) -> float:
+        return float(np.abs(scale * d - g).sum())
+
+    found: Any = minimize_scalar(error, bounds=(0, 3 * g.mean() / d.mean()), method="bounded", options={"xatol": 1e-10})
+    errors = video_depth_errors(predicted, truth, "scale")
+    scale = weighted_rounds(d, g)
+    assert errors.abs_rel == pytest.approx(float((np.abs(scale * d - g) / g).mean()), rel=1e-6)
+    assert depth_alignment(d, g).scale == pytest.approx(scale, rel=1e-6)
+    assert error(found.x) <= error(scale) <= 1.002 * error(found.x)  # ten rounds come close to the optimum
+    assert scale == pytest.approx(found.x, rel=0.02)
+
+
+def weighted_rounds(d, g) -> float:
+    """The protocol, one pixel after another: mean g / mean d, then ten times sum w d g / sum w d^2."""
+    scale = sum(g) / len(g) / (sum(d) / len(d))
+    for _ in range(10):
+        above = below = 0.0
+        for one, other in zip(d.tolist(), g.tolist(), strict=True):
+            weight = 1 / (abs(scale * one - other) + 1e-8)
+            above, below = above + weight * one * other, below + weight * one * one
+        scale = above / below
+    return scale
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_scale_and_shift_have_the_least_absolute_error_of_a_linear_program(seed):
+    predicted, truth = depths(seed, (2, 14, 14))
+    g, d = truth[truth > 0], predicted[truth > 0]
+    lines, slack = np.stack([d, np.ones_like(d)], axis=1), np.eye(len(d))
+    program = linprog(
+        np.r_[0, 0, np.ones_like(d)],
+        A_ub=np.block([[lines, -slack], [-lines, -slack]]),
+        b_ub=np.r_[g, -g],
+        bounds=[(None, None)] * 2 + [(0, None)] * len(d),
+    )
+    scale, shift = program.x[:2]
+    exact = video_depth_errors(scale * predicted + shift, truth, "metric")
+    found = video_depth_errors(predicted, truth, "scale-shift")
+    assert found.abs_rel == pytest.approx(exact.abs_rel, rel=2e-3)
+    assert found.rmse == pytest.approx(exact.rmse, rel=2e-3)
+
+
+def test_all_frames_share_one_alignment():
+    predicted = np.stack([np.full((2, 2), 1.0), np.full((2, 2), 1.0)])
+    truth = np.stack([np.full((2, 2), 1.0), np.full((2, 2), 99.0)])
+    for align in ("scale", "median"):
+        assert video_depth_errors(predicted, truth, align).delta3 == 0  # 50 is close to neither 1 nor 99
+
+
+@pytest.mark.parametrize(
+    ("predicted", "truth", "options", "sentence"),
+    [
+        (np.ones((2, 1, 3)), TRUTH, {}, "resize the prediction first"),
+        (np.ones((1, 2)), TRUTH[0], {}, r"expected a sequence \[S, H, W\]"),
+        (np.ones((2, 1, 2)), 0 * TRUTH, {}, "no pixel has a true depth above 0; nothing"),
+        (np.ones((2, 1, 2)), TRUTH, {"max_depth": 1}, "no pixel has a true depth above 0 below 1"),
+        (np.ones((2, 1, 2)), TRUTH, {"max_depth": -1}, "max_depth is -1"),
+        (np.full((2, 1, 2), np.inf), TRUTH, {}, "3 predicted depths are not finite"),
+        (np.ones((2, 1, 2)), TRUTH, {"align": "affine"}, "align is 'affine'; expected one of metric, median, scale,"),
+        (-np.ones((2, 1, 2)), TRUTH, {}, "the mean of the predicted depth is -1; expected it above 0"),
+        (np.zeros((2, 1, 2)), TRUTH, {"align": "median"}, "the median of the predicted depth is 0"),
+        (np.full((2, 1, 2), 0.1), TRUTH, {"align": "scale-shift"}, "is 0.1 in all valid pixels"),
+        (np.zeros((2, 1, 2)), TRUTH, {"align": "scale-shift"}, "is 0 in all valid pixels"),
+    ],
+)
+def test_depth_that_cannot_be_compared_is_one_sentence(predicted, truth, options, sentence):
+    with pytest.raises(InputError, match=sentence):
+        video_depth_errors(predicted, truth, **options)
+
+
+def test_resizing_by_hand():
+    row = np.array([[0.0, 4.0]])
+    assert resized_depth(row, (1, 4)).tolist() == [[0, 1, 3, 4]]  # centres at -0.25, 0.25, 0.75 and 1.25
+    assert resized_depth(row.T, (4, 1)).T.tolist() == [[0, 1, 3, 4]]
+    assert resized_depth(row, (3, 1)).tolist() == [[2], [2], [2]]
+    wide = np.array([[[0.0, 1, 2, 3, 4, 5]]])
+    assert resized_depth(wide, (1, 3)).tolist() == [[[0.5, 2.5, 4.5]]]
+    assert resized_depth(wide, (1, 2)).tolist() == [[[1, 4]]]  # the middle of three: nothing is averaged
+    assert resized_depth(wide.astype(np.float32), (1, 6)).dtype == np.float64
+
+
+@settings(max_examples=40, deadline=None)
+@given(h=st.integers(1, 6), w=st.integers(1, 6), H=st.integers(1, 13), W=st.integers(1, 13), seed=seeds)
+def test_resizing_follows_the_definition(h, w, H, W, seed):
+    depth = np.random.default_rng(seed).random((2, h, w))
+    resized = resized_depth(depth, (H, W))
+    assert resized.shape == (2, H, W)
+    for Y in range(H):
+        for X in range(W):
+            y, x = (min(max((i + 0.5) * n / N - 0.5, 0), n - 1) for i, n, N in ((Y, h, H), (X, w, W)))
+            wanted = sum(
+                max(0, 1 - abs(y - j)) * max(0, 1 - abs(x - i)) * depth[:, j, i] for j in range(h) for i in range(w)
+            )
+            assert resized[:, Y, X] == pytest.approx(wanted)
+
+
+def test_resizing_keeps_what_is_not_finite_where_it_is():
+    depth = np.array([[1.0, np.nan, 3.0, 3.0]])
+    assert np.isnan(resized_depth(depth, (1, 8))).tolist() == [[False, True, True, True, True, False, False, False]]
+    assert np.isnan(resized_depth(depth, (2, 4))).tolist() == [[False, True, False, False]] * 2
+
+
+@pytest.mark.parametrize(
+    ("depth", "size", "sentence"),
+    [
+        (np.ones(3), (2, 2), r"shape \(3,\)"),
+        (np.ones((2, 0, 3)), (2, 2), "with a pixel at least"),
+        (np.ones((2, 2)), (0, 2), r"size is \(0, 2\)"),
+        (np.ones((2, 2)), (2, 1.5), r"size is \(2, 1.5\)"),
+        (np.ones((2, 2)), (2,), r"size is \(2,\)"),
+    ],
+)
+def test_sizes_that_make_no_sense_are_one_sentence(depth, size, sentence):
+    with pytest.raises(InputError, match=sentence):
+        resized_depth(depth, size)

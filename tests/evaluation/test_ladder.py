@@ -1,0 +1,220 @@
+"""The ladder of methods: against the passes themselves, and what must hold for any model."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from benchmarks.seeded import seeded_images
+from tests.tiny import tiny_config
+from vggtjax import Model, Passes, assemble, infer, init_params, load_clip, reconstruct
+from vggtjax.clips.truth import Truth
+from vggtjax.errors import InputError
+from vggtjax.evaluation.ladder import LadderRow, ladder
+from vggtjax.evaluation.metrics.depth import depth_errors, median_scale
+from vggtjax.evaluation.metrics.masks import auc, jaccard
+from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
+from vggtjax.method.mask import upsample
+from vggtjax.options import LADDER
+from vggtjax.pipeline.stages import stages_of
+
+CLIPS, FRAMES, SIZE = 3, 4, (42, 56)
+SETTING = ("method", "mask_source", "mask_pairs", "suppress")
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    config = tiny_config()
+    params = init_params(3, config)
+    for blocks in ("frame_blocks", "global_blocks"):  # let what attention sees matter
+        for scale in ("scale1", "scale2"):
+            params["aggregator"][blocks] |= _scaled(params["aggregator"][blocks], scale)
+    return Model(config, params, "tiny")
+
+
+def _scaled(blocks, name):
+    return jax.tree_util.tree_map_with_path(
+        lambda path, leaf: leaf + 0.3 if path[-1].key == name else leaf, dict(blocks)
+    )
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    generator = np.random.default_rng(0)
+    H, W = SIZE
+    images = np.stack([seeded_images(FRAMES, H, W, seed=clip).transpose(0, 2, 3, 1) for clip in range(CLIPS)])
+    depth = np.exp(0.3 * generator.normal(size=(CLIPS, FRAMES, H, W))).astype(np.float32)
+    depth[:, :, :3] = 0  # not measured
+    mask = np.zeros((CLIPS, FRAMES, H, W), bool)
+    mask[:, :, 10:30, 20:40] = True
+    rotation = Rotation.from_rotvec(0.1 * generator.normal(size=(CLIPS * FRAMES, 3))).as_matrix()
+    poses = np.concatenate([rotation, generator.normal(size=(CLIPS * FRAMES, 3, 1))], axis=2)
+    intrinsics = np.tile(np.array([[50, 0, W / 2], [0, 50, H / 2], [0, 0, 1]]), (CLIPS, FRAMES, 1, 1))
+    return Truth(images, depth, mask, poses.reshape(CLIPS, FRAMES, 3, 4), intrinsics)
+
+
+@pytest.fixture(scope="module")
+def passes(model, truth) -> Passes:
+    """Both passes of the first two clips, by the library's own single jit."""
+    return infer(model.params, truth.images[:2], model.config, mask_pairs=2)[1]
+
+
+@pytest.fixture(scope="module")
+def rows(model, truth) -> list[LadderRow]:
+    seen = []
+    found = ladder(
+        model, truth, mask_pairs=(0, 2), suppress=("zero", "drop"), batch_size=2,
+        progress=lambda done, total: seen.append((done, total)),
+    )  # fmt: skip
+    assert seen == [(done, 2 * (1 + 8)) for done in range(1, 19)]
+    return found
+
+
+def only(rows, **wanted) -> LadderRow:
+    (row,) = (row for row in rows if all(getattr(row, name) == value for name, value in wanted.items()))
+    return row
+
+
+def close(a: LadderRow, b: LadderRow, rel=1e-3) -> bool:
+    names = [name for name, value in vars(a).items() if isinstance(value, float)]
+    return [getattr(a, name) for name in names] == pytest.approx([getattr(b, name) for name in names], rel=rel)
+
+
+def test_every_setting_has_a_row(rows):
+    masked = [name for name in LADDER if name != "vggt"]
+    settings = [("vggt", None, None, None)] + [
+        (method, source, pairs, suppress)
+        for source in ("mined", "true")
+        for pairs in (0, 2)
+        for suppress in ("zero", "drop")
+        for method in masked
+    ]
+    assert [(row.clip, *(getattr(row, name) for name in SETTING)) for row in rows] == [
+        (clip, *setting) for clip in range(CLIPS) for setting in settings
+    ]
+    assert not any(row.failure for row in rows)
+
+
+@pytest.mark.parametrize("method", LADDER)
+def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
+    settings = {} if method == "vggt" else {"mask_source": "mined", "mask_pairs": 2, "suppress": "zero"}
+    row = only(rows, clip=1, method=method, **settings)
+    made = assemble(passes, method)
+    depth, poses, clip = np.asarray(made.depth[1]), np.asarray(made.camera_from_world[1]), Truth(*(a[1] for a in truth))
+    scale = median_scale(depth, clip.depth)
+    assert row.abs_rel == pytest.approx(depth_errors(depth, clip.depth).abs_rel, rel=1e-4)
+    assert row.delta1 == pytest.approx(depth_errors(depth, clip.depth).delta1, abs=1e-3)
+    for value, region in ((row.abs_rel_static, ~clip.dynamic_mask), (row.abs_rel_dynamic, clip.dynamic_mask)):
+        assert value == pytest.approx(depth_errors(depth, clip.depth, region, scale=scale).abs_rel, rel=1e-4)
+    assert row.rotation_error == pytest.approx(rotation_error(poses, clip.camera_from_world), rel=1e-3)
+    assert row.centre_error == pytest.approx(centre_error(poses, clip.camera_from_world), rel=1e-3)
+    assert row.centre_error_ratio == pytest.approx(row.centre_error / np.median(clip.depth[:, 3:]))
+    pixels = np.asarray(upsample(passes.saliency, SIZE)[1])
+    assert row.saliency_auc == pytest.approx(auc(pixels, clip.dynamic_mask), abs=1e-3)
+    mined = np.asarray(passes.dynamic_mask[1])
+    expected = None if method == "vggt" else pytest.approx(jaccard(mined, clip.dynamic_mask), abs=1e-3)
+    assert row.mask_jaccard == expected
+
+
+def test_suppressing_nothing_is_the_plain_pass(rows):
+    plain = only(rows, clip=0, method="vggt")
+    for source in ("mined", "true"):
+        masked = only(rows, clip=0, method="pose-decoupling", mask_source=source, mask_pairs=0, suppress="drop")
+        assert close(plain, masked)
+
+
+def test_suppression_and_mask_change_the_second_pass(rows):
+    setting = {"clip": 0, "method": "pose-decoupling", "mask_pairs": 2}
+    errors = {
+        only(rows, mask_source=source, suppress=suppress, **setting).rotation_error
+        for source in ("mined", "true")
+        for suppress in ("zero", "drop")
+    }
+    assert len(errors) == 4
+    assert all(row.mask_jaccard == 1 for row in rows if row.mask_source == "true")
+
+
+def test_a_truth_that_is_the_mined_mask_makes_both_sources_equal(model, truth, passes):
+    own = Truth(*(array[:2] for array in truth))._replace(dynamic_mask=np.asarray(passes.dynamic_mask))
+    mined, true = ladder(model, own, methods=["4dvggt-d"], batch_size=2)[:2]
+    assert mined.mask_jaccard == pytest.approx(1, abs=1e-3)
+    assert close(mined, true)
+
+
+def test_a_prediction_is_right_about_itself(model, truth, passes):
+    made = assemble(passes, "vggt")
+    own = Truth(*(array[:2] for array in truth))._replace(
+        depth=2 * np.asarray(made.depth), camera_from_world=np.asarray(made.camera_from_world)
+    )
+    row = ladder(model, own, methods=["vggt"], batch_size=2)[0]
+    assert row.abs_rel == pytest.approx(0, abs=1e-4)
+    assert row.rotation_error == pytest.approx(0, abs=1e-3)
+    assert row.centre_error == pytest.approx(0, abs=1e-4)
+    assert row.delta1 == 1
+
+
+def test_batches_do_not_matter(model, truth, rows):
+    plain = [row for row in rows if row.method == "vggt"]
+    alone = ladder(model, truth, methods=["vggt"], batch_size=1)
+    assert all(close(a, b) for a, b in zip(plain, alone, strict=True))
+    single = ladder(model, Truth(*(array[1] for array in truth)), methods=["vggt"])
+    assert close(plain[1], replace(single[0], clip=1))
+
+
+def test_what_the_truth_leaves_undefined_is_none(model, truth):
+    still = truth._replace(
+        dynamic_mask=np.zeros_like(truth.dynamic_mask), camera_from_world=np.tile(np.eye(3, 4), (CLIPS, FRAMES, 1, 1))
+    )
+    row = ladder(model, still, methods=["vggt"], batch_size=2)[0]
+    assert row.abs_rel_dynamic is row.saliency_auc is row.centre_error is row.centre_error_ratio is None
+    assert row.abs_rel_static == row.abs_rel
+    assert row.rotation_error is not None
+    assert row.failure == "the true cameras do not move: their centres cannot be aligned"
+
+
+def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):
+    broken = replace(model, params=jax.tree.map(lambda leaf: jax.device_put(np.full_like(leaf, np.nan)), model.params))
+    row = ladder(broken, truth, methods=["vggt"], batch_size=2)[0]
+    assert row.abs_rel is row.abs_rel_static is row.delta1 is row.rotation_error is row.saliency_auc is None
+    for sentence in ("predicted depths are not finite", "camera poses hold values that are not finite"):
+        assert sentence in row.failure
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"methods": ["vgtt"]}, "unknown method 'vgtt'"),
+        ({"masks": ["guessed"]}, "guessed.*expected 'mined' or 'true'"),
+        ({"mask_pairs": [-1]}, "mask_pairs has .-1."),
+        ({"suppress": ["hide"]}, "suppress has .'hide'."),
+        ({"gram": "sine"}, "gram is 'sine'"),
+        ({"batch_size": 0}, "batch_size is 0"),
+    ],
+)
+def test_bad_input_is_one_sentence(model, truth, options, sentence):
+    with pytest.raises(InputError, match=sentence):
+        ladder(model, truth, **{"batch_size": 2, **options})
+
+
+def test_a_clip_that_was_reconstructed_has_the_network_traced_already(model, truth):
+    alone = Truth(*(array[0, :3] for array in truth))  # a shape that no other test has
+    reconstruct(model, load_clip(alone.images, size=SIZE[1], patch=model.config.patch_size))
+    traced = []
+
+    def listen(event: str, duration_secs: float, **known: str | int) -> None:
+        if event == "/jax/core/compile/jaxpr_trace_duration":
+            traced.append(known.get("fun_name"))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        ladder(model, alone)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert "upsample" in traced
+    stages = stages_of(
+        model.config, "4dvggt-d", alone.images.shape[:3], gram="cosine", suppress="zero", mask_pairs=5,
+        align_scale=False, smooth_frames=1, compute_dtype="float32",
+    )  # fmt: skip
+    assert not {stage.function.__name__ for stage in stages if stage.name != "assemble"} & set(traced)

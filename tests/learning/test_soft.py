@@ -1,0 +1,178 @@
+"""Soft masks: the method itself in the limit, and every gradient against finite differences in float64."""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tiny import tiny_config
+from vggtjax import forward, infer, init_params
+from vggtjax.errors import InputError
+from vggtjax.learning.distances import pose_error
+from vggtjax.learning.soft import SoftMasking, lift, reconstruct_softly, soft_masking, soft_pixels
+from vggtjax.method.fusion_rule import identity
+from vggtjax.method.passes import Cameras
+
+CONFIG = tiny_config(patch_size=8, image_size=32, taps=(0, 1, 2, 3))
+SHAPE = (1, 4, 16, 24, 3)
+
+
+@functools.cache
+def params():
+    """Return weights under which blocks matter: LayerScale starts at 0.01 in training."""
+    tree = init_params(0, CONFIG)
+    for blocks in ("frame_blocks", "global_blocks"):
+        for name in ("scale1", "scale2"):
+            tree["aggregator"][blocks][name] = jnp.ones_like(tree["aggregator"][blocks][name])
+    return tree
+
+
+def images(seed: int = 0) -> jax.Array:
+    return jnp.asarray(np.random.default_rng(seed).random(SHAPE), jnp.float32)
+
+
+softly = jax.jit(
+    reconstruct_softly,
+    static_argnames=("config", "gram", "motion", "stop_camera_gradient", "compute_dtype", "remat"),
+)
+
+
+def test_at_temperature_0_it_is_the_method():
+    assembly, passes = infer(params(), images(), CONFIG)
+    assert 0 < np.asarray(passes.dynamic_mask).mean() < 1
+    soft = softly(params(), images(), CONFIG, soft_masking(CONFIG))
+    assert (np.asarray(soft.dynamic) == np.asarray(passes.dynamic_mask)).all()
+    assert np.allclose(soft.depth, assembly.depth, rtol=2e-6)
+    assert np.allclose(np.exp(soft.log_precision), assembly.confidence, rtol=1e-5)
+    assert np.allclose(soft.cameras.camera_from_world, assembly.camera_from_world, atol=1e-6)
+
+
+def test_lower_temperatures_come_closer():
+    hard = softly(params(), images(), CONFIG, soft_masking(CONFIG))
+    apart = []
+    for temperature in (1e-1, 1e-2, 1e-3, 1e-5):
+        soft = softly(params(), images(), CONFIG, soft_masking(CONFIG, temperature=temperature))
+        apart.append(float(jnp.abs(soft.dynamic - hard.dynamic).mean()))
+    assert apart == sorted(apart, reverse=True)
+    assert apart[-1] < 1e-3
+
+
+@jax.jit
+def _second(tree, pictures, tokens, mask_pairs=5, strength=None):
+    return forward(
+        tree, pictures, CONFIG, dynamic_tokens=tokens, mask_pairs=mask_pairs, strength=strength, outputs=("camera",)
+    ).pose_encoding
+
+
+def test_shares_of_0_and_1_are_the_boolean_mask():
+    second = functools.partial(_second, params(), images())
+    tokens = jnp.asarray(np.random.default_rng(0).random((1, 4, 2, 3)) < 0.4)
+    for pairs in (0, 2, 5):
+        assert np.allclose(second(tokens, pairs), second(tokens.astype(jnp.float32), pairs), rtol=1e-5, atol=1e-6)
+    ones = jnp.where(jnp.arange(4) < 2, 1.0, 0.0)
+    assert np.allclose(second(tokens, strength=ones), second(tokens, 2), rtol=1e-5, atol=1e-6)
+    assert not np.allclose(second(0.5 * tokens, 2), second(tokens, 2), rtol=1e-4)
+    assert np.allclose(second(0.5 * tokens, 2), second(tokens, strength=0.5 * ones), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"suppress": "drop"}, "dropped whole"),
+        ({"strength": jnp.ones(3)}, r"strength has shape \(3,\); expected \(4,\)"),
+        ({"dynamic_tokens": jnp.ones((1, 4, 2, 3), int)}, "expected bool, or shares"),
+        ({"compute_dtype": "float64"}, "enable_x64"),
+    ],
+)
+def test_bad_shares_are_one_sentence(options, sentence):
+    options = {"dynamic_tokens": jnp.ones((1, 4, 2, 3))} | options
+    with pytest.raises(InputError, match=sentence):
+        jax.eval_shape(lambda: forward(params(), images(), CONFIG, **options))
+
+
+def test_constant_saliency_moves_nowhere():
+    masking = soft_masking(CONFIG, temperature=0.1)
+    assert (np.asarray(soft_pixels(jnp.ones((1, 2, 2, 3)), (16, 24), masking)) == 0).all()
+
+
+def test_points_are_lifted_from_pixel_centres():
+    camera = jnp.asarray([[1.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]])
+    K = jnp.asarray([[2.0, 0, 1.5], [0, 4.0, 1.0], [0, 0, 1]])
+    points = lift(jnp.full((2, 3), 2.0), Cameras(camera, K))
+    assert np.allclose(points[0, 0], [2 * (0.5 - 1.5) / 2 - 1, 2 * (0.5 - 1) / 4 - 2, 2 - 3])
+    assert np.allclose(points[1, 2], [2 * (2.5 - 1.5) / 2 - 1, 2 * (1.5 - 1) / 4 - 2, 2 - 3])
+
+
+def _in_float64(tree):
+    return jax.tree.map(lambda x: jnp.asarray(np.asarray(x, np.float64)), tree)
+
+
+def test_every_gradient_by_finite_differences():
+    """Of depth, precision, points and cameras by all that decides on masks, by the fusion and by a weight."""
+    weights32, pictures32 = params(), images(1)
+    with jax.enable_x64(True):
+        weights, pictures = _in_float64(weights32), _in_float64(pictures32)
+        masking = _in_float64(soft_masking(CONFIG, temperature=0.15))._replace(
+            strength=jnp.asarray([0.9, 0.7, 0.4, 0.2]), exponents=jnp.asarray([1.2, 0.7, 1.0, 0.9, 1.1])
+        )
+        fusion = _in_float64(identity()) | {"temperature": jnp.asarray(0.3), "floor": jnp.asarray([0.1, 0.2])}
+        generator = np.random.default_rng(2)
+        true = jnp.concatenate([jnp.tile(jnp.eye(3), (4, 1, 1)), jnp.asarray(generator.normal(size=(4, 3, 1)))], axis=2)
+        mix = [jnp.asarray(generator.normal(size=(1, 4, 16, 24))) for _ in range(2)]
+
+        @jax.jit
+        def loss(knobs):
+            masking, fusion, bias = knobs
+            tree = weights | {"aggregator": weights["aggregator"] | {"camera_token": bias}}
+            made = reconstruct_softly(
+                tree, pictures, CONFIG, masking, fusion, stop_camera_gradient=False, compute_dtype="float64", remat=True
+            )
+            cameras = sum(pose_error(made.cameras.camera_from_world[0], true))
+            outputs = {
+                "depth": jnp.mean(mix[0] * made.depth) + jnp.mean(mix[1] * made.log_precision),
+                "cameras": cameras,
+                "points": jnp.mean(mix[0][..., None] * made.points),
+            }
+            return sum(outputs.values()), outputs
+
+        knobs = (masking, fusion, weights["aggregator"]["camera_token"])
+        gradient, _ = jax.jit(jax.grad(loss, has_aux=True))(knobs)
+        flat, structure = jax.tree.flatten(knobs)
+        names = [*SoftMasking._fields, *sorted(fusion), "camera_token"]
+        assert len(names) == len(flat)
+        moved = dict.fromkeys(("depth", "cameras", "points"), 0)
+        for leaf, name in enumerate(names):
+            places = [np.unravel_index(i, flat[leaf].shape) for i in range(min(flat[leaf].size, 5))]
+            for place in places:
+                slopes = []
+                for sign in (1, -1):
+                    changed = list(flat)
+                    changed[leaf] = flat[leaf].at[place].add(sign * 1e-6)
+                    slopes.append(loss(jax.tree.unflatten(structure, changed)))
+                slope = float(slopes[0][0] - slopes[1][0]) / 2e-6
+                found = float(jax.tree.leaves(gradient)[leaf][place])
+                assert found == pytest.approx(slope, rel=2e-4, abs=2e-8), (name, place)
+                for output in moved:
+                    moved[output] += abs(float(slopes[0][1][output] - slopes[1][1][output])) > 2e-13
+        # Masks move everything; the rule of fusion moves depth and points, and not the cameras.
+        assert moved["depth"] > 20
+        assert moved["points"] > 15
+        assert moved["cameras"] >= 10
+
+
+def test_the_fusion_gradient_does_not_go_through_the_network():
+    """What is differentiated by the fusion alone has the products of the forward pass, and not one more."""
+
+    tree, pictures, masking = params(), images(), soft_masking(CONFIG, temperature=0.1)
+
+    def loss(fusion):
+        return softly(tree, pictures, CONFIG, masking, fusion).depth.mean()
+
+    def products(function) -> float:
+        analysis: Any = jax.jit(function).lower(identity()).cost_analysis()
+        return analysis["flops"]
+
+    assert products(jax.grad(loss)) < 1.1 * products(loss)  # a way back through one pass would add 70 %

@@ -1,0 +1,54 @@
+"""Fitted trees in files: what comes back is what went in, and what is none is one sentence."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from vggtjax.errors import InputError
+from vggtjax.method.fusion_file import load_fusion, save_fusion
+from vggtjax.method.fusion_rule import parse_family, start
+from vggtjax.storage.tensor_file import read_tensors
+
+
+@pytest.mark.parametrize("family", ["paper", "full", "gate"])
+def test_round_trip(tmp_path, family):
+    params = start(parse_family(family), seed=3, spread=0.1)
+    save_fusion(tmp_path / "a.safetensors", params, {"family": family})
+    back = load_fusion(tmp_path / "a.safetensors")
+    assert jax.tree.structure(back) == jax.tree.structure(params)
+    assert jax.tree.all(jax.tree.map(np.array_equal, back, params))
+    assert json.loads(read_tensors(tmp_path / "a.safetensors").metadata["about"]) == {"family": family}
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (lambda tree: tree.pop("power"), "has power of shape None"),
+        (lambda tree: tree.update(power=np.ones(3, np.float32)), r"has power of shape \(3,\); expected \(2,\)"),
+        (lambda tree: tree.update(more=np.ones(3, np.float32)), "has more of shape"),
+        (lambda tree: tree.update(scale=np.full(2, np.nan, np.float32)), "values of scale that are not finite"),
+        (lambda tree: tree.update(floor=np.full(2, -1, np.float32)), r"has floor \[-1.0, -1.0\]; expected values in"),
+    ],
+)
+def test_what_is_no_tree_is_one_sentence(tmp_path, change, sentence):
+    path = tmp_path / "a.safetensors"
+    save_fusion(path, start(()))
+    tree, metadata = load_file(path), read_tensors(path).metadata
+    change(tree)
+    save_file(tree, path, metadata)
+    with pytest.raises(InputError, match=sentence):
+        load_fusion(path)
+
+
+def test_other_files_are_one_sentence(tmp_path):
+    with pytest.raises(InputError, match="fit-fusion wrote"):
+        load_fusion(tmp_path / "nothing.safetensors")
+    (tmp_path / "text").write_text("no tensors")
+    with pytest.raises(InputError, match="fit-fusion wrote"):
+        load_fusion(tmp_path / "text")
+    save_file({"x": np.ones(3, np.float32)}, tmp_path / "other.safetensors")
+    with pytest.raises(InputError, match="is not a fitted fusion"):
+        load_fusion(tmp_path / "other.safetensors")

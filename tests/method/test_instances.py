@@ -1,0 +1,132 @@
+"""Objects of a mask, by hand, on generated scenes, and against scikit-image's labels."""
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage.measure import label
+
+from vggtjax.errors import InputError
+from vggtjax.method.instances import find_instances
+from vggtjax.scenes import load_textures
+from vggtjax.scenes.render import generate
+from vggtjax.scenes.scene import SceneConfig
+
+
+def boxes(*tracks, frames=5, size=(24, 90)) -> tuple[np.ndarray, np.ndarray]:
+    """Boxes (row, column, height, width, columns a frame); returns the mask and each box's pixels."""
+    each = np.zeros((len(tracks), frames, *size), bool)
+    for track, (row, column, height, width, speed) in zip(each, tracks, strict=True):
+        for frame in range(frames):
+            left = column + speed * frame
+            track[frame, row : row + height, left : left + width] = True
+    return np.asarray(each.any(axis=0)), each
+
+
+STANDS, WALKS = (2, 4, 6, 10, 0), (12, 2, 4, 5, 3)
+
+
+def test_two_objects_keep_their_ids():
+    mask, (stands, walks) = boxes(STANDS, WALKS)
+    ids = find_instances(mask)
+    assert ids.dtype == np.uint8
+    np.testing.assert_array_equal(ids, np.where(stands, 1, np.where(walks, 2, 0)))
+
+
+@pytest.mark.parametrize("speed", [3, 5, 10])
+def test_cars_in_a_row_are_not_each_other(speed):
+    mask, (rear, front) = boxes((5, 2, 8, 8, speed), (5, 14, 8, 8, speed), frames=4)
+    ids = find_instances(mask)
+    assert ids.max() == 2
+    assert len(np.unique(ids[rear])) == len(np.unique(ids[front])) == 1
+    assert ids[rear][0] != ids[front][0]
+
+
+def test_objects_that_pass_at_a_distance_keep_their_ids():
+    mask, (one, other) = boxes((2, 0, 6, 6, 6), (11, 60, 6, 6, -6), frames=11)
+    ids = find_instances(mask)
+    assert {len(np.unique(ids[track])) for track in (one, other)} == {1}
+    assert ids.max() == 2
+
+
+@pytest.mark.parametrize(("gap", "objects"), [(0, 3), (1, 2)])
+def test_an_object_that_is_lost_for_a_frame(gap, objects):
+    mask, (_, walks) = boxes(STANDS, WALKS)
+    mask[2] &= ~walks[2]
+    ids = find_instances(mask, gap=gap)
+    assert ids.max() == objects
+    assert not ids[2][walks[2]].any()
+
+
+def test_an_object_that_falls_apart_is_one_still():
+    mask, _ = boxes((4, 2, 8, 12, 3))
+    mask[3, :, 17] = False  # a crack
+    ids = find_instances(mask)
+    assert ids.max() == 1
+    assert (ids > 0).sum() == mask.sum()
+
+
+def test_what_is_too_small_is_no_object():
+    mask, _ = boxes(STANDS, WALKS)
+    mask[1, 20, 80] = True
+    assert find_instances(mask, least_share=0).max() == 3
+    ids = find_instances(mask, least_share=2 / mask[0].size)
+    assert ids.max() == 2
+    assert ids[1, 20, 80] == 0
+
+
+def test_the_largest_of_many_are_kept():
+    mask = np.zeros((1, 64, 64), bool)
+    mask[0, ::2, ::2] = True  # 1024 objects of a pixel
+    mask[0, 60:62, 60:62] = True  # joins its neighbours
+    ids = find_instances(mask, least_share=0)
+    assert np.array_equal(np.unique(ids), np.arange(256))
+    assert ids[0, 60, 60] == 1
+
+
+@given(st.integers(0, 10**6), st.floats(0.05, 0.6))
+@settings(deadline=None, max_examples=30)
+def test_of_one_frame_they_are_scikit_images_labels(seed, share):
+    mask = np.random.default_rng(seed).random((1, 6, 9)) < share
+    ids, labels = find_instances(mask, least_share=0), np.array(label(mask[0], connectivity=2))
+    pairs = {(int(a), int(b)) for a, b in zip(ids.ravel(), labels.ravel(), strict=True)}
+    assert len(pairs) == len(np.unique(ids)) == len(np.unique(labels))  # one to one
+    assert (np.diff(np.bincount(ids.ravel())[1:]) <= 0).all()
+
+
+@given(st.integers(0, 10**6), st.integers(1, 5), st.floats(0, 0.7), st.integers(0, 2))
+@settings(deadline=None, max_examples=30)
+def test_a_region_has_one_id_and_nothing_else_has_any(seed, frames, share, gap):
+    mask = np.random.default_rng(seed).random((frames, 7, 8)) < share
+    ids = find_instances(mask, gap=gap, least_share=0)
+    np.testing.assert_array_equal(ids > 0, mask)
+    for found, moving in zip(ids, mask, strict=True):
+        labels = np.array(label(moving, connectivity=2))
+        assert all(len(np.unique(found[labels == one])) == 1 for one in range(1, labels.max() + 1))
+
+
+def test_objects_of_generated_scenes_keep_their_ids():
+    config = SceneConfig(height=96, width=96, frames=10, dynamic=1.0, static_camera=0.0)
+    textures, render = load_textures("test"), jax.jit(generate, static_argnums=2)
+    kept = total = 0
+    for seed in range(4):
+        clip = render(jax.random.key(seed), textures, config)
+        mask = np.asarray(clip.dynamic_mask)
+        ids = find_instances(mask)
+        for before, after, moving in zip(ids[:-1], ids[1:], mask[:-1] & mask[1:], strict=True):
+            overlap = moving & (before > 0) & (after > 0)
+            kept += (before == after)[overlap].sum()
+            total += overlap.sum()
+    assert kept > 0.9 * total > 0
+
+
+def test_nothing_moves():
+    assert not find_instances(np.zeros((3, 4, 5), bool)).any()
+
+
+def test_wrong_arguments():
+    with pytest.raises(InputError, match=r"dynamic_mask is float64 \(2, 3\); expected bool \[S, H, W\]"):
+        find_instances(np.zeros((2, 3)))
+    with pytest.raises(InputError, match=r"gap is -1 and least_share 0\.1"):
+        find_instances(np.zeros((1, 2, 3), bool), gap=-1, least_share=0.1)

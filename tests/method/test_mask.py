@@ -1,0 +1,121 @@
+"""Otsu against scikit-image, upsampling, token masks."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skimage.filters import threshold_otsu
+
+from vggtjax.errors import InputError
+from vggtjax.method.mask import (
+    dynamic_pixels,
+    dynamic_tokens,
+    mine_mask,
+    multi_otsu_threshold,
+    otsu_threshold,
+    smooth_over_time,
+    upsample,
+)
+
+_otsu = jax.jit(otsu_threshold)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    share=st.floats(0.01, 0.99),
+    gap=st.floats(0, 5),
+    scale=st.sampled_from([1e-4, 1.0, 1e3]),
+)
+def test_otsu_agrees_with_scikit_image_within_a_bin(seed, share, gap, scale):
+    generator = np.random.default_rng(seed)
+    values = generator.normal(size=4000) + gap * (generator.random(4000) < share)
+    values = (scale * values).astype(np.float32)
+    width = (values.max() - values.min()) / 256
+    assert abs(float(_otsu(values)) - threshold_otsu(values)) <= 1.01 * width
+
+
+def test_otsu_by_hand():
+    values = jnp.asarray([0.0] * 6 + [1.0] * 2)
+    assert float(otsu_threshold(values)) == pytest.approx(0.5 / 256)  # the lowest of equally good bin centres
+    assert float(otsu_threshold(jnp.full((4,), 0.3))) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("value", [0.0, 0.7])
+def test_constant_saliency_has_no_dynamic_pixels(value):
+    assert not dynamic_pixels(jnp.full((1, 3, 2, 2), value), (28, 28)).any()
+
+
+@pytest.mark.parametrize("saliency", [np.full((1, 3, 2, 2), 0.4), np.zeros((1, 1, 4, 4))])
+def test_multi_otsu_of_constant_saliency_has_no_dynamic_pixels(saliency):
+    assert not dynamic_pixels(jnp.asarray(saliency), (28, 28), threshold="multi-otsu").any()
+
+
+def test_multi_otsu_cuts_every_clip_at_its_own_threshold():
+    saliency = np.zeros((2, 2, 4, 4), np.float32)
+    saliency[0, :, :2] = 1.0  # two values alone
+    saliency[1] = np.random.default_rng(0).uniform(0, 0.1, size=(2, 4, 4))
+    saliency[1, :, 0] += 0.5
+    run = jax.jit(dynamic_pixels, static_argnames=("size", "threshold"))
+    mask = np.asarray(run(jnp.asarray(saliency), (16, 16), threshold="multi-otsu"))
+    pixels = np.asarray(upsample(jnp.asarray(saliency), (16, 16)))
+    for one, values in zip(mask, pixels, strict=True):
+        assert np.array_equal(one, values > multi_otsu_threshold(values))
+        assert 0 < one.mean() < 0.7
+
+
+def test_saliency_that_is_no_number_moves_nothing():
+    values = jnp.full((1, 2, 2, 2), jnp.nan)
+    assert not dynamic_pixels(values, (8, 8), threshold="multi-otsu").any()
+
+
+def test_dynamic_pixels_are_at_or_above_the_threshold_of_their_own_clip():
+    saliency = np.zeros((2, 2, 3, 4), np.float32)
+    saliency[0, 0, 1, 1] = 1.0
+    saliency[1, 1, 2, 3] = 0.01  # another clip, another range
+    mask = np.asarray(dynamic_pixels(jnp.asarray(saliency), (42, 56)))
+    pixels = np.asarray(upsample(jnp.asarray(saliency), (42, 56)))
+    for clip in range(2):
+        threshold = threshold_otsu(pixels[clip])
+        bin_width = pixels[clip].max() / 256
+        sure = np.abs(pixels[clip] - threshold) > bin_width
+        assert (mask[clip] == (pixels[clip] >= threshold))[sure].all()
+        assert 0 < mask[clip].mean() < 0.5
+
+
+def test_upsampling_has_half_pixel_centres():
+    made = np.asarray(upsample(jnp.asarray([[[[0.0, 1.0]]]]), (1, 4)))
+    assert np.allclose(made, [[[[0, 0.25, 0.75, 1]]]])
+
+
+def test_a_token_is_dynamic_if_any_of_its_pixels_is():
+    mask = np.zeros((1, 1, 28, 42), bool)
+    mask[0, 0, 13, 14] = True
+    assert np.asarray(dynamic_tokens(jnp.asarray(mask), 14)).tolist() == [[[[False, True, False], [False] * 3]]]
+
+
+def test_smoothing_over_time_by_hand():
+    saliency = jnp.array([0.0, 3, 0, 0, 9])[None, :, None, None]
+    smoothed = smooth_over_time(saliency, 3)
+    np.testing.assert_allclose(smoothed[0, :, 0, 0], [1.5, 1, 1, 3, 4.5], rtol=1e-6)
+    assert smooth_over_time(saliency, 1) is saliency
+    np.testing.assert_allclose(smooth_over_time(saliency, 99)[0, :, 0, 0], [2.4] * 5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("frames", [0, 2, -3, 1.5])
+def test_smoothing_takes_odd_numbers(frames):
+    with pytest.raises(InputError, match=r"smooth_frames is .*; expected an odd number"):
+        smooth_over_time(jnp.zeros((1, 2, 3, 4)), frames)
+
+
+def test_a_flicker_is_smoothed_away():
+    saliency = np.zeros((1, 7, 2, 2), np.float32)
+    saliency[0, :, 0, 0] = 1
+    saliency[0, 3] = [[0.4, 1], [0, 0]]  # for one frame, the wrong patch
+    tokens = jnp.zeros((1, 7, 4, 3))
+    rough, smooth = (mine_mask(jnp.asarray(saliency), tokens, (28, 28), smooth_frames=n) for n in (1, 5))
+    assert rough[0, 3, 4, 20]
+    assert not smooth[0, 3, 4, 20]
+    assert smooth[0, 3, 4, 4]

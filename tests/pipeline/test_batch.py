@@ -1,0 +1,276 @@
+"""Many clips in one call: all of them, in spite of a broken one, and after an interruption."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks import __main__ as benchmarks
+from tests.moving_ball import moving_ball
+from tests.tiny import tiny_config
+from vggtjax import Reconstruction, init_params
+from vggtjax.checkpoint import Model, save_model
+from vggtjax.clips.sources import clips_by_name
+from vggtjax.commands.batch import _Clock
+from vggtjax.errors import ClipError, InputError
+from vggtjax.pipeline.batch import SETTINGS_NAME, reconstruct_many
+from vggtjax.results.reconstruction import ARCHIVE_NAME, is_result
+
+pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
+
+
+@pytest.fixture(scope="module")
+def model():
+    config = tiny_config()
+    return Model(config, init_params(0, config), "tiny")
+
+
+def write_clip(folder, frames, rows):
+    folder.mkdir(parents=True)
+    for i, frame in enumerate((255 * moving_ball(frames)).astype(np.uint8)):
+        Image.fromarray(frame[:rows]).save(folder / f"{i}.png")
+
+
+@pytest.fixture(scope="module")
+def clips(tmp_path_factory):
+    """Six clips of two shapes; the third is corrupt."""
+    root = tmp_path_factory.mktemp("clips")
+    for number in range(6):
+        write_clip(root / f"clip{number}", frames=2, rows=140 if number % 2 else 70)
+    (root / "clip2/1.png").write_bytes(b"broken")
+    (root / ".hidden").mkdir()
+    return root
+
+
+def test_every_good_clip_is_there_once_and_the_broken_one_is_named(model, clips, tmp_path):
+    sources = clips_by_name([str(clips)])
+    assert list(sources) == [f"clip{number}" for number in range(6)]
+    first = reconstruct_many(model, sources, tmp_path, options={"method": "vggt"})
+    done = [next(first) for _ in range(2)]
+    first.close()  # as an interruption does
+    assert all(outcome.status in ("done", "failed") for outcome in done)
+    finished = {path.parent.name: path.stat().st_mtime_ns for path in tmp_path.glob("*/reconstruction.npz")}
+    assert finished
+
+    outcomes = {o.name: o for o in reconstruct_many(model, sources, tmp_path, options={"method": "vggt"})}
+    assert len(outcomes) == 6
+    assert {name for name, outcome in outcomes.items() if outcome.status == "kept"} == set(finished)
+    assert outcomes["clip2"].status == "failed"
+    assert "1.png" in outcomes["clip2"].reason
+    for name, outcome in outcomes.items():
+        if name != "clip2":
+            result = Reconstruction.load(tmp_path / name)
+            assert result.method == "vggt"
+            assert outcome.status == "kept" or outcome.frames == 2
+    for name, written in finished.items():
+        assert (tmp_path / name / "reconstruction.npz").stat().st_mtime_ns == written
+    assert not list(tmp_path.rglob(".*partial*"))
+
+    with pytest.raises(InputError, match=rf"{SETTINGS_NAME} has other settings than this run"):
+        next(reconstruct_many(model, sources, tmp_path, options={"method": "4dvggt-d"}))
+
+
+def write_video(path, frames, rows):
+    import av
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=10)
+        stream.height, stream.width = rows, moving_ball(1).shape[2]
+        stream.pix_fmt = "yuv420p"
+        for picture in (255 * moving_ball(frames)).astype(np.uint8):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture[:rows], format="rgb24")))
+        container.mux(stream.encode())
+
+
+def test_the_command_goes_on_after_it_was_killed(model, tmp_path):
+    """Twenty clips of three shapes, two of them videos and one corrupt, killed once eight are done."""
+    root, out, visible = tmp_path / "clips", tmp_path / "out", f"[!.]*/{ARCHIVE_NAME}"
+    lengths = {}
+    for number in range(20):
+        name, frames, rows = f"clip{number:02}", *((2, 70), (3, 70), (2, 140))[number % 3]
+        lengths[name] = frames
+        if number in (5, 14):
+            write_video(root / f"{name}.mp4", frames, rows)
+        else:
+            write_clip(root / name, frames, rows)
+    (root / "clip03/1.png").write_bytes((root / "clip03/1.png").read_bytes()[:100])
+    save_model(tmp_path / "tiny.safetensors", model.params, model.config)
+    command = [sys.executable, "-m", "vggtjax", "batch", str(root), "--out", str(out), "--model"]
+    command += [str(tmp_path / "tiny.safetensors"), "--method", "pose-decoupling"]
+    environment = os.environ | {"VGGTJAX_CACHE": str(tmp_path / "cache"), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+
+    with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as running:
+        while len(list(out.glob(visible))) < 8 and running.poll() is None:
+            time.sleep(0.01)
+        running.kill()
+        _, said = running.communicate()
+    assert running.returncode < 0, said.decode()  # by the signal
+    finished = {path.parent.name: path.stat().st_mtime_ns for path in out.glob(visible)}
+    assert 8 <= len(finished) < 19
+    folders = {path.name for path in out.iterdir() if path.is_dir() and not path.name.startswith(".")}
+    assert folders == set(finished)  # what can be seen is whole
+    for name in finished:
+        assert is_result(out / name / ARCHIVE_NAME)
+        assert len(Reconstruction.load(out / name).depth) == lengths[name]
+
+    again = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert again.returncode == 0, again.stderr
+    results = {path.parent.name: path.stat().st_mtime_ns for path in out.rglob(ARCHIVE_NAME)}
+    assert set(results) == set(lengths) - {"clip03"}
+    assert {path.name for path in out.iterdir()} == {*results, SETTINGS_NAME}  # once each, and nothing left over
+    for name in results:
+        assert len(Reconstruction.load(out / name).depth) == lengths[name]
+        assert (out / name / "scene.glb").stat().st_size > 1000
+    assert {name: results[name] for name in finished} == finished
+    table = dict(line.split(maxsplit=1) for line in again.stdout.splitlines()[:4])
+    assert table == {"clips": "20", "done": f"{19 - len(finished)}", "kept": f"{len(finished)}", "failed": "1"}
+    assert "clip03 failed: " in again.stdout
+    assert "1.png" in again.stdout.partition("clip03 failed: ")[2].splitlines()[0]
+    for name in set(results) - set(finished):
+        assert f"{name}: done, 0:00:" in again.stderr  # and the time that is left
+    assert all(f"{name}: kept" in again.stderr for name in finished)
+
+
+def test_what_a_killed_run_has_left_is_cleared_away(model, clips, tmp_path):
+    (tmp_path / ".clip0.partial/depth").mkdir(parents=True)
+    (tmp_path / ".clip0.partial/depth/old.npy").write_bytes(b"half")
+    sources = {"clip0": str(clips / "clip0")}
+    assert [outcome.status for outcome in reconstruct_many(model, sources, tmp_path, options={"method": "vggt"})] == [
+        "done"
+    ]
+    assert {path.name for path in tmp_path.iterdir()} == {"clip0", SETTINGS_NAME}
+    assert not list(tmp_path.rglob("old.npy"))
+
+
+def test_a_folder_that_is_there_keeps_its_files(model, clips, tmp_path):
+    (tmp_path / "clip0").mkdir()
+    (tmp_path / "clip0/mine.txt").write_text("mine")
+    (tmp_path / "clip1/depth").mkdir(parents=True)
+    sources = {name: str(clips / name) for name in ("clip0", "clip1")}
+    outcomes = list(reconstruct_many(model, sources, tmp_path, options={"method": "vggt"}))
+    assert {outcome.name: outcome.status for outcome in outcomes} == {"clip0": "done", "clip1": "failed"}
+    assert (tmp_path / "clip0/mine.txt").read_text() == "mine"
+    assert is_result(tmp_path / "clip0" / ARCHIVE_NAME)
+    assert [path.name for path in (tmp_path / "clip1").iterdir()] == ["depth"]
+
+
+def test_clips_of_one_shape_share_a_compilation(model, tmp_path):
+    for number, frames in enumerate([5, 7, 5, 7, 5]):  # lengths that no other test compiles
+        write_clip(tmp_path / f"clips/{number}", frames, 70)
+    compiled, counts = [], []
+
+    def listen(event, duration_secs, **_):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(event)
+
+    def progress(done, total):
+        counts.append(len(compiled))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        sources = clips_by_name([str(tmp_path / "clips")])
+        outcomes = reconstruct_many(model, sources, tmp_path / "out", options={"method": "vggt"}, progress=progress)
+        assert {outcome.status for outcome in outcomes} == {"done"}
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert [new > 0 for new in np.diff(counts)] == [True, True, False, False, False]
+
+
+def test_progress_counts_frames(model, tmp_path):
+    """A video counts as the mean of the others until it is read, and a clip that fails not at all."""
+    root = tmp_path / "clips"
+    write_clip(root / "a", 2, 70)
+    write_video(root / "b.mp4", 3, 70)
+    write_clip(root / "c", 8, 70)
+    (root / "c/7.png").write_bytes(b"broken")
+    write_clip(root / "d", 2, 70)
+    seen = []
+    sources = clips_by_name([str(root)]) | {"nothing": str(tmp_path / "none")}
+    outcomes = reconstruct_many(
+        model, sources, tmp_path / "out", options={"method": "vggt"}, progress=lambda *count: seen.append(count)
+    )
+    assert sum(outcome.status == "failed" for outcome in outcomes) == 2
+    assert seen == [(0, 16), (2, 16), (5, 15), (5, 7), (7, 7), (7, 7)]
+
+
+def test_the_time_that_is_left_goes_by_frames(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
+    shown = []
+    clock = _Clock(lambda *count: shown.append(count))
+    clock.progress(0, 40)
+    assert clock.left() == ""
+    now[0] += 100
+    clock.progress(1, 40)
+    assert clock.left() == ", 1:05:00 left"
+    clock.progress(40, 40)
+    assert clock.left() == ", 0:00:00 left"
+    assert shown == [(0, 40), (1, 40), (40, 40)]
+
+
+def test_results_are_those_of_single_runs(model, clips, tmp_path):
+    from vggtjax import load_clip, reconstruct
+
+    sources = {"a": str(clips / "clip0"), "b": str(clips / "clip1")}
+    outcomes = list(
+        reconstruct_many(model, sources, tmp_path, options={"method": "vggt"}, saving={"resolution": "original"})
+    )
+    assert [outcome.status for outcome in outcomes] == ["done", "done"]
+    for name, source in sources.items():
+        alone = reconstruct(model, load_clip(source, size=56, patch=14), method="vggt")
+        np.testing.assert_array_equal(Reconstruction.load(tmp_path / name).depth, alone.depth)
+        with Image.open(tmp_path / name / "mask/000000.png") as mask, Image.open(f"{source}/0.png") as picture:
+            assert mask.size == picture.size
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b", "a\n"])
+def test_names_that_are_no_folders(model, tmp_path, name):
+    with pytest.raises(InputError, match="a clip is named"):
+        next(reconstruct_many(model, {name: "x"}, tmp_path))
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"size": 50}, "size is 50"),
+        ({"sampling": {"stride": 0}}, "stride is 0"),
+        ({"options": {"method": "best"}}, "unknown method 'best'"),
+    ],
+)
+def test_what_is_wrong_for_all_clips_is_said_once(model, clips, tmp_path, wrong, message):
+    with pytest.raises(InputError, match=message):
+        next(reconstruct_many(model, {"a": str(clips / "clip0")}, tmp_path, **wrong))
+    assert not any(tmp_path.iterdir())
+
+
+def test_what_is_no_clip(clips, tmp_path):
+    with pytest.raises(ClipError, match="is no clip and holds none"):
+        clips_by_name([str(tmp_path)])
+    with pytest.raises(ClipError, match="two clips are named clip0"):
+        clips_by_name([str(clips), str(clips / "clip0")])
+    with pytest.raises(ClipError, match="no clips"):
+        clips_by_name([])
+
+
+def test_the_benchmark_compares_both_ways(model, tmp_path, capsys):
+    path = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
+    out = tmp_path / "batch.json"
+    arguments = ["--clips", "2", "--lengths", "2", "--method", "vggt", "--repeats", "1", "--out", str(out)]
+    assert benchmarks.main(["batch", "--model", str(path), *arguments]) == 0
+    shown = capsys.readouterr().out
+    assert "1 clips of 2 frames, and a corrupt one" in shown
+    measured = json.loads(out.read_text())
+    for state in ("cold", "warm"):
+        alone, batch = (measured["seconds"][state][side][0] for side in ("one by one", "batch"))
+        assert min(alone, batch) > 0
+        assert measured["ratios"][state] == pytest.approx(alone / batch)
+        assert f"{alone / batch:.3f}" in shown
+    assert benchmarks.main(["batch", "--clips", "1"]) == 2
+    assert "clips is 1; expected at least 2" in capsys.readouterr().err

@@ -1,0 +1,160 @@
+"""Stages ahead of time, clips that are padded, passes that need not be run, and frames that are not real."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from tests.tiny import tiny_config
+from vggtjax import Model, compile_ahead, encode, forward, load_clip, reconstruct
+from vggtjax.config import MotionConfig, VGGTConfig
+from vggtjax.errors import InputError
+from vggtjax.method.passes import first_pass, second_pass
+from vggtjax.network.model import init_params
+from vggtjax.pipeline.frame_padding import padded_frames
+
+SIDE, OFFSETS = 70, MotionConfig().offsets
+
+
+@pytest.fixture(scope="module")
+def model() -> Model:
+    config: VGGTConfig = tiny_config(image_size=SIDE)
+    return Model(config, init_params(0, config), "tiny")
+
+
+def pictures(frames: int) -> np.ndarray:
+    return np.random.default_rng(frames).random((frames, SIDE, SIDE, 3), np.float32)
+
+
+def compilations(run) -> int:
+    """How many programs jax compiles while `run` runs."""
+    seen = []
+
+    def listen(event, *_, **__):
+        if event == "/jax/core/compile/backend_compile_duration":
+            seen.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        run()
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    return len(seen)
+
+
+def apart(a, b) -> float:
+    return float(np.abs(np.asarray(a) - np.asarray(b)).max() / np.asarray(b).std())
+
+
+def test_lengths_are_few_and_never_an_eighth_too_long():
+    lengths = [padded_frames(frames, OFFSETS) for frames in range(1, 300)]
+    assert lengths[:17] == [*range(1, 17), 18]
+    assert all(frames <= length <= frames * 9 / 8 for frames, length in enumerate(lengths, 1))
+    assert len(set(lengths)) < 60
+    assert padded_frames(17, (30,)) == 17  # frame 0 has no source among 17, but would have none among 18 either
+    assert padded_frames(17, (17, -17)) == 17  # frame 0 would get one
+
+
+@pytest.mark.parametrize("method", ["vggt4d", "4dvggt-d"])
+def test_a_padded_clip_gives_the_same(model, method):
+    clip = load_clip(pictures(17), size=SIDE)
+    alone = reconstruct(model, clip, method=method, align_scale=True, keep_passes=True)
+    padded = reconstruct(model, clip, method=method, align_scale=True, keep_passes=True, pad_frames=True)
+    assert padded.depth.shape == alone.depth.shape
+    assert (padded.dynamic_mask == alone.dynamic_mask).mean() > 0.999
+    for name in ("depth", "depth_confidence", "saliency"):
+        assert apart(getattr(padded, name), getattr(alone, name)) < 2e-4, name
+    assert np.abs(padded.camera_from_world - alone.camera_from_world).max() < 1e-4
+    assert jax.tree.map(np.shape, padded.passes) == jax.tree.map(np.shape, alone.passes)
+
+
+@pytest.mark.parametrize("suppress", ["zero", "drop"])
+def test_frames_that_are_not_real_change_nothing(model, suppress):
+    """Whatever they show, bit by bit; and the result is that of the shorter clip."""
+    config, count = model.config, jnp.array([5])
+    short = jnp.asarray(pictures(5))[None]
+    moving = np.zeros((1, 7, SIDE, SIDE), bool)
+    moving[:, 1:3, :28] = True
+    made = []
+    for rest in (np.zeros((2, SIDE, SIDE, 3)), pictures(2), np.full((2, SIDE, SIDE, 3), np.nan)):
+        images = jnp.concatenate([short, jnp.asarray(rest, jnp.float32)[None]], axis=1)
+        tokens = encode(model.params, images, config)
+        first, saliency = first_pass(model.params, images, tokens, config, frame_count=count)
+        second = second_pass(
+            model.params, images, tokens, jnp.asarray(moving), config, suppress=suppress, frame_count=count
+        )
+        made.append(jax.tree.map(lambda x: np.asarray(x[:, :5]), (first, saliency, second)))
+    for others in made[1:]:
+        assert all((a == b).all() for a, b in zip(jax.tree.leaves(made[0]), jax.tree.leaves(others), strict=True))
+    tokens = encode(model.params, short, config)
+    first, saliency = first_pass(model.params, short, tokens, config)
+    second = second_pass(model.params, short, tokens, jnp.asarray(moving[:, :5]), config, suppress=suppress)
+    for a, b in zip(jax.tree.leaves(made[0]), jax.tree.leaves((first, saliency, second)), strict=True):
+        assert apart(a, b) < 2e-4
+
+
+def test_clips_of_different_lengths_in_one_batch(model):
+    batch = jnp.asarray(np.stack([pictures(6), np.concatenate([pictures(4), pictures(2)])]))
+    made = forward(model.params, batch, model.config, frame_count=jnp.array([6, 4]))
+    for clip, frames in enumerate((6, 4)):
+        alone = forward(model.params, batch[clip : clip + 1, :frames], model.config)
+        for a, b in zip(jax.tree.leaves(made), jax.tree.leaves(alone), strict=True):
+            assert apart(a[clip, :frames], b[0]) < 2e-4
+
+
+def test_no_tracks_of_frames_that_are_not_real(model):
+    with pytest.raises(InputError, match="all real"):
+        forward(
+            model.params, jnp.asarray(pictures(4))[None], model.config, outputs=("tracks",),
+            query_points=jnp.ones((1, 1, 2)), frame_count=jnp.array([3]),
+        )  # fmt: skip
+
+
+def test_what_is_compiled_ahead_is_not_compiled_again(model):
+    clip = load_clip(pictures(18), size=SIDE)
+    needs = compile_ahead(model, 18, SIDE, SIDE)
+    assert {"image features", "first pass", "second pass"} <= needs.keys()
+    assert all(need.output > 0 for need in needs.values())
+    assert compilations(lambda: reconstruct(model, clip)) == 0
+    with pytest.raises(InputError, match="multiples of the patch size 14"):
+        compile_ahead(model, 2, 20, 70)
+    with pytest.raises(InputError, match="expected 'float32' or 'bfloat16'"):
+        compile_ahead(model, 2, SIDE, SIDE, compute_dtype="float16")
+
+
+def test_clips_of_similar_length_share_a_compilation(model):
+    def run(frames: int) -> int:
+        clip = load_clip(pictures(frames), size=SIDE)
+        return compilations(lambda: reconstruct(model, clip, method="vggt4d", pad_frames=True))
+
+    assert run(19) > run(20) > 0
+    assert run(19) == 0
+
+
+def test_a_mask_without_a_moving_pixel_needs_no_second_pass(model):
+    """The plain pass is returned as it is, which computing the second would not give: it is handed in changed."""
+    images = jnp.asarray(pictures(4))[None]
+    tokens = encode(model.params, images, model.config)
+    plain, _ = first_pass(model.params, images, tokens, model.config)
+    assert plain.depth is not None
+    marked = plain._replace(depth=plain.depth + 1)
+    still, moving = np.zeros((2, 1, 4, SIDE, SIDE), bool)
+    moving[0, 1] = True
+
+    def second(mask, **more):
+        return second_pass(model.params, images, tokens, jnp.asarray(mask), model.config, **more)
+
+    assert (np.asarray(second(still, plain=marked).depth) == np.asarray(marked.depth)).all()
+    assert apart(second(still).depth, plain.depth) < 1e-4
+    assert apart(second(moving, plain=marked).depth, second(moving).depth) < 1e-4
+
+
+def test_only_what_a_method_reads_of_the_second_pass_is_computed(model):
+    clip = load_clip(pictures(5), size=SIDE)
+    lean = compile_ahead(model, 5, SIDE, SIDE, method="vggt4d")["second pass"]
+    whole = compile_ahead(model, 5, SIDE, SIDE, method="vggt4d", keep_passes=True)["second pass"]
+    assert lean.output < whole.output / 4
+    made = reconstruct(model, clip, method="vggt4d")
+    kept = reconstruct(model, clip, method="vggt4d", keep_passes=True)
+    assert np.abs(made.camera_from_world - kept.camera_from_world).max() < 1e-5
+    assert kept.passes.second.depth is not None

@@ -1,0 +1,129 @@
+import io
+
+import numpy as np
+import pytest
+import trimesh
+
+from tests.room import WALL, make_room
+from vggtjax.results import point_cloud
+from vggtjax.results.frame import frame_of
+from vggtjax.results.glb import build_scene
+
+
+def load_scene(room, percentile=0.0, **options):
+    """Return the scene of a result, through a GLB file."""
+    least = point_cloud.least_confidence(room, percentile)
+    frames = [frame_of(room, number) for number in range(len(room.depth))]
+    static, dynamic = (
+        [point_cloud.frame_cloud(f, f.valid & (f.confidence >= least) & (f.dynamic_mask == own)) for f in frames]
+        for own in (False, True)
+    )
+    glb = build_scene(room, point_cloud.joined(static), dynamic, **options).export(file_type="glb")
+    assert isinstance(glb, bytes)
+    return trimesh.load_scene(io.BytesIO(glb), file_type="glb")
+
+
+def test_nodes_and_points():
+    room = make_room()
+    scene = load_scene(room)
+    names = {"static", "cameras", "dynamic_000000", "dynamic_000001", "dynamic_000002"}
+    assert set(scene.graph.nodes_geometry) == set(scene.geometry) == names
+    static = scene.geometry["static"].vertices
+    assert len(static) == (~room.dynamic_mask).sum()
+    np.testing.assert_allclose(static[:, 2], -WALL, rtol=1e-5)  # glTF looks along -z
+    highest = room.world_points()[~room.dynamic_mask][:, 1].min()  # y is down in the result, up in the file
+    np.testing.assert_allclose(static[:, 1].max(), -highest, rtol=1e-5)
+
+
+def test_colors_are_linear():
+    moving = load_scene(make_room()).geometry["dynamic_000001"].colors
+    # ((220 / 255 + 0.055) / 1.055) ** 2.4 = 0.7157; 40 -> 0.0212; 30 -> 0.0130
+    assert (moving == (183, 5, 3, 255)).all()
+
+
+@pytest.mark.parametrize("frame", [0, 1, 2])
+def test_cameras_open_toward_what_they_see(frame):
+    room = make_room()
+    cameras = build_scene(room, *no_points()).geometry["cameras"]
+    to_gltf = np.diag([1, -1, -1])
+    pose = room.world_from_camera[frame]
+    # In the camera (x right, y down, z forward); without points a camera has size 0.06.
+    near = (cameras.vertices @ to_gltf - pose[:3, 3]) @ pose[:3, :3]
+    near = near[np.linalg.norm(near, axis=-1) < 0.08]
+    assert near[:, 2].min() > -0.002
+    assert near[:, 2].max() == pytest.approx(0.06 / np.sqrt(1 + (1 / 1.8) ** 2 + (2 / 3 / 1.8) ** 2), abs=0.002)
+    roof = near[near[:, 1].argmin()]
+    assert roof[0] == pytest.approx(0, abs=1e-3)
+    assert roof[1] < near[:, 1].mean()
+
+
+def no_points():
+    empty = point_cloud.PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+    return empty, [empty, empty, empty]
+
+
+def test_first_and_last_camera_differ_in_color():
+    colors = build_scene(make_room(), *no_points()).geometry["cameras"].visual.vertex_colors
+    assert len(np.unique(colors, axis=0)) == 3
+
+
+def test_camera_size_follows_the_scene():
+    small = load_scene(make_room()).geometry["cameras"]
+    room = make_room()
+    moved = room.camera_from_world.copy()
+    moved[:, :, 3] *= 10
+    large = load_scene(make_room(camera_from_world=moved, depth=room.depth * 10)).geometry["cameras"]
+    np.testing.assert_allclose(large.extents, 10 * small.extents, rtol=1e-4)
+
+
+def test_points_are_limited_evenly_and_reproducibly():
+    room = make_room()
+    scene, again = load_scene(room, point_limit=1000), load_scene(room, point_limit=1000)
+    total, kept = room.depth.size, 0
+    for name in ("static", "dynamic_000000", "dynamic_000001", "dynamic_000002"):
+        whole = (~room.dynamic_mask).sum() if name == "static" else room.dynamic_mask[int(name[-1])].sum()
+        assert len(scene.geometry[name].vertices) == int(whole * 1000 / total)
+        kept += len(scene.geometry[name].vertices)
+        np.testing.assert_array_equal(scene.geometry[name].vertices, again.geometry[name].vertices)
+    assert 990 < kept <= 1000
+
+
+@pytest.mark.parametrize(
+    ("changes", "names"),
+    [
+        ({"dynamic_mask": np.zeros((3, 28, 42), bool)}, {"static", "cameras"}),
+        (
+            {"dynamic_mask": np.ones((3, 28, 42), bool)},
+            {"cameras", "dynamic_000000", "dynamic_000001", "dynamic_000002"},
+        ),
+        ({"depth": np.full((3, 28, 42), np.inf)}, {"cameras"}),
+    ],
+)
+def test_nothing_or_everything_moves(changes, names):
+    assert set(load_scene(make_room(**changes)).geometry) == names
+
+
+def test_single_frame_and_cameras_in_one_place():
+    assert len(load_scene(make_room(1)).geometry["cameras"].faces) == 8 * 8 + 2
+    still = np.tile(np.eye(4)[:3], (3, 1, 1))
+    assert len(load_scene(make_room(camera_from_world=still)).geometry["cameras"].faces) == 3 * (8 * 8 + 2)
+
+
+@pytest.mark.filterwarnings("ignore::vggtjax.results.reconstruction.FieldOfViewWarning")
+def test_extreme_depths_and_fields_of_view():
+    depth = make_room().depth.copy()
+    depth[:, ::2] = 1e38
+    intrinsics = make_room().intrinsics.copy()
+    intrinsics[0, 0, 0], intrinsics[1, 1, 1] = np.inf, -3
+    cameras = load_scene(make_room(depth=depth, intrinsics=intrinsics)).geometry["cameras"]
+    assert np.isfinite(cameras.vertices).all()
+
+
+def test_camera_faces_look_outward():
+    mesh = build_scene(make_room(1), *no_points()).geometry["cameras"]
+    bars, roof = mesh.faces[:-2], mesh.faces[-2:]
+    middles = mesh.vertices[:64].reshape(8, 8, 3).mean(axis=1)  # eight bars of eight corners
+    outward = mesh.vertices[bars].mean(axis=1) - middles[bars[:, 0] // 8]
+    assert (np.einsum("fi,fi->f", outward, mesh.face_normals[:-2]) > 0).all()
+    assert sorted(roof[0]) == sorted(roof[1])
+    np.testing.assert_allclose(mesh.face_normals[-2], -mesh.face_normals[-1])

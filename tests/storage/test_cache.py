@@ -1,0 +1,46 @@
+"""The user's cache: where it is, and that commands keep what jax compiles there."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vggtjax.storage.cache import cache_folder, keep_compilations
+
+PROGRAM = """
+from vggtjax.storage.cache import keep_compilations
+assert keep_compilations()
+import jax, jax.numpy as jnp
+jax.jit(lambda x: jnp.tanh(x @ x).sum())(jnp.ones((64, 64))).block_until_ready()
+"""
+
+
+def test_the_folder_can_be_named(monkeypatch, tmp_path):
+    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path / "here"))
+    assert cache_folder() == tmp_path / "here"
+    monkeypatch.delenv("VGGTJAX_CACHE")
+    assert cache_folder().name == "vggtjax"
+
+
+def compiled(environment, folder: Path) -> int:
+    made = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr
+    return len(list(folder.glob("*-cache"))) if folder.is_dir() else 0
+
+
+def test_what_is_compiled_is_kept_unless_the_user_has_said_otherwise(tmp_path):
+    own = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    own |= {"VGGTJAX_CACHE": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    assert compiled(own, tmp_path / "compiled") > 0
+    elsewhere = own | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "elsewhere"), "VGGTJAX_CACHE": str(tmp_path / "b")}
+    assert compiled(elsewhere, tmp_path / "elsewhere") > 0
+    assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.skipif("jax" not in sys.modules, reason="nothing here has imported jax")
+def test_it_comes_too_late_once_jax_is_there(monkeypatch):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    assert not keep_compilations()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ

@@ -1,0 +1,127 @@
+"""Programs that are kept: traced once, the same numbers afterwards, and made anew where a file is not whole."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from vggtjax.storage import programs
+from vggtjax.storage.programs import Program, keep_type, kept_text
+
+
+@keep_type
+class Pair(NamedTuple):
+    one: jax.Array
+    other: jax.Array | None = None
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Keep programs, as commands do."""
+    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path))
+    monkeypatch.setattr(programs, "_keeping", lambda: True)
+    return tmp_path / "lowered"
+
+
+def counted():
+    """Return a function that counts how often it is traced, twice over: as two processes have it."""
+    traced = []
+
+    def weighed(pair: Pair, extra, *, power: int, factor: float = 1.0):
+        traced.append(power)
+        return Pair(factor * pair.one**power, extra), jnp.sum(pair.one)
+
+    return [Program(weighed, static=("power",)) for _ in range(2)], traced
+
+
+X = jnp.arange(6.0).reshape(2, 3)
+
+
+def test_another_process_need_not_trace(folder):
+    (first, second), traced = counted()
+    made = first(Pair(X), None, power=2, factor=3.0)
+    again = second(Pair(X), None, power=2, factor=3.0)
+    assert traced == [2]
+    assert len(list(folder.iterdir())) == 1
+    assert np.array_equal(made[0].one, again[0].one)
+    assert np.array_equal(again[0].one, 3 * X**2)
+    assert isinstance(again[0], Pair)
+    assert again[0].other is None
+    # A traced option is an argument; static ones, shapes, types and structure make another program.
+    assert np.array_equal(second(Pair(X), None, power=2, factor=5.0)[0].one, 5 * X**2)
+    assert traced == [2]
+    second(Pair(X), None, power=3)
+    second(Pair(X[:1]), None, power=2, factor=3.0)
+    second(Pair(X.astype(jnp.int32)), None, power=2, factor=3.0)
+    second(Pair(X), X, power=2, factor=3.0)
+    assert len(traced) == 5
+
+
+def test_compiled_programs_are_what_calls_find(folder):
+    (first, second), traced = counted()
+    shape = jax.ShapeDtypeStruct((2, 3), jnp.float32)
+    for program in (first, second):
+        compiled, made = program.compile(Pair(shape), None, power=2, factor=3.0)
+        assert compiled.memory_analysis() is not None
+        assert made[0].one.shape == (2, 3)
+        assert np.array_equal(program(Pair(X), None, power=2, factor=3.0)[0].one, 3 * X**2)
+    assert traced == [2]
+
+
+def test_broken_files_are_made_anew(folder):
+    (first, second), traced = counted()
+    first(Pair(X), None, power=2)
+    (path,) = folder.iterdir()
+    path.write_bytes(path.read_bytes()[:50])
+    assert np.array_equal(second(Pair(X), None, power=2)[0].one, X**2)
+    assert traced == [2, 2]
+
+
+def test_what_cannot_be_kept_runs_all_the_same(folder):
+    def called(x):
+        return jax.pure_callback(lambda x: np.asarray(x) + 1, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+    assert np.array_equal(Program(called)(X), X + 1)
+    assert not folder.exists()
+    (program, _), _ = counted()
+    gradient = jax.grad(lambda x: program(Pair(x), None, power=2)[0].one.sum())(X)  # traced from outside
+    assert np.array_equal(gradient, 2 * X)
+
+
+def test_a_cache_that_cannot_be_written_is_none(folder):
+    folder.parent.mkdir(exist_ok=True)
+    folder.write_text("a file where the folder would be")
+    (program, _), _ = counted()
+    assert np.array_equal(program(Pair(X), None, power=2)[0].one, X**2)
+
+
+def test_without_a_cache_nothing_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path))
+    (program, _), traced = counted()
+    program.compile(Pair(X), None, power=2)
+    program(Pair(X), None, power=2)
+    assert traced == [2]
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_oldest_go_first(folder, monkeypatch):
+    monkeypatch.setattr(programs, "KEPT_BYTES", 1)
+    (program, _), _ = counted()
+    program(Pair(X), None, power=2)
+    program(Pair(X), None, power=3)
+    assert len(list(folder.glob("*.bin"))) == 0
+
+
+def test_text_is_kept(folder):
+    made = []
+
+    def make() -> str:
+        made.append(1)
+        return "text"
+
+    assert [kept_text("name", make), kept_text("name", make)] == ["text", "text"]
+    assert len(made) == 1
+    assert kept_text("other", make) == "text"
+    assert len(made) == 2

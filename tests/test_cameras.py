@@ -1,0 +1,113 @@
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from tests.room import WALL, make_room
+from vggtjax import cameras as geometry
+from vggtjax.errors import ResultError
+
+
+@pytest.mark.parametrize("name", ["forward_single", "forward_frames4"])
+def test_unproject_at_corners_equals_the_public_code(golden, name):
+    with np.load(golden / f"{name}.npz") as arrays:
+        assert json.loads(str(arrays["meta"]))["frames"] == arrays["plain/depth"].shape[1]
+        points = geometry.unproject(
+            arrays["plain/depth"][0, ..., 0],
+            arrays["plain/intrinsic"][0],
+            arrays["plain/extrinsic"][0],
+            pixel_offset=0.0,
+        )
+        expected = arrays["plain/world_points_from_depth"][0]
+    assert points.dtype == np.float32
+    np.testing.assert_allclose(points, expected, rtol=1e-5, atol=1e-5 * expected.std())
+
+
+def test_unproject_by_hand():
+    # A camera one to the right of the origin that looks along +x: its right is -z, its forward +x.
+    rotation = np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]], np.float32)
+    camera_from_world = np.concatenate([rotation, -rotation @ np.array([[1.0], [0], [0]], np.float32)], axis=1)[None]
+    intrinsics = np.array([[[2, 0, 1], [0, 4, 1], [0, 0, 1]]], np.float32)
+    depth = np.array([[[8, 8], [8, np.inf]]], np.float32)
+    points = geometry.unproject(depth, intrinsics, camera_from_world, pixel_offset=0.5)
+    # Pixel (0, 0) is seen at (0.5, 0.5): camera coordinates ((0.5 - 1) / 2 * 8, (0.5 - 1) / 4 * 8, 8) = (-2, -1, 8).
+    np.testing.assert_allclose(points[0, 0, 0], [9, -1, 2])
+    np.testing.assert_allclose(points[0, 0, 1], [9, -1, -2])
+    np.testing.assert_allclose(points[0, 1, 0], [9, 1, 2])
+    assert not np.isfinite(points[0, 1, 1]).all()
+
+
+@given(
+    turn=st.tuples(*[st.floats(-3, 3)] * 3),
+    centre=st.tuples(*[st.floats(-5, 5)] * 3),
+    focal=st.tuples(*[st.floats(5, 100)] * 2),
+    seed=st.integers(0, 100),
+)
+def test_unprojected_points_project_to_pixel_centres(turn, centre, focal, seed):
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    camera_from_world = np.concatenate([rotation, -rotation @ np.array(centre)[:, None]], axis=1)[None]
+    intrinsics = np.array([[[focal[0], 0, 4], [0, focal[1], 3], [0, 0, 1]]])
+    depth = np.random.default_rng(seed).uniform(0.5, 20, (1, 6, 8))
+    points = geometry.unproject(
+        *(array.astype(np.float32) for array in (depth, intrinsics, camera_from_world)), pixel_offset=0.5
+    )
+    seen = points[0] @ rotation.T + camera_from_world[0, :, 3]
+    seen = seen @ intrinsics[0].T
+    np.testing.assert_allclose(seen[..., 2], depth[0], rtol=1e-4, atol=1e-5)
+    y, x = np.mgrid[0:6, 0:8] + 0.5
+    np.testing.assert_allclose(seen[..., :2] / seen[..., 2:], np.stack([x, y], axis=-1), atol=2e-2)
+
+
+def test_unprojected_wall_is_flat():
+    room = make_room()
+    np.testing.assert_allclose(room.world_points()[~room.dynamic_mask][:, 2], WALL, rtol=1e-5)
+
+
+def test_inverse_and_centres_by_hand():
+    camera_from_world = np.array([[[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]], np.float32)
+    np.testing.assert_array_equal(geometry.camera_centres(camera_from_world), [[-2, 1, -3]])
+    expected = [[[0, 1, 0, -2], [-1, 0, 0, 1], [0, 0, 1, -3], [0, 0, 0, 1]]]
+    np.testing.assert_array_equal(geometry.world_from_camera(camera_from_world), expected)
+
+
+def test_fields_of_view_are_clamped_where_they_must():
+    fov = np.array([[1.0, 0.5], [0.0, 1.0], [1.0, 4.0], [np.inf, -1.0], [0.01, 3.1]])
+    clamped, frames = geometry.clamp_field_of_view(fov)
+    np.testing.assert_array_equal(clamped, [[1.0, 0.5], [0.01, 1.0], [1.0, 3.1], [3.1, 0.01], [0.01, 3.1]])
+    assert frames == (1, 2, 3)
+
+
+def test_field_of_view_that_is_not_a_number():
+    with pytest.raises(ResultError, match="frame 1 is not a number"):
+        geometry.clamp_field_of_view(np.array([[1.0, 1.0], [1.0, np.nan]]))
+
+
+def test_intrinsics_are_clamped_by_their_fields_of_view():
+    intrinsics = np.tile(np.array([[40, 0, 21], [0, 30, 14], [0, 0, 1]], np.float32), (6, 1, 1))
+    intrinsics[1, 0, 0] = np.inf  # field of view 0
+    intrinsics[2, 1, 1] = -10  # beyond pi
+    intrinsics[3, 0, 0] = 0  # pi
+    intrinsics[4, 1, 1] = 1e9  # nearly 0
+    clamped, frames = geometry.clamp_intrinsics(intrinsics, 28, 42)
+    assert frames == (1, 2, 3, 4)
+    np.testing.assert_array_equal(clamped[[0, 5]], intrinsics[[0, 5]])
+    np.testing.assert_allclose(clamped[1, 0, 0], 21 / np.tan(0.005), rtol=1e-6)
+    np.testing.assert_allclose(clamped[2, 1, 1], 14 / np.tan(1.55), rtol=1e-6)
+    np.testing.assert_allclose(clamped[3, 0, 0], 21 / np.tan(1.55), rtol=1e-6)
+    np.testing.assert_allclose(clamped[4, 1, 1], 14 / np.tan(0.005), rtol=1e-6)
+    assert (clamped[:, [0, 1], [1, 0]] == 0).all()
+    assert (clamped[:, :2, 2] == [21, 14]).all()
+    again, frames = geometry.clamp_intrinsics(clamped, 28, 42)
+    assert frames == ()
+    np.testing.assert_array_equal(again, clamped)
+
+
+def test_frustum_corners_by_hand():
+    intrinsics = np.array([[[3, 0, 3], [0, 2, 2], [0, 0, 1]]], np.float32)  # 90 degrees both ways
+    camera_from_world = np.concatenate([np.eye(3), [[0], [0], [-1]]], axis=1, dtype=np.float32)[None]
+    corners = geometry.frustum_corners(intrinsics, camera_from_world, height=4, width=6, size=3**0.5)
+    expected = [[0, 0, 1], [-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]]
+    np.testing.assert_allclose(corners[0], expected, atol=1e-6)

@@ -1,0 +1,99 @@
+"""The command `vggtjax calibrate-cues`. Does not import jax before it is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vggtjax.commands.report import Report
+from vggtjax.config import Gram
+from vggtjax.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from jaxtyping import Bool, Float32
+
+_KEYS = 0x63756573  # folded into the seed's key, so that no other use of a seed draws these scenes
+
+
+def calibrate_cues(
+    model: str,
+    out: Path,
+    *,
+    scenes: int = 64,
+    frames: int = 12,
+    size: int | None = None,
+    gram: Gram = "cosine",
+    max_terms: int = 5,
+    seed: int = 0,
+) -> None:
+    """Choose a model's motion cues on generated scenes, and save it with them.
+
+    Args:
+        model: a converted .safetensors, a PyTorch checkpoint, or a hub id such as facebook/VGGT-1B.
+        out: folder for model.safetensors, sweep.png and calibration.json; an earlier calibration is replaced.
+        scenes: number of scenes; every second one is held out.
+        frames: of each scene.
+        size: side in pixels to run at; the model's own by default.
+        gram: similarity that the cues are chosen for.
+        max_terms: choose so many cues at most.
+        seed: another seed draws other scenes.
+    """
+    if scenes < 2:
+        raise InputError(f"scenes is {scenes}; expected at least 2, one to choose the cues and one to confirm them")
+    if max_terms < 1:
+        raise InputError(f"max_terms is {max_terms}; expected at least 1")
+    if not 0 <= seed < 2**31:
+        raise InputError(f"seed is {seed}; expected a number in [0, 2**31)")
+    report = Report()
+    with report.running():
+        from vggtjax.calibration.choice import choose
+        from vggtjax.calibration.export import check_folder, save_calibration
+        from vggtjax.calibration.sweep import sweep
+        from vggtjax.pretrained.load import load_model
+
+        check_folder(out)
+        with report.stage("load model") as progress:
+            loaded = load_model(model, progress=progress)
+        side = loaded.config.image_size if size is None else size
+        if side < 1 or side % loaded.config.patch_size:
+            raise InputError(f"size is {side}; expected a multiple of the patch size {loaded.config.patch_size}")
+        with report.stage("sweep") as progress:
+            clips = generated_clips(scenes, frames, side, seed)
+            swept = sweep(loaded.params, clips, loaded.config, progress=progress, total=scenes)
+        with report.stage("choose") as progress:
+            choice = choose(swept, gram=gram, max_terms=max_terms, progress=progress)
+        source = {"scenes": scenes, "frames": frames, "size": side, "textures": "training"}
+        with report.stage("write"):
+            path = save_calibration(
+                out, loaded, swept, choice, source=source | {"key": f"fold_in(fold_in(key({seed}), {_KEYS}), scene)"}
+            )
+    rows = {
+        step.cue.name + (" (1 - m)" if step.cue.inverted else ""): f"{calibration:.3f}   {held_out:.3f}"
+        for step in choice.steps
+        for calibration, held_out in [step.rating]
+    }
+    report.line("AUC of the product up to each cue, on the calibration half and on the held-out one:")
+    report.table(rows | {"default table": "{:.3f}   {:.3f}".format(*choice.table), "model": path})
+    if choice.steps[-1].rating.held_out < choice.table.held_out:
+        report.line("On the held-out half the default table is better than the chosen one; try more scenes.")
+    if not loaded.trained:
+        report.line("The weights of this model are untrained, so its cues mean nothing.")
+
+
+def generated_clips(
+    scenes: int, frames: int, size: int, seed: int
+) -> Iterator[tuple[Float32[np.ndarray, "S H W 3"], Bool[np.ndarray, "S H W"]]]:
+    """Yield pictures and dynamic pixels of generated scenes with training textures, one scene at a time."""
+    import jax
+
+    from vggtjax.scenes import SceneConfig, generate, load_textures
+
+    config = SceneConfig(height=size, width=size, frames=frames, dynamic=True)
+    textures = load_textures("training")
+    key = jax.random.fold_in(jax.random.key(seed), _KEYS)
+    make = jax.jit(generate, static_argnames="config")
+    for scene in range(scenes):
+        clip = make(jax.random.fold_in(key, scene), textures, config)
+        yield jax.device_get((clip.images, clip.dynamic_mask))

@@ -1,0 +1,107 @@
+"""What `vggtjax train` does: a recipe from a file, progress on the terminal, a model at the end."""
+
+from __future__ import annotations
+
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from vggtjax.commands.report import Report
+from vggtjax.errors import InputError, MissingExtraError
+
+if TYPE_CHECKING:
+    from vggtjax.training.loop import Status
+
+_LINE_SECONDS = 20.0  # between lines of progress
+
+
+def train(
+    recipe: Path,
+    out: Path,
+    *,
+    init: str | None = None,
+    steps: int | None = None,
+    seconds: float | None = None,
+    log_every: int = 50,
+    checkpoint_seconds: float = 600.0,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+) -> None:
+    """Train a model on generated scenes, or go on with a run that was interrupted.
+
+    Args:
+        recipe: JSON file with the recipe.
+        out: folder for the model, checkpoints and metrics; a run that is there goes on.
+        init: a model to start from: a .safetensors, a PyTorch checkpoint, or a hub id; random parameters by default.
+        steps: steps in all; stages, warm-up and decay keep their shares. The recipe's own by default.
+        seconds: stop after so long, with a checkpoint to go on from.
+        log_every: steps that a row of metrics.csv averages over.
+        checkpoint_seconds: time between checkpoints.
+        dtype: of the weights in model.safetensors.
+    """
+    for name, value in (("log_every", log_every), ("checkpoint_seconds", checkpoint_seconds), ("seconds", seconds)):
+        if value is not None and not value > 0:
+            raise InputError(f"{name} is {value}; expected a number above 0")
+    if not all(find_spec(name) for name in ("optax", "orbax", "matplotlib")):
+        raise MissingExtraError("training", "train")
+    report = Report()
+    with report.running():
+        with report.stage("prepare"):
+            from vggtjax.training.loop import train as run
+            from vggtjax.training.recipe import read_recipe
+
+            chosen = read_recipe(recipe)
+            if steps is not None:
+                chosen = chosen.with_steps(steps)
+        params = None
+        if init is not None:
+            with report.stage("load model") as progress:
+                from vggtjax.pretrained.load import load_model
+
+                params = load_model(init, config=chosen.model, progress=progress).params
+        with report.stage("train") as advance:
+            shown = time.perf_counter()
+
+            def show(status: Status) -> None:
+                nonlocal shown
+                advance(status.step, status.total_steps)
+                if status.metrics and time.perf_counter() - shown >= _LINE_SECONDS:
+                    report.line(_line(status))
+                    shown = time.perf_counter()
+
+            outcome = run(
+                chosen,
+                out,
+                init=params,
+                progress=show,
+                stop_after=seconds,
+                log_every=log_every,
+                checkpoint_seconds=checkpoint_seconds,
+                export_dtype=dtype,
+            )
+    done, total = int(outcome.state.step), chosen.total_steps
+    report.table(
+        {
+            "steps": f"{done} of {total}" + ("" if outcome.finished else "; the same command goes on"),
+            "skipped": f"{int(outcome.state.skipped)} steps whose loss or gradient was not finite",
+            "model": outcome.model,
+            "metrics": f"{out / 'metrics.csv'}, {out / 'metrics.png'}",
+        }
+    )
+
+
+def _line(status: Status) -> str:
+    text = f"step {status.step} of {status.total_steps}, stage {status.stage + 1}"
+    if "loss" in status.metrics:
+        text += f", loss {status.metrics['loss']:.4g}"
+    if status.seconds_left is not None:
+        text += f", {_duration(status.seconds_left)} left"
+    return text
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min" if minutes else f"{rest} s"

@@ -1,0 +1,210 @@
+"""Depth of a video against the truth after one alignment for all its frames. Does not import jax."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Float64
+
+from vggtjax.errors import InputError
+from vggtjax.evaluation.metrics.depth import DELTA, measured
+
+Align = Literal["metric", "median", "scale", "scale-shift"]
+
+_SCALE_ROUNDS = 10
+_SHIFT_ROUNDS = 40
+_SHRINK = 0.6  # of the floor below which a residual gets no more weight, from round to round
+_LEAST = 1e-8  # a residual, in the truth's unit, that keeps a weight finite
+
+
+class VideoDepthErrors(NamedTuple):
+    """Errors over all valid pixels of a sequence, d the aligned prediction and g the truth."""
+
+    abs_rel: float  # mean of |d - g| / g
+    rmse: float  # in the truth's unit
+    delta1: float  # share of pixels with max(d / g, g / d) < 1.25
+    delta2: float  # < 1.25^2
+    delta3: float  # < 1.25^3
+    pixels: int  # that are valid: the weight of this sequence in a mean over several
+
+
+class DepthLine(NamedTuple):
+    """An alignment of depth: d -> scale * d + shift."""
+
+    scale: float
+    shift: float = 0.0
+
+
+def video_depth_errors(
+    predicted: Float[np.ndarray, "S H W"],
+    truth: Float[np.ndarray, "S H W"],
+    align: Align = "scale",
+    *,
+    max_depth: float | None = None,
+) -> VideoDepthErrors:
+    """Return the errors of a sequence's depth after one alignment over all valid pixels of all frames.
+
+    Args:
+        predicted: depth at the truth's size (`resized_depth`), finite wherever the truth is valid. A depth that is
+            not above 0 after the alignment is counted like any other in AbsRel and RMSE, and is within no delta.
+        truth: depth; valid where it is finite, above 0 and below `max_depth`.
+        align: "metric" changes nothing; "median" scales by median g / median d; "scale" by the least absolute error,
+            as MonST3R and CUT3R do it: from mean g / mean d, ten rounds of least squares with weights
+            1 / (|s d - g| + 1e-8); "scale-shift" by s d + t of the least absolute error, as `_least_absolute_line`
+            says.
+        max_depth: in the truth's unit; none if None.
+
+    Raises:
+        InputError: shapes that differ or are not [S, H, W], no valid pixel, a prediction that is not finite on one, an
+            unknown alignment, a `max_depth` that is not above 0, or a prediction that cannot be aligned: its mean or
+            median is not above 0, or with "scale-shift" it is the same everywhere.
+    """
+    if np.ndim(truth) != 3:
+        raise InputError(f"the true depth has shape {np.shape(truth)}; expected a sequence [S, H, W]")
+    predicted, truth = _valid_pixels(predicted, truth, max_depth)
+    scale, shift = _line(predicted, truth, align)
+    aligned = scale * predicted + shift
+    apart = np.abs(aligned - truth)
+    abs_rel, rmse = float((apart / truth).mean()), float(np.sqrt((apart**2).mean()))
+    del apart
+    low, high = np.minimum(aligned, truth), np.maximum(aligned, truth)
+    deltas = (float((high < DELTA**power * low).mean()) for power in (1, 2, 3))  # never where `low` is not above 0
+    return VideoDepthErrors(abs_rel, rmse, *deltas, pixels=len(truth))
+
+
+def depth_alignment(
+    predicted: Float[np.ndarray, "*S"],
+    truth: Float[np.ndarray, "*S"],
+    align: Align = "scale",
+    *,
+    max_depth: float | None = None,
+) -> DepthLine:
+    """Return the scale and the shift that `video_depth_errors` puts on a prediction; arguments and errors as there.
+
+    Any shape will do, one number of axes of both.
+    """
+    return _line(*_valid_pixels(predicted, truth, max_depth), align)
+
+
+def resized_depth(depth: Float[np.ndarray, "*S h w"], size: tuple[int, int]) -> Float64[np.ndarray, "*S H W"]:
+    """Return depth at another size: bilinear, pixel centres at .5, without smoothing when it shrinks.
+
+    Outside the outermost centres the depth of the border goes on.
+
+    Args:
+        depth: maps with a value in every pixel; one that is not finite spreads to all pixels that touch it.
+        size: height and width.
+
+    Raises:
+        InputError: depth without pixels or with fewer than 2 axes, or a size that is not two whole numbers above 0.
+    """
+    depth = np.asarray(depth)
+    if depth.ndim < 2 or 0 in depth.shape[-2:]:
+        raise InputError(f"depth has shape {depth.shape}; expected [..., H, W] with a pixel at least")
+    if len(size) != 2 or any(side != int(side) or side < 1 for side in size):
+        raise InputError(f"size is {tuple(size)}; expected a height and a width of at least 1")
+    resized = depth.astype(np.float64)
+    for axis, side in zip((-2, -1), size, strict=True):
+        if resized.shape[axis] != side:
+            resized = _interpolated(resized, axis, int(side))
+    return resized
+
+
+def _interpolated(values: Float64[np.ndarray, "*S h w"], axis: int, side: int) -> Float64[np.ndarray, "*S H W"]:
+    """Return values on another number of pixels along an axis."""
+    last = values.shape[axis] - 1
+    places = np.clip((np.arange(side) + 0.5) * (last + 1) / side - 0.5, 0, last)
+    before = np.floor(places).astype(int)
+    share = (places - before)[:, None] if axis == -2 else places - before
+    lower = np.take(values, before, axis)
+    upper = np.take(values, np.minimum(before + 1, last), axis)
+    # A share of 0 takes nothing from the other pixel, not even a NaN.
+    return np.where(share > 0, lower + share * (upper - lower), lower)
+
+
+def _median(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]) -> DepthLine:
+    return DepthLine(_ratio("median", float(np.median(predicted)), float(np.median(truth))))
+
+
+def _scale(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]) -> DepthLine:
+    """Return the scale of the least absolute error, by a fixed number of rounds of reweighted least squares."""
+    scale = _ratio("mean", float(predicted.mean()), float(truth.mean()))
+    for _ in range(_SCALE_ROUNDS):
+        weighted = predicted / (np.abs(scale * predicted - truth) + _LEAST)
+        scale = float(weighted @ truth / (weighted @ predicted))
+    return DepthLine(scale)
+
+
+def _least_absolute_line(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]) -> DepthLine:
+    """Return s and t of the least sum of |s d + t - g|, by reweighted least squares.
+
+    The start is the least squares line. Forty rounds follow, each the least squares line with weights
+    1 / max(|r|, floor) of the residuals r of the round before; the floor begins at their mean and shrinks by 0.6 from
+    round to round, down to 1e-8, so that no pixel that happens to lie on an early line holds it there. Of all these
+    lines the one with the least sum is kept.
+    """
+    middle = float(predicted.mean())
+    centred = predicted - middle  # the normal equations stay well conditioned
+    spread = float(np.abs(centred).max())
+    if spread <= 1e-9 * abs(middle) or spread == 0:
+        raise InputError(f"the predicted depth is {middle:.6g} in all valid pixels; scale and shift cannot be found")
+    weights = np.ones(len(truth))
+    best, least, floor = DepthLine(1.0), np.inf, 0.0
+    for round_ in range(_SHIFT_ROUNDS + 1):
+        total = weights.sum()
+        mean, true_mean = float(weights @ centred / total), float(weights @ truth / total)
+        weighted = weights * (centred - mean)
+        if (variance := float(weighted @ centred)) <= 0:
+            break  # all the weight is on one depth: the line is as good as found
+        scale = float(weighted @ truth / variance)
+        line = DepthLine(scale, true_mean - scale * mean)
+        apart = np.abs(line.scale * centred + line.shift - truth)
+        if (error := float(apart.sum())) < least:
+            best, least = line, error
+        floor = error / len(truth) if round_ == 0 else floor * _SHRINK
+        weights = 1 / np.maximum(apart, max(floor, _LEAST))
+    return DepthLine(best.scale, best.shift - best.scale * middle)
+
+
+_ALIGNMENTS: dict[str, Callable[[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]], DepthLine]] = {
+    "metric": lambda predicted, truth: DepthLine(1.0),
+    "median": _median,
+    "scale": _scale,
+    "scale-shift": _least_absolute_line,
+}
+
+
+def _line(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"], align: Align) -> DepthLine:
+    if align not in _ALIGNMENTS:
+        raise InputError(f"align is {align!r}; expected one of {', '.join(_ALIGNMENTS)}")
+    return _ALIGNMENTS[align](predicted, truth)
+
+
+def _ratio(name: str, predicted: float, truth: float) -> float:
+    if predicted <= 0:
+        raise InputError(f"the {name} of the predicted depth is {predicted:.6g}; expected it above 0 to find a scale")
+    return truth / predicted
+
+
+def _valid_pixels(predicted, truth, max_depth) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+    predicted, truth = np.asarray(predicted), np.asarray(truth)
+    if predicted.shape != truth.shape:
+        raise InputError(
+            f"predicted depth has shape {predicted.shape} and the truth {truth.shape}; resize the prediction first"
+        )
+    valid = measured(truth)
+    if max_depth is not None:
+        if not max_depth > 0:
+            raise InputError(f"max_depth is {max_depth}; expected it above 0")
+        valid &= truth < max_depth
+    if not valid.any():
+        below = "" if max_depth is None else f" below {max_depth}"
+        raise InputError(f"no pixel has a true depth above 0{below}; nothing can be compared")
+    found = predicted[valid].astype(np.float64)
+    if (wrong := int((~np.isfinite(found)).sum())) > 0:
+        raise InputError(
+            f"{wrong} predicted depths are not finite where the truth is valid; expected all of them to be"
+        )
+    return found, truth[valid].astype(np.float64)

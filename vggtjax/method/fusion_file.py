@@ -1,0 +1,90 @@
+"""A fitted tree in a file that `--fusion` takes: safetensors, with what it was fitted on in its header."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vggtjax.errors import CheckpointError, InputError
+from vggtjax.method.fusion_gate import CHANNELS, init_gate
+from vggtjax.method.fusion_rule import FEATURES, PARTS, FusionParams, projected
+from vggtjax.storage.tensor_file import Spec, read_tensors, write_tensors
+
+FORMAT = "vggtjax fusion"
+VERSION = 1
+
+
+def save_fusion(path: str | Path, params: FusionParams, about: Mapping[str, Any] | None = None) -> None:
+    """Write a tree; `about` are plain values that say where it is from.
+
+    Raises OutputError where the file cannot be written.
+    """
+    leaves = {name: np.asarray(leaf, np.float32) for name, leaf in _named(params).items()}
+    write_tensors(
+        path,
+        {name: Spec(leaf.shape, leaf.dtype) for name, leaf in leaves.items()},
+        lambda name: [np.atleast_1d(leaves[name])],
+        {"format": FORMAT, "version": str(VERSION), "about": json.dumps(dict(about or {}))},
+    )
+
+
+def load_fusion(path: str | Path) -> FusionParams:
+    """Read a tree.
+
+    Raises:
+        InputError: the file cannot be read, is no tree of this family, or has values out of range.
+    """
+    try:
+        file = read_tensors(path)
+    except CheckpointError as error:
+        raise InputError(f"{error}; expected a file that vggtjax fit-fusion wrote") from None
+    if file.metadata.get("format") != FORMAT or file.metadata.get("version") != str(VERSION):
+        raise InputError(f"{path} is not a fitted fusion of version {VERSION}; expected what vggtjax fit-fusion wrote")
+    wanted = _expected(any(name.startswith("gate.") for name in file.tensors))
+    shapes = {name: stored.shape for name, stored in file.tensors.items()}
+    if wrong := sorted(name for name in wanted.keys() | shapes.keys() if wanted.get(name) != shapes.get(name)):
+        raise InputError(
+            f"{path} has {wrong[0]} of shape {shapes.get(wrong[0])}; expected {wanted.get(wrong[0])}: fit it again"
+        )
+    leaves = {name: np.asarray(stored, np.float32) for name, stored in file.tensors.items()}
+    if bad := sorted(name for name, leaf in leaves.items() if not np.isfinite(leaf).all()):
+        raise InputError(f"{path} has values of {bad[0]} that are not finite; fit it again")
+    params: FusionParams = {name: jnp.asarray(leaves[name]) for name in PARTS}
+    for name, leaf in leaves.items():
+        if name.startswith("gate."):
+            _, layer, kind = name.split(".")
+            params.setdefault("gate", {}).setdefault(layer, {})[kind] = jnp.asarray(leaf)
+    for name, leaf in projected(params).items():
+        if name in PARTS and not np.allclose(leaf, params[name]):
+            part = PARTS[name]
+            raise InputError(
+                f"{path} has {name} {np.asarray(params[name]).tolist()}; expected values in [{part.low}, {part.high}]"
+            )
+    return params
+
+
+def fusion_about(path: str | Path) -> dict[str, Any]:
+    """Return what a file says of where its tree is from; nothing where that cannot be read."""
+    try:
+        about = json.loads(read_tensors(path).metadata.get("about", ""))
+    except (CheckpointError, ValueError, RecursionError):
+        return {}
+    return about if isinstance(about, dict) else {}
+
+
+def _named(params: FusionParams) -> dict[str, Any]:
+    flat, _ = jax.tree_util.tree_flatten_with_path(params)
+    return {".".join(entry.key for entry in path): leaf for path, leaf in flat}
+
+
+def _expected(gate: bool) -> dict[str, tuple[int, ...]]:
+    tree: dict[str, Any] = {name: jax.ShapeDtypeStruct(part.shape, np.float32) for name, part in PARTS.items()}
+    if gate:
+        tree["gate"] = jax.eval_shape(lambda: init_gate(jax.random.key(0), 4 + len(FEATURES), CHANNELS))
+    return {name: leaf.shape for name, leaf in _named(tree).items()}

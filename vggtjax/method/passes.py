@@ -1,0 +1,287 @@
+"""The two passes and what is made of them: the stages of 4DVGGT-D as pure functions (arXiv 2605.12027)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
+from vggtjax.errors import InputError
+from vggtjax.method.cues import GramCues
+from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
+from vggtjax.method.mask import dynamic_tokens, mine_mask
+from vggtjax.network.backbone import encode
+from vggtjax.network.layers import Params
+from vggtjax.network.model import Predictions, forward
+from vggtjax.network.pose import decode_pose
+from vggtjax.network.track_head import Tracks
+from vggtjax.options import Threshold, find_method
+
+_Value = TypeVar("_Value")
+
+
+class Passes(NamedTuple):
+    """Both passes over clips, and the mask between them. `second` is None where no second pass was run."""
+
+    first: Predictions
+    second: Predictions | None
+    saliency: Float[Array, "B S h w"]
+    dynamic_mask: Bool[Array, "B S H W"]
+
+
+class Cameras(NamedTuple):
+    """OpenCV cameras: x right, y down, z forward; intrinsics in pixels."""
+
+    camera_from_world: Float[Array, "B S 3 4"]
+    intrinsics: Float[Array, "B S 3 3"]
+
+
+class Assembly(NamedTuple):
+    """What a method returns: depth up to scale, its confidence, and the cameras."""
+
+    depth: Float[Array, "B S H W"]
+    confidence: Float[Array, "B S H W"]
+    cameras: Cameras
+
+    @property
+    def camera_from_world(self) -> Float[Array, "B S 3 4"]:
+        return self.cameras.camera_from_world
+
+    @property
+    def intrinsics(self) -> Float[Array, "B S 3 3"]:
+        return self.cameras.intrinsics
+
+
+def first_pass(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    patch_tokens: Float[Array, "B S P C"],
+    config: VGGTConfig,
+    *,
+    gram: Gram = "cosine",
+    motion: MotionConfig | None = None,
+    outputs: tuple[str, ...] = ("camera", "depth"),
+    query_points: Float[Array, "B Q 2"] | None = None,
+    frame_count: Int[Array, " B"] | None = None,
+    exponents: Float[Array, " cues"] | None = None,
+    compute_dtype: str = "float32",
+    remat: bool = False,
+) -> tuple[Predictions, Float[Array, "B S h w"]]:
+    """Run the plain pass and mine the motion saliency on the way; with `query_points`, track them too.
+
+    Of clips with a `frame_count` only the first so many frames mean anything. `exponents` are those of the cues.
+    """
+    if gram not in ("cosine", "dot"):
+        raise InputError(f"gram is {gram!r}; expected 'cosine' or 'dot'")
+    cues = GramCues(motion or config.motion, config.depth, gram)
+    predictions = forward(
+        params,
+        images,
+        config,
+        patch_tokens=patch_tokens,
+        outputs=outputs if query_points is None else (*outputs, "tracks"),
+        query_points=query_points,
+        frame_count=frame_count,
+        cues=cues,
+        compute_dtype=compute_dtype,
+        remat=remat,
+    )
+    h, w = (side // config.patch_size for side in images.shape[2:4])
+    saliency = cues.saliency(_present(predictions.cue_sums), exponents).reshape(*images.shape[:2], h, w)
+    return predictions._replace(cue_sums=None), saliency
+
+
+def second_pass(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    patch_tokens: Float[Array, "B S P C"],
+    dynamic_mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"],
+    config: VGGTConfig,
+    *,
+    plain: Predictions | None = None,
+    suppress: Suppress = "zero",
+    mask_pairs: int = 5,
+    strength: Float[Array, " depth"] | None = None,
+    outputs: tuple[str, ...] = ("camera", "depth"),
+    frame_count: Int[Array, " B"] | None = None,
+    stop_camera_gradient: bool = True,
+    compute_dtype: str = "float32",
+    remat: bool = False,
+) -> Predictions:
+    """Run the mask-aware pass: the keys of dynamic tokens suppressed in the first `mask_pairs` pairs.
+
+    Where no pixel of the whole batch is dynamic, it is the plain pass: if `plain` gives what that predicted, it is
+    returned, and nothing is computed (all is, if `plain` lacks some of the outputs). Of clips with a `frame_count` only
+    the first so many frames mean anything. A mask of shares in [0, 1] and a `strength` are as `forward` takes them.
+    """
+
+    def masked() -> Predictions:
+        return forward(
+            params,
+            images,
+            config,
+            patch_tokens=patch_tokens,
+            dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size),
+            suppress=suppress,
+            mask_pairs=mask_pairs,
+            strength=strength,
+            outputs=outputs,
+            frame_count=frame_count,
+            stop_camera_gradient=stop_camera_gradient,
+            compute_dtype=compute_dtype,
+            remat=remat,
+        )
+
+    fields = {"camera": ("pose_encoding",), "depth": ("depth", "depth_confidence")}
+    wanted = {name: getattr(plain, name, None) for output in outputs for name in fields.get(output, (output,))}
+    if plain is None or any(value is None for value in wanted.values()) or dynamic_mask.dtype != bool:
+        return masked()
+    return jax.lax.cond(dynamic_mask.any(), masked, lambda: Predictions(**wanted))
+
+
+def track_from(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    patch_tokens: Float[Array, "B S P C"],
+    query_points: Float[Array, "B Q 2"],
+    frame: Int[Array, ""],
+    config: VGGTConfig,
+    *,
+    compute_dtype: str = "float32",
+) -> Tracks:
+    """Track points of any frame: the clip is rolled so that the frame comes first, and its tracks are rolled back.
+
+    Args:
+        params: the model's parameter tree.
+        images, patch_tokens: of the clips, in their order.
+        query_points: x, y in pixels of the frame.
+        frame: its index (may be traced: one compilation serves all frames with as many points).
+        config: the model's configuration.
+        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
+    """
+    made = forward(
+        params,
+        jnp.roll(images, -frame, axis=1),
+        config,
+        patch_tokens=jnp.roll(patch_tokens, -frame, axis=1),
+        outputs=("tracks",),
+        query_points=query_points,
+        compute_dtype=compute_dtype,
+    )
+    tracks = (made.tracks, made.track_visibility, made.track_confidence)
+    return Tracks(*(jnp.roll(_present(value), frame, axis=1) for value in tracks))
+
+
+def motion_saliency(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    config: VGGTConfig,
+    *,
+    gram: Gram = "cosine",
+    motion: MotionConfig | None = None,
+) -> Float[Array, "B S h w"]:
+    """Return how much each patch seems to move, in [0, 1]: the product of the five Gram maps.
+
+    Args:
+        params: the model's parameter tree.
+        images: RGB in [0, 1].
+        config: the model's configuration.
+        gram: "cosine" (rows of q and k normalised per head, 4DVGGT-D) or "dot" (VGGT4D).
+        motion: the table of cues; the configuration's own if None.
+    """
+    return first_pass(params, images, encode(params, images, config), config, gram=gram, motion=motion, outputs=())[1]
+
+
+def run_passes(
+    params: Params,
+    images: Float[Array, "B S H W 3"],
+    config: VGGTConfig,
+    *,
+    gram: Gram = "cosine",
+    suppress: Suppress = "zero",
+    mask_pairs: int = 5,
+    motion: MotionConfig | None = None,
+    compute_dtype: str = "float32",
+    clusters: int = 0,
+    threshold: Threshold = "otsu",
+    smooth_frames: int = 1,
+    second: tuple[str, ...] = ("camera", "depth"),
+) -> Passes:
+    """Run both passes once, sharing the backbone's features; `assemble` makes a method's result of them.
+
+    The defaults serve all methods of `LADDER` at once; "vggt4d" wants passes of its own, made as its row of `METHODS`
+    says (`infer` does).
+
+    Args:
+        params: the model's parameter tree.
+        images: RGB in [0, 1]; any batch and any number of frames.
+        config: the model's configuration.
+        gram: similarity of the motion cues, "cosine" or "dot".
+        suppress: how keys of dynamic tokens are suppressed, "zero" or "drop".
+        mask_pairs: number of pairs in which they are.
+        motion: the table of cues; the configuration's own if None.
+        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
+        clusters, threshold, smooth_frames: how the mask is made of the saliency, as for `mine_mask`.
+        second: what the second pass shall predict; () for no second pass.
+    """
+    patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
+    first, saliency = first_pass(
+        params, images, patch_tokens, config, gram=gram, motion=motion, compute_dtype=compute_dtype
+    )
+    size = (images.shape[2], images.shape[3])
+    mining = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames}
+    mask = mine_mask(saliency, patch_tokens, size, **mining)
+    if not second:
+        return Passes(first, None, saliency, mask)
+    masking = {"suppress": suppress, "mask_pairs": mask_pairs, "outputs": second, "compute_dtype": compute_dtype}
+    made = second_pass(params, images, patch_tokens, mask, config, plain=first, **masking)
+    return Passes(first, made, saliency, mask)
+
+
+def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False) -> Assembly:
+    """Make a method's depth, confidence and cameras of two passes; the methods of `LADDER` share one run of them.
+
+    Args:
+        passes: what `run_passes` returned for cues, suppression and mask as the method has them, which is not checked.
+        method: a name of `METHODS`.
+        align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
+            pixels before it is used. Not in the paper.
+    """
+    row = find_method(method)
+    if passes.second is None and row.needs_second_pass:
+        raise InputError(f"method {method!r} needs the second pass, which was not run")
+    first, second = passes.first, passes.second or passes.first
+    scale = jnp.ones(passes.dynamic_mask.shape[0])
+    if align_scale and passes.second is not None:
+        scale = scale_between(_present(first.depth), _present(second.depth), passes.dynamic_mask)
+
+    def depth_of(predictions: Predictions, scale: Array) -> tuple[Array, Array]:
+        return _present(predictions.depth) * scale[:, None, None, None], _present(predictions.depth_confidence)
+
+    def of_both() -> tuple[Array, Array, Array, Array, Array]:
+        return (*depth_of(first, jnp.ones_like(scale)), *depth_of(second, scale), passes.dynamic_mask)
+
+    makers = {
+        "first": lambda: (_present(first.depth), _present(first.depth_confidence)),
+        "second": lambda: depth_of(second, scale),
+        "replaced": lambda: replace_depth(*of_both()),
+        "fused": lambda: fuse_depth(*of_both()),
+    }
+    depth, confidence = makers[row.depth]()
+    size = (depth.shape[2], depth.shape[3])
+    extrinsics, intrinsics = decode_pose(_present(second.pose_encoding), size)
+    cameras = {
+        "first": Cameras(*decode_pose(_present(first.pose_encoding), size)),
+        "second": Cameras(extrinsics.at[..., 3].multiply(scale[:, None, None]), intrinsics),
+    }
+    chosen = Cameras(cameras[row.extrinsics].camera_from_world, cameras[row.intrinsics].intrinsics)
+    return Assembly(depth, confidence, chosen)
+
+
+def _present(value: _Value | None) -> _Value:
+    if value is None:
+        raise InputError("the passes lack depth or cameras; run them with outputs=('camera', 'depth')")
+    return value

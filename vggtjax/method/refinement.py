@@ -1,0 +1,265 @@
+"""Mask refinement by projection (VGGT4D, stage 3): what agrees with the static scene in other frames does not move.
+
+Per frame, the points under the coarse mask are grouped by k-means; every group is projected into all other frames, and
+compared there in depth and colour with what those frames show on static pixels. Groups that agree leave the mask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy import ndimage
+from scipy.spatial import KDTree
+
+from vggtjax.cameras import unproject
+from vggtjax.errors import InputError
+from vggtjax.method.clustering import kmeans, nearest_centre
+from vggtjax.network.precision import full_precision
+
+CLUSTERS = 30
+RESTARTS = 4  # of k-means
+FITTED = 4096  # points of a frame, evenly drawn, that the centres of its clusters are fitted to; all are labelled
+NEIGHBOURS = 20  # of a point, itself among them
+OUTLIER_SIGMA = 2.5
+LEAST_SHARE = 0.05  # of a group's projections that must count
+MOST_LOSS = 0.1
+OCCLUSION = 0.01  # depth by which a point may lie behind what its target pixel shows
+TOO_FEW = 1e10  # loss of a group of which too little can be compared
+SAMPLES_AT_ONCE = 1 << 21  # projections of points, which bounds the memory
+_BUCKET = 2048  # points are padded to a multiple, so that masks of similar size share a compilation
+_CLOSING = np.array([[0, 0, 1, 0, 0], [1] * 5, [1] * 5, [1] * 5, [0, 0, 1, 0, 0]], bool)  # OpenCV's 5 x 5 ellipse
+
+
+class ClusterLosses(NamedTuple):
+    """How far every cluster is from what other frames show: means over its projections that count."""
+
+    depth: Float[Array, "S K"]
+    rgb: Float[Array, "S K"]  # absolute difference, summed over the channels
+    counted: Int[Array, "S K"]  # projections that count
+    points: Int[Array, "S K"]
+
+    @property
+    def total(self) -> Float[Array, "S K"]:
+        """Depth plus mean over channels of colour; TOO_FEW where too little counts."""
+        S = self.depth.shape[0]
+        enough = (self.counted >= LEAST_SHARE * (S - 1) * self.points) & (self.counted > 0)
+        return jnp.where(enough, self.depth + self.rgb / 3, TOO_FEW)
+
+
+def refine_masks(
+    images: Float[np.ndarray, "S H W 3"],
+    depth: Float[np.ndarray, "S H W"],
+    dynamic_mask: Bool[np.ndarray, "S H W"],
+    camera_from_world: Float[np.ndarray, "S 3 4"],
+    intrinsics: Float[np.ndarray, "S 3 3"],
+    *,
+    valid: Bool[np.ndarray, "S H W"] | None = None,
+    clusters: int = CLUSTERS,
+    seed: int = 0,
+    progress: Callable[[int, int], object] | None = None,
+) -> Bool[np.ndarray, "S H W"]:
+    """Return the dynamic mask without what agrees with other frames, closed and dilated (VGGT4D, stage 3).
+
+    Args:
+        images: RGB in [0, 1].
+        depth: z in the camera, in VGGT's unit: scenes are about 1 away, and the thresholds are lengths.
+        dynamic_mask: the coarse mask; an empty one stays empty.
+        camera_from_world, intrinsics: OpenCV cameras, as steady as can be had; intrinsics in pixels.
+        valid: False on padding, which is neither compared nor dynamic; None for none.
+        clusters: groups per frame.
+        seed: of k-means.
+        progress: called with frames done and frames in all, while outliers are looked for.
+
+    Raises:
+        InputError: arrays whose shapes or types do not fit together.
+    """
+    _check(images, depth, dynamic_mask, camera_from_world, intrinsics, valid)
+    S = len(depth)
+    valid = np.ones_like(dynamic_mask) if valid is None else valid
+    dynamic_mask = dynamic_mask & valid
+    if S < 2 or not dynamic_mask.any():
+        return dynamic_mask
+    points = unproject(depth, intrinsics, camera_from_world, pixel_offset=0.5)
+    inside = np.zeros_like(dynamic_mask)
+    for frame in range(S):
+        if dynamic_mask[frame].any():
+            inside[frame] = dynamic_mask[frame] & ~statistical_outliers(points[frame], valid[frame])
+        if progress is not None:
+            progress(frame + 1, S)
+    if not inside.any():
+        return inside
+    most = int(inside.sum(axis=(1, 2)).max())
+    count = min(-(-most // _BUCKET) * _BUCKET, depth[0].size)
+    index, weight = _packed(inside, count)
+    chosen = np.take_along_axis(points.reshape(S, -1, 3), index[..., None], axis=1)
+    chosen[~weight] = 0  # where there is nothing, depth may not even be a number
+    labels = cluster_points(jax.random.key(seed), chosen, weight, clusters)
+    hidden = dynamic_mask | ~valid
+    losses = cluster_losses(images, depth, hidden, camera_from_world, intrinsics, index, weight, labels, clusters)
+    static = np.asarray(losses.total <= MOST_LOSS)  # [S, K]
+    moves = ~np.take_along_axis(static, np.asarray(labels), axis=1) & weight
+    refined = np.zeros((S, depth[0].size), bool)
+    np.put_along_axis(refined, index, moves, axis=1)
+    return np.stack([_smoothed(mask) for mask in refined.reshape(depth.shape)]) & valid
+
+
+def statistical_outliers(
+    points: Float[np.ndarray, "H W 3"], valid: Bool[np.ndarray, "H W"] | None = None
+) -> Bool[np.ndarray, "H W"]:
+    """Return the points whose mean distance to their nearest neighbours is 2.5 standard deviations above the mean.
+
+    Points that are not finite, or not `valid`, are outliers too, and nobody's neighbours.
+    """
+    flat = points.reshape(-1, 3)
+    outlier = np.logical_not(np.isfinite(flat).all(axis=1, keepdims=True))[:, 0]
+    if valid is not None:
+        outlier |= ~valid.ravel()
+    known = flat[~outlier]
+    if len(known):
+        neighbours = min(NEIGHBOURS, len(known))
+        distance = (
+            KDTree(known, leafsize=32).query(known, k=neighbours, workers=-1)[0].reshape(len(known), -1).mean(axis=1)
+        )
+        outlier[~outlier] = distance > distance.mean() + OUTLIER_SIGMA * distance.std()
+    return outlier.reshape(points.shape[:2])
+
+
+@partial(jax.jit, static_argnames="clusters")
+def cluster_points(
+    key: Array, points: Float[Array, "S N 3"], weight: Bool[Array, "S N"], clusters: int = CLUSTERS
+) -> Int[Array, "S N"]:
+    """Group every frame's points by k-means, frame by frame; those of weight 0 are labelled but move nothing."""
+    keys = jax.random.split(key, points.shape[0])
+    fitted = min(FITTED, points.shape[1])
+
+    def one_frame(frame: tuple[Array, Array, Array]) -> Int[Array, " N"]:
+        key, points, there = frame
+        count = jnp.maximum(there.sum(), 1)  # those that are there come first
+        drawn = jnp.where(count > fitted, (jnp.arange(fitted) * (count / fitted)).astype(jnp.int32), jnp.arange(fitted))
+        centres = kmeans(key, points[drawn], clusters, there[drawn], restarts=RESTARTS).centres
+        return nearest_centre(points, centres)
+
+    return jax.lax.map(one_frame, (keys, points, weight))
+
+
+@partial(jax.jit, static_argnames="clusters")
+@full_precision
+def cluster_losses(
+    images: Float[Array, "S H W 3"],
+    depth: Float[Array, "S H W"],
+    dynamic_mask: Bool[Array, "S H W"],
+    camera_from_world: Float[Array, "S 3 4"],
+    intrinsics: Float[Array, "S 3 3"],
+    index: Int[Array, "S N"],
+    weight: Bool[Array, "S N"],
+    labels: Int[Array, "S N"],
+    clusters: int = CLUSTERS,
+) -> ClusterLosses:
+    """Compare every cluster with what the other frames show on static pixels.
+
+    A projection counts if it falls inside the frame, in front of the camera, not behind what is seen there, and on a
+    static pixel. Depth is sampled at the nearest pixel, colour and mask bilinearly.
+
+    Args:
+        images, depth, dynamic_mask, camera_from_world, intrinsics: as for `refine_masks`.
+        index: pixels of the points, row after row.
+        weight: whether there is such a point at all.
+        labels: its cluster.
+        clusters: number of clusters (static).
+    """
+    S, H, W = depth.shape
+    N = index.shape[1]
+    at_once = max(n for n in range(1, S + 1) if S % n == 0 and (n == 1 or n * N <= SAMPLES_AT_ONCE))
+    shown = jnp.concatenate([images, dynamic_mask[..., None].astype(images.dtype)], axis=-1)
+    targets = (jnp.arange(S), shown, depth, camera_from_world, intrinsics)
+    targets = jax.tree.map(lambda x: x.reshape(S // at_once, at_once, *x.shape[1:]), targets)
+
+    def one_frame(source):
+        frame, pixels, there, label = source
+        row, column = pixels // W, pixels % W
+        z = depth[frame].ravel()[pixels]
+        inverse = jnp.linalg.inv(intrinsics[frame])
+        places = jnp.stack([column + 0.5, row + 0.5, jnp.ones_like(z)], axis=-1)
+        local = z[:, None] * (places @ inverse.T)
+        rotation, translation = camera_from_world[frame, :, :3], camera_from_world[frame, :, 3]
+        world = (local - translation[None]) @ rotation
+        colour = images[frame].reshape(-1, 3)[pixels]
+        member = jax.nn.one_hot(label, clusters) * there[:, None]
+
+        def one_target(target):
+            number, shown, seen_depth, pose, camera = target
+            seen = world @ pose[:, :3].T + pose[:, 3][None]
+            projected = seen @ camera.T
+            u, v = projected[:, 0] / projected[:, 2], projected[:, 1] / projected[:, 2]
+            inside = (u > 0) & (u < W) & (v > 0) & (v < H) & (seen[:, 2] > 0)
+            u, v = jnp.where(inside, u, 0), jnp.where(inside, v, 0)
+            sampled_depth = _nearest(seen_depth, u, v)
+            sampled = _bilinear(shown, u, v)
+            counts = inside & (seen[:, 2] - OCCLUSION < sampled_depth) & (sampled_depth < jnp.inf)
+            counts &= (sampled[:, 3] <= 0.5) & (number != frame)
+            off = jnp.abs(sampled_depth - seen[:, 2])
+            faded = jnp.abs(sampled[:, :3] - colour).sum(axis=-1)
+            values = jnp.stack([jnp.ones_like(off), off, faded], axis=-1)
+            return jnp.einsum("nk,nv->kv", member, jnp.where(counts[:, None], values, 0))
+
+        sums = jax.lax.map(lambda some: jax.vmap(one_target)(some).sum(axis=0), targets).sum(axis=0)
+        return sums, member.sum(axis=0)
+
+    sums, points = jax.lax.map(one_frame, (jnp.arange(S), index, weight, labels))
+    mean = sums[..., 1:] / jnp.maximum(sums[..., :1], 1)
+    return ClusterLosses(mean[..., 0], mean[..., 1], sums[..., 0].astype(jnp.int32), points.astype(jnp.int32))
+
+
+def _nearest(image: Float[Array, "H W"], u: Float[Array, " N"], v: Float[Array, " N"]) -> Float[Array, " N"]:
+    """Sample where u and v count pixel centres from 0; 0 outside."""
+    H, W = image.shape
+    column, row = jnp.round(u).astype(jnp.int32), jnp.round(v).astype(jnp.int32)
+    inside = (column < W) & (row < H)
+    return jnp.where(inside, image[jnp.minimum(row, H - 1), jnp.minimum(column, W - 1)], 0)
+
+
+def _bilinear(image: Float[Array, "H W C"], u: Float[Array, " N"], v: Float[Array, " N"]) -> Float[Array, "N C"]:
+    """Sample where u and v, at least 0, count pixel centres from 0; 0 outside."""
+    padded = jnp.pad(image, ((0, 1), (0, 1), (0, 0)))
+    column, row = jnp.floor(u).astype(jnp.int32), jnp.floor(v).astype(jnp.int32)
+    x, y = (u - column)[:, None], (v - row)[:, None]
+    top = padded[row, column] * (1 - x) + padded[row, column + 1] * x
+    bottom = padded[row + 1, column] * (1 - x) + padded[row + 1, column + 1] * x
+    return top * (1 - y) + bottom * y
+
+
+def _check(images, depth, dynamic_mask, camera_from_world, intrinsics, valid) -> None:
+    S, H, W = depth.shape if depth.ndim == 3 else (0, 0, 0)
+    shapes = {
+        "images": (images, (S, H, W, 3)),
+        "depth": (depth, (S, H, W)),
+        "dynamic_mask": (dynamic_mask, (S, H, W)),
+        "camera_from_world": (camera_from_world, (S, 3, 4)),
+        "intrinsics": (intrinsics, (S, 3, 3)),
+        "valid": (dynamic_mask if valid is None else valid, (S, H, W)),
+    }
+    for name, (array, shape) in shapes.items():
+        kind = "bool" if name in ("dynamic_mask", "valid") else "floating point"
+        if array.shape != shape or (array.dtype != bool if kind == "bool" else array.dtype.kind != "f"):
+            raise InputError(f"{name} is {array.dtype} {array.shape}; expected {kind} {shape}")
+
+
+def _packed(inside: Bool[np.ndarray, "S H W"], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels of every frame's mask as indices [S, count], and which of them are real.
+
+    The others are distinct pixels outside the mask, so that every pixel is named at most once.
+    """
+    order = np.argsort(~inside.reshape(len(inside), -1), axis=1, kind="stable")[:, :count]
+    return order.astype(np.int32), np.take_along_axis(inside.reshape(len(inside), -1), order, axis=1)
+
+
+def _smoothed(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
+    """Close with OpenCV's 5 x 5 ellipse, then dilate with a full 3 x 3; beyond the edge is neither."""
+    closed = ndimage.binary_erosion(ndimage.binary_dilation(mask, _CLOSING), _CLOSING, border_value=1)
+    return ndimage.binary_dilation(closed, np.ones((3, 3), bool))

@@ -1,0 +1,1 @@
+"""Models by path or name, and the embedded model with its clip."""

@@ -1,0 +1,67 @@
+"""What `vggtjax demo` runs: the embedded model, and an embedded clip with its truth. Both are files of the package."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+
+from vggtjax.checkpoint import DType, Model, read_model
+from vggtjax.clips.truth import Truth
+from vggtjax.errors import CheckpointError, ClipError
+from vggtjax.storage.writing import writing
+
+MODEL = Path(__file__).with_name("model.safetensors")
+CLIP = MODEL.with_name("clip.npz")
+SCENE_SEED = 100  # of the held-out dynamic scenes that the clip is the first of; no evaluation takes this seed
+_NEAREST = np.float32(1e-3)  # metres
+_STEP = 5e-4  # of the logarithm of depth that 16 bits count
+
+
+def demo_model(dtype: DType = "float32") -> Model:
+    """Return the embedded model, trained on generated static scenes; see docs/model.md for how, and how well it does.
+
+    Raises:
+        CheckpointError: the installation lacks the file.
+    """
+    if not MODEL.is_file():
+        raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
+    model = read_model(MODEL, dtype=dtype)
+    return Model(model.config, model.params, "demo", model.path)
+
+
+def demo_clip() -> Truth:
+    """Return the embedded clip with its truth: a generated dynamic scene that no training has seen.
+
+    Raises:
+        ClipError: the installation lacks the file.
+    """
+    if not CLIP.is_file():
+        raise ClipError(f"the embedded clip {CLIP} is missing; install vggtjax again")
+    return read_demo_clip(CLIP)
+
+
+def read_demo_clip(path: Path) -> Truth:
+    """Read what `write_demo_clip` wrote."""
+    with np.load(path, allow_pickle=False) as stored:
+        depth = _NEAREST * np.exp(stored["log_depth"].astype(np.float32) * np.float32(_STEP))
+        mask = np.unpackbits(stored["dynamic_mask"], count=depth.size).astype(bool).reshape(depth.shape)
+        images = stored["images"].astype(np.float32) / 255
+        return Truth(images, depth, mask, stored["camera_from_world"], stored["intrinsics"])
+
+
+def write_demo_clip(path: Path, truth: Truth) -> None:
+    """Write a clip as the file that `demo_clip` reads: colours in 8 bits, depth in 16, the mask in one."""
+    steps = np.log(np.maximum(truth.depth, _NEAREST) / _NEAREST) / _STEP
+    content = io.BytesIO()
+    np.savez_compressed(
+        content,
+        images=np.rint(255 * truth.images).astype(np.uint8),
+        log_depth=np.rint(np.minimum(steps, 65535)).astype(np.uint16),
+        dynamic_mask=np.packbits(truth.dynamic_mask),
+        camera_from_world=truth.camera_from_world.astype(np.float32),
+        intrinsics=truth.intrinsics.astype(np.float32),
+    )
+    with writing(path) as temporary:
+        temporary.write_bytes(content.getvalue())

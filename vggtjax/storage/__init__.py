@@ -1,0 +1,1 @@
+"""Files: atomic writes, the user's cache, tensors, arrays, trajectories, compiled programs."""

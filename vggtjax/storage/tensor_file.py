@@ -1,0 +1,167 @@
+"""Safetensors files: read through a memory map, written one piece at a time. Does not import jax."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from math import prod
+from pathlib import Path
+from typing import NamedTuple
+
+import ml_dtypes
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from vggtjax.errors import CheckpointError
+from vggtjax.storage.writing import writing
+
+ALIGNMENT = 64  # of tensors that XLA takes from a memory map without a copy
+MAX_HEADER_BYTES = 2**24  # a model of this kind needs a quarter of a megabyte
+
+_DTYPES: dict[str, np.dtype] = {
+    code: np.dtype(kind)
+    for code, kind in {
+        "F64": np.float64,
+        "F32": np.float32,
+        "F16": np.float16,
+        "BF16": ml_dtypes.bfloat16,
+        "F8_E4M3": ml_dtypes.float8_e4m3fn,
+        "F8_E5M2": ml_dtypes.float8_e5m2,
+        "C64": np.complex64,
+        "I64": np.int64,
+        "I32": np.int32,
+        "I16": np.int16,
+        "I8": np.int8,
+        "U64": np.uint64,
+        "U32": np.uint32,
+        "U16": np.uint16,
+        "U8": np.uint8,
+        "BOOL": np.bool_,
+    }.items()
+}
+_CODES = {dtype: code for code, dtype in _DTYPES.items()}
+
+
+class StoredTensor(NamedTuple):
+    """A tensor in a file: `numpy.asarray` maps it into memory, read-only, until the array is dropped."""
+
+    path: Path
+    offset: int
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that it takes."""
+        return prod(self.shape) * self.dtype.itemsize
+
+    def within(self, content: np.ndarray) -> np.ndarray:
+        """Return the tensor as a view of the bytes of its whole file."""
+        return content[self.offset :][: self.nbytes].view(self.dtype).reshape(self.shape)
+
+    def __array__(self, dtype: np.dtype | None = None, copy: bool | None = None) -> np.ndarray:
+        if 0 in self.shape:
+            return np.empty(self.shape, dtype or self.dtype)
+        mapped = np.memmap(self.path, self.dtype, mode="r", offset=self.offset, shape=self.shape)
+        return np.array(mapped, dtype, copy=copy)
+
+
+class TensorFile(NamedTuple):
+    """What the header of a safetensors file says."""
+
+    tensors: dict[str, StoredTensor]
+    metadata: dict[str, str]
+
+
+class Spec(NamedTuple):
+    """Shape and type of a tensor to be written."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+def is_tensor_file(path: str | Path) -> bool:
+    """Return whether a file begins like a safetensors file: eight bytes of length, then JSON."""
+    try:
+        with Path(path).open("rb") as file:
+            start = file.read(9)
+    except OSError as error:
+        raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
+    return start[8:] == b"{" and int.from_bytes(start[:8], "little") < 2**48  # other formats begin with text
+
+
+def read_tensors(path: str | Path) -> TensorFile:
+    """Read the header of a safetensors file, and check that the file is whole.
+
+    Raises:
+        CheckpointError: the file cannot be read, is no whole safetensors file, or has a type that is not supported.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+            if length > MAX_HEADER_BYTES:
+                raise CheckpointError(
+                    f"{path} is not a safetensors file of weights: its header claims {length} bytes; "
+                    f"expected at most {MAX_HEADER_BYTES}"
+                )
+            with safe_open(path, framework="numpy") as opened:
+                metadata = opened.metadata() or {}
+                slices = {name: opened.get_slice(name) for name in opened.offset_keys()}
+                layout = {name: (tuple(piece.get_shape()), piece.get_dtype()) for name, piece in slices.items()}
+            unsupported = sorted({code for _, code in layout.values()} - set(_DTYPES))
+            if unsupported:
+                raise CheckpointError(f"{path} has tensors of type {', '.join(unsupported)}; expected floating point")
+            # The library has checked that the tensors fill the file without gaps, so their sizes give their places.
+            offset = 8 + length
+            tensors = {}
+            for name, (shape, code) in layout.items():
+                tensors[name] = StoredTensor(path, offset, shape, _DTYPES[code])
+                offset += tensors[name].nbytes
+    except SafetensorError as error:
+        raise CheckpointError(f"{path} is not a whole safetensors file ({error}); copy or download it again") from None
+    except OSError as error:
+        raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
+    return TensorFile(tensors, metadata)
+
+
+def write_tensors(
+    path: str | Path,
+    specs: Mapping[str, Spec],
+    pieces: Callable[[str], Iterable[np.ndarray]],
+    metadata: Mapping[str, str] | None = None,
+) -> None:
+    """Write a safetensors file with one piece in memory at a time; an interrupted run leaves no file.
+
+    Args:
+        path: the file; one that is there is replaced.
+        specs: names -> shape and type.
+        pieces: the parts of a tensor by its name, consecutive on axis 0, of any type: they are cast.
+        metadata: texts for the header.
+
+    Raises:
+        OutputError: the folder cannot be written or the disk is full.
+    """
+    sizes = {name: prod(spec.shape) * spec.dtype.itemsize for name, spec in specs.items()}
+    names = sorted(specs, key=lambda name: (sizes[name] % ALIGNMENT != 0, name))  # so that the first ones are aligned
+    header: dict[str, object] = {"__metadata__": dict(metadata)} if metadata else {}
+    total = 0
+    for name in names:
+        shape, dtype = specs[name]
+        header[name] = {
+            "dtype": _CODES[dtype],
+            "shape": list(shape),
+            "data_offsets": [total, total + sizes[name]],
+        }
+        total += sizes[name]
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-(8 + len(text)) % ALIGNMENT)
+
+    with writing(path) as temporary:
+        with temporary.open("wb") as file:
+            file.write(len(text).to_bytes(8, "little") + text)
+            for name in names:
+                for piece in pieces(name):
+                    piece = np.ascontiguousarray(piece, dtype=specs[name].dtype)
+                    file.write(piece.reshape(-1).view(np.uint8).data)
+        read_tensors(temporary)  # the library's own check that the file is whole
