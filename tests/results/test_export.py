@@ -12,6 +12,7 @@ from vggtjax.results import export, point_cloud
 from vggtjax.results.frame import frame_of
 from vggtjax.results.ply import write_ply
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.saving import Saving
 from vggtjax.storage.trajectories import read_trajectory
 
 FILES = {
@@ -170,19 +171,19 @@ def test_pictures_that_do_not_fit(tmp_path):
         with pytest.raises(InputError, match=r"the picture of frame 0 is .*; expected uint8 \(56, 84, 3\)"):
             room.save(tmp_path / "b", resolution="original", pictures=[wrong] * 3)  # pyright: ignore[reportArgumentType]
     mixed = make_room(source_size=[[56, 84], [84, 56], [56, 84]])
-    with pytest.raises(InputError, match="have 2 sizes, and the layout vggt4d wants one"):
-        mixed.save(tmp_path / "b", resolution="original", layout="vggt4d")
+    with pytest.raises(InputError, match="have 2 sizes; the format vggt4d expects one"):
+        mixed.save(tmp_path / "b", resolution="original", format="vggt4d")
     with pytest.raises(InputError, match="resolution is 'full'; expected one of"):
         room.save(tmp_path / "c", resolution="full")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="layout is 'cut3r'; expected one of"):
-        room.save(tmp_path / "d", layout="cut3r")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="format is 'cut3r'; expected one of"):
+        room.save(tmp_path / "d", format="cut3r")  # pyright: ignore[reportArgumentType]
     assert not any(files(tmp_path))
 
 
 @pytest.mark.parametrize("resolution", ["model", "original"])
-def test_layout_of_vggt4d(tmp_path, resolution):
+def test_format_of_vggt4d(tmp_path, resolution):
     room = make_room()
-    room.save(tmp_path, layout="vggt4d", resolution=resolution)
+    room.save(tmp_path, saving=Saving(format="vggt4d", resolution=resolution))
     names = ("frame_{}.png", "frame_{}.npy", "conf_{}.npy", "dynamic_mask_{}.png")
     theirs = {f"vggt4d/{name.format(f'{frame:04d}')}" for frame in range(3) for name in names}
     assert set(files(tmp_path)) == expected_files(3) | theirs | {"vggt4d/pred_intrinsics.txt", "vggt4d/pred_traj.txt"}

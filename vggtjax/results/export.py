@@ -19,7 +19,7 @@ In the folder, with a frame's number as its file name:
 At the resolution "original" everything that is a file per frame, the clouds and intrinsics.txt are at the size of the
 source's pictures; the archive, the sheet and the tracks' pictures stay at the model's.
 
-With the layout "vggt4d" there is also a folder as VGGT4D writes it, with frames from 0:
+With the format "vggt4d" there is also a folder as VGGT4D writes it, with frames from 0:
 
     vggt4d/frame_0000.png, frame_0000.npy       picture, depth
     vggt4d/conf_0000.npy, dynamic_mask_0000.png confidence, 255 where dynamic
@@ -42,7 +42,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -51,12 +51,14 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from vggtjax.errors import InputError
+from vggtjax.progress import Progress
 from vggtjax.results import foreign, point_cloud, previews, tracks
-from vggtjax.results.frame import Frame, Resolution, frame_of, valid_pixels
+from vggtjax.results.frame import Frame, frame_of, valid_pixels
 from vggtjax.results.glb import build_scene
 from vggtjax.results.ply import PlyWriter, write_ply
 from vggtjax.results.point_cloud import PointCloud
-from vggtjax.results.reconstruction import ARCHIVE_NAME, Layout, Reconstruction, is_result, saved_files
+from vggtjax.results.reconstruction import ARCHIVE_NAME, Reconstruction, is_result, saved_files
+from vggtjax.results.saving import Format, Resolution, Saving
 from vggtjax.storage import arrays as archive
 from vggtjax.storage.trajectories import write_trajectory
 from vggtjax.storage.writing import check_free, staging, writing
@@ -72,31 +74,21 @@ _WORKERS = 8
 def save(
     reconstruction: Reconstruction,
     folder: str | Path,
+    saving: Saving,
     *,
-    confidence_percentile: float,
-    resolution: Resolution,
-    layout: Layout,
     pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None,
-    progress: Callable[[int, int], object] | None,
+    progress: Progress | None,
 ) -> None:
     """Write all files of a result; see `Reconstruction.save`."""
     folder = Path(folder)
-    least = point_cloud.least_confidence(reconstruction, confidence_percentile)
-    for name, value, allowed in (
-        ("resolution", resolution, get_args(Resolution)),
-        ("layout", layout, get_args(Layout)),
-    ):
-        if value not in allowed:
-            raise InputError(f"{name} is {value!r}; expected one of {allowed}")
-    if pictures is not None and resolution != "original":
-        raise InputError("pictures are for the resolution 'original'; at the model's size they are not looked at")
+    least = point_cloud.least_confidence(reconstruction, saving.confidence_percentile)
+    if pictures is not None and saving.resolution != "original":
+        raise InputError("pictures are for the resolution 'original'; at the model's size they are not used")
     sizes = {tuple(size) for size in reconstruction.source_size.tolist()}
-    if layout == "vggt4d" and resolution == "original" and len(sizes) > 1:
-        raise InputError(
-            f"the source's pictures have {len(sizes)} sizes, and the layout vggt4d wants one; save without it"
-        )
-    sometimes = optional_files(tracks=reconstruction.track_positions is not None, layout=layout)
-    check_folder(folder, sometimes)
+    if saving.format == "vggt4d" and saving.resolution == "original" and len(sizes) > 1:
+        raise InputError(f"the source's pictures have {len(sizes)} sizes; the format vggt4d expects one")
+    optional = optional_files(tracks=reconstruction.track_positions is not None, format=saving.format)
+    check_folder(folder, optional)
     done, total = itertools.count(1), len(reconstruction.depth) + 4
 
     def advance() -> None:
@@ -104,17 +96,17 @@ def save(
             progress(next(done), total)
 
     with staging(folder) as staged:
-        frames = _frames(reconstruction, resolution, pictures)
-        _write_files(reconstruction, frames, least, layout, staged, advance)
+        frames = _frames(reconstruction, saving.resolution, pictures)
+        _write_files(reconstruction, frames, least, saving.format, staged, advance)
         with writing(staged / ARCHIVE_NAME) as path:
-            reconstruction.save_archive(path, files=sometimes)
+            reconstruction.save_archive(path, files=optional)
         advance()
-        _install(staged, folder, sometimes)
+        _install(staged, folder, optional)
 
 
-def optional_files(*, tracks: bool, layout: Layout) -> tuple[str, ...]:
-    """Return what a result has besides the files that every result has."""
-    return tuple(name for name, there in (("tracks.npz", tracks), ("vggt4d", layout == "vggt4d")) if there)
+def optional_files(*, tracks: bool, format: Format) -> tuple[str, ...]:
+    """Return the files that this result has and others do not."""
+    return tuple(name for name, is_written in (("tracks.npz", tracks), ("vggt4d", format == "vggt4d")) if is_written)
 
 
 def _frames(
@@ -133,23 +125,23 @@ def _frames(
         raise InputError(f"there are more pictures than the {count} frames; expected one for each")
 
 
-def check_folder(folder: Path, sometimes: Sequence[str] = ()) -> None:
+def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
     """Make sure that a result can be saved in `folder`, before hours are spent on one.
 
     Args:
         folder: need not be there.
-        sometimes: what `optional_files` says of the result.
+        optional: what `optional_files` says of the result.
 
     Raises OutputError where the folder cannot be made or written, or holds files of our names that are not part of an
     earlier result.
     """
     archive_path = folder / ARCHIVE_NAME
     check_free(folder, (ARCHIVE_NAME, *_NAMES), replaced=is_result(archive_path), what="result")
-    strange = [name for name in sometimes if name not in saved_files(archive_path)]
+    strange = [name for name in optional if name not in saved_files(archive_path)]
     check_free(folder, strange, replaced=False, what="result")
 
 
-def _install(staged: Path, folder: Path, sometimes: Sequence[str]) -> None:
+def _install(staged: Path, folder: Path, optional: Sequence[str]) -> None:
     """Swap the staged files for those of an earlier result; undo everything if a step fails.
 
     The archive leaves first and arrives last: whenever it is there, the files around it are its own.
@@ -159,7 +151,7 @@ def _install(staged: Path, folder: Path, sometimes: Sequence[str]) -> None:
     earlier = (ARCHIVE_NAME, *_NAMES, *saved_files(folder / ARCHIVE_NAME))
     old = [name for name in earlier if os.path.lexists(folder / name)]
     moves = [(folder / name, previous / name) for name in old]
-    moves += [(staged / name, folder / name) for name in (*_NAMES, *sometimes, ARCHIVE_NAME)]
+    moves += [(staged / name, folder / name) for name in (*_NAMES, *optional, ARCHIVE_NAME)]
     done: list[tuple[Path, Path]] = []
     try:
         for source, target in moves:
@@ -175,7 +167,7 @@ def _write_files(
     reconstruction: Reconstruction,
     frames: Iterator[Callable[[], Frame]],
     least_confidence: float,
-    layout: Layout,
+    format: Format,
     folder: Path,
     advance: Callable[[], None],
 ) -> None:
@@ -183,11 +175,11 @@ def _write_files(
     times, poses = reconstruction.timestamps, reconstruction.world_from_camera
     times = np.arange(len(poses), dtype=np.float64) if times is None else times  # frame numbers stand for them
     write_trajectory(folder / "trajectory.txt", poses, times)
-    written = _write_frames(reconstruction, frames, least_confidence, layout, folder, advance)
+    written = _write_frames(reconstruction, frames, least_confidence, format, folder, advance)
     advance()
     intrinsics = [frame.intrinsics for frame in written]
     write_intrinsics(folder / "intrinsics.txt", intrinsics, [frame.size for frame in written])
-    if layout == "vggt4d":
+    if format == "vggt4d":
         foreign.write_cameras(folder / "vggt4d", poses, intrinsics)
     _build_scene(reconstruction, least_confidence).export(folder / "scene.glb")
     advance()
@@ -219,14 +211,14 @@ def _write_frames(
     reconstruction: Reconstruction,
     frames: Iterator[Callable[[], Frame]],
     least_confidence: float,
-    layout: Layout,
+    format: Format,
     folder: Path,
     advance: Callable[[], None],
 ) -> list[_Written]:
     """Write the files that each frame has of its own, several frames at a time, and the cloud of what stands still."""
     for name in ("confidence", "depth", "mask", "instances", "preview/depth", "preview/overlay", "frames"):
         (folder / name).mkdir(parents=True)
-    if layout == "vggt4d":
+    if format == "vggt4d":
         (folder / "vggt4d").mkdir()
     valid = valid_pixels(reconstruction)
     scale = depth_scale(reconstruction.depth, valid)
@@ -247,7 +239,7 @@ def _write_frames(
         moving = previews.moving_ids(frame.dynamic_mask, frame.instances)
         _write_png(folder / f"preview/overlay/{name}.png", previews.overlay(frame.image, moving))
         write_ply(folder / f"frames/{name}.ply", [point_cloud.frame_cloud(frame, pixels)])
-        if layout == "vggt4d":
+        if format == "vggt4d":
             foreign.write_frame(folder / "vggt4d", number, frame)
         size = (frame.depth.shape[0], frame.depth.shape[1])
         return _Written(size, frame.intrinsics), point_cloud.frame_cloud(frame, pixels & ~frame.dynamic_mask)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
@@ -11,8 +11,7 @@ from PIL import Image
 from vggtjax import cameras as geometry
 from vggtjax.errors import InputError
 from vggtjax.results.reconstruction import Reconstruction
-
-Resolution = Literal["model", "original"]
+from vggtjax.results.saving import Resolution
 
 SAME_SURFACE = 0.05  # relative difference in depth up to which neighbours are taken for one surface
 

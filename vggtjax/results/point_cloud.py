@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from vggtjax.errors import InputError
 from vggtjax.results.frame import Frame, valid_pixels
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.saving import Saving
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,8 +26,7 @@ class PointCloud:
 
 def check_percentile(confidence_percentile: float) -> None:
     """Raise InputError for a percentile outside [0, 100)."""
-    if not 0 <= confidence_percentile < 100:
-        raise InputError(f"confidence_percentile is {confidence_percentile}; expected at least 0 and below 100")
+    Saving(confidence_percentile)
 
 
 def least_confidence(reconstruction: Reconstruction, confidence_percentile: float) -> float:

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 
 from vggtjax import cameras as geometry
 from vggtjax.errors import ResultError
+from vggtjax.progress import Progress
+from vggtjax.results.saving import Saving, SavingChanges
 from vggtjax.storage import arrays as archive
 
 if TYPE_CHECKING:
-    from vggtjax.results.frame import Resolution
     from vggtjax.storage.trajectories import Quaternion
-
-Layout = Literal["vggtjax", "vggt4d"]  # of a folder of files
 
 ARCHIVE_NAME = "reconstruction.npz"
 OPTIONAL_FILES = ("tracks.npz", "vggt4d")
+_DEFAULT = Saving()
 _FORMAT_VERSION = 1
 _MOST_FILES = 100
 _MOST_PIXELS = 2**28  # of a source's picture
@@ -168,36 +168,29 @@ class Reconstruction:
         self,
         folder: str | Path,
         *,
-        confidence_percentile: float = 20.0,
-        resolution: Resolution = "model",
-        layout: Layout = "vggtjax",
+        saving: Saving = _DEFAULT,
         pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None,
-        progress: Callable[[int, int], object] | None = None,
+        progress: Progress | None = None,
+        **changes: Unpack[SavingChanges],
     ) -> None:
         """Write the result into `folder`, made if missing; see vggtjax.results.export for the files.
 
-        An earlier result in the folder is replaced as a whole, or left untouched if anything fails; other files
-        stay. Point clouds leave out the `confidence_percentile` percent of pixels with the lowest confidence.
-        `progress(done, total)` is called as files are written.
+        An earlier result in the folder is replaced as a whole, or left untouched if anything fails; other files stay.
 
-        With `resolution="original"` the files of single frames, the clouds and the intrinsics are at the source's size,
-        in the colours of `pictures` (`Clip.pictures()`), or of the model's frames enlarged. `layout="vggt4d"` adds the
-        folder vggt4d/ with what VGGT4D writes.
+        Args:
+            folder: may be missing.
+            saving: what to leave out of the point clouds, the size of the files, the format.
+            pictures: for the resolution "original", the source's (`Clip.pictures()`); by default the model's enlarged.
+            progress: called with the number of files and frames written, and of all.
+            changes: single values of `saving`, such as `resolution="original"`; `layout` is the old name of `format`.
 
-        Raises InputError for a percentile outside [0, 100), an unknown name or pictures that do not fit, and
-        OutputError where the folder cannot be written or holds files of the same names that are not an earlier result.
+        Raises:
+            InputError: a percentile outside [0, 100), an unknown name, or pictures that do not fit.
+            OutputError: the folder cannot be written, or holds files of the same names that are no earlier result.
         """
         from vggtjax.results import export
 
-        export.save(
-            self,
-            folder,
-            confidence_percentile=confidence_percentile,
-            resolution=resolution,
-            layout=layout,
-            pictures=pictures,
-            progress=progress,
-        )
+        export.save(self, folder, saving.changed(**changes), pictures=pictures, progress=progress)
 
     def save_archive(self, path: Path, *, files: Sequence[str] = ()) -> None:
         """Write everything but `passes` to one compressed .npz file, which `load` reads back.
