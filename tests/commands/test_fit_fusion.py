@@ -15,7 +15,7 @@ from vggtjax.learning.ablation import CHOSEN, split_clips
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, identity_of, kept_passes, observations
 from vggtjax.method.fusion_file import load_fusion, save_fusion
 from vggtjax.method.fusion_rule import identity
-from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.pretrained.embedded import MODEL, demo_clip
 from vggtjax.results.reconstruction import Reconstruction
 
 FRAMES, CLIPS = 3, 4
@@ -93,13 +93,13 @@ def test_passes_and_fits_are_kept(dataset, cache, tmp_path, monkeypatch, capsys)
 
 
 @pytest.mark.filterwarnings("ignore:the field of view")
-def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset, tmp_path, capsys):
+def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset, tmp_path, capsys, caplog):
     frames = dataset / "clip0" / "rgb"
     common = ["--size", 64, "--max-frames", 3]
     results = {}
     save_fusion(tmp_path / "paper.safetensors", identity())
     files = {"none": [], "paper": ["--fusion", tmp_path / "paper.safetensors"]}
-    files["fitted"] = ["--fusion", fitted / "families" / "scale.safetensors"]
+    files["fitted"] = ["--fusion", fitted / "families" / "scale.safetensors", "--model", MODEL]
     for name, option in files.items():
         assert run("reconstruct", frames, "--out", tmp_path / name, *common, *option) == 0
         results[name] = Reconstruction.load(tmp_path / name)
@@ -112,6 +112,7 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
     assert np.allclose(batched.depth, results["fitted"].depth, rtol=1e-5)
     arguments = ["evaluate", "plain", dataset, "--out", tmp_path / "scores", "--size", 64, "--sequences", "clip0"]
     assert run(*arguments, "--methods", "hard-replacement,4dvggt-d", *files["fitted"]) == 0
+    assert "was fitted with" not in caplog.text  # the same model, by name and by path
     capsys.readouterr()
     assert run("reconstruct", frames, "--out", tmp_path / "x", "--method", "vggt", *files["fitted"]) == 2
     assert "method 'vggt' does not fuse; expected 4dvggt-d" in capsys.readouterr().err

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from tests.tiny import tiny_config
+from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
-from vggtjax.method.fusion_file import load_fusion, save_fusion
+from vggtjax.method.fusion_file import load_fusion, save_fusion, warn_if_fitted_otherwise
 from vggtjax.method.fusion_rule import parse_family, start
 from vggtjax.storage.tensor_file import read_tensors
 
@@ -52,3 +54,15 @@ def test_other_files_are_one_sentence(tmp_path):
     save_file({"x": np.ones(3, np.float32)}, tmp_path / "other.safetensors")
     with pytest.raises(InputError, match="is not a fitted fusion"):
         load_fusion(tmp_path / "other.safetensors")
+
+
+def test_other_models_and_settings_are_warned_of(tmp_path, caplog):
+    path, model = tmp_path / "a.safetensors", Model(tiny_config(), {}, "mine")
+    save_fusion(path, start(()), {"model": "mine", "mask_pairs": 5})
+    warn_if_fitted_otherwise(path, model, mask_pairs=5, align_scale=True)
+    assert not caplog.messages
+    warn_if_fitted_otherwise(path, Model(tiny_config(), {}, "other"), mask_pairs=3)
+    assert [message.partition("with ")[2] for message in caplog.messages] == [
+        "model mine, and is used with other",
+        "mask_pairs 5, and is used with 3",
+    ]

@@ -69,13 +69,17 @@ def batch(
         options: dict[str, object] = {"method": method, "compute_dtype": dtype}
         options |= {"pad_frames": True} if pad_frames else {}
         if fusion is not None:
-            from vggtjax.method.fusion_apply import read_fusion
+            from vggtjax.method.fusion_file import read_fusion
 
-            options["fusion"] = read_fusion(fusion, [method], model=model, align_scale=False, mask_pairs=5)
+            options["fusion"] = read_fusion(fusion, [method])
         with report.stage("load model") as progress:
             from vggtjax.pretrained.load import load_model
 
             loaded = load_model(model, progress=progress)
+        if fusion is not None:
+            from vggtjax.method.fusion_file import warn_if_fitted_otherwise
+
+            warn_if_fitted_otherwise(fusion, loaded, align_scale=False, mask_pairs=5)
         from vggtjax.pipeline.batch import reconstruct_many
 
         found = []

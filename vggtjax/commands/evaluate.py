@@ -130,14 +130,14 @@ def evaluate(
                 "compute_dtype": dtype,
             }
             if fusion is not None:
-                from vggtjax.method.fusion_apply import read_fusion
+                from vggtjax.method.fusion_file import read_fusion, warn_if_fitted_otherwise
 
-                said = {"model": loaded.name, "align_scale": align_scale, "mask_pairs": mask_pairs}
-                options["fusion"] = read_fusion(fusion, names, **said)
+                options["fusion"] = read_fusion(fusion, names)
+                warn_if_fitted_otherwise(fusion, loaded, align_scale=align_scale, mask_pairs=mask_pairs)
             source = _Methods(loaded, names, mode, loaded.config.image_size if size is None else size, options)
             settings |= {"model": _identity(loaded), "mode": mode, "size": source.size, **options}
             if fusion is not None:
-                from vggtjax.method.fusion_apply import fusion_digest
+                from vggtjax.method.fusion_file import fusion_digest
 
                 settings["fusion"] = fusion_digest(options["fusion"])
             if not loaded.trained:

@@ -109,10 +109,14 @@ def reconstruct(
         check_smooth_frames(smooth_frames)
         fitted = None
         if fusion is not None:
-            from vggtjax.method.fusion_apply import read_fusion
+            from vggtjax.method.fusion_file import read_fusion
 
-            fitted = read_fusion(fusion, [method], model=model, align_scale=align_scale, mask_pairs=mask_pairs)
+            fitted = read_fusion(fusion, [method])
         loaded = _load_model(report, model, config)
+        if fusion is not None:
+            from vggtjax.method.fusion_file import warn_if_fitted_otherwise
+
+            warn_if_fitted_otherwise(fusion, loaded, align_scale=align_scale, mask_pairs=mask_pairs)
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import load_clip
 

@@ -1,9 +1,11 @@
-"""A fitted tree in a file that `--fusion` takes: safetensors, with what it was fitted on in its header."""
+"""A fitted rule of fusion in a file that `--fusion` takes: safetensors, with its origin in the header."""
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vggtjax.checkpoint import Model
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.fusion_gate import CHANNELS, init_gate
 from vggtjax.method.fusion_rule import FEATURES, PARTS, FusionParams, projected
+from vggtjax.options import METHODS, find_method
 from vggtjax.storage.tensor_file import Spec, read_tensors, write_tensors
+
+logger = logging.getLogger(__name__)
 
 FORMAT = "vggtjax fusion"
 VERSION = 1
@@ -76,6 +82,37 @@ def fusion_about(path: str | Path) -> dict[str, Any]:
     except (CheckpointError, ValueError, RecursionError):
         return {}
     return about if isinstance(about, dict) else {}
+
+
+def check_fuses(*methods: str) -> None:
+    """Raise InputError unless at least one of the methods fuses both passes."""
+    if all(find_method(method).depth != "fused" for method in methods):
+        names = ", ".join(name for name, row in METHODS.items() if row.depth == "fused")
+        raise InputError(f"a fusion is given, and method {methods[0]!r} does not fuse; expected {names}")
+
+
+def read_fusion(path: Path, methods: Sequence[str]) -> FusionParams:
+    """Return the tree of a file for a run of `methods`; InputError as `load_fusion`, or where no method fuses."""
+    check_fuses(*methods)
+    return load_fusion(path)
+
+
+def warn_if_fitted_otherwise(path: Path, model: Model, **settings: Any) -> None:
+    """Log a warning for every setting (`align_scale`, `mask_pairs`) and for a model that the fit did not have."""
+    about = fusion_about(path)
+    for name, value in {"model": model.name, **settings}.items():
+        if name in about and about[name] != value:
+            logger.warning("%s was fitted with %s %s, and is used with %s", path, name, about[name], value)
+
+
+def fusion_digest(fusion: FusionParams | None) -> str | None:
+    """Return the digest of a tree's values, for the settings of a result."""
+    if fusion is None:
+        return None
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(fusion):
+        digest.update(np.asarray(leaf, np.float32).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def _named(params: FusionParams) -> dict[str, Any]:

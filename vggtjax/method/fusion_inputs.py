@@ -1,4 +1,4 @@
-"""Two passes over a clip -> what a rule of fusion looks at."""
+"""Two passes over a clip -> the inputs of a fusion rule; and a method's result with its depth fused by a rule."""
 
 from __future__ import annotations
 
@@ -7,13 +7,25 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.errors import InputError
-from vggtjax.method.fusion_rule import Observations
+from vggtjax.method.fusion import scale_between
+from vggtjax.method.fusion_rule import FusionParams, Observations, fuse
 from vggtjax.method.mask import upsample
-from vggtjax.method.passes import Passes
+from vggtjax.method.passes import Assembly, Passes
 
 REACH = 64  # pixels up to which distances are told apart
 _SMALLEST = 1e-6
 _STILL = -1e3  # margin of what cannot move, whatever the temperature
+
+
+def apply_fusion(
+    assembly: Assembly, passes: Passes, fusion: FusionParams, patch_size: int, *, align_scale: bool = False
+) -> Assembly:
+    """Return an assembly with depth and confidence by a fitted rule; the confidence is the fused precision."""
+    scale = None
+    if align_scale and passes.second is not None:
+        scale = scale_between(passes.first.depth, passes.second.depth, passes.dynamic_mask)  # pyright: ignore
+    fused = fuse(fusion, observe(passes, patch_size, scale=scale))
+    return assembly._replace(depth=fused.depth, confidence=fused.precision)
 
 
 def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None = None) -> Observations:

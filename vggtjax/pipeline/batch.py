@@ -18,7 +18,7 @@ from vggtjax.clips.preprocessing import Layout, Mode
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, OutputError, VggtjaxError
-from vggtjax.method.fusion_apply import fusion_digest
+from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.options import find_method
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.results.reconstruction import ARCHIVE_NAME, is_result

@@ -18,7 +18,7 @@ from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
 from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
 from vggtjax.errors import DeviceMemoryError, InputError
-from vggtjax.method.fusion_apply import check_fuses, fusion_digest
+from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.method.passes import Assembly, Passes, assemble, run_passes
 from vggtjax.method.refinement import refine_masks

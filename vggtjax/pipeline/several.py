@@ -9,7 +9,7 @@ from contextlib import nullcontext
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
-from vggtjax.method.fusion_apply import check_fuses, fusion_digest
+from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.options import find_method
 from vggtjax.pipeline.run import assembled_fields, reconstruct, refined
@@ -46,8 +46,8 @@ def reconstruct_methods(
     Raises:
         What `reconstruct` raises.
     """
-    if fusion is not None and all(find_method(name).depth != "fused" for name in methods):
-        check_fuses(methods[0])
+    if fusion is not None:
+        check_fuses(*methods)
     results: dict[str, Reconstruction] = {}
     for names in groups_of_methods(methods):
         made = reconstruct(

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtjax.clips.queries import Queries
 from vggtjax.config import Gram, Suppress, VGGTConfig
-from vggtjax.method.fusion_apply import fused_anew
+from vggtjax.method.fusion_inputs import apply_fusion
 from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.method.mask import mine_mask
 from vggtjax.method.passes import Assembly, Cameras, Passes, assemble, first_pass, second_pass, track_from
@@ -79,7 +79,7 @@ def _assemble(
 ) -> Assembly:
     passes = jax.tree.map(lambda x: x[:, :frames], Passes(first, second, saliency, dynamic_mask))
     made = assemble(passes, method, align_scale=align_scale)
-    return made if fusion is None else fused_anew(made, passes, fusion, patch_size, align_scale=align_scale)
+    return made if fusion is None else apply_fusion(made, passes, fusion, patch_size, align_scale=align_scale)
 
 
 def _unchanged(predictions: Predictions) -> Predictions:
