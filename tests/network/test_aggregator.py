@@ -41,7 +41,7 @@ def small():
 def run(params, tokens, dynamic=None, suppress: Suppress = "zero", mask_pairs=5, with_cues=False):
     return aggregate(
         params, tokens, CONFIG, GRID, captures=[identity] * 4, dynamic_tokens=dynamic, suppress=suppress,
-        mask_pairs=mask_pairs, cues=GramCues(CONFIG.motion, CONFIG.depth) if with_cues else None,
+        mask_pairs=mask_pairs, accumulator=GramCues(CONFIG.motion, CONFIG.depth) if with_cues else None,
     )  # fmt: skip
 
 
@@ -95,7 +95,7 @@ def test_only_captures_are_kept(small):
 def test_linear_cost_cues_equal_the_gram_matrices(small, gram):
     params, tokens, _ = small
     cues = GramCues(CONFIG.motion, CONFIG.depth, gram)
-    _, _, sums = jax.jit(partial(aggregate, config=CONFIG, grid=GRID, captures=[identity] * 4, cues=cues))(
+    _, _, sums = jax.jit(partial(aggregate, config=CONFIG, grid=GRID, captures=[identity] * 4, accumulator=cues))(
         params, tokens
     )
     maps = cues.maps(sums)
@@ -111,3 +111,23 @@ def test_linear_cost_cues_equal_the_gram_matrices(small, gram):
         low, high = product.min(1, keepdims=True), product.max(1, keepdims=True)
         saliency = np.asarray(cues.saliency(sums)[b])
         assert np.abs(saliency - (product - low) / (high - low + 1e-6)).max() <= 1e-4
+
+
+def test_anything_with_sums_can_be_accumulated(small):
+    """The aggregator knows no motion cues: here the mean of q, over the pairs that are counted."""
+    params, tokens, _ = small
+
+    class Means:
+        def layer_counts(self):
+            return np.arange(CONFIG.depth) % 2
+
+        def zeros(self, B, S, P):
+            return {"mean": np.zeros((B, S, P))}
+
+        def add(self, sums, counts, q, k, frame_count):
+            return {"mean": sums["mean"] + counts * q[:, :, -sums["mean"].shape[2] :].mean(axis=(3, 4))}
+
+    _, _, sums = aggregate(params, tokens, CONFIG, GRID, captures=[lambda t: ()] * 4, accumulator=Means())
+    q = reference.aggregate(params, tokens[0], CONFIG, GRID)[1]
+    expected = sum(x[:, -6:].mean(axis=(2, 3)) for x in q[1::2])
+    assert np.abs(np.asarray(sums["mean"][0]) - expected).max() < 1e-5

@@ -291,7 +291,7 @@ def test_match_loss_inside_the_aggregator_is_that_of_its_queries_and_keys():
     np.testing.assert_array_equal(loss.layer_counts(), [0, 1, 0, 1])
     captures = [lambda tokens: tokens[:, :, 0, :1]] * len(CONFIG.taps)
     cues: Any = Watched(loss, layers)
-    sums = aggregate(init_params(0, CONFIG), tokens, CONFIG, grid, captures=captures, cues=cues)[2]
+    sums = aggregate(init_params(0, CONFIG), tokens, CONFIG, grid, captures=captures, accumulator=cues)[2]
     accumulated, q, k = sums
     by_hand = [[float(x) for x in match_loss(found, q[layer], k[layer])] for layer in range(2)]
     assert abs(by_hand[0][0] - by_hand[1][0]) > 1e-4  # the layers differ

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress, VGGTConfig
-from vggtjax.method.cues import GramCues
 from vggtjax.network.block import Block
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import full_precision, widened
@@ -22,6 +21,33 @@ REGISTERS = 4
 SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
 
 Capture = Callable[[Float[Array, "B S T E"]], Any]
+
+
+class Accumulator(Protocol):
+    """Sums over q and k (after norm and rotation) of the global blocks: motion cues, or a loss of the attention.
+
+    The sums are any tree of arrays; they are carried through the scan, so that q and k of no pair are stored.
+    """
+
+    def layer_counts(self) -> Int[np.ndarray, "depth ..."]:
+        """Return how often every pair is read; `add` receives the pair's own entry."""
+        ...
+
+    def zeros(self, B: int, S: int, P: int, /) -> Any:
+        """Return empty sums for B clips of S frames with P patches each."""
+        ...
+
+    def add(
+        self,
+        sums: Any,
+        counts: Int[Array, ...],
+        q: Float[Array, "B S T N D"],
+        k: Float[Array, "B S T N D"],
+        frame_count: Int[Array, " B"] | None,
+        /,
+    ) -> Any:
+        """Return the sums with one pair added; of clips with a `frame_count` only the first frames count."""
+        ...
 
 
 def identity(tokens: Float[Array, "B S T E"]) -> Float[Array, "B S T E"]:
@@ -37,7 +63,7 @@ def aggregate(
     grid: tuple[int, int],
     *,
     captures: Sequence[Capture],
-    cues: GramCues | None = None,
+    accumulator: Accumulator | None = None,
     frame_count: Int[Array, " B"] | None = None,
     dynamic_tokens: Bool[Array, "B S h w"] | Float[Array, "B S h w"] | None = None,
     suppress: Suppress = "zero",
@@ -46,7 +72,7 @@ def aggregate(
     compute_dtype: str = "float32",
     remat: bool = False,
 ) -> tuple[Float[Array, "B S E"], tuple[Any, ...], Any]:
-    """Run the alternating blocks; return the last pair's camera tokens, the captured taps, and the cues' sums.
+    """Run the alternating blocks; return the last pair's camera tokens, the captured taps, and the accumulated sums.
 
     Args:
         params: the model's parameter tree (`aggregator` is read).
@@ -54,7 +80,7 @@ def aggregate(
         grid: rows and columns of patches, h and w.
         captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Nothing
             else of the tapped pairs is stored, and nothing at all of the others.
-        cues: the Gram cues to accumulate from q and k of the global blocks, or None.
+        accumulator: what to sum over q and k of the global blocks, such as motion cues, or None.
         frame_count: number of frames of each clip that are real, its first ones, one at least; the others change
             nothing in them.
         dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs, in both blocks of a pair;
@@ -83,13 +109,13 @@ def aggregate(
 
     def pair(carry, layer):
         x, _, taps, sums = carry
-        frame_params, global_params, masked, tapped, cued = layer
+        frame_params, global_params, masked, tapped, counts = layer
         x, _, _ = block(frame_params, x.reshape(B * S, T, C), rope, suppression(masked, B * S))
         frame = x
         x, q, k = block(global_params, x.reshape(B, S * T, C), rope, suppression(masked, B), there)
-        if cues is not None:
+        if accumulator is not None:
             q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
-            sums = cues.add(sums, cued, q, k, frame_count)
+            sums = accumulator.add(sums, counts, q, k, frame_count)
         taps = tuple(
             jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
             for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
@@ -107,9 +133,9 @@ def aggregate(
         params["global_blocks"],
         masked,
         jnp.asarray(index[:, None] == np.asarray(config.taps)[None]),
-        None if cues is None else jnp.asarray(cues.layer_counts()),
+        None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
     )
-    sums = None if cues is None else cues.zeros(B, S, P)
+    sums = None if accumulator is None else accumulator.zeros(B, S, P)
     if there is not None:  # what is not a number would count even with weight 0
         patch_tokens = jnp.where(there.reshape(B, S, T)[:, :, :1, None], patch_tokens, 0)
     tokens = _tokens(params, widened(patch_tokens))

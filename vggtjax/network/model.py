@@ -13,8 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import HEAD_NAMES, Suppress, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.method.cues import GramCues, Sums
-from vggtjax.network.aggregator import aggregate, declare_aggregator
+from vggtjax.network.aggregator import Accumulator, aggregate, declare_aggregator
 from vggtjax.network.backbone import declare_backbone, encode, patch_grid
 from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict_pose
 from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_tap
@@ -38,7 +37,7 @@ class Predictions(NamedTuple):
     tracks: Float[Array, "B S Q 2"] | None = None
     track_visibility: Float[Array, "B S Q"] | None = None
     track_confidence: Float[Array, "B S Q"] | None = None
-    cue_sums: Sums | None = None
+    cue_sums: Any = None  # of the accumulator
 
 
 @full_precision
@@ -55,7 +54,7 @@ def forward(
     strength: Float[Array, " depth"] | None = None,
     outputs: Sequence[str] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
-    cues: GramCues | None = None,
+    cues: Accumulator | None = None,
     stop_camera_gradient: bool = True,
     compute_dtype: str = "float32",
     remat: bool = False,
@@ -82,7 +81,7 @@ def forward(
             k (1 - strength m).
         outputs: any of "camera", "depth", "points", "tracks".
         query_points: x, y in pixels of the first frame, the points to track; given with "tracks" and only then.
-        cues: motion cues to accumulate on the way, into `.cue_sums`.
+        cues: motion cues, or another accumulator, whose sums become `.cue_sums`.
         stop_camera_gradient: whether the camera head's iterations see the previous estimate as a constant.
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
             "float64", with parameters and images of it and jax.enable_x64, is for checks of gradients.
@@ -113,7 +112,7 @@ def forward(
         config,
         grid,
         captures=[capture(slot) for slot in range(len(config.taps))],
-        cues=cues,
+        accumulator=cues,
         frame_count=frame_count,
         dynamic_tokens=dynamic_tokens,
         suppress=suppress,

@@ -113,7 +113,7 @@ def objective(
             config,
             grid,
             captures=[capture(slot) for slot in range(len(config.taps))],
-            cues=matching,  # type: ignore[arg-type]
+            accumulator=matching,
             compute_dtype=compute_dtype,
         )
 
