@@ -171,15 +171,15 @@ def test_file_is_checked_against_its_configuration(saved_once, tmp_path):
     ("metadata", "reason"),
     [
         ({"version": "2"}, "has version '2' of the format; this vggtjax reads '1'"),
-        ({"config": ""}, "configuration is not JSON"),
-        ({"config": "[" * 60_000}, "configuration is not JSON"),
-        ({"config": "[]"}, "configuration is a JSON list"),
+        ({"config": ""}, "x.safetensors is not JSON"),
+        ({"config": "[" * 60_000}, "x.safetensors is not JSON"),
+        ({"config": "[]"}, "x.safetensors is []; expected an object"),
         ({"config": '{"depht": 1}'}, "unknown fields ['depht']"),
         ({"config": '{"depth": "24"}'}, "depth is '24'"),
         ({"config": '{"embed_dim": 100000000000}'}, "embed_dim is 100000000000"),
         ({"config": '{"embed_dim": 1000000, "num_heads": 10, "dino_num_heads": 10}'}, "mis-shaped parameter"),
-        ({"config": '{"motion": {"cues": [5]}}'}, "cannot be used"),
-        ({"config": " " * 70_000}, "configuration of 70000 letters"),
+        ({"config": '{"motion": {"cues": [5]}}'}, "motion.cues[0] is 5"),
+        ({"config": " " * 70_000}, "more than 65536 bytes"),
     ],
 )
 def test_metadata_is_not_trusted(saved_once, tmp_path, metadata, reason):

@@ -1,6 +1,7 @@
 """The configuration: hashable, checked, and readable from a stranger's JSON."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -30,14 +31,18 @@ def test_json_round_trip(config):
     ("change", "sentence"),
     [
         ({"taps": (4, 11, 17, 24)}, "below depth 24"),
-        ({"taps": (4, 11, 17)}, "four numbers"),
-        ({"depth": 0}, "depth is 0"),
-        ({"depth": "24"}, "whole numbers"),
+        ({"taps": (4, 11, 17)}, "list of 4 values"),
+        ({"depth": 0}, "depth is 0; expected a whole number of at least 1"),
+        ({"depth": "24"}, "depth is '24'; expected a whole number"),
+        ({"depth": True}, "depth is True"),
+        ({"heads": ("depth", "camera")}, "in this order"),
         ({"embed_dim": 1000}, "embed_dim 1000 is not a multiple"),
         ({"image_size": 500}, "multiple of patch_size"),
         ({"dpt_features": 20}, "dpt_features 20"),
         ({"dpt_channels": (4, 4, 4, 6)}, "of 4"),
-        ({"embed_dim": 10**12}, "whole numbers"),
+        ({"embed_dim": 10**12}, "at most 1000000"),
+        ({"motion": {"offsets": (0,)}}, "offsets other than 0"),
+        ({"motion": {"cues": []}}, "cues is .*at least 1 values"),
     ],
 )
 def test_bad_values_are_named(change, sentence):
@@ -70,18 +75,20 @@ def test_bad_json_is_one_sentence(text):
 
 def test_bad_cues_are_named():
     cue = json.loads(VGGTConfig().to_json())["motion"]["cues"][0]
-    for change in (
-        {"layers": [24]},
-        {"layers": []},
-        {"layers": [[]]},
-        {"rows": "v"},
-        {"rows": []},
-        {"statistic": "median"},
+    for change, sentence in (
+        ({"layers": [24]}, "cue 'shallow_kk_mean' has layers (24,)"),
+        ({"layers": []}, "motion.cues[0].layers is []"),
+        ({"layers": [[]]}, "motion.cues[0].layers[0] is []"),
+        ({"rows": "v"}, "motion.cues[0].rows is 'v'; expected one of"),
+        ({"rows": []}, "motion.cues[0].rows is []"),
+        ({"statistic": "median"}, "motion.cues[0].statistic is 'median'"),
+        ({"name": 3}, "motion.cues[0].name is 3; expected text"),
+        ({"row": "k"}, "motion.cues[0] has unknown fields ['row']"),
     ):
-        with pytest.raises(InputError, match="shallow_kk_mean"):
-            MotionConfig(cues=(cue | change,))
+        with pytest.raises(InputError, match=re.escape(sentence)):
+            MotionConfig(cues=(cue | change,))  # pyright: ignore[reportArgumentType]: mappings become cues
 
 
 def test_the_command_line_starts_without_jax():
-    code = "import sys, vggtjax, vggtjax.cli, vggtjax.config, vggtjax.clips.clip; sys.exit('jax' in sys.modules)"
+    code = "import sys, vggtjax.commands.main, vggtjax.config, vggtjax.clips.clip; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -20,6 +20,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError, InputError, problems_sentence
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
+from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.programs import kept_text
 from vggtjax.storage.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
 
@@ -199,13 +200,10 @@ def _config(path: Path, metadata: Mapping[str, str]) -> VGGTConfig:
         raise CheckpointError(
             f"{path} has version {metadata.get('version', '')[:20]!r} of the format; this vggtjax reads {VERSION!r}"
         )
-    text = metadata.get("config", "")
-    if len(text) > _MOST_CONFIG_LETTERS:
-        raise CheckpointError(f"{path} has a configuration of {len(text)} letters; at most {_MOST_CONFIG_LETTERS} go")
-    try:
-        return VGGTConfig.from_json(text)
-    except InputError as error:
-        raise CheckpointError(f"{path} cannot be used: its {error}") from error
+    subject = f"the configuration of {path}"
+    return parse_json(
+        metadata.get("config", ""), VGGTConfig, subject, most_bytes=_MOST_CONFIG_LETTERS, error=CheckpointError
+    )
 
 
 def _origin(text: str) -> dict[str, str]:

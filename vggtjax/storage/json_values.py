@@ -1,0 +1,214 @@
+"""JSON of strangers -> checked dataclasses, and the same checks for dataclasses that Python code makes.
+
+The annotation of a field spells its constraint once, such as `Annotated[int, Meta(ge=1)]` or a name below. Every
+problem becomes one sentence with the place in the document, the value, and what was expected. Does not import jax.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import reprlib
+import typing
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+from msgspec import Meta
+from msgspec import inspect as kinds
+
+from vggtjax.errors import InputError
+
+MOST_BYTES = 2**24  # of a file or text, unless the caller says otherwise
+MOST_LEVELS = 64  # of nesting
+_MOST_INT = 2**63
+
+Natural = Annotated[int, Meta(ge=0)]
+Count = Annotated[int, Meta(ge=1)]
+Positive = Annotated[float, Meta(gt=0)]
+NotNegative = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+
+T = TypeVar("T")
+
+_ITEMS = (kinds.VarTupleType, kinds.ListType)
+_BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
+_WORDS = {kinds.StrType: "text", kinds.BoolType: "true or false", kinds.NoneType: "null", kinds.DictType: "an object"}
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
+
+
+class _MisfitError(Exception):
+    """A place in a document, such as .stages[0].steps, and the words that follow it in the sentence."""
+
+    def __init__(self, place: str, words: str) -> None:
+        super().__init__(place, words)
+        self.place, self.words = place, words
+
+
+def read_json(
+    path: str | Path, kind: type[T], what: str, *, most_bytes: int = MOST_BYTES, error: type[InputError] = InputError
+) -> T:
+    """Read a JSON file as `parse_json` reads text; raises `error` for a file that cannot be read, too."""
+    try:
+        with Path(path).open("rb") as file:
+            text = file.read(most_bytes + 1)
+    except OSError as problem:
+        raise error(f"cannot read {path}: {problem.strerror or problem}") from None
+    return parse_json(text, kind, f"{what} {path}", most_bytes=most_bytes, error=error)
+
+
+def parse_json(
+    text: str | bytes, kind: type[T], what: str, *, most_bytes: int = MOST_BYTES, error: type[InputError] = InputError
+) -> T:
+    """Return JSON text as `kind`: a dataclass, a builtin, or a collection of them.
+
+    Args:
+        text: JSON; bytes are UTF-8.
+        kind: its annotations name the types and ranges; lists become tuples where the annotation is a tuple.
+        what: subject of the sentence of an error, such as "recipe runs/a.json".
+        most_bytes: of the text.
+        error: class of the exception.
+
+    Raises:
+        `error` for text that is too long or is not JSON, for more than MOST_LEVELS levels, unknown or missing keys,
+        numbers that are not finite or need more than 64 bits, other types, and values out of range.
+    """
+    if len(text) > most_bytes:
+        raise error(f"{what} has more than {most_bytes} bytes")
+    try:
+        value = msgspec.json.decode(text)
+    except (ValueError, RecursionError) as problem:
+        raise error(f"{what} is not JSON that can be read: {problem}") from None
+    try:
+        return _converted(value, kind)
+    except _MisfitError as misfit:
+        colon = ": " if misfit.place.startswith((".", "[")) else ""
+        raise error(f"{what}{colon}{misfit.place.removeprefix('.')} {misfit.words}") from None
+
+
+def check_fields(instance: Any, what: str = "", *, error: type[InputError] = InputError) -> None:
+    """Check the fields of a frozen dataclass in its `__post_init__`, and bring them to the annotated types.
+
+    Lists become tuples, whole numbers become floats, and mappings become dataclasses where the annotation says so.
+
+    Args:
+        instance: the dataclass.
+        what: subject of the sentence of an error, such as "optimiser": it says "optimiser.b1 is 2; expected ...".
+        error: class of the exception.
+    """
+    for name, hint in _hints(type(instance)).items():
+        try:
+            value = _converted(getattr(instance, name), hint)
+        except _MisfitError as misfit:
+            raise error(f"{what}{'.' if what else ''}{name}{misfit.place} {misfit.words}") from None
+        object.__setattr__(instance, name, value)
+
+
+@lru_cache(maxsize=256)
+def _hints(kind: type) -> dict[str, Any]:
+    hints = typing.get_type_hints(kind, include_extras=True)
+    return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
+
+
+def _converted(value: Any, kind: Any) -> Any:
+    info = kinds.type_info(kind)
+    _check_values(value)
+    _check_keys(value, info)
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        words, _, place = str(error).removesuffix("`").partition(" - at `$")
+        if error.__cause__ is not None:  # of a __post_init__
+            raise _MisfitError(f"{place}:", str(error.__cause__)) from None
+        if missing := re.fullmatch("Object missing required field `(.*)`", words):
+            raise _MisfitError(place, f"lacks the field {missing[1]!r}") from None
+        for step in re.findall(r"\.\w+|\[[^]]*\]", place):
+            matches = [child for child in _children(value, info) if child[0] == step]
+            if not matches:  # within a mapping, whose keys the message does not name
+                raise _MisfitError(place, f"is invalid: {words}") from None
+            _, value, info = matches[0]
+        raise _MisfitError(place, f"is {_short(value)}; expected {_expected(info)}") from None
+
+
+def _check_values(value: Any, levels: int = 0) -> None:
+    """Raise _MisfitError for numbers that are not finite or are huge, and for values that are nested too deeply."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise _MisfitError("", f"is {value}; expected a finite number")
+    if isinstance(value, int) and abs(value) > _MOST_INT:
+        raise _MisfitError("", "is a number of more than 64 bits")
+    if not isinstance(value, Mapping | list | tuple):
+        return
+    if levels == MOST_LEVELS:
+        raise _MisfitError("", f"is nested more than {MOST_LEVELS} levels deep")
+    for key, child in value.items() if isinstance(value, Mapping) else enumerate(value):
+        try:
+            _check_values(child, levels + 1)
+        except _MisfitError as misfit:
+            place = "" if "nested" in misfit.words else _step(key) + misfit.place
+            raise _MisfitError(place, misfit.words) from None
+
+
+def _check_keys(value: Any, info: kinds.Type) -> None:
+    """Raise _MisfitError for keys of an object that its dataclass does not have."""
+    for option in info.types if isinstance(info, kinds.UnionType) else (info,):
+        if isinstance(option, kinds.DataclassType) and isinstance(value, Mapping):
+            known = [field.name for field in option.fields]
+            if unknown := sorted(str(key) for key in value if key not in known):
+                raise _MisfitError("", f"has unknown fields {_short(unknown)}; expected some of {known}")
+    for step, child, kind in _children(value, info):
+        try:
+            _check_keys(child, kind)
+        except _MisfitError as misfit:
+            raise _MisfitError(step + misfit.place, misfit.words) from None
+
+
+def _children(value: Any, info: kinds.Type) -> Iterator[tuple[str, Any, kinds.Type]]:
+    """Yield step, value and type of everything one level down."""
+    if isinstance(info, kinds.UnionType):
+        for option in info.types:
+            yield from _children(value, option)
+    elif isinstance(value, Mapping):
+        if isinstance(info, kinds.DataclassType):
+            yield from ((f".{f.name}", value[f.name], f.type) for f in info.fields if f.name in value)
+        elif isinstance(info, kinds.DictType):
+            yield from ((_step(key), child, info.value_type) for key, child in value.items())
+    elif isinstance(value, list | tuple):
+        types = info.item_types if isinstance(info, kinds.TupleType) else ()
+        types = len(value) * (info.item_type,) if isinstance(info, _ITEMS) else types
+        yield from ((_step(index), *pair) for index, pair in enumerate(zip(value, types, strict=False)))
+
+
+def _step(key: object) -> str:
+    return f".{key}" if isinstance(key, str) and re.fullmatch(r"\w{1,80}", key) else f"[{_short(key)}]"
+
+
+def _expected(info: kinds.Type) -> str:
+    if isinstance(info, kinds.UnionType):
+        return " or ".join(map(_expected, info.types))
+    if isinstance(info, kinds.LiteralType):
+        return f"one of {info.values}"
+    if isinstance(info, kinds.DataclassType):
+        return f"an object with the fields of {info.cls.__name__}"
+    if isinstance(info, kinds.TupleType):
+        return f"a list of {len(info.item_types)} values"
+    if isinstance(info, _ITEMS):
+        return "a list" + (f" of at least {info.min_length} values" if info.min_length else "")
+    if isinstance(info, kinds.IntType | kinds.FloatType):
+        bounds = [
+            f"{words} {getattr(info, name)}" for name, words in _BOUNDS.items() if getattr(info, name) is not None
+        ]
+        whole = "a whole number" if isinstance(info, kinds.IntType) else "a number"
+        return whole + (f" of {' and '.join(bounds)}" if bounds else "")
+    return _WORDS.get(type(info), type(info).__name__)
+
+
+def _short(value: Any) -> str:
+    try:
+        text = _SHORT.repr(value)
+    except ValueError:  # more digits than Python prints
+        return "a huge number"
+    return "".join(letter if letter.isprintable() else "?" for letter in text)
