@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from vggtjax.commands.report import Report
-from vggtjax.errors import InputError, MissingExtraError
+from vggtjax.errors import InputError, check_extra
 
 if TYPE_CHECKING:
     from vggtjax.training.loop import Status
@@ -42,8 +41,7 @@ def train(
     for name, value in (("log_every", log_every), ("checkpoint_seconds", checkpoint_seconds), ("seconds", seconds)):
         if value is not None and not value > 0:
             raise InputError(f"{name} is {value}; expected a number above 0")
-    if not all(find_spec(name) for name in ("optax", "orbax", "matplotlib")):
-        raise MissingExtraError("training", "train")
+    check_extra("training", "train", "optax", "orbax", "matplotlib")
     report = Report()
     with report.running():
         with report.stage("prepare"):
