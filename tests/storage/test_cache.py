@@ -27,6 +27,7 @@ def test_the_folder_can_be_named(monkeypatch, tmp_path):
 def compiled(environment, folder: Path) -> int:
     made = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr
+    assert "Warning" not in made.stderr
     return len(list(folder.glob("*-cache"))) if folder.is_dir() else 0
 
 
@@ -37,6 +38,22 @@ def test_what_is_compiled_is_kept_unless_the_user_has_said_otherwise(tmp_path):
     elsewhere = own | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "elsewhere"), "VGGTJAX_CACHE": str(tmp_path / "b")}
     assert compiled(elsewhere, tmp_path / "elsewhere") > 0
     assert not (tmp_path / "b").exists()
+
+
+def test_damaged_entries_are_made_anew(tmp_path):
+    own = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    own |= {"VGGTJAX_CACHE": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    compiled(own, tmp_path / "compiled")
+    contents = {path: path.read_bytes() for path in (tmp_path / "compiled").glob("*-cache")}
+    damaged = max(contents)
+    damaged.write_bytes(contents[damaged][:100])
+    half_written, unused = tmp_path / "compiled" / "jit_other-0-cache", tmp_path / "compiled" / "jit_used-0-cache"
+    half_written.write_bytes(b"no time of use beside it")
+    for path in (unused, unused.with_name("jit_used-0-atime")):
+        path.write_bytes(bytes(8))
+    compiled(own, tmp_path / "compiled")
+    assert set((tmp_path / "compiled").glob("*-cache")) == {*contents, unused}
+    assert len(damaged.read_bytes()) > 1000
 
 
 @pytest.mark.skipif("jax" not in sys.modules, reason="nothing here has imported jax")

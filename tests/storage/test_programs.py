@@ -1,5 +1,6 @@
 """Programs that are kept: traced once, the same numbers afterwards, and made anew where a file is not whole."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -7,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import vggtjax
 from vggtjax.storage import programs
 from vggtjax.storage.programs import Program, keep_type, kept_text
 
@@ -26,21 +28,21 @@ def folder(tmp_path, monkeypatch):
 
 
 def counted():
-    """Return a function that counts how often it is traced, twice over: as two processes have it."""
+    """Return a function that counts how often it is traced, three times over: as three processes have it."""
     traced = []
 
     def weighed(pair: Pair, extra, *, power: int, factor: float = 1.0):
         traced.append(power)
         return Pair(factor * pair.one**power, extra), jnp.sum(pair.one)
 
-    return [Program(weighed, static=("power",)) for _ in range(2)], traced
+    return [Program(weighed, static=("power",)) for _ in range(3)], traced
 
 
 X = jnp.arange(6.0).reshape(2, 3)
 
 
 def test_another_process_need_not_trace(folder):
-    (first, second), traced = counted()
+    (first, second, _), traced = counted()
     made = first(Pair(X), None, power=2, factor=3.0)
     again = second(Pair(X), None, power=2, factor=3.0)
     assert traced == [2]
@@ -60,7 +62,7 @@ def test_another_process_need_not_trace(folder):
 
 
 def test_compiled_programs_are_what_calls_find(folder):
-    (first, second), traced = counted()
+    (first, second, _), traced = counted()
     shape = jax.ShapeDtypeStruct((2, 3), jnp.float32)
     for program in (first, second):
         compiled, made = program.compile(Pair(shape), None, power=2, factor=3.0)
@@ -70,12 +72,17 @@ def test_compiled_programs_are_what_calls_find(folder):
     assert traced == [2]
 
 
-def test_broken_files_are_made_anew(folder):
-    (first, second), traced = counted()
+@pytest.mark.parametrize("place", [0, 50, -3])
+def test_damaged_programs_are_made_anew(folder, place):
+    (first, second, third), traced = counted()
     first(Pair(X), None, power=2)
     (path,) = folder.iterdir()
-    path.write_bytes(path.read_bytes()[:50])
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
     assert np.array_equal(second(Pair(X), None, power=2)[0].one, X**2)
+    assert traced == [2, 2]
+    assert np.array_equal(third(Pair(X), None, power=2)[0].one, X**2)
     assert traced == [2, 2]
 
 
@@ -85,7 +92,7 @@ def test_what_cannot_be_kept_runs_all_the_same(folder):
 
     assert np.array_equal(Program(called)(X), X + 1)
     assert not folder.exists()
-    (program, _), _ = counted()
+    (program, *_), _ = counted()
     gradient = jax.grad(lambda x: program(Pair(x), None, power=2)[0].one.sum())(X)  # traced from outside
     assert np.array_equal(gradient, 2 * X)
 
@@ -93,13 +100,13 @@ def test_what_cannot_be_kept_runs_all_the_same(folder):
 def test_a_cache_that_cannot_be_written_is_none(folder):
     folder.parent.mkdir(exist_ok=True)
     folder.write_text("a file where the folder would be")
-    (program, _), _ = counted()
+    (program, *_), _ = counted()
     assert np.array_equal(program(Pair(X), None, power=2)[0].one, X**2)
 
 
 def test_without_a_cache_nothing_is_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path))
-    (program, _), traced = counted()
+    (program, *_), traced = counted()
     program.compile(Pair(X), None, power=2)
     program(Pair(X), None, power=2)
     assert traced == [2]
@@ -108,7 +115,7 @@ def test_without_a_cache_nothing_is_kept(tmp_path, monkeypatch):
 
 def test_the_oldest_go_first(folder, monkeypatch):
     monkeypatch.setattr(programs, "KEPT_BYTES", 1)
-    (program, _), _ = counted()
+    (program, *_), _ = counted()
     program(Pair(X), None, power=2)
     program(Pair(X), None, power=3)
     assert len(list(folder.glob("*.bin"))) == 0
@@ -125,3 +132,23 @@ def test_text_is_kept(folder):
     assert len(made) == 1
     assert kept_text("other", make) == "text"
     assert len(made) == 2
+
+
+@pytest.mark.parametrize("damage", [b"", b'{"a": [1,', b"\xff" * 99])
+def test_damaged_text_is_made_anew(folder, damage):
+    assert kept_text("name", lambda: "one") == "one"
+    (path,) = folder.iterdir()
+    path.write_bytes(damage)
+    assert kept_text("name", lambda: "two") == "two"
+    assert kept_text("name", lambda: "three") == "two"
+
+
+def test_kept_files_depend_on_every_file_of_the_package(tmp_path, monkeypatch):
+    assert Path(vggtjax.__file__).parent == programs._PACKAGE
+    monkeypatch.setattr(programs, "_PACKAGE", tmp_path)
+    (tmp_path / "network").mkdir()
+    digests = set()
+    for name, text in (("a.py", "1"), ("network/b.py", "1"), ("network/b.py", "2"), ("notes.txt", "")):
+        (tmp_path / name).write_text(text)
+        digests.add(programs.source_digest.__wrapped__())
+    assert len(digests) == 3

@@ -267,12 +267,12 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, 2 for bad input or output, 130 when interrupted."""
     keep_freed_memory()
-    keep_compilations()
     atexit.register(gc.freeze)  # at the end there is nothing to collect, and a last collection takes half a second
     logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
     for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
+    keep_compilations()  # after the line above: it handles some warnings itself
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,

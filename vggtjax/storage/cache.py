@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
+import warnings
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 COMPILED_BYTES = 2 * 2**30  # of compiled programs that are kept; the ones that were not used for longest go first
+_DAMAGED = re.compile(r"Error (?:reading|writing) persistent compilation cache entry for '([^']+)'")
 _SHORTEST = 0.05  # seconds of compilation from which a program is kept
 
 
@@ -45,4 +51,21 @@ def keep_compilations() -> bool:
     }
     for name, value in settings.items():
         os.environ.setdefault(name, value)
+    warnings.showwarning = partial(_show_warning, warnings.showwarning)
     return True
+
+
+def _show_warning(show: Callable[..., object], message: Warning | str, *details: Any, **options: Any) -> None:
+    """Remove damaged entries of jax's cache instead of showing jax's warning: jax then compiles and keeps a new one.
+
+    jax itself would read the damaged entry again in every later process.
+    """
+    if (match := _DAMAGED.match(str(message))) is None:
+        show(message, *details, **options)
+        return
+    folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
+    for entry in folder.glob("*-cache"):
+        used = entry.with_name(entry.name.removesuffix("cache") + "atime")  # a killed process has not written it
+        if entry.name.startswith(f"{match[1]}-") or not used.exists():
+            for path in (entry, used):
+                path.unlink(missing_ok=True)

@@ -25,6 +25,8 @@ from vggtjax.storage.cache import compiled_folder, lowered_folder
 from vggtjax.storage.writing import writing
 
 KEPT_BYTES = 2**28  # of lowered programs; the oldest go first
+_DIGEST = 32  # bytes of the sha256 that a kept file begins with
+_PACKAGE = Path(__file__).parents[1]
 
 
 class Program:
@@ -84,23 +86,18 @@ class Program:
             (source_digest(), name, *map(str, key), str(jax.config.values["jax_default_matmul_precision"]))
         )
         path = lowered_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.bin"
-        try:
-            return jax.jit(export.deserialize(bytearray(path.read_bytes())).call)
-        except OSError:  # not there
-            pass
-        except Exception:  # whatever flatbuffers and MLIR raise of a file that is broken
-            path.unlink(missing_ok=True)
+        if (content := _read_kept(path)) is not None:
+            return jax.jit(export.deserialize(bytearray(content)).call)
         shapes, named = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), (arguments, traced)
         )
         try:
             exported = export.export(jax.jit(partial(self._function, **fixed)))(*shapes, **named)
-            content = exported.serialize()
+            content = bytes(exported.serialize())
         except (ValueError, NotImplementedError):  # calls back to the host
             return self._jitted
         try:
-            with writing(path) as temporary:
-                temporary.write_bytes(content)
+            _keep(path, content)
             _prune(path.parent)
         except OutputError:  # a cache that cannot be written is none
             return self._jitted
@@ -118,13 +115,29 @@ def kept_text(name: str, make: Callable[[], str]) -> str:
     if not _keeping():
         return make()
     path = lowered_folder() / f"{hashlib.sha256(f'{source_digest()} {name}'.encode()).hexdigest()[:32]}.txt"
+    if (content := _read_kept(path)) is not None:
+        return content.decode()
+    text = make()
+    with suppress(OutputError):
+        _keep(path, text.encode())
+    return text
+
+
+def _read_kept(path: Path) -> bytes | None:
+    """Return what `_keep` wrote; None where there is no file, or a damaged one, which is removed."""
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        made = make()
-    with suppress(OutputError), writing(path) as temporary:
-        temporary.write_text(made, encoding="utf-8")
-    return made
+        content = path.read_bytes()
+        if content[:_DIGEST] == hashlib.sha256(content[_DIGEST:]).digest():
+            return content[_DIGEST:]
+        path.unlink()
+    except OSError:
+        pass
+    return None
+
+
+def _keep(path: Path, content: bytes) -> None:
+    with writing(path) as temporary:
+        temporary.write_bytes(hashlib.sha256(content).digest() + content)
 
 
 def _keeping() -> bool:
@@ -136,9 +149,8 @@ def _keeping() -> bool:
 def source_digest() -> str:
     """Return what the results of this package depend on beside arguments: its sources, versions, and the platform."""
     digest = hashlib.sha256()
-    root = Path(__file__).parents[1]
-    for path in sorted(root.rglob("*.py")):
-        digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
     versions = [version(name) for name in ("jax", "jaxlib", "flax")]
     return f"{' '.join(versions)} {jax.default_backend()} {digest.hexdigest()}"
 
