@@ -13,8 +13,8 @@ from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
 from vggtjax.method.refinement import refine_masks, statistical_outliers
 from vggtjax.scenes import load_textures
+from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.render import generate
-from vggtjax.scenes.scene import SceneConfig
 
 
 def refinement(*, frames: int = 32, height: int = 294, width: int = 518, grow: int = 12, repeats: int = 3) -> None:

@@ -1,14 +1,14 @@
 """A training run small enough for tests: a tiny model, and an objective that pulls it towards the batch."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from tests.tiny import tiny_config
 from vggtjax.config import VGGTConfig
-from vggtjax.training.recipe import OptimiserConfig, Recipe, Stage
+from vggtjax.training.loop import Task
+from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
 
 CONFIG = tiny_config(
     image_size=28,
@@ -20,7 +20,7 @@ CONFIG = tiny_config(
 )
 RECIPE = Recipe(
     name="tiny",
-    stages=(Stage(4, 2, (2, 3), 28, 28), Stage(2, 1, (2,), 28, 42)),
+    stages=(Phase(4, 2, (2, 3), 28, 28), Phase(2, 1, (2,), 28, 42)),
     model=CONFIG,
     optimiser=OptimiserConfig(learning_rate=1e-2, warmup_steps=2, decay_steps=2),
     untrained=("track_head", "depth_head", "point_head"),
@@ -34,9 +34,9 @@ def init_probes(seed: int, config: VGGTConfig):
     return {"mean": {"kernel": jnp.full((3, 3), 0.1 * (1 + seed)), "bias": jnp.zeros(3)}}
 
 
-def make_batch(key, textures, stage: Stage, frames: int):
+def make_batch(key, textures, phase: Phase, frames: int):
     """Return noise images."""
-    return textures * jax.random.uniform(key, (stage.batch, frames, stage.height, stage.width, 3))
+    return textures * jax.random.uniform(key, (phase.batch, frames, phase.height, phase.width, 3))
 
 
 def objective(trained, batch, config, weights, *, compute_dtype, remat):
@@ -50,9 +50,4 @@ def objective(trained, batch, config, weights, *, compute_dtype, remat):
     return loss, {"colour_loss": colour_loss, "pose_loss": pose_loss}
 
 
-PARTS: dict[str, Any] = {
-    "textures": jnp.float32(1),
-    "make_batch": make_batch,
-    "init_probes": init_probes,
-    "objective": objective,
-}
+TASK = Task(jnp.float32(1), make_batch, init_probes, objective)

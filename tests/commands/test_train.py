@@ -4,19 +4,20 @@ import json
 import numpy as np
 import pytest
 
-from tests.training_runs import PARTS, PROBES
+from tests.training_runs import PROBES, TASK
 from vggtjax.checkpoint import read_model, save_model
 from vggtjax.commands import train as command
 from vggtjax.errors import CheckpointError, InputError, MissingExtraError
 from vggtjax.network.model import init_params
 from vggtjax.training import loop
 from vggtjax.training.metrics import read_metrics
+from vggtjax.training.options import RunOptions
 
 
 @pytest.fixture
 def recipe(tmp_path, monkeypatch):
     """A file with a recipe; the loop that the command calls runs on the tests' small parts."""
-    monkeypatch.setattr(loop, "train", functools.partial(loop.train, **PARTS))
+    monkeypatch.setattr(loop, "train", functools.partial(loop.train, task=TASK))
     path = tmp_path / "recipe.json"
     path.write_text(PROBES.to_json())
     return path
@@ -25,9 +26,9 @@ def recipe(tmp_path, monkeypatch):
 def test_train(recipe, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(command, "_LINE_SECONDS", 0.0)
     out = tmp_path / "out"
-    command.train(recipe, out, log_every=2)
+    command.train(recipe, out, options=RunOptions(log_every=2))
     said = capsys.readouterr().out
-    assert "step 2 of 6, stage 1, loss " in said
+    assert "step 2 of 6, phase 1, loss " in said
     assert "6 of 6" in said
     assert str(out / "model.safetensors") in said
     assert len(read_metrics(out / "metrics.csv")) == 3
@@ -37,7 +38,7 @@ def test_fewer_steps_from_a_model(recipe, tmp_path, capsys):
     params = init_params(4, PROBES.model)
     start = save_model(tmp_path / "start.safetensors", params, PROBES.model)
     out = tmp_path / "out"
-    command.train(recipe, out, init=str(start), steps=3, seconds=1e-9, dtype="bfloat16")
+    command.train(recipe, out, init=str(start), steps=3, options=RunOptions(seconds=1e-9, dtype="bfloat16"))
     assert "1 of 3; the same command goes on" in capsys.readouterr().out
     model = read_model(out / "model.safetensors")
     assert model.dtype == "bfloat16"
@@ -49,20 +50,21 @@ def test_fewer_steps_from_a_model(recipe, tmp_path, capsys):
 
 def test_bad_input(recipe, tmp_path, monkeypatch):
     for values, says in (
-        ({"steps": 0}, "steps is 0"),
         ({"seconds": 0.0}, "seconds is 0.0"),
         ({"seconds": float("nan")}, "seconds is nan"),
         ({"log_every": 0}, "log_every is 0"),
         ({"checkpoint_seconds": -1.0}, "checkpoint_seconds is -1.0"),
     ):
         with pytest.raises(InputError, match=says):
-            command.train(recipe, tmp_path / "out", **values)  # type: ignore[arg-type]
+            RunOptions(**values)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="steps is 0"):
+        command.train(recipe, tmp_path / "out", steps=0)
     with pytest.raises(InputError, match="cannot read"):
         command.train(tmp_path / "none.json", tmp_path / "out")
     with pytest.raises(CheckpointError):
         command.train(recipe, tmp_path / "out", init="demo")  # another configuration
     assert not (tmp_path / "out").exists()
-    monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: None)
+    monkeypatch.setattr(command, "find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"vggtjax\[train\]"):
         command.train(recipe, tmp_path / "out")
 

@@ -10,8 +10,8 @@ from skimage.measure import label
 from vggtjax.errors import InputError
 from vggtjax.method.instances import find_instances
 from vggtjax.scenes import load_textures
+from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.render import generate
-from vggtjax.scenes.scene import SceneConfig
 
 
 def boxes(*tracks, frames=5, size=(24, 90)) -> tuple[np.ndarray, np.ndarray]:

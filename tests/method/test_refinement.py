@@ -11,8 +11,8 @@ from vggtjax.errors import InputError
 from vggtjax.method import refinement
 from vggtjax.method.refinement import refine_masks, statistical_outliers
 from vggtjax.scenes import load_textures
+from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.render import generate
-from vggtjax.scenes.scene import SceneConfig
 
 CONFIG = SceneConfig(height=96, width=96, frames=6, dynamic=1.0, noise=0.0, flicker=0.0, static_camera=0.0)
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.generated import QUICK, textures
 from vggtjax.clips.clip import load_clip
-from vggtjax.commands.scenes import scenes
+from vggtjax.commands.scenes import Images, scenes
 from vggtjax.errors import InputError, OutputError
 from vggtjax.scenes import SceneConfig, dataset, generate
 from vggtjax.scenes.dataset import read_index, write_scenes
@@ -52,7 +52,7 @@ def written(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "new" / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset, "_draw", quick)
-        scenes(out, count=2, frames=S, height=H, width=W, seed=3)
+        scenes(out, count=2, images=Images(frames=S, height=H, width=W), seed=3)
     return out
 
 
@@ -211,15 +211,15 @@ def test_sets_of_other_settings_are_not_mixed(written, changes, says):
         ({"split": "validation"}, "split is 'validation'; expected one of"),
         ({"seed": -1}, "seed is -1; expected a whole number in"),
         ({"seed": 2**31}, "seed is 2147483648"),
-        ({"frames": 0}, "frames is 0"),
-        ({"shutter": 0.5}, "shutter is 0.5 with 1 exposures; motion blur needs"),
-        ({"exposures": 4}, "shutter is 0.0 with 4 exposures"),
+        ({"images": Images(frames=0)}, "frames is 0"),
+        ({"images": Images(shutter=0.5)}, "shutter is 0.5 with 1 exposures; motion blur needs"),
+        ({"images": Images(exposures=4)}, "shutter is 0.0 with 4 exposures"),
     ],
 )
 def test_bad_input_is_one_sentence_before_anything_is_drawn(tmp_path, monkeypatch, changes, says):
     monkeypatch.setattr(dataset, "_draw", None)
     with pytest.raises(InputError, match=says):
-        scenes(tmp_path / "set", **({"frames": S, "height": H, "width": W} | changes))
+        scenes(tmp_path / "set", **changes)
     assert not (tmp_path / "set").exists()
 
 
@@ -246,5 +246,5 @@ def test_other_peoples_files_are_not_touched(tmp_path, monkeypatch):
 
 
 def test_the_command_does_not_import_jax_before_it_runs():
-    code = "import sys; import vggtjax.scenes.command; sys.exit('jax' in sys.modules)"
+    code = "import sys; import vggtjax.commands.scenes; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

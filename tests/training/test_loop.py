@@ -7,16 +7,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_runs import PARTS, PROBES, SHORT
+from tests.training_runs import PROBES, SHORT, TASK
 from vggtjax.checkpoint import read_model
 from vggtjax.errors import CheckpointError, InputError, OutputError, VggtjaxError
 from vggtjax.network.model import init_params
 from vggtjax.training.checkpoints import latest
 from vggtjax.training.loop import draw_frames, train
 from vggtjax.training.metrics import read_metrics
-from vggtjax.training.recipe import OptimiserConfig, Stage, read_recipe
+from vggtjax.training.options import RunOptions
+from vggtjax.training.recipe import OptimiserConfig, Phase, read_recipe
 from vggtjax.training.run import MOST_SKIPPED
 from vggtjax.training.state import exported
+
+NOW = 1e-9  # seconds: a run that ends after one step
 
 
 def measured(path):
@@ -33,7 +36,7 @@ def straight(tmp_path_factory):
     """Six steps at a stretch."""
     out = tmp_path_factory.mktemp("straight")
     seen = []
-    return train(SHORT, out, log_every=2, progress=seen.append, **PARTS), out, seen
+    return train(SHORT, out, options=RunOptions(log_every=2), progress=seen.append, task=TASK), out, seen
 
 
 def test_what_a_run_leaves(straight):
@@ -60,8 +63,8 @@ def test_what_a_run_leaves(straight):
 
 
 def test_time_spent_rendering_is_measured(tmp_path):
-    recipe = dataclasses.replace(PROBES, stages=(Stage(6, 2, (2,), 28, 28),))
-    train(recipe, tmp_path, log_every=3, **PARTS)
+    recipe = dataclasses.replace(PROBES, stages=(Phase(6, 2, (2,), 28, 28),))
+    train(recipe, tmp_path, options=RunOptions(log_every=3), task=TASK)
     assert all(0 < row["render_share"] < 1 for row in read_metrics(tmp_path / "metrics.csv"))
 
 
@@ -70,7 +73,7 @@ def test_interrupted_after_every_step_gives_the_same_numbers(straight, tmp_path)
     whole, out, _ = straight
     part = whole
     for step in range(1, 7):
-        part = train(SHORT, tmp_path, log_every=2, stop_after=0.0, **PARTS)
+        part = train(SHORT, tmp_path, options=RunOptions(log_every=2, seconds=NOW), task=TASK)
         assert int(part.state.step) == step
         assert part.finished == (step == 6)
     assert measured(tmp_path / "metrics.csv") == measured(out / "metrics.csv")
@@ -81,17 +84,17 @@ def test_interrupted_after_every_step_gives_the_same_numbers(straight, tmp_path)
 def test_steps_after_the_last_checkpoint_are_done_again(straight, tmp_path):
     """A machine that stops without warning leaves rows past the checkpoint."""
     _, out, _ = straight
-    train(SHORT, tmp_path, log_every=2, stop_after=0.0, **PARTS)
+    train(SHORT, tmp_path, options=RunOptions(log_every=2, seconds=NOW), task=TASK)
     with (tmp_path / "metrics.csv").open("w") as file:
         file.write((out / "metrics.csv").read_text())
-    train(SHORT, tmp_path, log_every=2, **PARTS)
+    train(SHORT, tmp_path, options=RunOptions(log_every=2), task=TASK)
     assert measured(tmp_path / "metrics.csv") == measured(out / "metrics.csv")
 
 
 def test_a_finished_run_stays(straight):
     whole, out, _ = straight
     before = (out / "model.safetensors").stat().st_mtime_ns
-    again = train(SHORT, out, log_every=2, **PARTS)
+    again = train(SHORT, out, options=RunOptions(log_every=2), task=TASK)
     assert again.finished
     assert same(again.state, whole.state)
     assert (out / "model.safetensors").stat().st_mtime_ns == before
@@ -105,30 +108,31 @@ def test_signals_end_a_run_with_a_checkpoint(straight, tmp_path, number, error):
 
     handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
     with pytest.raises(error) as raised:
-        train(SHORT, tmp_path, log_every=2, progress=interrupt, **PARTS)
+        train(SHORT, tmp_path, options=RunOptions(log_every=2), progress=interrupt, task=TASK)
     if error is SystemExit:
         assert raised.value.code == 143
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
     assert latest(tmp_path / "checkpoints") == 4
     assert read_model(tmp_path / "model.safetensors").config == SHORT.model
-    train(SHORT, tmp_path, log_every=2, **PARTS)
+    train(SHORT, tmp_path, options=RunOptions(log_every=2), task=TASK)
     assert measured(tmp_path / "metrics.csv") == measured(straight[1] / "metrics.csv")
 
 
 def test_checkpoints_are_written_on_the_way(tmp_path):
-    train(PROBES, tmp_path, checkpoint_seconds=0.0, **PARTS)
+    train(PROBES, tmp_path, options=RunOptions(checkpoint_seconds=NOW), task=TASK)
     assert sorted(int(path.name) for path in (tmp_path / "checkpoints").iterdir()) == [5, 6]
 
 
 def test_bad_steps_are_skipped_and_counted(tmp_path):
     """Clips that are not a number in one of two steps."""
 
-    def sometimes(key, textures, stage, frames):
-        batch = PARTS["make_batch"](key, textures, stage, frames)
+    def with_gaps(key, textures, phase, frames):
+        batch = TASK.make_batch(key, textures, phase, frames)
         return jnp.where(jax.random.uniform(key) < 0.5, jnp.nan, batch)
 
-    recipe = dataclasses.replace(PROBES, stages=(Stage(12, 1, (2,), 28, 28),))
-    outcome = train(recipe, tmp_path, log_every=6, **{**PARTS, "make_batch": sometimes})
+    recipe = dataclasses.replace(PROBES, stages=(Phase(12, 1, (2,), 28, 28),))
+    task = dataclasses.replace(TASK, make_batch=with_gaps)
+    outcome = train(recipe, tmp_path, options=RunOptions(log_every=6), task=task)
     rows = read_metrics(tmp_path / "metrics.csv")
     skipped = int(outcome.state.skipped)
     assert 0 < skipped < 12
@@ -138,26 +142,26 @@ def test_bad_steps_are_skipped_and_counted(tmp_path):
 
 
 def test_a_run_that_only_skips_ends(tmp_path):
-    recipe = dataclasses.replace(PROBES, stages=(Stage(MOST_SKIPPED + 50, 1, (2,), 28, 28),))
+    recipe = dataclasses.replace(PROBES, stages=(Phase(MOST_SKIPPED + 50, 1, (2,), 28, 28),))
     with pytest.raises(VggtjaxError, match="50 steps in a row up to step 50 had a loss or gradient"):
-        train(recipe, tmp_path, **{**PARTS, "textures": jnp.float32(np.nan)})
+        train(recipe, tmp_path, task=dataclasses.replace(TASK, textures=jnp.float32(np.nan)))
 
 
 def test_a_start_is_read_once(tmp_path):
     params = init_params(9, SHORT.model)
-    begun = train(SHORT, tmp_path, init=params, stop_after=0.0, **PARTS)
+    begun = train(SHORT, tmp_path, init=params, options=RunOptions(seconds=NOW), task=TASK)
     assert same(begun.state.trained["model"]["backbone"], params["backbone"])
-    gone_on = train(SHORT, tmp_path, init=init_params(3, SHORT.model), stop_after=0.0, **PARTS)
+    gone_on = train(SHORT, tmp_path, init=init_params(3, SHORT.model), options=RunOptions(seconds=NOW), task=TASK)
     assert same(gone_on.state.trained["model"]["backbone"], params["backbone"])
 
 
 def test_bfloat16_model(tmp_path):
-    train(PROBES, tmp_path, export_dtype="bfloat16", stop_after=0.0, **PARTS)
+    train(PROBES, tmp_path, options=RunOptions(dtype="bfloat16", seconds=NOW), task=TASK)
     assert read_model(tmp_path / "model.safetensors").dtype == "bfloat16"
 
 
 def test_frames_depend_on_seed_and_step_alone():
-    recipe = dataclasses.replace(SHORT, stages=(Stage(60, 1, (2, 3, 5), 28, 28),))
+    recipe = dataclasses.replace(SHORT, stages=(Phase(60, 1, (2, 3, 5), 28, 28),))
     drawn = [draw_frames(recipe, step) for step in range(60)]
     assert drawn == [draw_frames(recipe, step) for step in range(60)]
     assert set(drawn) == {2, 3, 5}
@@ -165,18 +169,18 @@ def test_frames_depend_on_seed_and_step_alone():
 
 
 def test_another_recipe_in_the_folder(tmp_path, caplog):
-    train(PROBES, tmp_path, stop_after=0.0, **PARTS)
+    train(PROBES, tmp_path, options=RunOptions(seconds=NOW), task=TASK)
     muon = OptimiserConfig(kind="muon", warmup_steps=0, decay_steps=0)
     with pytest.raises(CheckpointError, match=r"another optimiser\.kind"):
-        train(dataclasses.replace(PROBES, optimiser=muon), tmp_path, **PARTS)
+        train(dataclasses.replace(PROBES, optimiser=muon), tmp_path, task=TASK)
     faster = dataclasses.replace(PROBES.optimiser, learning_rate=0.1)
-    train(dataclasses.replace(PROBES, optimiser=faster), tmp_path, stop_after=0.0, **PARTS)
-    assert "going on with the new one" in caplog.text
+    train(dataclasses.replace(PROBES, optimiser=faster), tmp_path, options=RunOptions(seconds=NOW), task=TASK)
+    assert "resuming with the new recipe" in caplog.text
 
 
 def test_bad_arguments(tmp_path):
     with pytest.raises(InputError, match="dtype is 'float16'"):
-        train(SHORT, tmp_path, export_dtype="float16", **PARTS)  # type: ignore[arg-type]
+        RunOptions(dtype="float16")  # type: ignore[arg-type]
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
-        train(SHORT, tmp_path / "file", **PARTS)
+        train(SHORT, tmp_path / "file", task=TASK)

@@ -13,7 +13,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.network.model import parameter_shapes
 from vggtjax.training.optimiser import decays, join, make_schedule, split
 from vggtjax.training.optimiser import make_optimiser as make_typed_optimiser
-from vggtjax.training.recipe import OptimiserConfig, Recipe, Stage
+from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
 
 
 def recipe_with(**optimiser: Any) -> Recipe:
@@ -144,7 +144,7 @@ def test_muon_leaves_everything_else_to_adam():
 def test_muon_reads_the_real_tree():
     """Only stacked kernels are matrices of Muon: convolutions, heads' projections and tables are Adam's."""
     shapes = {"model": parameter_shapes(VGGTConfig())}
-    stages = (Stage(5000, 1, (2,), 518, 518),)
+    stages = (Phase(5000, 1, (2,), 518, 518),)
     recipe = Recipe("full", stages, optimiser=OptimiserConfig(kind="muon"))
     state = jax.eval_shape(make_optimiser(recipe).init, split(shapes, recipe)[0])
     momentum = optax.tree.get_all_with_path(state, "mu")

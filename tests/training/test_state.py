@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_runs import PARTS, RECIPE, SHORT, init_probes, make_batch, objective
+from tests.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective
 from vggtjax.checkpoint import read_model, save_model
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError
@@ -15,7 +15,7 @@ from vggtjax.training.data import make_batch as scenes_batch
 from vggtjax.training.objective import LossWeights
 from vggtjax.training.objective import init_probes as scenes_probes
 from vggtjax.training.objective import objective as scenes_objective
-from vggtjax.training.recipe import OptimiserConfig, Recipe, Stage
+from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
 from vggtjax.training.state import TrainingState, compute_dtype, exported, initial_state, state_shapes, train_step
 
 
@@ -36,7 +36,7 @@ def start():
 
 @pytest.fixture(scope="module")
 def batch():
-    return make_batch(jax.random.key(0), PARTS["textures"], SHORT.stages[0], 2)
+    return make_batch(jax.random.key(0), TASK.textures, SHORT.stages[0], 2)
 
 
 def same(a, b) -> bool:
@@ -134,7 +134,7 @@ def test_weights_of_another_model_are_refused():
 @pytest.mark.parametrize(("trainable", "kind"), [("all", "muon"), ("heads", "adamw")])
 def test_shapes_of_the_full_model(textures, trainable, kind):
     """A step of VGGT-1B on generated clips, without its arrays."""
-    stages = (Stage(5000, 1, (2,), 518, 518),)
+    stages = (Phase(5000, 1, (2,), 518, 518),)
     recipe = Recipe("full", stages, VGGTConfig(), OptimiserConfig(kind=kind), trainable=trainable, remat=True)
     state = state_shapes(recipe, scenes_probes(0, recipe.model))
     batch = jax.eval_shape(lambda key: scenes_batch(key, textures, stages[0], 2), jax.random.key(0))
@@ -156,7 +156,7 @@ def test_fine_tuning_on_generated_clips(tmp_path, textures):
     """The camera head of a saved model takes steps that lower the real objective on one batch of clips."""
     recipe = dataclasses.replace(
         SHORT,
-        stages=(Stage(20, 2, (3,), 28, 28),),
+        stages=(Phase(20, 2, (3,), 28, 28),),
         losses=LossWeights(depth=0, points=0),
         optimiser=OptimiserConfig(learning_rate=1e-3, warmup_steps=0, decay_steps=0),
     )

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import time
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from vggtjax.commands.report import Report
-from vggtjax.errors import InputError, check_extra
+from vggtjax.errors import MissingExtraError
+from vggtjax.training.options import RunOptions
 
 if TYPE_CHECKING:
     from vggtjax.training.loop import Status
@@ -21,27 +25,19 @@ def train(
     *,
     init: str | None = None,
     steps: int | None = None,
-    seconds: float | None = None,
-    log_every: int = 50,
-    checkpoint_seconds: float = 600.0,
-    dtype: Literal["float32", "bfloat16"] = "float32",
+    options: Annotated[RunOptions, tyro.conf.OmitArgPrefixes] = RunOptions(),  # noqa: B008 (frozen)
 ) -> None:
-    """Train a model on generated scenes, or go on with a run that was interrupted.
+    """Train a model on generated scenes, or resume an interrupted run.
 
     Args:
         recipe: JSON file with the recipe.
-        out: folder for the model, checkpoints and metrics; a run that is there goes on.
+        out: folder for the model, checkpoints and metrics; an existing run in it is resumed.
         init: a model to start from: a .safetensors, a PyTorch checkpoint, or a hub id; random parameters by default.
-        steps: steps in all; stages, warm-up and decay keep their shares. The recipe's own by default.
-        seconds: stop after so long, with a checkpoint to go on from.
-        log_every: steps that a row of metrics.csv averages over.
-        checkpoint_seconds: time between checkpoints.
-        dtype: of the weights in model.safetensors.
+        steps: total number of steps; phases, warm-up and decay keep their shares. The recipe's own by default.
+        options: how the run logs, saves and ends.
     """
-    for name, value in (("log_every", log_every), ("checkpoint_seconds", checkpoint_seconds), ("seconds", seconds)):
-        if value is not None and not value > 0:
-            raise InputError(f"{name} is {value}; expected a number above 0")
-    check_extra("training", "train", "optax", "orbax", "matplotlib")
+    if not all(find_spec(name) for name in ("optax", "orbax", "matplotlib")):
+        raise MissingExtraError("training", "train")
     report = Report()
     with report.running():
         with report.stage("prepare"):
@@ -67,16 +63,7 @@ def train(
                     report.line(_line(status))
                     shown = time.perf_counter()
 
-            outcome = run(
-                chosen,
-                out,
-                init=params,
-                progress=show,
-                stop_after=seconds,
-                log_every=log_every,
-                checkpoint_seconds=checkpoint_seconds,
-                export_dtype=dtype,
-            )
+            outcome = run(chosen, out, init=params, options=options, progress=show)
     done, total = int(outcome.state.step), chosen.total_steps
     report.table(
         {
@@ -89,7 +76,7 @@ def train(
 
 
 def _line(status: Status) -> str:
-    text = f"step {status.step} of {status.total_steps}, stage {status.stage + 1}"
+    text = f"step {status.step} of {status.total_steps}, phase {status.phase + 1}"
     if "loss" in status.metrics:
         text += f", loss {status.metrics['loss']:.4g}"
     if status.seconds_left is not None:

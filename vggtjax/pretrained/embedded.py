@@ -27,7 +27,8 @@ def demo_model(dtype: DType = "float32") -> Model:
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
-    return read_model(MODEL, dtype=dtype, name="demo")
+    model = read_model(MODEL, dtype=dtype)
+    return Model(model.config, model.params, "demo", model.path)
 
 
 def demo_clip() -> Truth:

@@ -1,3 +1,4 @@
+from .config import SceneConfig as SceneConfig
 from .dataset import read_index as read_index
 from .dataset import write_scenes as write_scenes
 from .held_out import Hardness as Hardness
@@ -7,8 +8,7 @@ from .render import Surface as Surface
 from .render import SyntheticClip as SyntheticClip
 from .render import cast as cast
 from .render import generate as generate
+from .sampling import sample_scene as sample_scene
 from .scene import Scene as Scene
-from .scene import SceneConfig as SceneConfig
-from .scene import sample_scene as sample_scene
 from .textures import Textures as Textures
 from .textures import load_textures as load_textures

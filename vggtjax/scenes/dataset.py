@@ -33,9 +33,9 @@ from PIL import Image
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results.export import encode_depth, write_intrinsics
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.held_out import Kind
 from vggtjax.scenes.render import SyntheticClip, generate
-from vggtjax.scenes.scene import SceneConfig
 from vggtjax.scenes.sheet import draw_sheet
 from vggtjax.scenes.textures import Split, load_textures
 from vggtjax.storage.trajectories import write_trajectory

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vggtjax.errors import InputError
+from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.render import SyntheticClip, generate
-from vggtjax.scenes.scene import SceneConfig
 from vggtjax.scenes.textures import Textures, load_textures
 
 Kind = Literal["static", "dynamic"]

@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.network.precision import full_precision
-from vggtjax.scenes.scene import ROOM_FACES, Scene, SceneConfig, camera_pose, part_poses, sample_scene
+from vggtjax.scenes.config import SceneConfig
+from vggtjax.scenes.sampling import sample_scene
+from vggtjax.scenes.scene import ROOM_FACES, Scene, camera_pose, part_poses
 from vggtjax.scenes.shapes import SHAPES
 from vggtjax.scenes.textures import Textures, sample
 

@@ -124,7 +124,7 @@ def _converted(value: Any, kind: Any) -> Any:
         words, _, place = str(error).removesuffix("`").partition(" - at `$")
         if error.__cause__ is not None:  # of a __post_init__
             raise _MisfitError(f"{place}:", str(error.__cause__)) from None
-        if missing := re.fullmatch("Object missing required field `(.*)`", words):
+        if missing := re.fullmatch("Object missing required field `(.*?)`?", words):
             raise _MisfitError(place, f"lacks the field {missing[1]!r}") from None
         for step in re.findall(r"\.\w+|\[[^]]*\]", place):
             matches = [child for child in _children(value, info) if child[0] == step]

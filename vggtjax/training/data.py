@@ -7,26 +7,23 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from vggtjax.scenes.render import SyntheticClip, generate
-from vggtjax.scenes.scene import SceneConfig
 from vggtjax.scenes.textures import Textures
-from vggtjax.training.recipe import Stage
+from vggtjax.training.recipe import Phase
 
 GREY = 0.1  # share of clips without colour
 IN_ORDER = 0.5  # share of clips whose frames stay in the order of time
 
 
-def make_batch(key: Array, textures: Textures, stage: Stage, frames: int) -> SyntheticClip:
-    """Return `stage.batch` clips of `frames` frames: random order of frames, random colours. Pure.
+def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> SyntheticClip:
+    """Return `phase.batch` clips of `frames` frames: random order of frames, random colours. Pure.
 
     Args:
         key: a JAX random key; the same key gives the same batch.
         textures: the tiles of a split.
-        stage: size, motion and share of dynamic scenes (static).
+        phase: size, motion and share of dynamic scenes (static).
         frames: number of frames (static).
     """
-    config = SceneConfig(
-        height=stage.height, width=stage.width, frames=frames, dynamic=stage.dynamic, motion=stage.motion
-    )
+    config = phase.scenes(frames)
 
     def one(key: Array) -> SyntheticClip:
         scene_key, order_key, colour_key = jax.random.split(key, 3)
@@ -37,7 +34,7 @@ def make_batch(key: Array, textures: Textures, stage: Stage, frames: int) -> Syn
         clip = jax.tree.map(lambda leaf: leaf[order], clip)
         return clip._replace(images=_recolour(colour_key, clip.images))
 
-    return jax.vmap(one)(jax.random.split(key, stage.batch))
+    return jax.vmap(one)(jax.random.split(key, phase.batch))
 
 
 def _recolour(key: Array, images: Array) -> Array:

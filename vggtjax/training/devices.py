@@ -20,13 +20,13 @@ class Placement(NamedTuple):
 
 
 def placement(recipe: Recipe) -> Placement:
-    """Return shardings over as many of this machine's devices as divide the batch of every stage.
+    """Return shardings over as many of this machine's devices as divide the batch of every phase.
 
     A CPU counts as one device unless XLA_FLAGS=--xla_force_host_platform_device_count=N makes more of it, which keeps
     more of its cores busy with small models.
     """
     devices = jax.local_devices()
-    batches = math.gcd(*(stage.batch for stage in recipe.stages))
+    batches = math.gcd(*(phase.batch for phase in recipe.stages))
     count = max(n for n in range(1, len(devices) + 1) if batches % n == 0)
     mesh = Mesh(np.array(devices[:count]), ("clips",))
     return Placement(NamedSharding(mesh, PartitionSpec()), NamedSharding(mesh, PartitionSpec("clips")))

@@ -1,4 +1,4 @@
-"""The training loop: batches, steps, metrics, checkpoints; an interrupted run goes on where it was."""
+"""The training loop: batches, steps, metrics, checkpoints. An interrupted run resumes at its newest checkpoint."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from vggtjax.checkpoint import DType
 from vggtjax.network.layers import Params
+from vggtjax.scenes.textures import load_textures
 from vggtjax.training.data import make_batch as make_scene_batch
 from vggtjax.training.devices import placement
 from vggtjax.training.metrics import Row
 from vggtjax.training.objective import init_probes as init_scene_probes
 from vggtjax.training.objective import objective as scene_objective
-from vggtjax.training.recipe import Recipe, Stage
+from vggtjax.training.options import RunOptions
+from vggtjax.training.recipe import Phase, Recipe
 from vggtjax.training.run import Run
 from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient
 
 _AHEAD = 2  # steps that the host may prepare while the device computes
 _TIMED = 2  # steps of each interval in which rendering is timed by itself
-_PLOT_SECONDS = 180.0
 
 # Apart, so that the optimiser, whose shapes are always the same, is compiled once and not for every size of batch.
 _loss_and_gradient = jax.jit(loss_and_gradient, static_argnums=(2, 3))
@@ -39,22 +40,39 @@ logger = logging.getLogger(__name__)
 
 
 class Status(NamedTuple):
-    """How far a run is; given to the progress callback after every row of metrics, and at its start and end."""
+    """The progress of a run, at its start, after every row of metrics and at its end."""
 
     step: int
     total_steps: int
-    stage: int
+    phase: int
     seconds: float  # spent training, all runs together
-    seconds_left: float | None  # at the pace of this run, or until it is to stop; None while that is not known
+    seconds_left: float | None  # at the pace of this run, or until its time is over; None while unknown
     metrics: Row  # the last row
 
 
-class Outcome(NamedTuple):
-    """What a run leaves: its state, whether all steps are done, and the exported model."""
+class RunOutcome(NamedTuple):
+    """The result of a run: its state, whether all steps are done, and the exported model."""
 
     state: TrainingState
     finished: bool
     model: Path
+
+
+@dataclass(frozen=True)
+class Task:
+    """The data and the loss of a run; by default generated scenes and VGGT's losses.
+
+    Attributes:
+        textures: second argument of `make_batch`; None for the textures of the training split.
+        make_batch: (key, textures, phase, frames) -> batch, with the last two static.
+        init_probes: (seed, config) -> parameters of the objective alone.
+        objective: (trained, batch, config, weights, *, compute_dtype, remat) -> loss, metrics.
+    """
+
+    textures: Any = None
+    make_batch: Callable[..., Any] = make_scene_batch
+    init_probes: Callable[..., Params] = init_scene_probes
+    objective: Objective = scene_objective
 
 
 def train(
@@ -62,128 +80,130 @@ def train(
     out: str | Path,
     *,
     init: Params | None = None,
+    options: RunOptions | None = None,
     progress: Callable[[Status], object] | None = None,
-    stop_after: float | None = None,
-    log_every: int = 50,
-    checkpoint_seconds: float = 600.0,
-    export_dtype: DType = "float32",
-    textures: Any = None,
-    make_batch: Callable[..., Any] = make_scene_batch,
-    init_probes: Callable[..., Params] = init_scene_probes,
-    objective: Objective = scene_objective,
-) -> Outcome:
-    """Train a model, or go on from the newest checkpoint in `out`.
+    task: Task | None = None,
+) -> RunOutcome:
+    """Train a model, or resume from the newest checkpoint in `out`.
 
-    The batch of a step depends on the recipe and the step alone, so a run that was interrupted gives the numbers of one
-    that was not (on a GPU as far as its sums have a fixed order: XLA_FLAGS=--xla_gpu_deterministic_ops=true).
-    SIGINT and SIGTERM end the run after the step at hand, with a checkpoint; a second SIGINT ends it at once.
+    The batch of a step depends on the recipe and the step alone, so a resumed run gives the numbers of an uninterrupted
+    one (on a GPU if its sums have a fixed order: XLA_FLAGS=--xla_gpu_deterministic_ops=true).
+    SIGINT and SIGTERM end the run after the current step, with a checkpoint; a second SIGINT ends it at once.
 
     Args:
-        recipe: what to train, on what, and how.
-        out: folder for recipe.json, metrics.csv, metrics.png, checkpoints/ and model.safetensors, which holds the
-            averaged parameters.
+        recipe: the model, the data, the losses and the optimiser.
+        out: folder for recipe.json, metrics.csv, metrics.png, checkpoints/ and model.safetensors with the averaged
+            parameters.
         init: the model's parameters to start from; None for random ones. Not read when there is a checkpoint.
+        options: intervals of metrics and checkpoints, time limit, type of the exported weights.
         progress: called with a Status.
-        stop_after: seconds after which the run ends early, with a checkpoint; None for never.
-        log_every: steps that a row of metrics averages over.
-        checkpoint_seconds: time between checkpoints.
-        export_dtype: of the parameters in model.safetensors.
-        textures: what `make_batch` takes; None for those of the training split.
-        make_batch: (key, textures, stage, frames) -> batch, with the last two static.
-        init_probes: (seed, config) -> parameters that serve the objective alone.
-        objective: (trained, batch, config, weights, *, compute_dtype, remat) -> loss, metrics.
+        task: the data and the loss.
 
     Raises:
         CheckpointError: the checkpoint in `out` is of another model, or `init` does not fit the recipe's.
         OutputError: `out` cannot be written.
         VggtjaxError: 50 steps in a row had a loss or gradient that is not finite.
     """
-    if textures is None:
-        from vggtjax.scenes import load_textures
-
-        textures = load_textures("training")
-    run = Run(recipe, Path(out), init_probes(recipe.seed, recipe.model), init, export_dtype)
-    where = placement(recipe)
-    textures = jax.device_put(textures, where.whole)
-    batch_of = jax.jit(make_batch, static_argnums=(2, 3), out_shardings=where.by_clip)
-    key = jax.random.key(recipe.data_seed)
-    seen: set[tuple[Stage, int]] = set()  # what is compiled, and can be timed
-    ahead: deque[Metrics] = deque()
-    began = saved = plotted = time.perf_counter()
-    mark: tuple[float, int] | None = None  # time and step of the first row: what came before was mostly compiling
-    timed = 0
-
-    def report() -> None:
-        if progress is not None:
-            now, left = time.perf_counter(), None
-            if mark is not None and run.step > mark[1]:
-                left = (now - mark[0]) / (run.step - mark[1]) * (recipe.total_steps - run.step)
-            if stop_after is not None:
-                left = min(math.inf if left is None else left, max(began + stop_after - now, 0.0))
-            progress(Status(run.step, recipe.total_steps, run.stage, run.seconds, left, run.row))
-
-    report()
+    options, task = options or RunOptions(), task or Task()
+    run = Run(recipe, Path(out), task.init_probes(recipe.seed, recipe.model), init, options)
+    trainer = _Trainer(run, task)
+    pace = _Pace(run, progress)
+    pace.report()
     with _signals() as received:
         while run.step < recipe.total_steps:
-            index, stage = recipe.stage_at(run.step)
-            frames = draw_frames(recipe, run.step)
-            step_key = jax.random.fold_in(key, run.step)
-            to_time = timed < _TIMED and (stage, frames) in seen
-            if to_time:
-                jax.block_until_ready(run.state)
-            started = time.perf_counter()
-            batch = batch_of(step_key, textures, stage, frames)
-            if to_time:
-                jax.block_until_ready(batch)
-            rendered = time.perf_counter()
-            metrics, gradient = _loss_and_gradient(run.state.trained, batch, recipe, objective)
-            run.state, metrics = _apply_gradient(run.state, gradient, metrics, recipe)
-            del batch, gradient
-            if to_time:
-                jax.block_until_ready(metrics)
-                share = (rendered - started) / (time.perf_counter() - started)
-                run.averages.add({"render_share": share})
-                timed += 1
-            seen.add((stage, frames))
-            ahead.append(metrics)
-            run.advance(index, stage, metrics)
-            if len(ahead) > _AHEAD:
-                jax.block_until_ready(ahead.popleft())
-            if run.step % log_every == 0 or run.step == recipe.total_steps:
+            trainer.step()
+            if run.step % options.log_every == 0 or run.step == recipe.total_steps:
                 run.log()
-                report()
-                mark = mark or (time.perf_counter(), run.step)
-                timed = 0
-            now = time.perf_counter()
-            if now - plotted > _PLOT_SECONDS:
-                run.plot()
-                plotted = time.perf_counter()
-            stopping = bool(received) or (stop_after is not None and now - began >= stop_after)
-            if stopping or now - saved > checkpoint_seconds:
-                run.save()
-                saved = time.perf_counter()
+                pace.report()
+                trainer.timed = 0
+            stopping = bool(received) or pace.seconds_left <= 0
+            run.keep(save=stopping)
             if stopping:
                 break
         finished = run.step == recipe.total_steps
         run.save()
         run.plot()
-        report()
+        pace.report()
     if received and not finished:
         if received[0] == signal.SIGINT:
             raise KeyboardInterrupt
         raise SystemExit(128 + received[0])
-    return Outcome(run.state, finished, run.model_path)
+    return RunOutcome(run.state, finished, run.model_path)
 
 
 def draw_frames(recipe: Recipe, step: int) -> int:
-    """Return the number of frames of a step's clips: one of its stage's, by the data seed and the step."""
-    _, stage = recipe.stage_at(step)
-    return int(np.random.default_rng((recipe.data_seed, step)).choice(stage.frames))
+    """Return the number of frames of a step's clips: one of its phase's, by the data seed and the step."""
+    _, phase = recipe.phase_at(step)
+    return int(np.random.default_rng((recipe.data_seed, step)).choice(phase.frames))
+
+
+class _Trainer:
+    """The compiled parts of a step; in the first steps of each interval, rendering is timed."""
+
+    def __init__(self, run: Run, task: Task) -> None:
+        where = placement(run.recipe)
+        textures = load_textures("training") if task.textures is None else task.textures
+        self._run, self._objective = run, task.objective
+        self._textures = jax.device_put(textures, where.whole)
+        self._make_batch = jax.jit(task.make_batch, static_argnums=(2, 3), out_shardings=where.by_clip)
+        self._key = jax.random.key(run.recipe.data_seed)
+        self._compiled: set[tuple[Phase, int]] = set()
+        self._ahead: deque[Metrics] = deque()
+        self.timed = 0  # steps timed since the last row of metrics
+
+    def step(self) -> None:
+        """Do one step of the run."""
+        run, recipe = self._run, self._run.recipe
+        index, phase = recipe.phase_at(run.step)
+        frames = draw_frames(recipe, run.step)
+        is_timed = self.timed < _TIMED and (phase, frames) in self._compiled
+        wait = jax.block_until_ready if is_timed else lambda tree: tree
+        wait(run.state)
+        began = time.perf_counter()
+        batch = wait(self._make_batch(jax.random.fold_in(self._key, run.step), self._textures, phase, frames))
+        rendered = time.perf_counter()
+        metrics, gradient = _loss_and_gradient(run.state.trained, batch, recipe, self._objective)
+        run.state, metrics = wait(_apply_gradient(run.state, gradient, metrics, recipe))
+        if is_timed:
+            run.averages.add({"render_share": (rendered - began) / (time.perf_counter() - began)})
+            self.timed += 1
+        self._compiled.add((phase, frames))
+        run.advance(index, phase, metrics)
+        self._ahead.append(metrics)
+        if len(self._ahead) > _AHEAD:
+            jax.block_until_ready(self._ahead.popleft())
+
+
+class _Pace:
+    """The time that a run has taken and has left, for its progress callback and its time limit."""
+
+    def __init__(self, run: Run, progress: Callable[[Status], object] | None) -> None:
+        self._run, self._progress, self._began = run, progress, time.perf_counter()
+        self._first: tuple[float, int] | None = None  # time and step of the first row: before it, most is compilation
+
+    @property
+    def seconds_left(self) -> float:
+        """Seconds until the time limit; infinite without one."""
+        limit = self._run.options.seconds
+        return math.inf if limit is None else self._began + limit - time.perf_counter()
+
+    def report(self) -> None:
+        """Call the progress callback."""
+        run, total, left = self._run, self._run.recipe.total_steps, math.inf
+        now = time.perf_counter()
+        if self._first is not None and run.step > self._first[1]:
+            left = (now - self._first[0]) / (run.step - self._first[1]) * (total - run.step)
+        if self._first is None and run.row:
+            self._first = now, run.step
+        left = min(left, max(self.seconds_left, 0.0))
+        if self._progress is not None:
+            known = left if math.isfinite(left) else None
+            self._progress(Status(run.step, total, run.phase, run.seconds, known, run.row))
 
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Yield a list that SIGINT and SIGTERM are put into while the block runs; a second SIGINT interrupts at once."""
+    """Yield a list of the SIGINT and SIGTERM received while the block runs; a second SIGINT interrupts at once."""
     received: list[int] = []
 
     def note(number: int, _: Any) -> None:

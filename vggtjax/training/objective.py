@@ -19,6 +19,7 @@ from vggtjax.network.model import DENSE_HEADS
 from vggtjax.network.pose import quaternion_to_matrix
 from vggtjax.network.precision import full_precision
 from vggtjax.scenes.render import SyntheticClip
+from vggtjax.storage.json_values import Natural, NotNegative, check_fields
 from vggtjax.training.matching import MatchLoss
 from vggtjax.training.truth import Matches, Targets, matches, targets
 
@@ -40,17 +41,20 @@ class LossWeights:
         moments: another one of the camera tokens: means of the flow from which their camera's motion can be solved.
     """
 
-    translation: float = 1.0
-    rotation: float = 5.0
-    field_of_view: float = 1.0
-    huber: float = 0.0
-    depth: float = 1.0
-    points: float = 1.0
-    gradient: float = 1.0
-    match: float = 0.0
-    match_layers: tuple[int, ...] = (1, 2, 3)
-    probe: float = 0.0
-    moments: float = 0.0
+    translation: NotNegative = 1.0
+    rotation: NotNegative = 5.0
+    field_of_view: NotNegative = 1.0
+    huber: NotNegative = 0.0
+    depth: NotNegative = 1.0
+    points: NotNegative = 1.0
+    gradient: NotNegative = 1.0
+    match: NotNegative = 0.0
+    match_layers: tuple[Natural, ...] = (1, 2, 3)
+    probe: NotNegative = 0.0
+    moments: NotNegative = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self, "losses")
 
 
 def init_probes(seed: int, config: VGGTConfig) -> Params:

@@ -1,4 +1,4 @@
-"""What a training run has counted and written so far: its state, averages, checkpoints and tables."""
+"""The bookkeeping of a training run: its state, averages, checkpoints, tables and exported model."""
 
 from __future__ import annotations
 
@@ -10,31 +10,33 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from vggtjax.checkpoint import DType, numpy_dtype, save_model
+from vggtjax.checkpoint import numpy_dtype, save_model
 from vggtjax.errors import CheckpointError, VggtjaxError
 from vggtjax.network.layers import Params
 from vggtjax.storage.writing import writing
 from vggtjax.training import checkpoints
 from vggtjax.training.devices import placement
 from vggtjax.training.metrics import Averages, MetricsFile, Row, plot
-from vggtjax.training.recipe import Recipe, Stage
+from vggtjax.training.options import RunOptions
+from vggtjax.training.recipe import Phase, Recipe
 from vggtjax.training.state import Metrics, exported, initial_state, state_shapes
 
 MOST_SKIPPED = 50  # steps in a row that may be skipped
+_PLOT_SECONDS = 180.0
 
 logger = logging.getLogger(__name__)
 
 
 class Run:
-    """What a run has written and counted so far."""
+    """The state and the counts of a run, and the files in its folder."""
 
     def __init__(
-        self, recipe: Recipe, out: Path, probes: Params, init: Params | None = None, export_dtype: DType = "float32"
+        self, recipe: Recipe, out: Path, probes: Params, init: Params | None = None, options: RunOptions | None = None
     ) -> None:
-        """Take up the newest checkpoint in `out`, or begin with `init` (None for random parameters) and `probes`."""
-        self.recipe, self.out, self.export_dtype = recipe, out, numpy_dtype(export_dtype)
+        """Resume from the newest checkpoint in `out`, or start with `probes` and `init` (None: random parameters)."""
+        self.recipe, self.out, self.options = recipe, out, options or RunOptions()
         self.checkpoints, self.model_path = out / "checkpoints", out / "model.safetensors"
-        self.step, self.stage, self.samples, self.skipped_in_a_row = 0, 0, 0, 0
+        self.step, self.phase, self.samples, self.skipped_in_a_row = 0, 0, 0, 0
         self.averages = Averages()
         self.pending: list[Metrics] = []  # of the last steps, on the device
         self.row: Row = {}
@@ -48,16 +50,16 @@ class Run:
         with writing(out / "recipe.json") as temporary:
             temporary.write_text(recipe.to_json(), "utf-8")
         self.table = MetricsFile(out / "metrics.csv", last_step=self.step)
-        self.began = time.perf_counter()
+        self.began = self._saved_at = self._plotted_at = time.perf_counter()
 
     @property
     def seconds(self) -> float:
         """Time spent training, all runs together."""
         return self.earlier + time.perf_counter() - self.began
 
-    def advance(self, index: int, stage: Stage, metrics: Metrics) -> None:
+    def advance(self, index: int, phase: Phase, metrics: Metrics) -> None:
         """Count a step."""
-        self.stage, self.step, self.samples = index, self.step + 1, self.samples + stage.batch
+        self.phase, self.step, self.samples = index, self.step + 1, self.samples + phase.batch
         self.pending.append(metrics)
         if len(self.pending) >= MOST_SKIPPED:
             self.collect()
@@ -79,12 +81,19 @@ class Run:
     def log(self) -> None:
         """Write a row of metrics."""
         self.collect()
-        place = {"step": self.step, "stage": self.stage, "seconds": round(self.seconds, 3), "samples": self.samples}
+        place = {"step": self.step, "stage": self.phase, "seconds": round(self.seconds, 3), "samples": self.samples}
         self.row = {**place, **self.averages.take()}
         self.table.append(self.row)
 
+    def keep(self, *, save: bool) -> None:
+        """Draw the metrics, and write a checkpoint and the model, where these are due (`save`: now)."""
+        if time.perf_counter() - self._plotted_at > _PLOT_SECONDS:
+            self.plot()
+        if save or time.perf_counter() - self._saved_at > self.options.checkpoint_seconds:
+            self.save()
+
     def save(self) -> None:
-        """Write a checkpoint of this step and the averaged model, if there are none yet."""
+        """Write a checkpoint of this step and the averaged model, unless they exist."""
         if self.saved == self.step and self.model_path.exists():
             return
         self.collect()
@@ -95,28 +104,30 @@ class Run:
             "seconds": self.seconds,
         }
         checkpoints.save(self.checkpoints, self.state, self.recipe, notes)
-        averaged = exported(self.state, self.recipe)
-        params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(self.export_dtype, copy=False), averaged)
+        averaged, dtype = exported(self.state, self.recipe), numpy_dtype(self.options.dtype)
+        params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(dtype, copy=False), averaged)
         save_model(self.model_path, params, self.recipe.model, name=self.recipe.name)
-        self.saved = self.step
+        self.saved, self._saved_at = self.step, time.perf_counter()
         logger.info("step %d of %d saved in %s", self.step, self.recipe.total_steps, self.out)
 
     def plot(self) -> None:
         """Draw the metrics."""
         plot(self.table.path, self.out / "metrics.png")
+        self._plotted_at = time.perf_counter()
 
     def _restore(self, probes: Params) -> None:
-        found = checkpoints.restore(self.checkpoints, state_shapes(self.recipe, probes), self.recipe)
-        if found.recipe != self.recipe:
-            logger.warning("the recipe is not the one that the checkpoint was written under; going on with the new one")
-        self.state = jax.device_put(found.state, placement(self.recipe).whole)
-        self.step = self.saved = int(found.state.step)
+        restored = checkpoints.restore(self.checkpoints, state_shapes(self.recipe, probes), self.recipe)
+        if restored.recipe != self.recipe:
+            logger.warning("the recipe differs from that of the checkpoint; resuming with the new recipe")
+        self.state = jax.device_put(restored.state, placement(self.recipe).whole)
+        self.step = self.saved = int(restored.state.step)
+        notes = restored.notes
         try:
-            self.averages = Averages(**found.notes["averages"])
-            self.samples, self.skipped_in_a_row = int(found.notes["samples"]), int(found.notes["skipped_in_a_row"])
-            self.earlier = float(found.notes["seconds"])
+            self.averages = Averages(**notes["averages"])
+            self.samples, self.skipped_in_a_row = int(notes["samples"]), int(notes["skipped_in_a_row"])
+            self.earlier = float(notes["seconds"])
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(
                 f"the checkpoint of step {self.step} in {self.checkpoints} lacks the counts of a training run ({error})"
             ) from None
-        logger.info("going on from step %d of %d in %s", self.step, self.recipe.total_steps, self.out)
+        logger.info("resuming from step %d of %d in %s", self.step, self.recipe.total_steps, self.out)

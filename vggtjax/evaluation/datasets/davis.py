@@ -10,9 +10,10 @@ from pathlib import Path
 
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import files, subfolders
-from vggtjax.evaluation.datasets.frames import FrameChoice
+from vggtjax.evaluation.datasets.frames import Frames
+from vggtjax.evaluation.datasets.layout import Opener
 from vggtjax.evaluation.datasets.maps import mask_reader, read_labels
-from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
+from vggtjax.evaluation.datasets.sequence import Sequence
 
 _RESOLUTION = "480p"
 
@@ -26,9 +27,9 @@ def davis(root: Path) -> dict[str, Opener]:
     raise InputError(f"{root} holds no sequence of DAVIS; expected JPEGImages/{_RESOLUTION} with folders of frames")
 
 
-def _read(root: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
+def _read(root: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
     del gt  # there is one
     pictures = frames.of(list(files(root / "JPEGImages" / _RESOLUTION / name, ".jpg").values()), name)
     labels = files(root / "Annotations" / _RESOLUTION / name, ".png")
     mask, notes = mask_reader(pictures, [labels.get(path.stem) for path in pictures], read_labels)
-    return LabelledSequence(name, tuple(pictures), mask=mask, notes=notes)
+    return Sequence(name, tuple(pictures), mask=mask, notes=notes)
