@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Literal
 
 import numpy as np
@@ -15,7 +14,7 @@ from rich.progress import Progress
 
 from benchmarks.seeded import seeded_tensor
 from vggtjax.storage.tensor_file import Spec, write_tensors
-from vggtjax.storage.writing import writing
+from vggtjax.storage.writing import staging, writing
 
 VGGT_1B = Path(__file__).parents[1] / "tests" / "golden" / "shapes_vggt_1b.json"
 
@@ -95,9 +94,8 @@ def _write_shards(folder: Path, shapes: Shapes, make: Make, shards: int) -> None
 def _write_torch(path: Path, shapes: Shapes, make: Make) -> None:
     import torch
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {}
-    with TemporaryDirectory(prefix=".partial-", dir=path.parent) as folder, writing(path) as temporary:
+    with staging(path.parent) as folder, writing(path) as temporary:
         for number, (name, shape) in enumerate(shapes.items()):  # each lies in a file, not in memory, until saved
             tensors[name] = torch.from_file(f"{folder}/{number}", shared=True, size=prod(shape)).reshape(tuple(shape))
             tensors[name].copy_(torch.from_numpy(make(name)))

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from tests.room import make_room
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.results.reconstruction import Reconstruction
 
 
-def room_and_truth(frames: int = 4, **changes: Any) -> tuple[Reconstruction, Sequence]:
+def room_and_truth(frames: int = 4, **changes: Any) -> tuple[Reconstruction, LabelledSequence]:
     """Return a perfect result, and the sequence that it is of, at twice its size; `changes` replace fields of that."""
     room = make_room(frames)
     intrinsics = room.intrinsics.astype(np.float64)
@@ -23,4 +23,4 @@ def room_and_truth(frames: int = 4, **changes: Any) -> tuple[Reconstruction, Seq
         "world_from_camera": room.world_from_camera.astype(np.float64),
         "intrinsics": intrinsics,
     }
-    return room, Sequence(**(fields | changes))
+    return room, LabelledSequence(**(fields | changes))

@@ -1,6 +1,7 @@
 """Files of this library, and what `load_model` makes of names, paths and PyTorch weights."""
 
 import dataclasses
+import hashlib
 import json
 import logging
 import sys
@@ -20,7 +21,7 @@ from benchmarks.make_checkpoint import make_checkpoint
 from benchmarks.seeded import seeded_state_dict
 from converters import convert_state_dict
 from vggtjax import load_model
-from vggtjax.checkpoint import is_checkpoint, read_model, save_model
+from vggtjax.checkpoint import Model, is_checkpoint, read_model, save_model
 from vggtjax.errors import CheckpointError, InputError, OutputError
 
 
@@ -126,6 +127,37 @@ def test_summary(saved_once, config):
     json.dumps(summary)
 
 
+def test_identity(saved_once, config, tmp_path, monkeypatch):
+    path = tmp_path / "copy.safetensors"
+    path.write_bytes(saved_once.read_bytes())
+    model, again = read_model(path), read_model(path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert model.identity.to_json() == {"name": "tiny model", "sha256": digest}
+    with monkeypatch.context() as patch:
+        patch.setattr(hashlib, "file_digest", None)  # one process hashes a file once
+        assert again.identity == model.identity
+    assert len({model.identity, again.identity, read_model(path, name="other").identity}) == 2
+
+    in_memory = Model(config, jax.tree.map(np.array, model.params), "tiny model")
+    same = Model(config, model.params, "tiny model")
+    assert in_memory.identity == same.identity != model.identity
+    in_memory.params["camera_head"]["empty_pose"][:] += 1
+    retrained = dataclasses.replace(model, params=in_memory.params)
+    half = read_model(path, dtype="bfloat16")
+    other = Model(dataclasses.replace(config, num_heads=1), model.params, "tiny model")
+    assert len({m.identity for m in (model, same, retrained, half, other)}) == 5
+
+
+def test_identity_of_a_file_that_was_replaced(saved_once, tmp_path):
+    path = tmp_path / "copy.safetensors"
+    path.write_bytes(saved_once.read_bytes())
+    model = read_model(path)
+    rewritten(saved_once, tmp_path / "new", {"name": "new"})
+    (tmp_path / "new").replace(path)
+    assert model.identity == dataclasses.replace(model).identity
+    assert model.identity.sha256 != hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 def test_save_is_strict(tree, config, tmp_path):
     flat = flatten_dict(tree, sep=".")
     wrong = {"camera_head": tree["camera_head"], "extra": np.zeros(2, np.float64)}
@@ -209,7 +241,7 @@ def test_reading_torch_layout_as_own_is_refused(shapes, tmp_path):
 def test_demo_model(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     model = load_model("demo")
-    assert (model.name, model.trained, model.dtype) == ("demo", True, "float32")
+    assert (model.name, model.trained, model.dtype, model.origin) == ("demo", True, "float32", {})
     again = load_model("demo")
     assert jax.tree.all(jax.tree.map(np.array_equal, model.params, again.params))
     assert load_model("demo", dtype="bfloat16").dtype == "bfloat16"

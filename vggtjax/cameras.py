@@ -1,4 +1,4 @@
-"""Pinhole cameras on the host: inverses, unprojection, fields of view, frusta.
+"""Pinhole cameras: inverses, unprojection, fields of view, frusta.
 
 Axes are OpenCV's: x right, y down, z forward. Pixel coordinates put edges at integers: a picture spans
 [0, W] x [0, H] and the centre of its first pixel is (0.5, 0.5).
@@ -6,10 +6,17 @@ Axes are OpenCV's: x right, y down, z forward. Pixel coordinates put edges at in
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any, TypeVar
+
 import numpy as np
 from jaxtyping import Float, Float32
 
 from vggtjax.errors import ResultError
+
+if TYPE_CHECKING:
+    import jax
+
+_Array = TypeVar("_Array", np.ndarray, "jax.Array")
 
 FIELD_OF_VIEW_RANGE = (0.01, 3.1)  # radians; beyond it a pinhole camera has no usable focal length
 _FIELD_OF_VIEW_SLACK = 1e-6  # radians; a clamped camera that went through float32 is not clamped again
@@ -31,13 +38,13 @@ def world_from_camera(camera_from_world: Float32[np.ndarray, "S 3 4"]) -> Float3
 
 
 def unproject(
-    depth: Float32[np.ndarray, "S H W"],
-    intrinsics: Float32[np.ndarray, "S 3 3"],
-    camera_from_world: Float32[np.ndarray, "S 3 4"],
+    depth: Float[_Array, "*F H W"],
+    intrinsics: Float[_Array, "*F 3 3"],
+    camera_from_world: Float[_Array, "*F 3 4"],
     *,
     pixel_offset: float,
-) -> Float32[np.ndarray, "S H W 3"]:
-    """Lift every pixel to its point in the world.
+) -> Float[_Array, "*F H W 3"]:
+    """Lift every pixel to its point in the world, on the host or, given jax arrays, on the device.
 
     Args:
         depth: z in the camera; a non-finite depth gives a non-finite point.
@@ -46,15 +53,19 @@ def unproject(
         pixel_offset: where in its cell a pixel is seen. 0.5, the centre, is right for principal points at (W/2, H/2);
             0.0, the corner, is what VGGT's public code does and shifts the points by half a pixel.
     """
-    height, width = depth.shape[1:]
-    u = np.arange(width, dtype=np.float32) + np.float32(pixel_offset)
-    v = np.arange(height, dtype=np.float32) + np.float32(pixel_offset)
-    right = (u - intrinsics[:, 0, 2, None]) / intrinsics[:, 0, 0, None]  # [S, W]
-    down = (v - intrinsics[:, 1, 2, None]) / intrinsics[:, 1, 1, None]  # [S, H]
+    xp: Any = depth.__array_namespace__()
+    *frames, H, W = depth.shape
+    one = (1,) * len(frames)
+    u = (xp.arange(W, dtype=depth.dtype) + pixel_offset).reshape(*one, 1, W)
+    v = (xp.arange(H, dtype=depth.dtype) + pixel_offset).reshape(*one, H, 1)
+    K, translation = intrinsics[..., None, None], camera_from_world[..., None, None, :, 3]
+    right = (u - K[..., 0, 2, :, :]) / K[..., 0, 0, :, :]  # [*F, 1, W]
+    down = (v - K[..., 1, 2, :, :]) / K[..., 1, 1, :, :]  # [*F, H, 1]
     with np.errstate(over="ignore", invalid="ignore"):
-        points = np.stack([right[:, None, :] * depth, down[:, :, None] * depth, depth], axis=-1)
-        points -= camera_from_world[:, None, None, :, 3]
-        return points @ camera_from_world[:, None, :, :3]  # row vectors: p R is R^T p
+        points = xp.stack([right * depth, down * depth, depth], axis=-1)
+        points -= translation
+        points = points.reshape(*frames, H * W, 3) @ camera_from_world[..., :3]  # row vectors: p R is R^T p
+    return points.reshape(*frames, H, W, 3)
 
 
 def clamp_field_of_view(fov: Float[np.ndarray, "S 2"]) -> tuple[Float[np.ndarray, "S 2"], tuple[int, ...]]:

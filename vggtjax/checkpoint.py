@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -34,6 +36,18 @@ _MOST_CONFIG_LETTERS = 2**16
 _MOST_NAME_LETTERS = 200
 
 
+@dataclass(frozen=True)
+class ModelIdentity:
+    """What tells a model from all others: two models of one identity compute the same."""
+
+    name: str
+    sha256: str  # of the file, if the model is as it was read from there; else of configuration and parameters
+
+    def to_json(self) -> dict[str, str]:
+        """Return the identity as plain values, for the settings and records of results."""
+        return dataclasses.asdict(self)
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """A network ready to run."""
@@ -44,6 +58,13 @@ class Model:
     path: Path | None = None  # the file that the parameters are in
     trained: bool = True  # False: random parameters, whose results mean nothing
     origin: Mapping[str, str] = field(default_factory=dict)  # files that it was converted from -> their sha256
+    _file: _FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets it
+
+    @cached_property
+    def identity(self) -> ModelIdentity:
+        """Name and digest of the model. The first use reads all parameters, or the file that they are in."""
+        in_file = self._file is not None and self._file == _file_facts(self._file.path)
+        return ModelIdentity(self.name, _file_digest(self._file) if in_file else _params_digest(self))
 
     @property
     def parameter_count(self) -> int:
@@ -92,32 +113,37 @@ def is_checkpoint(path: str | Path) -> bool:
     return is_tensor_file(path) and read_tensors(path).metadata.get("format") == FORMAT
 
 
-def read_model(path: str | Path, *, dtype: DType | None = None) -> Model:
-    """Read a file of this library; the parameters keep its types unless `dtype` says otherwise.
+def read_model(path: str | Path, *, dtype: DType | None = None, name: str | None = None) -> Model:
+    """Read a file of this library.
+
+    Args:
+        path: the file.
+        dtype: of the parameters; None keeps the types of the file.
+        name: of the model; None keeps the name in the file.
 
     Raises:
         CheckpointError: the file is no whole checkpoint of this library, or does not fit the configuration in it; all
             problems at once.
     """
     path = Path(path)
+    facts = _file_facts(path)
     tensors, metadata = read_tensors(path)
     config = _config(path, metadata)
     _check(f"{path} does not fit the configuration in it", tensors, config)
     content = np.asarray(np.memmap(path, np.uint8, mode="r"))
     flat = {}
-    for name, stored in tensors.items():
+    for key, stored in tensors.items():
         tensor = stored.within(content)
         if dtype is not None:
             tensor = tensor.astype(numpy_dtype(dtype), copy=False)
-        flat[name] = jax.device_put(tensor).block_until_ready()  # on a CPU a view of the file, if aligned there
-    name = metadata.get("name", "")
-    return Model(
-        config,
-        unflatten_dict(flat, sep="."),
-        name if name.isprintable() and 0 < len(name) <= _MOST_NAME_LETTERS else path.stem,
-        path,
-        origin=_origin(metadata.get("origin", "{}")),
-    )
+        flat[key] = jax.device_put(tensor).block_until_ready()  # on a CPU a view of the file, if aligned there
+    stored_name = metadata.get("name", "")
+    is_valid = stored_name.isprintable() and 0 < len(stored_name) <= _MOST_NAME_LETTERS
+    name = name or (stored_name if is_valid else path.stem)
+    model = Model(config, unflatten_dict(flat, sep="."), name, path, origin=_origin(metadata.get("origin", "{}")))
+    if all(flat[key].dtype == stored.dtype for key, stored in tensors.items()):
+        object.__setattr__(model, "_file", facts)
+    return model
 
 
 def save_model(path: str | Path, params: Params, config: VGGTConfig, *, name: str | None = None) -> Path:
@@ -204,6 +230,44 @@ def _config(path: Path, metadata: Mapping[str, str]) -> VGGTConfig:
     return parse_json(
         metadata.get("config", ""), VGGTConfig, subject, most_bytes=_MOST_CONFIG_LETTERS, error=CheckpointError
     )
+
+
+class _FileFacts(NamedTuple):
+    """What changes when a file does."""
+
+    path: Path
+    size: int
+    modified: int  # nanoseconds
+    inode: int
+
+
+def _file_facts(path: Path) -> _FileFacts | None:
+    try:
+        stat = path.stat()
+        return _FileFacts(path.resolve(), stat.st_size, stat.st_mtime_ns, stat.st_ino)
+    except OSError:
+        return None
+
+
+@lru_cache(maxsize=64)
+def _file_digest(facts: _FileFacts) -> str:
+    """Return the sha256 of a file, also of an earlier process where programs are kept: hashing 5 GB takes seconds."""
+
+    def digest() -> str:
+        with facts.path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+
+    return kept_text(f"sha256 {facts}", digest)
+
+
+def _params_digest(model: Model) -> str:
+    digest = hashlib.sha256(model.config.to_json().encode())
+    flat: dict[str, Any] = flatten_dict(model.params, sep=".")
+    for name, leaf in sorted(flat.items()):
+        values = np.ascontiguousarray(leaf)
+        digest.update(f"{name} {values.dtype} {values.shape}".encode())
+        digest.update(values.reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()
 
 
 def _origin(text: str) -> dict[str, str]:

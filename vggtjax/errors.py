@@ -1,6 +1,7 @@
 """Exceptions of the public boundary: one clear sentence each; the command line turns them into exit code 2."""
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 
 _MOST_PROBLEMS = 20  # spelt out in one message
 
@@ -38,6 +39,12 @@ class MissingExtraError(VggtjaxError, ImportError):
 
     def __init__(self, purpose: str, extra: str) -> None:
         super().__init__(f"{purpose} needs the extra '{extra}': pip install 'vggtjax[{extra}]'")
+
+
+def check_extra(purpose: str, extra: str, *modules: str) -> None:
+    """Raise MissingExtraError unless all modules of an extra are installed: before hours are spent."""
+    if not all(find_spec(module) for module in modules):
+        raise MissingExtraError(purpose, extra)
 
 
 def problems_sentence(subject: str, problems: Sequence[str]) -> str:

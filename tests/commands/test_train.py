@@ -64,7 +64,7 @@ def test_bad_input(recipe, tmp_path, monkeypatch):
     with pytest.raises(CheckpointError):
         command.train(recipe, tmp_path / "out", init="demo")  # another configuration
     assert not (tmp_path / "out").exists()
-    monkeypatch.setattr(command, "find_spec", lambda name: None)
+    monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"vggtjax\[train\]"):
         command.train(recipe, tmp_path / "out")
 

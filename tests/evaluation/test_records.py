@@ -33,10 +33,10 @@ class Perfect:
         self.groups, self.failing, self.calls, self.sum = groups, failing, [], sum_of
         self.names = [name for group in groups for name in group]
 
-    def identity(self, name, sequence):
+    def fingerprint(self, name, sequence):
         return self.sum
 
-    def make(self, names, sequence, on_stage):
+    def results(self, names, sequence, on_stage):
         self.calls.append((sequence.name, tuple(names)))
         if sequence.name in self.failing:
             raise ClipError(f"{sequence.name} cannot be read")

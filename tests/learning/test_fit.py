@@ -9,20 +9,11 @@ import pytest
 
 from tests.generated import STATIC
 from tests.generated import clips as rendered
+from tests.simulated import simulate
 from vggtjax.errors import InputError
 from vggtjax.learning.fit import FitClips, FitConfig, clip_losses, fit_fusion
 from vggtjax.learning.objectives import View, joint_negative_log_likelihood
-from vggtjax.learning.search import (
-    candidate_losses,
-    free_vector,
-    grid_candidates,
-    hessian_vector_product,
-    jacobian,
-    random_candidates,
-    standard_errors,
-    take_candidate,
-)
-from vggtjax.learning.simulate import simulate
+from vggtjax.learning.sandwich import standard_errors
 from vggtjax.method.fusion_rule import PRESETS, Observations, fuse, identity, log_precisions, parse_family
 from vggtjax.method.passes import Cameras
 
@@ -191,59 +182,11 @@ def test_frames_that_agree_need_no_truth():
     zero = jnp.zeros(clip.depth.shape)
     seen = Observations(1.2 * clip.depth, zero, clip.depth, zero, zero, zero - 1, jnp.zeros((*zero.shape, 4)))
     view = View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
-    trusted = grid_candidates({"scale1": [-2.0, 2.0], "scale2": [2.0]})
-    trusted["scale"] = trusted["scale"].at[1, 1].set(-2.0)
+    clips = FitClips(seen, zero, view)
     for objective in ("photometric", "geometric"):
-        second, first = np.asarray(candidate_losses(trusted, FitClips(seen, zero, view), objective)).mean(axis=1)
+        trusted = [identity() | {"scale": jnp.asarray(scale)} for scale in ([-2.0, 2.0], [2.0, -2.0])]
+        second, first = (float(clip_losses(params, clips, objective).mean()) for params in trusted)
         assert second < first, objective
-
-
-def test_candidates_in_one_call_are_one_by_one():
-    clips = simulated(9, 3, 200)
-    candidates = random_candidates(jax.random.key(0), 40, ("scale", "power", "floor", "correlation"), 0.3)
-    losses = candidate_losses(candidates, clips, "gaussian")
-    assert losses.shape == (40, 3)
-    for index in (0, 17, 39):
-        alone = clip_losses(take_candidate(candidates, index), clips, "gaussian")
-        assert np.allclose(losses[index], alone, rtol=1e-5)
-    assert float(np.asarray(candidates["floor"]).min()) >= 0
-
-
-def test_a_grid_finds_the_correlation():
-    grid = grid_candidates({"correlation": np.linspace(-0.9, 0.9, 19).tolist(), "scale1": [2.0, 2.5], "scale2": [1.5]})
-    assert grid["scale"].shape == (38, 2)
-    grid |= {"power": jnp.broadcast_to(TRUE["power"], (38, 2))}
-    losses = np.asarray(candidate_losses(grid, simulated(10, 8, 3000), "joint")).mean(axis=1)
-    best = take_candidate(grid, int(losses.argmin()))
-    assert float(best["correlation"]) == pytest.approx(0.5, abs=0.06)
-    assert best["scale"].tolist() == [2.5, 1.5]
-    for name in ("nothing", "correlation2", ""):
-        with pytest.raises(InputError, match=f"'{name}' is no part"):
-            grid_candidates({name: [1.0]})
-
-
-def test_curvature_by_finite_differences():
-    clips, true = simulated(11, 4, 200), TRUE
-    with jax.enable_x64(True):
-        clips, true = jax.tree.map(lambda x: jnp.asarray(np.asarray(x, np.float64)), (clips, true))
-        at, tree = free_vector(true, FAMILY)
-        assert at.shape == (5,)
-        assert jax.tree.all(jax.tree.map(np.array_equal, tree(at), true))
-
-        def loss(params):
-            return clip_losses(params, clips, "joint").mean()
-
-        vector = jnp.asarray([1.0, -0.5, 0.3, 0.2, 1.5])
-        gradient = jax.jit(jax.grad(lambda x: loss(tree(x))))
-        wanted = (gradient(at + 1e-5 * vector) - gradient(at - 1e-5 * vector)) / 2e-5
-        found = jax.jit(lambda vector: hessian_vector_product(loss, true, FAMILY, vector))(vector)
-        assert np.allclose(found, wanted, rtol=1e-5)
-
-        depth = jax.jit(lambda params: fuse(params, clips.seen).depth)
-        slopes = jacobian(depth, true, FAMILY)
-        assert slopes.shape == (*clips.truth.shape, 5)
-        moved = depth(tree(at + 1e-5 * vector)) - depth(tree(at - 1e-5 * vector))
-        assert np.allclose(slopes @ vector, moved / 2e-5, atol=1e-7)
 
 
 def test_standard_errors_of_a_mean_by_hand():

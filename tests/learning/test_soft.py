@@ -10,11 +10,11 @@ import pytest
 
 from tests.tiny import tiny_config
 from vggtjax import forward, infer, init_params
+from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
 from vggtjax.learning.distances import pose_error
-from vggtjax.learning.soft import SoftMasking, lift, reconstruct_softly, soft_masking, soft_pixels
+from vggtjax.learning.soft import SoftMasking, reconstruct_softly, soft_masking, soft_pixels
 from vggtjax.method.fusion_rule import identity
-from vggtjax.method.passes import Cameras
 
 CONFIG = tiny_config(patch_size=8, image_size=32, taps=(0, 1, 2, 3))
 SHAPE = (1, 4, 16, 24, 3)
@@ -101,7 +101,7 @@ def test_constant_saliency_moves_nowhere():
 def test_points_are_lifted_from_pixel_centres():
     camera = jnp.asarray([[1.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]])
     K = jnp.asarray([[2.0, 0, 1.5], [0, 4.0, 1.0], [0, 0, 1]])
-    points = lift(jnp.full((2, 3), 2.0), Cameras(camera, K))
+    points = unproject(jnp.full((2, 3), 2.0), K, camera, pixel_offset=0.5)
     assert np.allclose(points[0, 0], [2 * (0.5 - 1.5) / 2 - 1, 2 * (0.5 - 1) / 4 - 2, 2 - 3])
     assert np.allclose(points[1, 2], [2 * (2.5 - 1.5) / 2 - 1, 2 * (1.5 - 1) / 4 - 2, 2 - 3])
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from vggtjax.commands.report import Report
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_extra
 
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
@@ -72,11 +72,10 @@ def fit_fusion(
         from vggtjax.learning.ablation import ablate, split_clips
         from vggtjax.learning.export import begin, check_folder, save_fits
         from vggtjax.learning.fit import FitConfig
-        from vggtjax.learning.plots import check_matplotlib
         from vggtjax.method.fusion_rule import parse_family
         from vggtjax.pretrained.load import load_model
 
-        check_matplotlib()
+        check_extra("drawing a fit", "train", "matplotlib")
         check_folder(out)
         split_clips(3, 0, held_out)  # says what is wrong with it before any pass is run
         for name in family:

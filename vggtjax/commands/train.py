@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import time
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from vggtjax.commands.report import Report
-from vggtjax.errors import MissingExtraError
+from vggtjax.errors import check_extra
 from vggtjax.training.options import RunOptions
 
 if TYPE_CHECKING:
@@ -36,8 +35,7 @@ def train(
         steps: total number of steps; phases, warm-up and decay keep their shares. The recipe's own by default.
         options: how the run logs, saves and ends.
     """
-    if not all(find_spec(name) for name in ("optax", "orbax", "matplotlib")):
-        raise MissingExtraError("training", "train")
+    check_extra("training", "train", "optax", "orbax", "matplotlib")
     report = Report()
     with report.running():
         with report.stage("prepare"):

@@ -1,5 +1,6 @@
 from .datasets import DATASETS as DATASETS
 from .datasets import open_dataset as open_dataset
+from .datasets.sequence import LabelledSequence as LabelledSequence
 from .datasets.sequence import Sequence as Sequence
 from .metrics.masks import frame_scores as frame_scores
 from .metrics.masks import mask_scores as mask_scores

@@ -8,11 +8,11 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from vggtjax.errors import MissingExtraError
+from vggtjax.errors import check_extra
 from vggtjax.evaluation import tables
-from vggtjax.evaluation.plots import check_matplotlib, draw_sequence
-from vggtjax.evaluation.records import Record, Records, costs, safe_name, summary
-from vggtjax.storage.writing import writing
+from vggtjax.evaluation.plots import draw_sequence
+from vggtjax.evaluation.records import FOLDER, Record, Records, costs, safe_name, summary
+from vggtjax.storage.writing import check_free, writing
 
 PLOT_FOLDER = "plots"
 _MOST_BYTES = 2**28
@@ -30,13 +30,16 @@ def is_report(path: Path) -> bool:
     return isinstance(values, dict) and {"settings", "sequences", "mean"} <= set(values)
 
 
-def check_extras() -> None:
-    """Raise MissingExtraError if what draws the page is not installed."""
-    check_matplotlib()
-    try:
-        import jinja2 as _  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("writing the page of an evaluation", "evaluate") from error
+def check_report(out: Path, store: Records) -> None:
+    """Make sure that `write_report` can write into `out`, before hours are spent.
+
+    Raises:
+        MissingExtraError: what draws the page is not installed.
+        OutputError: the folder cannot be written, or holds files that are not of an evaluation.
+    """
+    check_extra("drawing an evaluation", "evaluate", "matplotlib", "jinja2")
+    replaced = is_report(out / "results.json") or store.is_there()
+    check_free(out, (*NAMES, FOLDER), replaced=replaced, what="evaluation")
 
 
 def write_report(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vggtjax.errors import MissingExtraError
 from vggtjax.results.previews import color_depth, inverse_depth_range, overlay
 from vggtjax.storage.writing import writing
 
@@ -19,14 +18,6 @@ Curves = Mapping[str, Mapping[str, np.ndarray]]  # by method
 _ERROR_SHOWN = 0.5  # relative error of depth at full colour
 _DPI = 110
 _UNKNOWN = "#6f7480"  # where there is no true depth
-
-
-def check_matplotlib() -> None:
-    """Raise MissingExtraError if there is no matplotlib, before hours are spent."""
-    try:
-        import matplotlib as _  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("drawing an evaluation", "evaluate") from error
 
 
 def draw_sequence(folder: Path, curves: Curves) -> list[tuple[str, str]]:

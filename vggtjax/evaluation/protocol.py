@@ -13,7 +13,7 @@ from scipy.ndimage import map_coordinates
 from vggtjax import cameras as geometry
 from vggtjax.clips.truth import Placed, at_clip_pixels, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.metrics.masks import Empty, auc, frame_scores, mask_scores
 from vggtjax.evaluation.metrics.point_clouds import nearest_distances, paired_distance, statistics
 from vggtjax.evaluation.metrics.trajectory import (
@@ -57,7 +57,7 @@ class TruthAtPixels:
     Depth beyond `max_depth` metres counts as unknown.
     """
 
-    def __init__(self, sequence: Sequence, placed: Placed, *, max_depth: float | None = None) -> None:
+    def __init__(self, sequence: LabelledSequence, placed: Placed, *, max_depth: float | None = None) -> None:
         self.sequence = sequence
         self.max_depth = max_depth
         self._placed = placed

@@ -5,47 +5,24 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from vggtjax.errors import InputError, VggtjaxError
-from vggtjax.evaluation.datasets.sequence import Sequence as Clip
+from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.metrics.masks import Empty
 from vggtjax.evaluation.metrics.video_depth import Align
 from vggtjax.evaluation.protocol import TruthAtPixels, score
 from vggtjax.evaluation.records import Record, Records
+from vggtjax.evaluation.sources import ResultSource
+from vggtjax.progress import OnStage, Progress
 from vggtjax.results.reconstruction import Reconstruction
 
-OnStage = Callable[[str], AbstractContextManager[Any]]
 _LOOKED_AT = 3  # frames whose ground truth goes into the fingerprint of a sequence
-_MOST_FILES = 100_000  # of a folder that is fingerprinted
 _STEPS = 100  # of a progress bar, for each method
-
-
-class Results(Protocol):
-    """Where results come from: a model, or folders."""
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of the results for each sequence, in the order of tables."""
-        ...
-
-    @property
-    def groups(self) -> Sequence[Sequence[str]]:
-        """The same names in groups that are made together."""
-        ...
-
-    def identity(self, name: str, sequence: Clip) -> str:
-        """Return text that changes when the result of that name would."""
-        ...
-
-    def make(self, names: Sequence[str], sequence: Clip, on_stage: OnStage) -> Mapping[str, Reconstruction]:
-        """Return results of one group."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -58,8 +35,8 @@ class Scoring:
 
 
 def evaluate(
-    sequences: Mapping[str, Callable[[], Clip]],
-    results: Results,
+    sequences: Mapping[str, Callable[[], LabelledSequence]],
+    source: ResultSource,
     records: Records,
     settings: Mapping[str, Any],
     scoring: Scoring,
@@ -70,7 +47,7 @@ def evaluate(
 
     Args:
         sequences: of a data set, by name; they are opened when it is their turn.
-        results: where results come from.
+        source: where results come from.
         records: where finished ones are looked for, and kept.
         settings: everything else that the numbers depend on. Records are kept with them and with fingerprints of the
             sequence and of the result; those that were made with others are not taken for finished.
@@ -81,13 +58,15 @@ def evaluate(
         A record for each sequence and name of a result, in this order; one that failed says why.
     """
     found: list[Record] = []
-    names = results.names
+    names = source.names
     for number, (title, opener) in enumerate(sequences.items()):
         with on_stage(f"{number + 1}/{len(sequences)} {title}") as progress:
             try:
                 sequence = opener()
                 data = fingerprint(sequence)
-                facts = {name: {**settings, "data": data, "result": results.identity(name, sequence)} for name in names}
+                facts = {
+                    name: {**settings, "data": data, "result": source.fingerprint(name, sequence)} for name in names
+                }
             except (VggtjaxError, MemoryError) as error:
                 for name in names:
                     found.append(_failed(title, name, settings, error))
@@ -95,16 +74,16 @@ def evaluate(
                 continue
             kept = {name: records.kept(title, name, facts[name]) for name in names}
             truth = _Truths(sequence, scoring.max_depth)
-            missing = [[name for name in group if kept[name] is None] for group in results.groups]
+            missing = [[name for name in group if kept[name] is None] for group in source.groups]
             steps = _Steps(progress, sum(map(len, missing)))
             for group in missing:
-                for record in _evaluated(group, sequence, results, truth, facts, records, scoring, steps):
+                for record in _evaluated(group, sequence, source, truth, facts, records, scoring, steps):
                     kept[record.method] = record
             found += [record for record in kept.values() if record is not None]
     return found
 
 
-def fingerprint(sequence: Clip) -> str:
+def fingerprint(sequence: LabelledSequence) -> str:
     """Return a sum of what a sequence is: its pictures by size and date, its cameras, and some of its depth and masks.
 
     Raises InputError where a picture is not there, or what the ground truth is read from.
@@ -126,25 +105,10 @@ def fingerprint(sequence: Clip) -> str:
     return digest.hexdigest()
 
 
-def folder_fingerprint(folder: Path) -> str:
-    """Return a sum of the names, sizes and dates of the files of a folder, or of a file; "" where there is nothing."""
-    digest, count = hashlib.sha256(), 0
-    try:
-        for path in sorted(folder.rglob("*")) if folder.is_dir() else [folder]:
-            count += 1
-            if count > _MOST_FILES:
-                raise InputError(f"{folder} holds more than {_MOST_FILES} files; expected one result")
-            stat = path.stat()
-            digest.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode("utf-8", "surrogateescape"))
-    except OSError:
-        return ""
-    return digest.hexdigest()
-
-
 class _Truths:
     """The ground truth of one sequence at the pixels of results, read once for all that are placed alike."""
 
-    def __init__(self, sequence: Clip, max_depth: float | None) -> None:
+    def __init__(self, sequence: LabelledSequence, max_depth: float | None) -> None:
         self._sequence, self._max_depth = sequence, max_depth
         self._last: TruthAtPixels | None = None
 
@@ -157,7 +121,7 @@ class _Truths:
 class _Steps:
     """Progress over the results of a sequence that are to be scored."""
 
-    def __init__(self, progress: Callable[[int, int | None], object] | None, names: int) -> None:
+    def __init__(self, progress: Progress | None, names: int) -> None:
         self._progress, self._total, self._done = progress, _STEPS * names, 0
 
     def within(self, done: int, total: int) -> None:
@@ -171,8 +135,8 @@ class _Steps:
 
 def _evaluated(
     names: Sequence[str],
-    sequence: Clip,
-    results: Results,
+    sequence: LabelledSequence,
+    source: ResultSource,
     truths: _Truths,
     facts: Mapping[str, Mapping[str, Any]],
     records: Records,
@@ -190,7 +154,7 @@ def _evaluated(
         seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - started
 
     try:
-        made = results.make(names, sequence, timed)
+        made = source.results(names, sequence, timed)
     except (VggtjaxError, MemoryError) as error:
         made, failure = {}, error
     else:
@@ -228,7 +192,7 @@ def _evaluated(
 
 
 def _failed(
-    title: str, name: str, settings: Mapping[str, Any], error: BaseException, sequence: Clip | None = None
+    title: str, name: str, settings: Mapping[str, Any], error: BaseException, sequence: LabelledSequence | None = None
 ) -> Record:
     return Record(
         name=title,

@@ -24,13 +24,7 @@ from .rules import load_fusion as load_fusion
 from .rules import observe as observe
 from .rules import parse_family as parse_family
 from .rules import save_fusion as save_fusion
-from .search import candidate_losses as candidate_losses
-from .search import grid_candidates as grid_candidates
-from .search import hessian_vector_product as hessian_vector_product
-from .search import jacobian as jacobian
-from .search import random_candidates as random_candidates
-from .search import standard_errors as standard_errors
-from .simulate import simulate as simulate
+from .sandwich import standard_errors as standard_errors
 from .soft import SoftMasking as SoftMasking
 from .soft import SoftReconstruction as SoftReconstruction
 from .soft import reconstruct_softly as reconstruct_softly

@@ -173,11 +173,11 @@ def dataset_passes(
     from vggtjax.evaluation.run import fingerprint
 
     side = model.config.image_size if size is None else size
-    found, used = find_sequences(dataset, root), 0
+    found, used = find_sequences(dataset, root, max_frames=max_frames), 0
     max_depth = DATASETS[dataset].max_depth
     key = {"model": identity_of(model), "dataset": [dataset, max_depth], "size": side, "options": options}
     for number, (name, opener) in enumerate(found.items()):
-        sequence = opener() if max_frames is None else opener().taken(slice(max_frames))
+        sequence = opener()
         if sequence.depth is not None and any((sequence.depth(i) > 0).any() for i in range(len(sequence))):
             used += 1
 

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.learning.soft import lift
+from vggtjax.cameras import unproject
 from vggtjax.method.fusion_rule import Fused, FusionParams, Observations, fuse, log_precisions
 from vggtjax.method.passes import Cameras
 from vggtjax.network.precision import full_precision
+from vggtjax.network.sampling import bilinear
 
 Likelihood = Literal["gaussian", "laplace"]
 _MOST = 80.0
@@ -164,7 +165,7 @@ def _reproject(
     depth: Float[Array, "H W"], here: Cameras, there: Cameras
 ) -> tuple[Float[Array, "H W 2"], Float[Array, "H W"]]:
     """Return where another camera sees a frame's pixels (x, y in pixels), and their depth in it."""
-    points = lift(depth, here)
+    points = unproject(depth, here.intrinsics, here.camera_from_world, pixel_offset=0.5)
     pose, K = there
     moved = points @ pose[:, :3].T + pose[:, 3][None, None]
     z = moved[..., 2]
@@ -180,11 +181,4 @@ def _sample(
     place = jnp.where(jnp.isfinite(place), place, -1) - 0.5
     x, y = place[..., 0], place[..., 1]
     inside = (x >= 0) & (x <= W - 1) & (y >= 0) & (y <= H - 1)
-    x, y = jnp.where(inside, x, 0), jnp.where(inside, y, 0)
-    left = jnp.clip(jnp.floor(x), 0, max(W - 2, 0)).astype(jnp.int32)
-    top = jnp.clip(jnp.floor(y), 0, max(H - 2, 0)).astype(jnp.int32)
-    right, bottom = jnp.minimum(left + 1, W - 1), jnp.minimum(top + 1, H - 1)
-    across, down = (x - left)[..., None], (y - top)[..., None]
-    above = maps[top, left] * (1 - across) + maps[top, right] * across
-    below = maps[bottom, left] * (1 - across) + maps[bottom, right] * across
-    return above * (1 - down) + below * down, inside
+    return bilinear(maps, jnp.where(inside[..., None], place, 0)), inside

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from vggtjax.errors import MissingExtraError
 from vggtjax.evaluation.metrics.video_depth import depth_alignment
 from vggtjax.learning.ablation import PAPER, Outcome
 from vggtjax.learning.clip_passes import ClipPasses, observations
@@ -24,14 +23,6 @@ _DPI = 110
 _COLUMNS = 4
 
 _claims = jax.jit(log_precisions)
-
-
-def check_matplotlib() -> None:
-    """Raise MissingExtraError if there is no matplotlib, before anything is fitted."""
-    try:
-        import matplotlib as _  # noqa: F401
-    except ImportError as error:
-        raise MissingExtraError("drawing a fit", "train") from error
 
 
 def draw_fits(

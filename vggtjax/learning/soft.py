@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vggtjax.cameras import unproject
 from vggtjax.config import Gram, MotionConfig, VGGTConfig
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.fusion_rule import FusionParams, fuse, identity, soft_mask
@@ -99,9 +100,8 @@ def reconstruct_softly(
     passes = Passes(first, second, saliency, dynamic)  # pyright: ignore[reportArgumentType]
     fused = fuse(identity() if fusion is None else fusion, observe(passes, config.patch_size))
     cameras = Cameras(*decode_pose(second.pose_encoding, (images.shape[2], images.shape[3])))  # pyright: ignore
-    return SoftReconstruction(
-        fused.depth, fused.log_precision, cameras, lift(fused.depth, cameras), fused.dynamic, passes
-    )
+    points = unproject(fused.depth, cameras.intrinsics, cameras.camera_from_world, pixel_offset=0.5)
+    return SoftReconstruction(fused.depth, fused.log_precision, cameras, points, fused.dynamic, passes)
 
 
 def soft_pixels(
@@ -114,19 +114,3 @@ def soft_pixels(
         return jnp.where(varies, soft_mask(pixels - otsu_threshold(pixels) - masking.offset, masking.temperature), 0)
 
     return jax.vmap(one_clip)(upsample(saliency, size))
-
-
-@full_precision
-def lift(depth: Float[Array, "*F H W"], cameras: Cameras) -> Float[Array, "*F H W 3"]:
-    """Return the points in the world of all pixels, at their centres."""
-    H, W = depth.shape[-2:]
-    y, x = jnp.meshgrid(jnp.arange(H) + 0.5, jnp.arange(W) + 0.5, indexing="ij")
-
-    def one_frame(depth: Float[Array, "H W"], camera: Float[Array, "3 4"], K: Float[Array, "3 3"]):
-        rays = jnp.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], jnp.ones_like(x)], axis=-1)
-        return (depth[..., None] * rays - camera[:, 3][None, None]) @ camera[:, :3]
-
-    function = one_frame
-    for _ in range(depth.ndim - 2):
-        function = jax.vmap(function)
-    return function(depth, cameras.camera_from_world, cameras.intrinsics)

@@ -21,6 +21,7 @@ from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
 from vggtjax.method.clustering import kmeans, nearest_centre
 from vggtjax.network.precision import full_precision
+from vggtjax.network.sampling import bilinear
 
 CLUSTERS = 30
 RESTARTS = 4  # of k-means
@@ -177,18 +178,14 @@ def cluster_losses(
     N = index.shape[1]
     at_once = max(n for n in range(1, S + 1) if S % n == 0 and (n == 1 or n * N <= SAMPLES_AT_ONCE))
     shown = jnp.concatenate([images, dynamic_mask[..., None].astype(images.dtype)], axis=-1)
+    shown = jnp.pad(shown, ((0, 0), (0, 1), (0, 1), (0, 0)))  # 0 outside
     targets = (jnp.arange(S), shown, depth, camera_from_world, intrinsics)
     targets = jax.tree.map(lambda x: x.reshape(S // at_once, at_once, *x.shape[1:]), targets)
 
     def one_frame(source):
         frame, pixels, there, label = source
-        row, column = pixels // W, pixels % W
-        z = depth[frame].ravel()[pixels]
-        inverse = jnp.linalg.inv(intrinsics[frame])
-        places = jnp.stack([column + 0.5, row + 0.5, jnp.ones_like(z)], axis=-1)
-        local = z[:, None] * (places @ inverse.T)
-        rotation, translation = camera_from_world[frame, :, :3], camera_from_world[frame, :, 3]
-        world = (local - translation[None]) @ rotation
+        points = unproject(depth[frame], intrinsics[frame], camera_from_world[frame], pixel_offset=0.5)
+        world = points.reshape(-1, 3)[pixels]
         colour = images[frame].reshape(-1, 3)[pixels]
         member = jax.nn.one_hot(label, clusters) * there[:, None]
 
@@ -200,7 +197,7 @@ def cluster_losses(
             inside = (u > 0) & (u < W) & (v > 0) & (v < H) & (seen[:, 2] > 0)
             u, v = jnp.where(inside, u, 0), jnp.where(inside, v, 0)
             sampled_depth = _nearest(seen_depth, u, v)
-            sampled = _bilinear(shown, u, v)
+            sampled = bilinear(shown, jnp.stack([u, v], axis=-1))
             counts = inside & (seen[:, 2] - OCCLUSION < sampled_depth) & (sampled_depth < jnp.inf)
             counts &= (sampled[:, 3] <= 0.5) & (number != frame)
             off = jnp.abs(sampled_depth - seen[:, 2])
@@ -222,16 +219,6 @@ def _nearest(image: Float[Array, "H W"], u: Float[Array, " N"], v: Float[Array, 
     column, row = jnp.round(u).astype(jnp.int32), jnp.round(v).astype(jnp.int32)
     inside = (column < W) & (row < H)
     return jnp.where(inside, image[jnp.minimum(row, H - 1), jnp.minimum(column, W - 1)], 0)
-
-
-def _bilinear(image: Float[Array, "H W C"], u: Float[Array, " N"], v: Float[Array, " N"]) -> Float[Array, "N C"]:
-    """Sample where u and v, at least 0, count pixel centres from 0; 0 outside."""
-    padded = jnp.pad(image, ((0, 1), (0, 1), (0, 0)))
-    column, row = jnp.floor(u).astype(jnp.int32), jnp.floor(v).astype(jnp.int32)
-    x, y = (u - column)[:, None], (v - row)[:, None]
-    top = padded[row, column] * (1 - x) + padded[row, column + 1] * x
-    bottom = padded[row + 1, column] * (1 - x) + padded[row + 1, column + 1] * x
-    return top * (1 - y) + bottom * y
 
 
 def _check(images, depth, dynamic_mask, camera_from_world, intrinsics, valid) -> None:

@@ -15,6 +15,7 @@ from vggtjax.network.attention import attention
 from vggtjax.network.dpt_head import DPTFeatures, add_positions, declare_features, frames_at_once, resize_aligned
 from vggtjax.network.layers import MLP, LayerNorm, Params, apply, declare
 from vggtjax.network.precision import full_precision
+from vggtjax.network.sampling import bilinear, neighbours
 
 LAYERS = 6
 VIRTUAL_TRACKS = 64
@@ -59,10 +60,11 @@ def predict_tracks(
     maps = _feature_maps(params, taps, config, grid)  # [B, S, H, W, F]
     size = (maps.shape[2], maps.shape[3])
     query = query_points / STRIDE
-    features = jax.vmap(_sample)(maps[:, 0], query)  # [B, Q, F]
+    inside = jnp.clip(query, 0, jnp.asarray([[[size[1] - 1, size[0] - 1]]]))
+    features = jax.vmap(bilinear)(maps[:, 0], inside)  # [B, Q, F]
     features = jnp.broadcast_to(features[:, None], (B, S, *features.shape[1:]))
     pyramid = _pyramid(maps, config.track_corr_levels, config.track_corr_radius)
-    place = _position_embedding(query, size, 3 * F + 4)[:, :, None]  # [B, Q, 1, E]
+    place = _position_embedding(inside, size, 3 * F + 4)[:, :, None]  # [B, Q, 1, E]
     later = (np.arange(S) > 0).astype(np.int32)
     kind = params["query_token"][later][None, None]  # [1, 1, S, E]
     start = jnp.broadcast_to(query[:, None], (B, S, *query.shape[1:]))
@@ -179,26 +181,9 @@ def _level(maps, features, positions, size: tuple[int, int], window: int) -> Flo
     return jax.vmap(jax.vmap(one, (None, 0, 0, 0)))(maps, features, corner, fraction)
 
 
-def _sample(image: Float[Array, "H W F"], positions: Float[Array, "Q 2"]) -> Float[Array, "Q F"]:
-    """Sample bilinearly at x, y; positions outside are moved to the edge."""
-    low, high, fraction = _between(positions, (image.shape[0], image.shape[1]))
-    x, y = fraction[:, :1], fraction[:, 1:]
-    top = image[low[:, 1], low[:, 0]] * (1 - x) + image[low[:, 1], high[:, 0]] * x
-    bottom = image[high[:, 1], low[:, 0]] * (1 - x) + image[high[:, 1], high[:, 0]] * x
-    return top * (1 - y) + bottom * y
-
-
-def _between(positions: Float[Array, "... 2"], size: tuple[int, int]) -> tuple[Array, Array, Array]:
-    """Return the pixels below and above positions x, y that are moved into the image, and the share of those above."""
-    last = jnp.asarray([size[1] - 1, size[0] - 1]).reshape((1,) * (positions.ndim - 1) + (2,))
-    position = jnp.clip(positions, 0, last)
-    low = jnp.floor(position).astype(jnp.int32)
-    return low, jnp.minimum(low + 1, last), position - low
-
-
 def _position_embedding(query: Float[Array, "B Q 2"], size: tuple[int, int], E: int) -> Float[Array, "B Q E"]:
     """Sinusoids of x, then of y, at whole pixels and linear between them, as a sampled table of them is."""
-    low, high, fraction = _between(query, size)
+    low, high, fraction = neighbours(query, size)
     frequencies = jnp.asarray(1.0 / 10000 ** (np.arange(E // 4) / (E / 4)), jnp.float32)
 
     def waves(position: Array) -> Array:

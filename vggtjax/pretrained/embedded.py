@@ -27,8 +27,7 @@ def demo_model(dtype: DType = "float32") -> Model:
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
-    model = read_model(MODEL, dtype=dtype)
-    return Model(model.config, model.params, "demo", model.path)
+    return read_model(MODEL, dtype=dtype, name="demo")
 
 
 def demo_clip() -> Truth:

@@ -4,37 +4,38 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
-import tempfile
+import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from secrets import token_hex
+
+from filelock import FileLock, Timeout
 
 from vggtjax.errors import OutputError
 
 _MOST_JSON_BYTES = 2**24
+_LEFTOVER = re.compile(r"\.partial-\w+(\.lock)?|\..+\.partial(\.\w+)?")  # temporary names, of earlier versions too
+_OLD = 24 * 3600  # seconds; no writer takes this long
+_TRIES = 8
 
 
 @contextmanager
 def writing(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success it is synced and renamed to `path`, else removed.
+    """Yield a temporary path for a file or folder; on success it is synced and renamed to `path`, else removed.
 
     Raises OutputError where the folder cannot be written or the disk is full.
     """
     path = Path(path)
-    with _explaining(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=f".partial{path.suffix}", dir=path.parent)
-        os.close(handle)
-        temporary = Path(name)
-        try:
-            yield temporary
-            temporary.chmod(0o666 & ~_umask())
+    with _explaining(path), _staged(path.parent) as staged:
+        temporary = staged / path.name
+        yield temporary
+        if not temporary.is_dir():
             with temporary.open("rb+") as file:
                 os.fsync(file.fileno())
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        temporary.replace(path)
 
 
 @contextmanager
@@ -44,15 +45,27 @@ def staging(folder: str | Path) -> Iterator[Path]:
     Write everything there, then rename into place: a rename within one folder cannot run out of space.
     Raises OutputError where the folder cannot be written or the disk is full.
     """
-    folder = Path(folder)
-    with _explaining(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=".partial-", dir=folder))
-        try:
-            temporary.chmod(0o777 & ~_umask())
-            yield temporary
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+    with _explaining(Path(folder)), _staged(Path(folder)) as staged:
+        yield staged
+
+
+@contextmanager
+def locked_folder(folder: str | Path, what: str) -> Iterator[None]:
+    """Keep other runs, which lock the same folder (made if missing), from writing `what` there at the same time.
+
+    The operating system releases the lock of a killed process. Raises OutputError where another run holds the lock, or
+    where the folder cannot be written.
+    """
+    path = Path(folder) / ".vggtjax.lock"
+    with _explaining(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = _acquire(path)
+    if lock is None:
+        raise OutputError(f"another run is writing {what} into {folder}; wait for it or choose another folder")
+    try:
+        yield
+    finally:
+        _release(lock)
 
 
 def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str) -> None:
@@ -101,7 +114,53 @@ def _explaining(path: Path) -> Iterator[None]:
         raise OutputError(f"cannot write {path}: {reason}; choose a folder that is writable and has space") from error
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+@contextmanager
+def _staged(folder: Path) -> Iterator[Path]:
+    """Yield a new temporary folder whose lock file, beside it, tells other writers that this one is alive."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _remove_leftovers(folder)
+    lock, name = None, ""
+    for _ in range(_TRIES):  # another writer can take the lock file for a leftover before it is locked
+        name = f".partial-{token_hex(4)}"
+        try:
+            lock = _acquire(folder / f"{name}.lock")
+        except OSError:  # a file system without locks: leftovers go by their age
+            break
+        if lock is not None:
+            break
+    staged = folder / name
+    try:
+        staged.mkdir()
+        yield staged
+    finally:
+        shutil.rmtree(staged, ignore_errors=True)
+        if lock is not None:
+            _release(lock)
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove what killed writers left in a folder: their locks are free, or their files are old."""
+    for path in [Path(entry) for entry in os.scandir(folder) if _LEFTOVER.fullmatch(entry.name)]:
+        with suppress(OSError):  # files of another user, or of a writer that ends now
+            if path.suffix == ".lock":
+                if (lock := _acquire(path)) is not None:
+                    shutil.rmtree(path.with_suffix(""), ignore_errors=True)
+                    _release(lock)
+            elif time.time() - path.lstat().st_mtime > _OLD and not path.with_name(f"{path.name}.lock").exists():
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def _acquire(path: Path) -> FileLock | None:
+    """Return the lock of a file that is made if missing; None if another writer holds the lock."""
+    lock = FileLock(path, timeout=0, thread_local=False)
+    try:
+        lock.acquire()
+    except Timeout:
+        return None
+    return lock
+
+
+def _release(lock: FileLock) -> None:
+    with suppress(OSError):  # Windows removes no open file
+        Path(lock.lock_file).unlink(missing_ok=True)  # while the lock is held: nobody else holds it then
+    lock.release()

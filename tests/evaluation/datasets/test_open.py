@@ -10,7 +10,7 @@ from tests.dataset_files import depth_png, opened, picture, png, write
 from vggtjax.clips.images import read_image
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets import DATASETS, published
-from vggtjax.evaluation.datasets.frames import Frames
+from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.plain import takes
 from vggtjax.evaluation.metrics.trajectory import checked_poses
 
@@ -61,12 +61,12 @@ def depth_differences(sequence, source, target):
 
 
 def test_frames_are_a_window_then_a_stride_then_a_cap():
-    assert Frames(slice(2, 9), 3, 2).of(range(20), "a") == [2, 5]
-    assert Frames(slice(30, 140)).of(range(100), "a") == list(range(30, 100))
-    assert Frames(slice(30, 140)).shortage(100) == ("it has 100 frames; the protocol takes 30 to 139",)
-    assert Frames(slice(30, 140)).shortage(140) == Frames().shortage(1) == ()
+    assert FrameChoice(slice(2, 9), 3, 2).of(range(20), "a") == [2, 5]
+    assert FrameChoice(slice(30, 140)).of(range(100), "a") == list(range(30, 100))
+    assert FrameChoice(slice(30, 140)).shortage(100) == ("it has 100 frames; the protocol takes 30 to 139",)
+    assert FrameChoice(slice(30, 140)).shortage(140) == FrameChoice().shortage(1) == ()
     with pytest.raises(InputError, match="sequence a has 30 frames, and none of them from 30 on"):
-        Frames(slice(30, 140)).of(range(30), "a")
+        FrameChoice(slice(30, 140)).of(range(30), "a")
 
 
 def test_plain_folder(tmp_path):

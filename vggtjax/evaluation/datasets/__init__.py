@@ -14,11 +14,10 @@ from vggtjax.evaluation.datasets import published
 from vggtjax.evaluation.datasets.davis import davis
 from vggtjax.evaluation.datasets.dycheck import TRUTHS, dycheck
 from vggtjax.evaluation.datasets.folders import listed
-from vggtjax.evaluation.datasets.frames import EVERY_FRAME, Frames
+from vggtjax.evaluation.datasets.frames import EVERY_FRAME, FrameChoice
 from vggtjax.evaluation.datasets.kitti import kitti
-from vggtjax.evaluation.datasets.layout import Opener, Reader
 from vggtjax.evaluation.datasets.plain import plain
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener, Reader
 from vggtjax.evaluation.datasets.seven_scenes import seven_scenes
 from vggtjax.evaluation.datasets.sintel import sintel
 from vggtjax.evaluation.datasets.tum import bonn, tum
@@ -36,7 +35,7 @@ class Dataset:
     reader: Reader
     description: str
     truth: tuple[str, ...]  # of "depth", "poses", "intrinsics", "masks"; what a sequence lacks is in its notes
-    frames: Frames = EVERY_FRAME
+    frames: FrameChoice = EVERY_FRAME
     sequences: tuple[str, ...] | None = None  # of the published protocol
     max_depth: float | None = None  # metres; farther pixels do not count in video depth
     gt: tuple[str, ...] = ()  # ground truths to choose from, the first one unless told
@@ -53,11 +52,11 @@ DATASETS: Mapping[str, Dataset] = {
     "plain": Dataset(plain, "folders of rgb/, depth/, mask/, cameras", (*_ROOM, "masks")),
     "composite": Dataset(plain, "filmed objects pasted into a filmed room", (*_ROOM, "masks")),
     "hololens": Dataset(plain, "a static room, filmed in two takes", _ROOM),
-    "tum": Dataset(tum, "TUM RGB-D, moving people", _ROOM, Frames(stride=3, most=90), published.TUM),
-    "bonn": Dataset(bonn, "Bonn RGB-D Dynamic", _ROOM, Frames(slice(30, 140)), published.BONN, max_depth=70.0),
-    "dycheck": Dataset(dycheck, "DyCheck iPhone", _ROOM, Frames(stride=10), published.DYCHECK, gt=TRUTHS),
+    "tum": Dataset(tum, "TUM RGB-D, moving people", _ROOM, FrameChoice(stride=3, most=90), published.TUM),
+    "bonn": Dataset(bonn, "Bonn RGB-D Dynamic", _ROOM, FrameChoice(slice(30, 140)), published.BONN, max_depth=70.0),
+    "dycheck": Dataset(dycheck, "DyCheck iPhone", _ROOM, FrameChoice(stride=10), published.DYCHECK, gt=TRUTHS),
     "sintel": Dataset(sintel, "MPI Sintel, final pass", _ROOM, sequences=published.SINTEL, max_depth=70.0),
-    "kitti": Dataset(kitti, "KITTI drives", ("depth", "intrinsics"), Frames(most=110), published.KITTI),
+    "kitti": Dataset(kitti, "KITTI drives", ("depth", "intrinsics"), FrameChoice(most=110), published.KITTI),
     "davis": Dataset(davis, "DAVIS 2016, validation", ("masks",), sequences=published.DAVIS_2016),
     "davis-2017": Dataset(davis, "DAVIS 2017, validation", ("masks",), sequences=published.DAVIS_2017),
     "7scenes": Dataset(seven_scenes, "7-Scenes", _ROOM),
@@ -70,8 +69,9 @@ def find_sequences(
     *,
     sequences: Iterable[str] | None = None,
     stride: int | None = None,
+    max_frames: int | None = None,
     gt: str | None = None,
-) -> dict[str, Callable[[], Sequence]]:
+) -> dict[str, Callable[[], LabelledSequence]]:
     """Find sequences of a data set, each to be opened by a call: what is wrong with one shows only then.
 
     Args:
@@ -80,6 +80,7 @@ def find_sequences(
         sequences: names of those to open, in order. None takes the published ones that are there, or all where none
             of them is; what that leaves out is in the notes of every sequence, and logged.
         stride: takes every so many frames, in place of the data set's own; a window or cap of it stays.
+        max_frames: takes at most so many frames.
         gt: which ground truth, where the data set has several; None takes the first.
 
     Raises:
@@ -91,8 +92,9 @@ def find_sequences(
     dataset = DATASETS[name]
     if gt is not None and gt not in dataset.gt:
         raise InputError(f"gt is {gt!r}; {name} has {' and '.join(dataset.gt) or 'one ground truth, so leave it out'}")
-    if stride is not None and stride < 1:
-        raise InputError(f"stride is {stride}; expected 1 or more")
+    for option, value in (("stride", stride), ("max_frames", max_frames)):
+        if value is not None and value < 1:
+            raise InputError(f"{option} is {value}; expected at least 1")
     root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; expected that of the data set {name}")
@@ -101,8 +103,10 @@ def find_sequences(
     for notice in notices:
         logger.warning("%s", notice)
     frames = dataset.frames if stride is None else dataset.frames._replace(stride=stride)
+    if max_frames is not None:
+        frames = frames._replace(most=max_frames if frames.most is None else min(frames.most, max_frames))
 
-    def opened(sequence: str) -> Sequence:
+    def opened(sequence: str) -> LabelledSequence:
         made = found[sequence](frames, gt or dataset.gt_default)
         return dataclasses.replace(made, notes=(*notices, *(f"{made.name}: {note}" for note in made.notes)))
 
@@ -115,13 +119,14 @@ def open_dataset(
     *,
     sequences: Iterable[str] | None = None,
     stride: int | None = None,
+    max_frames: int | None = None,
     gt: str | None = None,
-) -> list[Sequence]:
+) -> list[LabelledSequence]:
     """Open sequences of a data set: cameras are read, pictures, depth and masks when they are asked for.
 
     Arguments and errors are those of `find_sequences`.
     """
-    found = find_sequences(name, root, sequences=sequences, stride=stride, gt=gt)
+    found = find_sequences(name, root, sequences=sequences, stride=stride, max_frames=max_frames, gt=gt)
     return [opener() for opener in found.values()]
 
 

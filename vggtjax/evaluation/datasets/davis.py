@@ -10,10 +10,9 @@ from pathlib import Path
 
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import files, subfolders
-from vggtjax.evaluation.datasets.frames import Frames
-from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import mask_reader, read_labels
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
 
 _RESOLUTION = "480p"
 
@@ -27,9 +26,9 @@ def davis(root: Path) -> dict[str, Opener]:
     raise InputError(f"{root} holds no sequence of DAVIS; expected JPEGImages/{_RESOLUTION} with folders of frames")
 
 
-def _read(root: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
+def _read(root: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
     del gt  # there is one
     pictures = frames.of(list(files(root / "JPEGImages" / _RESOLUTION / name, ".jpg").values()), name)
     labels = files(root / "Annotations" / _RESOLUTION / name, ".png")
     mask, notes = mask_reader(pictures, [labels.get(path.stem) for path in pictures], read_labels)
-    return Sequence(name, tuple(pictures), mask=mask, notes=notes)
+    return LabelledSequence(name, tuple(pictures), mask=mask, notes=notes)

@@ -29,11 +29,10 @@ from vggtjax.evaluation.datasets.cameras import (
 from vggtjax.evaluation.datasets.colmap import read_views
 from vggtjax.evaluation.datasets.depth_files import read_npy
 from vggtjax.evaluation.datasets.folders import files, inside, read_text, sequence_folders
-from vggtjax.evaluation.datasets.frames import Frames
-from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
 from vggtjax.evaluation.datasets.pictures import picture_size
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
 
 TRUTHS = ("easi3r", "lidar")
 _SPLIT = Path("splits/train.json")
@@ -58,7 +57,7 @@ def dycheck(root: Path) -> dict[str, Opener]:
     return {name: partial(_read, folder, name) for name, folder in folders.items()}
 
 
-def _read(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
+def _read(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
     names = _frame_names(folder / _SPLIT)
     chosen = frames.of(names, name)
     pictures = [inside(folder / _PICTURES, f"{frame}.png", folder / _SPLIT) for frame in chosen]
@@ -69,7 +68,7 @@ def _read(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
     there = files(folder / (_ALIGNED if easi3r else _LIDAR), ".npy")
     read = _from_disparity([there[frame] for frame in names if frame in there]) if easi3r else read_npy
     depth, notes = depth_reader(pictures, [there.get(frame) for frame in chosen], read)
-    return Sequence(
+    return LabelledSequence(
         name,
         tuple(pictures),
         depth,

@@ -10,7 +10,7 @@ from vggtjax.errors import InputError
 T = TypeVar("T")
 
 
-class Frames(NamedTuple):
+class FrameChoice(NamedTuple):
     """A window of frames, then every so many of them, then at most so many."""
 
     window: slice = slice(None)
@@ -33,4 +33,4 @@ class Frames(NamedTuple):
         return (f"it has {count} frames; the protocol takes {self.window.start or 0} to {self.window.stop - 1}",)
 
 
-EVERY_FRAME = Frames()
+EVERY_FRAME = FrameChoice()

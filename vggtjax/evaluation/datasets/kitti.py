@@ -19,10 +19,9 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.cameras import intrinsics_matrix
 from vggtjax.evaluation.datasets.depth_files import read_png
 from vggtjax.evaluation.datasets.folders import files, read_text, subfolders
-from vggtjax.evaluation.datasets.frames import Frames
-from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
 
 _PER_METRE = 256.0
 _TRUTH = Path("proj_depth/groundtruth/image_02")
@@ -52,7 +51,9 @@ def kitti(root: Path) -> dict[str, Opener]:
     return found
 
 
-def _read(name: str, truth: Path, folder: Path, calibration: Path, frames: Frames, gt: str | None) -> Sequence:
+def _read(
+    name: str, truth: Path, folder: Path, calibration: Path, frames: FrameChoice, gt: str | None
+) -> LabelledSequence:
     del gt  # there is one
     depths, pictures = files(truth, ".png"), files(folder, ".png")
     if not depths or not pictures:
@@ -69,7 +70,7 @@ def _read(name: str, truth: Path, folder: Path, calibration: Path, frames: Frame
         intrinsics = np.broadcast_to(_intrinsics(calibration), (len(taken), 3, 3))
     else:
         notes += (f"it has no {calibration.name}, so no intrinsics",)
-    return Sequence(name, tuple(taken), depth, intrinsics=intrinsics, notes=(*notes, *more, "it has no poses"))
+    return LabelledSequence(name, tuple(taken), depth, intrinsics=intrinsics, notes=(*notes, *more, "it has no poses"))
 
 
 def _intrinsics(path: Path) -> Float64[np.ndarray, "3 3"]:

@@ -22,10 +22,9 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.cameras import checked_intrinsics, checked_world_from_camera
 from vggtjax.evaluation.datasets.depth_files import read_png
 from vggtjax.evaluation.datasets.folders import files, sequence_folders
-from vggtjax.evaluation.datasets.frames import Frames
-from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader, mask_reader
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
 from vggtjax.storage.trajectories import read_numbers
 
 _NEW_TAKE = 10.0  # times the median step of the camera: a jump between takes in one folder
@@ -54,7 +53,7 @@ def takes(centres: Float64[np.ndarray, "S 3"]) -> list[range]:
     return [range(start, end) for start, end in pairwise([0, *cuts.tolist(), len(centres)])]
 
 
-def _read(folder: Path, name: str, part: slice, frames: Frames, gt: str | None) -> Sequence:
+def _read(folder: Path, name: str, part: slice, frames: FrameChoice, gt: str | None) -> LabelledSequence:
     del gt  # there is one
     pictures = _pictures(folder)
     poses = _poses(folder)
@@ -74,7 +73,7 @@ def _read(folder: Path, name: str, part: slice, frames: Frames, gt: str | None) 
         mask, more = mask_reader(taken, [masks.get(path.stem) for path in taken], read_mask)
         notes += more
     notes += ("it has no world_from_camera.txt",) * (poses is None) + ("it has no K.txt",) * (intrinsics is None)
-    return Sequence(
+    return LabelledSequence(
         name,
         tuple(taken),
         depth,

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.frames import FrameChoice
 
 DepthReader = Callable[[int], Float32[np.ndarray, "h w"]]
 MaskReader = Callable[[int], Bool[np.ndarray, "h w"]]
 
 
 @dataclass(frozen=True, eq=False)
-class Sequence:
+class LabelledSequence:
     """Frames in order, and ground truth where the data set has it: units are metres and seconds, axes OpenCV's.
 
     Depth and masks are read when they are asked for, by the frame's index. Intrinsics put the outer corner of the first
@@ -45,16 +44,7 @@ class Sequence:
     def __len__(self) -> int:
         return len(self.pictures)
 
-    def taken(self, frames: slice) -> Sequence:
-        """Return the same sequence with some of its frames alone."""
-        index = range(len(self))[frames]
-        if not index:
-            raise InputError(f"sequence {self.name} has {len(self)} frames, and none of them in {frames}; take others")
-        changes: dict[str, Any] = {"pictures": self.pictures[frames]}
-        for name in ("depth", "mask"):
-            if (read := getattr(self, name)) is not None:
-                changes[name] = lambda i, read=read: read(index[i])
-        for name in ("world_from_camera", "intrinsics", "timestamps"):
-            if (value := getattr(self, name)) is not None:
-                changes[name] = value[frames]
-        return dataclasses.replace(self, **changes)
+
+Sequence = LabelledSequence  # the older name
+Opener = Callable[[FrameChoice, str | None], LabelledSequence]  # of frames and the name of a ground truth
+Reader = Callable[[Path], Mapping[str, Opener]]  # of a root: the openers of its sequences by name

@@ -19,10 +19,9 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.cameras import checked_world_from_camera, intrinsics_matrix
 from vggtjax.evaluation.datasets.depth_files import read_png
 from vggtjax.evaluation.datasets.folders import files, sequence_folders
-from vggtjax.evaluation.datasets.frames import Frames
-from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
 from vggtjax.storage.trajectories import read_numbers
 
 _PER_METRE = 1000.0
@@ -37,7 +36,7 @@ def seven_scenes(root: Path) -> dict[str, Opener]:
     return {name: partial(_read, folder, name) for name, folder in folders.items()}
 
 
-def _read(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
+def _read(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
     del gt  # there is one
     pictures, depths, pose_files = (files(folder, ending) for ending in (_PICTURE, _DEPTH, _POSE))
     chosen = frames.of(list(pictures), name)
@@ -51,7 +50,7 @@ def _read(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
         poses = np.stack([_pose(pose_files[frame]) for frame in chosen])
     intrinsics = np.broadcast_to(intrinsics_matrix(*_CAMERA, first_pixel=0, source="7-Scenes"), (len(taken), 3, 3))
     notes += ("its depth is not registered to its pictures; the intrinsics are the depth camera's",)
-    return Sequence(name, tuple(taken), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes)
+    return LabelledSequence(name, tuple(taken), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes)
 
 
 def _pose(path: Path) -> Float64[np.ndarray, "4 4"]:

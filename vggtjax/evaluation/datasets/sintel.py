@@ -18,10 +18,9 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.cameras import PIXEL_CENTRE, checked_intrinsics, world_from_camera_of
 from vggtjax.evaluation.datasets.depth_files import SINTEL_TAG, read_dpt
 from vggtjax.evaluation.datasets.folders import files, read_bytes, subfolders
-from vggtjax.evaluation.datasets.frames import Frames
-from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
 
 _CAM_BYTES = 4 + 8 * (9 + 12)
 
@@ -46,7 +45,7 @@ def read_cam(path: Path) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray
     return values[:9].reshape(3, 3), values[9:].reshape(3, 4)
 
 
-def _read(training: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
+def _read(training: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
     del gt  # there is one
     pictures = frames.of(list(files(training / "final" / name, ".png").values()), name)
     depths = files(training / "depth" / name, ".dpt")
@@ -61,4 +60,4 @@ def _read(training: Path, name: str, frames: Frames, gt: str | None) -> Sequence
         intrinsics = checked_intrinsics(np.stack(matrices), source)
         intrinsics[:, :2, 2] += PIXEL_CENTRE
         poses = world_from_camera_of(np.stack(camera_from_world), source)
-    return Sequence(name, tuple(pictures), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes)
+    return LabelledSequence(name, tuple(pictures), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes)

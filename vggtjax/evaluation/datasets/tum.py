@@ -23,10 +23,9 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.cameras import intrinsics_matrix
 from vggtjax.evaluation.datasets.depth_files import read_png
 from vggtjax.evaluation.datasets.folders import inside, read_text, sequence_folders
-from vggtjax.evaluation.datasets.frames import Frames
-from vggtjax.evaluation.datasets.layout import Opener
+from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
-from vggtjax.evaluation.datasets.sequence import Sequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
 from vggtjax.evaluation.metrics.trajectory import associate
 from vggtjax.storage.trajectories import read_numbers, read_trajectory
 
@@ -93,7 +92,7 @@ def _found(root: Path, prefix: str) -> dict[str, Path]:
     return {name.removeprefix(prefix): folder for name, folder in folders.items()}
 
 
-def _read_tum(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
+def _read_tum(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
     del gt  # there is one
     pictures = _listed(folder, "rgb.txt")
     poses, posed = _poses(folder, pictures.times)
@@ -116,7 +115,7 @@ def _read_tum(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequen
     )
 
 
-def _read_bonn(folder: Path, name: str, frames: Frames, gt: str | None) -> Sequence:
+def _read_bonn(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
     del gt  # there is one
     pictures = _listed(folder, "rgb.txt")
     chosen = frames.of(range(len(pictures.paths)), name)
@@ -146,7 +145,7 @@ def _sequence(
     poses: Float64[np.ndarray, "S 4 4"] | None,
     intrinsics: Float64[np.ndarray, "3 3"] | None,
     notes: tuple[str, ...],
-) -> Sequence:
+) -> LabelledSequence:
     taken = [pictures.paths[frame] for frame in chosen]
     maps: list[Path | None] = [None] * len(taken)
     if (folder / "depth.txt").is_file():
@@ -158,7 +157,7 @@ def _sequence(
         if not path.is_file():
             raise InputError(f"{path} is not there, and {folder / 'rgb.txt'} or depth.txt names it; get it whole")
     depth, more = depth_reader(taken, maps, partial(read_png, per_metre=_PER_METRE))
-    return Sequence(
+    return LabelledSequence(
         name,
         tuple(taken),
         depth,

@@ -1,0 +1,143 @@
+"""Writers: whole files or none, no leftovers of killed writers, one writer for a locked folder."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from vggtjax.errors import OutputError
+from vggtjax.storage.writing import locked_folder, staging, writing
+
+WRITER = """
+import sys, time
+from pathlib import Path
+from vggtjax.storage import writing
+with getattr(writing, sys.argv[1])(Path(sys.argv[2]), *sys.argv[3:]) as path:
+    if path is not None:
+        path = path / "half" if path.is_dir() else path
+        path.write_text("half")
+    print("ready", flush=True)
+    time.sleep(60)
+"""
+
+
+@contextmanager
+def other_process(*arguments):
+    """Run a writer that has begun and does not end; kill it at the end."""
+    command = [sys.executable, "-c", WRITER, *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        try:
+            yield process
+        finally:
+            process.send_signal(signal.SIGKILL)
+
+
+def halves(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_file() and path.read_text() == "half"]
+
+
+def test_a_file_or_folder_appears_at_the_end(tmp_path):
+    with writing(tmp_path / "new" / "a.txt") as temporary:
+        temporary.write_text("whole")
+        assert temporary.suffix == ".txt"
+        assert not (tmp_path / "new" / "a.txt").exists()
+    with writing(tmp_path / "new" / "b") as temporary:
+        temporary.mkdir()
+        (temporary / "c").write_text("whole")
+    with pytest.raises(TypeError), writing(tmp_path / "new" / "d") as temporary:
+        temporary.write_text(3)  # pyright: ignore[reportArgumentType]: it makes the file, then fails
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
+        "new",
+        "new/a.txt",
+        "new/b",
+        "new/b/c",
+    ]
+    with pytest.raises(OutputError, match=r"cannot write .*a\.txt/e"), writing(tmp_path / "new/a.txt/e"):
+        pass
+
+
+@pytest.mark.skipif(os.name != "posix", reason="permission bits")
+def test_the_umask_decides_and_stays(tmp_path, monkeypatch):
+    def write(number: int) -> None:
+        with writing(tmp_path / str(number)) as temporary:
+            temporary.write_text("x")
+
+    previous = os.umask(0o027)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "umask", None)  # of the whole process: two threads that change it can lose it
+            with ThreadPoolExecutor(4) as pool:
+                list(pool.map(write, range(20)))
+            with staging(tmp_path / "staged") as staged:
+                assert staged.stat().st_mode & 0o777 == 0o750
+    finally:
+        assert os.umask(previous) == 0o027
+    assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir() if path.is_file()} == {0o640}
+
+
+@pytest.mark.parametrize("kind", ["writing", "staging"])
+def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path, kind):
+    with other_process(kind, tmp_path / "a" if kind == "writing" else tmp_path):
+        with writing(tmp_path / "b") as temporary:
+            temporary.write_text("whole")
+        assert len(halves(tmp_path)) == 1  # its writer lives
+    assert len(halves(tmp_path)) == 1
+    with writing(tmp_path / "b") as temporary:
+        temporary.write_text("whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["b"]
+
+
+def test_writers_of_one_process_keep_their_files(tmp_path):
+    with staging(tmp_path) as one, staging(tmp_path) as other, ThreadPoolExecutor(1) as pool:
+        (one / "x").write_text("half")
+
+        def write() -> None:
+            with writing(tmp_path / "b") as temporary:
+                temporary.write_text("whole")
+
+        pool.submit(write).result()
+        assert one.is_dir()
+        assert other.is_dir()
+    assert [path.name for path in tmp_path.iterdir()] == ["b"]
+
+
+def test_leftovers_without_a_lock_go_by_their_age(tmp_path):
+    leftovers = [tmp_path / ".partial-abcd1234", tmp_path / ".a.npz.x7_k2.partial.npz", tmp_path / ".clip.partial"]
+    others = [tmp_path / ".partially", tmp_path / "a.partial", tmp_path / ".partial-abcd1234" / "x"]
+    leftovers[0].mkdir()
+    for path in (*leftovers[1:], *others):
+        path.write_text("half")
+    with staging(tmp_path):
+        assert all(path.exists() for path in (*leftovers, *others))
+    for path in (*leftovers, *others):
+        os.utime(path, (time.time() - 2 * 24 * 3600, time.time() - 2 * 24 * 3600))
+    with staging(tmp_path):
+        pass
+    assert sorted(tmp_path.iterdir()) == sorted(others[:2])
+
+
+def test_a_locked_folder_has_one_writer(tmp_path):
+    folder = tmp_path / "out"
+    sentence = f"another run is writing the batch into {folder}; wait for it or choose another folder"
+    with other_process("locked_folder", folder, "the batch"):
+        with pytest.raises(OutputError) as raised, locked_folder(folder, "the batch"):
+            pass
+        assert str(raised.value) == sentence
+    with locked_folder(folder, "the batch"):  # a killed process holds no lock
+        with pytest.raises(OutputError), locked_folder(folder, "the batch"):
+            pass
+        with locked_folder(tmp_path, "the batch"):
+            pass
+        with pytest.raises(OutputError), locked_folder(folder, "the batch"):
+            pass
+    assert not list(folder.iterdir())
+    with pytest.raises(OutputError, match="cannot write"), locked_folder("/dev/null/x", "the batch"):
+        pass

@@ -1,0 +1,197 @@
+"""Where the results of an evaluation come from: a model that runs, or folders that other programs wrote."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from vggtjax.clips.preprocessing import Layout, Mode
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.pictures import picture_size
+from vggtjax.evaluation.datasets.sequence import LabelledSequence
+from vggtjax.evaluation.foreign_frames import placed
+from vggtjax.options import check_mask_pairs, check_smooth_frames, find_method
+from vggtjax.progress import OnStage
+from vggtjax.results.foreign import check_quaternion
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.storage.trajectories import Quaternion
+
+if TYPE_CHECKING:  # the folders of other programs are scored without jax
+    from vggtjax.checkpoint import Model
+    from vggtjax.clips.clip import Clip
+    from vggtjax.method.fusion_rule import FusionParams
+
+_MOST_FILES = 100_000  # of a folder with one result
+_UNTRAINED = "The weights of this model are untrained: these numbers show that everything runs, and mean nothing else."
+
+
+class ResultSource(Protocol):
+    """What `evaluate` scores: results by name for each sequence."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Names of the results of a sequence, in the order of the tables."""
+        ...
+
+    @property
+    def groups(self) -> Sequence[Sequence[str]]:
+        """The same names; the results of one group are computed together."""
+        ...
+
+    def fingerprint(self, name: str, sequence: LabelledSequence) -> str:
+        """Return text that changes when the result of that name changes."""
+        ...
+
+    def results(
+        self, names: Sequence[str], sequence: LabelledSequence, on_stage: OnStage
+    ) -> Mapping[str, Reconstruction]:
+        """Return the results of one group."""
+        ...
+
+
+@dataclass
+class ModelSource:
+    """Results of a model by several methods; methods with the same masks share one run of the passes.
+
+    Raises:
+        InputError: an unknown method or mode, or a value outside its range.
+    """
+
+    model: Model
+    names: Sequence[str]  # of `METHODS`
+    mode: Mode = "crop"
+    size: int | None = None  # side in pixels; the model's own if None
+    mask_pairs: int = 5
+    align_scale: bool = False
+    smooth_frames: int = 1
+    fusion: FusionParams | None = None
+    compute_dtype: str = "float32"
+    groups: Sequence[Sequence[str]] = field(init=False)
+    _last: tuple[LabelledSequence, Clip] | None = field(default=None, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        from vggtjax.pipeline.several import groups_of_methods
+
+        for name in self.names:
+            find_method(name)
+        if self.size is None:
+            self.size = self.model.config.image_size
+        Layout(self.mode, self.size, self.model.config.patch_size)
+        check_smooth_frames(self.smooth_frames)
+        check_mask_pairs(self.mask_pairs)
+        self.groups = groups_of_methods(self.names)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the results depend on besides the sequence, as JSON values."""
+        settings = {"model": _identity(self.model), "mode": self.mode, "size": self.size, **self._options}
+        if self.fusion is not None:
+            from vggtjax.method.fusion_file import fusion_digest
+
+            settings["fusion"] = fusion_digest(self.fusion)
+        return settings
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences that a reader of the numbers must know."""
+        return () if self.model.trained else (_UNTRAINED,)
+
+    def fingerprint(self, name: str, sequence: LabelledSequence) -> str:
+        """Return "": a model's results depend on the settings and the sequence alone."""
+        del name, sequence
+        return ""
+
+    def results(
+        self, names: Sequence[str], sequence: LabelledSequence, on_stage: OnStage
+    ) -> Mapping[str, Reconstruction]:
+        """Return the results of one group; the groups of a sequence share its clip."""
+        from vggtjax.clips.clip import load_clip
+        from vggtjax.pipeline.several import reconstruct_methods
+
+        if self._last is None or self._last[0] is not sequence:
+            paths = [str(path) for path in sequence.pictures]
+            clip = load_clip(paths, mode=self.mode, size=self.size, patch=self.model.config.patch_size)  # pyright: ignore
+            self._last = sequence, clip
+        clip = self._last[1]
+        return reconstruct_methods(
+            self.model, clip, names, size=self.size, fusion=self.fusion, on_stage=on_stage, **self._options
+        )
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        return {
+            "mask_pairs": self.mask_pairs,
+            "align_scale": self.align_scale,
+            "smooth_frames": self.smooth_frames,
+            "compute_dtype": self.compute_dtype,
+        }
+
+
+@dataclass(frozen=True)
+class FolderSource:
+    """Results in folders: `folders[name] / sequence` holds one result.
+
+    Raises:
+        InputError: an order of quaternions that `layout` lacks, or needs.
+    """
+
+    folders: Mapping[str, Path]
+    layout: str = "vggtjax"  # of the program that wrote the folders
+    quaternion: Quaternion | None = None
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_quaternion(self.layout, self.quaternion)
+
+    @property
+    def names(self) -> Sequence[str]:
+        return tuple(self.folders)
+
+    @property
+    def groups(self) -> Sequence[Sequence[str]]:
+        return tuple((name,) for name in self.folders)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the numbers depend on besides the files, as JSON values."""
+        return {"format": self.layout, "quaternion": self.quaternion}
+
+    def fingerprint(self, name: str, sequence: LabelledSequence) -> str:
+        """Return a digest of the names, sizes and dates of the result's files; "" where there are none."""
+        folder, digest, count = self.folders[name] / sequence.name, hashlib.sha256(), 0
+        try:
+            for path in sorted(folder.rglob("*")) if folder.is_dir() else [folder]:
+                count += 1
+                if count > _MOST_FILES:
+                    raise InputError(f"{folder} holds more than {_MOST_FILES} files; expected one result")
+                stat = path.stat()
+                digest.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode("utf-8", "surrogateescape"))
+        except OSError:
+            return ""
+        return digest.hexdigest()
+
+    def results(
+        self, names: Sequence[str], sequence: LabelledSequence, on_stage: OnStage
+    ) -> Mapping[str, Reconstruction]:
+        """Load the results of one group, with the place of their frames in the sequence's pictures."""
+        del on_stage
+        sizes = [picture_size(path) for path in sequence.pictures]
+        stems = [path.stem for path in sequence.pictures]
+        results = {}
+        for name in names:
+            folder = self.folders[name] / sequence.name
+            result = Reconstruction.load(folder, layout=self.layout, quaternion=self.quaternion)
+            results[name] = placed(result, self.layout, sizes, stems)
+        return results
+
+
+def _identity(model: Model) -> dict[str, Any]:
+    """Return what tells models apart: the name, and the digest of the file."""
+    digest = None
+    if model.path is not None:
+        with model.path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()
+    return {"name": model.name, "parameters": model.parameter_count, "sha256": digest, "trained": model.trained}
