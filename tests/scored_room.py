@@ -1,13 +1,18 @@
-"""The made-up room as a sequence with ground truth: what a perfect method would get everything right on."""
+"""The made-up room as a sequence with ground truth, and evaluations of results of it."""
 
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tests.room import make_room
+from vggtjax.errors import ClipError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
+from vggtjax.evaluation.run import Scoring, evaluate
 from vggtjax.results.reconstruction import Reconstruction
+
+SETTINGS = {"version": "0", "dataset": "room"}
 
 
 def room_and_truth(frames: int = 4, **changes: Any) -> tuple[Reconstruction, LabelledSequence]:
@@ -24,3 +29,36 @@ def room_and_truth(frames: int = 4, **changes: Any) -> tuple[Reconstruction, Lab
         "intrinsics": intrinsics,
     }
     return room, LabelledSequence(**(fields | changes))
+
+
+@contextmanager
+def stage(name):
+    yield None
+
+
+class Perfect:
+    """Returns the same result by every method, and remembers what it was asked for."""
+
+    def __init__(self, result, *groups, failing=(), sum_of="1"):
+        self.result: Reconstruction = result
+        self.groups, self.failing, self.calls, self.sum = groups, failing, [], sum_of
+        self.names = [name for group in groups for name in group]
+
+    def fingerprint(self, name, sequence):
+        return self.sum
+
+    def results(self, names, sequence, on_stage):
+        self.calls.append((sequence.name, tuple(names)))
+        if sequence.name in self.failing:
+            raise ClipError(f"{sequence.name} cannot be read")
+        with on_stage("first pass"):
+            pass
+        return dict.fromkeys(names, self.result)
+
+
+def opened(sequences):
+    return {sequence.name: (lambda sequence=sequence: sequence) for sequence in sequences}
+
+
+def run(sequences, results, store, settings=SETTINGS):
+    return evaluate(opened(sequences), results, store, settings, Scoring(), on_stage=stage)

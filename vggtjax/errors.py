@@ -47,8 +47,15 @@ def check_extra(purpose: str, extra: str, *modules: str) -> None:
         raise MissingExtraError(purpose, extra)
 
 
+def one_line(text: str, most: int = 300) -> str:
+    """Return text for one line of a terminal, a table or a page: printable, at most `most` letters."""
+    line = " ".join(text[: 4 * most].split())
+    line = line if len(line) <= most else f"{line[: most - 3]}..."
+    return "".join(letter if letter.isprintable() else "?" for letter in line)
+
+
 def problems_sentence(subject: str, problems: Sequence[str]) -> str:
     """Return one sentence that says how many problems there are and spells out the first ones."""
-    shown = "; ".join("".join(c if c.isprintable() else "?" for c in text[:300]) for text in problems[:_MOST_PROBLEMS])
+    shown = "; ".join(map(one_line, problems[:_MOST_PROBLEMS]))
     more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
     return f"{subject}: {len(problems)} {'problem' if len(problems) == 1 else 'problems'}: {shown}{more}"

@@ -41,7 +41,7 @@ class Report:
         self._out = Console()
         self._progress = Progress(
             SpinnerColumn(finished_text="[green]✓"),
-            TextColumn("{task.description:<18}"),
+            TextColumn("{task.description:<18}", markup=False),
             BarColumn(bar_width=24),
             _Count(),
             TimeElapsedColumn(),
@@ -66,7 +66,7 @@ class Report:
         self._seconds[name] = self._seconds.get(name, 0.0) + seconds
         self._finish(task)
         if not self._console.is_terminal:
-            self._console.print(f"{name:<18} {seconds:8.2f} s", highlight=False)
+            self.note(f"{name:<18} {seconds:8.2f} s")
 
     def summary(self, result: Reconstruction, out: Path, *, trained: bool) -> None:
         """Print what was reconstructed, what it took, and where the files are."""
@@ -126,7 +126,7 @@ class Report:
 
         table = Table(box=None, pad_edge=False)
         for name in ("", *means):
-            table.add_column(name, justify="right" if name else "left", no_wrap=True)
+            table.add_column(Text(name), justify="right" if name else "left", no_wrap=True)
         for column in shown_columns(means):
             top = best(means, column)
             cells = (

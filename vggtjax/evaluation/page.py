@@ -8,10 +8,11 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from vggtjax.errors import check_extra
+from vggtjax.errors import InputError, check_extra
 from vggtjax.evaluation import tables
 from vggtjax.evaluation.plots import draw_sequence
 from vggtjax.evaluation.records import FOLDER, Record, Records, costs, safe_name, summary
+from vggtjax.storage.json_values import read_json
 from vggtjax.storage.writing import check_free, writing
 
 PLOT_FOLDER = "plots"
@@ -22,12 +23,10 @@ NAMES = ("results.json", "results.csv", "table.md", "table.tex", "index.html", P
 def is_report(path: Path) -> bool:
     """Return whether a file is the results.json of an evaluation."""
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            return False
-        values = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
+        values = read_json(path, dict[str, Any], "evaluation", most_bytes=_MOST_BYTES)
+    except InputError:
         return False
-    return isinstance(values, dict) and {"settings", "sequences", "mean"} <= set(values)
+    return {"settings", "sequences", "mean"} <= set(values)
 
 
 def check_report(out: Path, store: Records) -> None:
@@ -135,4 +134,4 @@ def _page(
 
 def _write(path: Path, text: str) -> None:
     with writing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")  # a path may have any bytes

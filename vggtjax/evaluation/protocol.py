@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property, partial
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -177,7 +178,8 @@ def score(
         except InputError as error:
             problems.append(f"{name}: {error}")
         else:
-            metrics |= {key: float(value) for key, value in found.items()}
+            problems += [f"{name}: {key} is {value}, not finite" for key, value in found.items() if not isfinite(value)]
+            metrics |= {key: float(value) for key, value in found.items() if isfinite(value)}
             curves |= drawn
     return Scores(metrics, tuple(notes), tuple(problems), curves)
 

@@ -1,4 +1,4 @@
-"""What an evaluation keeps of every sequence and method: a JSON file with the numbers, an npz with the curves."""
+"""The records of an evaluation, one for each sequence and method: a JSON file of numbers, an npz of curves."""
 
 from __future__ import annotations
 
@@ -13,28 +13,29 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vggtjax.errors import ResultError
-from vggtjax.storage import arrays as archive
+from vggtjax.errors import InputError, ResultError, one_line
+from vggtjax.storage.arrays import read_arrays, write_arrays
+from vggtjax.storage.json_values import Natural, read_json
 from vggtjax.storage.writing import writing
 
 FOLDER = "sequences"
 BOTH_OVER_ONE = "both passes over one"
-_MARK = "evaluation.json"  # in that folder: it is ours
-_MOST_BYTES = 2**24  # of a record's JSON
+_MARK = "evaluation.json"  # in that folder: it holds records
+_MOST_LETTERS = 80  # of a name
 
 
 @dataclass(frozen=True)
 class Record:
-    """How one method did on one sequence, with the settings that it was made with."""
+    """The scores of one method on one sequence, with the settings that they depend on."""
 
     name: str  # of the sequence
     method: str
     status: Literal["ok", "failed"]
     settings: dict[str, Any]
     metrics: dict[str, float] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()  # what the ground truth lacks, and why a metric is not there
+    notes: tuple[str, ...] = ()  # what the ground truth lacks, and why a metric is missing
     reason: str = ""  # of a failure
-    frames: int = 0
+    frames: Natural = 0
     seconds: dict[str, float] = field(default_factory=dict)  # of the stages of its group of methods
 
 
@@ -55,30 +56,28 @@ class Records:
 
     def kept(self, name: str, method: str, settings: Mapping[str, Any]) -> Record | None:
         """Return the record of an earlier run, if it succeeded with the very same settings; else None."""
-        path = self._path(name, method, "json")
         try:
-            if path.stat().st_size > _MOST_BYTES:
-                return None
-            values = json.loads(path.read_text(encoding="utf-8"))
-            record = Record(**{**values, "notes": tuple(values["notes"])})
-        except (OSError, ValueError, TypeError, KeyError):  # not there, not whole, or of another version
+            record = read_json(self._path(name, method, "json"), Record, "record")
+            self.curves(record)
+        except InputError:  # missing, cut off, or of another version
             return None
-        good = record.status == "ok" and self._path(name, method, "npz").is_file()
-        return record if good and record.settings == _plain(settings) and record.name == name else None
+        good = record.status == "ok" and record.name == name
+        return record if good and record.settings == json.loads(json.dumps(settings)) else None
 
     def keep(self, record: Record, curves: Mapping[str, np.ndarray]) -> None:
-        """Write a record; the JSON leaves first and comes last, so that where it is, all of it is."""
-        self._path(record.name, record.method, "json").unlink(missing_ok=True)
-        with writing(self._path(record.name, record.method, "npz")) as path:
-            archive.write_arrays(path, curves)
-        with writing(self._path(record.name, record.method, "json")) as path:
-            path.write_text(json.dumps(_plain(asdict(record)), indent=2) + "\n", encoding="utf-8")
+        """Write a record. Its JSON goes first and comes last: where a JSON file is, the record is whole."""
+        path = self._path(record.name, record.method, "json")
+        path.unlink(missing_ok=True)
+        with writing(path.with_suffix(".npz")) as temporary:
+            write_arrays(temporary, curves)
+        with writing(path) as temporary:
+            temporary.write_text(json.dumps(asdict(record), indent=2) + "\n", encoding="utf-8")
 
     def curves(self, record: Record) -> dict[str, np.ndarray]:
         """Return the curves of a record; raises ResultError where the file is broken."""
         path = self._path(record.name, record.method, "npz")
         try:
-            return archive.read_arrays(path)
+            return read_arrays(path)
         except ResultError as error:
             raise ResultError(f"{path} cannot be read: {error}; delete it and run again") from error
 
@@ -86,10 +85,20 @@ class Records:
         return self.folder / safe_name(name) / f"{safe_name(method)}.{suffix}"
 
 
+def shown_name(name: str) -> str:
+    """Return a printable name of one line: the name itself if it is one, else with a digest of its bytes."""
+    line = one_line(name, _MOST_LETTERS)
+    return name if line == name else f"{line}-{_digest(name)}"
+
+
 def safe_name(name: str) -> str:
-    """Return a file name for any text: itself where it is plain, else with a digest that keeps different ones apart."""
-    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name)[:80]
-    return plain if plain and plain == name else f"{plain}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+    """Return a file name: the name itself if only letters, digits, - and _ are in it, else with a digest."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name)[:_MOST_LETTERS]
+    return plain if plain and plain == name else f"{plain}-{_digest(name)}"
+
+
+def _digest(name: str) -> str:
+    return hashlib.sha256(name.encode("utf-8", "surrogateescape")).hexdigest()[:8]
 
 
 def summary(records: Sequence[Record]) -> dict[str, dict[str, float]]:
@@ -139,7 +148,3 @@ def costs(records: Sequence[Record]) -> dict[str, dict[str, float]]:
         if row:
             found[method] = row
     return found
-
-
-def _plain(values: Any) -> Any:
-    return json.loads(json.dumps(values))

@@ -1,28 +1,32 @@
-"""Evaluate methods, or results of other programs, on sequences; what is finished is kept and not done again."""
+"""Evaluate methods, or results of other programs, on sequences; records of an earlier run are not computed again."""
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from vggtjax.errors import InputError, VggtjaxError
+from vggtjax.errors import InputError, VggtjaxError, one_line
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.metrics.masks import Empty
 from vggtjax.evaluation.metrics.video_depth import Align
 from vggtjax.evaluation.protocol import TruthAtPixels, score
-from vggtjax.evaluation.records import Record, Records
+from vggtjax.evaluation.records import Record, Records, shown_name
 from vggtjax.evaluation.sources import ResultSource
 from vggtjax.progress import OnStage, Progress
 from vggtjax.results.reconstruction import Reconstruction
 
-_LOOKED_AT = 3  # frames whose ground truth goes into the fingerprint of a sequence
-_STEPS = 100  # of a progress bar, for each method
+_SAMPLES = 3  # frames whose depth and mask are in the fingerprint of a sequence
+_MOST_LETTERS = 1000  # of a reason or a note
+_STEPS = 100  # of a progress bar for each result
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -43,61 +47,131 @@ def evaluate(
     *,
     on_stage: OnStage,
 ) -> list[Record]:
-    """Score results on sequences.
+    """Score results on sequences; results of an earlier run with the same settings are not computed again.
 
     Args:
-        sequences: of a data set, by name; they are opened when it is their turn.
-        source: where results come from.
-        records: where finished ones are looked for, and kept.
-        settings: everything else that the numbers depend on. Records are kept with them and with fingerprints of the
-            sequence and of the result; those that were made with others are not taken for finished.
+        sequences: openers of a data set's sequences by name; each is called when its turn comes.
+        source: where the results come from.
+        records: where the records of earlier runs are, and new ones are written.
+        settings: everything that the numbers depend on but the sequence and the result; fingerprints of these two are
+            added to the settings of each record.
         scoring: how results are scored.
-        on_stage: called with the name of each stage, returns a context in which it runs.
+        on_stage: called with the number and name of each sequence.
 
     Returns:
-        A record for each sequence and name of a result, in this order; one that failed says why.
+        A record for each sequence and name of a result, in this order. A sequence that cannot be opened or scored,
+        whatever its opener or its result raises, has records with the status "failed" and a reason.
     """
-    found: list[Record] = []
-    names = source.names
-    for number, (title, opener) in enumerate(sequences.items()):
+    run = _Run(source, records, settings, scoring)
+    scored: list[Record] = []
+    for number, (name, opener) in enumerate(sequences.items()):
+        title = shown_name(name)
         with on_stage(f"{number + 1}/{len(sequences)} {title}") as progress:
+            scored += run.records_of(title, opener, progress)
+    return scored
+
+
+@dataclass(frozen=True)
+class _Run:
+    source: ResultSource
+    store: Records
+    settings: Mapping[str, Any]
+    scoring: Scoring
+
+    def records_of(self, title: str, opener: Callable[[], LabelledSequence], progress: Progress | None) -> list[Record]:
+        """Return the records of a sequence, computed or kept, in the order of the source's names."""
+        names = self.source.names
+        drafts = {name: Record(title, name, "failed", dict(self.settings)) for name in names}
+        try:
+            sequence = opener()
+            facts = {"notes": _lines(sequence.notes), "frames": len(sequence)}
+            data = fingerprint(sequence)
+            for name in names:
+                settings = {**self.settings, "data": data, "result": self.source.fingerprint(name, sequence)}
+                drafts[name] = Record(title, name, "failed", settings, **facts)
+        except Exception as error:
+            failures = [replace(draft, reason=_reason(error)) for draft in drafts.values()]
+            for failure in failures:
+                self.store.keep(failure, {})
+            return failures
+        records = {name: self.store.kept(title, name, drafts[name].settings) for name in names}
+        groups = [[drafts[name] for name in group if records[name] is None] for group in self.source.groups]
+        truths = _Truths(sequence, self.scoring.max_depth)
+        steps = _Steps(progress, sum(map(len, groups)))
+        for group in filter(None, groups):
+            records |= {record.method: record for record in self._scored(group, sequence, truths, steps)}
+        return [record for record in records.values() if record is not None]
+
+    def _scored(
+        self, drafts: Sequence[Record], sequence: LabelledSequence, truths: _Truths, steps: _Steps
+    ) -> Iterator[Record]:
+        """Compute the results of a group, score them, and write their records."""
+        seconds: dict[str, float] = {}
+
+        @contextmanager
+        def timed(name: str) -> Iterator[None]:
+            started = time.perf_counter()
+            yield None
+            seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - started
+
+        results: Mapping[str, Reconstruction] = {}
+        problem = None
+        try:
+            results = self.source.results([draft.method for draft in drafts], sequence, timed)
+        except Exception as error:
+            problem = error
+        for draft in drafts:
+            curves: dict[str, np.ndarray] = {}
             try:
-                sequence = opener()
-                data = fingerprint(sequence)
-                facts = {
-                    name: {**settings, "data": data, "result": source.fingerprint(name, sequence)} for name in names
-                }
-            except (VggtjaxError, MemoryError) as error:
-                for name in names:
-                    found.append(_failed(title, name, settings, error))
-                    records.keep(found[-1], {})
-                continue
-            kept = {name: records.kept(title, name, facts[name]) for name in names}
-            truth = _Truths(sequence, scoring.max_depth)
-            missing = [[name for name in group if kept[name] is None] for group in source.groups]
-            steps = _Steps(progress, sum(map(len, missing)))
-            for group in missing:
-                for record in _evaluated(group, sequence, source, truth, facts, records, scoring, steps):
-                    kept[record.method] = record
-            found += [record for record in kept.values() if record is not None]
-    return found
+                if problem is not None:
+                    raise problem
+                result = results[draft.method]
+                align, empty = self.scoring.depth_align, self.scoring.empty
+                scores = score(result, truths.at(result), depth_align=align, empty=empty, progress=steps.within)
+            except Exception as error:
+                record = replace(draft, reason=_reason(error))
+            else:
+                record = replace(
+                    draft,
+                    status="failed" if scores.problems else "ok",
+                    metrics=scores.metrics,
+                    notes=draft.notes + _lines(scores.notes),
+                    reason=one_line("; ".join(scores.problems), _MOST_LETTERS),
+                    seconds=seconds,
+                )
+                curves = scores.curves
+            self.store.keep(record, curves)
+            steps.next()
+            yield record
+
+
+def _reason(error: Exception) -> str:
+    """Return why a sequence failed, as one line."""
+    if isinstance(error, VggtjaxError | MemoryError):
+        return one_line(str(error) or "out of memory", _MOST_LETTERS)
+    logger.debug("a sequence failed", exc_info=error)
+    return one_line(f"{type(error).__name__}: {error}", _MOST_LETTERS)
+
+
+def _lines(notes: Sequence[str]) -> tuple[str, ...]:
+    return tuple(one_line(note, _MOST_LETTERS) for note in notes)
 
 
 def fingerprint(sequence: LabelledSequence) -> str:
-    """Return a sum of what a sequence is: its pictures by size and date, its cameras, and some of its depth and masks.
+    """Return a digest of a sequence: names, sizes and dates of its pictures, its cameras, three depth maps and masks.
 
-    Raises InputError where a picture is not there, or what the ground truth is read from.
+    Raises InputError where a picture or a file of the ground truth is missing.
     """
     digest = hashlib.sha256()
     for path in sequence.pictures:
         try:
             stat = path.stat()
         except OSError as error:
-            raise InputError(f"{path} cannot be looked at: {error.strerror or error}") from error
+            raise InputError(f"cannot read {path}: {error.strerror or error}") from error
         digest.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode("utf-8", "surrogateescape"))
     for array in (sequence.world_from_camera, sequence.intrinsics, sequence.timestamps):
         digest.update(b"-" if array is None else np.ascontiguousarray(array, np.float64).tobytes())
-    frames = np.unique(np.linspace(0, len(sequence) - 1, _LOOKED_AT).round().astype(int)).tolist()
+    frames = np.unique(np.linspace(0, len(sequence) - 1, _SAMPLES).round().astype(int)).tolist()
     for read in (sequence.depth, sequence.mask):
         if read is not None:
             for frame in frames:
@@ -106,7 +180,7 @@ def fingerprint(sequence: LabelledSequence) -> str:
 
 
 class _Truths:
-    """The ground truth of one sequence at the pixels of results, read once for all that are placed alike."""
+    """The ground truth of one sequence at the pixels of results, read once for all results with the same placement."""
 
     def __init__(self, sequence: LabelledSequence, max_depth: float | None) -> None:
         self._sequence, self._max_depth = sequence, max_depth
@@ -119,7 +193,7 @@ class _Truths:
 
 
 class _Steps:
-    """Progress over the results of a sequence that are to be scored."""
+    """Progress over the results of a sequence."""
 
     def __init__(self, progress: Progress | None, names: int) -> None:
         self._progress, self._total, self._done = progress, _STEPS * names, 0
@@ -131,75 +205,3 @@ class _Steps:
     def next(self) -> None:
         self.within(1, 1)
         self._done += _STEPS
-
-
-def _evaluated(
-    names: Sequence[str],
-    sequence: LabelledSequence,
-    source: ResultSource,
-    truths: _Truths,
-    facts: Mapping[str, Mapping[str, Any]],
-    records: Records,
-    scoring: Scoring,
-    steps: _Steps,
-) -> Iterator[Record]:
-    if not names:
-        return
-    seconds: dict[str, float] = {}
-
-    @contextmanager
-    def timed(name: str) -> Iterator[None]:
-        started = time.perf_counter()
-        yield None
-        seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - started
-
-    try:
-        made = source.results(names, sequence, timed)
-    except (VggtjaxError, MemoryError) as error:
-        made, failure = {}, error
-    else:
-        failure = None
-    for name in names:
-        curves: dict[str, np.ndarray] = {}
-        try:
-            if failure is not None:
-                raise failure
-            scores = score(
-                made[name],
-                truths.at(made[name]),
-                depth_align=scoring.depth_align,
-                empty=scoring.empty,
-                progress=steps.within,
-            )
-        except (VggtjaxError, MemoryError) as error:
-            record = _failed(sequence.name, name, facts[name], error, sequence)
-        else:
-            record = Record(
-                name=sequence.name,
-                method=name,
-                status="failed" if scores.problems else "ok",
-                settings=dict(facts[name]),
-                metrics=scores.metrics,
-                notes=(*sequence.notes, *scores.notes),
-                reason="; ".join(scores.problems),
-                frames=len(sequence),
-                seconds=seconds,
-            )
-            curves = scores.curves
-        records.keep(record, curves)
-        steps.next()
-        yield record
-
-
-def _failed(
-    title: str, name: str, settings: Mapping[str, Any], error: BaseException, sequence: LabelledSequence | None = None
-) -> Record:
-    return Record(
-        name=title,
-        method=name,
-        status="failed",
-        settings=dict(settings),
-        notes=() if sequence is None else sequence.notes,
-        reason=str(error) or "out of memory",
-        frames=0 if sequence is None else len(sequence),
-    )

@@ -7,6 +7,7 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from vggtjax.errors import one_line
 from vggtjax.evaluation.records import Record
 
 
@@ -126,7 +127,7 @@ def failed(row: Mapping[str, float]) -> str:
 
 
 def _plain(text: str) -> str:
-    return text.replace("\\", "\\\\").replace("|", r"\|").replace("\n", " ")
+    return one_line(text).replace("\\", "\\\\").replace("|", r"\|")
 
 
 def _inert(text: str) -> str:
