@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import struct
 import sys
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
+from math import prod
 from pathlib import Path
-from tokenize import TokenError
 from typing import IO, NamedTuple
 
 import numpy as np
@@ -19,9 +21,12 @@ from vggtjax.errors import ResultError
 _DEFLATE_LEVEL = 1  # higher ones take several times as long for a few percent
 SIZE_LIMIT = 64 * 2**30  # bytes of all arrays of one archive
 
-
-# What zipfile and numpy raise on files that are cut off or changed.
-_BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, SyntaxError, TokenError, RuntimeError)
+_LENGTHS = {(1, 0): 2, (2, 0): 4}  # version of the format -> bytes of the length of a header
+_MOST_HEADER_BYTES = 2**14
+_MOST_AXES = 32
+_DESCR = re.compile(r"[<>|=]?(?:[?biufcmM]|[SUV][1-9])\d{0,10}(\[\w{1,10}\])?")
+# What zipfile, numpy and Python's parser raise on files that are cut off or changed.
+_BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, SyntaxError, RuntimeError)
 
 
 class Header(NamedTuple):
@@ -115,20 +120,38 @@ def _members(archive: zipfile.ZipFile) -> Iterator[tuple[str, zipfile.ZipInfo, I
 
 
 def _read_header(file: IO[bytes], name: str, length: int) -> Header:
+    """Return the header at the start of `length` bytes; the array behind it must take the rest of them exactly."""
     version = np.lib.format.read_magic(file)
-    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-    if version not in readers:
+    if version not in _LENGTHS:
         raise ResultError(f"{name} has version {version} of the array format; expected (1, 0) or (2, 0)")
-    shape, fortran_order, dtype = readers[version](file)
-    if dtype.hasobject:
-        raise ResultError(f"{name} holds Python objects, which are never loaded")
+    header_length = int.from_bytes(file.read(_LENGTHS[version]), "little")
+    if header_length > _MOST_HEADER_BYTES:
+        raise ResultError(f"{name} has a header of {header_length} bytes; expected at most {_MOST_HEADER_BYTES}")
+    try:
+        header = ast.literal_eval(file.read(header_length).decode("latin1"))
+        descr, by_columns, shape = (header.pop(key) for key in ("descr", "fortran_order", "shape"))
+        sides = {type(side) is int and 0 <= side <= SIZE_LIMIT for side in shape}
+        if (
+            header
+            or type(by_columns) is not bool
+            or type(shape) is not tuple
+            or len(shape) > _MOST_AXES
+            or False in sides
+        ):
+            raise ValueError
+    except (*_BROKEN, MemoryError, TypeError, LookupError, AttributeError):
+        raise ResultError(f"{name} has an invalid header; expected one as numpy writes it") from None
+    if type(descr) is not str or "O" in descr:
+        raise ResultError(f"{name} holds Python objects, which are never loaded, or structures; expected plain values")
+    try:
+        dtype = np.dtype(descr if _DESCR.fullmatch(descr) else "")
+    except (TypeError, ValueError):
+        raise ResultError(f"{name} has the type {descr[:50]!r}; expected numbers, booleans or text") from None
     if not dtype.isnative:
         raise ResultError(f"{name} has type {dtype}, in the byte order of another machine")
-    if fortran_order and len(shape) > 1:
+    if by_columns and len(shape) > 1:
         raise ResultError(f"{name} is stored by columns; expected rows")
-    size = dtype.itemsize
-    for side in shape:
-        size *= side
+    size = prod(shape) * dtype.itemsize
     if size != length - file.tell():
         raise ResultError(f"{name} is {length - file.tell()} bytes long; its header says {size}")
     return Header(dtype, shape)
