@@ -3,20 +3,20 @@
 import dataclasses
 import json
 
-import jax
 import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax import load_model
 from vggtjax.commands import main as cli
 from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.learning.ablation import CHOSEN, split_clips
-from vggtjax.learning.clip_passes import ClipPasses, fit_clips, identity_of, kept_passes, observations
+from vggtjax.learning.clip_passes import ClipPasses, fit_clips, kept_passes, observations, sequence_digest
 from vggtjax.method.fusion_file import load_fusion, save_fusion
 from vggtjax.method.fusion_rule import identity
 from vggtjax.pretrained.embedded import MODEL, demo_clip
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.storage.arrays import write_arrays
 
 FRAMES, CLIPS = 3, 4
 
@@ -41,7 +41,8 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
 
-ARGUMENTS = ["--family", "scale", "scale+correlation", "paper", "--seeds", "2", "--steps", "20", "--pixels", "300"]
+ARGUMENTS = ["--family", "scale", "scale+correlation", "paper", "--seeds", 2, "--steps", 20, "--pixels", 300]
+ARGUMENTS += ["--size", 64]
 
 
 def run(*arguments) -> int:
@@ -53,7 +54,7 @@ def fitted(dataset, cache, tmp_path_factory):
     out = tmp_path_factory.mktemp("fits")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VGGTJAX_CACHE", str(cache))
-        code = run("fit-fusion", "--out", out, "--data", f"plain={dataset}", "--size", 64, *ARGUMENTS)
+        code = run("fit-fusion", "--out", out, "--data", f"plain={dataset}", "--model", MODEL, *ARGUMENTS)
     assert code == 0
     return out
 
@@ -82,8 +83,8 @@ def test_all_of_it(fitted, cache):
 def test_passes_and_fits_are_kept(dataset, cache, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("VGGTJAX_CACHE", str(cache))
     monkeypatch.setattr("vggtjax.learning.clip_passes.reconstruct", None)  # would fail
-    arguments = ["--out", tmp_path, "--data", f"plain={dataset}", "--size", 64, "--family", "scale", "--seeds", 1]
-    arguments += ["--steps", 20, "--pixels", 300]
+    arguments = ["--out", tmp_path, "--data", f"plain={dataset}", "--model", MODEL, *ARGUMENTS]
+    arguments += ["--family", "scale", "--seeds", 1]
     assert run("fit-fusion", *arguments) == 0
     before = json.loads((tmp_path / "fit.json").read_text())
     monkeypatch.setattr("vggtjax.learning.fit._advanced", None)  # would fail: the states are those of the end
@@ -96,10 +97,12 @@ def test_passes_and_fits_are_kept(dataset, cache, tmp_path, monkeypatch, capsys)
 def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset, tmp_path, capsys, caplog):
     frames = dataset / "clip0" / "rgb"
     common = ["--size", 64, "--max-frames", 3]
+    (tmp_path / "link.safetensors").symlink_to(MODEL)
     results = {}
     save_fusion(tmp_path / "paper.safetensors", identity())
     files = {"none": [], "paper": ["--fusion", tmp_path / "paper.safetensors"]}
-    files["fitted"] = ["--fusion", fitted / "families" / "scale.safetensors", "--model", MODEL]
+    files["fitted"] = ["--fusion", fitted / "families" / "scale.safetensors"]
+    files["fitted"] += ["--model", tmp_path / "link.safetensors"]
     for name, option in files.items():
         assert run("reconstruct", frames, "--out", tmp_path / name, *common, *option) == 0
         results[name] = Reconstruction.load(tmp_path / name)
@@ -112,7 +115,7 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
     assert np.allclose(batched.depth, results["fitted"].depth, rtol=1e-5)
     arguments = ["evaluate", "plain", dataset, "--out", tmp_path / "scores", "--size", 64, "--sequences", "clip0"]
     assert run(*arguments, "--methods", "hard-replacement,4dvggt-d", *files["fitted"]) == 0
-    assert "was fitted with" not in caplog.text  # the same model, by name and by path
+    assert "was fitted with" not in caplog.text  # the same model by another path
     capsys.readouterr()
     assert run("reconstruct", frames, "--out", tmp_path / "x", "--method", "vggt", *files["fitted"]) == 2
     assert "method 'vggt' does not fuse; expected 4dvggt-d" in capsys.readouterr().err
@@ -189,38 +192,45 @@ def test_frames_are_taken_where_there_is_truth():
     assert np.array_equal(np.asarray(taken.seen.depth1)[0], clip.depth1[3:])
 
 
-def test_models_are_told_apart():
-    model = load_model("demo")
-    other = dataclasses.replace(model.config, motion=dataclasses.replace(model.config.motion, offsets=(-1, 1)))
-    halved = jax.tree.map(lambda x: x / 2, model.params)
-    names = [
-        identity_of(m)
-        for m in (
-            model,
-            load_model("demo"),
-            *(dataclasses.replace(model, config=other), dataclasses.replace(model, params=halved)),
-        )
-    ]
-    assert names[0] == names[1]
-    assert len(set(names)) == 3
+def test_every_frame_of_the_truth_is_in_the_key(tmp_path):
+    (tmp_path / "a.png").touch()
+    depth = np.ones((7, 4, 6), np.float32)
+    sequence = LabelledSequence("a", (tmp_path / "a.png",) * 7, depth.__getitem__)
+    digests = [sequence_digest(sequence)]
+    depth[1, 2, 3] = 2  # a frame that `evaluation.run.fingerprint` does not read
+    digests += [sequence_digest(sequence), sequence_digest(dataclasses.replace(sequence, mask=depth.__getitem__))]
+    assert len(set(digests)) == 3
 
 
-def test_kept_passes_are_made_anew_where_the_file_is_not_whole(tmp_path):
-    made = []
+def test_kept_passes_are_made_anew_where_the_file_is_damaged(tmp_path):
+    clip, calls = clip_of(2, 28, 0), []
 
     def make() -> ClipPasses:
-        made.append(1)
-        return clip_of(2, 28, 0)
+        calls.append(1)
+        return clip
 
     for _ in range(2):
-        clip = kept_passes({"a": 1}, make, tmp_path)
-        assert np.array_equal(clip.depth1, clip_of(2, 28, 0).depth1)
-    assert len(made) == 1
+        assert np.array_equal(kept_passes({"a": 1}, make, tmp_path).depth1, clip.depth1)
+    assert len(calls) == 1
     (path,) = tmp_path.iterdir()
-    path.write_bytes(path.read_bytes()[:200])
-    kept_passes({"a": 1}, make, tmp_path)
+    whole = path.read_bytes()
+    wrong_shape, wrong_type = clip._replace(truth=clip.truth[:1]), clip._replace(images=clip.truth)
+    for number, damaged in enumerate((whole[:200], b"", wrong_shape, wrong_type, clip._asdict() | {"x": clip.truth})):
+        if isinstance(damaged, bytes):
+            path.write_bytes(damaged)
+        else:
+            write_arrays(path, damaged if isinstance(damaged, dict) else damaged._asdict())
+        kept_passes({"a": 1}, make, tmp_path)
+        assert len(calls) == number + 2
     kept_passes({"a": 2}, make, tmp_path)
-    assert len(made) == 3
+    assert len(calls) == 7
+
+
+def test_passes_that_cannot_be_kept_are_still_returned(tmp_path, caplog):
+    (tmp_path / "file").touch()
+    clip = clip_of(2, 28, 0)
+    assert kept_passes({"a": 1}, lambda: clip, tmp_path / "file" / "folder") is clip
+    assert "passes are not kept: cannot write" in caplog.text
 
 
 def test_splits_share_no_clip_and_differ_by_seed():

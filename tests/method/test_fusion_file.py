@@ -1,5 +1,6 @@
 """Fitted trees in files: what comes back is what went in, and what is none is one sentence."""
 
+import dataclasses
 import json
 
 import jax
@@ -10,7 +11,7 @@ from safetensors.numpy import load_file, save_file
 from tests.tiny import tiny_config
 from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
-from vggtjax.method.fusion_file import load_fusion, save_fusion, warn_if_fitted_otherwise
+from vggtjax.method.fusion_file import load_fusion, read_fusion, save_fusion, warn_if_fitted_otherwise
 from vggtjax.method.fusion_rule import parse_family, start
 from vggtjax.storage.tensor_file import read_tensors
 
@@ -56,13 +57,38 @@ def test_other_files_are_one_sentence(tmp_path):
         load_fusion(tmp_path / "other.safetensors")
 
 
+@pytest.mark.parametrize(
+    ("about", "sentence"),
+    [
+        ("{", "is not JSON"),
+        ("[]", "expected an object"),
+        ('{"mask_pairs": ' + "9" * 5000 + "}", "out of range"),
+        ('{"align_scale": ' + "[" * 5000 + "]" * 5000 + "}", "origin of the fusion"),
+    ],
+)
+def test_a_malformed_origin_is_one_sentence(tmp_path, about, sentence):
+    path = tmp_path / "a.safetensors"
+    save_fusion(path, start(()))
+    save_file(load_file(path), path, read_tensors(path).metadata | {"about": about})
+    with pytest.raises(InputError, match=sentence):
+        read_fusion(path, ["4dvggt-d"])
+
+
 def test_other_models_and_settings_are_warned_of(tmp_path, caplog):
-    path, model = tmp_path / "a.safetensors", Model(tiny_config(), {}, "mine")
-    save_fusion(path, start(()), {"model": "mine", "mask_pairs": 5})
-    warn_if_fitted_otherwise(path, model, mask_pairs=5, align_scale=True)
-    assert not caplog.messages
-    warn_if_fitted_otherwise(path, Model(tiny_config(), {}, "other"), mask_pairs=3)
-    assert [message.partition("with ")[2] for message in caplog.messages] == [
-        "model mine, and is used with other",
-        "mask_pairs 5, and is used with 3",
-    ]
+    """By digest; by the name of the model where an older file has no digest."""
+    path = tmp_path / "a.safetensors"
+    model, other = (Model(tiny_config(), {"x": np.full(2, value)}, "mine") for value in (1.0, 2.0))
+    renamed = dataclasses.replace(model, name="models/renamed.safetensors")
+    digest, others = model.identity.sha256, other.identity.sha256
+    assert renamed.identity.sha256 == digest
+    for about, user, warning in (
+        ({"model": "mine", "model_sha256": digest, "mask_pairs": 5}, renamed, None),
+        ({"model": "mine", "model_sha256": digest}, other, f"mine (sha256 {digest[:8]}) mine (sha256 {others[:8]})"),
+        ({"model": "mine", "mask_pairs": 3}, other, "3 5"),
+        ({"model": "mine"}, dataclasses.replace(model, name="other"), "mine other"),
+        ({"model": "weights/mine.safetensors"}, model, None),
+    ):
+        caplog.clear()
+        save_fusion(path, start(()), about)
+        warn_if_fitted_otherwise(path, user, mask_pairs=5, align_scale=True)
+        assert [f"{record.args[2]} {record.args[3]}" for record in caplog.records] == ([warning] if warning else [])

@@ -104,7 +104,14 @@ def fit_fusion(
                 clips,
                 patch,
                 config,
-                about={"model": loaded.name, "data": list(data), "held_out": held_out, "pixels": pixels, **options}
+                about={
+                    "model": loaded.name,
+                    "model_sha256": loaded.identity.sha256,
+                    "data": list(data),
+                    "held_out": held_out,
+                    "pixels": pixels,
+                    **options,
+                }
                 | {"align_scale": align_scale, "max_frames": max_frames, "size": size},
             )
     _say(report, outcomes, chosen, out)

@@ -18,19 +18,18 @@ from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.fusion_gate import CHANNELS, init_gate
 from vggtjax.method.fusion_rule import FEATURES, PARTS, FusionParams, projected
 from vggtjax.options import METHODS, find_method
-from vggtjax.storage.tensor_file import Spec, read_tensors, write_tensors
+from vggtjax.storage.json_values import parse_json
+from vggtjax.storage.tensor_file import Spec, StoredTensor, read_tensors, write_tensors
 
 logger = logging.getLogger(__name__)
 
 FORMAT = "vggtjax fusion"
 VERSION = 1
+_MODEL_FILES = (".safetensors", ".pt", ".pth", ".json")
 
 
 def save_fusion(path: str | Path, params: FusionParams, about: Mapping[str, Any] | None = None) -> None:
-    """Write a tree; `about` are plain values that say where it is from.
-
-    Raises OutputError where the file cannot be written.
-    """
+    """Write a tree with `about`, plain values that tell its origin; OutputError where the file cannot be written."""
     leaves = {name: np.asarray(leaf, np.float32) for name, leaf in _named(params).items()}
     write_tensors(
         path,
@@ -44,21 +43,16 @@ def load_fusion(path: str | Path) -> FusionParams:
     """Read a tree.
 
     Raises:
-        InputError: the file cannot be read, is no tree of this family, or has values out of range.
+        InputError: the file cannot be read, is not a tree of this family, or has values out of range.
     """
-    try:
-        file = read_tensors(path)
-    except CheckpointError as error:
-        raise InputError(f"{error}; expected a file that vggtjax fit-fusion wrote") from None
-    if file.metadata.get("format") != FORMAT or file.metadata.get("version") != str(VERSION):
-        raise InputError(f"{path} is not a fitted fusion of version {VERSION}; expected what vggtjax fit-fusion wrote")
-    wanted = _expected(any(name.startswith("gate.") for name in file.tensors))
-    shapes = {name: stored.shape for name, stored in file.tensors.items()}
+    tensors, _ = _read(path)
+    wanted = _expected(any(name.startswith("gate.") for name in tensors))
+    shapes = {name: stored.shape for name, stored in tensors.items()}
     if wrong := sorted(name for name in wanted.keys() | shapes.keys() if wanted.get(name) != shapes.get(name)):
         raise InputError(
             f"{path} has {wrong[0]} of shape {shapes.get(wrong[0])}; expected {wanted.get(wrong[0])}: fit it again"
         )
-    leaves = {name: np.asarray(stored, np.float32) for name, stored in file.tensors.items()}
+    leaves = {name: np.asarray(stored, np.float32) for name, stored in tensors.items()}
     if bad := sorted(name for name, leaf in leaves.items() if not np.isfinite(leaf).all()):
         raise InputError(f"{path} has values of {bad[0]} that are not finite; fit it again")
     params: FusionParams = {name: jnp.asarray(leaves[name]) for name in PARTS}
@@ -75,15 +69,6 @@ def load_fusion(path: str | Path) -> FusionParams:
     return params
 
 
-def fusion_about(path: str | Path) -> dict[str, Any]:
-    """Return what a file says of where its tree is from; nothing where that cannot be read."""
-    try:
-        about = json.loads(read_tensors(path).metadata.get("about", ""))
-    except (CheckpointError, ValueError, RecursionError):
-        return {}
-    return about if isinstance(about, dict) else {}
-
-
 def check_fuses(*methods: str) -> None:
     """Raise InputError unless at least one of the methods fuses both passes."""
     if all(find_method(method).depth != "fused" for method in methods):
@@ -98,9 +83,19 @@ def read_fusion(path: Path, methods: Sequence[str]) -> FusionParams:
 
 
 def warn_if_fitted_otherwise(path: Path, model: Model, **settings: Any) -> None:
-    """Log a warning for every setting (`align_scale`, `mask_pairs`) and for a model that the fit did not have."""
-    about = fusion_about(path)
-    for name, value in {"model": model.name, **settings}.items():
+    """Log a warning for a model and for every setting (`align_scale`, `mask_pairs`) that differ from those of the fit.
+
+    Models are compared by their sha256; where a file has none, by their names, unless it has a path for the name.
+    """
+    _, about = _read(path)
+    digest, fitted = about.get("model_sha256"), str(about.get("model"))
+    if isinstance(digest, str):
+        if digest != model.identity.sha256:
+            about["model"] = f"{fitted} (sha256 {digest[:8]})"
+            settings["model"] = f"{model.name} (sha256 {model.identity.sha256[:8]})"
+    elif not Path(fitted).is_absolute() and Path(fitted).suffix not in _MODEL_FILES:
+        settings["model"] = model.name
+    for name, value in settings.items():
         if name in about and about[name] != value:
             logger.warning("%s was fitted with %s %s, and is used with %s", path, name, about[name], value)
 
@@ -113,6 +108,17 @@ def fusion_digest(fusion: FusionParams | None) -> str | None:
     for leaf in jax.tree.leaves(fusion):
         digest.update(np.asarray(leaf, np.float32).tobytes())
     return digest.hexdigest()[:16]
+
+
+def _read(path: str | Path) -> tuple[Mapping[str, StoredTensor], dict[str, Any]]:
+    """Return a file's tensors and its origin."""
+    try:
+        file = read_tensors(path)
+    except CheckpointError as error:
+        raise InputError(f"{error}; expected a file that vggtjax fit-fusion wrote") from None
+    if file.metadata.get("format") != FORMAT or file.metadata.get("version") != str(VERSION):
+        raise InputError(f"{path} is not a fitted fusion of version {VERSION}; expected what vggtjax fit-fusion wrote")
+    return file.tensors, parse_json(file.metadata.get("about", "{}"), dict[str, Any], f"origin of the fusion {path}")
 
 
 def _named(params: FusionParams) -> dict[str, Any]:
