@@ -9,7 +9,7 @@ from PIL import Image
 from tests.dataset_files import depth_png, opened, picture, png, write
 from vggtjax.clips.images import read_image
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets import DATASETS, published
+from vggtjax.evaluation.datasets import DATASETS, find_sequences, published
 from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.plain import takes
 from vggtjax.evaluation.metrics.trajectory import checked_poses
@@ -179,6 +179,19 @@ def test_cameras_that_are_none_are_refused(tmp_path, file, content, message):
         opened("plain", folder)
 
 
+def test_one_bad_sequence_does_not_hide_the_others(tmp_path):
+    plain_folder(tmp_path / "good")
+    write(plain_folder(tmp_path / "bad") / "world_from_camera.txt", "1 2 3\n")
+    write(tmp_path / "far" / "rgb.txt", f"0.0 {'n' * 300}.png\n")
+    found = find_sequences("plain", tmp_path)
+    assert list(found) == ["bad", "good"]
+    assert len(found["good"]()) == 3
+    with pytest.raises(InputError, match="has 3 numbers"):
+        found["bad"]()
+    with pytest.raises(InputError, match="cannot read sequence far: File name too long"):
+        find_sequences("tum", tmp_path)["far"]()
+
+
 def test_arguments_that_cannot_work(tmp_path):
     plain_folder(tmp_path / "clip")
     with pytest.raises(InputError, match="'imagenet' is not known; expected one of plain, composite"):
@@ -193,6 +206,8 @@ def test_arguments_that_cannot_work(tmp_path):
         opened("plain", tmp_path, sequences=[])
     with pytest.raises(InputError, match="stride is 0"):
         opened("plain", tmp_path, stride=0)
+    with pytest.raises(InputError, match="max_frames is 0"):
+        opened("plain", tmp_path, max_frames=0)
     with pytest.raises(InputError, match="gt is 'lidar'; plain has one ground truth"):
         opened("plain", tmp_path, gt="lidar")
     with pytest.raises(InputError, match="gt is 'colmap'; dycheck has easi3r and lidar"):

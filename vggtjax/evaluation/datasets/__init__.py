@@ -98,7 +98,8 @@ def find_sequences(
     root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; expected that of the data set {name}")
-    found = dataset.reader(root)
+    gt = gt or dataset.gt_default
+    found = dataset.reader(root, gt) if gt else dataset.reader(root)
     chosen, notices = _chosen(name, root, found, sequences)
     for notice in notices:
         logger.warning("%s", notice)
@@ -106,9 +107,12 @@ def find_sequences(
     if max_frames is not None:
         frames = frames._replace(most=max_frames if frames.most is None else min(frames.most, max_frames))
 
-    def opened(sequence: str) -> LabelledSequence:
-        made = found[sequence](frames, gt or dataset.gt_default)
-        return dataclasses.replace(made, notes=(*notices, *(f"{made.name}: {note}" for note in made.notes)))
+    def opened(name: str) -> LabelledSequence:
+        try:
+            sequence = found[name](frames)
+        except OSError as error:
+            raise InputError(f"cannot read sequence {name}: {error.strerror or error}") from error
+        return dataclasses.replace(sequence, notes=(*notices, *(f"{sequence.name}: {note}" for note in sequence.notes)))
 
     return {sequence: partial(opened, sequence) for sequence in chosen}
 

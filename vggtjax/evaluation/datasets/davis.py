@@ -26,8 +26,7 @@ def davis(root: Path) -> dict[str, Opener]:
     raise InputError(f"{root} holds no sequence of DAVIS; expected JPEGImages/{_RESOLUTION} with folders of frames")
 
 
-def _read(root: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
-    del gt  # there is one
+def _read(root: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     pictures = frames.of(list(files(root / "JPEGImages" / _RESOLUTION / name, ".jpg").values()), name)
     labels = files(root / "Annotations" / _RESOLUTION / name, ".png")
     mask, notes = mask_reader(pictures, [labels.get(path.stem) for path in pictures], read_labels)

@@ -10,8 +10,7 @@ flow3d_preprocessed/ adds cameras refined with COLMAP (colmap/sparse) and dispar
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,13 +27,14 @@ from vggtjax.evaluation.datasets.cameras import (
 )
 from vggtjax.evaluation.datasets.colmap import read_views
 from vggtjax.evaluation.datasets.depth_files import read_npy
-from vggtjax.evaluation.datasets.folders import files, inside, read_text, sequence_folders
+from vggtjax.evaluation.datasets.folders import files, inside, sequence_folders
 from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
 from vggtjax.evaluation.datasets.pictures import picture_size
 from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
+from vggtjax.storage.json_values import read_json
 
-TRUTHS = ("easi3r", "lidar")
+EASI3R, LIDAR = TRUTHS = ("easi3r", "lidar")
 _SPLIT = Path("splits/train.json")
 _PICTURES = Path("rgb/1x")
 _LIDAR = Path("depth/1x")
@@ -51,19 +51,19 @@ class _Cameras(NamedTuple):
     notes: tuple[str, ...]
 
 
-def dycheck(root: Path) -> dict[str, Opener]:
+def dycheck(root: Path, gt: str = EASI3R) -> dict[str, Opener]:
     """Find sequences. Their ground truth is "easi3r", disparity aligned to COLMAP with COLMAP's cameras, or "lidar"."""
     folders = sequence_folders(root, lambda folder: (folder / _SPLIT).is_file(), str(_SPLIT))
-    return {name: partial(_read, folder, name) for name, folder in folders.items()}
+    return {name: partial(_read, folder, name, gt) for name, folder in folders.items()}
 
 
-def _read(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
+def _read(folder: Path, name: str, gt: str, frames: FrameChoice) -> LabelledSequence:
     names = _frame_names(folder / _SPLIT)
     chosen = frames.of(names, name)
     pictures = [inside(folder / _PICTURES, f"{frame}.png", folder / _SPLIT) for frame in chosen]
     if absent := [path for path in pictures if not path.is_file()]:
         raise InputError(f"{absent[0]} is not there, and {folder / _SPLIT} names its frame; get the sequence whole")
-    easi3r = gt == TRUTHS[0]
+    easi3r = gt == EASI3R
     cameras = (_colmap_cameras if easi3r else _json_cameras)(folder, chosen, pictures)
     there = files(folder / (_ALIGNED if easi3r else _LIDAR), ".npy")
     read = _from_disparity([there[frame] for frame in names if frame in there]) if easi3r else read_npy
@@ -79,8 +79,7 @@ def _read(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> Label
 
 
 def _frame_names(path: Path) -> list[str]:
-    split = _read_json(path)
-    names = split.get("frame_names") if isinstance(split, dict) else None
+    names = read_json(path, dict[str, Any], "split").get("frame_names")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
         raise InputError(f"{path} has no list of names under 'frame_names'; expected the train split of a sequence")
     for name in names:
@@ -132,7 +131,7 @@ def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cam
         return _Cameras(None, None, (note,))
     poses, intrinsics, distorted = [], [], False
     for path, picture in zip(paths, pictures, strict=True):
-        camera = _read_json(path)
+        camera = read_json(path, dict[str, Any], "camera")
         pose = np.eye(4)
         pose[:3, :3] = _numbers(camera, "orientation", (3, 3), path).T  # the file has camera-from-world
         pose[:3, 3] = _numbers(camera, "position", (3,), path)
@@ -151,7 +150,7 @@ def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cam
     return _Cameras(np.stack(poses), np.stack(intrinsics), (_DISTORTION,) * distorted)
 
 
-def _numbers(camera: Any, key: str, shape: tuple[int, ...], path: Path) -> Float64[np.ndarray, ...]:
+def _numbers(camera: Mapping[str, Any], key: str, shape: tuple[int, ...], path: Path) -> Float64[np.ndarray, ...]:
     try:
         value = np.asarray(camera[key], np.float64)
     except (KeyError, TypeError, ValueError, IndexError, OverflowError):
@@ -159,12 +158,3 @@ def _numbers(camera: Any, key: str, shape: tuple[int, ...], path: Path) -> Float
     if value.shape != shape or not np.isfinite(value).all():
         raise InputError(f"{path} has a '{key}' of shape {value.shape}; expected finite numbers of shape {shape}")
     return value
-
-
-def _read_json(path: Path) -> Any:
-    try:
-        return json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"{path} is not JSON ({str(error)[:100]}); get it whole") from None

@@ -51,10 +51,7 @@ def kitti(root: Path) -> dict[str, Opener]:
     return found
 
 
-def _read(
-    name: str, truth: Path, folder: Path, calibration: Path, frames: FrameChoice, gt: str | None
-) -> LabelledSequence:
-    del gt  # there is one
+def _read(name: str, truth: Path, folder: Path, calibration: Path, frames: FrameChoice) -> LabelledSequence:
     depths, pictures = files(truth, ".png"), files(folder, ".png")
     if not depths or not pictures:
         raise InputError(f"{folder if depths else truth} holds no .png; the drive {name} needs pictures and depth")

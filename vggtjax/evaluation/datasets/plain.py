@@ -33,16 +33,19 @@ _PER_METRE = 1000.0
 
 def plain(root: Path) -> dict[str, Opener]:
     """Find plain folders; one with several takes, between which the camera jumps, gives a sequence for each."""
-    found: dict[str, Opener] = {}
+    openers: dict[str, Opener] = {}
     for name, folder in sequence_folders(root, lambda folder: (folder / "rgb").is_dir(), "a folder rgb").items():
-        poses = _poses(folder)
+        try:
+            poses = _poses(folder)
+        except InputError:  # the opener raises it
+            poses = None
         parts = [] if poses is None else takes(poses[:, :3, 3])
         if len(parts) < 2:
-            found[name] = partial(_read, folder, name, slice(None))
+            openers[name] = partial(_read, folder, name, slice(None))
         for part in parts if len(parts) > 1 else []:
             title = f"{name} {part.start}-{part.stop - 1}"
-            found[title] = partial(_read, folder, title, slice(part.start, part.stop))
-    return found
+            openers[title] = partial(_read, folder, title, slice(part.start, part.stop))
+    return openers
 
 
 def takes(centres: Float64[np.ndarray, "S 3"]) -> list[range]:
@@ -53,8 +56,7 @@ def takes(centres: Float64[np.ndarray, "S 3"]) -> list[range]:
     return [range(start, end) for start, end in pairwise([0, *cuts.tolist(), len(centres)])]
 
 
-def _read(folder: Path, name: str, part: slice, frames: FrameChoice, gt: str | None) -> LabelledSequence:
-    del gt  # there is one
+def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> LabelledSequence:
     pictures = _pictures(folder)
     poses = _poses(folder)
     if poses is not None and len(poses) != len(pictures):

@@ -46,5 +46,5 @@ class LabelledSequence:
 
 
 Sequence = LabelledSequence  # the older name
-Opener = Callable[[FrameChoice, str | None], LabelledSequence]  # of frames and the name of a ground truth
+Opener = Callable[[FrameChoice], LabelledSequence]
 Reader = Callable[[Path], Mapping[str, Opener]]  # of a root: the openers of its sequences by name

@@ -36,8 +36,7 @@ def seven_scenes(root: Path) -> dict[str, Opener]:
     return {name: partial(_read, folder, name) for name, folder in folders.items()}
 
 
-def _read(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
-    del gt  # there is one
+def _read(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     pictures, depths, pose_files = (files(folder, ending) for ending in (_PICTURE, _DEPTH, _POSE))
     chosen = frames.of(list(pictures), name)
     taken = [pictures[frame] for frame in chosen]

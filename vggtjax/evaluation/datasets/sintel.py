@@ -45,8 +45,7 @@ def read_cam(path: Path) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray
     return values[:9].reshape(3, 3), values[9:].reshape(3, 4)
 
 
-def _read(training: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
-    del gt  # there is one
+def _read(training: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     pictures = frames.of(list(files(training / "final" / name, ".png").values()), name)
     depths = files(training / "depth" / name, ".dpt")
     depth, notes = depth_reader(pictures, [depths.get(path.stem) for path in pictures], read_dpt)

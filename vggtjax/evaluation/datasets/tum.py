@@ -92,8 +92,7 @@ def _found(root: Path, prefix: str) -> dict[str, Path]:
     return {name.removeprefix(prefix): folder for name, folder in folders.items()}
 
 
-def _read_tum(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
-    del gt  # there is one
+def _read_tum(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     pictures = _listed(folder, "rgb.txt")
     poses, posed = _poses(folder, pictures.times)
     notes: tuple[str, ...] = ()
@@ -115,8 +114,7 @@ def _read_tum(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> L
     )
 
 
-def _read_bonn(folder: Path, name: str, frames: FrameChoice, gt: str | None) -> LabelledSequence:
-    del gt  # there is one
+def _read_bonn(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     pictures = _listed(folder, "rgb.txt")
     chosen = frames.of(range(len(pictures.paths)), name)
     notes = (*frames.shortage(len(pictures.paths)), "lens distortion is left as it is, the intrinsics do not have it")
