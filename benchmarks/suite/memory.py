@@ -19,13 +19,13 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.method.passes import first_pass, run_passes
 from vggtjax.network.aggregator import SPECIAL_TOKENS
-from vggtjax.network.backbone import encode
+from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.model import forward, parameter_shapes
+from vggtjax.network.precision import Compute
 
 
 def _first_with_cues(params, images, config: VGGTConfig, compute_dtype: str):
-    tokens = encode(params, images, config, compute_dtype=compute_dtype)
-    return first_pass(params, images, tokens, config, compute_dtype=compute_dtype)
+    return first_pass(params, ClipBatch(images), config, compute=Compute(compute_dtype))
 
 
 _PROGRAMS = {"plain pass": forward, "first pass with cues": _first_with_cues, "both passes": run_passes}

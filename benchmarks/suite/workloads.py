@@ -26,6 +26,7 @@ from vggtjax.network.aggregator import aggregate
 from vggtjax.network.backbone import encode
 from vggtjax.network.dpt_head import predict_dense, project_tap
 from vggtjax.network.model import forward
+from vggtjax.network.precision import Compute
 from vggtjax.network.track_head import predict_tracks
 from vggtjax.pipeline.run import infer
 from vggtjax.scenes import SceneConfig, load_textures
@@ -58,7 +59,7 @@ def aggregator(case: Case) -> Program:
 
     def run(params, images):
         tokens = encode(params, images, case.config, compute_dtype=case.dtype)
-        return aggregate(params, tokens, case.config, case.grid, captures=(), compute_dtype=case.dtype)[0]
+        return aggregate(params, tokens, case.config, case.grid, captures=(), compute=Compute(case.dtype))[0]
 
     return run, (case.params, case.images())
 

@@ -20,12 +20,12 @@ from vggtjax import (
     init_params,
     load_clip,
     motion_saliency,
-    pipeline,
     reconstruct,
 )
 from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.method.fusion import scale_between
 from vggtjax.method.mask import dynamic_pixels, dynamic_tokens, mine_mask
+from vggtjax.pipeline import run
 from vggtjax.results.reconstruction import FieldOfViewWarning
 
 FRAMES, SIZE = 4, (140, 140)
@@ -169,7 +169,7 @@ def test_running_out_of_memory_is_one_sentence(params, config, images, monkeypat
     def exhausted(*_):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
 
-    monkeypatch.setattr(pipeline, "compile_stages", exhausted)
+    monkeypatch.setattr(run, "compile_stages", exhausted)
     with pytest.raises(DeviceMemoryError, match="4 frames of 140 x 140 pixels do not fit"):
         reconstruct(Model(config, params, "tiny"), load_clip(images[0], size=140))
 

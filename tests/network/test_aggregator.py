@@ -12,6 +12,7 @@ from vggtjax.config import Suppress
 from vggtjax.method.cues import GramCues
 from vggtjax.network.aggregator import aggregate, identity
 from vggtjax.network.model import parameter_shapes
+from vggtjax.network.suppression import Suppression
 
 GRID = (2, 3)
 CONFIG = VGGTConfig(
@@ -40,8 +41,8 @@ def small():
 @partial(jax.jit, static_argnames=("suppress", "mask_pairs", "with_cues"))
 def run(params, tokens, dynamic=None, suppress: Suppress = "zero", mask_pairs=5, with_cues=False):
     return aggregate(
-        params, tokens, CONFIG, GRID, captures=[identity] * 4, dynamic_tokens=dynamic, suppress=suppress,
-        mask_pairs=mask_pairs, accumulator=GramCues(CONFIG.motion, CONFIG.depth) if with_cues else None,
+        params, tokens, CONFIG, GRID, captures=[identity] * 4, suppression=Suppression(dynamic, suppress, mask_pairs),
+        accumulator=GramCues(CONFIG.motion, CONFIG.depth) if with_cues else None,
     )  # fmt: skip
 
 

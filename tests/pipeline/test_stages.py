@@ -10,7 +10,9 @@ from vggtjax import Model, compile_ahead, encode, forward, load_clip, reconstruc
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.method.passes import first_pass, second_pass
+from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.model import init_params
+from vggtjax.network.suppression import Suppression
 from vggtjax.pipeline.frame_padding import padded_frames
 
 SIDE, OFFSETS = 70, MotionConfig().offsets
@@ -71,7 +73,7 @@ def test_a_padded_clip_gives_the_same(model, method):
 @pytest.mark.parametrize("suppress", ["zero", "drop"])
 def test_frames_that_are_not_real_change_nothing(model, suppress):
     """Whatever they show, bit by bit; and the result is that of the shorter clip."""
-    config, count = model.config, jnp.array([5])
+    config, count, suppression = model.config, jnp.array([5]), Suppression(suppress=suppress)
     short = jnp.asarray(pictures(5))[None]
     moving = np.zeros((1, 7, SIDE, SIDE), bool)
     moving[:, 1:3, :28] = True
@@ -79,16 +81,15 @@ def test_frames_that_are_not_real_change_nothing(model, suppress):
     for rest in (np.zeros((2, SIDE, SIDE, 3)), pictures(2), np.full((2, SIDE, SIDE, 3), np.nan)):
         images = jnp.concatenate([short, jnp.asarray(rest, jnp.float32)[None]], axis=1)
         tokens = encode(model.params, images, config)
-        first, saliency = first_pass(model.params, images, tokens, config, frame_count=count)
-        second = second_pass(
-            model.params, images, tokens, jnp.asarray(moving), config, suppress=suppress, frame_count=count
-        )
+        clips = ClipBatch(images, tokens, count)
+        first, saliency = first_pass(model.params, clips, config)
+        second = second_pass(model.params, clips, jnp.asarray(moving), config, suppression=suppression)
         made.append(jax.tree.map(lambda x: np.asarray(x[:, :5]), (first, saliency, second)))
     for others in made[1:]:
         assert all((a == b).all() for a, b in zip(jax.tree.leaves(made[0]), jax.tree.leaves(others), strict=True))
-    tokens = encode(model.params, short, config)
-    first, saliency = first_pass(model.params, short, tokens, config)
-    second = second_pass(model.params, short, tokens, jnp.asarray(moving[:, :5]), config, suppress=suppress)
+    clips = ClipBatch(short, encode(model.params, short, config))
+    first, saliency = first_pass(model.params, clips, config)
+    second = second_pass(model.params, clips, jnp.asarray(moving[:, :5]), config, suppression=suppression)
     for a, b in zip(jax.tree.leaves(made[0]), jax.tree.leaves((first, saliency, second)), strict=True):
         assert apart(a, b) < 2e-4
 
@@ -134,15 +135,15 @@ def test_clips_of_similar_length_share_a_compilation(model):
 def test_a_mask_without_a_moving_pixel_needs_no_second_pass(model):
     """The plain pass is returned as it is, which computing the second would not give: it is handed in changed."""
     images = jnp.asarray(pictures(4))[None]
-    tokens = encode(model.params, images, model.config)
-    plain, _ = first_pass(model.params, images, tokens, model.config)
+    clips = ClipBatch(images, encode(model.params, images, model.config))
+    plain, _ = first_pass(model.params, clips, model.config)
     assert plain.depth is not None
     marked = plain._replace(depth=plain.depth + 1)
     still, moving = np.zeros((2, 1, 4, SIDE, SIDE), bool)
     moving[0, 1] = True
 
     def second(mask, **more):
-        return second_pass(model.params, images, tokens, jnp.asarray(mask), model.config, **more)
+        return second_pass(model.params, clips, jnp.asarray(mask), model.config, **more)
 
     assert (np.asarray(second(still, plain=marked).depth) == np.asarray(marked.depth)).all()
     assert apart(second(still).depth, plain.depth) < 1e-4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -15,9 +16,11 @@ from vggtjax.method.fusion_rule import FusionParams, fuse, identity, soft_mask
 from vggtjax.method.mask import CONSTANT, otsu_threshold, upsample
 from vggtjax.method.passes import Cameras, Passes, first_pass, second_pass
 from vggtjax.network.backbone import encode
+from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.layers import Params
 from vggtjax.network.pose import decode_pose
-from vggtjax.network.precision import full_precision
+from vggtjax.network.precision import Compute, full_precision
+from vggtjax.network.suppression import Suppression
 
 
 class SoftMasking(NamedTuple):
@@ -82,21 +85,14 @@ def reconstruct_softly(
         gram, motion, compute_dtype: as for `run_passes`.
         stop_camera_gradient, remat: as for `forward`.
     """
-    network = {"compute_dtype": compute_dtype, "remat": remat}
-    patch_tokens = encode(params, images, config, **network)
+    clips = ClipBatch(images, encode(params, images, config, compute_dtype=compute_dtype, remat=remat))
+    compute = Compute(compute_dtype, remat)
     mining = {"gram": gram, "motion": motion, "exponents": masking.exponents}
-    first, saliency = first_pass(params, images, patch_tokens, config, **mining, **network)
+    first, saliency = first_pass(params, clips, config, compute=compute, **mining)
     dynamic = soft_pixels(saliency, (images.shape[2], images.shape[3]), masking)
-    second = second_pass(
-        params,
-        images,
-        patch_tokens,
-        dynamic,
-        config,
-        strength=masking.strength,
-        stop_camera_gradient=stop_camera_gradient,
-        **network,
-    )
+    compute = dataclasses.replace(compute, stop_camera_gradient=stop_camera_gradient)
+    suppression = Suppression(strength=masking.strength)
+    second = second_pass(params, clips, dynamic, config, suppression=suppression, compute=compute)
     passes = Passes(first, second, saliency, dynamic)  # pyright: ignore[reportArgumentType]
     fused = fuse(identity() if fusion is None else fusion, observe(passes, config.patch_size))
     cameras = Cameras(*decode_pose(second.pose_encoding, (images.shape[2], images.shape[3])))  # pyright: ignore

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -13,10 +14,13 @@ from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
 from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
 from vggtjax.method.mask import dynamic_tokens, mine_mask
-from vggtjax.network.backbone import encode
+from vggtjax.network.backbone import encode, patch_grid
+from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.layers import Params
-from vggtjax.network.model import Predictions, forward
+from vggtjax.network.model import Predictions, predict
 from vggtjax.network.pose import decode_pose
+from vggtjax.network.precision import FLOAT32, Compute
+from vggtjax.network.suppression import NOTHING_SUPPRESSED, Suppression
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Threshold, find_method
 
@@ -57,83 +61,69 @@ class Assembly(NamedTuple):
 
 def first_pass(
     params: Params,
-    images: Float[Array, "B S H W 3"],
-    patch_tokens: Float[Array, "B S P C"],
+    clips: ClipBatch,
     config: VGGTConfig,
     *,
     gram: Gram = "cosine",
     motion: MotionConfig | None = None,
+    exponents: Float[Array, " cues"] | None = None,
     outputs: tuple[str, ...] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
-    frame_count: Int[Array, " B"] | None = None,
-    exponents: Float[Array, " cues"] | None = None,
-    compute_dtype: str = "float32",
-    remat: bool = False,
+    compute: Compute = FLOAT32,
 ) -> tuple[Predictions, Float[Array, "B S h w"]]:
-    """Run the plain pass and mine the motion saliency on the way; with `query_points`, track them too.
+    """Run the plain pass and mine the motion saliency inside it; with `query_points`, track them too.
 
-    Of clips with a `frame_count` only the first so many frames mean anything. `exponents` are those of the cues.
+    Of clips with a `frame_count` only the real frames are valid. `exponents` are those of the cues in their product.
     """
     if gram not in ("cosine", "dot"):
         raise InputError(f"gram is {gram!r}; expected 'cosine' or 'dot'")
     cues = GramCues(motion or config.motion, config.depth, gram)
-    predictions = forward(
+    predictions = predict(
         params,
-        images,
+        clips,
         config,
-        patch_tokens=patch_tokens,
         outputs=outputs if query_points is None else (*outputs, "tracks"),
         query_points=query_points,
-        frame_count=frame_count,
-        cues=cues,
-        compute_dtype=compute_dtype,
-        remat=remat,
+        accumulator=cues,
+        compute=compute,
     )
-    h, w = (side // config.patch_size for side in images.shape[2:4])
-    saliency = cues.saliency(_present(predictions.cue_sums), exponents).reshape(*images.shape[:2], h, w)
+    B, S, h, w = (*clips.images.shape[:2], *patch_grid(clips.images, config))
+    saliency = cues.saliency(predictions.cue_sums, exponents).reshape(B, S, h, w)
     return predictions._replace(cue_sums=None), saliency
 
 
 def second_pass(
     params: Params,
-    images: Float[Array, "B S H W 3"],
-    patch_tokens: Float[Array, "B S P C"],
+    clips: ClipBatch,
     dynamic_mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"],
     config: VGGTConfig,
     *,
     plain: Predictions | None = None,
-    suppress: Suppress = "zero",
-    mask_pairs: int = 5,
-    strength: Float[Array, " depth"] | None = None,
+    suppression: Suppression = NOTHING_SUPPRESSED,
     outputs: tuple[str, ...] = ("camera", "depth"),
-    frame_count: Int[Array, " B"] | None = None,
-    stop_camera_gradient: bool = True,
-    compute_dtype: str = "float32",
-    remat: bool = False,
+    compute: Compute = FLOAT32,
 ) -> Predictions:
-    """Run the mask-aware pass: the keys of dynamic tokens suppressed in the first `mask_pairs` pairs.
+    """Run the mask-aware pass: the keys of dynamic tokens are suppressed in the first pairs of blocks.
 
-    Where no pixel of the whole batch is dynamic, it is the plain pass: if `plain` gives what that predicted, it is
-    returned, and nothing is computed (all is, if `plain` lacks some of the outputs). Of clips with a `frame_count` only
-    the first so many frames mean anything. A mask of shares in [0, 1] and a `strength` are as `forward` takes them.
+    Without a dynamic pixel in the whole batch, it equals the plain pass: the predictions of `plain`, where given, are
+    returned without computation, unless `plain` lacks one of the outputs. Of clips with a `frame_count` only the real
+    frames are valid.
+
+    Args:
+        params: the model's parameter tree.
+        clips: images, patch tokens and numbers of real frames.
+        dynamic_mask: dynamic pixels, or their shares in [0, 1]. They become the dynamic tokens of the suppression.
+        config: the model's configuration.
+        plain: predictions of the first pass.
+        suppression: how keys are suppressed, and in which pairs.
+        outputs: what to predict, as for `forward`.
+        compute: as for `predict`.
     """
 
     def masked() -> Predictions:
-        return forward(
-            params,
-            images,
-            config,
-            patch_tokens=patch_tokens,
-            dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size),
-            suppress=suppress,
-            mask_pairs=mask_pairs,
-            strength=strength,
-            outputs=outputs,
-            frame_count=frame_count,
-            stop_camera_gradient=stop_camera_gradient,
-            compute_dtype=compute_dtype,
-            remat=remat,
-        )
+        tokens = dynamic_tokens(dynamic_mask, config.patch_size)
+        masking = dataclasses.replace(suppression, dynamic_tokens=tokens)
+        return predict(params, clips, config, suppression=masking, outputs=outputs, compute=compute)
 
     fields = {"camera": ("pose_encoding",), "depth": ("depth", "depth_confidence")}
     wanted = {name: getattr(plain, name, None) for output in outputs for name in fields.get(output, (output,))}
@@ -144,34 +134,26 @@ def second_pass(
 
 def track_from(
     params: Params,
-    images: Float[Array, "B S H W 3"],
-    patch_tokens: Float[Array, "B S P C"],
+    clips: ClipBatch,
     query_points: Float[Array, "B Q 2"],
     frame: Int[Array, ""],
     config: VGGTConfig,
     *,
-    compute_dtype: str = "float32",
+    compute: Compute = FLOAT32,
 ) -> Tracks:
     """Track points of any frame: the clip is rolled so that the frame comes first, and its tracks are rolled back.
 
     Args:
         params: the model's parameter tree.
-        images, patch_tokens: of the clips, in their order.
+        clips: images and patch tokens of the clips, in their order; all frames are real.
         query_points: x, y in pixels of the frame.
-        frame: its index (may be traced: one compilation serves all frames with as many points).
+        frame: its index (can be traced: one compilation serves all frames with equal numbers of points).
         config: the model's configuration.
-        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
+        compute: as for `predict`.
     """
-    made = forward(
-        params,
-        jnp.roll(images, -frame, axis=1),
-        config,
-        patch_tokens=jnp.roll(patch_tokens, -frame, axis=1),
-        outputs=("tracks",),
-        query_points=query_points,
-        compute_dtype=compute_dtype,
-    )
-    tracks = (made.tracks, made.track_visibility, made.track_confidence)
+    rolled = jax.tree.map(lambda x: jnp.roll(x, -frame, axis=1), clips)
+    predictions = predict(params, rolled, config, outputs=("tracks",), query_points=query_points, compute=compute)
+    tracks = (predictions.tracks, predictions.track_visibility, predictions.track_confidence)
     return Tracks(*(jnp.roll(_present(value), frame, axis=1) for value in tracks))
 
 
@@ -192,7 +174,7 @@ def motion_saliency(
         gram: "cosine" (rows of q and k normalised per head, 4DVGGT-D) or "dot" (VGGT4D).
         motion: the table of cues; the configuration's own if None.
     """
-    return first_pass(params, images, encode(params, images, config), config, gram=gram, motion=motion, outputs=())[1]
+    return first_pass(params, ClipBatch(images), config, gram=gram, motion=motion, outputs=())[1]
 
 
 def run_passes(
@@ -228,17 +210,16 @@ def run_passes(
         second: what the second pass shall predict; () for no second pass.
     """
     patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
-    first, saliency = first_pass(
-        params, images, patch_tokens, config, gram=gram, motion=motion, compute_dtype=compute_dtype
-    )
+    clips, compute = ClipBatch(images, patch_tokens), Compute(compute_dtype)
+    first, saliency = first_pass(params, clips, config, gram=gram, motion=motion, compute=compute)
     size = (images.shape[2], images.shape[3])
     mining = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames}
     mask = mine_mask(saliency, patch_tokens, size, **mining)
     if not second:
         return Passes(first, None, saliency, mask)
-    masking = {"suppress": suppress, "mask_pairs": mask_pairs, "outputs": second, "compute_dtype": compute_dtype}
-    made = second_pass(params, images, patch_tokens, mask, config, plain=first, **masking)
-    return Passes(first, made, saliency, mask)
+    suppression = Suppression(suppress=suppress, mask_pairs=mask_pairs)
+    options = {"plain": first, "suppression": suppression, "outputs": second, "compute": compute}
+    return Passes(first, second_pass(params, clips, mask, config, **options), saliency, mask)
 
 
 def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False) -> Assembly:

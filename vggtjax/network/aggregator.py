@@ -8,14 +8,15 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from vggtjax.config import Suppress, VGGTConfig
+from vggtjax.config import VGGTConfig
 from vggtjax.network.block import Block
+from vggtjax.network.clip_batch import real_frames
 from vggtjax.network.layers import Params
-from vggtjax.network.precision import full_precision, widened
+from vggtjax.network.precision import FLOAT32, Compute, full_precision, widened
 from vggtjax.network.rope import rope_table
-from vggtjax.network.suppression import Suppression
+from vggtjax.network.suppression import NOTHING_SUPPRESSED, SuppressedKeys, Suppression
 
 REGISTERS = 4
 SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
@@ -65,54 +66,42 @@ def aggregate(
     captures: Sequence[Capture],
     accumulator: Accumulator | None = None,
     frame_count: Int[Array, " B"] | None = None,
-    dynamic_tokens: Bool[Array, "B S h w"] | Float[Array, "B S h w"] | None = None,
-    suppress: Suppress = "zero",
-    mask_pairs: int = 5,
-    strength: Float[Array, " depth"] | None = None,
-    compute_dtype: str = "float32",
-    remat: bool = False,
+    suppression: Suppression = NOTHING_SUPPRESSED,
+    compute: Compute = FLOAT32,
 ) -> tuple[Float[Array, "B S E"], tuple[Any, ...], Any]:
     """Run the alternating blocks; return the last pair's camera tokens, the captured taps, and the accumulated sums.
 
     Args:
         params: the model's parameter tree (`aggregator` is read).
         patch_tokens: what `encode` returned.
+        config: the model's configuration.
         grid: rows and columns of patches, h and w.
-        captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Nothing
-            else of the tapped pairs is stored, and nothing at all of the others.
+        captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Only these
+            trees are stored, and only of the tapped pairs.
         accumulator: what to sum over q and k of the global blocks, such as motion cues, or None.
-        frame_count: number of frames of each clip that are real, its first ones, one at least; the others change
-            nothing in them.
-        dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs, in both blocks of a pair;
-            bool, or how much of each key is, in [0, 1].
-        suppress, mask_pairs, compute_dtype: as for `forward`.
-        strength: share of the suppression in every pair, in place of `mask_pairs`.
-        remat: keep one pair's input for the gradient, and compute what is inside again.
+        frame_count: number of real frames of each clip, its first ones, at least one; the other frames do not influence
+            them.
+        suppression: the keys to suppress, in both blocks of a pair.
+        compute: type of the products; with `remat`, only the input of every pair is stored for the gradient.
     """
     params = params["aggregator"]
     B, S, P, C = patch_tokens.shape
     T = SPECIAL_TOKENS + P
-    block = _block(config, compute_dtype)
-    head_dim = C // config.num_heads
-    rope = rope_table(grid, SPECIAL_TOKENS, head_dim)
+    block = _block(config, compute.compute_dtype)
+    rope = rope_table(grid, SPECIAL_TOKENS, C // config.num_heads)
+    real = real_frames(frame_count, S)
+    real_tokens = None if real is None else jnp.repeat(real, T, axis=1)
+    keys = suppression.keys(SPECIAL_TOKENS)
 
-    there = None if frame_count is None else jnp.repeat(jnp.arange(S)[None] < frame_count[:, None], T, axis=1)
-
-    if strength is not None and dynamic_tokens is not None:
-        dynamic_tokens = dynamic_tokens.astype(jnp.promote_types(dynamic_tokens.dtype, strength.dtype))
-
-    def suppression(active: Array, rows: int) -> Suppression | None:
-        if dynamic_tokens is None:
-            return None
-        keys = jnp.pad(dynamic_tokens.reshape(B, S, P), ((0, 0), (0, 0), (SPECIAL_TOKENS, 0)))  # [B, S, T]
-        return Suppression(keys.reshape(rows, -1), active, suppress)
+    def suppressed(active: Array, rows: int) -> SuppressedKeys | None:
+        return None if keys is None else SuppressedKeys(keys.reshape(rows, -1), active, suppression.suppress)
 
     def pair(carry, layer):
         x, _, taps, sums = carry
-        frame_params, global_params, masked, tapped, counts = layer
-        x, _, _ = block(frame_params, x.reshape(B * S, T, C), rope, suppression(masked, B * S))
+        frame_params, global_params, active, tapped, counts = layer
+        x, _, _ = block(frame_params, x.reshape(B * S, T, C), rope, suppressed(active, B * S))
         frame = x
-        x, q, k = block(global_params, x.reshape(B, S * T, C), rope, suppression(masked, B), there)
+        x, q, k = block(global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens)
         if accumulator is not None:
             q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
             sums = accumulator.add(sums, counts, q, k, frame_count)
@@ -124,24 +113,20 @@ def aggregate(
         camera = jnp.concatenate([frame.reshape(B, S, T, C)[:, :, 0], x[:, :, 0]], axis=-1)  # [B, S, 2C]
         return (x, camera, taps, sums), None
 
-    index = np.arange(config.depth)
-    masked = jnp.asarray(index) < mask_pairs
-    if dynamic_tokens is not None and dynamic_tokens.dtype != bool:
-        masked = masked.astype(dynamic_tokens.dtype) if strength is None else strength
     layers = (
         params["frame_blocks"],
         params["global_blocks"],
-        masked,
-        jnp.asarray(index[:, None] == np.asarray(config.taps)[None]),
+        suppression.active(config.depth),
+        jnp.asarray(np.arange(config.depth)[:, None] == np.asarray(config.taps)[None]),
         None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
     )
     sums = None if accumulator is None else accumulator.zeros(B, S, P)
-    if there is not None:  # what is not a number would count even with weight 0
-        patch_tokens = jnp.where(there.reshape(B, S, T)[:, :, :1, None], patch_tokens, 0)
+    if real is not None:  # NaN would count even with weight 0
+        patch_tokens = jnp.where(real[:, :, None, None], patch_tokens, 0)
     tokens = _tokens(params, widened(patch_tokens))
     camera = jnp.zeros((B, S, 2 * C), tokens.dtype)
     taps = tuple(_empty(capture, (B, S, T, 2 * C), tokens.dtype) for capture in captures)
-    step = jax.checkpoint(pair, prevent_cse=False) if remat else pair
+    step = jax.checkpoint(pair, prevent_cse=False) if compute.remat else pair
     (_, camera, taps, sums), _ = jax.lax.scan(step, (tokens, camera, taps, sums), layers)
     return camera, taps, sums
 
@@ -171,7 +156,7 @@ def _tokens(params: Params, patch_tokens: Float[Array, "B S P C"]) -> Float[Arra
 
 
 def _captured(capture: Capture, shape: tuple[int, int, int, int]) -> Callable:
-    """The branch of a tapped pair: join frame and global output, keep what `capture` makes of them."""
+    """Return the branch of a tapped pair: join frame and global output, and capture them."""
 
     def branch(frame, x, tap):
         del tap
@@ -181,5 +166,5 @@ def _captured(capture: Capture, shape: tuple[int, int, int, int]) -> Callable:
 
 
 def _empty(capture: Capture, shape: tuple[int, ...], dtype: Any) -> Any:
-    kept = jax.eval_shape(capture, jax.ShapeDtypeStruct(shape, dtype))
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), kept)
+    shapes = jax.eval_shape(capture, jax.ShapeDtypeStruct(shape, dtype))
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

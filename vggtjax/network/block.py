@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from vggtjax.network.layers import MLP, DType, LayerNorm, Params, apply, declare
 from vggtjax.network.pieces import in_pieces, replaced_in_pieces
 from vggtjax.network.rope import Rope, apply_rope
-from vggtjax.network.suppression import Suppression, suppressed_attention
+from vggtjax.network.suppression import SuppressedKeys, suppressed_attention
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Block:
         params: Params,
         x: Float[Array, "B L C"],
         rope: Rope | None = None,
-        suppression: Suppression | None = None,
-        present: Bool[Array, "B L"] | None = None,
+        suppressed: SuppressedKeys | None = None,
+        is_real: Bool[Array, "B L"] | None = None,
     ) -> tuple[Float[Array, "B L C"], Float[Array, "B L N D"], Float[Array, "B L N D"]]:
         """Return the tokens after the block, and q and k after norm and rotation, which the motion cues read.
 
@@ -41,8 +41,8 @@ class Block:
             params: what `declare` declares.
             x: B sequences of L tokens.
             rope: the angles of T tokens, where L is a multiple of T; or None.
-            suppression: the keys to suppress, or None.
-            present: tokens that others may look at; None for all.
+            suppressed: the keys to suppress, or None.
+            is_real: tokens that others attend to; None for all.
         """
         B, L, C = x.shape
         heads = (self.num_heads, C // self.num_heads)
@@ -72,7 +72,7 @@ class Block:
 
         place = jnp.arange(B * L) % (L if rope is None else rope.cos.shape[0])
         q, k, v = (y.reshape(B, L, *heads) for y in in_pieces(before, (tokens, place)))
-        y = suppressed_attention(q, k, v, suppression, present).reshape(B * L, C)
+        y = suppressed_attention(q, k, v, suppressed, is_real).reshape(B * L, C)
         return replaced_in_pieces(after, tokens, y).reshape(B, L, C), q, k
 
     def declare(self, C: int) -> Params:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.block import Block
+from vggtjax.network.clip_batch import real_frames
 from vggtjax.network.layers import MLP, LayerNorm, Params, apply, declare
 from vggtjax.network.pose import POSE_SIZE
 from vggtjax.network.precision import full_precision
@@ -39,7 +40,7 @@ def predict_pose(
     block = Block(config.camera_num_heads, dtype=camera_tokens.dtype)
     tokens = apply(LayerNorm(), params["token_norm"], camera_tokens)
     normed = apply(LayerNorm(1e-6, use_bias=False, use_scale=False), {}, tokens)
-    there = None if frame_count is None else jnp.arange(tokens.shape[1])[None] < frame_count[:, None]
+    is_real = real_frames(frame_count, tokens.shape[1])
     empty = jnp.broadcast_to(params["empty_pose"], (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
 
     def iteration(estimates, _):
@@ -48,7 +49,7 @@ def predict_pose(
         modulation = apply(nn.Dense(3 * E), params["modulation"], nn.silu(embedded))
         shift, scale, gate = jnp.split(modulation, 3, axis=-1)
         x = tokens + gate * (normed * (1 + scale) + shift)
-        x, _ = jax.lax.scan(lambda x, layer: (block(layer, x, present=there)[0], None), x, params["trunk"])
+        x, _ = jax.lax.scan(lambda x, layer: (block(layer, x, is_real=is_real)[0], None), x, params["trunk"])
         x = apply(LayerNorm(), params["trunk_norm"], x)
         pose = pose + apply(_branch(config), params["pose_branch"], x)
         return (pose, jax.lax.stop_gradient(pose) if stop_gradient else pose), None

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -13,21 +14,22 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import HEAD_NAMES, Suppress, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.aggregator import Accumulator, aggregate, declare_aggregator
+from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, aggregate, declare_aggregator
 from vggtjax.network.backbone import declare_backbone, encode, patch_grid
 from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict_pose
+from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_tap
 from vggtjax.network.layers import Params
-from vggtjax.network.precision import check_compute_dtype, full_precision
+from vggtjax.network.precision import FLOAT32, Compute, full_precision
+from vggtjax.network.suppression import NOTHING_SUPPRESSED, Suppression
 from vggtjax.network.track_head import declare_track_head, predict_tracks, smallest_side
-from vggtjax.options import check_mask_pairs
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
 HEADS = {"camera": "camera_head", **DENSE_HEADS, "tracks": "track_head"}
 
 
 class Predictions(NamedTuple):
-    """What a pass predicts; None where it was not asked for. Depth and points are up to scale."""
+    """Outputs of a pass; None for those that were not requested. Depth and points are up to scale."""
 
     pose_encoding: Float[Array, "B S 9"] | None = None
     depth: Float[Array, "B S H W"] | None = None
@@ -40,7 +42,18 @@ class Predictions(NamedTuple):
     cue_sums: Any = None  # of the accumulator
 
 
-@full_precision
+class ForwardChanges(TypedDict, total=False):
+    """The fields of `Suppression` and `Compute` as keywords of `forward`."""
+
+    dynamic_tokens: Bool[Array, "B S h w"] | Float[Array, "B S h w"] | None
+    suppress: Suppress
+    mask_pairs: int | Int[Array, ""]
+    strength: Float[Array, " depth"] | None
+    stop_camera_gradient: bool
+    compute_dtype: str
+    remat: bool
+
+
 def forward(
     params: Params,
     images: Float[Array, "B S H W 3"],
@@ -48,16 +61,11 @@ def forward(
     *,
     patch_tokens: Float[Array, "B S P C"] | None = None,
     frame_count: Int[Array, " B"] | None = None,
-    dynamic_tokens: Bool[Array, "B S h w"] | Float[Array, "B S h w"] | None = None,
-    suppress: Suppress = "zero",
-    mask_pairs: int = 5,
-    strength: Float[Array, " depth"] | None = None,
     outputs: Sequence[str] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
     cues: Accumulator | None = None,
-    stop_camera_gradient: bool = True,
-    compute_dtype: str = "float32",
-    remat: bool = False,
+    suppression: Suppression = NOTHING_SUPPRESSED,
+    **changes: Unpack[ForwardChanges],
 ) -> Predictions:
     """Run VGGT on clips, optionally with the keys of dynamic tokens suppressed.
 
@@ -68,43 +76,61 @@ def forward(
         images: RGB in [0, 1], any number of frames; H and W are multiples of the patch size.
         config: the model's configuration (static under jit).
         patch_tokens: what `encode` returned for these images; computed here if None.
-        frame_count: for clips of different lengths in one batch: how many of a clip's frames are real: its first ones,
-            one at least.
-            The others change nothing in them, whatever they show. Not with "tracks"; and with `cues`, every real frame
-            must have a source at the cues' offsets (four frames do by default).
-        dynamic_tokens: patches whose keys are suppressed in the first `mask_pairs` pairs; None for the plain pass.
-            Shares m in [0, 1] in place of booleans leave k (1 - m) of a key, with a gradient by m.
-        suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value leave the softmax, VGGT4D; not for
-            shares).
-        mask_pairs: number of pairs in which keys are suppressed (L_mask of the paper).
-        strength: in place of `mask_pairs`, how much of the suppression every pair takes, in [0, 1]: a key keeps
-            k (1 - strength m).
+        frame_count: for clips of different lengths in one batch: number of real frames of each clip, its first ones, at
+            least one. The other frames do not influence them. Not with "tracks"; with `cues`, every real frame needs a
+            source at the cues' offsets (four frames are enough by default).
         outputs: any of "camera", "depth", "points", "tracks".
-        query_points: x, y in pixels of the first frame, the points to track; given with "tracks" and only then.
+        query_points: x, y in pixels of the first frame, the points to track; required with "tracks", invalid without.
         cues: motion cues, or another accumulator, whose sums become `.cue_sums`.
-        stop_camera_gradient: whether the camera head's iterations see the previous estimate as a constant.
-        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
-            "float64", with parameters and images of it and jax.enable_x64, is for checks of gradients.
-        remat: compute activations of blocks and dense heads again in the backward pass: less memory, more time.
+        suppression: the keys to suppress; none for the plain pass.
+        changes: fields of `Suppression` (`dynamic_tokens`, `suppress`, `mask_pairs`, `strength`) in place of those of
+            `suppression`, and fields of `Compute` (`compute_dtype`, `remat`, `stop_camera_gradient`).
 
     Raises:
         InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing.
+        TypeError: an unknown keyword.
     """
-    grid = patch_grid(images, config)
-    _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pairs, outputs, compute_dtype)
-    _check_strength(config, dynamic_tokens, suppress, strength)
-    _check_queries(images, config, outputs, query_points, frame_count)
+    if unknown := changes.keys() - ForwardChanges.__annotations__.keys():
+        raise TypeError(f"forward() got unexpected keyword arguments: {', '.join(sorted(unknown))}")
+    masking = {name: value for name, value in changes.items() if name in Suppression.__dataclass_fields__}
+    computing: Any = {name: value for name, value in changes.items() if name not in masking}
+    clips = ClipBatch(images, patch_tokens, frame_count)
+    suppression, compute = dataclasses.replace(suppression, **masking), Compute(**computing)
+    options = {"outputs": outputs, "query_points": query_points, "accumulator": cues}
+    return predict(params, clips, config, **options, suppression=suppression, compute=compute)
+
+
+@full_precision
+def predict(
+    params: Params,
+    clips: ClipBatch,
+    config: VGGTConfig,
+    *,
+    outputs: Sequence[str] = ("camera", "depth"),
+    query_points: Float[Array, "B Q 2"] | None = None,
+    accumulator: Accumulator | None = None,
+    suppression: Suppression = NOTHING_SUPPRESSED,
+    compute: Compute = FLOAT32,
+) -> Predictions:
+    """Run the network as `forward`, whose keywords travel here as values: a batch of clips, a suppression, a compute.
+
+    Outputs that are not requested are not computed.
+    """
+    grid = patch_grid(clips.images, config)
+    _check(grid, clips, config, outputs)
+    suppression.check((*clips.images.shape[:2], *grid), config.depth)
+    _check_queries(clips, config, outputs, query_points)
+    patch_tokens = clips.patch_tokens
     if patch_tokens is None:
-        patch_tokens = encode(params, images, config, compute_dtype=compute_dtype, remat=remat)
-    dense = [name for name in outputs if name in DENSE_HEADS]
+        patch_tokens = encode(params, clips.images, config, compute_dtype=compute.compute_dtype, remat=compute.remat)
     tapped = [HEADS[name] for name in outputs if name != "camera"]
 
     def capture(slot: int):
-        def kept(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
-            patches = tokens[:, :, -grid[0] * grid[1] :]
+        def projected(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
+            patches = tokens[:, :, SPECIAL_TOKENS:]
             return {head: project_tap(params[head], patches, slot, config) for head in tapped}
 
-        return kept
+        return projected
 
     camera_tokens, taps, sums = aggregate(
         params,
@@ -112,37 +138,32 @@ def forward(
         config,
         grid,
         captures=[capture(slot) for slot in range(len(config.taps))],
-        accumulator=cues,
-        frame_count=frame_count,
-        dynamic_tokens=dynamic_tokens,
-        suppress=suppress,
-        mask_pairs=mask_pairs,
-        strength=strength,
-        compute_dtype=compute_dtype,
-        remat=remat,
+        accumulator=accumulator,
+        frame_count=clips.frame_count,
+        suppression=suppression,
+        compute=compute,
     )
-    found: dict[str, Any] = {"cue_sums": sums}
+    fields: dict[str, Any] = {"cue_sums": sums}
     if "camera" in outputs:
-        found["pose_encoding"] = predict_pose(
-            params, camera_tokens, config, frame_count=frame_count, stop_gradient=stop_camera_gradient
+        fields["pose_encoding"] = predict_pose(
+            params,
+            camera_tokens,
+            config,
+            frame_count=clips.frame_count,
+            stop_gradient=compute.stop_camera_gradient,
         )
-    densely = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4)) if remat else predict_dense
-    for name in dense:
-        head = DENSE_HEADS[name]
-        values, confidence = densely(params[head], [tap[head] for tap in taps], config, grid, name)
-        if name == "depth":
-            found |= {"depth": values[..., 0], "depth_confidence": confidence}
-        else:
-            found |= {"world_points": values, "world_points_confidence": confidence}
+    regress = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4)) if compute.remat else predict_dense
+    for name, field in (("depth", "depth"), ("points", "world_points")):
+        if name in outputs:
+            head = HEADS[name]
+            values, confidence = regress(params[head], [tap[head] for tap in taps], config, grid, name)
+            fields |= {field: values[..., 0] if name == "depth" else values, f"{field}_confidence": confidence}
     if query_points is not None:
         head = HEADS["tracks"]
         tracks = predict_tracks(params[head], [tap[head] for tap in taps], query_points, config, grid)
-        found |= {
-            "tracks": tracks.positions,
-            "track_visibility": tracks.visibility,
-            "track_confidence": tracks.confidence,
-        }
-    return Predictions(**found)
+        names = ("tracks", "track_visibility", "track_confidence")
+        fields |= dict(zip(names, tracks, strict=True))
+    return Predictions(**fields)
 
 
 def parameter_shapes(config: VGGTConfig) -> Params:
@@ -199,47 +220,26 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
     return params
 
 
-def _check(grid, images, config, patch_tokens, dynamic_tokens, suppress, mask_pairs, outputs, compute_dtype) -> None:
-    B, S = images.shape[:2]
-    tokens_shape = (B, S, grid[0] * grid[1], config.embed_dim)
-    if patch_tokens is not None and tuple(patch_tokens.shape) != tokens_shape:
-        raise InputError(f"patch_tokens have shape {tuple(patch_tokens.shape)}; expected {tokens_shape}")
-    if dynamic_tokens is not None and tuple(dynamic_tokens.shape) != (B, S, *grid):
-        raise InputError(f"dynamic_tokens have shape {tuple(dynamic_tokens.shape)}; expected {(B, S, *grid)}")
-    if dynamic_tokens is not None and dynamic_tokens.dtype != bool and not _is_floating(dynamic_tokens):
-        raise InputError(f"dynamic_tokens have type {dynamic_tokens.dtype}; expected bool, or shares as floats")
-    check_mask_pairs(mask_pairs)
+def _check(grid: tuple[int, int], clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str]) -> None:
+    tokens_shape = (*clips.images.shape[:2], grid[0] * grid[1], config.embed_dim)
+    if clips.patch_tokens is not None and tuple(clips.patch_tokens.shape) != tokens_shape:
+        raise InputError(f"patch_tokens have shape {tuple(clips.patch_tokens.shape)}; expected {tokens_shape}")
+    if clips.frame_count is not None and tuple(clips.frame_count.shape) != tokens_shape[:1]:
+        raise InputError(f"frame_count has shape {tuple(clips.frame_count.shape)}; expected {tokens_shape[:1]}")
     if unknown := [name for name in outputs if name not in HEAD_NAMES]:
         raise InputError(f"outputs has {unknown}; expected some of {HEAD_NAMES}")
     if absent := [name for name in outputs if name not in config.heads]:
-        raise InputError(f"outputs has {absent}, and this model has only the heads {config.heads}")
-    if suppress not in ("zero", "drop"):
-        raise InputError(f"suppress is {suppress!r}; expected 'zero' or 'drop'")
-    check_compute_dtype(compute_dtype)
+        raise InputError(f"outputs has {absent}; this model has only the heads {config.heads}")
 
 
-def _check_strength(config: VGGTConfig, dynamic_tokens, suppress, strength) -> None:
-    if suppress != "zero" and (strength is not None or (dynamic_tokens is not None and _is_floating(dynamic_tokens))):
-        raise InputError(
-            f"suppress is {suppress!r} with shares of tokens or a strength; expected 'zero': a key that is dropped is "
-            "dropped whole"
-        )
-    if strength is not None and tuple(strength.shape) != (config.depth,):
-        raise InputError(f"strength has shape {tuple(strength.shape)}; expected {(config.depth,)}, one for each pair")
-
-
-def _is_floating(x: Array) -> bool:
-    return jnp.issubdtype(x.dtype, jnp.floating)
-
-
-def _check_queries(images, config: VGGTConfig, outputs: Sequence[str], query_points, frame_count) -> None:
-    B, _, H, W, _ = images.shape
+def _check_queries(clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str], query_points) -> None:
+    B, _, H, W, _ = clips.images.shape
     if ("tracks" in outputs) != (query_points is not None):
         raise InputError("query_points and 'tracks' in outputs go together; give both or neither")
     if query_points is None:
         return
-    if frame_count is not None:
-        raise InputError("frame_count and query_points are given; tracks are of clips whose frames are all real")
+    if clips.frame_count is not None:
+        raise InputError("frame_count and query_points are given; tracking requires clips whose frames are all real")
     if len(query_points.shape) != 3 or query_points.shape[0] != B or query_points.shape[2] != 2:
         raise InputError(f"query_points have shape {tuple(query_points.shape)}; expected {(B, 'Q', 2)}")
     if query_points.shape[1] < 1:

@@ -1,9 +1,10 @@
-"""Float32 means float32: matrix products at full precision, whatever the accelerator's default."""
+"""How the network is computed: the blocks' type, and float32 products at full precision on every accelerator."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import ParamSpec, TypeVar
 
 import jax
@@ -16,23 +17,46 @@ _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 
 
+@dataclass(frozen=True)
+class Compute:
+    """How the network is computed; static under jit.
+
+    Attributes:
+        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
+            "float64" is for checks of gradients; it requires parameters and images in float64 and jax.enable_x64.
+        remat: compute activations of blocks and dense heads again in the backward pass: less memory, more time.
+        stop_camera_gradient: treat the previous estimate as a constant in every iteration of the camera head, as in
+            VGGT's training.
+    """
+
+    compute_dtype: str = "float32"
+    remat: bool = False
+    stop_camera_gradient: bool = True
+
+    def __post_init__(self) -> None:
+        check_compute_dtype(self.compute_dtype)
+
+
 def check_compute_dtype(name: str) -> None:
-    """Raise InputError for a type that the blocks do not compute in."""
+    """Raise InputError for a type in which the blocks cannot be computed."""
     if name not in ("float32", "bfloat16", "float64"):
         raise InputError(f"compute_dtype is {name!r}; expected 'float32' or 'bfloat16'")
     if name == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        raise InputError("compute_dtype is 'float64', which jax computes in only after jax.enable_x64(True)")
+        raise InputError("compute_dtype is 'float64', which requires jax.enable_x64(True)")
+
+
+FLOAT32 = Compute()
 
 
 def widened(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
-    """Return x in float32, or in float64 if it is in that: what sums and residual streams are kept in."""
+    """Return x in float32, or unchanged in float64: the types of sums and residual streams."""
     return x.astype(jnp.promote_types(x.dtype, jnp.float32))
 
 
 def full_precision(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
     """Trace `function` with every matrix product and convolution at the highest precision (never TF32).
 
-    The setting holds while `function` is traced and is gone afterwards; nothing global changes.
+    The setting holds only while `function` is traced; nothing global changes.
     """
 
     @functools.wraps(function)

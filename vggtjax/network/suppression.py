@@ -1,56 +1,121 @@
-"""The suppression of dynamic keys (4DVGGT-D, stage 2)."""
+"""The suppression of dynamic keys (4DVGGT-D, stage 2): what a pass suppresses, and the attention of one block."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress
+from vggtjax.errors import InputError
 from vggtjax.network.attention import attention
 
 
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=("dynamic_tokens", "mask_pairs", "strength"),
+    meta_fields=("suppress",),
+)
 @dataclass(frozen=True)
 class Suppression:
-    """Which keys a block suppresses, how, and whether this layer does so at all.
+    """The keys that a pass suppresses: a pytree whose leaves are arrays; `suppress` is static under jit.
 
-    Keys may also be shares in [0, 1], of which the layer takes the share `active`: they are shrunk, with gradients.
+    Attributes:
+        dynamic_tokens: patches whose keys are suppressed; None for the plain pass. Shares m in [0, 1] in place of
+            booleans scale a key by 1 - m, with a gradient with respect to m.
+        suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value are excluded from the softmax, VGGT4D;
+            not with shares or a strength).
+        mask_pairs: number of pairs of blocks, from the first, in which keys are suppressed (L_mask of the paper). It
+            can be traced: one compilation serves all numbers.
+        strength: share of the suppression in every pair, in [0, 1], in place of `mask_pairs`: a key is scaled by
+            1 - strength m.
     """
+
+    dynamic_tokens: Bool[Array, "B S h w"] | Float[Array, "B S h w"] | None = None
+    suppress: Suppress = "zero"
+    mask_pairs: int | Int[Array, ""] = 5
+    strength: Float[Array, " depth"] | None = None
+
+    def check(self, shape: tuple[int, ...], depth: int) -> None:
+        """Raise InputError unless the values fit patches of shape (B, S, h, w) and a model with `depth` pairs."""
+        tokens, strength, pairs = self.dynamic_tokens, self.strength, self.mask_pairs
+        if tokens is not None and tuple(tokens.shape) != shape:
+            raise InputError(f"dynamic_tokens have shape {tuple(tokens.shape)}; expected {shape}")
+        shares = tokens is not None and jnp.issubdtype(tokens.dtype, jnp.floating)
+        if tokens is not None and tokens.dtype != bool and not shares:
+            raise InputError(f"dynamic_tokens have type {tokens.dtype}; expected bool, or shares as floats")
+        if isinstance(pairs, int | float) and (pairs != int(pairs) or pairs < 0):
+            raise InputError(f"mask_pairs is {pairs}; expected a whole number of at least 0")
+        if self.suppress not in ("zero", "drop"):
+            raise InputError(f"suppress is {self.suppress!r}; expected 'zero' or 'drop'")
+        if self.suppress != "zero" and (shares or strength is not None):
+            raise InputError(
+                f"suppress is {self.suppress!r} with shares of tokens or a strength; expected 'zero': a dropped key is "
+                "dropped whole"
+            )
+        if strength is not None and tuple(strength.shape) != (depth,):
+            raise InputError(f"strength has shape {tuple(strength.shape)}; expected {(depth,)}, one for each pair")
+
+    def keys(self, special_tokens: int) -> Bool[Array, "B S T"] | Float[Array, "B S T"] | None:
+        """Return which keys are suppressed, or their shares; never those of the special tokens before the patches."""
+        tokens = self.dynamic_tokens
+        if tokens is None:
+            return None
+        if self.strength is not None:
+            tokens = tokens.astype(jnp.promote_types(tokens.dtype, self.strength.dtype))
+        return jnp.pad(tokens.reshape(*tokens.shape[:2], -1), ((0, 0), (0, 0), (special_tokens, 0)))
+
+    def active(self, depth: int) -> Bool[Array, " depth"] | Float[Array, " depth"]:
+        """Return in which pairs keys are suppressed: flags for boolean tokens, the share of each pair for shares."""
+        if self.strength is not None:
+            return self.strength
+        pairs = jnp.arange(depth) < self.mask_pairs
+        tokens = self.dynamic_tokens
+        return pairs if tokens is None or tokens.dtype == bool else pairs.astype(tokens.dtype)
+
+
+NOTHING_SUPPRESSED = Suppression()
+
+
+@dataclass(frozen=True)
+class SuppressedKeys:
+    """The keys that one block suppresses; `active` is the pair's flag, or the share of the suppression for shares."""
 
     keys: Bool[Array, "B T"] | Float[Array, "B T"]
     active: Bool[Array, ""] | Float[Array, ""]
-    mode: Suppress
+    suppress: Suppress
 
 
 def suppressed_attention(
     q: Float[Array, "B T N D"],
     k: Float[Array, "B T N D"],
     v: Float[Array, "B T N D"],
-    suppression: Suppression | None,
-    present: Bool[Array, "B T"] | None = None,
+    suppressed: SuppressedKeys | None,
+    is_real: Bool[Array, "B T"] | None = None,
 ) -> Float[Array, "B T N D"]:
-    """Attention that suppresses keys where the layer's flag is set; keys that are not `present` never count.
+    """Return attention with suppressed keys where the pair's flag is set; keys that are not real are always excluded.
 
-    `zero` replaces a suppressed key by 0, which keeps its logit, 0, in the softmax (4DVGGT-D); `drop` takes key and
-    value out of it (VGGT4D). The flag is a scalar per layer, so the choice is a real branch, not a select. Shares m
-    take k (1 - m), which is `zero` for shares of 0 and 1.
+    "zero" replaces a suppressed key by 0; its logit 0 stays in the softmax (4DVGGT-D). "drop" excludes key and value
+    (VGGT4D). The flag is a scalar per pair, so the choice is a branch, not a select. A share m scales the key by 1 - m,
+    which equals "zero" for shares of 0 and 1.
     """
-    if suppression is None:
-        return attention(q, k, v, present)
-    if jnp.issubdtype(suppression.keys.dtype, jnp.floating):
-        left = 1 - suppression.active * suppression.keys
-        return attention(q, k * left.astype(k.dtype)[:, :, None, None], v, present)
+    if suppressed is None:
+        return attention(q, k, v, is_real)
+    if jnp.issubdtype(suppressed.keys.dtype, jnp.floating):
+        scale = 1 - suppressed.active * suppressed.keys
+        return attention(q, k * scale.astype(k.dtype)[:, :, None, None], v, is_real)
 
     def zero(q, k, v, keys):
-        return attention(q, jnp.where(keys[:, :, None, None], 0, k), v, present)
+        return attention(q, jnp.where(keys[:, :, None, None], 0, k), v, is_real)
 
     def drop(q, k, v, keys):
-        return attention(q, k, v, ~keys if present is None else ~keys & present)
+        return attention(q, k, v, ~keys if is_real is None else ~keys & is_real)
 
     def plain(q, k, v, keys):
-        return attention(q, k, v, present)
+        return attention(q, k, v, is_real)
 
-    masked = {"zero": zero, "drop": drop}[suppression.mode]
-    return jax.lax.cond(suppression.active, masked, plain, q, k, v, suppression.keys)
+    masked = {"zero": zero, "drop": drop}[suppressed.suppress]
+    return jax.lax.cond(suppressed.active, masked, plain, q, k, v, suppressed.keys)

@@ -17,7 +17,10 @@ from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.method.mask import mine_mask
 from vggtjax.method.passes import Assembly, Cameras, Passes, assemble, first_pass, second_pass, track_from
 from vggtjax.network.backbone import encode
+from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.model import Predictions
+from vggtjax.network.precision import Compute
+from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import check_mask_pairs, check_smooth_frames, find_method
 from vggtjax.storage.programs import Program, keep_type
@@ -48,13 +51,22 @@ class StageMemory(NamedTuple):
     output: int
 
 
-def _first(params, images, patch_tokens, frame_count, query_points=None, **options):
-    given = {"frame_count": frame_count, "query_points": query_points}
-    return first_pass(params, images, patch_tokens, **given, **options)
+def _first(params, images, patch_tokens, frame_count, query_points=None, *, compute_dtype, **options):
+    clips = ClipBatch(images, patch_tokens, frame_count)
+    return first_pass(params, clips, query_points=query_points, compute=Compute(compute_dtype), **options)
 
 
-def _second(params, images, patch_tokens, frame_count, dynamic_mask, first, **options):
-    return second_pass(params, images, patch_tokens, dynamic_mask, plain=first, frame_count=frame_count, **options)
+def _second(
+    params, images, patch_tokens, frame_count, dynamic_mask, first, *, suppress, mask_pairs, compute_dtype, **options
+):
+    clips = ClipBatch(images, patch_tokens, frame_count)
+    options |= {"suppression": Suppression(suppress=suppress, mask_pairs=mask_pairs), "compute": Compute(compute_dtype)}
+    return second_pass(params, clips, dynamic_mask, plain=first, **options)
+
+
+def _tracks(params, images, patch_tokens, query_points, frame, *, config, compute_dtype):
+    clips = ClipBatch(images, patch_tokens)
+    return track_from(params, clips, query_points, frame, config, compute=Compute(compute_dtype))
 
 
 def _mine(
@@ -90,7 +102,7 @@ _encode = Program(encode, static=("config", "compute_dtype"))
 _first_pass = Program(_first, static=("config", "gram", "motion", "outputs", "compute_dtype"))
 _mine_mask = Program(_mine, static=("frames", "size", "clusters", "threshold", "smooth_frames"))
 _second_pass = Program(_second, static=("config", "suppress", "outputs", "compute_dtype"))  # one for all mask_pairs
-_track_from = Program(track_from, static=("config", "compute_dtype"))
+_track_from = Program(_tracks, static=("config", "compute_dtype"))
 _same = Program(_unchanged)
 assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
 for _kind in (Predictions, Passes, Cameras, Assembly, Tracks):

@@ -17,7 +17,7 @@ from vggtjax.network.dpt_head import predict_dense, project_tap
 from vggtjax.network.layers import LayerNorm, Params, apply
 from vggtjax.network.model import DENSE_HEADS
 from vggtjax.network.pose import quaternion_to_matrix
-from vggtjax.network.precision import full_precision
+from vggtjax.network.precision import Compute, full_precision
 from vggtjax.scenes.render import SyntheticClip
 from vggtjax.storage.json_values import Natural, NotNegative, check_fields
 from vggtjax.training.matching import MatchLoss
@@ -118,7 +118,7 @@ def objective(
             grid,
             captures=[capture(slot) for slot in range(len(config.taps))],
             accumulator=matching,
-            compute_dtype=compute_dtype,
+            compute=Compute(compute_dtype),
         )
 
     camera_tokens, taps, sums = (jax.checkpoint(network) if remat else network)(model)
