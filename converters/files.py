@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vggtjax.errors import CheckpointError, problems_sentence
+from vggtjax.storage.json_values import read_json
 from vggtjax.storage.tensor_file import StoredTensor, is_tensor_file, read_tensors
 
 INDEX = ".safetensors.index.json"
 SUFFIXES = (".safetensors", INDEX, ".pt", ".pth")
-_MOST_INDEX_BYTES = 2**24
 
 Tensor = np.ndarray | StoredTensor
 
@@ -100,15 +99,8 @@ def _read_shards(index: Path) -> StateDict:
 
 
 def _weight_map(index: Path) -> dict[str, str]:
-    try:
-        if index.stat().st_size > _MOST_INDEX_BYTES:
-            raise CheckpointError(f"{index} has {index.stat().st_size} bytes; an index has at most {_MOST_INDEX_BYTES}")
-        content = json.loads(index.read_bytes())
-    except OSError as error:
-        raise CheckpointError(f"cannot read {index}: {error.strerror or error}") from error
-    except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{index} is not JSON: {error}") from None
-    weight_map = content.get("weight_map") if isinstance(content, dict) else None
+    content = read_json(index, dict[str, Any], "the index", error=CheckpointError)
+    weight_map = content.get("weight_map")
     if not isinstance(weight_map, dict) or not weight_map:
         raise CheckpointError(f"{index} has no weight_map from keys to shards")
     strange = sorted({str(shard)[:100] for shard in weight_map.values() if not _is_file_name(shard)})

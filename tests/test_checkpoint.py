@@ -212,6 +212,10 @@ def test_file_is_checked_against_its_configuration(saved_once, tmp_path):
         ({"config": '{"embed_dim": 1000000, "num_heads": 10, "dino_num_heads": 10}'}, "mis-shaped parameter"),
         ({"config": '{"motion": {"cues": [5]}}'}, "motion.cues[0] is 5"),
         ({"config": " " * 70_000}, "more than 65536 bytes"),
+        ({"origin": "[" * 60_000}, "x.safetensors is not JSON"),
+        ({"origin": '{"a": ' + "9" * 400 + "}"}, "a is a number of more than 64 bits"),
+        ({"origin": '{"a": "b"}'}, "Expected `str` matching regex"),
+        ({"origin": '{"\\u001b": "' + "0" * 64 + '"}'}, "unprintable letters"),
     ],
 )
 def test_metadata_is_not_trusted(saved_once, tmp_path, metadata, reason):

@@ -5,18 +5,18 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
+from msgspec import Meta
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError, InputError, problems_sentence
@@ -32,8 +32,10 @@ FORMAT = "vggtjax"
 VERSION = "1"
 
 _DTYPES = {name: np.dtype(jax.numpy.dtype(name)) for name in ("float32", "bfloat16")}
-_MOST_CONFIG_LETTERS = 2**16
+_MOST_METADATA_LETTERS = 2**16
 _MOST_NAME_LETTERS = 200
+
+Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 
 @dataclass(frozen=True)
@@ -140,7 +142,7 @@ def read_model(path: str | Path, *, dtype: DType | None = None, name: str | None
     stored_name = metadata.get("name", "")
     is_valid = stored_name.isprintable() and 0 < len(stored_name) <= _MOST_NAME_LETTERS
     name = name or (stored_name if is_valid else path.stem)
-    model = Model(config, unflatten_dict(flat, sep="."), name, path, origin=_origin(metadata.get("origin", "{}")))
+    model = Model(config, unflatten_dict(flat, sep="."), name, path, origin=_origin(path, metadata))
     if all(flat[key].dtype == stored.dtype for key, stored in tensors.items()):
         object.__setattr__(model, "_file", facts)
     return model
@@ -228,7 +230,7 @@ def _config(path: Path, metadata: Mapping[str, str]) -> VGGTConfig:
         )
     subject = f"the configuration of {path}"
     return parse_json(
-        metadata.get("config", ""), VGGTConfig, subject, most_bytes=_MOST_CONFIG_LETTERS, error=CheckpointError
+        metadata.get("config", ""), VGGTConfig, subject, most_bytes=_MOST_METADATA_LETTERS, error=CheckpointError
     )
 
 
@@ -270,12 +272,9 @@ def _params_digest(model: Model) -> str:
     return digest.hexdigest()
 
 
-def _origin(text: str) -> dict[str, str]:
-    """Return the sha256 of the files that a model was made of; nothing where the text is not what we write."""
-    try:
-        origin = json.loads(text) if len(text) <= _MOST_CONFIG_LETTERS else {}
-    except (ValueError, RecursionError):
-        return {}
-    pairs = origin.items() if isinstance(origin, dict) else ()
-    known = all(name.isprintable() and re.fullmatch("[0-9a-f]{64}", str(digest)) for name, digest in pairs)
-    return dict(pairs) if known else {}
+def _origin(path: Path, metadata: Mapping[str, str]) -> dict[str, str]:
+    text, subject = metadata.get("origin", "{}"), f"the origin of {path}"
+    origin = parse_json(text, dict[str, Sha256], subject, most_bytes=_MOST_METADATA_LETTERS, error=CheckpointError)
+    if not all(name.isprintable() for name in origin):
+        raise CheckpointError(f"{subject} names files with unprintable letters; expected names and sha256")
+    return origin

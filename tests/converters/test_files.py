@@ -78,6 +78,7 @@ def refusal(path, function=read_state_dict) -> str:
         function(path)
     message = str(raised.value)
     assert "\n" not in message
+    assert len(message) < 6000
     return message
 
 
@@ -212,6 +213,10 @@ def test_name_of_the_model(few, small, tmp_path):
 # Damage and malice
 
 
+def header(content: bytes) -> bytes:
+    return len(content).to_bytes(8, "little") + content
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -223,6 +228,9 @@ def test_name_of_the_model(few, small, tmp_path):
         ((2**63).to_bytes(8, "little") + b"{}", "is a file that starts with"),
         ((500).to_bytes(8, "little") + b'{"a":', "is not a whole safetensors file"),
         ((8).to_bytes(8, "little") + b"{not js}", "is not a whole safetensors file"),
+        (header(b'{"a":' * 100_000), "is not a whole safetensors file"),
+        (header(b'{"a": {"dtype": "F32", "shape": [' + b"9" * 400), "is not a whole safetensors file"),
+        (header(b'{"a": {"dtype": "' + b"F" * 9000 + b'"}}'), "is not a whole safetensors file"),
     ],
 )
 def test_not_weights(tmp_path, content, reason):
@@ -332,7 +340,10 @@ def test_index_stays_in_its_folder(few, name):
     [
         ("{", "is not JSON"),
         ("[" * 100_000, "is not JSON"),
-        ("[]", "no weight_map"),
+        ("[]", "is []; expected an object"),
+        ('{"metadata": ' + "9" * 400 + "}", "metadata is a number of more than 64 bits"),
+        ('{"weight_map": {"a": ' + "[" * 70 + "]" * 70 + "}}", "is nested more than 64 levels deep"),
+        ('{"weight_map": ' + "9" * 9000 + "}", "is not JSON"),
         ('{"weight_map": []}', "no weight_map"),
     ],
 )

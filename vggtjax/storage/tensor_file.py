@@ -119,7 +119,8 @@ def read_tensors(path: str | Path) -> TensorFile:
                 tensors[name] = StoredTensor(path, offset, shape, _DTYPES[code])
                 offset += tensors[name].nbytes
     except SafetensorError as error:
-        raise CheckpointError(f"{path} is not a whole safetensors file ({error}); copy or download it again") from None
+        reason = str(error)[:200]
+        raise CheckpointError(f"{path} is not a whole safetensors file ({reason}); copy or download it again") from None
     except OSError as error:
         raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
     return TensorFile(tensors, metadata)
