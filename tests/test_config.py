@@ -14,7 +14,7 @@ from vggtjax.errors import InputError
 def test_defaults_are_vggt_1b(golden):
     assert VGGTConfig() == vggt_1b()
     assert hash(VGGTConfig()) == hash(vggt_1b())
-    assert VGGTConfig().camera_dim == 2048
+    assert VGGTConfig().tap_dim == 2048
     assert VGGTConfig().grid_size == 37
 
 

@@ -109,7 +109,7 @@ class VGGTConfig:
         for channels, heads, multiple in (
             ("embed_dim", "num_heads", 4),  # a quarter of each head turns with sin/cos of y, a quarter of x
             ("embed_dim", "dino_num_heads", 1),
-            ("camera_dim", "camera_num_heads", 1),
+            ("tap_dim", "camera_num_heads", 1),
         ):
             if getattr(self, channels) % (multiple * getattr(self, heads)):
                 raise InputError(
@@ -124,7 +124,7 @@ class VGGTConfig:
             raise InputError(f"taps is {self.taps}; expected rising pair indices below depth {self.depth}")
 
     @property
-    def camera_dim(self) -> int:
+    def tap_dim(self) -> int:
         """Channels of a tap: the frame block's output next to the global block's."""
         return 2 * self.embed_dim
 

@@ -55,7 +55,7 @@ class Ceilings:
             "exp": _repeated(lambda x: jnp.exp(-x), values),
             "GELU": _repeated(lambda x: jax.nn.gelu(x, approximate=False), values),
             "convolution": _convolution(pixels, (4 * grid[0], 4 * grid[1]), config.dpt_features),
-            "weights": _reading(12 * config.camera_depth, config.camera_dim),
+            "weights": _reading(12 * config.camera_depth, config.tap_dim),
         }
         self.looks: dict[str, list[float]] = {kind: [] for kind in self._probes}
 

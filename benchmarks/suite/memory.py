@@ -88,7 +88,7 @@ def memory(
         from benchmarks.suite.pictures import plot_growth
 
         tokens = SPECIAL_TOKENS + shape[0] * shape[1] // config.patch_size**2
-        kept = 4 * config.depth * tokens * config.camera_dim
+        kept = 4 * config.depth * tokens * config.tap_dim
         lines = {
             f"{row[0]}, {row[1]}: {row[-1]} MB a frame": (frames, line["bytes"])
             for row, line in zip(rows, found, strict=True)

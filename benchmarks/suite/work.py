@@ -62,7 +62,7 @@ def alternating(config: VGGTConfig, S: int, grid: Grid) -> list[Work]:
 
 def camera_head(config: VGGTConfig, S: int) -> list[Work]:
     """Count the camera head: a part of its own, since its weights are read in every iteration for S tokens."""
-    E, n = config.camera_dim, camera.ITERATIONS
+    E, n = config.tap_dim, camera.ITERATIONS
     weights = 12 * config.camera_depth * E**2 + POSE_SIZE * E + 3 * E**2 + E * E // 2 + E // 2 * POSE_SIZE
     blocks = _blocks(config.camera_depth, 1, S, E, config.camera_num_heads)
     rest = {"linear, float32": n * 2.0 * S * weights, "weights": n * 4.0 * weights}

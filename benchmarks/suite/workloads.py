@@ -116,7 +116,7 @@ def tracks(case: Case) -> Program:
 
 
 def _tapped(case: Case) -> tuple[Any, Any]:
-    tokens = case.drawn(1, case.frames, case.grid[0] * case.grid[1], case.config.camera_dim)
+    tokens = case.drawn(1, case.frames, case.grid[0] * case.grid[1], case.config.tap_dim)
     return tokens, jnp.arange(4) / 10
 
 

@@ -62,7 +62,7 @@ def head(config):
     """Parameters of a track head and taps of two clips of three frames, 6 x 5 patches."""
     params = init_params(1, config)["track_head"]
     generator = np.random.default_rng(2)
-    tokens = jnp.asarray(generator.normal(size=(2, 3, 30, config.camera_dim)), jnp.float32)
+    tokens = jnp.asarray(generator.normal(size=(2, 3, 30, config.tap_dim)), jnp.float32)
     return params, [project_tap(params, tokens, slot, config) for slot in range(4)]
 
 

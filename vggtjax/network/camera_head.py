@@ -36,7 +36,7 @@ def predict_pose(
         stop_gradient: whether each iteration sees the previous estimate as a constant, as in VGGT's training.
     """
     params = params["camera_head"]
-    E = config.camera_dim
+    E = config.tap_dim
     block = Block(config.camera_num_heads, dtype=camera_tokens.dtype)
     tokens = apply(LayerNorm(), params["token_norm"], camera_tokens)
     normed = apply(LayerNorm(1e-6, use_bias=False, use_scale=False), {}, tokens)
@@ -60,7 +60,7 @@ def predict_pose(
 
 def declare_camera_head(config: VGGTConfig) -> Params:
     """Declare the parameters of the camera head."""
-    E = config.camera_dim
+    E = config.tap_dim
     x, pose = jnp.zeros((1, 1, E)), jnp.zeros((1, 1, POSE_SIZE))
     return {
         "token_norm": declare(LayerNorm(), x),
@@ -74,4 +74,4 @@ def declare_camera_head(config: VGGTConfig) -> Params:
 
 
 def _branch(config: VGGTConfig) -> MLP:
-    return MLP(config.camera_dim // 2, POSE_SIZE)
+    return MLP(config.tap_dim // 2, POSE_SIZE)

@@ -176,7 +176,7 @@ def declare_features(config: VGGTConfig, features: DPTFeatures) -> Params:
     """Declare the parameters of the tap projections and of the reassembly that follows them."""
     params = {"features": declare(features, [jnp.zeros((1, 1, 1, channels)) for channels in config.dpt_channels])}
     for slot, channels in enumerate(config.dpt_channels):
-        weights = declare(TapProjection(channels), jnp.zeros((1, config.camera_dim)))
+        weights = declare(TapProjection(channels), jnp.zeros((1, config.tap_dim)))
         params |= {"norm": weights["norm"], f"projection{slot}": weights["projection"]}
     return params
 

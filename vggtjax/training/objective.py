@@ -60,7 +60,7 @@ class LossWeights:
 def init_probes(seed: int, config: VGGTConfig) -> Params:
     """Return the parameters of the linear read-outs of the taps: zero, so that they start by saying nothing."""
     del seed
-    E, taps = config.camera_dim, len(config.taps)
+    E, taps = config.tap_dim, len(config.taps)
     return {
         "patch": {"kernel": jnp.zeros((taps, E, PATCH_PROBE)), "bias": jnp.zeros((taps, PATCH_PROBE))},
         "camera": {"kernel": jnp.zeros((taps, E, CAMERA_PROBE)), "bias": jnp.zeros((taps, CAMERA_PROBE))},
