@@ -39,7 +39,7 @@ def test_fewer_steps_from_a_model(recipe, tmp_path, capsys):
     start = save_model(tmp_path / "start.safetensors", params, PROBES.model)
     out = tmp_path / "out"
     command.train(recipe, out, init=str(start), steps=3, options=RunOptions(seconds=1e-9, dtype="bfloat16"))
-    assert "1 of 3; the same command goes on" in capsys.readouterr().out
+    assert "1 of 3; the same command resumes the run" in capsys.readouterr().out
     model = read_model(out / "model.safetensors")
     assert model.dtype == "bfloat16"
     np.testing.assert_allclose(

@@ -100,6 +100,32 @@ def test_a_finished_run_stays(straight):
     assert (out / "model.safetensors").stat().st_mtime_ns == before
 
 
+def test_a_run_killed_before_its_model_is_written(straight, tmp_path, monkeypatch):
+    """The checkpoint of the last step exists, and the model of an earlier one."""
+
+    def killed(*args, **kwargs):
+        raise RuntimeError("killed")
+
+    whole, out, _ = straight
+    train(SHORT, tmp_path, options=RunOptions(log_every=2, seconds=NOW), task=TASK)
+    with monkeypatch.context() as patch:
+        patch.setattr("vggtjax.training.run.save_model", killed)
+        with pytest.raises(RuntimeError, match="killed"):
+            train(SHORT, tmp_path, options=RunOptions(log_every=2), task=TASK)
+    assert latest(tmp_path / "checkpoints") == 6
+    assert train(SHORT, tmp_path, options=RunOptions(log_every=2), task=TASK).finished
+    assert same(read_model(tmp_path / "model.safetensors").params, exported(whole.state, SHORT))
+    assert (tmp_path / "model.safetensors").read_bytes() == (out / "model.safetensors").read_bytes()
+
+
+def test_one_run_in_a_folder(tmp_path):
+    def again(status):
+        with pytest.raises(OutputError, match="another run is writing checkpoints and a model into"):
+            train(PROBES, tmp_path, task=TASK)
+
+    assert train(PROBES, tmp_path, options=RunOptions(seconds=NOW), progress=again, task=TASK).state.step == 1
+
+
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)])
 def test_signals_end_a_run_with_a_checkpoint(straight, tmp_path, number, error):
     def interrupt(status):

@@ -1,16 +1,19 @@
 """Where training from nothing starts."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from tests.training_runs import RECIPE
-from vggtjax.errors import InputError
+from tests.training_runs import RECIPE, init_probes
+from vggtjax.errors import CheckpointError, InputError
+from vggtjax.network.backbone import encode
 from vggtjax.network.model import init_params
-from vggtjax.training.recipe import Recipe, Start
-from vggtjax.training.state import start_params
+from vggtjax.pretrained.embedded import demo_model
+from vggtjax.training.recipe import Recipe, Start, read_recipe
+from vggtjax.training.state import adapted, initial_state, start_params
 
 
 def test_the_default_is_vggts_start():
@@ -27,6 +30,24 @@ def test_tied_keys_and_layer_scale():
         assert not np.array_equal(query, value)
         assert np.allclose(params[blocks]["scale1"], 0.3)
     assert Recipe.from_json(recipe.to_json()) == recipe
+
+
+def test_the_embedded_model_starts_its_last_recipe():
+    """The recipe has the default cues, and images of another size."""
+    recipe = read_recipe(Path(__file__).parents[2] / "docs" / "embedded" / "5-four-frames.json")
+    model = demo_model()
+    assert (model.config.image_size, model.config.motion) != (recipe.model.image_size, recipe.model.motion)
+    params = adapted(model, recipe.model)
+    jax.eval_shape(lambda params: initial_state(recipe, init_probes(0, recipe.model), params), params)
+    same = adapted(model, dataclasses.replace(recipe.model, image_size=model.config.image_size))
+    assert jax.tree.all(jax.tree.map(np.array_equal, same, model.params))
+    images = np.random.default_rng(0).uniform(size=(1, 1, 112, 112, 3)).astype(np.float32)
+    tokens = [
+        encode(weights, images, config) for weights, config in ((model.params, model.config), (params, recipe.model))
+    ]
+    np.testing.assert_allclose(tokens[0], tokens[1], atol=1e-5)  # the backbone resizes the table alike
+    with pytest.raises(CheckpointError, match="it has embed_dim 128, not 256, num_heads 4, not 8; use these values in"):
+        adapted(model, dataclasses.replace(recipe.model, embed_dim=256, num_heads=8))
 
 
 def test_a_start_of_no_scale_is_refused():

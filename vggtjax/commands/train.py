@@ -31,7 +31,8 @@ def train(
     Args:
         recipe: JSON file with the recipe.
         out: folder for the model, checkpoints and metrics; an existing run in it is resumed.
-        init: a model to start from: a .safetensors, a PyTorch checkpoint, or a hub id; random parameters by default.
+        init: a model to start from: "demo", a .safetensors, a PyTorch checkpoint, or a hub id; random parameters by
+            default. The recipe's image size and cues replace those of the model.
         steps: total number of steps; phases, warm-up and decay keep their shares. The recipe's own by default.
         options: how the run logs, saves and ends.
     """
@@ -48,9 +49,10 @@ def train(
         params = None
         if init is not None:
             with report.stage("load model") as progress:
-                from vggtjax.pretrained.load import load_model
+                from vggtjax.pretrained.load import load_weights
+                from vggtjax.training.state import adapted
 
-                params = load_model(init, config=chosen.model, progress=progress).params
+                params = adapted(load_weights(init, config=chosen.model, progress=progress), chosen.model)
         with report.stage("train") as advance:
             shown = time.perf_counter()
 
@@ -65,7 +67,7 @@ def train(
     done, total = int(outcome.state.step), chosen.total_steps
     report.table(
         {
-            "steps": f"{done} of {total}" + ("" if outcome.finished else "; the same command goes on"),
+            "steps": f"{done} of {total}" + ("" if outcome.finished else "; the same command resumes the run"),
             "skipped": f"{int(outcome.state.skipped)} steps whose loss or gradient was not finite",
             "model": outcome.model,
             "metrics": f"{out / 'metrics.csv'}, {out / 'metrics.png'}",

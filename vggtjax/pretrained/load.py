@@ -44,19 +44,29 @@ def load_model(
         CheckpointError: nothing is there, or it cannot be read, or does not fit the configuration.
         MissingExtraError: the weights need torch or huggingface_hub, which is not installed.
     """
-    if dtype is not None:
-        numpy_dtype(dtype)
-    if str(name_or_path) == "demo":
-        model = demo_model(dtype or "float32")
-    else:
-        weights = locate(name_or_path)
-        path = weights.path
-        if not is_checkpoint(path):
-            path = _converted(path, weights.name, config or vggt_1b(), dtype or "float32", progress)
-        model = read_model(path, dtype=dtype)
+    model = load_weights(name_or_path, config=config, dtype=dtype, progress=progress)
     if config not in (None, model.config):
         raise CheckpointError(f"{name_or_path} knows its configuration, and it is not the one given; leave that out")
     return model
+
+
+def load_weights(
+    name_or_path: str | Path,
+    *,
+    config: VGGTConfig | None = None,
+    dtype: DType | None = None,
+    progress: Progress | None = None,
+) -> Model:
+    """Load a model as `load_model`, but let a file of this library have another configuration than `config`."""
+    if dtype is not None:
+        numpy_dtype(dtype)
+    if str(name_or_path) == "demo":
+        return demo_model(dtype or "float32")
+    weights = locate(name_or_path)
+    path = weights.path
+    if not is_checkpoint(path):
+        path = _converted(path, weights.name, config or vggt_1b(), dtype or "float32", progress)
+    return read_model(path, dtype=dtype)
 
 
 def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:

@@ -19,6 +19,7 @@ import numpy as np
 
 from vggtjax.network.layers import Params
 from vggtjax.scenes.textures import load_textures
+from vggtjax.storage.writing import locked_folder
 from vggtjax.training.data import make_batch as make_scene_batch
 from vggtjax.training.devices import placement
 from vggtjax.training.metrics import Row
@@ -101,29 +102,30 @@ def train(
 
     Raises:
         CheckpointError: the checkpoint in `out` is of another model, or `init` does not fit the recipe's.
-        OutputError: `out` cannot be written.
+        OutputError: `out` cannot be written, or another run is writing into it.
         VggtjaxError: 50 steps in a row had a loss or gradient that is not finite.
     """
     options, task = options or RunOptions(), task or Task()
-    run = Run(recipe, Path(out), task.init_probes(recipe.seed, recipe.model), init, options)
-    trainer = _Trainer(run, task)
-    pace = _Pace(run, progress)
-    pace.report()
-    with _signals() as received:
-        while run.step < recipe.total_steps:
-            trainer.step()
-            if run.step % options.log_every == 0 or run.step == recipe.total_steps:
-                run.log()
-                pace.report()
-                trainer.timed = 0
-            stopping = bool(received) or pace.seconds_left <= 0
-            run.keep(save=stopping)
-            if stopping:
-                break
-        finished = run.step == recipe.total_steps
-        run.save()
-        run.plot()
+    with locked_folder(out, "checkpoints and a model"):
+        run = Run(recipe, Path(out), task.init_probes(recipe.seed, recipe.model), init, options)
+        trainer = _Trainer(run, task)
+        pace = _Pace(run, progress)
         pace.report()
+        with _signals() as received:
+            while run.step < recipe.total_steps:
+                trainer.step()
+                if run.step % options.log_every == 0 or run.step == recipe.total_steps:
+                    run.log()
+                    pace.report()
+                    trainer.timed = 0
+                stopping = bool(received) or pace.seconds_left <= 0
+                run.keep(save=stopping)
+                if stopping:
+                    break
+            finished = run.step == recipe.total_steps
+            run.save()
+            run.plot()
+            pace.report()
     if received and not finished:
         if received[0] == signal.SIGINT:
             raise KeyboardInterrupt

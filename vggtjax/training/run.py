@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from vggtjax.checkpoint import numpy_dtype, save_model
+from vggtjax.checkpoint import numpy_dtype, read_model, save_model
 from vggtjax.errors import CheckpointError, VggtjaxError
 from vggtjax.network.layers import Params
 from vggtjax.storage.writing import writing
@@ -40,7 +40,7 @@ class Run:
         self.averages = Averages()
         self.pending: list[Metrics] = []  # of the last steps, on the device
         self.row: Row = {}
-        self.saved: int | None = None  # step of the newest checkpoint
+        self.exported: int | None = None  # step whose model this run has written or compared
         self.earlier = 0.0  # seconds of the runs before this one
         if checkpoints.latest(self.checkpoints) is None:
             # Committed to the device like a restored state, for which jit would compile again otherwise.
@@ -93,8 +93,11 @@ class Run:
             self.save()
 
     def save(self) -> None:
-        """Write a checkpoint of this step and the averaged model, unless they exist."""
-        if self.saved == self.step and self.model_path.exists():
+        """Write a checkpoint of this step and the averaged model, unless they exist.
+
+        A run can be killed between the two, so the model of an earlier run is compared with the state.
+        """
+        if self.exported == self.step:
             return
         self.collect()
         notes = {
@@ -106,8 +109,9 @@ class Run:
         checkpoints.save(self.checkpoints, self.state, self.recipe, notes)
         averaged, dtype = exported(self.state, self.recipe), numpy_dtype(self.options.dtype)
         params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(dtype, copy=False), averaged)
-        save_model(self.model_path, params, self.recipe.model, name=self.recipe.name)
-        self.saved, self._saved_at = self.step, time.perf_counter()
+        if not self._has_exported(params):
+            save_model(self.model_path, params, self.recipe.model, name=self.recipe.name)
+        self.exported, self._saved_at = self.step, time.perf_counter()
         logger.info("step %d of %d saved in %s", self.step, self.recipe.total_steps, self.out)
 
     def plot(self) -> None:
@@ -115,12 +119,26 @@ class Run:
         plot(self.table.path, self.out / "metrics.png")
         self._plotted_at = time.perf_counter()
 
+    def _has_exported(self, params: Params) -> bool:
+        """Return whether the file of the model holds these parameters, and the recipe's name and configuration."""
+        if self.exported is not None or not self.model_path.exists():
+            return False
+        try:
+            model = read_model(self.model_path)
+        except CheckpointError:
+            return False
+        if (model.config, model.name) != (self.recipe.model, self.recipe.name):
+            return False
+        return jax.tree.all(
+            jax.tree.map(lambda a, b: a.dtype == b.dtype and np.array_equal(a, b), model.params, params)
+        )
+
     def _restore(self, probes: Params) -> None:
         restored = checkpoints.restore(self.checkpoints, state_shapes(self.recipe, probes), self.recipe)
         if restored.recipe != self.recipe:
             logger.warning("the recipe differs from that of the checkpoint; resuming with the new recipe")
         self.state = jax.device_put(restored.state, placement(self.recipe).whole)
-        self.step = self.saved = int(restored.state.step)
+        self.step = int(restored.state.step)
         notes = restored.notes
         try:
             self.averages = Averages(**notes["averages"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -11,8 +12,10 @@ import optax
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float, Int
 
-from vggtjax.checkpoint import flat_shapes
+from vggtjax.checkpoint import Model, flat_shapes
+from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError, problems_sentence
+from vggtjax.network.backbone import patch_positions
 from vggtjax.network.layers import Params
 from vggtjax.network.model import init_params, parameter_shapes
 from vggtjax.training.optimiser import join, make_optimiser, make_schedule, split
@@ -149,6 +152,38 @@ def compute_dtype(recipe: Recipe) -> str:
     return "bfloat16" if jax.default_backend() == "gpu" else "float32"
 
 
+def start_params(recipe: Recipe) -> Params:
+    """Return the random parameters that a recipe starts from, by its `seed` and its `start`."""
+    flat: dict[Any, Any] = flatten_dict(init_params(recipe.seed, recipe.model))
+    for path, leaf in flat.items():
+        if path[0] == "aggregator" and path[-1] in ("scale1", "scale2"):
+            flat[path] = jnp.full_like(leaf, recipe.start.layer_scale)
+        if recipe.start.tied_keys and path[:2] == ("aggregator", "global_blocks") and path[-2:] == ("qkv", "kernel"):
+            query, _, value = jnp.split(leaf, 3, axis=-1)
+            flat[path] = jnp.concatenate([query, query, value], axis=-1)
+    return unflatten_dict(flat)
+
+
+def adapted(model: Model, config: VGGTConfig) -> Params:
+    """Return a model's parameters for a configuration with another image size or other motion cues.
+
+    The table of positions is resized as the backbone resizes the table for images of another size.
+
+    Raises CheckpointError for a configuration that differs in anything else.
+    """
+    names = [field.name for field in dataclasses.fields(config) if field.name not in ("image_size", "motion")]
+    if other := [name for name in names if getattr(model.config, name) != getattr(config, name)]:
+        values = ", ".join(f"{name} {getattr(model.config, name)}, not {getattr(config, name)}" for name in other)
+        raise CheckpointError(
+            f"the model '{model.name}' cannot start this recipe: it has {values}; use these values in the recipe's "
+            "model, or start from another model"
+        )
+    backbone, side = model.params["backbone"], config.grid_size
+    table = backbone["position_embedding"].astype(jnp.float32)
+    patches = patch_positions(table[1:], model.config.grid_size, (side, side))
+    return {**model.params, "backbone": {**backbone, "position_embedding": jnp.concatenate([table[:1], patches])}}
+
+
 def _check(params: Mapping[str, Any], recipe: Recipe) -> None:
     flat: dict[str, Any] = flatten_dict(params, sep=".")
     shapes = flat_shapes(recipe.model)
@@ -161,15 +196,3 @@ def _check(params: Mapping[str, Any], recipe: Recipe) -> None:
     ]
     if problems:
         raise CheckpointError(problems_sentence("the parameters to start from do not fit the recipe's model", problems))
-
-
-def start_params(recipe: Recipe) -> Params:
-    """Return the random parameters that a recipe starts from, by its `seed` and its `start`."""
-    flat: dict[Any, Any] = flatten_dict(init_params(recipe.seed, recipe.model))
-    for path, leaf in flat.items():
-        if path[0] == "aggregator" and path[-1] in ("scale1", "scale2"):
-            flat[path] = jnp.full_like(leaf, recipe.start.layer_scale)
-        if recipe.start.tied_keys and path[:2] == ("aggregator", "global_blocks") and path[-2:] == ("qkv", "kernel"):
-            query, _, value = jnp.split(leaf, 3, axis=-1)
-            flat[path] = jnp.concatenate([query, query, value], axis=-1)
-    return unflatten_dict(flat)
