@@ -27,7 +27,7 @@ from vggtjax.options import MethodName
 from vggtjax.pipeline.batch import reconstruct_many
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pretrained.load import load_model
-from vggtjax.results.reconstruction import ARCHIVE_NAME, is_result
+from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.scenes import SceneConfig, generate, load_textures
 from vggtjax.storage.writing import writing
 

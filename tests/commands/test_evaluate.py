@@ -106,7 +106,7 @@ def test_results_of_a_folder(dataset, tmp_path, capsys):
     shutil.move(tmp_path / "theirs/first/vggt4d", tmp_path / "vggt4d/first")
     code, _, err = run(
         capsys, "evaluate", "plain", dataset, "--results", tmp_path / "vggt4d", "--format", "vggt4d", "--quaternion",
-        "xyzw", "--sequences", "first", "--out", tmp_path / "again",
+        "wxyz", "--sequences", "first", "--out", tmp_path / "again",
     )  # fmt: skip
     assert code == 0, err
     again = json.loads((tmp_path / "again/results.json").read_text())["sequences"][0]["metrics"]

@@ -96,7 +96,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     code, _, err = run(capsys, *arguments)
     assert code == 2
     assert "does not say the order of its quaternions" in err
-    code, _, err = run(capsys, *arguments, "--quaternion", "xyzw")
+    code, _, err = run(capsys, *arguments, "--quaternion", "wxyz")
     assert code == 0, err
     again = Reconstruction.load(tmp_path / "again")
     assert again.depth.shape == (3, *picture.size[::-1])

@@ -26,7 +26,7 @@ from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.method.fusion import scale_between
 from vggtjax.method.mask import dynamic_pixels, dynamic_tokens, mine_mask
 from vggtjax.pipeline import run
-from vggtjax.results.reconstruction import FieldOfViewWarning
+from vggtjax.results.result import FieldOfViewWarning
 
 FRAMES, SIZE = 4, (140, 140)
 

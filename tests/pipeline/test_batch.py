@@ -20,7 +20,7 @@ from vggtjax.clips.sources import clips_by_name
 from vggtjax.commands.batch import _Clock
 from vggtjax.errors import ClipError, InputError
 from vggtjax.pipeline.batch import SETTINGS_NAME, reconstruct_many
-from vggtjax.results.reconstruction import ARCHIVE_NAME, is_result
+from vggtjax.results.archive import ARCHIVE_NAME, is_result
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
 

@@ -226,7 +226,7 @@ def test_broken_files_of_da3(tmp_path, arrays, message):
 
 
 def test_what_is_not_there(tmp_path):
-    with pytest.raises(InputError, match="layout is 'dust3r'; expected one of vggtjax, vggt4d, monst3r, cut3r, da3"):
+    with pytest.raises(InputError, match="format is 'dust3r'; expected one of vggtjax, vggt4d, monst3r, cut3r, da3"):
         Reconstruction.load(tmp_path, layout="dust3r")
     with pytest.raises(ResultError, match="there is no such folder"):
         Reconstruction.load(tmp_path / "nowhere", layout="cut3r")

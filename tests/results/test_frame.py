@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.room import make_room
 from vggtjax import Clip, Reconstruction, load_clip
 from vggtjax.errors import InputError
-from vggtjax.results.frame import SAME_SURFACE, enlarged_depth, frame_of, valid_pixels
+from vggtjax.results.frame import SAME_SURFACE, enlarged_depth, frame_of
 
 
 def result_of(clip: Clip) -> Reconstruction:
@@ -112,7 +112,7 @@ def test_valid_pixels_by_hand():
     expected[0, 0, :4] = expected[1, 0, :2] = False
     expected[2] = False
     expected[2, 5:27, 3:40] = True
-    np.testing.assert_array_equal(valid_pixels(room), expected)
+    np.testing.assert_array_equal(room.valid_pixels, expected)
     np.testing.assert_array_equal(np.stack([frame_of(room, number).valid for number in range(3)]), expected)
 
 

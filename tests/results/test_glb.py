@@ -15,7 +15,7 @@ def load_scene(room, percentile=0.0, **options):
     least = point_cloud.least_confidence(room, percentile)
     frames = [frame_of(room, number) for number in range(len(room.depth))]
     static, dynamic = (
-        [point_cloud.frame_cloud(f, f.valid & (f.confidence >= least) & (f.dynamic_mask == own)) for f in frames]
+        [point_cloud.frame_cloud(f, f.surer_than(least) & (f.dynamic_mask == own)) for f in frames]
         for own in (False, True)
     )
     glb = build_scene(room, point_cloud.joined(static), dynamic, **options).export(file_type="glb")
@@ -96,7 +96,7 @@ def test_points_are_limited_evenly_and_reproducibly():
             {"dynamic_mask": np.ones((3, 28, 42), bool)},
             {"cameras", "dynamic_000000", "dynamic_000001", "dynamic_000002"},
         ),
-        ({"depth": np.full((3, 28, 42), np.inf)}, {"cameras"}),
+        ({"depth": np.zeros((3, 28, 42))}, {"cameras"}),
     ],
 )
 def test_nothing_or_everything_moves(changes, names):
@@ -109,7 +109,7 @@ def test_single_frame_and_cameras_in_one_place():
     assert len(load_scene(make_room(camera_from_world=still)).geometry["cameras"].faces) == 3 * (8 * 8 + 2)
 
 
-@pytest.mark.filterwarnings("ignore::vggtjax.results.reconstruction.FieldOfViewWarning")
+@pytest.mark.filterwarnings("ignore::vggtjax.results.result.FieldOfViewWarning")
 def test_extreme_depths_and_fields_of_view():
     depth = make_room().depth.copy()
     depth[:, ::2] = 1e38

@@ -2,19 +2,19 @@ import numpy as np
 import pytest
 
 from tests.room import make_room
-from vggtjax.errors import InputError
 from vggtjax.results import point_cloud
-from vggtjax.results.frame import frame_of, valid_pixels
+from vggtjax.results.frame import LeastConfidence, frame_of
 
 
 def confident(room, percentile):
-    return valid_pixels(room) & (room.depth_confidence >= point_cloud.least_confidence(room, percentile))
+    least = point_cloud.least_confidence(room, percentile)
+    return np.stack([frame_of(room, number).surer_than(least) for number in range(len(room.depth))])
 
 
 def test_percentile_is_taken_over_the_clip_and_ties_stay():
     confidence = np.ones((2, 14, 14), np.float32)
     confidence[0, 0, :4] = (0.1, 0.2, 0.3, 0.4)
-    room = make_room(2, 14, 14, depth_confidence=confidence)
+    room = make_room(2, 14, 14, depth_confidence=confidence, dynamic_mask=np.zeros((2, 14, 14), bool))
     kept = confident(room, 100 * 2 / 391)  # the third lowest of 392
     assert (~kept).sum() == 2
     assert not kept[0, 0, :2].any()
@@ -22,14 +22,15 @@ def test_percentile_is_taken_over_the_clip_and_ties_stay():
     assert confident(room, 50).sum() == 388  # all the ones tie with the median
 
 
-def test_share_that_stays():
-    assert confident(make_room(frames=4), 20).mean() == pytest.approx(0.8, abs=1e-3)
-
-
-@pytest.mark.parametrize("percentile", [-1, 100, float("nan")])
-def test_percentile_out_of_range(percentile):
-    with pytest.raises(InputError, match=r"expected at least 0 and below 100"):
-        point_cloud.least_confidence(make_room(1), percentile)
+@pytest.mark.parametrize("resolution", ["model", "original"])
+def test_what_moves_stays_in_the_same_share(resolution):
+    room = make_room(frames=4)
+    room = make_room(frames=4, depth_confidence=room.depth_confidence + ~room.dynamic_mask)  # C1 + C2, but C1
+    least = point_cloud.least_confidence(room, 20)
+    frames = [frame_of(room, number, resolution) for number in range(4)]
+    for region in (False, True):
+        chosen = np.concatenate([f.surer_than(least)[f.valid & (f.dynamic_mask == region)] for f in frames])
+        assert chosen.mean() == pytest.approx(0.8, abs=2e-3)
 
 
 def test_clouds_are_the_chosen_points():
@@ -59,8 +60,8 @@ def test_points_too_far_for_float32_are_left_out():
 
 
 def test_nothing_to_show():
-    room = make_room(2, depth=np.full((2, 28, 42), np.inf, np.float32))
-    assert point_cloud.least_confidence(room, 20) == 0
+    room = make_room(2, depth=np.zeros((2, 28, 42), np.float32))
+    assert point_cloud.least_confidence(room, 20) == LeastConfidence(0, 0)
     cloud = point_cloud.frame_cloud(frame_of(room, 0), frame_of(room, 0).valid)
     assert cloud.points.shape == (0, 3)
     assert cloud.colors.dtype == np.uint8

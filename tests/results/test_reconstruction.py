@@ -7,7 +7,9 @@ import pytest
 
 from tests.room import make_room
 from vggtjax.errors import ResultError
-from vggtjax.results.reconstruction import FieldOfViewWarning, Reconstruction, is_result
+from vggtjax.results.archive import is_result
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.result import FieldOfViewWarning
 from vggtjax.storage import arrays as archive
 
 

@@ -30,7 +30,7 @@ def import_result(
     """
     report = Report()
     with report.running():
-        from vggtjax.results.export import check_folder
+        from vggtjax.results.folder import check_folder
         from vggtjax.results.point_cloud import check_percentile
         from vggtjax.results.reconstruction import Reconstruction
 

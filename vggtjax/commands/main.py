@@ -320,7 +320,7 @@ def _check_early(
 
 
 def _check_folder(out: Path) -> None:
-    from vggtjax.results.export import check_folder
+    from vggtjax.results.folder import check_folder
 
     check_folder(out)
 

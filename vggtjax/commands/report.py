@@ -74,7 +74,7 @@ class Report:
         rows = {
             "frames": f"{S} of {W} x {H} pixels",
             "method": f"{result.method}, model {result.model_name}",
-            "dynamic": f"{100 * result.dynamic_mask.mean():.1f} % of the pixels",
+            "dynamic": f"{100 * result.dynamic_share:.1f} % of the pixels",
             **{name: f"{seconds:.2f} s" for name, seconds in self._seconds.items()},
             "total": f"{sum(self._seconds.values()):.2f} s",
             "peak memory": _peak_memory(),

@@ -27,7 +27,6 @@ from vggtjax.evaluation.metrics.trajectory import (
 )
 from vggtjax.evaluation.metrics.uncertainty import reliability_curve, sparsification_curve, uncertainty_scores
 from vggtjax.evaluation.metrics.video_depth import Align, depth_alignment, video_depth_errors
-from vggtjax.results.frame import inside_pictures
 from vggtjax.results.reconstruction import Reconstruction
 
 PIXEL_OFFSET = 0.0  # of points: the protocol lifts whole pixel numbers, predicted and true ones alike
@@ -235,7 +234,7 @@ def _half(progress: Progress | None, part: int) -> Progress | None:
 def _masks(result: Reconstruction, truth: TruthAtPixels, *, empty: Empty) -> _Found:
     true = truth.mask
     _predicted(result, "dynamic_mask", "masks")
-    inside = inside_pictures(result)
+    inside = result.inside_pictures
     predicted = result.dynamic_mask & inside
     rows, columns = (np.flatnonzero(inside.any(axis=axes)) for axes in ((0, 2), (0, 1)))
     window = np.s_[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]  # padding is no part of the picture

@@ -21,7 +21,7 @@ from vggtjax.errors import InputError, OutputError, VggtjaxError
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.options import find_method
 from vggtjax.pipeline.run import reconstruct
-from vggtjax.results.reconstruction import ARCHIVE_NAME, is_result
+from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.storage.writing import writing
 
 SETTINGS_NAME = "batch.json"

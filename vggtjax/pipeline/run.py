@@ -27,7 +27,6 @@ from vggtjax.network.model import Predictions
 from vggtjax.options import find_method
 from vggtjax.pipeline.frame_padding import padded_frames
 from vggtjax.pipeline.stages import StageMemory, compile_stages, stages_of, with_masks, with_tracks
-from vggtjax.results.frame import inside_pictures
 from vggtjax.results.reconstruction import Reconstruction
 
 OnStage = Callable[[str], AbstractContextManager[Any]]
@@ -268,7 +267,7 @@ def refined(result: Reconstruction, progress: Callable[[int, int], object] | Non
         result.dynamic_mask,
         result.camera_from_world,
         result.intrinsics,
-        valid=inside_pictures(result),
+        valid=result.inside_pictures,
         progress=progress,
     )
     return dataclasses.replace(result, dynamic_mask=mask)

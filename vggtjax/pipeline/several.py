@@ -15,7 +15,8 @@ from vggtjax.options import find_method
 from vggtjax.pipeline.run import assembled_fields, reconstruct, refined
 from vggtjax.pipeline.stages import assembled
 from vggtjax.progress import OnStage
-from vggtjax.results.reconstruction import FieldOfViewWarning, Reconstruction
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.result import FieldOfViewWarning
 
 
 def reconstruct_methods(

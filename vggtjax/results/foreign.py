@@ -1,12 +1,13 @@
-"""Result folders of other projects: VGGT4D's written and read; MonST3R's, CUT3R's and Depth Anything 3's read.
+"""Result folders of other programs: VGGT4D's written and read; MonST3R's, CUT3R's and Depth Anything 3's read.
 
-Where each keeps what, and in which unit, was read off their public code:
+Files and units are those of their public code:
 
     vggt4d    frame_0000.png, frame_0000.npy (depth), conf_0000.npy, dynamic_mask_0000.png, and for all frames
-              pred_intrinsics.txt (nine numbers a line), pred_traj.txt (world-from-camera)
+              pred_intrinsics.txt (nine numbers a line), pred_traj.txt (world-from-camera, qw before qx qy qz;
+              folders of earlier versions of this library have qw last: read these with quaternion="xyzw")
     monst3r   the same with conf_0.npy, dynamic_mask_0.png; the confidence is a logarithm, -inf where it was 0
-    cut3r     depth/000000.npy, conf/000000.npy, color/000000.png, camera/000000.npz (pose, which is world-from-camera,
-              and intrinsics)
+    cut3r     depth/000000.npy, conf/000000.npy, color/000000.png, camera/000000.npz (pose: world-from-camera;
+              intrinsics)
     da3       exports/npz/results.npz or exports/mini_npz/results.npz: depth, conf, extrinsics (camera-from-world),
               intrinsics, and image in the former
 
@@ -25,16 +26,15 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
-from vggtjax import cameras as geometry
+from vggtjax.cameras import world_from_camera
 from vggtjax.clips.images import read_image
 from vggtjax.clips.masks import read_mask
-from vggtjax.errors import ClipError, InputError, ResultError
+from vggtjax.errors import InputError, ResultError
 from vggtjax.results.frame import Frame
-from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.storage import arrays as archive
+from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, read_headers
 from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory
 
-_GREY = 128  # of pictures that a layout does not keep
+_GREY = 128  # of pictures that a format does not keep
 
 logger = logging.getLogger(__name__)
 
@@ -51,9 +51,10 @@ def write_frame(folder: Path, number: int, frame: Frame) -> None:
 def write_cameras(
     folder: Path, world_from_camera: Float[np.ndarray, "S 4 4"], intrinsics: Sequence[Float[np.ndarray, "3 3"]]
 ) -> None:
-    """Write the cameras in VGGT4D's files, but the quaternions in TUM's order."""
+    """Write the cameras as VGGT4D does."""
     np.savetxt(folder / "pred_intrinsics.txt", np.stack(intrinsics).reshape(-1, 9), fmt="%.9g")
-    write_trajectory(folder / "pred_traj.txt", world_from_camera, np.arange(len(world_from_camera), dtype=np.float64))
+    numbers = np.arange(len(world_from_camera), dtype=np.float64)
+    write_trajectory(folder / "pred_traj.txt", world_from_camera, numbers, quaternion="wxyz")
 
 
 class Cameras(NamedTuple):
@@ -64,7 +65,7 @@ class Cameras(NamedTuple):
 
 
 class _Folder(NamedTuple):
-    """Where a layout keeps a frame's files, as patterns of their paths with the frame's number, and its cameras."""
+    """The paths of a frame's files, as patterns with the frame's number, and the reader of the cameras."""
 
     example: str  # of a depth file
     depth: str
@@ -75,78 +76,82 @@ class _Folder(NamedTuple):
     logarithmic: bool = False  # confidence
 
 
-def load_foreign(path: Path, layout: str, quaternion: Quaternion | None) -> Reconstruction:
-    """Read a result folder of another project; see `Reconstruction.load`."""
-    if layout not in LAYOUTS:
-        raise InputError(f"layout is {layout!r}; expected one of vggtjax, {', '.join(LAYOUTS)}")
-    check_quaternion(layout, quaternion)
-    try:
-        if not path.exists() or (layout != "da3" and not path.is_dir()):
-            raise ResultError("there is no such folder")
-        fields = _read_da3(path) if layout == "da3" else _read_folder(path, _FOLDERS[layout], quaternion)
-        S, H, W = fields["depth"].shape
-        plain: dict[str, Any] = {
-            "depth_confidence": np.ones((S, H, W), np.float32),
-            "dynamic_mask": np.zeros((S, H, W), bool),
-            "images": np.full((S, H, W, 3), _GREY, np.uint8),
-        }
-        missing = [name for name in plain if fields.get(name) is None]
-        result = Reconstruction(
-            **(plain | {name: value for name, value in fields.items() if value is not None}),
-            saliency=None,
-            frame_names=tuple(f"{number:06d}" for number in range(S)),
-            timestamps=None,
-            method=layout,
-            model_name=layout,
-            settings={"layout": layout, "quaternion": quaternion, "missing": missing},
-            source_size=np.tile([H, W], (S, 1)),
-            source_scale=np.ones((S, 2)),
-            source_offset=np.zeros((S, 2)),
-            valid_box=np.tile([0, 0, W, H], (S, 1)),
-        )
-    except (ClipError, ResultError) as error:
-        raise ResultError(f"{path} cannot be loaded as a result of {layout}: {error}") from error
+def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict[str, Any]:
+    """Read the result folder of another program as fields of a `Result`; see `Reconstruction.load`.
+
+    Raises ClipError or ResultError, without the path, for anything but a whole folder.
+    """
+    if not path.exists() or (format != "da3" and not path.is_dir()):
+        raise ResultError("there is no such folder")
+    fields = _read_da3(path) if format == "da3" else _read_folder(path, _FOLDERS[format], quaternion)
+    S, H, W = fields["depth"].shape
+    plain = {
+        "depth_confidence": np.ones((S, H, W), np.float32),
+        "dynamic_mask": np.zeros((S, H, W), bool),
+        "images": np.full((S, H, W, 3), _GREY, np.uint8),
+    }
+    missing = [name for name in plain if fields.get(name) is None]
     if missing:
         logger.warning("%s has no %s; plain values stand for them", path, ", ".join(missing))
-    return result
+    return {
+        **plain,
+        **{name: value for name, value in fields.items() if value is not None},
+        "saliency": None,
+        "frame_names": tuple(f"{number:06d}" for number in range(S)),
+        "timestamps": None,
+        "method": format,
+        "model_name": format,
+        "settings": {"layout": format, "quaternion": quaternion, "missing": missing},
+        "source_size": np.tile([H, W], (S, 1)),
+        "source_scale": np.ones((S, 2)),
+        "source_offset": np.zeros((S, 2)),
+        "valid_box": np.tile([0, 0, W, H], (S, 1)),
+    }
 
 
-def check_quaternion(layout: str, quaternion: str | None) -> None:
-    """Raise InputError where a layout needs the order of its quaternions, or has none."""
-    if quaternion is None and layout in _WITH_TRAJECTORY:
+def check_format(format: str, quaternion: str | None) -> None:
+    """Raise InputError for an unknown format, or an order of quaternions that is unknown, missing or not wanted."""
+    if format not in FORMATS:
+        raise InputError(f"format is {format!r}; expected one of vggtjax, {', '.join(FORMATS)}")
+    check_quaternion(format, quaternion)
+
+
+def check_quaternion(format: str, quaternion: str | None) -> None:
+    """Raise InputError where a format needs the order of its quaternions, or has none."""
+    if quaternion is None and format in _WITH_TRAJECTORY:
         raise InputError(
-            f"pred_traj.txt of {layout} does not say the order of its quaternions; give quaternion='wxyz' (what "
-            "VGGT4D, MonST3R, CUT3R and Easi3R write) or 'xyzw' (TUM's order, what vggtjax writes)"
+            f"pred_traj.txt of {format} does not say the order of its quaternions; give quaternion='wxyz' (as VGGT4D, "
+            "MonST3R, CUT3R, Easi3R and vggtjax write them) or 'xyzw' (TUM's order, and that of earlier vggtjax)"
         )
-    if quaternion is not None and (quaternion not in get_args(Quaternion) or layout not in _WITH_TRAJECTORY):
+    if quaternion is not None and (quaternion not in get_args(Quaternion) or format not in _WITH_TRAJECTORY):
         raise InputError(
-            f"quaternion is {quaternion!r} for {layout}; expected 'xyzw' or 'wxyz' for "
+            f"quaternion is {quaternion!r} for {format}; expected 'xyzw' or 'wxyz' for "
             f"{' and '.join(_WITH_TRAJECTORY)}, and none for others, which keep matrices"
         )
 
 
-def _read_folder(folder: Path, layout: _Folder, quaternion: Quaternion | None) -> dict[str, Any]:
-    depth_files = _numbered(folder, layout.depth)
+def _read_folder(folder: Path, files: _Folder, quaternion: Quaternion | None) -> dict[str, Any]:
+    depth_files = _numbered(folder, files.depth)
     if not depth_files:
-        raise ResultError(f"it has no depth; expected files like {layout.example}")
+        raise ResultError(f"it has no depth; expected files like {files.example}")
     numbers = sorted(depth_files)
-    cameras = layout.cameras(folder, numbers, quaternion)
+    cameras = files.cameras(folder, numbers, quaternion)
     depth = _stacked(depth_files, numbers, _read_map, None)
     shape = depth.shape[1:]
-    confidence = _stacked(_numbered(folder, layout.confidence), numbers, _read_map, shape)
-    if confidence is not None and layout.logarithmic:
+    confidence = _stacked(_numbered(folder, files.confidence), numbers, _read_map, shape)
+    if confidence is not None and files.logarithmic:
         if padded := sorted(path.name for path in folder.glob("conf_0[0-9]*.npy")):
             raise ResultError(
                 f"{padded[0]} is numbered as VGGT4D does, whose confidence is no logarithm; load it as that"
             )
         with np.errstate(over="ignore"):
             confidence = np.exp(confidence).clip(0, np.finfo(np.float32).max)
-    mask = None if layout.mask is None else _stacked(_numbered(folder, layout.mask), numbers, read_mask, shape)
+    mask = None if files.mask is None else _stacked(_numbered(folder, files.mask), numbers, read_mask, shape)
     return {
         "depth": depth,
         "depth_confidence": confidence,
         "dynamic_mask": mask,
-        "images": _stacked(_numbered(folder, layout.picture), numbers, _read_picture, (*shape, 3)),
+        "images": _stacked(_numbered(folder, files.picture), numbers, _read_picture, (*shape, 3)),
         **cameras._asdict(),
     }
 
@@ -187,15 +192,15 @@ def _stacked(
         if array.shape != shape:
             raise ResultError(f"{files[number].name} has shape {array.shape}; expected {shape}, as frame {numbers[0]}")
         if arrays is None:
-            if len(numbers) * array.nbytes > archive.SIZE_LIMIT:
-                raise ResultError(f"{len(numbers)} frames of {shape} take more than {archive.SIZE_LIMIT} bytes")
+            if len(numbers) * array.nbytes > SIZE_LIMIT:
+                raise ResultError(f"{len(numbers)} frames of {shape} take more than {SIZE_LIMIT} bytes")
             arrays = np.empty((len(numbers), *shape), array.dtype)
         arrays[place] = array
     return arrays
 
 
 def _read_map(path: Path) -> Float32[np.ndarray, "H W"]:
-    array = archive.read_array(path)
+    array = read_array(path)
     if array.dtype.kind != "f" or array.ndim != 2:
         raise ResultError(f"{path.name} is {array.dtype} {array.shape}; expected floating point [H, W]")
     return array.astype(np.float32)
@@ -215,7 +220,7 @@ def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion |
             raise ResultError(
                 f"{name} has {len(array)} lines for {len(numbers)} frames of depth; expected one for each"
             )
-    return Cameras(geometry.world_from_camera(poses[:, :3])[:, :3], intrinsics)  # the inverse, whichever way
+    return Cameras(world_from_camera(poses[:, :3])[:, :3], intrinsics)  # the inverse, whichever way
 
 
 def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
@@ -227,7 +232,7 @@ def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | 
         arrays = _read_some(files[number], {"pose": ((4, 4),), "intrinsics": ((3, 3),)}, {})
         poses.append(arrays["pose"].astype(np.float64))
         intrinsics.append(arrays["intrinsics"].astype(np.float64))
-    return Cameras(geometry.world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
+    return Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
 
 
 def _read_da3(path: Path) -> dict[str, Any]:
@@ -238,7 +243,7 @@ def _read_da3(path: Path) -> dict[str, Any]:
     file = next((place for place in places if place.is_file()), None)
     if file is None:
         raise ResultError("it has no results.npz; export with the format 'npz' or 'mini_npz'")
-    shape = archive.read_headers(file).get("depth", archive.Header(np.dtype(float), ())).shape
+    shape = read_headers(file).get("depth", Header(np.dtype(float), ())).shape
     if len(shape) != 3 or 0 in shape:
         raise ResultError(f"'depth' of {file.name} is missing or has shape {shape}; expected (N, H, W)")
     S, H, W = shape
@@ -262,7 +267,7 @@ def _read_some(
 
     Headers are looked at first, so that nothing larger is ever read. All are floating point but `image`, 8 bits.
     """
-    headers = archive.read_headers(file)
+    headers = read_headers(file)
     for name, shapes in {**needed, **others}.items():
         header, kind = headers.get(name), "uint8" if name == "image" else "floating point"
         if header is None and name in needed:
@@ -270,7 +275,7 @@ def _read_some(
         right = header is None or (header.dtype == np.uint8 if name == "image" else header.dtype.kind == "f")
         if header is not None and (header.shape not in shapes or not right):
             raise ResultError(f"{name!r} of {file.name} is {header.dtype} {header.shape}; expected {kind} {shapes[0]}")
-    return archive.read_arrays(file, {*needed, *others})
+    return read_arrays(file, {*needed, *others})
 
 
 _MONST3R = _Folder(
@@ -294,5 +299,5 @@ _FOLDERS = {
         cameras=_npz_cameras,
     ),
 }
-LAYOUTS = (*_FOLDERS, "da3")
-_WITH_TRAJECTORY = tuple(name for name, layout in _FOLDERS.items() if layout.cameras is _text_cameras)
+FORMATS = (*_FOLDERS, "da3")
+_WITH_TRAJECTORY = tuple(name for name, files in _FOLDERS.items() if files.cameras is _text_cameras)

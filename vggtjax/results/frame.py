@@ -1,29 +1,36 @@
-"""One frame of a result, at the model's size or at that of the picture it came from: crop, scale, padding undone."""
+"""One frame of a result, at the model's size or at its source's, where crop, scale and padding are undone."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from PIL import Image
 
-from vggtjax import cameras as geometry
+from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.result import Result, inside_box, show_points
 from vggtjax.results.saving import Resolution
 
-SAME_SURFACE = 0.05  # relative difference in depth up to which neighbours are taken for one surface
+SAME_SURFACE = 0.05  # relative difference in depth up to which neighbours belong to one surface
+
+
+class LeastConfidence(NamedTuple):
+    """The least confidence of the points of a cloud, for static and for dynamic pixels."""
+
+    static: float
+    dynamic: float
 
 
 class Frame(NamedTuple):
-    """What a frame of h x w pixels shows."""
+    """A frame of h x w pixels."""
 
     image: UInt8[np.ndarray, "h w 3"]
-    depth: Float32[np.ndarray, "h w"]  # z in the camera; 0 where not seen, at the source's size
-    confidence: Float32[np.ndarray, "h w"]  # 0 there
-    dynamic_mask: Bool[np.ndarray, "h w"]  # False there
-    instances: UInt8[np.ndarray, "h w"]  # 0 there
+    depth: Float32[np.ndarray, "h w"]  # z in the camera; 0 where not seen at the source's size
+    confidence: Float32[np.ndarray, "h w"]  # 0 where not seen
+    dynamic_mask: Bool[np.ndarray, "h w"]  # False where not seen
+    instances: UInt8[np.ndarray, "h w"]  # 0 where not seen
     seen: Bool[np.ndarray, "h w"]  # by the model: neither padding nor cut off
     intrinsics: Float64[np.ndarray, "3 3"]  # pixels of h x w
     camera_from_world: Float32[np.ndarray, "3 4"]
@@ -31,23 +38,20 @@ class Frame(NamedTuple):
     @property
     def valid(self) -> Bool[np.ndarray, "h w"]:
         """Pixels that show a point: seen, with a finite depth above 0 and a finite confidence."""
-        return self.seen & np.isfinite(self.depth) & (self.depth > 0) & np.isfinite(self.confidence)
+        return show_points(self.depth, self.confidence, self.seen)
 
-    def surer_than(self, least_confidence: float) -> Bool[np.ndarray, "h w"]:
+    def surer_than(self, least: LeastConfidence) -> Bool[np.ndarray, "h w"]:
         """Valid pixels of at least this confidence."""
-        return self.valid & (self.confidence >= least_confidence)
+        return self.valid & (self.confidence >= np.where(self.dynamic_mask, least.dynamic, least.static))
 
     def world_points(self, *, pixel_offset: float = 0.5) -> Float32[np.ndarray, "h w 3"]:
         """Lift every pixel to its point in the world; those of depth 0 are at the camera's centre."""
         intrinsics = self.intrinsics[None].astype(np.float32)
-        points = geometry.unproject(
-            self.depth[None], intrinsics, self.camera_from_world[None], pixel_offset=pixel_offset
-        )
-        return points[0]
+        return unproject(self.depth[None], intrinsics, self.camera_from_world[None], pixel_offset=pixel_offset)[0]
 
 
 def frame_of(
-    result: Reconstruction,
+    result: Result,
     frame: int,
     resolution: Resolution = "model",
     *,
@@ -55,18 +59,18 @@ def frame_of(
 ) -> Frame:
     """Return a frame at the model's size, or at its source's.
 
-    At the source's size every pixel takes the place that its centre has in the model's frame. Masks and confidence are
-    those of the nearest pixel. Depth is bilinear in the inverse where the four pixels around belong to one surface, and
-    that of the nearest one elsewhere: bilinear everywhere invents points between object and background.
+    At the source's size the centre of every pixel is mapped to the model's frame. Masks and confidence are those of the
+    nearest pixel. Depth is bilinear in the inverse where the four nearest pixels belong to one surface, and that of the
+    nearest pixel elsewhere: bilinear depth everywhere invents points between object and background.
 
     Args:
         result: of a clip.
         frame: its index.
         resolution: "model" or "original".
-        picture: the source's, for "original"; without it the model's frame is enlarged, and black where that was cut.
+        picture: the source's, for "original"; by default the model's frame enlarged, and black where it was cut off.
 
     Raises:
-        InputError: a frame that is not there, an unknown resolution, or a picture of another size than the source's.
+        InputError: a frame out of range, an unknown resolution, or a picture of another size than the source's.
     """
     if not 0 <= frame < len(result.depth):
         raise InputError(f"frame is {frame}; expected 0 to {len(result.depth) - 1}")
@@ -75,37 +79,20 @@ def frame_of(
     return _model_frame(result, frame) if resolution == "model" else _source_frame(result, frame, picture)
 
 
-def inside_pictures(result: Reconstruction) -> Bool[np.ndarray, "S H W"]:
-    """Return the pixels that are not padding."""
-    return _inside(result.valid_box, result.depth.shape[1:])
-
-
-def valid_pixels(result: Reconstruction) -> Bool[np.ndarray, "S H W"]:
-    """Return the pixels that show a point: not padding, with a finite depth above 0 and a finite confidence."""
-    depth = result.depth
-    return inside_pictures(result) & np.isfinite(depth) & (depth > 0) & np.isfinite(result.depth_confidence)
-
-
-def _inside(box: Int[np.ndarray, "... 4"], size: tuple[int, ...]) -> Bool[np.ndarray, "... H W"]:
-    rows, columns = np.arange(size[0])[:, None], np.arange(size[1])
-    left, top, right, bottom = np.moveaxis(box, -1, 0)[..., None, None]
-    return (left <= columns) & (columns < right) & (top <= rows) & (rows < bottom)
-
-
-def _model_frame(result: Reconstruction, frame: int) -> Frame:
+def _model_frame(result: Result, frame: int) -> Frame:
     return Frame(
         image=result.images[frame],
         depth=result.depth[frame],
         confidence=result.depth_confidence[frame],
         dynamic_mask=result.dynamic_mask[frame],
         instances=result.instances[frame],
-        seen=_inside(result.valid_box[frame], result.depth.shape[1:]),
+        seen=inside_box(result.valid_box[frame], result.depth.shape[1:]),
         intrinsics=result.intrinsics[frame].astype(np.float64),
         camera_from_world=result.camera_from_world[frame],
     )
 
 
-def _source_frame(result: Reconstruction, frame: int, picture: UInt8[np.ndarray, "h w 3"] | None) -> Frame:
+def _source_frame(result: Result, frame: int, picture: UInt8[np.ndarray, "h w 3"] | None) -> Frame:
     height, width = (int(side) for side in result.source_size[frame])
     scale, offset = result.source_scale[frame], result.source_offset[frame]
     if picture is None:
@@ -144,7 +131,7 @@ def enlarged_depth(
 ) -> Float[np.ndarray, "h w"]:
     """Sample depth at rows y and columns x (pixel edges at whole numbers), without mixing surfaces.
 
-    Depth that is not a positive number is nobody's surface: there the nearest pixel stands alone.
+    Depth that is not a positive number belongs to no surface: it is never mixed.
     """
     H, W = depth.shape
     (low_x, high_x, share_x), (low_y, high_y, share_y) = (
@@ -165,7 +152,7 @@ def _nearest(position: Float[np.ndarray, " n"], side: int) -> np.ndarray:
 
 
 def _between(position: Float[np.ndarray, " n"], side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pixels whose centres lie at or below and above each position, and the share of the one above."""
+    """Return the pixels with centres at or below and above each position, and the share of the pixel above."""
     centred = np.clip(position - 0.5, 0, side - 1)
     low = np.floor(centred).astype(int)
     return low, np.minimum(low + 1, side - 1), centred - low

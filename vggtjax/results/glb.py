@@ -10,23 +10,23 @@ from cmap import Colormap
 from jaxtyping import Float, Int, UInt8
 from trimesh.visual import ColorVisuals
 
-from vggtjax import cameras as geometry
+from vggtjax.cameras import frustum_corners
 from vggtjax.results.point_cloud import PointCloud
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.result import Result
 
 POINT_LIMIT = 1_000_000  # points that viewers in a browser still turn smoothly
 _TO_GLTF = np.array([1, -1, -1], np.float32)  # half a turn about x: y down and z forward become y up and z backward
 _CAMERA_SIZE = 0.06  # of the median distance from the middle of the cameras to the points
 _BAR_SIZE = 0.015  # of a camera: half the thickness of its edges
 
-# What `geometry.frustum_corners` returns: 0 the centre, then 1 top left, 2 top right, 3 bottom right, 4 bottom left.
+# What `frustum_corners` returns: 0 the centre, then 1 top left, 2 top right, 3 bottom right, 4 bottom left.
 _FRUSTUM_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 # A bar between two squares of corners 0-3 and 4-7.
 _BAR_FACES = np.array([[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])
 
 
 def build_scene(
-    reconstruction: Reconstruction, static: PointCloud, dynamic: Sequence[PointCloud], *, point_limit: int = POINT_LIMIT
+    result: Result, static: PointCloud, dynamic: Sequence[PointCloud], *, point_limit: int = POINT_LIMIT
 ) -> trimesh.Scene:
     """Return the scene, with y up.
 
@@ -38,7 +38,7 @@ def build_scene(
     clouds = {"static": static} | {f"dynamic_{frame:06d}": cloud for frame, cloud in enumerate(dynamic)}
     share = min(1.0, point_limit / max(1, sum(map(len, clouds.values()))))
     random = np.random.default_rng(0)
-    middle = reconstruction.camera_centres.mean(axis=0, dtype=np.float64)
+    middle = result.camera_centres.mean(axis=0, dtype=np.float64)
     distances = []
     scene = trimesh.Scene()
     for name, cloud in clouds.items():
@@ -48,15 +48,14 @@ def build_scene(
             scene.add_geometry(trimesh.PointCloud(points * _TO_GLTF, colors), node_name=name, geom_name=name)
             distances.append(np.linalg.norm(points - middle, axis=-1))
     size = _CAMERA_SIZE * (float(np.median(np.concatenate(distances))) if distances else 1.0)
-    scene.add_geometry(_cameras(reconstruction, size), node_name="cameras", geom_name="cameras")
+    scene.add_geometry(_cameras(result, size), node_name="cameras", geom_name="cameras")
     return scene
 
 
-def _cameras(reconstruction: Reconstruction, size: float) -> trimesh.Trimesh:
-    frames, height, width = reconstruction.depth.shape
-    corners = geometry.frustum_corners(
-        reconstruction.intrinsics, reconstruction.camera_from_world, height, width, size
-    ).astype(np.float64)  # [S, 5, 3]
+def _cameras(result: Result, size: float) -> trimesh.Trimesh:
+    frames, height, width = result.depth.shape
+    corners = frustum_corners(result.intrinsics, result.camera_from_world, height, width, size)  # [S, 5, 3]
+    corners = corners.astype(np.float64)
     colors = (Colormap("plasma")(np.linspace(0, 0.9, frames))[:, :3] * 255).round().astype(np.uint8)
 
     edges = corners[:, _FRUSTUM_EDGES].reshape(-1, 2, 3)

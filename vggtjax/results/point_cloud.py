@@ -1,16 +1,32 @@
-"""Coloured point clouds of a result: what stands still over the whole clip, and what each frame shows."""
+"""Coloured point clouds of a result, and PLY files, written in pieces: a clip at its source's size outgrows memory."""
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from vggtjax.results.frame import Frame, valid_pixels
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.frame import Frame, LeastConfidence
+from vggtjax.results.result import Result
 from vggtjax.results.saving import Saving
+
+_VERTEX = np.dtype([("points", "<f4", 3), ("colors", "u1", 3), ("alpha", "u1")])
+_HEADER = """ply
+format binary_little_endian 1.0
+element vertex {count}
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+property uchar alpha
+end_header
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,19 +45,22 @@ def check_percentile(confidence_percentile: float) -> None:
     Saving(confidence_percentile)
 
 
-def least_confidence(reconstruction: Reconstruction, confidence_percentile: float) -> float:
+def least_confidence(result: Result, confidence_percentile: float) -> LeastConfidence:
     """Return the confidence that `confidence_percentile` percent of the clip's valid pixels do not reach.
 
-    The percentile is taken over all frames together, at the model's size; 0 where no pixel is valid.
-    Raises InputError for a percentile outside [0, 100).
+    Static and dynamic pixels have a percentile each, over all frames at the model's size: fused confidence is the sum
+    of two passes in static pixels and of one in dynamic pixels, so a common percentile would leave out what moves.
     """
-    check_percentile(confidence_percentile)
-    confidence = reconstruction.depth_confidence[valid_pixels(reconstruction)]
-    return float(np.percentile(confidence, confidence_percentile)) if confidence.size else 0.0
+
+    def percentile(pixels: Bool[np.ndarray, "S H W"]) -> float:
+        return float(np.percentile(result.depth_confidence[pixels], confidence_percentile)) if pixels.any() else 0.0
+
+    valid = result.valid_pixels
+    return LeastConfidence(percentile(valid & ~result.dynamic_mask), percentile(valid & result.dynamic_mask))
 
 
 def frame_cloud(frame: Frame, pixels: Bool[np.ndarray, "h w"]) -> PointCloud:
-    """Return the points of the chosen pixels of a frame, less those too far away for float32."""
+    """Return the points of the chosen pixels of a frame, but for points too far away for float32."""
     points = frame.world_points()[pixels]
     finite = np.isfinite(points).all(axis=-1)
     return PointCloud(points[finite], frame.image[pixels][finite])
@@ -52,3 +71,36 @@ def joined(clouds: Sequence[PointCloud]) -> PointCloud:
     return PointCloud(
         np.concatenate([cloud.points for cloud in clouds]), np.concatenate([cloud.colors for cloud in clouds])
     )
+
+
+class PlyWriter:
+    """A context that writes a PLY file of float32 positions and 8-bit sRGB colours; the file is whole at its end."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._body = path, path.with_name(f"{path.name}.points")
+        self._count = 0
+
+    def __enter__(self) -> PlyWriter:
+        self._file = self._body.open("wb")
+        return self
+
+    def add(self, cloud: PointCloud) -> None:
+        """Append points."""
+        vertices = np.empty(len(cloud), _VERTEX)
+        vertices["points"], vertices["colors"], vertices["alpha"] = cloud.points, cloud.colors, 255
+        self._file.write(vertices.data)
+        self._count += len(cloud)
+
+    def __exit__(self, kind: type | None, *_: object) -> None:
+        self._file.close()
+        if kind is None:  # the header holds the number of points, so it is written last
+            with self._path.open("wb") as file, self._body.open("rb") as body:
+                file.write(_HEADER.format(count=self._count).encode())
+                shutil.copyfileobj(body, file, 1 << 20)
+        self._body.unlink(missing_ok=True)
+
+
+def write_ply(path: Path, cloud: PointCloud) -> None:
+    """Write a cloud, which may be empty, as one file."""
+    with PlyWriter(path) as ply:
+        ply.add(cloud)

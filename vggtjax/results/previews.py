@@ -10,8 +10,7 @@ from jaxtyping import Bool, Float32, UInt8
 from PIL import Image, ImageDraw, ImageFont
 from skimage.segmentation import find_boundaries
 
-from vggtjax.results.frame import valid_pixels
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.result import Result
 
 _DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm
 _SALIENCY_COLORS = (Colormap("inferno").lut(256)[:, :3] * 255).round().astype(np.uint8)
@@ -73,27 +72,28 @@ def moving_ids(mask: Bool[np.ndarray, ...], instances: UInt8[np.ndarray, ...]) -
     return np.where(mask & (instances == 0), len(INSTANCE_COLORS) - 1, instances).astype(np.uint8)
 
 
-def contact_sheet(reconstruction: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
+def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
     """Draw up to eight frames, evenly spread: columns of picture, depth, saliency where known, and what moves."""
-    frames, height, width = reconstruction.depth.shape
+    frames, height, width = result.depth.shape
     shown = np.linspace(0, frames - 1, min(frames, _SHEET_FRAMES)).round().astype(int)
     scale = min(_THUMBNAIL[0] / width, _THUMBNAIL[1] / height, _SHEET_WIDTH / len(shown) / width)
     size = max(1, round(width * scale)), max(1, round(height * scale))
     step_x, step_y = size[0] + _GAP, size[1] + _GAP
     left, top = _MARGIN + _LABEL_WIDTH, _MARGIN + _HEADER_HEIGHT
 
-    labels = tuple(_thumbnails(reconstruction, 0, np.zeros((height, width, 3), np.uint8), size))
+    labels = tuple(_thumbnails(result, 0, np.zeros((height, width, 3), np.uint8), size))
 
     sheet_width = max(left + len(shown) * step_x - _GAP, _TITLE_WIDTH) + _MARGIN
     sheet = Image.new("RGB", (sheet_width, top + len(labels) * step_y - _GAP + _MARGIN), BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     large, small = ImageFont.load_default(22), ImageFont.load_default(15)
-    draw.text((_MARGIN, _MARGIN), f"{reconstruction.method}  ·  {reconstruction.model_name}", TEXT, large)
+    draw.text((_MARGIN, _MARGIN), f"{result.method}  ·  {result.model_name}", TEXT, large)
     count = f"{frames} frame{'s' if frames > 1 else ''} of {width} x {height} pixels"
     draw.text((_MARGIN, _MARGIN + 30), count, FAINT, small)
+    draw.text((_MARGIN, _MARGIN + 48), result.model_note, FAINT, small)
 
-    objects = int(reconstruction.instances.max())
-    notes = (f"{reconstruction.dynamic_mask.mean():.1%} of pixels", f"{objects} object{'' if objects == 1 else 's'}")
+    objects = int(result.instances.max())
+    notes = (f"{result.dynamic_share:.1%} of pixels", f"{objects} object{'' if objects == 1 else 's'}")
     legends = {"Depth": (_DEPTH_COLORS, "far", "near"), "Saliency": (_SALIENCY_COLORS, "0", "1")}
     for row, label in enumerate(labels):
         y = top + row * step_y
@@ -106,28 +106,28 @@ def contact_sheet(reconstruction: Reconstruction) -> UInt8[np.ndarray, "height w
         if label == "Dynamic":
             draw.text((_MARGIN, y + 22), "\n".join(notes), FAINT, small)
 
-    valid = valid_pixels(reconstruction)
-    inverse_range = inverse_depth_range(reconstruction.depth, valid)
+    valid = result.valid_pixels
+    inverse_range = inverse_depth_range(result.depth, valid)
     for column, frame in enumerate(shown):
         x = left + column * step_x
-        time = "" if reconstruction.timestamps is None else f"  ·  {reconstruction.timestamps[frame]:.2f} s"
+        time = "" if result.timestamps is None else f"  ·  {result.timestamps[frame]:.2f} s"
         draw.text((x, top - 24), f"frame {frame}{time}", FAINT, small)
-        depth = color_depth(reconstruction.depth[frame], valid[frame], inverse_range)
-        for row, thumbnail in enumerate(_thumbnails(reconstruction, int(frame), depth, size).values()):
+        depth = color_depth(result.depth[frame], valid[frame], inverse_range)
+        for row, thumbnail in enumerate(_thumbnails(result, int(frame), depth, size).values()):
             sheet.paste(thumbnail, (x, top + row * step_y))
     return np.asarray(sheet)
 
 
 def _thumbnails(
-    reconstruction: Reconstruction, frame: int, depth: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]
+    result: Result, frame: int, depth: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]
 ) -> dict[str, Image.Image]:
     """Return one column of the sheet, from top to bottom."""
-    picture = Image.fromarray(reconstruction.images[frame]).resize(size, Image.Resampling.LANCZOS)
+    picture = Image.fromarray(result.images[frame]).resize(size, Image.Resampling.LANCZOS)
     column = {"Picture": picture, "Depth": Image.fromarray(depth).resize(size, Image.Resampling.LANCZOS)}
-    if reconstruction.saliency is not None:
-        saliency = np.nan_to_num(reconstruction.saliency[frame]).clip(0, 1)
+    if result.saliency is not None:
+        saliency = np.nan_to_num(result.saliency[frame]).clip(0, 1)
         saliency = np.asarray(Image.fromarray(saliency).resize(size, Image.Resampling.BILINEAR))
         column["Saliency"] = Image.fromarray(_SALIENCY_COLORS[(saliency * 255).round().astype(np.uint8)])
-    moving = Image.fromarray(moving_ids(reconstruction.dynamic_mask[frame], reconstruction.instances[frame]))
+    moving = Image.fromarray(moving_ids(result.dynamic_mask[frame], result.instances[frame]))
     moving = np.asarray(moving.resize(size, Image.Resampling.NEAREST))
     return column | {"Dynamic": Image.fromarray(overlay(np.asarray(picture), moving))}

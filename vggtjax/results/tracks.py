@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from vggtjax.results.previews import BACKGROUND, FAINT, TEXT
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.result import Result
 
 SEEN = 0.5  # visibility from which a point is drawn filled
 _COLORS = (Colormap("gist_rainbow").lut(256)[:, :3] * 255).round().astype(int)
@@ -25,7 +25,7 @@ _MARGIN, _GAP = 24, 6
 logger = logging.getLogger(__name__)
 
 
-def track_strip(result: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
+def track_strip(result: Result) -> UInt8[np.ndarray, "height width 3"]:
     """Draw up to six frames, evenly spread, with every track: its place, and where it came from."""
     S, H, W = result.depth.shape
     shown = np.linspace(0, S - 1, min(S, _STRIP_FRAMES)).round().astype(int)
@@ -42,7 +42,7 @@ def track_strip(result: Reconstruction) -> UInt8[np.ndarray, "height width 3"]:
     return np.asarray(strip)
 
 
-def write_track_video(path: Path, result: Reconstruction) -> bool:
+def write_track_video(path: Path, result: Result) -> bool:
     """Write the clip with its tracks as an mp4; return False, with a note logged, where PyAV or its encoder lacks."""
     try:
         import av
@@ -65,7 +65,7 @@ def write_track_video(path: Path, result: Reconstruction) -> bool:
     return True
 
 
-def _drawn(result: Reconstruction, frame: int, size: tuple[int, int]) -> Image.Image:
+def _drawn(result: Result, frame: int, size: tuple[int, int]) -> Image.Image:
     """Return a frame, greyed and enlarged, with the tracks over it; points that are hidden are rings."""
     positions, visibility = _present(result.track_positions), _present(result.track_visibility)
     _, H, W = result.depth.shape
@@ -85,7 +85,7 @@ def _drawn(result: Reconstruction, frame: int, size: tuple[int, int]) -> Image.I
     return picture
 
 
-def _colors(result: Reconstruction) -> list[tuple[int, int, int]]:
+def _colors(result: Result) -> list[tuple[int, int, int]]:
     """Return a colour per track by the direction in which it lies from the middle of the first frame."""
     _, H, W = result.depth.shape
     x, y = (_present(result.track_positions)[0] - [W / 2, H / 2]).T

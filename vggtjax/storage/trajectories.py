@@ -1,4 +1,4 @@
-"""Camera trajectories as text: timestamp tx ty tz and a quaternion a line, world-from-camera. Does not import jax."""
+"""Camera trajectories as text: timestamp tx ty tz and a quaternion per line, world-from-camera. Does not import jax."""
 
 from __future__ import annotations
 
@@ -16,15 +16,33 @@ Quaternion = Literal["xyzw", "wxyz"]
 
 _MOST_BYTES = 2**27  # of a text file; a million poses
 _UNIT = 0.01  # by which a quaternion's length may differ from 1
+_COLUMNS = {"xyzw": "qx qy qz qw", "wxyz": "qw qx qy qz"}
 
 
-def write_trajectory(path: Path, world_from_camera: Float[np.ndarray, "S 4 4"], times: Float[np.ndarray, " S"]) -> None:
-    """Write poses in TUM format: timestamp tx ty tz qx qy qz qw, with qw at least 0."""
+def write_trajectory(
+    path: Path,
+    world_from_camera: Float[np.ndarray, "S 4 4"],
+    times: Float[np.ndarray, " S"],
+    *,
+    quaternion: Quaternion = "xyzw",
+    note: str = "",
+) -> None:
+    """Write poses as timestamp tx ty tz and a quaternion with w at least 0.
+
+    Files in TUM's order "xyzw" start with a comment of the columns and the `note`; files in the order "wxyz" of MonST3R
+    and VGGT4D have no comments, as theirs.
+    """
     poses = world_from_camera.astype(np.float64)
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
-    header = "timestamp tx ty tz qx qy qz qw (world-from-camera)"
-    rows = np.column_stack([times, poses[:, :3, 3], quaternions])
-    np.savetxt(path, rows, fmt=["%.6f"] + ["%.9g"] * 7, header=header, encoding="utf-8")
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True, scalar_first=quaternion == "wxyz")
+    rows = np.column_stack([times, poses[:, :3, 3], turns])
+    header = commented(f"timestamp tx ty tz {_COLUMNS['xyzw']} (world-from-camera)", note)
+    header = header if quaternion == "xyzw" else ""
+    np.savetxt(path, rows, fmt=["%.6f"] + ["%.9g"] * 7, header=header, comments="", encoding="utf-8")
+
+
+def commented(columns: str, note: str) -> str:
+    """Return the header of a text file: a comment of its columns and, unless empty, one of the note."""
+    return "\n".join(f"# {line}" for line in (columns, note) if line)
 
 
 def read_trajectory(
@@ -33,16 +51,21 @@ def read_trajectory(
     """Read a trajectory: timestamps, and world-from-camera poses.
 
     Args:
-        path: of a text file with eight numbers a line; lines that start with # are comments.
+        path: of a text file with eight numbers per line; text after # is a comment.
         quaternion: order of the last four: "xyzw" is TUM's, "wxyz" that of MonST3R, CUT3R, Easi3R and VGGT4D.
 
     Raises:
-        InputError: an order that is neither.
-        ResultError: a file that cannot be read, lines without eight finite numbers, or quaternions not of length 1.
+        InputError: an unknown order.
+        ResultError: an unreadable file, a first line that names the other order, lines without eight finite numbers,
+            or quaternions not of length 1.
     """
     if quaternion not in ("xyzw", "wxyz"):
         raise InputError(f"quaternion is {quaternion!r}; expected 'xyzw' or 'wxyz'")
     rows = read_numbers(path, 8)
+    other: Quaternion = "wxyz" if quaternion == "xyzw" else "xyzw"
+    with Path(path).open(encoding="utf-8") as file:
+        if _COLUMNS[other] in file.readline(1000):
+            raise ResultError(f"{path} names its columns {_COLUMNS[other]}; read it with quaternion={other!r}")
     turns = rows[:, 4:] if quaternion == "xyzw" else rows[:, [5, 6, 7, 4]]
     lengths = np.linalg.norm(turns, axis=1)
     if (abs(lengths - 1) > _UNIT).any():
@@ -55,22 +78,22 @@ def read_trajectory(
 
 
 def read_numbers(path: str | Path, columns: int) -> Float[np.ndarray, "S columns"]:
-    """Read a text file of so many finite numbers a line; raises ResultError for anything else."""
+    """Read a text file of `columns` finite numbers per line. Raises ResultError for anything else."""
     path = Path(path)
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ResultError(f"{path} has {path.stat().st_size} bytes; expected at most {_MOST_BYTES}")
         with path.open(encoding="utf-8") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that it is empty, which is said below
+            warnings.simplefilter("ignore")  # of an empty file, an error below
             array = np.loadtxt((line.replace(",", " ") for line in file), ndmin=2)
     except OSError as error:
         raise ResultError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:  # neither text nor numbers, or another number of them
+    except ValueError as error:  # not text, not numbers, or lines of different length
         reason = str(error).split(";")[0].split("\n")[0][:100]
         raise ResultError(f"{path} is not a table of {columns} numbers a line ({reason})") from None
     if array.shape[1] != columns or not len(array):
-        found = f"has {array.shape[1]} numbers a line" if len(array) else "is empty"
-        raise ResultError(f"{path} {found}; expected {columns} numbers a line")
+        problem = f"has {array.shape[1]} numbers a line" if len(array) else "is empty"
+        raise ResultError(f"{path} {problem}; expected {columns} numbers a line")
     if not np.isfinite(array).all():
         raise ResultError(f"{path} holds {array[~np.isfinite(array)][0]}; expected finite numbers")
     return array

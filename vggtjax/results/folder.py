@@ -1,0 +1,93 @@
+"""Replacing the files of an earlier result as a whole, however the process ends.
+
+The new files are written in a hidden folder beside the old ones. Once they are whole, that folder is renamed to
+`.replacing`, which holds new/ and old/. Then the old files move to old/, the archive first, and the new files to their
+places, the archive last. A killed process leaves `.replacing` at one of these steps: the next process goes on from
+there, and until then the archive in new/ is read where the folder has none.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from vggtjax.results.archive import ARCHIVE_NAME, OPTIONAL_FILES, is_result, saved_files
+from vggtjax.storage.writing import check_free, staging
+
+NAMES = (
+    "confidence", "depth", "mask", "instances", "preview", "frames",
+    "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb",
+)  # fmt: skip
+_REPLACING = ".replacing"
+
+
+def find_archive(folder: Path) -> Path:
+    """Return the path of the archive in the folder of a result, also where its replacement was interrupted."""
+    pending = folder / _REPLACING / "new" / ARCHIVE_NAME
+    return pending if pending.is_file() and not (folder / ARCHIVE_NAME).is_file() else folder / ARCHIVE_NAME
+
+
+def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
+    """Make sure that a result can be saved in `folder`, before hours are spent on one.
+
+    An interrupted replacement is finished first.
+
+    Args:
+        folder: may be missing.
+        optional: names of `OPTIONAL_FILES` that the result will have.
+
+    Raises OutputError where the folder cannot be made or written, or holds files of our names that are not part of an
+    earlier result.
+    """
+    if os.path.lexists(folder / _REPLACING):
+        with staging(folder):
+            _swap(folder)
+    archive = folder / ARCHIVE_NAME
+    check_free(folder, (ARCHIVE_NAME, *NAMES), replaced=is_result(archive), what="result")
+    strange = [name for name in optional if name not in saved_files(archive)]
+    check_free(folder, strange, replaced=False, what="result")
+
+
+@contextmanager
+def replacing(folder: Path, optional: Sequence[str]) -> Iterator[Path]:
+    """Yield an empty folder; at the end its files, the archive and all `NAMES` among them, replace those of `folder`.
+
+    If anything fails, the earlier result is left untouched. Raises what `check_folder` raises.
+    """
+    check_folder(folder, optional)
+    with staging(folder) as staged:
+        for name in ("new", "old"):
+            (staged / name).mkdir()
+        yield staged / "new"
+        staged.rename(folder / _REPLACING)
+        _swap(folder)
+
+
+def _swap(folder: Path) -> None:
+    """Do the moves of a replacement that are left to do; undo them if one fails."""
+    new, old = folder / _REPLACING / "new", folder / _REPLACING / "old"
+    moves = [(new / name, folder / name) for name in (*NAMES, *OPTIONAL_FILES, ARCHIVE_NAME)]
+    if os.path.lexists(new / NAMES[0]):  # the first to arrive: what is in the folder is old
+        archive = next((path for path in (old / ARCHIVE_NAME, folder / ARCHIVE_NAME) if path.is_file()), None)
+        earlier = () if archive is None else (ARCHIVE_NAME, *NAMES, *saved_files(archive))
+        moves = [(folder / name, old / name) for name in earlier] + moves
+    moves = [(source, target) for source, target in moves if os.path.lexists(source)]
+    try:
+        for source, target in moves:
+            source.rename(target)
+    except BaseException:
+        for source, target in reversed(moves):
+            if os.path.lexists(target) and not os.path.lexists(source):
+                target.rename(source)
+        if os.path.lexists(new / NAMES[0]) and not any(old.iterdir()):  # as before the first move
+            _remove(folder)
+        raise
+    _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    """Remove what a replacement has left; by a rename first, so that no half of it is ever taken for a step of one."""
+    with staging(folder) as rubbish:
+        (folder / _REPLACING).rename(rubbish / "replaced")

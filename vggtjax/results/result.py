@@ -1,0 +1,265 @@
+"""The fields of a reconstructed clip, their checks, and what follows from them."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
+
+from vggtjax.cameras import FIELD_OF_VIEW_RANGE, camera_centres, clamp_intrinsics, unproject, world_from_camera
+from vggtjax.errors import ResultError
+from vggtjax.method.instances import find_instances
+
+_MOST_SIDE, _MOST_PIXELS = 1 << 20, 1 << 28  # of a source's picture
+
+# Arrays: type and dimensions. depth binds S, H, W, saliency h, w and track_frames Q; the others must agree.
+ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
+    "depth": (np.float32, ("S", "H", "W")),
+    "depth_confidence": (np.float32, ("S", "H", "W")),
+    "saliency": (np.float32, ("S", "h", "w")),
+    "dynamic_mask": (np.bool_, ("S", "H", "W")),
+    "camera_from_world": (np.float32, ("S", 3, 4)),
+    "intrinsics": (np.float32, ("S", 3, 3)),
+    "images": (np.uint8, ("S", "H", "W", 3)),
+    "source_size": (np.int64, ("S", 2)),
+    "source_scale": (np.float64, ("S", 2)),
+    "source_offset": (np.float64, ("S", 2)),
+    "valid_box": (np.int64, ("S", 4)),
+    "timestamps": (np.float64, ("S",)),
+    "track_positions": (np.float32, ("S", "Q", 2)),
+    "track_visibility": (np.float32, ("S", "Q")),
+    "track_confidence": (np.float32, ("S", "Q")),
+    "track_frames": (np.int64, ("Q",)),
+}
+TRACKS = frozenset(name for name in ARRAYS if name.startswith("track_"))  # all are given, or none
+OPTIONAL = TRACKS | {"timestamps", "saliency"}
+STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": (), "model_name": (), "settings": ()}
+
+
+class FieldOfViewWarning(UserWarning):
+    """Cameras whose field of view was clamped because no pinhole camera has it."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result:
+    """Cameras, depth and motion of a clip of S frames, at the model's size of H x W pixels in h x w patches.
+
+    A pixel whose depth is 0, negative or not finite, or whose confidence is not finite, has unknown depth and becomes
+    no point. Arrays of a wider type are cast to the type below, `dynamic_mask` is cleared in padding, and fields of
+    view outside [0.01, 3.1] rad are clamped with a FieldOfViewWarning that names the frames.
+
+    Raises ResultError where the fields do not fit together, or where no depth or no confidence of a frame is finite:
+    the weights or the computation are broken then. The depth of a frame without any known depth is 0.
+    """
+
+    depth: Float32[np.ndarray, "S H W"]  # z in the camera, up to scale
+    depth_confidence: Float32[np.ndarray, "S H W"]  # above 0; higher is surer; compare by rank, not by value
+    saliency: Float32[np.ndarray, "S h w"] | None  # motion of each patch, in [0, 1], where known
+    dynamic_mask: Bool[np.ndarray, "S H W"]
+    camera_from_world: Float32[np.ndarray, "S 3 4"]  # OpenCV axes: x right, y down, z forward
+    intrinsics: Float32[np.ndarray, "S 3 3"]  # pixels of H x W
+    images: UInt8[np.ndarray, "S H W 3"]
+    frame_names: tuple[str, ...]
+    timestamps: Float64[np.ndarray, " S"] | None  # seconds, where known
+    method: str
+    model_name: str
+    settings: dict[str, Any]  # JSON values
+    source_size: Int64[np.ndarray, "S 2"]  # height, width of the source pictures
+    source_scale: Float64[np.ndarray, "S 2"]  # source (x, y) = scale * (x, y) + offset; pixel edges at integers
+    source_offset: Float64[np.ndarray, "S 2"]
+    valid_box: Int64[np.ndarray, "S 4"]  # left, top, right, bottom; pixels outside are padding
+    track_positions: Float32[np.ndarray, "S Q 2"] | None = None  # x, y in pixels of H x W
+    track_visibility: Float32[np.ndarray, "S Q"] | None = None  # probabilities
+    track_confidence: Float32[np.ndarray, "S Q"] | None = None
+    track_frames: Int64[np.ndarray, " Q"] | None = None  # of the queries
+    passes: Any = None  # outputs of the network; in memory only, never saved
+
+    def __post_init__(self) -> None:
+        for name, (dtype, _) in ARRAYS.items():
+            if name not in OPTIONAL or getattr(self, name) is not None:
+                self._set(name, _cast(name, getattr(self, name), dtype))
+        self._set("frame_names", tuple(self.frame_names))
+        self._set("settings", _json_values(self.settings))
+        shapes = {name: getattr(self, name).shape for name in ARRAYS if getattr(self, name) is not None}
+        check_shapes(shapes | {"frame_names": (len(self.frame_names),)})
+        intrinsics, clamped = clamp_intrinsics(self.intrinsics, *self.depth.shape[1:])
+        self._set("intrinsics", intrinsics)
+        self._check_cameras()
+        self._check_places()
+        padding = ~self.inside_pictures
+        self._check_depth(padding)
+        if (self.dynamic_mask & padding).any():
+            self._set("dynamic_mask", self.dynamic_mask & ~padding)
+        if clamped:
+            lowest, highest = FIELD_OF_VIEW_RANGE
+            warnings.warn(
+                f"the field of view of frames {_listed(clamped)} was clamped to [{lowest}, {highest}] rad; "
+                "their cameras and points are not to be trusted",
+                FieldOfViewWarning,
+                stacklevel=3,
+            )
+
+    def _set(self, name: str, value: object) -> None:
+        object.__setattr__(self, name, value)
+
+    def _check_cameras(self) -> None:
+        rotation = self.camera_from_world[:, :, :3]
+        with np.errstate(invalid="ignore", over="ignore"):
+            error = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+            rigid = (error < 0.01) & (np.linalg.det(rotation) > 0)
+        rigid &= np.isfinite(self.camera_from_world).all(axis=(1, 2))
+        if not rigid.all():
+            raise ResultError(f"camera_from_world of frame {np.argmin(rigid)} is not a finite rotation and translation")
+        for name in ("intrinsics", "timestamps", "source_scale", "source_offset", *sorted(TRACKS)):
+            value = getattr(self, name)
+            if value is not None and not np.isfinite(value).all():
+                raise ResultError(f"{name} holds {value[~np.isfinite(value)][0]}; expected finite numbers")
+
+    def _check_places(self) -> None:
+        """Check what says where things lie: sizes of the sources, frames of the tracks, boxes inside the padding."""
+        sides = self.source_size
+        outside = (sides < 1).any() or (sides > _MOST_SIDE).any() or (sides.prod(axis=1) > _MOST_PIXELS).any()
+        if outside or (self.source_scale <= 0).any():
+            raise ResultError(
+                f"source_size or source_scale is out of range; expected sides of 1 to {_MOST_SIDE}, at most "
+                f"{_MOST_PIXELS} pixels, and scales above 0"
+            )
+        frames, last = self.track_frames, len(self.depth) - 1
+        if frames is not None and ((frames < 0) | (frames > last)).any():
+            raise ResultError(f"track_frames holds {frames[(frames < 0) | (frames > last)][0]}; expected 0 to {last}")
+        height, width = self.depth.shape[1:]
+        left, top, right, bottom = self.valid_box.T
+        inside = (left >= 0) & (left < right) & (right <= width) & (top >= 0) & (top < bottom) & (bottom <= height)
+        if not inside.all():
+            frame = int(np.argmin(inside))
+            raise ResultError(
+                f"valid_box of frame {frame} is {self.valid_box[frame].tolist()}; expected left < right and "
+                f"top < bottom inside {width} x {height} pixels"
+            )
+
+    def _check_depth(self, padding: Bool[np.ndarray, "S H W"]) -> None:
+        for name in ("depth", "depth_confidence"):
+            lost = ~np.isfinite(getattr(self, name))
+            without = (lost | padding).all(axis=(1, 2))
+            if without.any():
+                raise ResultError(
+                    f"{name} of frame {np.argmax(without)} has no finite value, and {lost.sum()} of {lost.size} values "
+                    "of the clip are not finite; check the weights and the inputs (unknown depth is written as 0)"
+                )
+
+    def __repr__(self) -> str:
+        frames, height, width = self.depth.shape
+        return (
+            f"{type(self).__name__}({frames} frames of {width} x {height} pixels, method {self.method!r}, "
+            f"model {self.model_name!r}, {self.dynamic_share:.1%} dynamic)"
+        )
+
+    @property
+    def inside_pictures(self) -> Bool[np.ndarray, "S H W"]:
+        """Pixels that are not padding."""
+        return inside_box(self.valid_box, self.depth.shape[1:])
+
+    @property
+    def valid_pixels(self) -> Bool[np.ndarray, "S H W"]:
+        """Pixels that show a point: not padding, with a finite depth above 0 and a finite confidence."""
+        return show_points(self.depth, self.depth_confidence, self.inside_pictures)
+
+    @property
+    def dynamic_share(self) -> float:
+        """Share of the pixels that are dynamic, of those that are not padding."""
+        return float(self.dynamic_mask.sum() / self.inside_pictures.sum())
+
+    @cached_property
+    def instances(self) -> UInt8[np.ndarray, "S H W"]:
+        """Moving objects: 0 where nothing moves, else the same id in all frames; see `find_instances`."""
+        return find_instances(self.dynamic_mask)
+
+    @property
+    def camera_centres(self) -> Float32[np.ndarray, "S 3"]:
+        """Centres of the cameras in the world."""
+        return camera_centres(self.camera_from_world)
+
+    @property
+    def world_from_camera(self) -> Float32[np.ndarray, "S 4 4"]:
+        """Poses of the cameras in the world, as 4x4 matrices."""
+        return world_from_camera(self.camera_from_world)
+
+    @property
+    def model_note(self) -> str:
+        """What readers of the files should know of the model, on one line; empty where there is nothing to say."""
+        return " ".join(str(self.settings.get("model_note", "")).split())
+
+    def world_points(self, *, pixel_offset: float = 0.5) -> Float32[np.ndarray, "S H W 3"]:
+        """Lift every pixel to its point in the world, padding and unsure pixels too.
+
+        `pixel_offset` 0.5 sees each pixel at its centre, which fits principal points at (W/2, H/2) and the refinement
+        of masks; VGGT's own unprojection uses 0.0, so its points lie half a pixel up and left of these.
+        """
+        return unproject(self.depth, self.intrinsics, self.camera_from_world, pixel_offset=pixel_offset)
+
+
+def inside_box(box: Int[np.ndarray, "*F 4"], size: tuple[int, ...]) -> Bool[np.ndarray, "*F H W"]:
+    """Return the pixels of a picture of this height and width that lie in a box of left, top, right, bottom."""
+    rows, columns = np.arange(size[0])[:, None], np.arange(size[1])
+    left, top, right, bottom = np.moveaxis(box, -1, 0)[..., None, None]
+    return (left <= columns) & (columns < right) & (top <= rows) & (rows < bottom)
+
+
+def show_points(
+    depth: Float32[np.ndarray, "*F H W"], confidence: Float32[np.ndarray, "*F H W"], seen: Bool[np.ndarray, "*F H W"]
+) -> Bool[np.ndarray, "*F H W"]:
+    """Return the seen pixels with a finite depth above 0 and a finite confidence."""
+    return seen & np.isfinite(depth) & (depth > 0) & np.isfinite(confidence)
+
+
+def check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Raise ResultError unless every shape is as the tables say."""
+    for name in ("depth", "saliency"):
+        if name in shapes and (len(shapes[name]) != 3 or 0 in shapes[name]):
+            raise ResultError(f"{name} has shape {shapes[name]}; expected (frames, rows, columns), none of them 0")
+    sizes: dict[str | int, int] = dict(zip("SHW", shapes["depth"], strict=True))
+    if "saliency" in shapes:
+        sizes |= dict(zip("hw", shapes["saliency"][1:], strict=True))
+    if tracks := TRACKS & set(shapes):
+        if missing := sorted(TRACKS - tracks):
+            raise ResultError(f"tracks lack {', '.join(missing)}")
+        if len(shapes["track_frames"]) != 1:
+            raise ResultError(f"track_frames has shape {shapes['track_frames']}; expected one number per track")
+        sizes["Q"] = shapes["track_frames"][0]
+    for name, shape in shapes.items():
+        dimensions = ARRAYS[name][1] if name in ARRAYS else STRINGS[name]
+        expected = tuple(sizes.get(dimension, dimension) for dimension in dimensions)
+        if shape != expected:
+            raise ResultError(f"{name} has shape {shape}; expected {expected} to go with depth {shapes['depth']}")
+    if "saliency" in shapes and (sizes["H"] % sizes["h"] or sizes["W"] % sizes["w"]):
+        raise ResultError(
+            f"saliency has {sizes['h']} x {sizes['w']} patches, which do not divide {sizes['H']} x {sizes['W']} pixels"
+        )
+
+
+def _cast(name: str, value: Any, dtype: type) -> np.ndarray:
+    array = np.asarray(value)
+    if not np.can_cast(array.dtype, dtype, "same_kind"):
+        raise ResultError(f"{name} has type {array.dtype}; expected {np.dtype(dtype)}")
+    return array.astype(dtype, copy=False)
+
+
+def _json_values(settings: Any) -> dict[str, Any]:
+    try:
+        values = json.loads(json.dumps(settings, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ResultError(f"settings cannot be written as JSON: {error}") from None
+    if not isinstance(values, dict):
+        raise ResultError(f"settings is a {type(settings).__name__}; expected a dictionary")
+    return values
+
+
+def _listed(frames: tuple[int, ...], shown: int = 10) -> str:
+    listed = ", ".join(map(str, frames[:shown]))
+    return f"{listed} and {len(frames) - shown} more" if len(frames) > shown else listed
