@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog, minimize_scalar
 
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.video_depth import depth_alignment, resized_depth, video_depth_errors
+from vggtjax.evaluation.metrics.video_depth import depth_alignment, video_depth_errors
 
 TRUTH = np.array([[[2.0, 4.0]], [[8.0, 0.0]]])  # two frames of two pixels; the last is not measured
 seeds = st.integers(0, 2**32 - 1)
@@ -161,50 +161,3 @@ def test_all_frames_share_one_alignment():
 def test_depth_that_cannot_be_compared_is_one_sentence(predicted, truth, options, sentence):
     with pytest.raises(InputError, match=sentence):
         video_depth_errors(predicted, truth, **options)
-
-
-def test_resizing_by_hand():
-    row = np.array([[0.0, 4.0]])
-    assert resized_depth(row, (1, 4)).tolist() == [[0, 1, 3, 4]]  # centres at -0.25, 0.25, 0.75 and 1.25
-    assert resized_depth(row.T, (4, 1)).T.tolist() == [[0, 1, 3, 4]]
-    assert resized_depth(row, (3, 1)).tolist() == [[2], [2], [2]]
-    wide = np.array([[[0.0, 1, 2, 3, 4, 5]]])
-    assert resized_depth(wide, (1, 3)).tolist() == [[[0.5, 2.5, 4.5]]]
-    assert resized_depth(wide, (1, 2)).tolist() == [[[1, 4]]]  # the middle of three: nothing is averaged
-    assert resized_depth(wide.astype(np.float32), (1, 6)).dtype == np.float64
-
-
-@settings(max_examples=40, deadline=None)
-@given(h=st.integers(1, 6), w=st.integers(1, 6), H=st.integers(1, 13), W=st.integers(1, 13), seed=seeds)
-def test_resizing_follows_the_definition(h, w, H, W, seed):
-    depth = np.random.default_rng(seed).random((2, h, w))
-    resized = resized_depth(depth, (H, W))
-    assert resized.shape == (2, H, W)
-    for Y in range(H):
-        for X in range(W):
-            y, x = (min(max((i + 0.5) * n / N - 0.5, 0), n - 1) for i, n, N in ((Y, h, H), (X, w, W)))
-            wanted = sum(
-                max(0, 1 - abs(y - j)) * max(0, 1 - abs(x - i)) * depth[:, j, i] for j in range(h) for i in range(w)
-            )
-            assert resized[:, Y, X] == pytest.approx(wanted)
-
-
-def test_resizing_keeps_what_is_not_finite_where_it_is():
-    depth = np.array([[1.0, np.nan, 3.0, 3.0]])
-    assert np.isnan(resized_depth(depth, (1, 8))).tolist() == [[False, True, True, True, True, False, False, False]]
-    assert np.isnan(resized_depth(depth, (2, 4))).tolist() == [[False, True, False, False]] * 2
-
-
-@pytest.mark.parametrize(
-    ("depth", "size", "sentence"),
-    [
-        (np.ones(3), (2, 2), r"shape \(3,\)"),
-        (np.ones((2, 0, 3)), (2, 2), "with a pixel at least"),
-        (np.ones((2, 2)), (0, 2), r"size is \(0, 2\)"),
-        (np.ones((2, 2)), (2, 1.5), r"size is \(2, 1.5\)"),
-        (np.ones((2, 2)), (2,), r"size is \(2,\)"),
-    ],
-)
-def test_sizes_that_make_no_sense_are_one_sentence(depth, size, sentence):
-    with pytest.raises(InputError, match=sentence):
-        resized_depth(depth, size)

@@ -47,4 +47,4 @@ class LabelledSequence:
 
 Sequence = LabelledSequence  # the older name
 Opener = Callable[[FrameChoice], LabelledSequence]
-Reader = Callable[[Path], Mapping[str, Opener]]  # of a root: the openers of its sequences by name
+Reader = Callable[..., Mapping[str, Opener]]  # of a root, and of a ground truth where a data set has several

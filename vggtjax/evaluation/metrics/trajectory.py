@@ -32,13 +32,6 @@ class Similarity(NamedTuple):
         return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
 
-class RelativeErrors(NamedTuple):
-    """Errors between consecutive poses: RMSE of the translation in the truth's unit, of the angle in degrees."""
-
-    translation: float
-    rotation: float
-
-
 class TrajectoryErrors(NamedTuple):
     """RMSE of the centres, and of the steps between consecutive frames; `trajectory_errors` says how."""
 
@@ -132,19 +125,6 @@ def from_first(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Rotation:
     return rotations[1:] * rotations[0].inv()
 
 
-def relative_errors(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray, "S 3 4"]) -> RelativeErrors:
-    """Return RTE and RRE: errors of E = (Q_i^-1 Q_i+1)^-1 (P_i^-1 P_i+1), world-from-camera, aligned by Sim(3).
-
-    Every consecutive pair counts once; P is the prediction, aligned by its centres, and Q the truth.
-
-    Raises:
-        InputError: fewer than 3 poses, or a trajectory that does not move.
-    """
-    source, target = _pair_of_centres(predicted, truth)
-    aligned = align(predicted, umeyama_sim3(source, target, allow_line=True))
-    return _relative(aligned, checked_poses(truth))
-
-
 def trajectory_errors(
     predicted: Float[np.ndarray, "S 4 4"], truth: Float[np.ndarray, "S 4 4"], align: Alignment = "sim3"
 ) -> TrajectoryErrors:
@@ -168,9 +148,8 @@ def trajectory_errors(
     fewest = 2 if align == "first" else FEWEST_POSES
     source, target = _pair(_camera_from_world("predicted", predicted), _camera_from_world("true", truth), fewest)
     aligned = _onto(source, target, align)
-    apart = centres(aligned) - centres(target)
-    relative = _relative(aligned, target)
-    return TrajectoryErrors(float(np.sqrt((apart**2).sum(axis=1).mean())), relative.translation, relative.rotation)
+    offsets = centres(aligned) - centres(target)
+    return TrajectoryErrors(float(np.sqrt((offsets**2).sum(axis=1).mean())), *_step_errors(aligned, target))
 
 
 def associate(
@@ -216,12 +195,12 @@ def associate(
     return np.stack([found, partner[found]], axis=1)
 
 
-def _relative(aligned: Float64[np.ndarray, "S 3 4"], truth: Float64[np.ndarray, "S 3 4"]) -> RelativeErrors:
-    """Return the errors of the steps of camera-from-world poses that share a world."""
+def _step_errors(aligned: Float64[np.ndarray, "S 3 4"], truth: Float64[np.ndarray, "S 3 4"]) -> tuple[float, float]:
+    """Return RTE and RRE of camera-from-world poses in one world."""
     (rotation, translation), (true_rotation, true_translation) = _steps(aligned), _steps(truth)
-    apart = true_rotation.inv().apply(translation - true_translation)
+    offsets = true_rotation.inv().apply(translation - true_translation)
     angles = (true_rotation.inv() * rotation).magnitude()
-    return RelativeErrors(float(np.sqrt((apart**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((angles**2).mean()))))
+    return float(np.sqrt((offsets**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((angles**2).mean())))
 
 
 def checked_poses(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarray, "S 3 4"]:

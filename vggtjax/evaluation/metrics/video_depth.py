@@ -47,7 +47,7 @@ def video_depth_errors(
     """Return the errors of a sequence's depth after one alignment over all valid pixels of all frames.
 
     Args:
-        predicted: depth at the truth's size (`resized_depth`), finite wherever the truth is valid. A depth that is
+        predicted: depth at the truth's size, finite wherever the truth is valid. A depth that is
             not above 0 after the alignment is counted like any other in AbsRel and RMSE, and is within no delta.
         truth: depth; valid where it is finite, above 0 and below `max_depth`.
         align: "metric" changes nothing; "median" scales by median g / median d; "scale" by the least absolute error,
@@ -86,42 +86,6 @@ def depth_alignment(
     Any shape will do, one number of axes of both.
     """
     return _line(*_valid_pixels(predicted, truth, max_depth), align)
-
-
-def resized_depth(depth: Float[np.ndarray, "*S h w"], size: tuple[int, int]) -> Float64[np.ndarray, "*S H W"]:
-    """Return depth at another size: bilinear, pixel centres at .5, without smoothing when it shrinks.
-
-    Outside the outermost centres the depth of the border goes on.
-
-    Args:
-        depth: maps with a value in every pixel; one that is not finite spreads to all pixels that touch it.
-        size: height and width.
-
-    Raises:
-        InputError: depth without pixels or with fewer than 2 axes, or a size that is not two whole numbers above 0.
-    """
-    depth = np.asarray(depth)
-    if depth.ndim < 2 or 0 in depth.shape[-2:]:
-        raise InputError(f"depth has shape {depth.shape}; expected [..., H, W] with a pixel at least")
-    if len(size) != 2 or any(side != int(side) or side < 1 for side in size):
-        raise InputError(f"size is {tuple(size)}; expected a height and a width of at least 1")
-    resized = depth.astype(np.float64)
-    for axis, side in zip((-2, -1), size, strict=True):
-        if resized.shape[axis] != side:
-            resized = _interpolated(resized, axis, int(side))
-    return resized
-
-
-def _interpolated(values: Float64[np.ndarray, "*S h w"], axis: int, side: int) -> Float64[np.ndarray, "*S H W"]:
-    """Return values on another number of pixels along an axis."""
-    last = values.shape[axis] - 1
-    places = np.clip((np.arange(side) + 0.5) * (last + 1) / side - 0.5, 0, last)
-    before = np.floor(places).astype(int)
-    share = (places - before)[:, None] if axis == -2 else places - before
-    lower = np.take(values, before, axis)
-    upper = np.take(values, np.minimum(before + 1, last), axis)
-    # A share of 0 takes nothing from the other pixel, not even a NaN.
-    return np.where(share > 0, lower + share * (upper - lower), lower)
 
 
 def _median(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]) -> DepthLine:
