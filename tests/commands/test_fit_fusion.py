@@ -240,5 +240,5 @@ def test_splits_share_no_clip_and_differ_by_seed():
             assert sorted([*split.fitted, *split.validation, *split.test]) == list(range(count))
             assert min(map(len, split)) >= 1
     assert split_clips(16, 0) != split_clips(16, 1)
-    with pytest.raises(InputError, match="expected three at least"):
+    with pytest.raises(InputError, match="expected at least three"):
         split_clips(2, 0)

@@ -203,7 +203,7 @@ def test_standard_errors_of_a_mean_by_hand():
         ({"steps": 0}, "steps is 0"),
         ({"learning_rate": -1.0}, "learning_rate is -1.0"),
         ({"decay": 1.5}, "decay is 1.5"),
-        ({"family": "calibrated"}, "family has 'c'"),
+        ({"family": "calibrated"}, "family is 'calibrated'; expected a list"),
         ({"family": ("scale", "nothing")}, "family has 'nothing'"),
         ({"family": ("temperature",), "objective": "joint"}, "does not see soft masks"),
     ],

@@ -10,7 +10,7 @@ from vggtjax.errors import InputError, check_extra
 
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
-    from vggtjax.learning.ablation import Outcome
+    from vggtjax.learning.ablation import RuleScore
     from vggtjax.learning.clip_passes import ClipPasses
 
 GENERATED = "generated"
@@ -94,13 +94,13 @@ def fit_fusion(
         patch = loaded.config.patch_size
         with report.stage("fit") as progress:
             settings: dict[str, Any] = {"seeds": range(seeds), "held_out": held_out, "pixels": pixels}
-            outcomes = ablate(
+            scores = ablate(
                 list(clips.values()), patch, family, config, folder=begin(out), progress=progress, **settings
             )
         with report.stage("write"):
             chosen = save_fits(
                 out,
-                outcomes,
+                scores,
                 clips,
                 patch,
                 config,
@@ -114,24 +114,24 @@ def fit_fusion(
                 }
                 | {"align_scale": align_scale, "max_frames": max_frames, "size": size},
             )
-    _say(report, outcomes, chosen, out)
+    _say(report, scores, chosen, out)
     if not loaded.trained:
         report.line("The weights of this model are untrained: these numbers show that everything runs, no more.")
 
 
-def _say(report: Report, outcomes: list[Outcome], chosen: str, out: Path) -> None:
+def _say(report: Report, scores: list[RuleScore], chosen: str, out: Path) -> None:
     from vggtjax.learning.ablation import CHOSEN, METRICS, PAPER, gains, table
 
-    rows = table(outcomes)
+    rows = table(scores)
     names = ("abs_rel", "nll", "ece", "ause")
     width = max(map(len, rows))
     report.line(f"{'':{width}}  " + "  ".join(f"{METRICS[name]:>15}" for name in names))
     for rule, row in rows.items():
         cells = (f"{row[name][0]:7.4f} ±{row[name][1]:7.4f}" for name in names)
         report.line(f"{rule:{width}}  " + "  ".join(cells))
-    apart = gains(outcomes).get(CHOSEN, gains(outcomes).get(chosen))
+    apart = gains(scores).get(CHOSEN, gains(scores).get(chosen))
     if apart is not None:
-        count = len({outcome.seed for outcome in outcomes})
+        count = len({score.seed for score in scores})
         text = (f"{METRICS[name]} {apart[name][0]:+.4f} (lower with {apart[name][2]} of {count})" for name in names[:2])
         name = CHOSEN if CHOSEN in rows else chosen
         report.line(f"{name} against {PAPER}, on clips that were not fitted to: {', '.join(text)}")

@@ -1,4 +1,4 @@
-"""Rules of fusion side by side on clips that none of them was fitted to, over several seeds."""
+"""Fusion rules compared on clips that no rule was fitted to, over several seeds."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ from vggtjax.evaluation.metrics.depth import depth_errors
 from vggtjax.evaluation.metrics.uncertainty import reliability_curve, uncertainty_scores
 from vggtjax.evaluation.metrics.video_depth import depth_alignment
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, observations
-from vggtjax.learning.fit import NEEDS_FRAMES, Fit, FitConfig, fit_fusion
+from vggtjax.learning.fit import NEEDS_FRAMES, FitConfig, FitOutcome, fit_fusion
 from vggtjax.method.fusion_rule import Fused, Observations, fuse, identity, parse_family
+from vggtjax.progress import Progress
 
 METRICS = {
     "abs_rel": "AbsRel",
@@ -34,26 +35,26 @@ METRICS = {
 }
 PAPER = "paper"
 CHOSEN = "chosen by the clips for stopping"
-_FRAMES = 4  # of a clip, for fits that look at whole frames
+_FRAMES = 4  # of a clip, for fits that need whole frames
 
 Rule = Callable[[Observations], Fused]
 
 _fused = jax.jit(fuse)
 
 
-class Outcome(NamedTuple):
-    """What one rule scored with one seed: means over the test clips; and its fit, if it was fitted."""
+class RuleScore(NamedTuple):
+    """The score of one rule with one seed: means over the test clips; and the rule's fit, if there is one."""
 
     rule: str
     seed: int
     metrics: dict[str, float]
-    fit: Fit | None
+    fit: FitOutcome | None
     reliability: Float[np.ndarray, "2 K"]  # claimed levels, observed shares
-    stopping: dict[str, float]  # the metrics on the clips for early stopping, by which a family is chosen
+    stopping: dict[str, float]  # metrics on the clips for early stopping, by which a family is chosen
 
 
 class Split(NamedTuple):
-    """Which clips are fitted to, looked at for early stopping, and kept for the scores."""
+    """Indices of the clips for the fit, for early stopping, and for the scores."""
 
     fitted: list[int]
     validation: list[int]
@@ -68,7 +69,7 @@ def split_clips(count: int, seed: int, held_out: float = 0.25) -> Split:
     if not 0 < held_out < 1:
         raise InputError(f"held_out is {held_out}; expected a share above 0 and below 1")
     if count < 3:
-        raise InputError(f"{count} clips with a true depth; expected three at least: to fit, to stop at, and to score")
+        raise InputError(f"{count} clips with a true depth; expected at least three: to fit, to stop at, and to score")
     order = np.random.default_rng(seed).permutation(count).tolist()
     tests = min(max(round(held_out * count), 1), count - 2)
     stops = min(max(round(held_out * (count - tests)), 1), count - tests - 1)
@@ -77,7 +78,7 @@ def split_clips(count: int, seed: int, held_out: float = 0.25) -> Split:
 
 @cache
 def baselines() -> dict[str, Rule]:
-    """Return the rules that nothing is learned of: either pass, hard replacement, and the paper's; jitted."""
+    """Return the rules without a fit: either pass, hard replacement, and the paper's rule; jitted."""
 
     def replaced(seen: Observations) -> Fused:
         moves = seen.dynamic >= 0.5
@@ -102,52 +103,53 @@ def ablate(
     held_out: float = 0.25,
     pixels: int = 16384,
     folder: Path | None = None,
-    progress: Callable[[int, int], object] | None = None,
-) -> list[Outcome]:
-    """Fit families to clips and score them, and the baselines, on clips that they were not fitted to.
+    progress: Progress | None = None,
+) -> list[RuleScore]:
+    """Fit families to clips, and score the fitted rules and the baselines on other clips.
 
     Args:
         clips: at least three, with true depth.
         patch_size: of the model.
-        families: names that `parse_family` takes.
+        families: names for `parse_family`.
         config: of the fits; family and seed are filled in.
-        seeds: each splits the clips anew, and draws other pixels.
-        held_out: share of the clips for the scores, and of the rest for early stopping.
-        pixels: of a clip that fits look at, where they need no whole frames.
-        folder: for the states of fits, so that an interrupted run goes on; none if None.
+        seeds: each seed splits the clips and draws pixels anew.
+        held_out: share of the clips for the scores, and of the other clips for early stopping.
+        pixels: of a clip, for fits that do not need whole frames.
+        folder: for the states of fits, from which an interrupted run resumes; None keeps no states.
         progress: called with the fits done and their number.
 
     Returns:
-        For every seed the outcomes of the baselines, those of the families, and that of the family with the lowest NLL
-        on the clips for stopping, if there are several.
+        For every seed the scores of the baselines and of the families, and, of several families, those of the family
+        with the lowest NLL on the clips for early stopping.
     """
-    chosen = {name: parse_family(name) for name in families}
-    found: list[Outcome] = []
+    parts = {name: parse_family(name) for name in families}
+    scores: list[RuleScore] = []
     seen = [observations(clip, patch_size) for clip in clips]
-    total, done = len(seeds) * sum(map(bool, chosen.values())), 0
+    total, done = len(seeds) * sum(map(bool, parts.values())), 0
     for seed in seeds:
         split = split_clips(len(clips), seed, held_out)
 
-        def outcome(name: str, rule: Rule, fit: Fit | None = None, split=split, seed=seed) -> Outcome:
-            parts = [[(clips[i], seen[i]) for i in indices] for indices in (split.test, split.validation)]
-            (metrics, reliability), (stopping, _) = (score_rule(rule, part) for part in parts)
-            return Outcome(name, seed, metrics, fit, reliability, stopping)
+        def score(name: str, rule: Rule, fit: FitOutcome | None = None, split=split, seed=seed) -> RuleScore:
+            groups = [[(clips[i], seen[i]) for i in indices] for indices in (split.test, split.validation)]
+            (metrics, reliability), (stopping, _) = (score_rule(rule, group) for group in groups)
+            return RuleScore(name, seed, metrics, fit, reliability, stopping)
 
-        found += [outcome(name, rule) for name, rule in baselines().items()]
-        fitted: list[Outcome] = []
-        for name, family in chosen.items():
+        scores += [score(name, rule) for name, rule in baselines().items()]
+        fitted: list[RuleScore] = []
+        for name, family in parts.items():
             if not family:
-                continue  # the paper's own: a baseline
-            fit = fit_split(clips, seen, split, _with(config, family, seed), pixels=pixels, folder=folder)
-            fitted.append(outcome(name, partial(_fused, fit.params), fit))
+                continue  # the paper's rule is a baseline
+            settings = dataclasses.replace(config, family=family, seed=seed)
+            fit = fit_split(clips, seen, split, settings, pixels=pixels, folder=folder)
+            fitted.append(score(name, partial(_fused, fit.params), fit))
             done += 1
             if progress is not None:
                 progress(done, total)
-        found += fitted
+        scores += fitted
         if len(fitted) > 1:
             best = min(fitted, key=lambda one: one.stopping["nll"])
-            found.append(best._replace(rule=CHOSEN, fit=None))
-    return found
+            scores.append(best._replace(rule=CHOSEN, fit=None))
+    return scores
 
 
 def fit_split(
@@ -158,11 +160,11 @@ def fit_split(
     *,
     pixels: int = 16384,
     folder: Path | None = None,
-) -> Fit:
-    """Fit one family to the clips of a split; `seen` is what `observations` made of each, the rest as for `ablate`.
+) -> FitOutcome:
+    """Fit one family to the clips of a split; `seen` holds the `observations` of each, other arguments as for `ablate`.
 
-    Fits that need whole frames (the gate, photometric and geometric objectives) look at four of each clip, the others
-    at `pixels` of all.
+    Fits that need whole frames (the gate, photometric and geometric objectives) take four frames of each clip, other
+    fits `pixels` of all frames.
     """
     whole = config.objective in NEEDS_FRAMES or "gate" in config.family
     sampling: dict[str, Any] = {"frames": _FRAMES} if whole else {"pixels": pixels, "seed": config.seed}
@@ -180,9 +182,9 @@ def fit_split(
 def score_rule(
     rule: Rule, clips: Sequence[tuple[ClipPasses, Observations]]
 ) -> tuple[dict[str, float], Float[np.ndarray, "2 K"]]:
-    """Return a rule's metrics and its reliability curve, means over clips, each brought to its truth by one scale.
+    """Return a rule's metrics and reliability curve, means over clips; each clip is aligned to its truth by one scale.
 
-    A metric that no clip allows, such as that of dynamic pixels where nothing moves, is left out.
+    Metrics that no clip defines are absent, such as the error of dynamic pixels where nothing moves.
     """
     scores: list[dict[str, float]] = []
     curves = []
@@ -193,43 +195,40 @@ def score_rule(
         truth = clip.truth[known] / depth_alignment(depth[known], clip.truth[known], "scale")[0]
         depth, moves = depth[known], clip.true_dynamic[known]
         claimed = uncertainty_scores(depth, truth, precision[known])
-        row = {"abs_rel": depth_errors(depth, truth, scale=1.0).abs_rel}
+        metrics = {"abs_rel": depth_errors(depth, truth, scale=1.0).abs_rel}
         for name, part in (("abs_rel_static", ~moves), ("abs_rel_dynamic", moves)):
             if part.any() and clip.true_dynamic.any():
-                row[name] = depth_errors(depth[part], truth[part], scale=1.0).abs_rel
-        row |= {name: getattr(claimed, name) for name in ("nll", "nll_calibrated", "ece", "ause")}
-        scores.append(row)
+                metrics[name] = depth_errors(depth[part], truth[part], scale=1.0).abs_rel
+        metrics |= {name: getattr(claimed, name) for name in ("nll", "nll_calibrated", "ece", "ause")}
+        scores.append(metrics)
         curves.append(np.stack(reliability_curve(depth - truth, precision[known], 1.0)))
-    present = {name: [row[name] for row in scores if name in row] for name in METRICS}
-    return {name: float(np.mean(values)) for name, values in present.items() if values}, np.mean(curves, axis=0)
+    means = {name: float(np.mean(values)) for name, values in _by_metric(scores).items()}
+    return means, np.mean(curves, axis=0)
 
 
-def table(outcomes: Sequence[Outcome]) -> dict[str, dict[str, tuple[float, float]]]:
+def table(scores: Sequence[RuleScore]) -> dict[str, dict[str, tuple[float, float]]]:
     """Return mean and standard deviation over the seeds of every rule's metrics."""
-    rows: dict[str, dict[str, tuple[float, float]]] = {}
-    for rule in dict.fromkeys(outcome.rule for outcome in outcomes):
-        own = [outcome.metrics for outcome in outcomes if outcome.rule == rule]
-        present = {name: [m[name] for m in own if name in m] for name in METRICS}
-        rows[rule] = {name: _spread(values) for name, values in present.items() if values}
-    return rows
+    return {
+        rule: {name: _spread(values) for name, values in _by_metric(list(by_seed.values())).items()}
+        for rule, by_seed in _by_rule(scores).items()
+    }
 
 
-def gains(outcomes: Sequence[Outcome], against: str = PAPER) -> dict[str, dict[str, tuple[float, float, int]]]:
-    """Return every rule's metrics minus another's on the same clips: mean, standard deviation, seeds that are lower."""
-    base = {outcome.seed: outcome.metrics for outcome in outcomes if outcome.rule == against}
+def gains(scores: Sequence[RuleScore], against: str = PAPER) -> dict[str, dict[str, tuple[float, float, int]]]:
+    """Return every rule's metrics minus those of another rule: mean, standard deviation, number of lower seeds."""
+    by_rule = _by_rule(scores)
+    base = by_rule.pop(against)
     rows: dict[str, dict[str, tuple[float, float, int]]] = {}
-    for rule in dict.fromkeys(outcome.rule for outcome in outcomes if outcome.rule != against):
-        own = {outcome.seed: outcome.metrics for outcome in outcomes if outcome.rule == rule}
-        rows[rule] = {}
-        for name in METRICS:
-            apart = [m[name] - base[seed][name] for seed, m in own.items() if name in m and name in base[seed]]
-            if apart:
-                rows[rule][name] = (*_spread(apart), sum(value < 0 for value in apart))
+    for rule, by_seed in by_rule.items():
+        differences = _by_metric(
+            [{name: m[name] - base[seed][name] for name in m.keys() & base[seed]} for seed, m in by_seed.items()]
+        )
+        rows[rule] = {name: (*_spread(values), sum(v < 0 for v in values)) for name, values in differences.items()}
     return rows
 
 
 def markdown(rows: Mapping[str, Mapping[str, tuple[float, float]]]) -> str:
-    """Return the table in Markdown, mean ± standard deviation."""
+    """Return the rows of `table` in Markdown, mean ± standard deviation."""
     names = [name for name in METRICS if any(name in row for row in rows.values())]
     lines = ["| rule | " + " | ".join(METRICS[name] for name in names) + " |", "|---" * (len(names) + 1) + "|"]
     for rule, row in rows.items():
@@ -238,8 +237,16 @@ def markdown(rows: Mapping[str, Mapping[str, tuple[float, float]]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _with(config: FitConfig, family: tuple[str, ...], seed: int) -> FitConfig:
-    return dataclasses.replace(config, family=family, seed=seed)
+def _by_rule(scores: Sequence[RuleScore]) -> dict[str, dict[int, dict[str, float]]]:
+    """Return rule -> seed -> metrics."""
+    rules = dict.fromkeys(score.rule for score in scores)
+    return {rule: {score.seed: score.metrics for score in scores if score.rule == rule} for rule in rules}
+
+
+def _by_metric(metrics: Sequence[Mapping[str, float]]) -> dict[str, list[float]]:
+    """Return metric -> values, in the order of METRICS, without metrics that are absent everywhere."""
+    lists = {name: [one[name] for one in metrics if name in one] for name in METRICS}
+    return {name: values for name, values in lists.items() if values}
 
 
 def _spread(values: Sequence[float]) -> tuple[float, float]:

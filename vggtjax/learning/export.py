@@ -1,13 +1,13 @@
-"""Writing what was fitted.
+"""Writing fits.
 
 In the folder:
 
-    fusion.safetensors      the chosen family's tree, fitted to all clips but those for stopping; --fusion takes it
-    families/               one such file for every family
-    fit.json                every number: scores, fits, settings; written last, so its presence says that all is whole
+    fusion.safetensors      tree of the chosen family, fitted to all clips but those for early stopping; for --fusion
+    families/               such a file for every family
+    fit.json                all numbers: scores, fits, settings; written last, when all other files are whole
     table.md                means over the seeds
     *.png                   scores, precision against confidence, calibration, losses
-    states/                 states of the fits, for an interrupted run to go on
+    states/                 states of the fits, from which an interrupted run resumes
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vggtjax.learning.ablation import PAPER, Outcome, Split, fit_split, gains, markdown, split_clips, table
+from vggtjax.learning.ablation import PAPER, RuleScore, Split, fit_split, gains, markdown, split_clips, table
 from vggtjax.learning.clip_passes import ClipPasses, observations
 from vggtjax.learning.fit import FitConfig
 from vggtjax.learning.plots import draw_fits
@@ -34,30 +34,30 @@ FORMAT = "vggtjax fits"
 VERSION = 1
 NUMBERS, FUSION, TABLE, FAMILIES, STATES = "fit.json", "fusion.safetensors", "table.md", "families", "states"
 PICTURES = ("scores.png", "precision.png", "calibration.png", "losses.png")
-_MARK = "fits.json"  # in the folder of states: it is ours
+_MARK = "fits.json"  # marks the folder of states as written by this library
 
 
 def check_folder(folder: Path) -> None:
-    """Make sure that fits can be saved in `folder`; OutputError where it cannot be written or holds files of others."""
+    """Raise OutputError where fits cannot be saved: the folder cannot be written, or holds other files of our names."""
     check_free(folder, (NUMBERS, FUSION, TABLE, FAMILIES, *PICTURES), replaced=_is_ours(folder), what="fit")
 
 
 def save_fits(
     folder: Path,
-    outcomes: Sequence[Outcome],
+    scores: Sequence[RuleScore],
     clips: Mapping[str, ClipPasses],
     patch_size: int,
     config: FitConfig,
     *,
     about: Mapping[str, Any],
 ) -> str:
-    """Write everything, and return the name of the chosen family: the lowest mean NLL on the clips for stopping.
+    """Write all files, and return the name of the chosen family: the lowest mean NLL on the clips for early stopping.
 
-    Every family is fitted once more to all clips but a part for stopping, which the scores then do not hold for; where
-    no family was fitted, the paper's rule is written.
+    Every family is fitted again to all clips but those for early stopping, so the scores are of other trees than the
+    files. Where no family was fitted, the paper's rule is written.
     """
-    families = list(dict.fromkeys(outcome.rule for outcome in outcomes if outcome.fit is not None))
-    stopping = {name: float(np.mean([o.stopping["nll"] for o in outcomes if o.rule == name])) for name in families}
+    families = list(dict.fromkeys(score.rule for score in scores if score.fit is not None))
+    stopping = {name: float(np.mean([o.stopping["nll"] for o in scores if o.rule == name])) for name in families}
     chosen = min(stopping, key=stopping.__getitem__) if families else PAPER
     facts = dict(about) | {"clips": list(clips), "objective": config.objective}
     split = _final_split(len(clips), float(about["held_out"]))
@@ -75,17 +75,17 @@ def save_fits(
         "about": facts,
         "config": dataclasses.asdict(config),
         "nll_for_stopping": stopping,
-        "table": table(outcomes),
-        "against_the_paper": gains(outcomes),
-        "outcomes": [_plain(outcome) for outcome in outcomes],
+        "table": table(scores),
+        "against_the_paper": gains(scores),
+        "outcomes": [_plain(score) for score in scores],
         "fitted_to_all": {name: _values(tree) for name, tree in trees.items()},
     }
     with staging(folder) as staged:
         for name, tree in trees.items():
             save_fusion(staged / FAMILIES / f"{name.replace('+', '_')}.safetensors", tree, facts | {"family": name})
         save_fusion(staged / FUSION, trees[chosen], facts | {"family": chosen})
-        (staged / TABLE).write_text(markdown(table(outcomes)), encoding="utf-8")
-        draw_fits(staged, outcomes, all_clips, patch_size, chosen)
+        (staged / TABLE).write_text(markdown(table(scores)), encoding="utf-8")
+        draw_fits(staged, scores, all_clips, patch_size, chosen)
         (staged / NUMBERS).write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         (folder / NUMBERS).unlink(missing_ok=True)
         shutil.rmtree(folder / FAMILIES, ignore_errors=True)
@@ -95,19 +95,19 @@ def save_fits(
 
 
 def _final_split(count: int, held_out: float) -> Split:
-    """Return a split in which what is kept for the scores elsewhere is fitted to as well."""
+    """Return a split whose test clips are fitted to as well."""
     split = split_clips(count, 0, held_out)
     return Split(sorted([*split.fitted, *split.test]), split.validation, split.test)
 
 
-def _plain(outcome: Outcome) -> dict[str, Any]:
-    fit = outcome.fit
+def _plain(score: RuleScore) -> dict[str, Any]:
+    fit = score.fit
     return {
-        "rule": outcome.rule,
-        "seed": outcome.seed,
-        "metrics": outcome.metrics,
-        "stopping": outcome.stopping,
-        "reliability": outcome.reliability.tolist(),
+        "rule": score.rule,
+        "seed": score.seed,
+        "metrics": score.metrics,
+        "stopping": score.stopping,
+        "reliability": score.reliability.tolist(),
         "fit": fit
         and {
             "params": _values(fit.params),
@@ -119,7 +119,7 @@ def _plain(outcome: Outcome) -> dict[str, Any]:
 
 
 def _values(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a tree's numbers; of a gate, how many it has."""
+    """Return a tree's numbers, or the number of values of a gate."""
     return {
         name: {"values": sum(np.size(x) for x in jax.tree.leaves(leaf))}
         if name == "gate"
@@ -129,7 +129,7 @@ def _values(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def begin(folder: Path) -> Path:
-    """Make the folder for the states of fits, with a mark that it is one; return it."""
+    """Return the folder for the states of fits, made now and marked."""
     with writing(folder / STATES / _MARK) as path:
         path.write_text(json.dumps({"format": FORMAT}) + "\n", encoding="utf-8")
     return folder / STATES

@@ -1,19 +1,19 @@
-"""Fitting a family to clips with optax: schedule, early stopping on held-out clips, exact resume."""
+"""Fitting a family of fusion rules to clips with optax: schedule, early stopping on held-out clips, exact resume."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Bool, Float, Int
+from msgspec import Meta
 
 from vggtjax.errors import InputError, ResultError
 from vggtjax.learning.objectives import (
@@ -24,87 +24,78 @@ from vggtjax.learning.objectives import (
     photometric_loss,
 )
 from vggtjax.method.fusion_rule import PARTS, FusionParams, Observations, fuse, identity, is_free, projected, start
-from vggtjax.storage import arrays as archive
+from vggtjax.progress import Progress
+from vggtjax.storage.arrays import read_arrays, write_arrays
+from vggtjax.storage.json_values import Count, check_fields
+from vggtjax.storage.programs import source_digest
 from vggtjax.storage.writing import writing
 
 Objective = Literal["gaussian", "laplace", "joint", "photometric", "geometric"]
-OBJECTIVES: tuple[Objective, ...] = ("gaussian", "laplace", "joint", "photometric", "geometric")
-NEEDS_FRAMES = ("photometric", "geometric")  # objectives that look at whole frames; so does the gate
-HARD_ONLY = ("joint", *NEEDS_FRAMES)  # objectives that would gain by marking what is badly predicted as moving
-_CHUNK = 10  # steps between two looks at the held-out clips
-_GATE_RATE = 0.3  # of learning, beside other parts
-
-Progress = Callable[[int, int], object]
+NEEDS_FRAMES = ("photometric", "geometric")  # objectives that compare whole frames; the gate needs whole frames too
+HARD_ONLY = ("joint", *NEEDS_FRAMES)  # objectives that would gain by marking badly predicted pixels as moving
+_CHUNK = 10  # steps between two evaluations of the held-out clips
+_GATE_RATE = 0.3  # of learning, relative to other parts
 
 
 class FitClips(NamedTuple):
-    """Clips of one shape to fit to, or to hold out: C clips; frames of scattered pixels [1, N] where that will do."""
+    """C clips of one shape to fit to, or to hold out; scattered pixels are frames of shape [1, N]."""
 
     seen: Observations  # [C, S, H, W]
-    truth: Float[Array, "C S H W"]  # depth; not above 0 where it is not known
+    truth: Float[Array, "C S H W"]  # depth; at most 0 where it is unknown
     view: View | None = None  # [C, S, ...], for objectives that compare frames
 
     @property
     def clips(self) -> int:
-        """Their number, C."""
+        """Number of clips, C."""
         return self.truth.shape[0]
 
     def taken(self, index: Int[Array, " n"] | Int[np.ndarray, " n"]) -> FitClips:
-        """Return some of the clips."""
+        """Return the clips of these indices."""
         return jax.tree.map(lambda x: x[index], self)
 
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How a fit goes on."""
+    """Settings of a fit."""
 
     family: tuple[str, ...] = ("scale", "power", "floor")
     objective: Objective = "gaussian"
-    steps: int = 300
-    learning_rate: float = 0.05
-    clips_at_once: int = 8
-    patience: int = 10  # looks at the held-out clips without gain after which a fit ends
-    decay: float = 1e-4  # of the gate's weights
+    steps: Count = 300
+    learning_rate: Annotated[float, Meta(gt=0, le=10)] = 0.05
+    clips_at_once: Count = 8
+    patience: Count = 10  # evaluations of the held-out clips without gain after which a fit ends
+    decay: Annotated[float, Meta(ge=0, lt=1)] = 1e-4  # of the gate's weights
     seed: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "family", tuple(self.family))
+        check_fields(self)
         if unknown := [name for name in self.family if name not in (*PARTS, "gate")]:
             raise InputError(
                 f"family has {unknown[0]!r}; expected parts such as parse_family returns: {', '.join(PARTS)}"
             )
         if self.objective in HARD_ONLY and {"offset", "temperature"} & set(self.family):
             raise InputError(f"objective {self.objective!r} does not see soft masks; leave offset and temperature out")
-        if self.objective not in OBJECTIVES:
-            raise InputError(f"objective is {self.objective!r}; expected one of {OBJECTIVES}")
-        for name in ("steps", "clips_at_once", "patience"):
-            if type(getattr(self, name)) is not int or getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)!r}; expected a whole number of at least 1")
-        if not 0 < self.learning_rate <= 10:
-            raise InputError(f"learning_rate is {self.learning_rate}; expected above 0, and 10 at most")
-        if not 0 <= self.decay < 1:
-            raise InputError(f"decay is {self.decay}; expected a number in [0, 1)")
 
 
 class FitState(NamedTuple):
-    """All that a fit needs to go on exactly as if it had never stopped."""
+    """The state from which an interrupted fit resumes exactly."""
 
     params: FusionParams
     optimiser: Any
-    key: Array  # raw, as arrays are kept
+    key: Array  # raw data, which can be stored
     step: Int[Array, ""]
     best: FusionParams
     best_loss: Float[Array, ""]  # on the held-out clips
-    waited: Int[Array, ""]  # looks since
-    losses: Float[Array, "L 2"]  # of the fitted and of the held-out clips at each look; NaN for those to come
+    waited: Int[Array, ""]  # evaluations since the best one
+    losses: Float[Array, "L 2"]  # of the fitted and the held-out clips at each evaluation; NaN for later ones
 
 
-class Fit(NamedTuple):
-    """A fitted tree: the one that was best on the held-out clips."""
+class FitOutcome(NamedTuple):
+    """The fitted tree of lowest loss on the held-out clips."""
 
     params: FusionParams
     held_out_loss: float
-    losses: Float[np.ndarray, "L 3"]  # step, loss of the clips that it is fitted to, of those held out
+    losses: Float[np.ndarray, "L 3"]  # step, loss on the fitted clips, loss on the held-out clips
     stopped_early: bool
 
 
@@ -132,30 +123,29 @@ def fit_fusion(
     *,
     checkpoint: Path | None = None,
     progress: Progress | None = None,
-) -> Fit:
-    """Fit the free parts of a family to clips; the rest stays the paper's.
+) -> FitOutcome:
+    """Fit the free parts of a family to clips; the other parts stay those of the paper's rule.
 
-    Adam with a cosine schedule over `steps`; every 10 steps the held-out clips are looked at, and what was best there
-    is returned. The paper's rule is looked at first, so it is returned where nothing is better.
+    Adam with a cosine schedule over `steps`. The held-out clips are evaluated every 10 steps, and the tree of lowest
+    loss there is returned. The paper's rule is evaluated first, and returned unless a later tree is better.
 
     Args:
-        fitted, held_out: clips; both need one at least.
-        config: see there.
-        checkpoint: file that the state is kept in after every look; if it is there, and of the same settings and clips,
-            that goes on.
+        fitted, held_out: at least one clip each.
+        config: settings of the fit.
+        checkpoint: file for the state of every evaluation; a fit of the same settings and clips resumes from the file.
         progress: called with the steps done and their number.
 
     Raises:
         InputError: no clips, nothing to fit, or a loss that is not finite.
     """
     if not fitted.clips or not held_out.clips:
-        raise InputError(f"{fitted.clips} clips to fit to, {held_out.clips} held out; expected one of each at least")
+        raise InputError(f"{fitted.clips} clips to fit to, {held_out.clips} held out; expected at least one of each")
     if not config.family:
         raise InputError("the family has no free part; there is nothing to fit")
     state = _initial(config)
     free = jax.tree.map(jnp.asarray, is_free(state.params, config.family))
     paper = identity() | ({"gate": state.params["gate"]} if "gate" in state.params else {})
-    state = _look(state._replace(params=paper), fitted, held_out, config.objective)._replace(params=state.params)
+    state = _evaluated(state._replace(params=paper), fitted, held_out, config.objective)._replace(params=state.params)
     _check_finite(state, 0)
     digest = "" if checkpoint is None else _digest(config, fitted, held_out)
     if checkpoint is not None:
@@ -163,26 +153,26 @@ def fit_fusion(
     while int(state.step) < config.steps and int(state.waited) < config.patience:
         at_once = min(config.clips_at_once, fitted.clips)
         state = _advanced(state, free, fitted, config.objective, at_once, _plan(config))
-        state = _look(state, fitted, held_out, config.objective)
+        state = _evaluated(state, fitted, held_out, config.objective)
         _check_finite(state, int(state.step) // _CHUNK)
         if checkpoint is not None:
             _keep(checkpoint, state, digest)
         if progress is not None:
             progress(min(int(state.step), config.steps), config.steps)
-    looks = int(state.step) // _CHUNK + 1
-    losses = np.column_stack([np.arange(looks) * _CHUNK, np.asarray(state.losses)[:looks]])
+    count = int(state.step) // _CHUNK + 1
+    losses = np.column_stack([np.arange(count) * _CHUNK, np.asarray(state.losses)[:count]])
     best = jax.tree.map(np.asarray, state.best)
-    return Fit(best, float(state.best_loss), losses, int(state.step) < config.steps)
+    return FitOutcome(best, float(state.best_loss), losses, int(state.step) < config.steps)
 
 
-def _check_finite(state: FitState, look: int) -> None:
-    losses = np.asarray(state.losses[look])
+def _check_finite(state: FitState, evaluation: int) -> None:
+    losses = np.asarray(state.losses[evaluation])
     if not np.isfinite(losses).all():
-        raise InputError(f"the loss is {losses.tolist()} after {look * _CHUNK} steps; expected finite numbers")
+        raise InputError(f"the loss is {losses.tolist()} after {evaluation * _CHUNK} steps; expected finite numbers")
 
 
 class _Plan(NamedTuple):
-    """What the optimiser depends on; arrays, so that fits of all plans share a compilation."""
+    """Settings of the optimiser; arrays, so that fits of all plans share a compilation."""
 
     steps: Array
     learning_rate: Array
@@ -194,7 +184,7 @@ def _plan(config: FitConfig) -> _Plan:
 
 
 def _optimiser(plan: _Plan) -> optax.GradientTransformation:
-    """Adam with a short warm-up and half a cosine; every part at a rate of its own, and the gate's weights decay."""
+    """Return Adam with a short warm-up and half a cosine; each part has its own rate, and the gate's weights decay."""
 
     def rate(step: Array) -> Array:
         warm = jnp.minimum(1.0, (step + 1) * 20 / plan.steps)
@@ -222,7 +212,7 @@ def _optimiser(plan: _Plan) -> optax.GradientTransformation:
 
 def _initial(config: FitConfig) -> FitState:
     params = start(config.family, config.seed)
-    nothing = jnp.full((-(-config.steps // _CHUNK) + 1, 2), jnp.nan)
+    losses = jnp.full((-(-config.steps // _CHUNK) + 1, 2), jnp.nan)
     return FitState(
         params,
         _optimiser(_plan(config)).init(params),
@@ -231,7 +221,7 @@ def _initial(config: FitConfig) -> FitState:
         params,
         jnp.asarray(jnp.inf),
         jnp.zeros((), jnp.int32),
-        nothing,
+        losses,
     )
 
 
@@ -265,23 +255,23 @@ def _advanced(
 
 
 @partial(jax.jit, static_argnames=("objective",))
-def _look(state: FitState, fitted: FitClips, held_out: FitClips, objective: Objective) -> FitState:
-    """Write down how the clips are doing, and keep what was best on those held out."""
-    both = [
+def _evaluated(state: FitState, fitted: FitClips, held_out: FitClips, objective: Objective) -> FitState:
+    """Return the state with the losses of both sets of clips, and the best tree on the held-out clips."""
+    losses = [
         jax.lax.map(lambda clip: clip_loss(state.params, clip, objective), clips).mean() for clips in (fitted, held_out)
     ]
-    better: Bool[Array, ""] = both[1] < state.best_loss
+    better: Bool[Array, ""] = losses[1] < state.best_loss
     return state._replace(
         best=jax.tree.map(lambda new, old: jnp.where(better, new, old), state.params, state.best),
-        best_loss=jnp.where(better, both[1], state.best_loss),
+        best_loss=jnp.where(better, losses[1], state.best_loss),
         waited=jnp.where(better, 0, state.waited + 1),
-        losses=state.losses.at[state.step // _CHUNK].set(jnp.stack(both)),
+        losses=state.losses.at[state.step // _CHUNK].set(jnp.stack(losses)),
     )
 
 
 def _digest(config: FitConfig, *clips: FitClips) -> str:
-    """Return what a fit depends on."""
-    digest = hashlib.sha256(repr(config).encode())
+    """Return the digest of all that a fit depends on."""
+    digest = hashlib.sha256(f"{source_digest()} {config}".encode())
     for leaf in jax.tree.leaves(clips):
         digest.update(str(leaf.shape).encode() + np.asarray(leaf).tobytes())
     return digest.hexdigest()
@@ -290,21 +280,21 @@ def _digest(config: FitConfig, *clips: FitClips) -> str:
 def _keep(path: Path, state: FitState, digest: str) -> None:
     with writing(path) as temporary:
         leaves = {f"{i:04d}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(state))}
-        archive.write_arrays(temporary, leaves | {"digest": np.frombuffer(bytes.fromhex(digest), np.uint8)})
+        write_arrays(temporary, leaves | {"digest": np.frombuffer(bytes.fromhex(digest), np.uint8)})
 
 
 def _restored(path: Path, state: FitState, digest: str) -> FitState:
-    """Return the state of a file, or the one that is given where there is none of the same fit."""
+    """Return the state in a file; `state` itself unless the file holds a whole state of the same fit."""
     leaves, structure = jax.tree.flatten(state)
     try:
-        stored = archive.read_arrays(path)
+        stored = read_arrays(path)
     except ResultError:
         return state
     if stored.pop("digest", np.zeros(0, np.uint8)).tobytes() != bytes.fromhex(digest):
         return state
-    found = [stored.get(f"{i:04d}") for i in range(len(leaves))]
-    alike = len(stored) == len(leaves) and all(
+    read = [stored.get(f"{i:04d}") for i in range(len(leaves))]
+    whole = len(stored) == len(leaves) and all(
         new is not None and (new.shape, new.dtype) == (old.shape, old.dtype)
-        for new, old in zip(found, leaves, strict=True)
+        for new, old in zip(read, leaves, strict=True)
     )
-    return jax.tree.unflatten(structure, [jnp.asarray(leaf) for leaf in found]) if alike else state
+    return jax.tree.unflatten(structure, [jnp.asarray(leaf) for leaf in read]) if whole else state

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from vggtjax.evaluation.metrics.video_depth import depth_alignment
-from vggtjax.learning.ablation import PAPER, Outcome
+from vggtjax.learning.ablation import PAPER, RuleScore
 from vggtjax.learning.clip_passes import ClipPasses, observations
 from vggtjax.method.fusion_rule import FusionParams, log_precisions
 from vggtjax.storage.writing import writing
@@ -26,14 +26,14 @@ _claims = jax.jit(log_precisions)
 
 
 def draw_fits(
-    folder: Path, outcomes: Sequence[Outcome], clips: Sequence[ClipPasses], patch_size: int, shown: str
+    folder: Path, scores: Sequence[RuleScore], clips: Sequence[ClipPasses], patch_size: int, shown: str
 ) -> list[Path]:
-    """Draw all pictures into a folder; `shown` is the family whose precision and calibration are looked at."""
+    """Draw all pictures into a folder, precision and calibration of the family `shown`."""
     figures = {
-        "precision.png": _precision(outcomes, clips, patch_size, shown),
-        "calibration.png": _calibration(outcomes, shown),
-        "scores.png": _scores(outcomes),
-        "losses.png": _losses(outcomes),
+        "precision.png": _precision(scores, clips, patch_size, shown),
+        "calibration.png": _calibration(scores, shown),
+        "scores.png": _scores(scores),
+        "losses.png": _losses(scores),
     }
     for name, figure in figures.items():
         with writing(folder / name) as path:
@@ -44,10 +44,10 @@ def draw_fits(
 def precision_by_confidence(
     clips: Sequence[ClipPasses], which: int, patch_size: int, trees: Sequence[FusionParams]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return bins of a pass's confidence, the precision observed in each, and the ones that trees claim there.
+    """Return bins of a pass's confidence, the precision observed in each bin, and the precision that trees claim there.
 
-    Bins have as many pixels each. Observed is one over the mean squared error after one scale for each clip, in the
-    unit of the prediction; claimed is one over the mean claimed variance, [trees, bins].
+    All bins have the same number of pixels. Observed precision is one over the mean squared error after one scale for
+    each clip, in the unit of the prediction; claimed precision is one over the mean claimed variance, [trees, bins].
     """
     confidences, squares, variances = [], [], []
     for clip in clips:
@@ -72,9 +72,9 @@ def _figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _precision(outcomes: Sequence[Outcome], clips: Sequence[ClipPasses], patch_size: int, shown: str) -> Figure:
+def _precision(scores: Sequence[RuleScore], clips: Sequence[ClipPasses], patch_size: int, shown: str) -> Figure:
     figure = _figure(9, 4)
-    fits = [outcome.fit for outcome in outcomes if outcome.rule == shown and outcome.fit is not None]
+    fits = [score.fit for score in scores if score.rule == shown and score.fit is not None]
     for which in (0, 1):
         axis = figure.add_subplot(1, 2, which + 1)
         middles, observed, claimed = precision_by_confidence(clips, which, patch_size, [fit.params for fit in fits])
@@ -90,13 +90,13 @@ def _precision(outcomes: Sequence[Outcome], clips: Sequence[ClipPasses], patch_s
     return figure
 
 
-def _calibration(outcomes: Sequence[Outcome], shown: str) -> Figure:
+def _calibration(scores: Sequence[RuleScore], shown: str) -> Figure:
     figure = _figure(4.8, 4.6)
     axis = figure.add_subplot()
     axis.plot([0, 1], [0, 1], color="black", linewidth=1, label="calibrated")
     for rule, color in ((PAPER, "tab:orange"), (shown, "tab:blue")):
-        for i, outcome in enumerate(outcome for outcome in outcomes if outcome.rule == rule):
-            axis.plot(*outcome.reliability, ".-", color=color, alpha=0.6, label=None if i else rule)
+        for i, score in enumerate(score for score in scores if score.rule == rule):
+            axis.plot(*score.reliability, ".-", color=color, alpha=0.6, label=None if i else rule)
     axis.set(xlabel="claimed share of errors within the interval", ylabel="observed share", xlim=(0, 1), ylim=(0, 1))
     axis.set_aspect("equal")
     axis.grid(alpha=0.3)
@@ -104,15 +104,15 @@ def _calibration(outcomes: Sequence[Outcome], shown: str) -> Figure:
     return figure
 
 
-def _scores(outcomes: Sequence[Outcome]) -> Figure:
+def _scores(scores: Sequence[RuleScore]) -> Figure:
     names = {"abs_rel": "AbsRel", "nll": "NLL, nats", "ece": "ECE"}
-    rules = list(dict.fromkeys(outcome.rule for outcome in outcomes))
+    rules = list(dict.fromkeys(score.rule for score in scores))
     figure = _figure(11, 0.8 + 0.34 * len(rules))
     for place, (name, title) in enumerate(names.items()):
         axis = figure.add_subplot(1, len(names), place + 1)
         for row, rule in enumerate(rules):
-            values = [outcome.metrics[name] for outcome in outcomes if outcome.rule == rule]
-            color = "tab:orange" if rule == PAPER else "tab:blue" if _is_fitted(outcomes, rule) else "tab:gray"
+            values = [score.metrics[name] for score in scores if score.rule == rule]
+            color = "tab:orange" if rule == PAPER else "tab:blue" if _is_fitted(scores, rule) else "tab:gray"
             axis.plot(values, [row] * len(values), "o", color=color, alpha=0.5, markersize=5)
             axis.plot([np.mean(values)], [row], "|", color=color, markersize=16, markeredgewidth=2)
         axis.set_yticks(range(len(rules)), rules if place == 0 else [""] * len(rules))
@@ -122,15 +122,15 @@ def _scores(outcomes: Sequence[Outcome]) -> Figure:
     return figure
 
 
-def _is_fitted(outcomes: Sequence[Outcome], rule: str) -> bool:
-    return any(outcome.fit is not None for outcome in outcomes if outcome.rule == rule)
+def _is_fitted(scores: Sequence[RuleScore], rule: str) -> bool:
+    return any(score.fit is not None for score in scores if score.rule == rule)
 
 
-def _losses(outcomes: Sequence[Outcome]) -> Figure:
+def _losses(scores: Sequence[RuleScore]) -> Figure:
     fitted: dict[str, list[Any]] = {}
-    for outcome in outcomes:
-        if outcome.fit is not None:
-            fitted.setdefault(outcome.rule, []).append(outcome.fit)
+    for score in scores:
+        if score.fit is not None:
+            fitted.setdefault(score.rule, []).append(score.fit)
     columns = min(max(len(fitted), 1), _COLUMNS)
     rows = -(-max(len(fitted), 1) // columns)
     figure = _figure(3 * columns + 1, 2.4 * rows + 0.5)
