@@ -23,8 +23,8 @@ HEAD_NAMES = ("camera", "depth", "points", "tracks")
 class Cue:
     """One row of the table of motion cues: a statistic of one Gram map (method of VGGT4D, arXiv 2511.19971).
 
-    `rows` and `columns` say which of q and k of the global blocks the Gram map compares; `layers` are 0-based pair
-    indices of a model with `MotionConfig.reference_depth` pairs; an `inverted` map enters the product as 1 - m.
+    The Gram map compares `rows` with `columns`: queries or keys of the global blocks. `layers` are 0-based pair indices
+    of a model with `MotionConfig.reference_depth` pairs. An `inverted` map enters the product as 1 - m.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Cue:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """The cues, and the frames (as offsets from the reference frame) that they are averaged over."""
+    """The cues, and the frames that each cue is averaged over, as offsets from the reference frame."""
 
     cues: Annotated[tuple[Cue, ...], Meta(min_length=1)] = (
         Cue("shallow_kk_mean", "k", "k", (0,), "mean", inverted=True),
@@ -63,9 +63,9 @@ class MotionConfig:
                 )
 
     def layers(self, cue: Cue, depth: int) -> tuple[int, ...]:
-        """Layers of `cue` in a model with `depth` pairs: l becomes round(l (depth - 1) / (reference_depth - 1)).
+        """Return the layers of `cue` in a model with `depth` pairs: round(l (depth - 1) / (reference_depth - 1)).
 
-        A shallower model can read a layer more than once, which then weighs more.
+        A shallower model can contain a layer more than once; its weight grows accordingly.
         """
         if depth == self.reference_depth:
             return cue.layers
@@ -77,13 +77,13 @@ class MotionConfig:
 class VGGTConfig:
     """Architecture of a VGGT model (arXiv 2503.11651). The defaults are VGGT-1B.
 
-    Head counts cannot be read off a checkpoint's shapes, so a model of another size names its configuration.
+    The shapes in a checkpoint do not tell the numbers of heads, so a model of another size needs its configuration.
     """
 
-    image_size: Size = 518  # pixels; the square that the positional embedding of the backbone covers
+    image_size: Size = 518  # pixels; side of the square of the backbone's positional embedding
     patch_size: Size = 14
     embed_dim: Size = 1024
-    depth: Size = 24  # alternating pairs: a frame block and a global block each
+    depth: Size = 24  # pairs of a frame block and a global block
     num_heads: Size = 16
     dino_depth: Size = 24
     dino_num_heads: Size = 16
@@ -91,13 +91,13 @@ class VGGTConfig:
     camera_num_heads: Size = 16
     dpt_features: Size = 256
     dpt_channels: tuple[Size, Size, Size, Size] = (256, 512, 1024, 1024)
-    taps: tuple[Natural, Natural, Natural, Natural] = (4, 11, 17, 23)  # pairs whose output the dense heads read
+    taps: tuple[Natural, Natural, Natural, Natural] = (4, 11, 17, 23)  # pairs whose outputs the dense heads read
     track_features: Size = 128
     track_hidden: Size = 384
     track_corr_levels: Size = 7
     track_corr_radius: Annotated[int, Meta(ge=0, le=_LARGEST)] = 4
     track_position_embedding: bool = False
-    heads: tuple[str, ...] = HEAD_NAMES  # that the model has; a conversion can leave some out
+    heads: tuple[str, ...] = HEAD_NAMES  # of the model; a conversion can omit some
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def __post_init__(self) -> None:
@@ -107,7 +107,7 @@ class VGGTConfig:
         if self.image_size % self.patch_size:
             raise InputError(f"image_size {self.image_size} is not a multiple of patch_size {self.patch_size}")
         for channels, heads, multiple in (
-            ("embed_dim", "num_heads", 4),  # a quarter of each head turns with sin/cos of y, a quarter of x
+            ("embed_dim", "num_heads", 4),  # rotary embedding: quarters for sin and cos of y and of x
             ("embed_dim", "dino_num_heads", 1),
             ("tap_dim", "camera_num_heads", 1),
         ):
@@ -125,12 +125,12 @@ class VGGTConfig:
 
     @property
     def tap_dim(self) -> int:
-        """Channels of a tap: the frame block's output next to the global block's."""
+        """Channels of a tap: outputs of the frame block and of the global block, concatenated."""
         return 2 * self.embed_dim
 
     @property
     def grid_size(self) -> int:
-        """Side of the square grid of patches that the backbone's positional embedding covers."""
+        """Side of the square grid of patches of the backbone's positional embedding."""
         return self.image_size // self.patch_size
 
     def to_json(self) -> str:
@@ -141,7 +141,7 @@ class VGGTConfig:
     def from_json(cls, text: str) -> VGGTConfig:
         """Read a configuration from JSON text, such as a checkpoint's metadata.
 
-        Raises InputError for text that is not a JSON object of known fields with valid values.
+        Raises InputError unless the text is a JSON object of known fields with valid values.
         """
         return parse_json(text, cls, "configuration")
 

@@ -3,23 +3,23 @@
 from collections.abc import Sequence
 from importlib.util import find_spec
 
-_MOST_PROBLEMS = 20  # spelt out in one message
+_MOST_PROBLEMS = 20  # in full, in one message
 
 
 class VggtjaxError(Exception):
-    """Base of everything that this library raises on purpose."""
+    """Base of all exceptions that this library raises on purpose."""
 
 
 class InputError(VggtjaxError, ValueError):
-    """An argument has a value that cannot work."""
+    """An argument with an invalid value."""
 
 
 class ClipError(InputError):
-    """Frames or video that cannot be read, or cannot be used as a clip."""
+    """Frames or video that cannot be read or used as a clip."""
 
 
 class CheckpointError(InputError):
-    """Weights that cannot be read, or are not those of the model they are said to be."""
+    """Weights that cannot be read, or do not fit the configuration of their model."""
 
 
 class ResultError(InputError):
@@ -35,7 +35,7 @@ class DeviceMemoryError(VggtjaxError, MemoryError):
 
 
 class MissingExtraError(VggtjaxError, ImportError):
-    """An optional dependency that is not installed; the message names the extra that brings it."""
+    """A missing optional dependency; the message names the extra that installs it."""
 
     def __init__(self, purpose: str, extra: str) -> None:
         super().__init__(f"{purpose} needs the extra '{extra}': pip install 'vggtjax[{extra}]'")
@@ -55,7 +55,7 @@ def one_line(text: str, most: int = 300) -> str:
 
 
 def problems_sentence(subject: str, problems: Sequence[str]) -> str:
-    """Return one sentence that says how many problems there are and spells out the first ones."""
+    """Return one sentence with the number of problems and the text of the first ones."""
     shown = "; ".join(map(one_line, problems[:_MOST_PROBLEMS]))
     more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
     return f"{subject}: {len(problems)} {'problem' if len(problems) == 1 else 'problems'}: {shown}{more}"

@@ -1,4 +1,4 @@
-"""Reading and writing .npz files of plain arrays: nothing is unpickled and sizes are checked before they are read."""
+"""Files of plain arrays (.npz, .npy): nothing is unpickled, and sizes are checked before arrays are read."""
 
 from __future__ import annotations
 
@@ -18,19 +18,18 @@ import numpy as np
 
 from vggtjax.errors import ResultError
 
-_DEFLATE_LEVEL = 1  # higher ones take several times as long for a few percent
-SIZE_LIMIT = 64 * 2**30  # bytes of all arrays of one archive
-
+_DEFLATE_LEVEL = 1  # higher levels take several times as long and save a few percent
+SIZE_LIMIT = 64 * 2**30  # bytes of all arrays of one file
 _LENGTHS = {(1, 0): 2, (2, 0): 4}  # version of the format -> bytes of the length of a header
 _MOST_HEADER_BYTES = 2**14
 _MOST_AXES = 32
 _DESCR = re.compile(r"[<>|=]?(?:[?biufcmM]|[SUV][1-9])\d{0,10}(\[\w{1,10}\])?")
-# What zipfile, numpy and Python's parser raise on files that are cut off or changed.
+# Exceptions of zipfile, numpy and Python's parser for truncated or damaged files.
 _BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, SyntaxError, RuntimeError)
 
 
 class Header(NamedTuple):
-    """What the header of a stored array says."""
+    """Type and shape of a stored array."""
 
     dtype: np.dtype
     shape: tuple[int, ...]
@@ -45,17 +44,17 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def read_headers(path: Path) -> dict[str, Header]:
-    """Return the type and shape of every array of an .npz file, without reading the arrays.
+    """Return name -> type and shape of the arrays in an .npz file, without reading the arrays.
 
-    Raises ResultError for a file that is not a whole .npz, has arrays of Python objects, or is larger than SIZE_LIMIT;
-    the message says "it" and leaves naming the file to the caller.
+    Raises ResultError for a file that is not a whole .npz, holds Python objects, or exceeds SIZE_LIMIT. The message
+    says "it"; the caller names the file.
     """
     with _opened(path) as archive:
         return {name: _read_header(file, member.filename, member.file_size) for name, member, file in _members(archive)}
 
 
 def read_array(path: Path) -> np.ndarray:
-    """Return the array of an .npy file; raises ResultError for what `read_headers` refuses in one of an .npz."""
+    """Return the array of an .npy file; raises ResultError as `read_headers` does."""
     try:
         with path.open("rb") as file:
             size = path.stat().st_size
@@ -71,9 +70,9 @@ def read_array(path: Path) -> np.ndarray:
 
 
 def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """Return the arrays of an .npz file, or those of these names; raises what `read_headers` raises.
+    """Return all arrays of an .npz file, or those with these names; raises ResultError as `read_headers` does.
 
-    For a file of a stranger look at the headers first: a small file can hold arrays of any size.
+    Check the headers of a stranger's file first: compressed, a small file can hold large arrays.
     """
     arrays = {}
     with _opened(path) as archive:
@@ -112,15 +111,15 @@ def _members(archive: zipfile.ZipFile) -> Iterator[tuple[str, zipfile.ZipInfo, I
     for member in members:
         name, dot, suffix = member.filename.rpartition(".")
         if not dot or suffix != "npy":
-            raise ResultError(f"it holds {member.filename!r}; expected arrays only")
+            raise ResultError(f"it holds {member.filename!r}; expected arrays alone")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ResultError(f"array '{name}' is compressed in a way that numpy does not write")
+            raise ResultError(f"array '{name}' has compression type {member.compress_type}; expected numpy's: 0 or 8")
         with archive.open(member) as file:
             yield name, member, file
 
 
 def _read_header(file: IO[bytes], name: str, length: int) -> Header:
-    """Return the header at the start of `length` bytes; the array behind it must take the rest of them exactly."""
+    """Return the header at the start of `length` bytes; the array must fill the remaining bytes."""
     version = np.lib.format.read_magic(file)
     if version not in _LENGTHS:
         raise ResultError(f"{name} has version {version} of the array format; expected (1, 0) or (2, 0)")
@@ -130,28 +129,22 @@ def _read_header(file: IO[bytes], name: str, length: int) -> Header:
     try:
         header = ast.literal_eval(file.read(header_length).decode("latin1"))
         descr, by_columns, shape = (header.pop(key) for key in ("descr", "fortran_order", "shape"))
-        sides = {type(side) is int and 0 <= side <= SIZE_LIMIT for side in shape}
-        if (
-            header
-            or type(by_columns) is not bool
-            or type(shape) is not tuple
-            or len(shape) > _MOST_AXES
-            or False in sides
-        ):
+        is_valid = not header and type(by_columns) is bool and type(shape) is tuple and len(shape) <= _MOST_AXES
+        if not (is_valid and all(type(side) is int and 0 <= side <= SIZE_LIMIT for side in shape)):
             raise ValueError
     except (*_BROKEN, MemoryError, TypeError, LookupError, AttributeError):
         raise ResultError(f"{name} has an invalid header; expected one as numpy writes it") from None
     if type(descr) is not str or "O" in descr:
-        raise ResultError(f"{name} holds Python objects, which are never loaded, or structures; expected plain values")
+        raise ResultError(f"{name} holds Python objects or structures, which are never loaded; expected plain values")
     try:
         dtype = np.dtype(descr if _DESCR.fullmatch(descr) else "")
     except (TypeError, ValueError):
         raise ResultError(f"{name} has the type {descr[:50]!r}; expected numbers, booleans or text") from None
     if not dtype.isnative:
-        raise ResultError(f"{name} has type {dtype}, in the byte order of another machine")
+        raise ResultError(f"{name} has the type {dtype} in foreign byte order; save the array with native byte order")
     if by_columns and len(shape) > 1:
-        raise ResultError(f"{name} is stored by columns; expected rows")
+        raise ResultError(f"{name} is stored in column order; expected row order")
     size = prod(shape) * dtype.itemsize
     if size != length - file.tell():
-        raise ResultError(f"{name} is {length - file.tell()} bytes long; its header says {size}")
+        raise ResultError(f"{name} has {length - file.tell()} bytes of values; its header says {size}")
     return Header(dtype, shape)

@@ -1,4 +1,4 @@
-"""The user's cache folder: converted weights, what jax traces and compiles, passes for fits. Does not import jax."""
+"""The user's cache folder: converted weights, traced and compiled programs, passes for fits. Does not import jax."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-COMPILED_BYTES = 2 * 2**30  # of compiled programs that are kept; the ones that were not used for longest go first
+COMPILED_BYTES = 2 * 2**30  # of kept compiled programs; the least recently used go first
 _DAMAGED = re.compile(r"Error (?:reading|writing) persistent compilation cache entry for '([^']+)'")
-_SHORTEST = 0.05  # seconds of compilation from which a program is kept
+_SHORTEST = 0.05  # seconds; programs that compile faster are not kept
 
 
 def cache_folder() -> Path:
-    """Return the folder that VGGTJAX_CACHE names, or else the user's cache of this library; it need not be there."""
+    """Return the folder that VGGTJAX_CACHE names, else the user's cache of this library; the folder may be missing."""
     if folder := os.environ.get("VGGTJAX_CACHE"):
         return Path(folder).expanduser()
     import platformdirs
@@ -26,21 +26,20 @@ def cache_folder() -> Path:
 
 
 def compiled_folder() -> Path:
-    """Return the folder of what jax compiles."""
+    """Return the folder of compiled programs."""
     return cache_folder() / "compiled"
 
 
 def lowered_folder() -> Path:
-    """Return the folder of programs before they are compiled."""
+    """Return the folder of traced programs, not yet compiled."""
     return cache_folder() / "lowered"
 
 
 def keep_compilations() -> bool:
-    """Tell jax to keep what it compiles in the user's cache, so that the next process need not compile it again.
+    """Tell jax to keep compiled programs in the user's cache, so that the next process need not compile them again.
 
-    A setting of the whole process, by jax's own environment variables, which win where they are set already: commands
-    make it before they import jax, the library never does. Returns False where jax was imported before, and nothing
-    is changed.
+    This sets jax's environment variables, unless the user set them, for the whole process: commands call it before they
+    import jax; the library never does. Returns False, and changes nothing, if jax is already imported.
     """
     if "jax" in sys.modules:
         return False

@@ -1,7 +1,7 @@
-"""Jitted functions that need not be traced again by the next process.
+"""Jitted functions that the next process need not trace again.
 
-Tracing and lowering the network take as long as loading what XLA has compiled of it. Where compilations are kept in the
-user's cache (`cache.keep_compilations`), so are the lowered programs (jax.export): by the sources of this package, the
+Tracing and lowering the network take as long as loading its compiled form. If compiled programs are kept in the user's
+cache (`cache.keep_compilations`), so are lowered programs (jax.export). Their key is the sources of this package, the
 versions of jax, the platform, the static options, and the shapes of the arguments.
 """
 
@@ -24,13 +24,13 @@ from vggtjax.errors import OutputError
 from vggtjax.storage.cache import compiled_folder, lowered_folder
 from vggtjax.storage.writing import writing
 
-KEPT_BYTES = 2**28  # of lowered programs; the oldest go first
-_DIGEST = 32  # bytes of the sha256 that a kept file begins with
+KEPT_BYTES = 2**28  # of lowered programs; the oldest are removed first
+_DIGEST = 32  # bytes of the sha256 at the start of a kept file
 _PACKAGE = Path(__file__).parents[1]
 
 
 class Program:
-    """A function under `jax.jit`, whose lowered form is kept on disk where compilations are."""
+    """A function under `jax.jit` whose lowered form is kept on disk if compiled programs are."""
 
     def __init__(self, function: Callable[..., Any], static: Sequence[str] = ()) -> None:
         self.__name__ = function.__name__
@@ -40,17 +40,17 @@ class Program:
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """Run the function."""
-        ready, options = self._found(arguments, options)
+        ready, options = self._find(arguments, options)
         return ready(*arguments, **options)
 
     def compile(self, *arguments: Any, **options: Any) -> tuple[Any, Any]:
-        """Compile for arguments, or shapes of such, which calls with the like of them find; return it and its output.
+        """Compile for arguments, or for their shapes and types; later calls with such arguments use the program.
 
-        Of the output, shapes and types.
+        Returns the compiled program, and the shapes and types of its output.
         """
         key, _ = self._key(arguments, options)
         self._ready.pop(key, None)
-        ready, options = self._found(arguments, options)
+        ready, options = self._find(arguments, options)
         lowered = ready.lower(*arguments, **options)
         compiled = lowered.compile()
         if key is not None and ready is not self._jitted:
@@ -58,7 +58,7 @@ class Program:
         return compiled, lowered.out_info
 
     def _key(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return what a program on disk depends on, or None where none is kept; and the options that are traced."""
+        """Return the key of a program on disk, None if it cannot be kept; and the traced options."""
         traced = {name: value for name, value in options.items() if name not in self._static}
         if not _keeping():
             return None, traced
@@ -68,19 +68,21 @@ class Program:
         static = tuple(sorted((name, repr(value)) for name, value in options.items() if name in self._static))
         return (static, structure, tuple((jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)), traced
 
-    def _found(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return what to call, and the options that it takes: the traced ones, or all."""
+    def _find(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
+        """Return the function to call, and its options: the traced options, or all."""
         key, traced = self._key(arguments, options)
         if key is None:
             return self._jitted, options
         if key not in self._ready:
             fixed = {name: value for name, value in options.items() if name in self._static}
-            self._ready[key] = self._kept(key, fixed, arguments, traced)
+            self._ready[key] = self._load_or_trace(key, fixed, arguments, traced)
         ready = self._ready[key]
         return ready, options if ready is self._jitted else traced
 
-    def _kept(self, key: tuple, fixed: dict[str, Any], arguments: tuple, traced: dict[str, Any]) -> Callable[..., Any]:
-        """Return the program of a file, or trace it and write the file; the jitted function if it cannot be written."""
+    def _load_or_trace(
+        self, key: tuple, fixed: dict[str, Any], arguments: tuple, traced: dict[str, Any]
+    ) -> Callable[..., Any]:
+        """Return the program of a file, or trace the function and write the file; on failure, the jitted function."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
         text = "\n".join(
             (source_digest(), name, *map(str, key), str(jax.config.values["jax_default_matmul_precision"]))
@@ -99,19 +101,19 @@ class Program:
         try:
             _keep(path, content)
             _prune(path.parent)
-        except OutputError:  # a cache that cannot be written is none
+        except OutputError:  # the cache cannot be written
             return self._jitted
         return jax.jit(exported.call)
 
 
 def keep_type(kind: type) -> type:
-    """Decorate a NamedTuple that programs take or return, so that it can be part of one on disk."""
+    """Decorate a NamedTuple that kept programs take or return: register how it is stored."""
     export.register_namedtuple_serialization(kind, serialized_name=f"{kind.__module__}.{kind.__qualname__}")
     return kind
 
 
 def kept_text(name: str, make: Callable[[], str]) -> str:
-    """Return text that follows from the sources of this package: what was made of them before, where it is kept."""
+    """Return text that depends on `name` and the sources of this package alone, made once where programs are kept."""
     if not _keeping():
         return make()
     path = lowered_folder() / f"{hashlib.sha256(f'{source_digest()} {name}'.encode()).hexdigest()[:32]}.txt"
@@ -124,7 +126,7 @@ def kept_text(name: str, make: Callable[[], str]) -> str:
 
 
 def _read_kept(path: Path) -> bytes | None:
-    """Return what `_keep` wrote; None where there is no file, or a damaged one, which is removed."""
+    """Return the content that `_keep` wrote; None for a missing file, and for a damaged file, which is removed."""
     try:
         content = path.read_bytes()
         if content[:_DIGEST] == hashlib.sha256(content[_DIGEST:]).digest():
@@ -147,7 +149,7 @@ def _keeping() -> bool:
 
 @cache
 def source_digest() -> str:
-    """Return what the results of this package depend on beside arguments: its sources, versions, and the platform."""
+    """Return versions, platform, and a digest of all sources: what results depend on besides arguments."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())

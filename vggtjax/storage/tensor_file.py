@@ -12,11 +12,11 @@ import ml_dtypes
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from vggtjax.errors import CheckpointError
+from vggtjax.errors import CheckpointError, one_line
 from vggtjax.storage.writing import writing
 
-ALIGNMENT = 64  # of tensors that XLA takes from a memory map without a copy
-MAX_HEADER_BYTES = 2**24  # a model of this kind needs a quarter of a megabyte
+ALIGNMENT = 64  # bytes; XLA uses aligned tensors of a memory map without a copy
+MAX_HEADER_BYTES = 2**24  # VGGT-1B needs 2**18
 
 _DTYPES: dict[str, np.dtype] = {
     code: np.dtype(kind)
@@ -43,7 +43,7 @@ _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 
 
 class StoredTensor(NamedTuple):
-    """A tensor in a file: `numpy.asarray` maps it into memory, read-only, until the array is dropped."""
+    """A tensor in a file: `numpy.asarray` maps the tensor into memory, read-only."""
 
     path: Path
     offset: int
@@ -52,7 +52,7 @@ class StoredTensor(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it takes."""
+        """Bytes of the tensor."""
         return prod(self.shape) * self.dtype.itemsize
 
     def within(self, content: np.ndarray) -> np.ndarray:
@@ -67,21 +67,21 @@ class StoredTensor(NamedTuple):
 
 
 class TensorFile(NamedTuple):
-    """What the header of a safetensors file says."""
+    """Header of a safetensors file."""
 
     tensors: dict[str, StoredTensor]
     metadata: dict[str, str]
 
 
 class Spec(NamedTuple):
-    """Shape and type of a tensor to be written."""
+    """Shape and type of a tensor to write."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
 
 
 def is_tensor_file(path: str | Path) -> bool:
-    """Return whether a file begins like a safetensors file: eight bytes of length, then JSON."""
+    """Return whether a file starts as a safetensors file does: eight bytes of length, then JSON."""
     try:
         with Path(path).open("rb") as file:
             start = file.read(9)
@@ -94,7 +94,7 @@ def read_tensors(path: str | Path) -> TensorFile:
     """Read the header of a safetensors file, and check that the file is whole.
 
     Raises:
-        CheckpointError: the file cannot be read, is no whole safetensors file, or has a type that is not supported.
+        CheckpointError: the file cannot be read, is not a whole safetensors file, or holds an unsupported type.
     """
     path = Path(path)
     try:
@@ -112,14 +112,14 @@ def read_tensors(path: str | Path) -> TensorFile:
             unsupported = sorted({code for _, code in layout.values()} - set(_DTYPES))
             if unsupported:
                 raise CheckpointError(f"{path} has tensors of type {', '.join(unsupported)}; expected floating point")
-            # The library has checked that the tensors fill the file without gaps, so their sizes give their places.
+            # safe_open has checked that the tensors fill the file without gaps, so their sizes give their offsets.
             offset = 8 + length
             tensors = {}
             for name, (shape, code) in layout.items():
                 tensors[name] = StoredTensor(path, offset, shape, _DTYPES[code])
                 offset += tensors[name].nbytes
     except SafetensorError as error:
-        reason = str(error)[:200]
+        reason = one_line(str(error))
         raise CheckpointError(f"{path} is not a whole safetensors file ({reason}); copy or download it again") from None
     except OSError as error:
         raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
@@ -135,26 +135,23 @@ def write_tensors(
     """Write a safetensors file with one piece in memory at a time; an interrupted run leaves no file.
 
     Args:
-        path: the file; one that is there is replaced.
-        specs: names -> shape and type.
-        pieces: the parts of a tensor by its name, consecutive on axis 0, of any type: they are cast.
+        path: the file; an existing file is replaced.
+        specs: name -> shape and type.
+        pieces: returns the parts of the tensor of a name, consecutive on axis 0, of any type: they are cast.
         metadata: texts for the header.
 
     Raises:
         OutputError: the folder cannot be written or the disk is full.
     """
     sizes = {name: prod(spec.shape) * spec.dtype.itemsize for name, spec in specs.items()}
-    names = sorted(specs, key=lambda name: (sizes[name] % ALIGNMENT != 0, name))  # so that the first ones are aligned
+    names = sorted(specs, key=lambda name: (sizes[name] % ALIGNMENT != 0, name))  # keeps all but the last ones aligned
     header: dict[str, object] = {"__metadata__": dict(metadata)} if metadata else {}
     total = 0
     for name in names:
         shape, dtype = specs[name]
-        header[name] = {
-            "dtype": _CODES[dtype],
-            "shape": list(shape),
-            "data_offsets": [total, total + sizes[name]],
-        }
-        total += sizes[name]
+        end = total + sizes[name]
+        header[name] = {"dtype": _CODES[dtype], "shape": list(shape), "data_offsets": [total, end]}
+        total = end
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-(8 + len(text)) % ALIGNMENT)
 
@@ -165,4 +162,4 @@ def write_tensors(
                 for piece in pieces(name):
                     piece = np.ascontiguousarray(piece, dtype=specs[name].dtype)
                     file.write(piece.reshape(-1).view(np.uint8).data)
-        read_tensors(temporary)  # the library's own check that the file is whole
+        read_tensors(temporary)  # checks that the file is whole

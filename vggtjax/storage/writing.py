@@ -1,8 +1,7 @@
-"""Writing files so that an interrupted run never leaves one that looks whole."""
+"""Writing files and folders so that an interrupted run never leaves a partial one under the final name."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -11,12 +10,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from secrets import token_hex
+from typing import Any
 
 from filelock import FileLock, Timeout
 
-from vggtjax.errors import OutputError
+from vggtjax.errors import InputError, OutputError
+from vggtjax.storage.json_values import read_json
 
-_MOST_JSON_BYTES = 2**24
 _LEFTOVER = re.compile(r"\.partial-\w+(\.lock)?|\..+\.partial(\.\w+)?")  # temporary names, of earlier versions too
 _OLD = 24 * 3600  # seconds; no writer takes this long
 _TRIES = 8
@@ -26,7 +26,7 @@ _TRIES = 8
 def writing(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path for a file or folder; on success it is synced and renamed to `path`, else removed.
 
-    Raises OutputError where the folder cannot be written or the disk is full.
+    Raises OutputError if the folder cannot be written or the disk is full.
     """
     path = Path(path)
     with _explaining(path), _staged(path.parent) as staged:
@@ -40,10 +40,10 @@ def writing(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def staging(folder: str | Path) -> Iterator[Path]:
-    """Yield a new temporary folder inside `folder` (made if missing), removed at the end whatever happens.
+    """Yield a new temporary folder inside `folder` (made if missing), and remove it at the end in every case.
 
-    Write everything there, then rename into place: a rename within one folder cannot run out of space.
-    Raises OutputError where the folder cannot be written or the disk is full.
+    Write all files there, then rename them into place: a rename within one folder needs no space.
+    Raises OutputError if the folder cannot be written or the disk is full.
     """
     with _explaining(Path(folder)), _staged(Path(folder)) as staged:
         yield staged
@@ -69,15 +69,15 @@ def locked_folder(folder: str | Path, what: str) -> Iterator[None]:
 
 
 def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str) -> None:
-    """Make sure that files of these names can be written in `folder`, before hours are spent on them.
+    """Check that files of these names can be written in `folder`, before hours of computation.
 
     Args:
-        folder: need not be there; it is not made.
+        folder: may be missing; it is not made.
         names: of the files.
-        replaced: whether what is there is an earlier one of the same kind, and may go.
-        what: that kind, for the message.
+        replaced: whether existing files belong to an earlier output of the same kind, and may be replaced.
+        what: kind of the output, for the message.
 
-    Raises OutputError where the folder cannot be made or written, or holds such files that may not go.
+    Raises OutputError if the folder cannot be made or written, or holds files that may not be replaced.
     """
     taken = [name for name in names if os.path.lexists(folder / name)]
     if taken and not replaced:
@@ -93,14 +93,11 @@ def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str)
 
 
 def says_format(path: Path, name: str) -> bool:
-    """Return whether a file is small JSON that says to be of this format."""
+    """Return whether a file is JSON whose "format" is `name`."""
     try:
-        if path.stat().st_size > _MOST_JSON_BYTES:
-            return False
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return read_json(path, dict[str, Any], "file").get("format") == name
+    except InputError:
         return False
-    return isinstance(values, dict) and values.get("format") == name
 
 
 @contextmanager
