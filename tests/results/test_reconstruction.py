@@ -64,6 +64,19 @@ def test_cameras():
     np.testing.assert_allclose(product, np.tile(np.eye(4), (3, 1, 1)), atol=1e-6)
 
 
+def test_nothing_moves_in_padding():
+    room = make_room(dynamic_mask=np.ones((3, 28, 42), bool), valid_box=np.tile([0, 7, 42, 21], (3, 1)))
+    np.testing.assert_array_equal(room.dynamic_mask, room.inside_pictures)
+    np.testing.assert_array_equal(room.instances > 0, room.inside_pictures)
+    assert room.dynamic_share == 1
+
+
+def test_the_text_of_a_result_is_one_line():
+    text = repr(make_room())
+    assert text == "Reconstruction(3 frames of 42 x 28 pixels, method '4dvggt-d', model 'tiny', 10.2% dynamic)"
+    assert dataclasses.replace(make_room(), method="vggt").method == "vggt"
+
+
 def test_pixel_offset_moves_points_by_half_a_pixel():
     room = make_room(1, camera_from_world=np.eye(4)[None, :3])
     moved = room.world_points() - room.world_points(pixel_offset=0.0)
@@ -123,6 +136,11 @@ def nan_at(name, index):
         (nan_at("intrinsics", (1, 0, 2)), "intrinsics holds nan"),
         (nan_at("timestamps", 0), "timestamps holds nan"),
         (nan_at("source_scale", (0, 0)), "source_scale holds nan"),
+        (
+            {"depth": np.where(np.arange(3)[:, None, None] == 1, np.nan, make_room().depth)},
+            r"depth of frame 1 has no finite value, and 1176 of 3528 values .* are not finite; check the weights",
+        ),
+        ({"depth_confidence": np.full((3, 28, 42), np.inf)}, "depth_confidence of frame 0 has no finite value"),
         ({"settings": {"a": object()}}, "settings cannot be written as JSON"),
         ({"settings": {"a": float("nan")}}, "settings cannot be written as JSON"),
         ({"settings": [1]}, "settings is a list"),
@@ -148,6 +166,9 @@ def test_fields_that_do_not_fit(changes, message):
         ({"frame_names": np.array(["a"])}, "frame_names has shape"),
         ({"settings": np.array("{")}, "Expecting property name"),
         ({"settings": np.array("[" * 100_000)}, "recursion"),
+        ({"settings": np.array('{"a": ' + "7" * 5000 + "}")}, "settings are not JSON"),
+        ({"settings": np.array('{"a": NaN}')}, "settings cannot be written as JSON"),
+        ({"settings": np.array('{"a": 1e999}')}, "settings cannot be written as JSON"),
         ({"settings": np.array("[1]")}, "settings is a list"),
         ({"method": np.frombuffer(b"\xff" * 4, "<U1").reshape(())}, "text that is not Unicode"),
         ({"valid_box": np.zeros((2, 4), np.int64)}, "valid_box of frame 0"),

@@ -41,6 +41,16 @@ def test_poses_come_back(tmp_path, turn, centre):
     np.testing.assert_allclose(read_trajectory(tmp_path / "t")[1], room.world_from_camera, rtol=1e-6, atol=1e-5)
 
 
+def test_the_order_of_a_file_is_kept_and_checked(tmp_path):
+    room = make_room()
+    for order in ("xyzw", "wxyz"):
+        write_trajectory(tmp_path / order, room.world_from_camera, np.arange(3.0), quaternion=order)
+        np.testing.assert_allclose(read_trajectory(tmp_path / order, order)[1], room.world_from_camera, atol=1e-6)
+    assert "#" not in (tmp_path / "wxyz").read_text()
+    with pytest.raises(ResultError, match="names its columns qx qy qz qw; read it with quaternion='xyzw'"):
+        read_trajectory(tmp_path / "xyzw", "wxyz")
+
+
 def test_one_pose_is_a_table_too(tmp_path):
     (tmp_path / "t").write_text("0 0 0 0 0 0 0 1")
     assert read_trajectory(tmp_path / "t")[1].shape == (1, 4, 4)
