@@ -27,7 +27,7 @@ def test_the_wheel_works_outside_the_repository(tmp_path):
     assert tops == {"vggtjax", "converters"}
     assert {"vggtjax/__init__.pyi", "vggtjax/py.typed"} <= set(names)
     (entry_points,) = (tmp_path / "installed").glob("*.dist-info/entry_points.txt")
-    assert "vggtjax = vggtjax.commands.main:main" in entry_points.read_text()
+    assert "vggtjax = vggtjax.__main__:run" in entry_points.read_text()
     code = "import vggtjax, converters; print(vggtjax.__file__); vggtjax.forward; converters.convert; vggtjax.METHODS"
     made = subprocess.run(
         [sys.executable, "-P", "-c", code],

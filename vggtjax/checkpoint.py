@@ -60,6 +60,7 @@ class Model:
     path: Path | None = None  # the file that the parameters are in
     trained: bool = True  # False: random parameters, whose results mean nothing
     origin: Mapping[str, str] = field(default_factory=dict)  # files that it was converted from -> their sha256
+    note: str = ""  # what users of the model must know; part of every result's settings
     _file: _FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets it
 
     @cached_property
@@ -115,13 +116,14 @@ def is_checkpoint(path: str | Path) -> bool:
     return is_tensor_file(path) and read_tensors(path).metadata.get("format") == FORMAT
 
 
-def read_model(path: str | Path, *, dtype: DType | None = None, name: str | None = None) -> Model:
+def read_model(path: str | Path, *, dtype: DType | None = None, name: str | None = None, note: str = "") -> Model:
     """Read a file of this library.
 
     Args:
         path: the file.
         dtype: of the parameters; None keeps the types of the file.
         name: of the model; None keeps the name in the file.
+        note: what users of the model must know; see `Model`.
 
     Raises:
         CheckpointError: the file is no whole checkpoint of this library, or does not fit the configuration in it; all
@@ -142,7 +144,8 @@ def read_model(path: str | Path, *, dtype: DType | None = None, name: str | None
     stored_name = metadata.get("name", "")
     is_valid = stored_name.isprintable() and 0 < len(stored_name) <= _MOST_NAME_LETTERS
     name = name or (stored_name if is_valid else path.stem)
-    model = Model(config, unflatten_dict(flat, sep="."), name, path, origin=_origin(path, metadata))
+    origin = _origin(path, metadata)
+    model = Model(config, unflatten_dict(flat, sep="."), name, path, origin=origin, note=note)
     if all(flat[key].dtype == stored.dtype for key, stored in tensors.items()):
         object.__setattr__(model, "_file", facts)
     return model

@@ -1,24 +1,28 @@
-"""The methods, as a table: how motion is mined, which pass gives what (4DVGGT-D, table 2). Does not import jax."""
+"""The methods as a table, and the options of a reconstruction. Does not import jax."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Any, Literal, TypedDict, get_args
+
+import tyro
 
 from vggtjax.config import Gram, Suppress
 from vggtjax.errors import InputError
 
 Pass = Literal["first", "second"]
 Threshold = Literal["otsu", "multi-otsu"]
+ComputeDType = Literal["float32", "bfloat16"]
 MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d"]
 
 
 @dataclass(frozen=True)
 class Method:
-    """Where a method takes its depth (and confidence) and its cameras from, and how it masks the second pass.
+    """One row of the table of methods: where depth and cameras come from, and how the dynamic mask is mined.
 
-    `clusters` is the number of groups of patch features within which the saliency is averaged before it is cut at the
-    `threshold`; 0 for none. `refine` says whether the mask is refined at the end, by the method's depth and cameras.
+    `clusters` is the number of groups of patch features; the saliency is averaged within each group before the
+    `threshold` is applied; 0 for no groups. `refine`: refine the mask at the end by the method's depth and cameras.
     """
 
     depth: Literal["first", "second", "replaced", "fused"]
@@ -35,10 +39,11 @@ class Method:
         return {self.depth, self.extrinsics, self.intrinsics} != {"first"}
 
     def second_outputs(self, align_scale: bool = False) -> tuple[str, ...]:
-        """What is read of the second pass: scales are aligned by depth, and otherwise its cameras may be enough."""
+        """Return the outputs needed of the second pass; aligning scales needs its depth."""
         return ("camera", "depth") if self.depth != "first" or align_scale else ("camera",)
 
 
+# 4DVGGT-D, table 2, and VGGT4D
 METHODS: dict[str, Method] = {
     "vggt": Method("first", "first", "first"),
     "vggt4d": Method("first", "second", "first", "dot", "drop", clusters=64, threshold="multi-otsu", refine=True),
@@ -47,23 +52,115 @@ METHODS: dict[str, Method] = {
     "4dvggt-d": Method("fused", "second", "second"),
 }
 
-LADDER = ("vggt", "pose-decoupling", "hard-replacement", "4dvggt-d")  # what one run of both passes gives
+LADDER = ("vggt", "pose-decoupling", "hard-replacement", "4dvggt-d")  # one run of both passes serves all four
 
 
-def check_smooth_frames(frames: int) -> None:
-    """Raise InputError for a number of frames to average over that has no middle."""
+def find_method(name: str) -> Method:
+    """Return the method of that name. Raises InputError for an unknown name."""
+    if name not in METHODS:
+        raise InputError(f"unknown method {name!r}; expected one of {', '.join(METHODS)}")
+    return METHODS[name]
+
+
+def check_smooth_frames(frames: object) -> None:
+    """Raise InputError for an invalid number of frames to average over."""
     if type(frames) is not int or frames < 1 or frames % 2 == 0:
         raise InputError(f"smooth_frames is {frames!r}; expected an odd number of frames, such as 3")
 
 
 def check_mask_pairs(pairs: object) -> None:
-    """Raise InputError for a number that is no number of pairs; what is traced is not looked at."""
+    """Raise InputError for an invalid number of pairs; traced values are not checked."""
     if isinstance(pairs, int | float) and (pairs != int(pairs) or pairs < 0):
         raise InputError(f"mask_pairs is {pairs}; expected a whole number of at least 0")
 
 
-def find_method(name: str) -> Method:
-    """Return the method of that name; InputError if there is none."""
-    if name not in METHODS:
-        raise InputError(f"unknown method {name!r}; expected one of {', '.join(METHODS)}")
-    return METHODS[name]
+def _refine_mask(
+    refine_mask: tyro.conf.FlagCreatePairsOff[bool] = False, no_refine_mask: tyro.conf.FlagCreatePairsOff[bool] = False
+) -> bool | None:
+    """Whether the mask is refined; the method's own choice by default.
+
+    Args:
+        refine_mask: remove pixels from the mask that agree with other frames, as vggt4d does.
+        no_refine_mask: leave the mask as it was mined, with vggt4d too.
+    """
+    if refine_mask and no_refine_mask:
+        raise InputError("--refine-mask and --no-refine-mask are opposites; give one of them")
+    return True if refine_mask else False if no_refine_mask else None
+
+
+@dataclass(frozen=True)
+class Options:
+    """How a clip is reconstructed. Raises InputError for an invalid value."""
+
+    method: MethodName = "4dvggt-d"
+    """which passes give depth and cameras; see the table of methods in the README"""
+    gram: Gram | None = None
+    """similarity of the motion cues; the method's own by default"""
+    suppress: Suppress | None = None
+    """how the keys of dynamic tokens are suppressed; the method's own by default"""
+    mask_pairs: int = 5
+    """number of pairs of blocks in which the keys of dynamic tokens are suppressed (L_mask of the paper)"""
+    align_scale: tyro.conf.FlagCreatePairsOff[bool] = False
+    """scale the second pass to the first pass before it is used (not in the paper)"""
+    smooth_frames: int = 1
+    """odd number of frames over which the saliency is averaged before thresholding (not in the papers)"""
+    refine_mask: Annotated[bool | None, tyro.conf.arg(constructor=_refine_mask)] = None
+    """remove pixels from the mask that agree with other frames; the method's own choice by default"""
+    compute_dtype: Annotated[ComputeDType, tyro.conf.arg(name="dtype")] = "float32"
+    """type of the blocks' matrix products"""
+
+    def __post_init__(self) -> None:
+        find_method(self.method)
+        for name, allowed in (("gram", Gram), ("suppress", Suppress), ("compute_dtype", ComputeDType)):
+            value, choices = getattr(self, name), get_args(allowed)
+            if value not in choices and not (value is None and name != "compute_dtype"):
+                raise InputError(f"{name} is {value!r}; expected {' or '.join(map(repr, choices))}")
+        check_mask_pairs(self.mask_pairs)
+        check_smooth_frames(self.smooth_frames)
+        for name, kinds in (("align_scale", bool), ("refine_mask", bool | None)):
+            if not isinstance(getattr(self, name), kinds):
+                raise InputError(f"{name} is {getattr(self, name)!r}; expected True or False")
+
+    @property
+    def row(self) -> Method:
+        """The method's row, with `gram` and `suppress` overridden where they are given."""
+        method = METHODS[self.method]
+        return dataclasses.replace(
+            method,
+            gram=self.gram or method.gram,
+            suppress=self.suppress or method.suppress,
+            refine=method.refine if self.refine_mask is None else self.refine_mask,
+        )
+
+    def resolved(self) -> Options:
+        """Return the options with the method's own values in place of None."""
+        row = self.row
+        return dataclasses.replace(self, gram=row.gram, suppress=row.suppress, refine_mask=row.refine)
+
+    @property
+    def passes_key(self) -> tuple[Any, ...]:
+        """What decides the two passes: methods with equal keys share one run of them, caches are valid for one key."""
+        row = self.row
+        mining = (row.gram, row.suppress, row.clusters, row.threshold)
+        return (*mining, self.mask_pairs, self.smooth_frames, self.compute_dtype)
+
+    def changed(self, **changes: Any) -> Options:
+        """Return the options with other values. Raises TypeError for an unknown name."""
+        return dataclasses.replace(self, **changes) if changes else self
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the options as JSON values."""
+        return dataclasses.asdict(self)
+
+
+class OptionChanges(TypedDict, total=False):
+    """Keywords of functions with `options`: each changes one field of the options."""
+
+    method: str
+    gram: Gram | None
+    suppress: Suppress | None
+    mask_pairs: int
+    align_scale: bool
+    smooth_frames: int
+    refine_mask: bool | None
+    compute_dtype: str

@@ -120,6 +120,10 @@ def test_given_masks_replace_the_mined_ones(params, config):
     assert not np.allclose(made.camera_from_world, still.camera_from_world, atol=1e-4)
     with pytest.raises(InputError, match="expected bool"):
         reconstruct(model, clip, size=56, masks=masks[:2])
+    of_source = masks.repeat(2, axis=1).repeat(2, axis=2)  # at the size of the source's pictures
+    large = images.repeat(2, axis=1).repeat(2, axis=2)
+    loaded = reconstruct(model, large, size=56, masks=of_source, method="vggt")  # a source instead of a clip
+    assert np.array_equal(loaded.dynamic_mask, masks)
 
 
 @pytest.mark.filterwarnings("ignore:the field of view")

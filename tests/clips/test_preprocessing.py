@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from vggtjax.clips.images import to_rgb
-from vggtjax.clips.preprocessing import Fit, Layout
+from vggtjax.clips.preprocessing import Fit, Fitter
 from vggtjax.errors import ClipError, InputError
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "preprocess.npz"
@@ -21,32 +21,32 @@ def test_pixels_are_those_of_vggt(picture, mode):
     with np.load(GOLDEN, allow_pickle=False) as golden:
         image = to_rgb(Image.fromarray(golden[f"{picture}/input"]), picture)
         expected = golden[f"{picture}/{mode}"].transpose(1, 2, 0)
-    np.testing.assert_array_equal(Layout(mode).fit(*image.size, picture).render(image), expected)
+    np.testing.assert_array_equal(Fitter(mode).fit(*image.size, picture).render(image), expected)
 
 
 def test_crop_makes_the_width_whole_and_cuts_the_height():
     # 20 x 30 becomes 28 wide and round(30 * 1.4 / 14) * 14 = 42 high, of which the middle 28 stay.
-    fit = Layout("crop", 28, 14).fit(20, 30, "a")
+    fit = Fitter("crop", 28, 14).fit(20, 30, "a")
     assert fit == Fit((20, 30), (28, 42), 7, (28, 28), (0, 0, 28, 28))
     assert fit.scale == (20 / 28, 30 / 42)
     assert fit.offset == (0, 7 * 30 / 42)
 
 
 def test_crop_leaves_a_low_picture_low():
-    fit = Layout("crop", 28, 14).fit(40, 20, "a")
+    fit = Fitter("crop", 28, 14).fit(40, 20, "a")
     assert fit == Fit((40, 20), (28, 14), 0, (28, 14), (0, 0, 28, 14))
 
 
 def test_pad_puts_the_odd_rest_below():
     # 40 x 10 at size 15, patch 3: round(10 * 0.375 / 3) * 3 = 3 high, 12 rows of white: 6 above, 6 below.
-    assert Layout("pad", 15, 3).fit(40, 10, "a").box == (0, 6, 15, 9)
+    assert Fitter("pad", 15, 3).fit(40, 10, "a").box == (0, 6, 15, 9)
     # 40 x 15: round(15 * 0.375 / 3) * 3 = 6 high, 9 rows of white: 4 above, 5 below.
-    assert Layout("pad", 15, 3).fit(40, 15, "a").box == (0, 4, 15, 10)
-    assert Layout("pad", 15, 3).fit(15, 40, "a").box == (4, 0, 10, 15)
+    assert Fitter("pad", 15, 3).fit(40, 15, "a").box == (0, 4, 15, 10)
+    assert Fitter("pad", 15, 3).fit(15, 40, "a").box == (4, 0, 10, 15)
 
 
 def test_padding_is_white():
-    frame = Layout("pad", 15, 3).fit(40, 10, "a").render(Image.new("RGB", (40, 10), (9, 8, 7)))
+    frame = Fitter("pad", 15, 3).fit(40, 10, "a").render(Image.new("RGB", (40, 10), (9, 8, 7)))
     assert (frame[:6] == 255).all()
     assert (frame[9:] == 255).all()
     assert (frame[6:9] == (9, 8, 7)).all()
@@ -63,7 +63,7 @@ def test_every_fit(width, height, patches, patch, mode):
     size = patches * patch
     if round(min(width, height) * size / max(width, height) / patch) < 1:
         return
-    fit = Layout(mode, size, patch).fit(width, height, "a")
+    fit = Fitter(mode, size, patch).fit(width, height, "a")
     left, top, right, bottom = fit.box
     assert fit.frame_size[0] == size
     assert fit.frame_size[1] <= size if mode == "crop" else fit.frame_size[1] == size
@@ -90,15 +90,15 @@ def test_every_fit(width, height, patches, patch, mode):
 )
 def test_layouts_that_cannot_work(values, message):
     with pytest.raises(InputError, match=message):
-        Layout(**values)
+        Fitter(**values)
 
 
 @pytest.mark.parametrize("mode", ["crop", "pad"])
 def test_a_side_of_no_patches(mode):
     with pytest.raises(ClipError, match="frame strip is 1000 x 3, which becomes 518 x 0"):
-        Layout(mode).fit(1000, 3, "strip")
+        Fitter(mode).fit(1000, 3, "strip")
 
 
 def test_a_picture_too_long_to_cut():
     with pytest.raises(ClipError, match="frame tower is 1 x 10000"):
-        Layout("crop").fit(1, 10000, "tower")
+        Fitter("crop").fit(1, 10000, "tower")

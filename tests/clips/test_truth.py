@@ -83,7 +83,12 @@ def test_truth_gets_a_batch_axis_and_is_checked():
 
 
 def test_metrics_do_not_import_jax():
-    names = ("trajectory", "blind", "depth", "masks", "truth")
-    imports = "; ".join(f"import vggtjax.evaluation.{name}" for name in names)
+    names = (
+        "evaluation.metrics.trajectory",
+        "evaluation.blind",
+        "evaluation.metrics.depth",
+        "evaluation.metrics.masks",
+    )
+    imports = "; ".join(f"import vggtjax.{name}" for name in (*names, "clips.truth"))
     code = f"import sys; {imports}; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

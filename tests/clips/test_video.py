@@ -3,7 +3,6 @@
 import gc
 import logging
 import struct
-import sys
 from fractions import Fraction
 
 import av
@@ -15,7 +14,7 @@ from av.video.format import VideoFormat
 
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.video import VideoFile, is_video_name, upright
-from vggtjax.errors import ClipError, MissingExtraError
+from vggtjax.errors import ClipError
 
 WIDTH, HEIGHT = 64, 48
 
@@ -309,12 +308,6 @@ def test_past_the_end(even):
 def test_frames_larger_than_any_camera_makes(even, monkeypatch):
     monkeypatch.setattr("vggtjax.clips.video._MOST_PIXELS", WIDTH * HEIGHT - 1)
     with pytest.raises(ClipError, match=f"has frames of {WIDTH} x {HEIGHT}"):
-        read(even)
-
-
-def test_without_pyav(even, monkeypatch):
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'vggtjax\[video\]'"):
         read(even)
 
 

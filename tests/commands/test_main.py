@@ -1,7 +1,9 @@
 """The command line: what it writes, what it says, and its exit codes."""
 
+import dataclasses
 import functools
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -11,9 +13,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import vggtjax
 from benchmarks.seeded import seeded_images, seeded_state_dict
-from vggtjax import Reconstruction
+from vggtjax import Reconstruction, __main__
+from vggtjax.clips.preprocessing import Framing
+from vggtjax.clips.sampling import Sampling
 from vggtjax.commands import main as cli
+from vggtjax.options import Options
+from vggtjax.results.saving import Saving
 
 README = Path(__file__).parents[2] / "README.md"
 
@@ -78,11 +85,11 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
         Image.fromarray(np.pad(np.full((30, 40), 255, np.uint8), ((10, 50), (20, 60)))).save(masks / f"frame_{i}.png")
     (tmp_path / "points.csv").write_text("x,y,frame\n60,45,0\n30,20,1\n", encoding="utf-8")
     code, out, err = run(
-        capsys, "reconstruct", frames, "--out", tmp_path / "out", "--masks", masks, "--refine-mask", "--tracks",
-        tmp_path / "points.csv", "--method", "vggt4d", "--resolution", "original", "--format", "vggt4d",
+        capsys, "reconstruct", frames, "--model", "demo", "--out", tmp_path / "out", "--masks", masks, "--refine-mask",
+        "--tracks", tmp_path / "points.csv", "--method", "vggt4d", "--resolution", "original", "--format", "vggt4d",
     )  # fmt: skip
     assert code == 0, err
-    assert "track head of the embedded model is untrained" in out
+    assert "track head of this model is untrained" in out
     result = Reconstruction.load(tmp_path / "out")
     assert (result.settings["masks"], result.settings["refine_mask"]) == ("given", True)
     assert np.asarray(result.track_frames).tolist() == [0, 1]
@@ -102,7 +109,8 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     assert again.depth.shape == (3, *picture.size[::-1])
     assert np.allclose(again.camera_from_world, result.camera_from_world, atol=1e-5)
 
-    code, _, err = run(capsys, "reconstruct", frames, "--out", tmp_path / "still", "--no-masks", "--tracks", "grid:2")
+    arguments = ("--model", "demo", "--out", tmp_path / "still", "--no-masks", "--tracks", "grid:2")
+    code, _, err = run(capsys, "reconstruct", frames, *arguments)
     assert code == 0, err
     still = Reconstruction.load(tmp_path / "still")
     assert not still.dynamic_mask.any()
@@ -120,10 +128,13 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--tracks", "{tmp}/none.csv"], "none.csv"),
         (["reconstruct", "{tmp}/nothing", "--out", "{tmp}/out"], "does not exist"),
         (["reconstruct", "--out", "{tmp}/out"], "no input"),
+        (["reconstruct", "{frames}", "--out", "{tmp}/out"], "no model is named"),
+        (["batch", "{frames}", "--out", "{tmp}/out"], "no model is named"),
+        (["batch", "{frames}", "--model", "demo", "--out", "{tmp}/out", "--smooth-frames", "2"], "an odd number"),
         (["reconstruct", "{tmp}", "--out", "{tmp}/out"], "no images"),
-        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--size", "100"], "100"),
+        (["reconstruct", "{frames}", "--model", "demo", "--out", "{tmp}/out", "--size", "100"], "100"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--stride", "0"], "stride"),
-        (["reconstruct", "{frames}", "--out", "{tmp}/out", "--start", "7"], "start is 7"),
+        (["reconstruct", "{frames}", "--model", "demo", "--out", "{tmp}/out", "--start", "7"], "start is 7"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--confidence-percentile", "150"], "is 150"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--model", "{tmp}/none.safetensors"], "none.safetensors"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--smooth-frames", "2"], "an odd number of frames"),
@@ -187,3 +198,48 @@ def test_the_commands_of_the_readme_are_understood(line, monkeypatch):
     arguments = shlex.split(line)[1:]
     assert cli.main(arguments) == 0
     assert called == [arguments[0]]
+
+
+@pytest.mark.parametrize("command", ["reconstruct", "batch", "evaluate"])
+def test_commands_that_reconstruct_have_all_options(command, capsys):
+    with pytest.raises(SystemExit, match="0"):
+        cli.main([command, "--help"])
+    flags = set(re.findall(r"--[a-z-]+", capsys.readouterr().out))
+    groups = [Options, Sampling, Framing, *([] if command == "evaluate" else [Saving])]
+    names = {field.name for group in groups for field in dataclasses.fields(group)} - {"compute_dtype"} | {"dtype"}
+    names -= {"method"} if command == "evaluate" else set()  # --methods there
+    assert {f"--{name.replace('_', '-')}" for name in names} <= flags
+
+
+def test_version(capsys):
+    assert run(capsys, "--version") == (0, f"vggtjax {vggtjax.__version__}\n", "")
+
+
+def test_interruption_while_modules_are_imported(monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.delitem(sys.modules, "vggtjax.commands.main")
+    monkeypatch.setattr(sys, "meta_path", [type("Finder", (), {"find_spec": staticmethod(interrupted)})])
+    assert __main__.run() == 130
+    assert capsys.readouterr().err == "vggtjax: interrupted\n"
+
+
+def test_stages_and_the_kind_of_model_are_said_once(tmp_path, capsys, frames):
+    code, out, err = run(
+        capsys,
+        "reconstruct",
+        frames,
+        "--model",
+        "demo",
+        "--out",
+        tmp_path / "out",
+        "--method",
+        "vggt",
+        "--max-frames",
+        2,
+    )
+    assert code == 0, err
+    assert (out + err).count("first pass") == 1
+    assert "The model demo is a small demonstration model" in out
+    assert Reconstruction.load(tmp_path / "out").settings["model_note"].startswith("small demonstration model")

@@ -166,7 +166,7 @@ def test_unknown_names(params, config, images, inferred):
 
 
 def test_running_out_of_memory_is_one_sentence(params, config, images, monkeypatch):
-    def exhausted(*_):
+    def exhausted(*_, **__):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
 
     monkeypatch.setattr(run, "compile_stages", exhausted)

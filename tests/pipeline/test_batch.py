@@ -18,7 +18,7 @@ from vggtjax import Reconstruction, init_params
 from vggtjax.checkpoint import Model, save_model
 from vggtjax.clips.sources import clips_by_name
 from vggtjax.commands.batch import _Clock
-from vggtjax.errors import ClipError, InputError
+from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.pipeline.batch import SETTINGS_NAME, reconstruct_many
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 
@@ -227,6 +227,25 @@ def test_results_are_those_of_single_runs(model, clips, tmp_path):
         np.testing.assert_array_equal(Reconstruction.load(tmp_path / name).depth, alone.depth)
         with Image.open(tmp_path / name / "mask/000000.png") as mask, Image.open(f"{source}/0.png") as picture:
             assert mask.size == picture.size
+
+
+def test_results_of_other_weights_are_not_kept(model, clips, tmp_path):
+    sources = {"clip0": str(clips / "clip0")}
+    assert [outcome.status for outcome in reconstruct_many(model, sources, tmp_path, method="vggt")] == ["done"]
+    retrained = Model(model.config, jax.tree.map(lambda leaf: leaf + 1e-3, model.params), model.name)
+    with pytest.raises(InputError, match="other settings than this run"):
+        next(reconstruct_many(retrained, sources, tmp_path, method="vggt"))
+
+
+def test_two_batches_on_one_folder(model, clips, tmp_path):
+    sources = {name: str(clips / name) for name in ("clip0", "clip1")}
+    first = reconstruct_many(model, sources, tmp_path, method="vggt")
+    assert next(first).status == "done"
+    with pytest.raises(OutputError, match="another run is writing a batch"):
+        next(reconstruct_many(model, sources, tmp_path, method="vggt"))
+    assert [outcome.status for outcome in first] == ["done"]
+    again = [outcome.status for outcome in reconstruct_many(model, sources, tmp_path, method="vggt")]
+    assert again == ["kept", "kept"]
 
 
 @pytest.mark.parametrize("name", ["", "..", "a/b", "a\n"])

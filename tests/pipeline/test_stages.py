@@ -13,7 +13,7 @@ from vggtjax.method.passes import first_pass, second_pass
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.model import init_params
 from vggtjax.network.suppression import Suppression
-from vggtjax.pipeline.frame_padding import padded_frames
+from vggtjax.pipeline.stages import padded_frames
 
 SIDE, OFFSETS = 70, MotionConfig().offsets
 

@@ -5,21 +5,20 @@ from __future__ import annotations
 import logging
 import os
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, UInt8
 
-from vggtjax.clips.preprocessing import Fit, Layout, Mode
+from vggtjax.clips.preprocessing import Fit, Fitter, Mode
 from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import ClipError, InputError
+from vggtjax.progress import Progress
 
 logger = logging.getLogger(__name__)
-
-Progress = Callable[[int, int | None], object]
 
 _MOST_WORKERS = 4
 _MOST_BYTES = 2**34  # of the images of one clip; over 5000 frames of 518 x 518
@@ -74,7 +73,7 @@ class Clip:
             InputError: a value out of range, as in `load_clip`.
             ClipError: the source cannot be read any more, or gives other frames than before.
         """
-        clip = _read(self.source, self.sampling, Layout(mode or self.mode, size, patch), None)
+        clip = read_clip(self.source, self.sampling, Fitter(mode or self.mode, size, patch))
         if clip.frame_names != self.frame_names or not np.array_equal(clip.source_size, self.source_size):
             raise ClipError("the source of the clip gives other frames than before; load the clip anew")
         return clip
@@ -99,15 +98,15 @@ def load_clip(
             a list of PIL images or of arrays [H, W, 3], or one array [S, H, W, 3] (uint8, uint16, or floating point
             in [0, 1], all brought to 8 bits). Files of folders and patterns are taken in natural order (frame_2 before
             frame_10), hidden files and files that are not images left out; a list keeps its order.
-        mode: "crop" makes frames `size` wide and cuts the height to `size` at most; "pad" makes the long side `size`
-            and the frame square with white.
+        mode: "crop" makes frames `size` wide and cuts the height to at most `size`; "pad" makes the long side `size`
+            and pads the frame with white to a square.
         size: width, or side of the square; a multiple of `patch`.
         patch: side of the model's patches; sides of frames are multiples of it.
         fps: frames to take per second of a video, by presentation time: of every 1 / fps seconds the first frame.
         stride: take every stride-th frame; not together with `fps`.
         start: index of the first frame to take, counted in frames of the source, for video too.
-        max_frames: take so many frames at most; a video is not decoded further.
-        progress: called after each frame with the frames done and their number, None where it is not known.
+        max_frames: take at most this many frames; a video is not decoded further.
+        progress: called after each frame with the number of frames done and of all frames, None if unknown.
 
     Returns:
         The clip. Frames of different sizes are padded with white to the largest, as VGGT does, with a warning logged.
@@ -115,14 +114,13 @@ def load_clip(
     Raises:
         InputError: an argument out of range.
         ClipError: no frames, a source that is missing or cannot be read, or a frame that cannot be used.
-        MissingExtraError: the source is a video, and PyAV is not installed.
     """
-    layout = Layout(mode, size, patch)
-    sampling = Sampling(start, stride, fps, max_frames)
-    return _read(open_source(source), sampling, layout, progress)
+    fitter, sampling = Fitter(mode, size, patch), Sampling(start, stride, fps, max_frames)
+    return read_clip(open_source(source), sampling, fitter, progress)
 
 
-def _read(source: Source, sampling: Sampling, layout: Layout, progress: Progress | None) -> Clip:
+def read_clip(source: Source, sampling: Sampling, fitter: Fitter, progress: Progress | None = None) -> Clip:
+    """Read the frames of a source that `sampling` takes, fitted to the model; `load_clip` says more."""
     total = source.total(sampling)
     names: list[str] = []
     times: list[float] = []
@@ -132,7 +130,7 @@ def _read(source: Source, sampling: Sampling, layout: Layout, progress: Progress
     workers = min(os.cpu_count() or 1, _MOST_WORKERS)
     with ThreadPoolExecutor(workers) as pool:  # Pillow resizes without holding the interpreter
         for frame in source.frames(sampling):
-            fit = layout.fit(*frame.image.size, frame.name)
+            fit = fitter.fit(*frame.image.size, frame.name)
             width, height = fit.frame_size
             if 12 * width * height * (len(fits) + 1) > _MOST_BYTES:  # 3 channels of 4 bytes
                 raise ClipError(
@@ -144,7 +142,7 @@ def _read(source: Source, sampling: Sampling, layout: Layout, progress: Progress
                 times.append(frame.time)
             fits.append(fit)
             rendering.append(pool.submit(fit.render, frame.image))
-            if len(rendering) > workers:  # no more than so many frames of the source's size at a time
+            if len(rendering) > workers:  # bounds the frames of the source's size in memory
                 pixels.append(rendering.popleft().result())
             if progress is not None:
                 progress(len(fits), total)
@@ -154,9 +152,9 @@ def _read(source: Source, sampling: Sampling, layout: Layout, progress: Progress
         images=images,
         frame_names=names,
         timestamps=np.array(times, np.float64) if times else None,
-        mode=layout.mode,
-        size=layout.size,
-        patch=layout.patch,
+        mode=fitter.mode,
+        size=fitter.size,
+        patch=fitter.patch,
         source_size=np.array([fit.source_size[::-1] for fit in fits], np.int64),
         source_scale=np.array([fit.scale for fit in fits], np.float64),
         source_offset=np.array([fit.offset for fit in fits], np.float64),
@@ -169,7 +167,7 @@ def _read(source: Source, sampling: Sampling, layout: Layout, progress: Progress
 def _joined(
     pixels: list[UInt8[np.ndarray, "H W 3"]], fits: list[Fit]
 ) -> tuple[Float32[np.ndarray, "S H W 3"], list[Fit]]:
-    """Return the frames in one array, the smaller ones centred on white, and where they are now."""
+    """Return the frames in one array, smaller frames centred on white, and their new fits."""
     sizes = {fit.frame_size for fit in fits}
     width, height = max(size[0] for size in sizes), max(size[1] for size in sizes)
     if len(sizes) > 1:

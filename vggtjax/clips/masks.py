@@ -12,14 +12,15 @@ from PIL import Image
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.images import ImageFiles, known_formats, read_image
 from vggtjax.clips.sources import open_source
-from vggtjax.errors import ClipError
+from vggtjax.clips.truth import at_clip_pixels
+from vggtjax.errors import ClipError, InputError
 
 _WHITE = 127  # above it, a pixel of a picture in grey or colour moves
 _LABELS = ("P", "1")  # modes whose values are numbers of objects, not brightness
 
 
 def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
-    """Load pictures of what moves, and bring them to the clip's frames.
+    """Load pictures of what moves, fitted to the clip's frames.
 
     A pixel moves where a grey or coloured picture is bright and not transparent, or where a picture with a palette, as
     DAVIS has them, holds an object (any value but 0). Crop, scale and padding are those of the frames: every pixel
@@ -39,12 +40,12 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
         raise ClipError(f"{folder} is no folder of pictures; masks need one picture per frame")
     names = Counter(path.stem for path in source.paths)
     by_name = {path.stem: path for path in source.paths}
-    there = [name for name in clip.frame_names if name in by_name]
-    if len(there) == len(clip):
+    named = [name for name in clip.frame_names if name in by_name]
+    if len(named) == len(clip):
         if twice := [name for name in clip.frame_names if names[name] > 1]:
             raise ClipError(f"{folder} has {names[twice[0]]} pictures named {twice[0]}; expected one for each frame")
         paths = [by_name[name] for name in clip.frame_names]
-    elif there or len(source.paths) != len(clip):
+    elif named or len(source.paths) != len(clip):
         missing = next(name for name in clip.frame_names if name not in by_name)
         raise ClipError(
             f"{folder} has {len(source.paths)} pictures for {len(clip)} frames, and none is named {missing}; "
@@ -53,6 +54,29 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
     else:
         paths = list(source.paths)
     return np.stack([_mask(path, clip, frame) for frame, path in enumerate(paths)])
+
+
+def masks_at_clip_pixels(masks: Bool[np.ndarray, "S h w"] | str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
+    """Return masks at the pixels of the clip's frames.
+
+    Args:
+        masks: boolean, at the size of the clip's frames or of the source's pictures; or a folder for `load_masks`.
+        clip: what `load_clip` returned.
+
+    Raises:
+        InputError: masks of another type or size, or pictures that `load_masks` refuses.
+    """
+    if isinstance(masks, str | Path):
+        return load_masks(masks, clip)
+    masks = np.asarray(masks)
+    expected = clip.images.shape[:3]
+    sizes = {(int(height), int(width)) for height, width in clip.source_size}
+    if masks.dtype == bool and masks.shape == expected:
+        return masks
+    if masks.dtype == bool and masks.ndim == 3 and len(masks) == len(clip) and {masks.shape[1:]} == sizes:
+        return at_clip_pixels(clip, masks)
+    source = f" or {(len(clip), *sizes.pop())}, as the source's pictures" if len(sizes) == 1 else ""
+    raise InputError(f"masks are {masks.dtype} {masks.shape}; expected bool {expected}, as the frames{source}")
 
 
 def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypedDict, get_args
 
 import numpy as np
 from jaxtyping import UInt8
@@ -19,9 +19,37 @@ _MOST_PIXELS = 2**26  # of a resized frame, before it is cut: 8192 x 8192
 
 
 @dataclass(frozen=True)
-class Layout:
-    """The frames that the model takes: `crop` fills the width `size` and cuts the height down to it, `pad` makes the
-    long side `size` and the frame square with white; sides of the picture are multiples of `patch`.
+class Framing:
+    """How pictures are fitted to the model. Raises InputError for an invalid value."""
+
+    mode: Mode = "crop"
+    """"crop" makes frames `size` wide and cuts tall frames to `size`; "pad" keeps every pixel and pads to a square"""
+    size: int | None = None
+    """side in pixels to run at, a multiple of the patch size; the model's own by default"""
+
+    def __post_init__(self) -> None:
+        if self.mode not in get_args(Mode):
+            raise InputError(f"mode is {self.mode!r}; expected 'crop' or 'pad'")
+        if self.size is not None:
+            object.__setattr__(self, "size", whole_number("size", self.size, 1))
+
+    def fitter(self, *, size: int, patch: int) -> Fitter:
+        """Return the fitter for a model of this `size` and `patch` size in pixels; `self.size` wins over `size`."""
+        return Fitter(self.mode, size if self.size is None else self.size, patch)
+
+
+class FramingChanges(TypedDict, total=False):
+    """Keywords of functions with `framing`: each changes one field of it."""
+
+    mode: Mode
+    size: int | None
+
+
+@dataclass(frozen=True)
+class Fitter:
+    """Fits pictures to frames whose sides are multiples of `patch`; see `Framing` for `mode` and `size`.
+
+    Raises InputError for an invalid value.
     """
 
     mode: Mode = "crop"
@@ -29,18 +57,16 @@ class Layout:
     patch: int = 14
 
     def __post_init__(self) -> None:
-        if self.mode not in get_args(Mode):
-            raise InputError(f"mode is {self.mode!r}; expected 'crop' or 'pad'")
+        Framing(self.mode, self.size)
         object.__setattr__(self, "patch", whole_number("patch", self.patch, 1))
         object.__setattr__(self, "size", whole_number("size", self.size, 1))
         if self.size % self.patch:
             raise InputError(f"size is {self.size}; expected a multiple of patch {self.patch}")
 
     def fit(self, width: int, height: int, name: str) -> Fit:
-        """Return where a picture of `width` x `height` lands; `name` is for the error.
+        """Return where a picture of `width` x `height` pixels lands; the error says `name`.
 
-        Raises:
-            ClipError: a side would become less than half a patch, or a picture to be cut absurdly long.
+        Raises ClipError for a picture so narrow or so long that a side becomes 0 or the resized picture huge.
         """
         wide = self.mode == "crop" or width >= height
         # The order of these operations decides how halves round; it is that of VGGT.
@@ -55,13 +81,13 @@ class Layout:
                 f"frame {name} is {width} x {height}, which becomes {resized_width} x {resized_height} at size "
                 f"{self.size} and patch {self.patch}; cut it to a less extreme shape"
             )
-        kept = (resized_width, min(resized_height, self.size))
+        frame_size = (resized_width, min(resized_height, self.size))
         fit = Fit(
             source_size=(width, height),
             resized_size=(resized_width, resized_height),
-            cut=(resized_height - kept[1]) // 2,
-            frame_size=kept,
-            box=(0, 0, *kept),
+            cut=(resized_height - frame_size[1]) // 2,
+            frame_size=frame_size,
+            box=(0, 0, *frame_size),
         )
         return fit.widen(self.size, self.size) if self.mode == "pad" else fit
 
@@ -70,7 +96,7 @@ class Layout:
 class Fit:
     """Where a picture lands in a frame of the clip: resized, cut above and below, placed on white.
 
-    Sizes are (width, height). `cut` rows of the resized picture are gone above; what is kept fills `box`
+    Sizes are (width, height). The first `cut` rows of the resized picture are removed; the rest fills `box`
     (left, top, right, bottom) of the frame. Continuous coordinates have pixel edges at whole numbers, and
     source = scale * frame + offset in (x, y).
     """
@@ -92,7 +118,7 @@ class Fit:
         return -self.box[0] * self.scale[0], (self.cut - self.box[1]) * self.scale[1]
 
     def widen(self, width: int, height: int) -> Fit:
-        """Return the fit of the same frame centred in a larger one; an odd rest goes to the right and below."""
+        """Return the fit of the same frame centred in a larger frame; an odd remainder is added right and below."""
         right, down = (width - self.frame_size[0]) // 2, (height - self.frame_size[1]) // 2
         left, top, *ends = self.box
         box = (left + right, top + down, ends[0] + right, ends[1] + down)

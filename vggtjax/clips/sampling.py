@@ -29,39 +29,49 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sampling:
-    """The frames to take: from source frame `start` every `stride`-th, or `fps` a second; `max_frames` at most."""
+    """Which frames of a source are taken. Raises InputError for a value out of range."""
 
     start: int = 0
-    stride: int = 1
+    """index of the first frame to take, counted in frames of the source"""
+    stride: int | None = None
+    """take every stride-th frame; 1 by default, in an evaluation the published protocol's own"""
     fps: float | None = None
+    """frames to take per second of a video, by presentation time; not together with stride"""
     max_frames: int | None = None
+    """take at most this many frames"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "start", whole_number("start", self.start, 0))
-        object.__setattr__(self, "stride", whole_number("stride", self.stride, 1))
+        if self.stride is not None:
+            object.__setattr__(self, "stride", whole_number("stride", self.stride, 1))
         if self.max_frames is not None:
             object.__setattr__(self, "max_frames", whole_number("max_frames", self.max_frames, 1))
         if self.fps is None:
             return
         if isinstance(self.fps, bool) or not isinstance(self.fps, Real) or not 0 < self.fps < math.inf:
             raise InputError(f"fps is {self.fps!r}; expected a number of frames per second above 0")
-        if self.stride != 1:
+        if self.step != 1:
             raise InputError(f"fps={self.fps} and stride={self.stride} exclude each other; give one of them")
         object.__setattr__(self, "fps", float(self.fps))
 
+    @property
+    def step(self) -> int:
+        """Frames of the source from one taken frame to the next, without `fps`."""
+        return 1 if self.stride is None else self.stride
+
     def indices(self, count: int) -> range:
-        """Return the indices taken of `count` still frames. Raises InputError for `fps`, ClipError past the end."""
+        """Return the indices taken of `count` still frames. Raises InputError for `fps`, ClipError for a late start."""
         if self.fps is not None:
             raise InputError(f"fps is {self.fps}, but still images have no presentation times; use stride")
         if self.start >= count:
             raise ClipError(f"start is {self.start}, but the source has only {count} frames; expected below {count}")
-        return range(self.start, count, self.stride)[: self.max_frames]
+        return range(self.start, count, self.step)[: self.max_frames]
 
     def select(self, frames: Iterable[tuple[float, Item]]) -> Iterator[tuple[int, float, Item]]:
-        """Yield (index, time, item) of the frames taken, and ask for none after the last of them.
+        """Yield (index, time, item) of the frames taken; frames after the last one are not read.
 
-        With `fps`, ticks are 1 / fps apart from the time of frame `start`, and each tick takes the first frame at or
-        after it; a frame is taken once, however many ticks wait for it.
+        With `fps`, ticks are 1 / fps apart from the time of frame `start`. Each tick takes the first frame at or after
+        it, and no frame is taken twice.
 
         Args:
             frames: (presentation time in seconds, item) of every frame of the source, in order.
@@ -77,7 +87,7 @@ class Sampling:
             if index == self.start:
                 begin = time
             if self.fps is None:
-                wanted = (index - self.start) % self.stride == 0
+                wanted = (index - self.start) % self.step == 0
             else:
                 passed = (time - begin + TIME_ROUNDING) * self.fps
                 wanted = passed >= tick
@@ -94,10 +104,10 @@ class Sampling:
 
 
 class Source(Protocol):
-    """Something that frames come from, as often as they are asked for."""
+    """A source of frames that can be read again and again."""
 
     def total(self, sampling: Sampling) -> int | None:
-        """Return how many frames `sampling` takes, or None where only reading the source can tell."""
+        """Return how many frames `sampling` takes, or None if only reading the source can tell."""
         ...
 
     def frames(self, sampling: Sampling) -> Iterator[Frame]:

@@ -13,7 +13,7 @@ from PIL import Image
 
 from vggtjax.clips.arrays import frame_name
 from vggtjax.clips.sampling import Frame, Sampling
-from vggtjax.errors import ClipError, MissingExtraError
+from vggtjax.errors import ClipError
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -48,15 +48,11 @@ class VideoFile:
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes; decoding stops after the last of them.
 
-        Raises:
-            ClipError: not a video, no video stream, no frame at `start`, or the file breaks off before its end.
-            MissingExtraError: PyAV is not installed.
+        Raises ClipError for a file that is not a video or has no video stream, no frame at `start`, or breaks off.
         """
-        try:
-            import av
-            import av.error
-        except ImportError as error:
-            raise MissingExtraError("reading video files", "video") from error
+        import av
+        import av.error
+
         rotation, matrix = None, np.eye(2)
         for index, time, frame in sampling.select(_timed(self.path, av)):
             if frame.rotation != rotation:  # asking a frame for its matrix keeps it alive until garbage is collected

@@ -1,18 +1,95 @@
-"""What `vggtjax evaluate` does: methods, or results of other programs, on the sequences of a data set."""
+"""The command `vggtjax evaluate`. Does not import jax before it is needed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
+from vggtjax.clips.preprocessing import Framing
+from vggtjax.clips.sampling import Sampling
+from vggtjax.commands.models import FittedFusion, load
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
+from vggtjax.options import METHODS, MethodName, Options, find_method
 
 if TYPE_CHECKING:
     from vggtjax.evaluation.sources import FolderSource, ModelSource
+
+
+@dataclass(frozen=True)
+class EvaluatedOptions(Options):
+    """The options of all methods; `--methods` names the methods."""
+
+    method: tyro.conf.Suppress[MethodName] = "4dvggt-d"
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """A model and its methods."""
+
+    model: str | None = None
+    """"demo" (the default), a converted .safetensors, a PyTorch checkpoint, or a hub id"""
+    methods: str | None = None
+    """names of methods, with commas; all five by default; methods that mine alike share one run of the passes"""
+    fusion: Path | None = None
+    """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""
+
+    def source(self, report: Report, options: Options, framing: Framing) -> ModelSource:
+        """Return the results of the model, loaded as a stage of the report."""
+        names = tuple(METHODS) if self.methods is None else _words(self.methods)
+        for name in names:
+            find_method(name)
+        fitted = FittedFusion(self.fusion, names)
+        network = load(report, self.model or "demo")
+        fitted.warn(network, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
+        from vggtjax.evaluation.sources import ModelSource
+
+        return ModelSource(network, names, options, framing, fitted.params)
+
+
+@dataclass(frozen=True)
+class Folders:
+    """Results of other programs, or earlier ones of ours."""
+
+    results: tuple[str, ...] = ()
+    """score results in these folders instead, NAME=FOLDER, each with a folder per sequence; no model is run"""
+    format: Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] | None = None
+    """the program that wrote the folders; vggtjax by default"""
+    quaternion: Literal["xyzw", "wxyz"] | None = None
+    """order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw"""
+
+    def source(self) -> FolderSource:
+        """Return the results in the folders."""
+        from vggtjax.evaluation.sources import FolderSource
+
+        folders: dict[str, Path] = {}
+        for text in self.results:
+            name, equals, folder = text.rpartition("=")
+            path = Path(folder)
+            if not path.is_dir():
+                raise InputError(f"--results has {text}, which names no folder; expected NAME=FOLDER")
+            name = name if equals else path.resolve().name
+            if name in folders:
+                raise InputError(f"--results has two folders named {name}; give them different names: NAME=FOLDER")
+            folders[name] = path
+        return FolderSource(folders, self.format or "vggtjax", self.quaternion)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """What is scored, and how."""
+
+    sequences: str | None = None
+    """names, with commas; the sequences of the published protocol, or all, by default"""
+    gt: str | None = None
+    """ground truth to use, where a data set has several: for dycheck easi3r or lidar"""
+    depth_align: Literal["metric", "median", "scale", "scale-shift"] = "scale"
+    """how video depth is brought to metres"""
+    empty: Literal["davis", "vggt4d"] = "davis"
+    """J of a frame in which nothing moves and nothing is found: 1 (davis) or 0 (vggt4d)"""
 
 
 def evaluate(
@@ -21,54 +98,27 @@ def evaluate(
     /,
     out: Path,
     *,
-    model: str | None = None,
-    methods: str | None = None,
-    results: tuple[str, ...] = (),
-    layout: Annotated[
-        Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] | None, tyro.conf.arg(name="format")
-    ] = None,
-    quaternion: Literal["xyzw", "wxyz"] | None = None,
-    sequences: str | None = None,
-    stride: int | None = None,
-    max_frames: int | None = None,
-    gt: str | None = None,
-    depth_align: Literal["metric", "median", "scale", "scale-shift"] = "scale",
-    empty: Literal["davis", "vggt4d"] = "davis",
-    mode: Literal["crop", "pad"] = "crop",
-    size: int | None = None,
-    mask_pairs: int = 5,
-    align_scale: bool = False,
-    smooth_frames: int = 1,
-    fusion: Path | None = None,
-    dtype: Literal["float32", "bfloat16"] = "float32",
+    candidates: Candidates = Candidates(),
+    folders: Folders = Folders(),
+    scores: Scores = Scores(),
+    sampling: Sampling = Sampling(),
+    framing: Framing = Framing(),
+    options: EvaluatedOptions = EvaluatedOptions(),
 ) -> None:
     """Score methods on a data set with ground truth: cameras, point clouds, masks, depth, uncertainty.
 
-    Sequences that are finished are kept: the same command goes on where it was interrupted.
+    Finished sequences are kept: run the same command again to resume.
 
     Args:
         dataset: its name: composite, hololens, plain, tum, bonn, dycheck, sintel, kitti, davis, davis-2017 or 7scenes.
         root: folder of the data set, or of one sequence of it.
         out: folder for results.json, results.csv, table.md, table.tex and index.html.
-        model: "demo" (the default), a converted .safetensors, a PyTorch checkpoint, or a hub id.
-        methods: names of methods, with commas; all five by default. Those that mine alike share one run of the passes.
-        results: score results in these folders instead, NAME=FOLDER, each with a folder for every sequence; no model
-            is run.
-        layout: of those, by the program that wrote them; vggtjax by default.
-        quaternion: order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw.
-        sequences: names, with commas; those of the published protocol, or all, by default.
-        stride: take every stride-th frame; the published protocol's own by default, whose window or cap stays.
-        max_frames: take so many frames at most.
-        gt: ground truth to use, where a data set has several: for dycheck easi3r or lidar.
-        depth_align: how video depth is brought to metres.
-        empty: J of a frame in which nothing moves and nothing is found: 1 (davis) or 0 (vggt4d).
-        mode: how frames are fitted to the model: crop or pad.
-        size: side in pixels to run at; the model's own by default.
-        mask_pairs: number of pairs in which the keys of dynamic tokens are suppressed.
-        align_scale: bring the second pass to the first one's scale before fusing (not in the paper).
-        smooth_frames: odd number of frames that the saliency is averaged over (not in the papers).
-        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default.
-        dtype: of the blocks' matrix products.
+        candidates: model
+        folders: results of other programs
+        scores: scores
+        sampling: frames
+        framing: size
+        options: settings of all methods
     """
     report = Report()
     with report.running():
@@ -82,31 +132,34 @@ def evaluate(
 
             store = Records(out)
             check_report(out, store)
-            chosen = None if sequences is None else _words(sequences)
-            found = find_sequences(dataset, root, sequences=chosen, stride=stride, max_frames=max_frames, gt=gt)
-        if results:
-            _refuse({"--model": model, "--methods": methods, "--fusion": fusion}, "and --results exclude each other")
-            source = _folder_source(results, layout or "vggtjax", quaternion)
+            chosen = None if scores.sequences is None else _words(scores.sequences)
+            found = find_sequences(dataset, root, sequences=chosen, sampling=sampling, gt=scores.gt)
+        if folders.results:
+            for name in ("model", "methods", "fusion"):
+                if getattr(candidates, name) is not None:
+                    raise InputError(f"--{name} and --results exclude each other; give one of them")
+            source = folders.source()
         else:
-            _refuse({"--format": layout, "--quaternion": quaternion}, "is about the folders of --results")
-            options = {"mask_pairs": mask_pairs, "align_scale": align_scale, "smooth_frames": smooth_frames}
-            options |= {"mode": mode, "size": size, "compute_dtype": dtype}
-            source = _model_source(report, model or "demo", methods, fusion, options)
-        row = DATASETS[dataset]
+            for name in ("format", "quaternion"):
+                if getattr(folders, name) is not None:
+                    raise InputError(f"--{name} is about the folders of --results; give both or neither")
+            source = candidates.source(report, options, framing)
+        labels = DATASETS[dataset]
         settings = {
             "version": __version__,
             "dataset": dataset,
             "root": str(root.resolve()),
-            "gt": gt or row.gt_default,
-            "stride": stride,
-            "max_frames": max_frames,
-            "depth_align": depth_align,
-            "max_depth": row.max_depth,
-            "empty": empty,
+            "gt": scores.gt or labels.gt_default,
+            "start": sampling.start,
+            "stride": sampling.stride,
+            "max_frames": sampling.max_frames,
+            "depth_align": scores.depth_align,
+            "max_depth": labels.max_depth,
+            "empty": scores.empty,
             **source.settings,
         }
         store.begin()
-        scoring = Scoring(depth_align, row.max_depth, empty)
+        scoring = Scoring(scores.depth_align, labels.max_depth, scores.empty)
         records = run(found, source, store, settings, scoring, on_stage=report.stage)
         with report.stage("draw"):
             write_report(out, records, store, settings, warnings=source.warnings)
@@ -125,47 +178,3 @@ def evaluate(
 
 def _words(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(word.strip() for word in text.split(",")))
-
-
-def _refuse(options: Mapping[str, object], reason: str) -> None:
-    for name, value in options.items():
-        if value is not None:
-            raise InputError(f"{name} {reason}; give both or neither")
-
-
-def _folder_source(results: Sequence[str], layout: str, quaternion: Literal["xyzw", "wxyz"] | None) -> FolderSource:
-    from vggtjax.evaluation.sources import FolderSource
-
-    folders: dict[str, Path] = {}
-    for text in results:
-        name, equals, folder = text.rpartition("=")
-        path = Path(folder)
-        if not path.is_dir():
-            raise InputError(f"--results has {text}, which names no folder; expected NAME=FOLDER")
-        name = name if equals else path.resolve().name
-        if name in folders:
-            raise InputError(f"--results has two folders named {name}; name them apart: NAME=FOLDER")
-        folders[name] = path
-    return FolderSource(folders, layout, quaternion)
-
-
-def _model_source(
-    report: Report, model: str, methods: str | None, fusion: Path | None, options: dict[str, Any]
-) -> ModelSource:
-    from vggtjax.options import METHODS, find_method
-
-    names = tuple(METHODS) if methods is None else _words(methods)
-    for name in names:
-        find_method(name)
-    with report.stage("load model") as progress:
-        from vggtjax.evaluation.sources import ModelSource
-        from vggtjax.pretrained.load import load_model
-
-        loaded = load_model(model, progress=progress)
-    if fusion is not None:
-        from vggtjax.method.fusion_file import read_fusion, warn_if_fitted_otherwise
-
-        options["fusion"] = read_fusion(fusion, names)
-        about = {name: options[name] for name in ("align_scale", "mask_pairs")}
-        warn_if_fitted_otherwise(fusion, loaded, **about)
-    return ModelSource(loaded, names, **options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,33 +13,34 @@ from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    Progress,
     SpinnerColumn,
     Task,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
 )
+from rich.progress import Progress as Bars
 from rich.table import Table
 from rich.text import Text
 
+from vggtjax.progress import Progress
+
 if TYPE_CHECKING:
+    from vggtjax.checkpoint import Model
     from vggtjax.evaluation.ladder import LadderRow
     from vggtjax.results.reconstruction import Reconstruction
-
-Advance = Callable[[int, int | None], None]
 
 
 class Report:
     """Stages with a clock each, on standard error; tables on standard output.
 
-    A terminal shows the stages live; a log gets a line for each when it is done.
+    A terminal shows the stages live; a log gets a line per stage when it is done.
     """
 
     def __init__(self) -> None:
         self._console = Console(stderr=True)
         self._out = Console()
-        self._progress = Progress(
+        self._progress = Bars(
             SpinnerColumn(finished_text="[green]✓"),
             TextColumn("{task.description:<18}", markup=False),
             BarColumn(bar_width=24),
@@ -57,8 +58,8 @@ class Report:
             yield
 
     @contextmanager
-    def stage(self, name: str) -> Iterator[Advance]:
-        """Time a stage and show it; yields a callable that takes the steps done and their number, if known."""
+    def stage(self, name: str) -> Iterator[Progress]:
+        """Time a stage and show it; yields the callable that shows its progress."""
         task = self._progress.add_task(name, total=None)
         started = time.perf_counter()
         yield lambda done, total: self._progress.update(task, completed=done, total=total)
@@ -68,21 +69,23 @@ class Report:
         if not self._console.is_terminal:
             self.note(f"{name:<18} {seconds:8.2f} s")
 
-    def summary(self, result: Reconstruction, out: Path, *, trained: bool) -> None:
-        """Print what was reconstructed, what it took, and where the files are."""
-        S, H, W = result.depth.shape
-        rows = {
-            "frames": f"{S} of {W} x {H} pixels",
-            "method": f"{result.method}, model {result.model_name}",
-            "dynamic": f"{100 * result.dynamic_share:.1f} % of the pixels",
-            **{name: f"{seconds:.2f} s" for name, seconds in self._seconds.items()},
-            "total": f"{sum(self._seconds.values()):.2f} s",
-            "peak memory": _peak_memory(),
-            "results": f"{out}/",
-            "look at": f"{out / 'preview' / 'sheet.png'}, {out / 'scene.glb'}",
-        }
-        self.table(rows)
-        if not trained:
+    def summary(self, result: Reconstruction, out: Path, model: Model | None = None) -> None:
+        """Print what was reconstructed, by which model, the total time, and where the files are."""
+        frames, height, width = result.depth.shape
+        self.table(
+            {
+                "frames": f"{frames} of {width} x {height} pixels",
+                "method": f"{result.method}, model {result.model_name}",
+                "dynamic": f"{100 * result.dynamic_share:.1f} % of the pixels",
+                "total": f"{sum(self._seconds.values()):.2f} s",
+                "peak memory": _peak_memory(),
+                "results": f"{out}/",
+                "look at": f"{out / 'preview' / 'sheet.png'}, {out / 'scene.glb'}",
+            }
+        )
+        if model is not None and model.note:
+            self.line(f"The model {model.name} is a {model.note}.")
+        if model is not None and not model.trained:
             self.line(
                 "The weights of this model are untrained: this shows that everything runs, not what the scene is. "
                 "For a reconstruction, run: vggtjax reconstruct CLIP --out DIR --model WEIGHTS"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from vggtjax.clips.preprocessing import Layout
+from vggtjax.clips.preprocessing import Fitter
 from vggtjax.errors import ClipError, InputError
 from vggtjax.results.reconstruction import Reconstruction
 
@@ -67,7 +67,7 @@ def placed(
 def _resized_and_cut(width: int, height: int, W: int, H: int) -> Place | None:
     """VGGT's: the width becomes W, the height what goes with it in whole patches, cut to W if it is more."""
     try:
-        fit = Layout("crop", W, 14 if W % 14 == 0 else 1).fit(width, height, "0")
+        fit = Fitter("crop", W, 14 if W % 14 == 0 else 1).fit(width, height, "0")
     except ClipError:
         return None
     return (fit.scale, fit.offset) if fit.frame_size == (W, H) else None

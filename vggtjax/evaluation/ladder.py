@@ -20,8 +20,9 @@ from vggtjax.evaluation.metrics.masks import auc, jaccard
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.method.mask import upsample
 from vggtjax.method.passes import Assembly, Passes, assemble
-from vggtjax.options import LADDER, find_method
-from vggtjax.pipeline.stages import Stage, stages_of
+from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.options import LADDER, Options, find_method
+from vggtjax.pipeline.stages import Stages
 from vggtjax.storage.programs import Program
 
 MaskSource = Literal["mined", "true"]
@@ -129,16 +130,12 @@ def ladder(
     masked = tuple(name for name, row in zip(methods, rows, strict=True) if row.needs_second_pass)
     settings = list(product(masks, mask_pairs, suppress)) if masked else []
 
-    shape = truth.images.shape[1:4]
+    frames, height, width = truth.images.shape[1:4]
 
-    def stages(pairs: int = 0, how: Suppress = "zero") -> dict[str, Stage]:
-        same = {"gram": gram, "align_scale": False, "smooth_frames": 1, "compute_dtype": compute_dtype}
-        table = stages_of(model.config, LADDER[-1], shape, suppress=how, mask_pairs=pairs, **same)
-        return {stage.name: stage for stage in table}
+    def stages(pairs: int = 0, how: Suppress = "zero") -> Stages:
+        options = Options(gram=gram, suppress=how, mask_pairs=pairs, compute_dtype=compute_dtype)  # type: ignore[arg-type]
+        return Stages(model.config, options, frames, (height, width))
 
-    shared = [stages()[name] for name in ("image features", "first pass", "dynamic mask")]
-    if motion is not None:
-        shared[1] = shared[1]._replace(options=shared[1].options | {"motion": motion})
     found: list[LadderRow] = []
     batches = list(_batches(len(truth.images), batch_size))
     done, total = 0, len(batches) * (1 + len(settings))
@@ -151,21 +148,18 @@ def ladder(
 
     for clips, padded in batches:
         images = jax.device_put(truth.images[padded].astype(np.float32, copy=False))
-        arrays = {"params": model.params, "images": images, "frame_count": None}
-        for stage in shared:
-            arrays |= stage.run(arrays)
-        first, saliency = arrays["first"], arrays["saliency"]
-        dynamic = {"mined": arrays["dynamic_mask"], "true": jax.device_put(truth.dynamic_mask[padded])}
-        pixels = np.asarray(_upsample(saliency, size=shape[1:]))
+        batch = ClipBatch(images, stages().image_features(model.params, images))
+        first, saliency = stages().first_pass(model.params, batch, motion=motion)
+        mined = stages().dynamic_mask(saliency, batch.patch_tokens)
+        pixels = np.asarray(_upsample(saliency, size=(height, width)))
         scenes = [_Scene(clip, Truth(*(a[clip] for a in truth)), pixels[i]) for i, clip in enumerate(clips)]
-        passes = Passes(first, None, saliency, dynamic["mined"])
+        passes = Passes(first, None, saliency, mined)
         found += _scored(passes, plain, scenes, _Setting())
         advance()
         for source, pairs, how in settings:
-            mask = dynamic[source]
-            second = stages(pairs, how)["second pass"].run(arrays | {"dynamic_mask": mask})
-            both = passes._replace(**second, dynamic_mask=mask)
-            found += _scored(both, masked, scenes, _Setting(source, pairs, how))
+            mask = mined if source == "mined" else jax.device_put(truth.dynamic_mask[padded])
+            second = stages(pairs, how).second_pass(model.params, batch, mask, first)
+            found += _scored(Passes(first, second, saliency, mask), masked, scenes, _Setting(source, pairs, how))
             advance()
     return sorted(found, key=lambda row: row.clip)
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from vggtjax.clips.preprocessing import Layout, Mode
+from vggtjax.clips.preprocessing import Framing
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.pictures import picture_size
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.foreign_frames import placed
-from vggtjax.options import check_mask_pairs, check_smooth_frames, find_method
+from vggtjax.options import Options
 from vggtjax.progress import OnStage
 from vggtjax.results.foreign import check_quaternion
 from vggtjax.results.reconstruction import Reconstruction
@@ -62,32 +62,24 @@ class ModelSource:
 
     model: Model
     names: Sequence[str]  # of `METHODS`
-    mode: Mode = "crop"
-    size: int | None = None  # side in pixels; the model's own if None
-    mask_pairs: int = 5
-    align_scale: bool = False
-    smooth_frames: int = 1
+    options: Options = Options()  # of all methods; `options.method` is not read
+    framing: Framing = Framing()
     fusion: FusionParams | None = None
-    compute_dtype: str = "float32"
     groups: Sequence[Sequence[str]] = field(init=False)
     _last: tuple[LabelledSequence, Clip] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         from vggtjax.pipeline.several import groups_of_methods
 
-        for name in self.names:
-            find_method(name)
-        if self.size is None:
-            self.size = self.model.config.image_size
-        Layout(self.mode, self.size, self.model.config.patch_size)
-        check_smooth_frames(self.smooth_frames)
-        check_mask_pairs(self.mask_pairs)
-        self.groups = groups_of_methods(self.names)
+        config = self.model.config
+        self._fitter = self.framing.fitter(size=config.image_size, patch=config.patch_size)
+        self.groups = [[each.method for each in group] for group in groups_of_methods(self.names, self.options)]
 
     @property
     def settings(self) -> dict[str, Any]:
         """What the results depend on besides the sequence, as JSON values."""
-        settings = {"model": _identity(self.model), "mode": self.mode, "size": self.size, **self._options}
+        settings = {"model": _identity(self.model), "mode": self._fitter.mode, "size": self._fitter.size}
+        settings |= {name: value for name, value in self.options.to_json().items() if name != "method"}
         if self.fusion is not None:
             from vggtjax.method.fusion_file import fusion_digest
 
@@ -108,26 +100,24 @@ class ModelSource:
         self, names: Sequence[str], sequence: LabelledSequence, on_stage: OnStage
     ) -> Mapping[str, Reconstruction]:
         """Return the results of one group; the groups of a sequence share its clip."""
-        from vggtjax.clips.clip import load_clip
+        from vggtjax.clips.clip import read_clip
+        from vggtjax.clips.sampling import Sampling
+        from vggtjax.clips.sources import open_source
         from vggtjax.pipeline.several import reconstruct_methods
 
         if self._last is None or self._last[0] is not sequence:
             paths = [str(path) for path in sequence.pictures]
-            clip = load_clip(paths, mode=self.mode, size=self.size, patch=self.model.config.patch_size)  # pyright: ignore
-            self._last = sequence, clip
+            self._last = sequence, read_clip(open_source(paths), Sampling(), self._fitter)
         clip = self._last[1]
         return reconstruct_methods(
-            self.model, clip, names, size=self.size, fusion=self.fusion, on_stage=on_stage, **self._options
+            self.model,
+            clip,
+            names,
+            options=self.options,
+            size=self._fitter.size,
+            fusion=self.fusion,
+            on_stage=on_stage,
         )
-
-    @property
-    def _options(self) -> dict[str, Any]:
-        return {
-            "mask_pairs": self.mask_pairs,
-            "align_scale": self.align_scale,
-            "smooth_frames": self.smooth_frames,
-            "compute_dtype": self.compute_dtype,
-        }
 
 
 @dataclass(frozen=True)

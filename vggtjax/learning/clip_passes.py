@@ -180,11 +180,12 @@ def dataset_passes(
 
     Raises InputError where no sequence has true depth.
     """
+    from vggtjax.clips.sampling import Sampling
     from vggtjax.evaluation.datasets import DATASETS, find_sequences
     from vggtjax.evaluation.protocol import TruthAtPixels
 
     side = model.config.image_size if size is None else size
-    openers, used = find_sequences(dataset, root, max_frames=max_frames), 0
+    openers, used = find_sequences(dataset, root, sampling=Sampling(max_frames=max_frames)), 0
     max_depth = DATASETS[dataset].max_depth
     key = {"model": model.identity.sha256, "dataset": [dataset, max_depth], "size": side, "options": options}
 

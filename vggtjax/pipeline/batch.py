@@ -1,35 +1,41 @@
-"""Many clips, one after the other: while one is computed the next is loaded and the one before is written."""
+"""Many clips, each into a folder of its own; an interrupted batch resumes."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Unpack
 
 from vggtjax.checkpoint import Model
-from vggtjax.clips.clip import Clip, load_clip
-from vggtjax.clips.preprocessing import Layout, Mode
+from vggtjax.clips.clip import Clip, read_clip
+from vggtjax.clips.preprocessing import Fitter, Framing, FramingChanges
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, OutputError, VggtjaxError
-from vggtjax.method.fusion_file import fusion_digest
-from vggtjax.options import find_method
+from vggtjax.method.fusion_file import check_fuses, fusion_digest
+from vggtjax.method.fusion_rule import FusionParams
+from vggtjax.options import OptionChanges, Options
 from vggtjax.pipeline.run import reconstruct
+from vggtjax.progress import Progress
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
-from vggtjax.storage.writing import writing
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.saving import Saving
+from vggtjax.storage.writing import locked_folder, writing
 
 SETTINGS_NAME = "batch.json"
 _AHEAD = 1  # clips that are loaded before they are needed, and results that wait to be written
 
 
-class Outcome(NamedTuple):
-    """What became of a clip."""
+class ClipOutcome(NamedTuple):
+    """The outcome of one clip of a batch."""
 
     name: str
     status: Literal["done", "kept", "failed"]  # kept: an earlier run has finished it
@@ -37,75 +43,146 @@ class Outcome(NamedTuple):
     frames: int = 0
 
 
+class ManyChanges(FramingChanges, OptionChanges, total=False):
+    """Keywords of `reconstruct_many` that change fields of its `framing` and `options`."""
+
+
 def reconstruct_many(
     model: Model,
     sources: Mapping[str, ClipSource],
     out: str | Path,
     *,
-    mode: Mode = "crop",
-    size: int | None = None,
-    sampling: Mapping[str, Any] | None = None,
-    options: Mapping[str, Any] | None = None,
-    saving: Mapping[str, Any] | None = None,
-    progress: Callable[[int, int], object] | None = None,
-) -> Generator[Outcome]:
-    """Reconstruct clips, each into a folder of its own, and yield what became of each as it is finished.
+    options: Options | Mapping[str, Any] | None = None,
+    framing: Framing | None = None,
+    sampling: Sampling | Mapping[str, Any] | None = None,
+    saving: Saving | Mapping[str, Any] | None = None,
+    fusion: FusionParams | None = None,
+    pad_frames: bool = False,
+    progress: Progress | None = None,
+    **changes: Unpack[ManyChanges],
+) -> Generator[ClipOutcome]:
+    """Reconstruct clips, each into a folder of its own, and yield the outcome of each as it is finished.
 
-    Clips of one shape share a compilation. A clip that fails does not stop the others. Run again with the same
-    settings, and what is finished is kept: an interrupted run goes on. A clip's folder appears whole or not at all.
+    Clips of one shape share compiled programs. A clip that fails does not stop the others. A later run with the same
+    settings keeps finished clips, so an interrupted run resumes. A clip's folder appears whole or not at all.
 
     Args:
         model: what `load_model` returned.
         sources: clips by name, as for `load_clip`; the names become folders.
-        out: folder for theirs.
-        mode, size: as for `load_clip`; the model's own size if None.
-        sampling: `fps`, `stride`, `start`, `max_frames` of `load_clip`.
-        options: keywords of `reconstruct`, such as `method`.
-        saving: keywords of `Reconstruction.save`, but for pictures, which are the clips' own where it wants them.
-        progress: called before the first clip and after each is computed, with the frames done and the frames of all
-            clips but those kept or failed; a clip whose length only reading tells, such as a video, counts until then
-            as the mean of the others.
+        out: the folder of these folders.
+        options, fusion, pad_frames: as for `reconstruct`; a mapping of its keywords serves as options, too.
+        framing, sampling: how frames are fitted and which are taken; the keywords of `load_clip` serve, too.
+        saving: how results are written; the keywords of `Reconstruction.save` serve, too.
+        progress: called before the first clip and after each computed clip, with the frames done and the frames of all
+            clips but kept and failed ones; a clip of unknown length, such as a video, counts as the mean of the others.
+        changes: fields of `framing` and `options` by name, such as `mode="pad"`.
 
     Raises:
-        InputError: names that are no plain file names, a size, sampling or method that is none, or a folder with
-            results of other settings.
-        OutputError: the folder cannot be written.
+        InputError: names that are not plain file names, an invalid option, or a folder with results of other settings.
+        OutputError: the folder cannot be written, or another run is writing it.
     """
+    run = _Run.of(model, options, framing, sampling, saving, fusion, pad_frames, changes)
     out = Path(out)
     for name in sources:
         if name in ("", ".", "..") or Path(name).name != name or not name.isprintable():
-            raise InputError(f"a clip is named {name!r}; expected a plain name, that of its folder")
-    size = model.config.image_size if size is None else size
-    Layout(mode, size, model.config.patch_size)  # what is wrong for all clips is said once, and before any
-    sampling, options, saving = dict(sampling or {}), dict(options or {}), dict(saving or {})
-    frames_taken = Sampling(**sampling)
-    find_method(options.get("method", "4dvggt-d"))
-    settings = {"model": model.name, "mode": mode, "size": size, **sampling, **options, **saving}
-    if options.get("fusion") is not None:
-        settings["fusion"] = fusion_digest(options["fusion"])
-    _settle(out, settings)
+            raise InputError(f"a clip is named {name!r}; expected a plain name, which becomes its folder")
+    with locked_folder(out, "a batch"):
+        _settle(out, run.settings)
+        kept = {name for name in sources if is_result(out / name / ARCHIVE_NAME)}
+        yield from (ClipOutcome(name, "kept") for name in sources if name in kept)
+        names = [name for name in sources if name not in kept]
+        work = _Work({name: _length(sources[name], run.sampling) for name in names}, progress or (lambda *_: None))
+        yield from _reconstruct_all(run, {name: sources[name] for name in names}, out, work)
 
-    def load(name: str) -> Clip:
-        return load_clip(sources[name], mode=mode, size=size, patch=model.config.patch_size, **sampling)
 
-    def write(name: str, clip: Clip, result: Any) -> Outcome:
-        pictures = clip.pictures() if saving.get("resolution") == "original" else None
-        with _arriving(out / name) as folder:
-            result.save(folder, pictures=pictures, **saving)
-        return Outcome(name, "done", frames=len(clip))
+@dataclass(frozen=True)
+class _Run:
+    """What all clips of a batch have in common."""
 
-    kept = {name for name in sources if is_result(out / name / ARCHIVE_NAME)}
-    names = [name for name in sources if name not in kept]
-    yield from (Outcome(name, "kept") for name in sources if name in kept)
-    work = None if progress is None else _Work({name: _length(sources[name], frames_taken) for name in names}, progress)
+    model: Model
+    options: Options
+    fitter: Fitter
+    sampling: Sampling
+    saving: Saving
+    fusion: FusionParams | None
+    pad_frames: bool
+
+    @classmethod
+    def of(
+        cls,
+        model: Model,
+        options: Any,
+        framing: Any,
+        sampling: Any,
+        saving: Any,
+        fusion: Any,
+        pad_frames: bool,
+        changes: Mapping[str, Any],
+    ) -> _Run:
+        """Return a run of the arguments of `reconstruct_many`; what is wrong for all clips is raised once, here."""
+        words = dict(changes)
+        if isinstance(options, Mapping):
+            words, options = words | dict(options), None
+            fusion, pad_frames = words.pop("fusion", fusion), words.pop("pad_frames", pad_frames)
+        of_framing = {name: words.pop(name) for name in FramingChanges.__annotations__ if name in words}
+        framing = dataclasses.replace(framing or Framing(), **of_framing)
+        options = (options or Options()).changed(**words)
+        if fusion is not None:
+            check_fuses(options.method)
+        return cls(
+            model=model,
+            options=options,
+            fitter=framing.fitter(size=model.config.image_size, patch=model.config.patch_size),
+            sampling=Sampling(**sampling) if isinstance(sampling, Mapping) else sampling or Sampling(),
+            saving=Saving().changed(**saving) if isinstance(saving, Mapping) else saving or Saving(),
+            fusion=fusion,
+            pad_frames=pad_frames,
+        )
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What decides the results, as JSON values."""
+        return {
+            "model": self.model.identity.to_json(),
+            "mode": self.fitter.mode,
+            "size": self.fitter.size,
+            **dataclasses.asdict(self.sampling),
+            **self.options.to_json(),
+            **dataclasses.asdict(self.saving),
+            "fusion": fusion_digest(self.fusion),
+            "pad_frames": self.pad_frames,
+        }
+
+    def load(self, source: ClipSource) -> Clip:
+        return read_clip(open_source(source), self.sampling, self.fitter)
+
+    def reconstruct(self, clip: Clip) -> Reconstruction:
+        return reconstruct(
+            self.model,
+            clip,
+            options=self.options,
+            size=self.fitter.size,
+            fusion=self.fusion,
+            pad_frames=self.pad_frames,
+        )
+
+    def write(self, name: str, clip: Clip, result: Reconstruction, folder: Path) -> ClipOutcome:
+        pictures = clip.pictures() if self.saving.resolution == "original" else None
+        with _arriving(folder) as arriving:
+            result.save(arriving, saving=self.saving, pictures=pictures)
+        return ClipOutcome(name, "done", frames=len(clip))
+
+
+def _reconstruct_all(run: _Run, sources: Mapping[str, ClipSource], out: Path, work: _Work) -> Generator[ClipOutcome]:
+    """Yield the outcomes of clips: while one is computed, the next is loaded and the previous one written."""
     with ThreadPoolExecutor(1) as loader, ThreadPoolExecutor(1) as writer:
         loading: deque[tuple[str, Future[Clip]]] = deque()
-        writes: deque[tuple[str, Future[Outcome]]] = deque()
-        waiting = iter(names)
+        writes: deque[tuple[str, Future[ClipOutcome]]] = deque()
+        waiting = iter(sources)
 
         def fill() -> None:
             while len(loading) <= _AHEAD and (name := next(waiting, None)) is not None:
-                loading.append((name, loader.submit(load, name)))
+                loading.append((name, loader.submit(run.load, sources[name])))
 
         try:
             fill()
@@ -114,16 +191,14 @@ def reconstruct_many(
                 fill()
                 try:
                     clip = loaded.result()
-                    result = reconstruct(model, clip, size=size, **options)
+                    result = run.reconstruct(clip)
                 except (VggtjaxError, MemoryError) as error:
-                    if work is not None:
-                        work.finish(name, 0)
-                    yield Outcome(name, "failed", str(error) or "out of memory")
+                    work.finish(name, 0)
+                    yield _failed(name, error)
                     continue
-                if work is not None:
-                    work.finish(name, len(clip))
-                writes.append((name, writer.submit(write, name, clip, result)))
-                del clip, result  # the writer has them
+                work.finish(name, len(clip))
+                writes.append((name, writer.submit(run.write, name, clip, result, out / name)))
+                del clip, result  # the writer holds them
                 while len(writes) > _AHEAD:
                     yield _written(*writes.popleft())
             while writes:
@@ -134,17 +209,21 @@ def reconstruct_many(
             raise
 
 
-class _Work:
-    """Frames done and to do; a clip of unknown length counts as the mean of the others, or 1 where none is known."""
+def _failed(name: str, error: BaseException) -> ClipOutcome:
+    return ClipOutcome(name, "failed", str(error) or "out of memory")
 
-    def __init__(self, lengths: Mapping[str, int | None], progress: Callable[[int, int], object]) -> None:
+
+class _Work:
+    """Frames done and to do; a clip of unknown length counts as the mean of the others, or as 1 if none is known."""
+
+    def __init__(self, lengths: Mapping[str, int | None], progress: Progress) -> None:
         self._waiting = dict(lengths)
         self._done: list[int] = []
         self._progress = progress
         self._tell()
 
     def finish(self, name: str, frames: int) -> None:
-        """A clip is computed, or has failed with 0 frames."""
+        """Count a clip as done; a failed clip has 0 frames."""
         del self._waiting[name]
         if frames:
             self._done.append(frames)
@@ -158,7 +237,7 @@ class _Work:
 
 
 def _length(source: ClipSource, sampling: Sampling) -> int | None:
-    """Return how many frames a clip has: 0 where it will fail, None where only reading tells."""
+    """Return the number of frames of a clip: 0 if the clip will fail, None if only reading it can tell."""
     try:
         return open_source(source).total(sampling)
     except VggtjaxError:
@@ -167,9 +246,9 @@ def _length(source: ClipSource, sampling: Sampling) -> int | None:
 
 @contextmanager
 def _arriving(folder: Path) -> Iterator[Path]:
-    """Yield a new folder that becomes `folder` by one rename at the end; `folder` itself where that is there already.
+    """Yield a new folder that is renamed to `folder` at the end; `folder` itself if it exists.
 
-    What a killed run has left of the new folder goes first. Raises OutputError where it cannot be renamed.
+    The remains of a killed run are removed first. Raises OutputError if the new folder cannot be renamed.
     """
     if os.path.lexists(folder):
         yield folder
@@ -181,25 +260,25 @@ def _arriving(folder: Path) -> Iterator[Path]:
         try:
             part.rename(folder)
         except OSError as error:
-            raise OutputError(f"cannot write {folder}: {error.strerror}; is another run writing it?") from error
+            raise OutputError(f"cannot write {folder}: {error.strerror}") from error
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _written(name: str, write: Future[Outcome]) -> Outcome:
+def _written(name: str, write: Future[ClipOutcome]) -> ClipOutcome:
     try:
         return write.result()
     except (VggtjaxError, MemoryError) as error:
-        return Outcome(name, "failed", str(error) or "out of memory")
+        return _failed(name, error)
 
 
 def _settle(out: Path, settings: Mapping[str, Any]) -> None:
-    """Write the settings of a batch into its folder, or make sure that those there are the same."""
+    """Write the settings of a batch into its folder. Raises InputError if the folder has other settings."""
     text = json.dumps(settings, indent=2, sort_keys=True, default=str) + "\n"
     path = out / SETTINGS_NAME
     if path.is_file():
         if path.read_text(encoding="utf-8") != text:
-            raise InputError(f"{path} has other settings than this run; choose another folder, or move it away")
+            raise InputError(f"{path} has other settings than this run; choose another folder, or move the file away")
         return
     with writing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

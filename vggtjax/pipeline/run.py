@@ -1,12 +1,14 @@
-"""A clip and a model -> a Reconstruction: the stages one by one, or all of them under a single jit."""
+"""A clip and a model -> a Reconstruction: stage by stage, or the whole batch under a single jit."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Any, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +16,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.checkpoint import Model
-from vggtjax.clips.clip import Clip
+from vggtjax.clips.clip import Clip, load_clip
+from vggtjax.clips.masks import masks_at_clip_pixels
 from vggtjax.clips.queries import Queries
-from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
+from vggtjax.clips.sources import ClipSource
+from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.fusion_rule import FusionParams
@@ -24,33 +28,23 @@ from vggtjax.method.passes import Assembly, Passes, assemble, run_passes
 from vggtjax.method.refinement import refine_masks
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
-from vggtjax.options import find_method
-from vggtjax.pipeline.frame_padding import padded_frames
-from vggtjax.pipeline.stages import StageMemory, compile_stages, stages_of, with_masks, with_tracks
+from vggtjax.network.track_head import Tracks
+from vggtjax.options import OptionChanges, Options
+from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, padded_frames, run_stages
+from vggtjax.progress import OnStage, Progress
 from vggtjax.results.reconstruction import Reconstruction
 
-OnStage = Callable[[str], AbstractContextManager[Any]]
+logger = logging.getLogger(__name__)
 
 
-@partial(
-    jax.jit,
-    static_argnames=(
-        "config", "method", "gram", "suppress", "mask_pairs", "motion", "align_scale", "smooth_frames", "compute_dtype",
-    ),
-)  # fmt: skip
 def infer(
     params: Params,
     images: Float[Array, "B S H W 3"],
     config: VGGTConfig,
     *,
-    method: str = "4dvggt-d",
-    gram: Gram | None = None,
-    suppress: Suppress | None = None,
-    mask_pairs: int = 5,
+    options: Options = Options(),
     motion: MotionConfig | None = None,
-    align_scale: bool = False,
-    smooth_frames: int = 1,
-    compute_dtype: str = "float32",
+    **changes: Unpack[OptionChanges],
 ) -> tuple[Assembly, Passes]:
     """Run a method on a batch of clips as one compiled function.
 
@@ -58,177 +52,178 @@ def infer(
         params: the model's parameter tree.
         images: RGB in [0, 1]; H and W are multiples of the patch size.
         config: the model's configuration.
-        method: a name of `METHODS`.
-        gram, suppress: override the method's own.
-        mask_pairs, motion, compute_dtype: as for `run_passes`.
-        align_scale: as for `assemble`.
-        smooth_frames: as for `mine_mask`.
+        options: how the clips are reconstructed; masks are not refined.
+        motion: the table of motion cues; the configuration's own if None.
+        changes: fields of `options` by name, such as `method="vggt4d"`.
 
     Returns:
-        The method's depth, confidence and cameras, and the passes that they were made of.
+        The method's depth, confidence and cameras, and the passes they were made of.
     """
-    row = find_method(method)
+    options = options.changed(**changes)
+    return _infer(params, images, config, options, motion)
+
+
+@partial(jax.jit, static_argnames=("config", "options", "motion"))
+def _infer(
+    params: Params, images: Array, config: VGGTConfig, options: Options, motion: MotionConfig | None
+) -> tuple[Assembly, Passes]:
+    method = options.row
     passes = run_passes(
         params,
         images,
         config,
-        gram=gram or row.gram,
-        suppress=suppress or row.suppress,
-        mask_pairs=mask_pairs,
+        gram=method.gram,
+        suppress=method.suppress,
+        mask_pairs=options.mask_pairs,
         motion=motion,
-        compute_dtype=compute_dtype,
-        clusters=row.clusters,
-        threshold=row.threshold,
-        smooth_frames=smooth_frames,
-        second=row.second_outputs(align_scale) if row.needs_second_pass else (),
+        compute_dtype=options.compute_dtype,
+        clusters=method.clusters,
+        threshold=method.threshold,
+        smooth_frames=options.smooth_frames,
+        second=method.second_outputs(options.align_scale) if method.needs_second_pass else (),
     )
-    return assemble(passes, method, align_scale=align_scale), passes
+    return assemble(passes, options.method, align_scale=options.align_scale), passes
 
 
 def reconstruct(
     model: Model,
-    clip: Clip,
+    clip: Clip | ClipSource,
     *,
-    method: str = "4dvggt-d",
+    options: Options = Options(),
     size: int | None = None,
-    gram: Gram | None = None,
-    suppress: Suppress | None = None,
-    mask_pairs: int = 5,
-    align_scale: bool = False,
-    smooth_frames: int = 1,
-    masks: Bool[np.ndarray, "S H W"] | None = None,
-    refine_mask: bool | None = None,
+    masks: Bool[np.ndarray, "S h w"] | str | Path | None = None,
     tracks: Queries | None = None,
     fusion: FusionParams | None = None,
-    compute_dtype: str = "float32",
     pad_frames: bool = False,
     keep_passes: bool = False,
     on_stage: OnStage | None = None,
+    **changes: Unpack[OptionChanges],
 ) -> Reconstruction:
     """Reconstruct a clip: cameras, depth, its confidence, and what moves.
 
     Args:
         model: what `load_model` returned.
-        clip: what `load_clip` returned. It is refitted from its source where its size or patch is not the model's.
-        method: a name of `METHODS`.
+        clip: what `load_clip` returned, or a source that it loads, such as "clip.mp4". A clip of another size or patch
+            size than the model's is read from its source again.
+        options: the method and its settings.
         size: side in pixels to run at, a multiple of the patch size; the model's own if None.
-        gram, suppress: override the method's own similarity and suppression.
-        mask_pairs: number of pairs in which the keys of dynamic tokens are suppressed (L_mask of the paper).
-        align_scale: bring the second pass to the first one's scale before it is used (not in the paper).
-        smooth_frames: odd number of frames that the saliency is averaged over before it is cut (not in the papers).
-        masks: what moves, in place of what is mined; without a moving pixel the second pass is the first.
-        refine_mask: take out of the mask what agrees with other frames, by the method's depth and cameras (VGGT4D); the
-            method's own choice if None.
-        tracks: points to follow through the clip, in pixels of its frames as they are given. Those of the first frame
-            come with the first pass; every other frame that has some costs a pass of its own, over the clip rolled so
-            that this frame comes first.
-        fusion: how the passes are fused, as `load_fusion` returns it; the paper's rule if None. The confidence is then
-            the fused precision.
-        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
-        pad_frames: pad the clip to one of a few lengths (`padded_frames`), so that clips of similar length share a
-            compilation; what is returned is the same to rounding. Not for clips with tracks.
+        masks: what moves, instead of the mined masks: boolean at the size of the clip's frames or of the source's
+            pictures, or a folder of pictures. If no pixel moves, the second pass is not run.
+        tracks: points to follow, in pixels of the clip's frames. Points of the first frame are tracked by the first
+            pass; each other frame with points costs a pass over the clip, rolled so that this frame comes first.
+        fusion: how the two passes are fused, as `load_fusion` returns it; the paper's rule if None. The confidence is
+            then the fused precision.
+        pad_frames: pad the clip to one of a few lengths (`padded_frames`), so that clips of similar length share
+            compiled programs; the result is the same to rounding. Not for clips with tracks.
         keep_passes: keep both passes on the result, as `.passes`.
-        on_stage: called with the name of each stage, returns a context in which it runs; for progress and timing.
+        on_stage: called with the name of each stage, returns a context in which the stage runs.
+        changes: fields of `options` by name, such as `method="vggt4d"`.
 
     Raises:
-        InputError: an unknown method, masks of another shape than the frames, or a size that is not a multiple of the
-            patch size.
-        DeviceMemoryError: the clip does not fit.
+        InputError: an invalid option, masks of another size, or a size that is not a multiple of the patch size.
+        ClipError: the source of the clip cannot be read.
+        DeviceMemoryError: the clip does not fit in the memory of the device.
     """
-    row = find_method(method)
-    config = model.config
+    options = options.changed(**changes).resolved()
     on_stage = on_stage or (lambda name: nullcontext())
-    size = config.image_size if size is None else size
-    refine_mask = row.refine if refine_mask is None else refine_mask
-    if tracks is not None:
-        tracks.check(*clip.images.shape[:3])
-    if (clip.size, clip.patch) != (size, config.patch_size):
-        with on_stage("fit clip to model"):
-            given, clip = clip, clip.refit(size, config.patch_size)
-            tracks = None if tracks is None else tracks.moved(given, clip)
-    settings = {
-        "gram": gram or row.gram,
-        "suppress": suppress or row.suppress,
-        "mask_pairs": mask_pairs,
-        "align_scale": align_scale,
-        "smooth_frames": smooth_frames,
-        "compute_dtype": compute_dtype,
-    }
     if fusion is not None:
-        check_fuses(method)
-    stages = stages_of(config, method, clip.images.shape[:3], all_outputs=keep_passes, **settings)
-    S = len(clip)
-    room = padded_frames(S, config.motion.offsets) - S if pad_frames and tracks is None else 0
+        check_fuses(options.method)
+    if masks is not None and options.smooth_frames != 1:
+        raise InputError(f"smooth_frames is {options.smooth_frames}, but only mined masks are smoothed, not given ones")
+    clip, tracks = _fitted(model, clip, size, tracks, on_stage)
+    given = None if masks is None else masks_at_clip_pixels(masks, clip)
+    stages = _stages(model, options, clip.images.shape[:3])
+    padding = padded_frames(len(clip), model.config.motion.offsets) - len(clip) if pad_frames and tracks is None else 0
 
     def padded(frames: np.ndarray) -> Array:
-        frames = np.pad(frames, ((0, room), *((0, 0),) * (frames.ndim - 1))) if room else frames
+        frames = np.pad(frames, ((0, padding), *((0, 0),) * (frames.ndim - 1))) if padding else frames
         return jax.device_put(frames[None])
 
-    count = jax.device_put(np.array([S], np.int32)) if room else None
-    arrays: dict[str, Any] = {"params": model.params, "images": padded(clip.images)}
-    arrays |= {"frame_count": count, "second": None, "fusion": fusion}
-    if masks is not None and smooth_frames != 1:
-        raise InputError(f"smooth_frames is {smooth_frames} and masks are given; smoothing is for masks that are mined")
-    if masks is not None:
-        arrays["dynamic_mask"] = padded(_checked(masks, clip))
-        stages = with_masks(stages, bool(masks.any()))
-    if tracks is not None:
-        stages = with_tracks(stages, tracks, arrays)
+    inputs = ClipInputs(
+        images=padded(clip.images),
+        frame_count=jax.device_put(np.array([len(clip)], np.int32)) if padding else None,
+        dynamic_mask=None if given is None else padded(given),
+        moves=given is None or bool(given.any()),
+        query_points={} if tracks is None else _points_by_frame(tracks),
+    )
+    run = partial(run_stages, params=model.params, inputs=inputs, fusion=fusion, all_outputs=keep_passes)
     with _memory_errors(*clip.images.shape[:3]):
         with on_stage("compile"):
-            compile_stages(stages, arrays)
-        for stage in stages:
-            with on_stage(stage.name):
-                arrays |= jax.block_until_ready(stage.run(arrays))
-    passes = Passes(arrays["first"], arrays["second"], arrays["saliency"], arrays["dynamic_mask"])
-    passes = jax.tree.map(lambda x: np.asarray(x)[:, :S], passes) if room else passes
-    followed = {} if tracks is None else _joined_tracks(tracks, arrays)
+            run(dataclasses.replace(stages, run=Compile()))
+        passes, assembly, by_frame = run(dataclasses.replace(stages, run=Execute(on_stage)))
+    passes = jax.tree.map(lambda x: np.asarray(x)[:, : len(clip)], passes)
     result = Reconstruction(
-        **assembled_fields(arrays["assembly"], getattr(passes, row.intrinsics)),
-        saliency=np.asarray(passes.saliency)[0],
-        dynamic_mask=np.asarray(passes.dynamic_mask)[0],
+        **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
+        saliency=passes.saliency[0],
+        dynamic_mask=passes.dynamic_mask[0],
         images=np.round(clip.images * 255).astype(np.uint8),
         frame_names=tuple(clip.frame_names),
         timestamps=clip.timestamps,
-        method=method,
+        method=options.method,
         model_name=model.name,
-        settings=settings
-        | {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
-        | {"masks": "mined" if masks is None else "given", "refine_mask": refine_mask}
-        | ({} if fusion is None else {"fusion": fusion_digest(fusion)}),
+        settings=_settings(model, clip, options, masks is not None, fusion),
         source_size=clip.source_size,
         source_scale=clip.source_scale,
         source_offset=clip.source_offset,
         valid_box=clip.valid_box,
-        **followed,
-        passes=jax.tree.map(np.asarray, passes) if keep_passes else None,
+        **({} if tracks is None else _track_fields(tracks, by_frame, len(clip))),
+        passes=passes if keep_passes else None,
     )
-    if refine_mask:
+    if options.refine_mask:
         with on_stage("refine mask") as progress:
             result = refined(result, progress)
     return result
 
 
-@contextmanager
-def _memory_errors(frames: int, height: int, width: int) -> Iterator[None]:
-    """Say in one sentence that a clip does not fit."""
-    try:
-        yield
-    except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        raise DeviceMemoryError(
-            f"{frames} frames of {width} x {height} pixels do not fit in the memory of the device; take fewer frames "
-            "(max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
-        ) from error
+def compile_ahead(
+    model: Model,
+    frames: int,
+    height: int,
+    width: int,
+    *,
+    options: Options = Options(),
+    pad_frames: bool = False,
+    keep_passes: bool = False,
+    **changes: Unpack[OptionChanges],
+) -> dict[str, StageMemory]:
+    """Compile ahead of time what `reconstruct` runs with these options for a clip of this shape.
+
+    Later calls for this shape in this process start at once, and so do those of other processes where compilations are
+    kept (as the command line does).
+
+    Returns:
+        The memory of each stage beside its inputs, by XLA's own analysis: `.temporary` and `.output` bytes.
+
+    Raises:
+        InputError: an invalid option, no frame, or sides that are not multiples of the model's patch size.
+        DeviceMemoryError: the clip does not fit in the memory of the device.
+    """
+    patch = model.config.patch_size
+    if frames < 1 or min(height, width) < patch or height % patch or width % patch:
+        raise InputError(
+            f"{frames} frames of {width} x {height} pixels; expected at least one frame, with sides that are multiples "
+            f"of the patch size {patch}"
+        )
+    options = options.changed(**changes)
+    length = padded_frames(frames, model.config.motion.offsets) if pad_frames else frames
+    inputs = ClipInputs(
+        images=jax.ShapeDtypeStruct((1, length, height, width, 3), jnp.float32),  # type: ignore[arg-type]
+        frame_count=None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32),  # type: ignore[arg-type]
+    )
+    compiler = Compile()
+    stages = dataclasses.replace(_stages(model, options, (frames, height, width)), run=compiler)
+    with _memory_errors(frames, height, width):
+        run_stages(stages, model.params, inputs, all_outputs=keep_passes)
+    return compiler.memory
 
 
 def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, np.ndarray]:
-    """Return a method's depth, confidence and cameras of the first clip; its intrinsics are of the pass `source`."""
+    """Return a method's depth, confidence and cameras of the first clip; the pass `source` gave the intrinsics."""
     depth, confidence, camera_from_world, intrinsics = (np.array(x)[0] for x in jax.tree.leaves(assembly))
-    fields = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
+    fields_of_view = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
     focal = intrinsics[:, [0, 1], [0, 1]]
-    intrinsics[:, [0, 1], [0, 1]] = np.where(fields > np.pi, -np.abs(focal), focal)  # beyond 2 pi the tangent repeats
+    # Beyond 2 pi the tangent repeats: such cameras get a negative focal length, which Reconstruction clamps.
+    intrinsics[:, [0, 1], [0, 1]] = np.where(fields_of_view > np.pi, -np.abs(focal), focal)
     return {
         "depth": depth,
         "depth_confidence": confidence,
@@ -237,30 +232,8 @@ def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, np.nd
     }
 
 
-def _joined_tracks(queries: Queries, arrays: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Return the tracks of all query frames in the order of the queries, as fields of a Reconstruction."""
-    S, Q = arrays["images"].shape[1], len(queries.frames)
-    fields = {
-        "track_positions": np.zeros((S, Q, 2), np.float32),
-        "track_visibility": np.zeros((S, Q), np.float32),
-        "track_confidence": np.zeros((S, Q), np.float32),
-    }
-    for frame in np.unique(queries.frames).tolist():
-        first = arrays["first"]
-        made = arrays[f"tracks {frame}"] if frame else (first.tracks, first.track_visibility, first.track_confidence)
-        for field, value in zip(fields.values(), made, strict=True):
-            field[:, queries.frames == frame] = value[0]
-    return fields | {"track_frames": queries.frames}
-
-
-def _checked(masks: Bool[np.ndarray, "S H W"], clip: Clip) -> Bool[np.ndarray, "S H W"]:
-    if masks.shape != clip.images.shape[:3] or masks.dtype != bool:
-        raise InputError(f"masks are {masks.dtype} {masks.shape}; expected bool {clip.images.shape[:3]}, as the frames")
-    return masks
-
-
-def refined(result: Reconstruction, progress: Callable[[int, int], object] | None) -> Reconstruction:
-    """Return a result whose mask lacks what agrees with other frames, by its own depth and cameras."""
+def refined(result: Reconstruction, progress: Progress | None) -> Reconstruction:
+    """Return the result without the mask's pixels that agree with other frames, by the result's depth and cameras."""
     mask = refine_masks(
         result.images / np.float32(255),
         result.depth,
@@ -273,47 +246,73 @@ def refined(result: Reconstruction, progress: Callable[[int, int], object] | Non
     return dataclasses.replace(result, dynamic_mask=mask)
 
 
-def compile_ahead(
-    model: Model,
-    frames: int,
-    height: int,
-    width: int,
-    *,
-    method: str = "4dvggt-d",
-    gram: Gram | None = None,
-    suppress: Suppress | None = None,
-    mask_pairs: int = 5,
-    align_scale: bool = False,
-    smooth_frames: int = 1,
-    compute_dtype: str = "float32",
-    pad_frames: bool = False,
-    keep_passes: bool = False,
-) -> dict[str, StageMemory]:
-    """Compile what `reconstruct` runs with these options for clips of this shape.
+def _fitted(
+    model: Model, clip: Clip | ClipSource, size: int | None, tracks: Queries | None, on_stage: OnStage
+) -> tuple[Clip, Queries | None]:
+    """Return the clip at the model's size and patch size, and the points to track in its pixels."""
+    config = model.config
+    size = config.image_size if size is None else size
+    if not isinstance(clip, Clip):
+        if tracks is not None:
+            raise InputError("tracks are points in pixels of a loaded clip; load the clip with load_clip first")
+        with on_stage("load clip") as progress:
+            return load_clip(clip, size=size, patch=config.patch_size, progress=progress), None
+    if tracks is not None:
+        tracks.check(*clip.images.shape[:3])
+    if (clip.size, clip.patch) != (size, config.patch_size):
+        with on_stage("fit clip to model"):
+            loaded, clip = clip, clip.refit(size, config.patch_size)
+            tracks = None if tracks is None else tracks.moved(loaded, clip)
+    return clip, tracks
 
-    Raises InputError for a shape that is none, or not of the model's patches.
-    """
-    row, patch = find_method(method), model.config.patch_size
-    if frames < 1 or min(height, width) < patch or height % patch or width % patch:
-        raise InputError(
-            f"{frames} frames of {width} x {height} pixels; expected at least one, with sides that are multiples of "
-            f"the patch size {patch}"
-        )
-    stages = stages_of(
-        model.config,
-        method,
-        (frames, height, width),
-        gram=gram or row.gram,
-        suppress=suppress or row.suppress,
-        mask_pairs=mask_pairs,
-        align_scale=align_scale,
-        smooth_frames=smooth_frames,
-        compute_dtype=compute_dtype,
-        all_outputs=keep_passes,
-    )
-    length = padded_frames(frames, model.config.motion.offsets) if pad_frames else frames
-    images = jax.ShapeDtypeStruct((1, length, height, width, 3), jnp.float32)
-    count = None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32)
-    arrays = {"params": model.params, "images": images, "frame_count": count, "second": None, "fusion": None}
-    with _memory_errors(frames, height, width):
-        return compile_stages(stages, arrays)
+
+def _stages(model: Model, options: Options, shape: tuple[int, ...]) -> Stages:
+    frames, height, width = shape
+    return Stages(model.config, options, frames, (height, width))
+
+
+def _settings(
+    model: Model, clip: Clip, options: Options, masks_given: bool, fusion: FusionParams | None
+) -> dict[str, Any]:
+    """Return what decided a result beside the method, as JSON values."""
+    settings = {name: value for name, value in options.to_json().items() if name not in ("method", "refine_mask")}
+    settings |= {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
+    settings |= {"masks": "given" if masks_given else "mined", "refine_mask": options.refine_mask}
+    settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
+    return settings | ({"model_note": model.note} if model.note else {})
+
+
+def _points_by_frame(queries: Queries) -> dict[int, Float[Array, "1 Q 2"]]:
+    """Return the points to track by the frame in which they are given."""
+    return {
+        frame: jnp.asarray(queries.points[queries.frames == frame])[None]
+        for frame in np.unique(queries.frames).tolist()
+    }
+
+
+def _track_fields(queries: Queries, by_frame: dict[int, Tracks], frames: int) -> dict[str, np.ndarray]:
+    """Return the tracks of all query frames in the order of the queries, as fields of a Reconstruction."""
+    Q = len(queries.frames)
+    fields = {
+        "track_positions": np.zeros((frames, Q, 2), np.float32),
+        "track_visibility": np.zeros((frames, Q), np.float32),
+        "track_confidence": np.zeros((frames, Q), np.float32),
+    }
+    for frame, tracks in by_frame.items():
+        for values, of_frame in zip(fields.values(), tracks, strict=True):
+            values[:, queries.frames == frame] = of_frame[0]
+    return fields | {"track_frames": queries.frames}
+
+
+@contextmanager
+def _memory_errors(frames: int, height: int, width: int) -> Iterator[None]:
+    """Turn the device's running out of memory into one sentence."""
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise DeviceMemoryError(
+            f"{frames} frames of {width} x {height} pixels do not fit in the memory of the device; take fewer frames "
+            "(max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
+        ) from error

@@ -1,4 +1,4 @@
-"""Several methods on one clip: those that mine and suppress alike share one run of the passes."""
+"""Several methods on one clip: methods with equal passes share one run of them."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ import dataclasses
 import warnings
 from collections.abc import Sequence
 from contextlib import nullcontext
+from typing import Unpack
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.fusion_rule import FusionParams
-from vggtjax.options import find_method
+from vggtjax.options import OptionChanges, Options
 from vggtjax.pipeline.run import assembled_fields, reconstruct, refined
-from vggtjax.pipeline.stages import assembled
+from vggtjax.pipeline.stages import Stages
 from vggtjax.progress import OnStage
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
@@ -24,22 +25,21 @@ def reconstruct_methods(
     clip: Clip,
     methods: Sequence[str],
     *,
+    options: Options = Options(),
     size: int | None = None,
-    mask_pairs: int = 5,
-    align_scale: bool = False,
-    smooth_frames: int = 1,
     fusion: FusionParams | None = None,
-    compute_dtype: str = "float32",
     on_stage: OnStage | None = None,
+    **changes: Unpack[OptionChanges],
 ) -> dict[str, Reconstruction]:
-    """Reconstruct a clip by several methods, each as `reconstruct` does; what they have in common is computed once.
+    """Reconstruct a clip by several methods, each as `reconstruct` does.
 
-    Methods that mine and suppress alike, which those of `LADDER` do, share one run of the passes.
+    Methods that mine and suppress alike, such as those of `LADDER`, share one run of the passes.
 
     Args:
         methods: names of `METHODS`.
-        fusion: how those that fuse do it; one of them must.
-        model, clip, size, mask_pairs, align_scale, smooth_frames, compute_dtype, on_stage: as for `reconstruct`.
+        options: settings of all methods; `options.method` is not read.
+        fusion: the rule of fusion of the methods that fuse; at least one of them must.
+        model, clip, size, on_stage, changes: as for `reconstruct`.
 
     Returns:
         The results by method, in the order of `methods`.
@@ -47,64 +47,54 @@ def reconstruct_methods(
     Raises:
         What `reconstruct` raises.
     """
+    options = options.changed(**changes)
     if fusion is not None:
         check_fuses(*methods)
     results: dict[str, Reconstruction] = {}
-    for names in groups_of_methods(methods):
-        made = reconstruct(
+    for group in groups_of_methods(methods, options):
+        shared = next((each for each in group if each.row.needs_second_pass), group[0])
+        result = reconstruct(
             model,
             clip,
-            method=next((name for name in names if find_method(name).needs_second_pass), names[0]),
+            options=shared.changed(refine_mask=False),
             size=size,
-            mask_pairs=mask_pairs,
-            align_scale=align_scale,
-            smooth_frames=smooth_frames,
-            refine_mask=False,
-            compute_dtype=compute_dtype,
             keep_passes=True,
             on_stage=on_stage,
         )
-        for name in names:
-            results[name] = _as_method(
-                made, name, align_scale, model.config.patch_size, fusion, on_stage or (lambda name: nullcontext())
-            )
+        for each in group:
+            results[each.method] = _as_method(result, model, each, fusion, on_stage or (lambda name: nullcontext()))
     return {name: results[name] for name in methods}
 
 
-def groups_of_methods(methods: Sequence[str]) -> list[list[str]]:
-    """Return methods in groups that mine and suppress alike: the passes are run once for each."""
-    alike: dict[tuple, list[str]] = {}
+def groups_of_methods(methods: Sequence[str], options: Options) -> list[list[Options]]:
+    """Return the options of each method, in groups with equal passes."""
+    groups: dict[tuple, list[Options]] = {}
     for name in methods:
-        row = find_method(name)
-        alike.setdefault((row.gram, row.suppress, row.clusters, row.threshold), []).append(name)
-    return list(alike.values())
+        each = options.changed(method=name)
+        groups.setdefault(each.passes_key, []).append(each)
+    return list(groups.values())
 
 
 def _as_method(
-    made: Reconstruction,
-    method: str,
-    align_scale: bool,
-    patch_size: int,
-    fusion: FusionParams | None,
-    on_stage: OnStage,
+    result: Reconstruction, model: Model, options: Options, fusion: FusionParams | None, on_stage: OnStage
 ) -> Reconstruction:
     """Return what another method makes of the passes that a result keeps."""
-    row, passes = find_method(method), made.passes
-    making = {"frames": len(made.depth), "method": method, "align_scale": align_scale, "patch_size": patch_size}
-    fusion = fusion if row.depth == "fused" else None
+    method, passes = options.row, result.passes
+    frames, height, width = result.depth.shape
+    fusion = fusion if method.depth == "fused" else None
+    assembly = Stages(model.config, options, frames, (height, width)).assemble(passes, fusion)
+    settings = result.settings | {"refine_mask": method.refine}
     with warnings.catch_warnings():
-        if made.method == method:  # it has said already which cameras were clamped
+        if result.method == options.method:  # its clamped cameras have been named already
             warnings.simplefilter("ignore", FieldOfViewWarning)
         result = dataclasses.replace(
-            made,
-            **assembled_fields(assembled(*passes, fusion, **making), getattr(passes, row.intrinsics)),
-            method=method,
-            settings=made.settings
-            | {"refine_mask": row.refine}
-            | ({} if fusion is None else {"fusion": fusion_digest(fusion)}),
+            result,
+            **assembled_fields(assembly, getattr(passes, method.intrinsics)),
+            method=options.method,
+            settings=settings if fusion is None else settings | {"fusion": fusion_digest(fusion)},
             passes=None,
         )
-    if row.refine:
+    if method.refine:
         with on_stage("refine mask") as progress:
             result = refined(result, progress)
     return result

@@ -1,191 +1,240 @@
-"""The stages that reconstruct a clip, as a table of jitted functions, and their compilation ahead of the first run."""
+"""The data flow of a reconstruction: one function, to run or to compile ahead."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from vggtjax.clips.queries import Queries
-from vggtjax.config import Gram, Suppress, VGGTConfig
+from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.method.fusion_inputs import apply_fusion
 from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.method.mask import mine_mask
 from vggtjax.method.passes import Assembly, Cameras, Passes, assemble, first_pass, second_pass, track_from
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
 from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
-from vggtjax.options import check_mask_pairs, check_smooth_frames, find_method
+from vggtjax.options import Options
+from vggtjax.progress import OnStage
 from vggtjax.storage.programs import Program, keep_type
 
-
-class Stage(NamedTuple):
-    """A program, the arrays that it reads and makes (by name), and its static options."""
-
-    name: str
-    reads: tuple[str, ...]
-    makes: tuple[str, ...]
-    function: Program
-    options: dict[str, Any]
-
-    def run(self, arrays: Mapping[str, Any]) -> dict[str, Any]:
-        """Return what the stage makes of what it reads, by name."""
-        return self.named(self.function(*(arrays[name] for name in self.reads), **self.options))
-
-    def named(self, made: Any) -> dict[str, Any]:
-        """Return what the function has returned, by name."""
-        return dict(zip(self.makes, made if len(self.makes) > 1 else (made,), strict=True))
+_DIGITS = 4  # significant binary digits of padded lengths: no clip gets longer by more than an eighth
 
 
-class StageMemory(NamedTuple):
-    """What a compiled stage needs beside what it reads, by XLA's own analysis, in bytes."""
+def padded_frames(frames: int, offsets: tuple[int, ...]) -> int:
+    """Return the next length with four significant binary digits: 1 to 16, 18, 20, ... 32, 36, ...
 
-    temporary: int
-    output: int
+    Clips of similar length then share compiled programs. A clip keeps its length if one of its frames has no other
+    frame at any of the `offsets` of the motion cues.
+    """
+    if not all(any(0 <= frame + offset < frames for offset in offsets) for frame in range(frames)):
+        return frames
+    step = 1 << max(frames.bit_length() - _DIGITS, 0)
+    return -(-frames // step) * step
 
 
-def _first(params, images, patch_tokens, frame_count, query_points=None, *, compute_dtype, **options):
-    clips = ClipBatch(images, patch_tokens, frame_count)
+def _first(params, clips, query_points=None, *, compute_dtype, **options):
     return first_pass(params, clips, query_points=query_points, compute=Compute(compute_dtype), **options)
 
 
-def _second(
-    params, images, patch_tokens, frame_count, dynamic_mask, first, *, suppress, mask_pairs, compute_dtype, **options
-):
-    clips = ClipBatch(images, patch_tokens, frame_count)
-    options |= {"suppression": Suppression(suppress=suppress, mask_pairs=mask_pairs), "compute": Compute(compute_dtype)}
-    return second_pass(params, clips, dynamic_mask, plain=first, **options)
+def _second(params, clips, dynamic_mask, first, *, suppress, mask_pairs, compute_dtype, **options):
+    suppression = Suppression(suppress=suppress, mask_pairs=mask_pairs)
+    compute = Compute(compute_dtype)
+    return second_pass(params, clips, dynamic_mask, plain=first, suppression=suppression, compute=compute, **options)
 
 
-def _tracks(params, images, patch_tokens, query_points, frame, *, config, compute_dtype):
-    clips = ClipBatch(images, patch_tokens)
+def _track(params, clips, query_points, frame, *, config, compute_dtype):
     return track_from(params, clips, query_points, frame, config, compute=Compute(compute_dtype))
 
 
 def _mine(
     saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"], *, frames: int, **options
 ) -> Bool[Array, "B F H W"]:
-    """Mine the mask of the first `frames` frames; nothing moves in the others."""
+    """Mine the mask of the first `frames` frames; the mask of padded frames is False."""
     mask = mine_mask(saliency[:, :frames], patch_tokens[:, :frames], **options)
     return jnp.pad(mask, ((0, 0), (0, saliency.shape[1] - frames), (0, 0), (0, 0)))
 
 
 def _assemble(
-    first: Predictions,
-    second: Predictions | None,
-    saliency,
-    dynamic_mask,
-    fusion: FusionParams | None = None,
-    *,
-    frames: int,
-    method: str,
-    align_scale: bool,
-    patch_size: int,
+    passes: Passes, fusion: FusionParams | None, *, frames: int, method: str, align_scale: bool, patch_size: int
 ) -> Assembly:
-    passes = jax.tree.map(lambda x: x[:, :frames], Passes(first, second, saliency, dynamic_mask))
-    made = assemble(passes, method, align_scale=align_scale)
-    return made if fusion is None else apply_fusion(made, passes, fusion, patch_size, align_scale=align_scale)
-
-
-def _unchanged(predictions: Predictions) -> Predictions:
-    return predictions
+    passes = jax.tree.map(lambda x: x[:, :frames], passes)
+    assembly = assemble(passes, method, align_scale=align_scale)
+    return assembly if fusion is None else apply_fusion(assembly, passes, fusion, patch_size, align_scale=align_scale)
 
 
 _encode = Program(encode, static=("config", "compute_dtype"))
 _first_pass = Program(_first, static=("config", "gram", "motion", "outputs", "compute_dtype"))
 _mine_mask = Program(_mine, static=("frames", "size", "clusters", "threshold", "smooth_frames"))
-_second_pass = Program(_second, static=("config", "suppress", "outputs", "compute_dtype"))  # one for all mask_pairs
-_track_from = Program(_tracks, static=("config", "compute_dtype"))
-_same = Program(_unchanged)
-assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
-for _kind in (Predictions, Passes, Cameras, Assembly, Tracks):
+_second_pass = Program(_second, static=("config", "suppress", "outputs", "compute_dtype"))  # mask_pairs is traced
+_track_from = Program(_track, static=("config", "compute_dtype"))
+_assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
+for _kind in (ClipBatch, Predictions, Passes, Cameras, Assembly, Tracks):
     keep_type(_kind)
 
 
-def stages_of(
-    config: VGGTConfig,
-    method: str,
-    shape: tuple[int, int, int],
-    *,
-    gram: Gram,
-    suppress: Suppress,
-    mask_pairs: int,
-    align_scale: bool,
-    smooth_frames: int,
-    compute_dtype: str,
-    all_outputs: bool = False,
-) -> list[Stage]:
-    """Return the stages of a method for clips of this shape (frames, height, width).
+class StageMemory(NamedTuple):
+    """Memory of a compiled stage beside its inputs, by XLA's own analysis, in bytes."""
 
-    They begin with "params", "images" and "frame_count", which is None where every frame is real, "second", None, and
-    "fusion", None for the method's own rule.
-    With `all_outputs` the second pass predicts depth even if the method does not read it. Raises InputError for
-    settings that are none.
-    """
-    check_mask_pairs(mask_pairs)
-    check_smooth_frames(smooth_frames)
-    row = find_method(method)
-    frames, *size = shape
-    network = {"config": config, "compute_dtype": compute_dtype}
-    outputs = ("camera", "depth") if all_outputs else row.second_outputs(align_scale)
-    masking = {"suppress": suppress, "mask_pairs": mask_pairs, "outputs": outputs}
-    making = {"frames": frames, "method": method, "align_scale": align_scale, "patch_size": config.patch_size}
-    mining = {"clusters": row.clusters, "threshold": row.threshold, "smooth_frames": smooth_frames}
-    mining |= {"frames": frames, "size": tuple(size)}
-    seen = ("params", "images", "patch_tokens", "frame_count")
-    stages = [
-        Stage("image features", ("params", "images"), ("patch_tokens",), _encode, network),
-        Stage("first pass", seen, ("first", "saliency"), _first_pass, network | {"gram": gram}),
-        Stage("dynamic mask", ("saliency", "patch_tokens"), ("dynamic_mask",), _mine_mask, mining),
-        Stage("second pass", (*seen, "dynamic_mask", "first"), ("second",), _second_pass, network | masking),
-        Stage("assemble", ("first", "second", "saliency", "dynamic_mask", "fusion"), ("assembly",), assembled, making),
-    ]
-    return [stage for stage in stages if stage.name != "second pass" or row.needs_second_pass]
+    temporary: int
+    output: int
 
 
-def with_masks(stages: list[Stage], moving: bool) -> list[Stage]:
-    """Return the stages with masks that are given; if nothing moves, the second pass is the first."""
-    stages = [stage for stage in stages if stage.name != "dynamic mask"]
-    if moving:
-        return stages
-    same = Stage("second pass", ("first",), ("second",), _same, {})
-    return [same if stage.name == same.name else stage for stage in stages]
+class Execute:
+    """Runs each program as a stage of its own."""
+
+    def __init__(self, on_stage: OnStage | None = None) -> None:
+        self._on_stage = on_stage or (lambda name: nullcontext())
+
+    def __call__(self, stage: str, program: Program, *arguments: Any, **options: Any) -> Any:
+        """Return the outputs of the program, when they are computed."""
+        with self._on_stage(stage):
+            return jax.block_until_ready(program(*arguments, **options))
 
 
-def with_tracks(stages: list[Stage], queries: Queries, arrays: dict[str, Any]) -> list[Stage]:
-    """Return the stages with tracks: of the first frame's points by the first pass, then of every other frame's.
+class Compile:
+    """Compiles each program for the shapes of its arguments; later calls with such arguments find it compiled."""
 
-    The points are put into `arrays`.
-    """
-    stages = list(stages)
-    network = {name: stages[0].options[name] for name in ("config", "compute_dtype")}
-    for frame in np.unique(queries.frames).tolist():
-        points = jnp.asarray(queries.points[queries.frames == frame])[None]
-        if frame == 0:
-            arrays["query_points"] = points
-            index = next(i for i, stage in enumerate(stages) if stage.name == "first pass")
-            stages[index] = stages[index]._replace(reads=(*stages[index].reads, "query_points"))
-        else:
-            arrays |= {f"points {frame}": points, f"frame {frame}": jnp.int32(frame)}
-            reads = ("params", "images", "patch_tokens", f"points {frame}", f"frame {frame}")
-            stages.append(Stage("tracks", reads, (f"tracks {frame}",), _track_from, network))
-    return stages
+    def __init__(self) -> None:
+        self.memory: dict[str, StageMemory] = {}
 
-
-def compile_stages(stages: list[Stage], arrays: dict[str, Any]) -> dict[str, StageMemory]:
-    """Compile every stage for the shapes that it will see; the calls that follow find the result in jit's cache."""
-    shapes, needs = dict(arrays), {}
-    for stage in stages:
-        compiled, made = stage.function.compile(*(shapes[name] for name in stage.reads), **stage.options)
+    def __call__(self, stage: str, program: Program, *arguments: Any, **options: Any) -> Any:
+        """Return the shapes of the program's outputs."""
+        compiled, outputs = program.compile(*arguments, **options)
         memory = compiled.memory_analysis()
-        if memory is not None:  # not every platform tells
-            needs[stage.name] = StageMemory(memory.temp_size_in_bytes, memory.output_size_in_bytes)
-        shapes |= stage.named(made)
-    return needs
+        if memory is not None:  # some platforms do not tell
+            self.memory[stage] = StageMemory(memory.temp_size_in_bytes, memory.output_size_in_bytes)
+        return outputs
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The stages for clips of one shape; each reads of `options` what it needs, so that the others stay compiled.
+
+    The clips may be padded beyond `frames`; `frame_count` then says how many frames are real, and is None otherwise.
+    """
+
+    config: VGGTConfig
+    options: Options
+    frames: int
+    size: tuple[int, int]  # height and width in pixels
+    run: Callable[..., Any] = field(default_factory=Execute)  # Execute or Compile
+
+    @property
+    def _network(self) -> dict[str, Any]:
+        return {"config": self.config, "compute_dtype": self.options.compute_dtype}
+
+    def image_features(self, params: Params, images: Float[Array, "B F H W 3"]) -> Float[Array, "B F P C"]:
+        return self.run("image features", _encode, params, images, **self._network)
+
+    def first_pass(
+        self,
+        params: Params,
+        clips: ClipBatch,
+        query_points: Float[Array, "B Q 2"] | None = None,
+        *,
+        motion: MotionConfig | None = None,
+    ) -> tuple[Predictions, Float[Array, "B F h w"]]:
+        """Return what the plain pass predicts, and the motion saliency."""
+        options = self._network | {"gram": self.options.row.gram} | ({} if motion is None else {"motion": motion})
+        points = () if query_points is None else (query_points,)
+        return self.run("first pass", _first_pass, params, clips, *points, **options)
+
+    def dynamic_mask(
+        self, saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"]
+    ) -> Bool[Array, "B F H W"]:
+        method = self.options.row
+        options = {"clusters": method.clusters, "threshold": method.threshold}
+        options |= {"smooth_frames": self.options.smooth_frames, "frames": self.frames, "size": self.size}
+        return self.run("dynamic mask", _mine_mask, saliency, patch_tokens, **options)
+
+    def second_pass(
+        self,
+        params: Params,
+        clips: ClipBatch,
+        dynamic_mask: Bool[Array, "B F H W"],
+        first: Predictions,
+        *,
+        all_outputs: bool = False,
+    ) -> Predictions:
+        """Return what the mask-aware pass predicts; depth only if the method needs it, or with `all_outputs`."""
+        method = self.options.row
+        outputs = ("camera", "depth") if all_outputs else method.second_outputs(self.options.align_scale)
+        options = {"suppress": method.suppress, "mask_pairs": self.options.mask_pairs, "outputs": outputs}
+        return self.run("second pass", _second_pass, params, clips, dynamic_mask, first, **self._network, **options)
+
+    def assemble(self, passes: Passes, fusion: FusionParams | None = None) -> Assembly:
+        """Return the method's depth, confidence and cameras of the real frames, fused by `fusion` if given."""
+        options = {"method": self.options.method, "align_scale": self.options.align_scale}
+        options |= {"frames": self.frames, "patch_size": self.config.patch_size}
+        return self.run("assemble", _assembled, passes, fusion, **options)
+
+    def tracks(
+        self, params: Params, clips: ClipBatch, query_points: Float[Array, "B Q 2"], frame: Int[Array, ""]
+    ) -> Tracks:
+        """Return the tracks of points of a later frame."""
+        return self.run("tracks", _track_from, params, clips, query_points, frame, **self._network)
+
+
+class ClipInputs(NamedTuple):
+    """The arrays of a batch of clips, or their shapes."""
+
+    images: Float[Array, "B F H W 3"]  # RGB in [0, 1]
+    frame_count: Int[Array, " B"] | None = None  # real frames; None: all
+    dynamic_mask: Bool[Array, "B F H W"] | None = None  # None: mined
+    moves: bool = True  # False: no pixel of the given mask is dynamic
+    query_points: Mapping[int, Float[Array, "B Q 2"]] = MappingProxyType({})  # points to track, by frame
+
+
+class Outputs(NamedTuple):
+    """What the stages compute of a batch of clips."""
+
+    passes: Passes
+    assembly: Assembly
+    tracks: dict[int, Tracks]  # by the frame of their query points
+
+
+def run_stages(
+    stages: Stages,
+    params: Params,
+    inputs: ClipInputs,
+    *,
+    fusion: FusionParams | None = None,
+    all_outputs: bool = False,
+) -> Outputs:
+    """Reconstruct clips: image features, first pass, dynamic mask, second pass, assembly, tracks.
+
+    Args:
+        stages: the stages for these clips; `stages.run` decides whether they run or are compiled.
+        params: the model's parameter tree.
+        inputs: the clips, and optionally their masks and points to track.
+        fusion: a fitted rule of fusion; the method's own rule if None.
+        all_outputs: run the second pass with depth even if the method does not need it.
+    """
+    points = dict(inputs.query_points)
+    clips = ClipBatch(inputs.images, stages.image_features(params, inputs.images), inputs.frame_count)
+    first, saliency = stages.first_pass(params, clips, points.pop(0, None))
+    mask = inputs.dynamic_mask
+    if mask is None:
+        mask = stages.dynamic_mask(saliency, clips.patch_tokens)
+    second = first if stages.options.row.needs_second_pass else None
+    if second is not None and inputs.moves:
+        second = stages.second_pass(params, clips, mask, first, all_outputs=all_outputs)
+    passes = Passes(first, second, saliency, mask)
+    assembly = stages.assemble(passes, fusion)
+    tracks = {
+        frame: stages.tracks(params, clips, frame_points, jnp.int32(frame)) for frame, frame_points in points.items()
+    }
+    if 0 in inputs.query_points:
+        tracks[0] = Tracks(first.tracks, first.track_visibility, first.track_confidence)  # type: ignore[arg-type]
+    return Outputs(passes, assembly, tracks)

@@ -14,6 +14,7 @@ from vggtjax.storage.writing import writing
 
 MODEL = Path(__file__).with_name("model.safetensors")
 CLIP = MODEL.with_name("clip.npz")
+NOTE = "small demonstration model, trained on generated scenes; not for real footage"
 SCENE_SEED = 100  # of the held-out dynamic scenes that the clip is the first of; no evaluation takes this seed
 _NEAREST = np.float32(1e-3)  # metres
 _STEP = 5e-4  # of the logarithm of depth that 16 bits count
@@ -27,7 +28,7 @@ def demo_model(dtype: DType = "float32") -> Model:
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
-    return read_model(MODEL, dtype=dtype, name="demo")
+    return read_model(MODEL, dtype=dtype, name="demo", note=NOTE)
 
 
 def demo_clip() -> Truth:

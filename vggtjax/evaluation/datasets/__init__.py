@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets import published
 from vggtjax.evaluation.datasets.davis import davis
@@ -68,8 +69,7 @@ def find_sequences(
     root: str | Path,
     *,
     sequences: Iterable[str] | None = None,
-    stride: int | None = None,
-    max_frames: int | None = None,
+    sampling: Sampling = Sampling(),
     gt: str | None = None,
 ) -> dict[str, Callable[[], LabelledSequence]]:
     """Find sequences of a data set, each to be opened by a call: what is wrong with one shows only then.
@@ -79,8 +79,8 @@ def find_sequences(
         root: the data set's folder; for "plain", "tum", "bonn", "dycheck" and "7scenes", one sequence's folder too.
         sequences: names of those to open, in order. None takes the published ones that are there, or all where none
             of them is; what that leaves out is in the notes of every sequence, and logged.
-        stride: takes every so many frames, in place of the data set's own; a window or cap of it stays.
-        max_frames: takes at most so many frames.
+        sampling: which frames of each sequence; its stride replaces the data set's own, a window or cap of the data set
+            stays. Pictures have no `fps`.
         gt: which ground truth, where the data set has several; None takes the first.
 
     Raises:
@@ -92,9 +92,8 @@ def find_sequences(
     dataset = DATASETS[name]
     if gt is not None and gt not in dataset.gt:
         raise InputError(f"gt is {gt!r}; {name} has {' and '.join(dataset.gt) or 'one ground truth, so leave it out'}")
-    for option, value in (("stride", stride), ("max_frames", max_frames)):
-        if value is not None and value < 1:
-            raise InputError(f"{option} is {value}; expected at least 1")
+    if sampling.fps is not None:
+        raise InputError(f"fps is {sampling.fps}, but pictures have no presentation times; use stride")
     root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; expected that of the data set {name}")
@@ -103,9 +102,7 @@ def find_sequences(
     chosen, notices = _chosen(name, root, found, sequences)
     for notice in notices:
         logger.warning("%s", notice)
-    frames = dataset.frames if stride is None else dataset.frames._replace(stride=stride)
-    if max_frames is not None:
-        frames = frames._replace(most=max_frames if frames.most is None else min(frames.most, max_frames))
+    frames = dataset.frames.sampled(sampling)
 
     def opened(name: str) -> LabelledSequence:
         try:
@@ -128,9 +125,10 @@ def open_dataset(
 ) -> list[LabelledSequence]:
     """Open sequences of a data set: cameras are read, pictures, depth and masks when they are asked for.
 
-    Arguments and errors are those of `find_sequences`.
+    Arguments and errors are those of `find_sequences`; `stride` and `max_frames` are those of its `sampling`.
     """
-    found = find_sequences(name, root, sequences=sequences, stride=stride, max_frames=max_frames, gt=gt)
+    sampling = Sampling(stride=stride, max_frames=max_frames)
+    found = find_sequences(name, root, sequences=sequences, sampling=sampling, gt=gt)
     return [opener() for opener in found.values()]
 
 

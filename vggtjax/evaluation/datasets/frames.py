@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
+from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import InputError
 
 T = TypeVar("T")
@@ -16,6 +17,13 @@ class FrameChoice(NamedTuple):
     window: slice = slice(None)
     stride: int = 1
     most: int | None = None
+
+    def sampled(self, sampling: Sampling) -> FrameChoice:
+        """Return the frames that `sampling` takes of the window; its stride, if given, replaces this one."""
+        window = slice((self.window.start or 0) + sampling.start, self.window.stop)
+        stride = self.stride if sampling.stride is None else sampling.stride
+        mosts = [most for most in (self.most, sampling.max_frames) if most is not None]
+        return FrameChoice(window if sampling.start else self.window, stride, min(mosts, default=None))
 
     def of(self, items: Sequence[T], name: str) -> list[T]:
         """Return those of `items`, one for each frame of the sequence `name`; raises InputError where none is left."""

@@ -1,0 +1,84 @@
+"""The commands `vggtjax convert`, `vggtjax import` and `vggtjax info`. Do not import jax before it is needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from vggtjax.commands.models import load, read_config
+from vggtjax.commands.reconstruct import check_output
+from vggtjax.commands.report import Report
+from vggtjax.results.saving import Saving
+
+
+def convert(
+    source: tyro.conf.Positional[str],
+    destination: tyro.conf.Positional[Path],
+    /,
+    *,
+    config: Path | None = None,
+    heads: str | None = None,
+    dtype: Literal["float32", "bfloat16"] = "float32",
+) -> None:
+    """Convert a PyTorch VGGT checkpoint to one .safetensors with Flax names, and say what was read and written.
+
+    Args:
+        source: a .safetensors file, a sharded one (its index or folder), a .pt or .pth file, or a hub id.
+        destination: the .safetensors file to write.
+        config: JSON file with the configuration; VGGT-1B by default.
+        heads: heads to convert, such as camera,depth; all of camera,depth,points,tracks by default.
+        dtype: of the written weights.
+    """
+    report = Report()
+    with report.running(), report.stage("convert") as progress:
+        from converters import convert as run
+
+        names = None if heads is None else [name.strip() for name in heads.split(",")]
+        conversion = run(source, destination, dtype=dtype, config=read_config(config), heads=names, progress=progress)
+    report.table(conversion.summary())
+
+
+def import_result(
+    source: tyro.conf.Positional[Path],
+    /,
+    out: Path,
+    *,
+    layout: Annotated[Literal["vggt4d", "monst3r", "cut3r", "da3"], tyro.conf.arg(name="format")],
+    quaternion: Literal["xyzw", "wxyz"] | None = None,
+    confidence_percentile: float = 20.0,
+) -> None:
+    """Read the result folder of another project, and write it as ours: pictures, clouds, a scene to look at.
+
+    Args:
+        source: the folder.
+        out: folder for our files; an earlier result in it is replaced.
+        layout: the project that wrote the folder.
+        quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw.
+        confidence_percentile: percent of the pixels, the least confident, to leave out of the point clouds.
+    """
+    saving = Saving(confidence_percentile=confidence_percentile)
+    report = Report()
+    with report.running():
+        from vggtjax.results.reconstruction import Reconstruction
+
+        check_output(out)
+        with report.stage("read"):
+            result = Reconstruction.load(source, layout=layout, quaternion=quaternion)
+        with report.stage("write") as progress:
+            result.save(out, saving=saving, progress=progress)
+    report.summary(result, out)
+
+
+def info(model: tyro.conf.Positional[str] = "demo", /, *, config: Path | None = None) -> None:
+    """Print a model's configuration, heads, number of parameters and type.
+
+    Args:
+        model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id.
+        config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
+    """
+    report = Report()
+    with report.running():
+        network = load(report, model, config)
+    report.table(network.summary())

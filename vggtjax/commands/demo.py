@@ -1,0 +1,50 @@
+"""The command `vggtjax demo`. Does not import jax before it is needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vggtjax.commands.models import load
+from vggtjax.commands.reconstruct import check_output
+from vggtjax.commands.report import Report
+from vggtjax.options import MethodName, Options
+
+
+def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-d") -> None:
+    """Reconstruct the embedded clip with the embedded model, and measure the ladder of methods against its truth.
+
+    Args:
+        out: folder for the results.
+        method: which passes give the depth and cameras that are written.
+    """
+    report = Report()
+    with report.running():
+        check_output(out)
+        model = load(report, "demo")
+        with report.stage("load clip"):
+            from vggtjax.clips.clip import load_clip
+            from vggtjax.pretrained.embedded import demo_clip
+
+            truth = demo_clip()
+            size = truth.images.shape[2]
+            clip = load_clip(truth.images, size=size, patch=model.config.patch_size)
+        from vggtjax.pipeline.run import reconstruct
+
+        result = reconstruct(model, clip, options=Options(method), size=size, on_stage=report.stage)
+        with report.stage("write") as progress:
+            from PIL import Image
+
+            from vggtjax.evaluation.picture import truth_sheet
+            from vggtjax.storage.writing import writing
+
+            result.save(out, progress=progress)
+            sheet = out / "preview" / "truth.png"
+            with writing(sheet) as temporary:
+                Image.fromarray(truth_sheet(result, truth)).save(temporary)
+        with report.stage("measure") as progress:
+            from vggtjax.evaluation.ladder import ladder
+
+            rows = ladder(model, truth, progress=progress)
+    report.summary(result, out, model)
+    report.ladder(rows)
+    report.line(f"Next to the truth: {sheet}")

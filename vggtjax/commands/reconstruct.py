@@ -1,0 +1,139 @@
+"""The command `vggtjax reconstruct`. Does not import jax before it is needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import tyro
+
+from vggtjax.clips.preprocessing import Framing
+from vggtjax.clips.sampling import Sampling
+from vggtjax.commands.models import FittedFusion, load
+from vggtjax.commands.report import Report
+from vggtjax.errors import InputError
+from vggtjax.options import Options
+from vggtjax.results.saving import Saving
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from vggtjax.clips.clip import Clip
+
+
+@dataclass(frozen=True)
+class Masks:
+    """What moves, if you know it. Raises InputError where both options are given."""
+
+    masks: Path | None = None
+    """folder of pictures, bright where something moves, one per frame; mined from the clip by default"""
+    no_masks: tyro.conf.FlagCreatePairsOff[bool] = False
+    """nothing moves: one pass is enough"""
+
+    def __post_init__(self) -> None:
+        if self.masks is not None and self.no_masks:
+            raise InputError("--masks and --no-masks are opposites; give one of them")
+
+    def check(self, options: Options) -> None:
+        """Raise InputError for a missing folder, or for options that need mined masks."""
+        if options.smooth_frames != 1 and (self.masks is not None or self.no_masks):
+            raise InputError("--smooth-frames is for mined masks; leave it out with --masks and --no-masks")
+        if self.masks is not None:
+            from vggtjax.clips.sources import open_source
+
+            open_source(str(self.masks))
+
+    def of(self, clip: Clip) -> np.ndarray | None:
+        """Return the masks at the clip's frames, or None where they are mined."""
+        import numpy as np
+
+        from vggtjax.clips.masks import load_masks
+
+        if self.no_masks:
+            return np.zeros(clip.images.shape[:3], bool)
+        return None if self.masks is None else load_masks(self.masks, clip)
+
+
+def reconstruct(
+    source: tyro.conf.Positional[tuple[str, ...]],
+    /,
+    out: Path,
+    *,
+    model: str | None = None,
+    config: Path | None = None,
+    tracks: str | None = None,
+    fusion: Path | None = None,
+    sampling: Sampling = Sampling(),
+    framing: Framing = Framing(),
+    options: Options = Options(),
+    masks: Masks = Masks(),
+    saving: Saving = Saving(),
+) -> None:
+    """Cameras, depth, dynamic masks and a 4-D point cloud of a clip.
+
+    Args:
+        source: a folder of images, a pattern, images, or a video.
+        out: folder for the results; an earlier result in it is replaced.
+        model: a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or "demo", the small
+            demonstration model, which is not for real footage.
+        config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
+        tracks: points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and,
+            optionally, frame, in pixels of the source.
+        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default.
+        sampling: frames
+        framing: size
+        options: method
+        masks: masks
+        saving: output
+    """
+    if not source:
+        raise InputError("no input; name a folder of images, a pattern, images, or a video")
+    frames = source[0] if len(source) == 1 else list(source)
+    report = Report()
+    with report.running():
+        from vggtjax.clips.sources import open_source
+
+        opened = open_source(frames)  # before the model is loaded, which takes longer
+        masks.check(options)
+        check_output(out)
+        if tracks is not None:
+            from vggtjax.clips.queries import check_words
+
+            check_words(tracks)
+        fitted = FittedFusion(fusion, [options.method])
+        network = load(report, model, config)
+        fitted.warn(network, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
+        with report.stage("load clip") as progress:
+            from vggtjax.clips.clip import read_clip
+            from vggtjax.clips.queries import parse_queries
+
+            fitter = framing.fitter(size=network.config.image_size, patch=network.config.patch_size)
+            clip = read_clip(opened, sampling, fitter, progress)
+            given = masks.of(clip)
+            queries = None if tracks is None else parse_queries(tracks, clip)
+        from vggtjax.pipeline.run import reconstruct as run
+
+        result = run(
+            network,
+            clip,
+            options=options,
+            size=fitter.size,
+            masks=given,
+            tracks=queries,
+            fusion=fitted.params,
+            on_stage=report.stage,
+        )
+        with report.stage("write") as progress:
+            pictures = clip.pictures() if saving.resolution == "original" else None
+            result.save(out, saving=saving, pictures=pictures, progress=progress)
+    report.summary(result, out, network)
+    if tracks is not None and network.note:
+        report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")
+
+
+def check_output(out: Path) -> None:
+    """Raise OutputError now for a folder that cannot take a result, rather than after minutes of work."""
+    from vggtjax.results.folder import check_folder
+
+    check_folder(out)
