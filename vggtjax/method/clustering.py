@@ -1,6 +1,6 @@
-"""k-means on the device: greedy k-means++ seeds, then Lloyd's iterations; with weights, so that points can be left out.
+"""k-means on the device with weighted points: greedy k-means++ seeds, then Lloyd's iterations.
 
-The seeding draws several candidates for every centre and keeps the best, as scikit-learn does (Arthur and
+The seeding draws several candidates for every centre and keeps the best one, as scikit-learn does (Arthur and
 Vassilvitskii, 2007; the greedy variant of their conclusion).
 """
 
@@ -16,11 +16,11 @@ from jaxtyping import Array, Float, Int
 from vggtjax.network.precision import full_precision
 
 ITERATIONS = 300
-TOLERANCE = 1e-4  # squared movement of all centres, over the points' mean variance, at which the iterations end
+TOLERANCE = 1e-4  # the iterations end at this squared movement of all centres over the mean variance of the points
 
 
 class Clusters(NamedTuple):
-    """A partition of points: each belongs to its nearest centre."""
+    """A partition of points by their nearest centres."""
 
     labels: Int[Array, " N"]
     centres: Float[Array, "K C"]
@@ -36,37 +36,38 @@ def kmeans(
     *,
     restarts: int = 1,
 ) -> Clusters:
-    """Partition points into `clusters` groups of small squared distance to their mean.
+    """Partition points into `clusters` groups of small squared distance to their means.
 
-    Pure: works under jit and vmap (`clusters` and `restarts` are static). A cluster that loses all its points keeps its
-    centre.
+    Pure: works under jit and vmap (`clusters` and `restarts` are static). An empty cluster keeps its centre.
 
     Args:
-        key: a JAX random key, of the seeds.
-        points: any number of them, fewer than `clusters` too.
+        key: JAX random key for the seeds.
+        points: any number of points, also fewer than `clusters`.
         clusters: number of centres.
-        weights: at least 0; a point of weight 0 moves no centre but is labelled too. 1 if None.
-        restarts: partitions from different seeds, of which the one of least inertia is returned.
+        weights: at least 0; points of weight 0 are labelled but move no centre. 1 if None.
+        restarts: number of partitions from different seeds; the one of least inertia is returned.
     """
     weights = jnp.ones(points.shape[0]) if weights is None else weights.astype(jnp.float32)
     total = jnp.maximum(weights.sum(), 1e-30)
     mean = jnp.einsum("n,nc->c", weights, points) / total
-    points = points - mean[None]  # squares of what is far from the origin would cancel
+    points = points - mean[None]  # squares of points far from the origin would cancel
     variance = jnp.einsum("n,nc->c", weights, points**2).mean() / total
     keys = jax.random.split(key, restarts)
-    found = jax.lax.map(lambda key: _lloyd(_seeds(key, points, clusters, weights), points, weights, variance), keys)
-    best = jax.tree.map(lambda leaf: leaf[jnp.argmin(found.inertia)], found)
+    partitions = jax.lax.map(
+        lambda key: _lloyd(_seeds(key, points, clusters, weights), points, weights, variance), keys
+    )
+    best = jax.tree.map(lambda leaf: leaf[jnp.argmin(partitions.inertia)], partitions)
     return best._replace(centres=best.centres + mean[None])
 
 
 def _lloyd(centres: Array, points: Array, weights: Array, variance: Array) -> Clusters:
     clusters = len(centres)
 
-    def moving(state):
+    def not_converged(state):
         _, shift, count = state
         return (shift > TOLERANCE * variance) & (count < ITERATIONS)
 
-    def moved(state):
+    def iteration(state):
         centres, _, count = state
         labels = jnp.argmin(_distances(points, centres), axis=1)
         member = jax.nn.one_hot(labels, clusters) * weights[:, None]
@@ -75,43 +76,43 @@ def _lloyd(centres: Array, points: Array, weights: Array, variance: Array) -> Cl
         means = jnp.where(mass > 0, means, centres)
         return means, jnp.sum((means - centres) ** 2), count + 1
 
-    centres, _, _ = jax.lax.while_loop(moving, moved, (centres, jnp.inf, 0))
+    centres, _, _ = jax.lax.while_loop(not_converged, iteration, (centres, jnp.inf, 0))
     distances = _distances(points, centres)
     inertia = (weights * jnp.maximum(distances.min(axis=1), 0)).sum()
     return Clusters(jnp.argmin(distances, axis=1).astype(jnp.int32), centres, inertia)
 
 
 def _seeds(key: Array, points: Float[Array, "N C"], clusters: int, weights: Float[Array, " N"]) -> Array:
-    """Draw centres among the points, each as likely as it is far from those before; the best of a few every time."""
+    """Draw centres among the points by their squared distance to earlier centres, each the best of a few candidates."""
     trials = 2 + int(math.log(clusters))
     keys = jax.random.split(key, clusters)
 
-    def drawn(key: Array, mass: Float[Array, " N"], count: int) -> Int[Array, " T"]:
+    def draw(key: Array, mass: Float[Array, " N"], count: int) -> Int[Array, " T"]:
         cumulative = jnp.cumsum(mass)
         return jnp.searchsorted(cumulative, jax.random.uniform(key, (count,)) * cumulative[-1])
 
-    first = points[jnp.minimum(drawn(keys[0], weights, 1)[0], len(points) - 1)]
+    first = points[jnp.minimum(draw(keys[0], weights, 1)[0], len(points) - 1)]
     centres = jnp.zeros((clusters, points.shape[1])).at[:].set(first[None])
 
-    def added(i, state):
+    def add(i, state):
         centres, nearest = state
-        candidates = points[jnp.minimum(drawn(keys[i], weights * nearest, trials), len(points) - 1)]
+        candidates = points[jnp.minimum(draw(keys[i], weights * nearest, trials), len(points) - 1)]
         distances = jnp.minimum(nearest[:, None], jnp.maximum(_distances(points, candidates), 0))  # [N, T]
         best = jnp.argmin(jnp.einsum("n,nt->t", weights, distances))
         return centres.at[i].set(candidates[best]), distances[:, best]
 
     nearest = jnp.maximum(_distances(points, first[None])[:, 0], 0)
-    centres, _ = jax.lax.fori_loop(1, clusters, added, (centres, nearest))
+    centres, _ = jax.lax.fori_loop(1, clusters, add, (centres, nearest))
     return centres
 
 
 def nearest_centre(points: Float[Array, "N C"], centres: Float[Array, "K C"]) -> Int[Array, " N"]:
-    """Return the centre that each point is nearest to."""
-    middle = centres.mean(axis=0)[None]  # squares of what is far from the origin would cancel
+    """Return the index of the nearest centre of each point."""
+    middle = centres.mean(axis=0)[None]  # squares of points far from the origin would cancel
     return jnp.argmin(_distances(points - middle, centres - middle), axis=1).astype(jnp.int32)
 
 
 def _distances(points: Float[Array, "N C"], centres: Float[Array, "K C"]) -> Float[Array, "N K"]:
-    """Squared distances, up to rounding that can take them a little below 0."""
+    """Return squared distances; rounding can take them slightly below 0."""
     squares = jnp.sum(points**2, axis=1)[:, None] + jnp.sum(centres**2, axis=1)[None]
     return squares - 2 * points @ centres.T

@@ -31,7 +31,7 @@ def fuse_depth(
     """Confidence fusion (D_3b): inverse-variance weighting with confidence as precision, vmapped over frames.
 
     On static pixels w = C2 / (C1 + C2 + eps), depth = (1 - w) D1 + w D2, and the fused precision is C1 + C2; on
-    dynamic pixels pass 1 stands alone.
+    dynamic pixels the output is that of pass 1.
 
     Args:
         depth1, confidence1: of the plain pass; any number of leading axes.
@@ -44,9 +44,9 @@ def fuse_depth(
     """
 
     def one_frame(d1, c1, d2, c2, dynamic):
-        c1, c2 = (jnp.minimum(c, jnp.finfo(c.dtype).max / 4) for c in (c1, c2))  # odd weights can overflow
+        c1, c2 = (jnp.minimum(c, jnp.finfo(c.dtype).max / 4) for c in (c1, c2))  # untrained weights can overflow
         total = c1 + c2 + eps
-        fused = (c1 + eps) / total * d1 + c2 / total * d2  # 1 - w without its cancellation
+        fused = (c1 + eps) / total * d1 + c2 / total * d2  # (c1 + eps) / total is 1 - w without cancellation
         return jnp.where(dynamic, d1, fused), jnp.where(dynamic, c1, c1 + c2)
 
     fused = one_frame
@@ -58,7 +58,7 @@ def fuse_depth(
 def scale_between(
     depth1: Float[Array, "B S H W"], depth2: Float[Array, "B S H W"], dynamic_mask: Bool[Array, "B S H W"]
 ) -> Float[Array, " B"]:
-    """Return the factor per clip that takes depth2 to depth1: the median ratio over static pixels, 1 if none."""
+    """Return the factor from depth2 to depth1 of each clip: the median ratio over static pixels, 1 without any."""
     ratio = jnp.where(dynamic_mask, jnp.nan, depth1 / depth2)
     median = jnp.nanmedian(ratio.reshape(ratio.shape[0], -1), axis=-1)
     return jnp.where(jnp.isfinite(median), median, 1.0)

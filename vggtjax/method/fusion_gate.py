@@ -1,4 +1,4 @@
-"""A small convolutional gate: the flexible end of the family. It shifts both log precisions, pixel by pixel."""
+"""A small convolutional gate, the most flexible part of the family: it shifts both log precisions of every pixel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CHANNELS = 16
 
 
 class Gate(nn.Module):
-    """Two 3 x 3 convolutions, and a last layer of zeros: untrained it changes nothing."""
+    """Two 3 x 3 convolutions and a last layer of zeros: an untrained gate changes nothing."""
 
     channels: int = CHANNELS
 
@@ -25,7 +25,7 @@ class Gate(nn.Module):
 
 
 def _neighbourhoods(x: Float[Array, "F H W C"]) -> Float[Array, "F H W 9C"]:
-    """Put the 3 x 3 pixels around each next to each other: XLA has no fast gradient of a convolution inside a loop."""
+    """Concatenate the 3 x 3 pixels around each pixel: XLA has no fast gradient of a convolution inside a loop."""
     H, W = x.shape[1:3]
     x = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
     return jnp.concatenate([x[:, i : i + H, j : j + W] for i in range(3) for j in range(3)], axis=-1)
@@ -37,7 +37,7 @@ def init_gate(key: Array, inputs: int, channels: int = CHANNELS) -> dict[str, An
 
 
 def apply_gate(params: dict[str, Any], maps: Float[Array, "H W C"]) -> Float[Array, "H W 2"]:
-    """Return what is added to the log precision of each pass."""
+    """Return the shifts of the log precision of each pass."""
     channels = params["conv0"]["bias"].shape[0]
     with jax.default_matmul_precision("highest"):
         return Gate(channels).apply({"params": params}, maps[None])[0]  # pyright: ignore[reportIndexIssue]

@@ -12,9 +12,9 @@ from vggtjax.method.fusion_rule import FusionParams, Observations, fuse
 from vggtjax.method.mask import upsample
 from vggtjax.method.passes import Assembly, Passes
 
-REACH = 64  # pixels up to which distances are told apart
+REACH = 64  # pixels; larger distances to the mask's edge are infinite
 _SMALLEST = 1e-6
-_STILL = -1e3  # margin of what cannot move, whatever the temperature
+_STILL = -1e3  # margin of pixels that are static at any temperature
 
 
 def apply_fusion(
@@ -29,15 +29,15 @@ def apply_fusion(
 
 
 def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None = None) -> Observations:
-    """Return what `fuse` reads of two passes.
+    """Return the inputs of `fuse` for two passes.
 
-    The features are the saliency; log depth of pass 1 over the clip's median; exp(-d / patch size) of the distance d to
-    the mask's edge, 0 beyond `REACH` pixels; and the mask. No gradient passes through the distance.
+    The features are the saliency; log depth of pass 1 over the clip's median; exp(-d / patch size) with the distance
+    d to the mask's edge, 0 beyond `REACH` pixels; and the mask. No gradient passes through the distance.
 
     Args:
-        passes: both, with depth. A mask of shares in [0, 1] may stand for the boolean one.
+        passes: both, with depth; the mask is boolean or of shares in [0, 1].
         patch_size: of the model, in pixels.
-        scale: factor on the second pass's depth, as `scale_between` returns it; 1 if None.
+        scale: factor on the depth of the second pass, as from `scale_between`; 1 if None.
 
     Raises:
         InputError: a pass, or its depth, is missing.
@@ -46,7 +46,7 @@ def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None
     if second is None or first.depth is None or second.depth is None:
         raise InputError("fusion needs depth and confidence of both passes; run them with both outputs")
     if first.depth_confidence is None or second.depth_confidence is None:
-        raise InputError("fusion needs the confidence of both passes, and one of them has none")
+        raise InputError("fusion needs the confidence of both passes, and one pass lacks it")
     depth1, depth2 = first.depth, second.depth
     depth2 = depth2 if scale is None else depth2 * scale[:, None, None, None]
     dynamic = passes.dynamic_mask.astype(depth1.dtype)
@@ -54,7 +54,7 @@ def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None
     hard = jax.lax.stop_gradient(dynamic) >= 0.5
     median = jnp.median(depth1.reshape(len(depth1), -1), axis=1)[:, None, None, None]
     log_depth = jnp.log(jnp.maximum(depth1, _SMALLEST)) - jnp.log(jnp.maximum(median, _SMALLEST))
-    features = [saliency, log_depth, jax.vmap(jax.vmap(lambda one: edge_proximity(one, patch_size)))(hard), dynamic]
+    features = [saliency, log_depth, jax.vmap(jax.vmap(lambda frame: edge_proximity(frame, patch_size)))(hard), dynamic]
     return Observations(
         depth1,
         _log_confidence(first.depth_confidence),
@@ -67,42 +67,41 @@ def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None
 
 
 def edge_proximity(mask: Bool[Array, "H W"], patch_size: int) -> Float[Array, "H W"]:
-    """Return exp(-d / patch_size), where d is `edge_distance`; 0 where that is not told."""
-    distance = edge_distance(mask)
-    return jnp.where(jnp.isfinite(distance), jnp.exp(-distance / patch_size), 0)
+    """Return exp(-d / patch_size) with d from `edge_distance`."""
+    return jnp.exp(-edge_distance(mask) / patch_size)
 
 
 def edge_distance(mask: Bool[Array, "H W"]) -> Float[Array, "H W"]:
-    """Return every pixel's distance to the nearest one on the other side of the mask's edge, in pixels.
+    """Return every pixel's distance to the nearest pixel on the other side of the mask's edge, in pixels.
 
-    Exact and Euclidean, between centres, up to `REACH`; infinite beyond.
+    Exact and Euclidean, between centres, up to `REACH`; larger distances are infinite.
     """
     to_dynamic, to_static = _squared_distance(mask), _squared_distance(~mask)
     squared = jnp.where(mask, to_static, to_dynamic)
     return jnp.where(squared <= REACH**2, jnp.sqrt(squared), jnp.inf)
 
 
-def _squared_distance(there: Bool[Array, "H W"]) -> Float[Array, "H W"]:
-    """Squared distance to the nearest pixel that is there: along columns first, then the best of the columns nearby."""
-    H, W = there.shape
+def _squared_distance(mask: Bool[Array, "H W"]) -> Float[Array, "H W"]:
+    """Return the squared distance to the nearest True pixel: within columns first, then over columns up to `REACH`."""
+    H, W = mask.shape
     rows = jnp.broadcast_to(jnp.arange(H, dtype=jnp.float32)[:, None], (H, W))
     far = float(4 * (REACH + max(H, W)))
-    above = jax.lax.cummax(jnp.where(there, rows, -far), axis=0)
-    below = jax.lax.cummin(jnp.where(there, rows, H + far), axis=0, reverse=True)
+    above = jax.lax.cummax(jnp.where(mask, rows, -far), axis=0)
+    below = jax.lax.cummin(jnp.where(mask, rows, H + far), axis=0, reverse=True)
     column = jnp.minimum(rows - above, below - rows) ** 2
     padded = jnp.pad(column, ((0, 0), (REACH, REACH)), constant_values=far * far)
 
     def nearer(best, offset):
-        there = jax.lax.dynamic_slice_in_dim(padded, offset, W, axis=1)
-        return jnp.minimum(best, there + ((offset - REACH) ** 2).astype(best.dtype)), None
+        shifted = jax.lax.dynamic_slice_in_dim(padded, offset, W, axis=1)
+        return jnp.minimum(best, shifted + ((offset - REACH) ** 2).astype(best.dtype)), None
 
     return jax.lax.scan(nearer, column, jnp.arange(2 * REACH + 1))[0]
 
 
 def _margin(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"]) -> Float[Array, "S H W"]:
-    """Return the saliency minus the threshold of the mask, on the mask's side of 0 where the two disagree.
+    """Return the saliency minus the threshold of the mask, clipped to the mask's side of 0.
 
-    They do where the mask was given or smoothed: such a pixel is on the edge. Where nothing moves there is no edge.
+    Saliency and mask disagree where the mask was supplied by the user or smoothed. An empty mask has no edge.
     """
     margin = saliency - _threshold(saliency, dynamic)
     margin = jnp.where(dynamic, jnp.maximum(margin, 0), jnp.minimum(margin, -_SMALLEST))
@@ -110,9 +109,9 @@ def _margin(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"]) -> F
 
 
 def _threshold(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"]) -> Float[Array, ""]:
-    """Return the value that the mask of a clip was cut at: midway between the two sides next to it.
+    """Return the threshold of a clip's mask: midway between the largest static and the smallest dynamic saliency.
 
-    Of an empty mask it is half above the largest saliency, of a full one half below the smallest.
+    For an empty mask it is 1/2 above the largest saliency, for a full mask 1/2 below the smallest.
     """
     low = jnp.where(dynamic, -jnp.inf, saliency).max()
     high = jnp.where(dynamic, saliency, jnp.inf).min()

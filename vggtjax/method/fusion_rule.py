@@ -1,4 +1,4 @@
-"""A family of fusion rules with a parameter tree, of which the paper's rule (4DVGGT-D, stage 3) is the default.
+"""A family of fusion rules with a parameter tree; its default is the paper's rule (4DVGGT-D, stage 3).
 
 Each pass i claims precision_i = exp(scale_i + features) C_i^power_i + floor_i for its depth. The two depths are then
 joined by the best linear unbiased estimator of two correlated observations, pixel by pixel:
@@ -6,8 +6,8 @@ joined by the best linear unbiased estimator of two correlated observations, pix
     w_2 = (v_1 - c) / (v_1 + v_2 - 2 c),    v_i = 1 / precision_i,    c = correlation sqrt(v_1 v_2),
     fused precision = (precision_1 + precision_2 - 2 correlation sqrt(precision_1 precision_2)) / (1 - correlation^2),
 
-which for correlation 0 is inverse-variance weighting. Where something moves, pass 1 stands alone. All of it is computed
-with logarithms of precisions, so that it stays finite, with its gradients, from confidence 1 to 1e30.
+which for correlation 0 is inverse-variance weighting. On dynamic pixels the output is that of pass 1. Computations use
+logarithms of precisions, so that values and gradients are finite for confidences from 1 to 1e30.
 """
 
 from __future__ import annotations
@@ -27,66 +27,63 @@ from vggtjax.method.fusion_gate import CHANNELS, apply_gate, init_gate
 FusionParams = dict[str, Any]
 
 FEATURES = ("saliency", "depth", "boundary", "dynamic")
-_MOST = 80.0  # of exponents: exp of it is a float32 with room to spare
+_MOST = 80.0  # of exponents: exp(80) is well within float32
 _TINY = 1e-30
 _COLDEST = 1e-6
 
 
 class Observations(NamedTuple):
-    """What two passes say of every pixel, and what a rule may look at; see `observe`."""
+    """The inputs of a rule for every pixel, from two passes; see `observe`."""
 
     depth1: Float[Array, "*F H W"]
     log_confidence1: Float[Array, "*F H W"]
     depth2: Float[Array, "*F H W"]
     log_confidence2: Float[Array, "*F H W"]
     dynamic: Float[Array, "*F H W"]  # share of the pixel that moves, 0 or 1 for a hard mask
-    margin: Float[Array, "*F H W"]  # saliency minus the threshold that the mask was cut at
-    features: Float[Array, "*F H W K"]  # one for each of FEATURES, of order one
+    margin: Float[Array, "*F H W"]  # saliency minus the threshold of the mask
+    features: Float[Array, "*F H W K"]  # in the order of FEATURES, of order one
 
 
 class Fused(NamedTuple):
-    """Depth, the logarithm of its precision (inverse variance, in the unit of depth), and how it came about."""
+    """Depth, the logarithm of its precision (inverse variance, in the unit of depth), and the weights of the passes."""
 
     depth: Float[Array, "*F H W"]
     log_precision: Float[Array, "*F H W"]
-    weight: Float[Array, "*F H W"]  # of pass 2 where nothing moves
+    weight: Float[Array, "*F H W"]  # of pass 2 on static pixels
     dynamic: Float[Array, "*F H W"]  # share of pass 1 alone
 
     @property
     def precision(self) -> Float[Array, "*F H W"]:
-        """The precision itself, cut off before it overflows."""
+        """The precision, limited below overflow."""
         return jnp.exp(jnp.minimum(self.log_precision, _MOST))
 
 
 @dataclass(frozen=True)
 class Part:
-    """A leaf of the tree: its shape, the value that makes it the paper's rule, where a fit starts, and its range."""
+    """A leaf of the tree: its shape, its value in the paper's rule, its value at the start of a fit, and its range."""
 
-    about: str
     shape: tuple[int, ...] = (2,)  # one value for each pass
     identity: float = 0.0
-    start: float | None = None  # the identity, unless that is a corner from which no gradient leads
+    start: float | None = None  # the identity if None; another value where the gradient at the identity is 0
     low: float = -math.inf
     high: float = math.inf
-    least: float | None = None  # while it is fitted: from 0 no gradient of a mask leads back
-    rate: float = 1.0  # of learning, beside other parts
+    least: float | None = None  # lower end of the range during a fit, where the gradient at `low` is 0
+    rate: float = 1.0  # of learning, relative to other parts
 
 
 PARTS: dict[str, Part] = {
-    "scale": Part("logarithm of a factor on the precision"),
-    "power": Part("exponent of the confidence", identity=1.0, low=-8, high=8),
-    "floor": Part("precision that is added whatever the confidence", start=1e-3, low=0, high=1e6),
-    "saliency": Part("change of log precision from saliency 0 to 1", low=-50, high=50),
-    "depth": Part("change of log precision with log depth over the clip's median", low=-50, high=50),
-    "boundary": Part("change of log precision next to the mask's edge", low=-50, high=50),
-    "dynamic": Part("change of log precision where something moves", low=-50, high=50),
-    "correlation": Part("of the two passes' errors", shape=(), low=-0.99, high=0.99),
-    "inflation": Part("how far disagreement beyond the claimed variances widens the fused one", (), low=0, high=1e3),
-    "distrust": Part("how far such disagreement discounts a pass", low=0, high=1e3),
-    "offset": Part("added to the threshold of the saliency", (), low=-1, high=1, rate=0.1),
-    "temperature": Part(
-        "width of a soft mask's edge; 0 is the hard mask", (), start=0.1, low=0, high=10, least=1e-3, rate=0.1
-    ),
+    "scale": Part(),  # logarithm of a factor on the precision
+    "power": Part(identity=1.0, low=-8, high=8),  # exponent of the confidence
+    "floor": Part(start=1e-3, low=0, high=1e6),  # precision added at any confidence
+    "saliency": Part(low=-50, high=50),  # change of log precision from saliency 0 to 1
+    "depth": Part(low=-50, high=50),  # change of log precision with log depth over the clip's median
+    "boundary": Part(low=-50, high=50),  # change of log precision next to the mask's edge
+    "dynamic": Part(low=-50, high=50),  # change of log precision on dynamic pixels
+    "correlation": Part((), low=-0.99, high=0.99),  # of the two passes' errors
+    "inflation": Part((), low=0, high=1e3),  # widens the fused variance by disagreement beyond the claimed variances
+    "distrust": Part(low=0, high=1e3),  # discounts a pass by such disagreement
+    "offset": Part((), low=-1, high=1, rate=0.1),  # added to the threshold of the saliency
+    "temperature": Part((), start=0.1, low=0, high=10, least=1e-3, rate=0.1),  # width of a soft mask's edge; 0: hard
 }
 
 PRESETS: dict[str, tuple[str, ...]] = {
@@ -103,10 +100,7 @@ PRESETS: dict[str, tuple[str, ...]] = {
 
 
 def parse_family(text: str) -> tuple[str, ...]:
-    """Return the free parts of a family: a name of `PRESETS`, or parts joined by "+".
-
-    Raises InputError for a name that is neither.
-    """
+    """Return the free parts of a family: a name of `PRESETS`, or parts joined by "+"; InputError for another name."""
     if text in PRESETS:
         return PRESETS[text]
     parts = tuple(dict.fromkeys(part.strip() for part in text.split("+")))
@@ -124,11 +118,11 @@ def identity() -> FusionParams:
 
 
 def start(family: tuple[str, ...], seed: int = 0, spread: float = 0.0) -> FusionParams:
-    """Return the tree from which a fit of a family starts: the paper's rule, but for leaves that would not move there.
+    """Return the tree at the start of a fit: the paper's rule, except for free leaves whose gradient is 0 there.
 
     Args:
         family: the free parts.
-        seed: of the gate's weights, whose last layer is 0, and of the `spread`.
+        seed: of the gate's weights, whose last layer is 0, and of the noise.
         spread: standard deviation of noise on the free leaves.
     """
     keys = jax.random.split(jax.random.key(seed), len(PARTS) + 1)
@@ -143,7 +137,7 @@ def start(family: tuple[str, ...], seed: int = 0, spread: float = 0.0) -> Fusion
 
 
 def projected(params: FusionParams, fitted: tuple[str, ...] = ()) -> FusionParams:
-    """Return the tree with every leaf within its range, or within that of a fit for parts that are fitted."""
+    """Return the tree with every leaf clipped to its range; for `fitted` parts, to the range during a fit."""
 
     def low(name: str) -> float:
         part = PARTS[name]
@@ -155,7 +149,7 @@ def projected(params: FusionParams, fitted: tuple[str, ...] = ()) -> FusionParam
 
 
 def is_free(params: FusionParams, family: tuple[str, ...]) -> FusionParams:
-    """Return a tree of booleans of the same structure: which leaves a family leaves free."""
+    """Return a tree of booleans of the same structure: True for the free leaves of a family."""
     return {name: jax.tree.map(lambda _, name=name: name in family, leaf) for name, leaf in params.items()}
 
 
@@ -165,7 +159,7 @@ def fuse(params: FusionParams, seen: Observations) -> Fused:
 
 
 def log_precisions(params: FusionParams, seen: Observations) -> tuple[Float[Array, "*F H W"], Float[Array, "*F H W"]]:
-    """Return the logarithm of the precision that each pass claims, before any disagreement discounts it."""
+    """Return the logarithm of the precision that each pass claims, without the discount by disagreement."""
     return _over_frames(_claims, params, seen)
 
 
@@ -183,13 +177,13 @@ def _claims(params: FusionParams, seen: Observations) -> tuple[Float[Array, "H W
         claim = params["scale"][i] + params["power"][i] * log_confidence + shifts[..., i]
         claims.append(_above(claim, params["floor"][i]))
     if "gate" in params:
-        shift = apply_gate(params["gate"], _seen_by_gate(seen))
+        shift = apply_gate(params["gate"], _gate_inputs(seen))
         claims = [claim + shift[..., i] for i, claim in enumerate(claims)]
     return claims[0], claims[1]
 
 
 def _above(log_precision: Float[Array, "H W"], floor: Float[Array, ""]) -> Float[Array, "H W"]:
-    """log(exp(log_precision) + floor); with a gradient by a floor of 0 too, unless the precision is next to nothing."""
+    """Return log(exp(log_precision) + floor), with a gradient by a floor of 0 unless the precision is nearly 0."""
     near = log_precision > -_MOST
     usual = log_precision + jnp.log1p(floor * jnp.exp(-jnp.where(near, log_precision, 0)))
     low = jnp.where(floor > 0, jnp.logaddexp(log_precision, jnp.log(jnp.where(floor > 0, floor, 1))), log_precision)
@@ -227,16 +221,16 @@ def _fuse_frame(params: FusionParams, seen: Observations) -> Fused:
 def _blended(
     dynamic: Float[Array, "H W"], first: Float[Array, "H W"], joined: Float[Array, "H W"]
 ) -> Float[Array, "H W"]:
-    """Log precision of m D_1 + (1 - m) D_f: its variance is m^2 v_1 + (1 - m^2) v_f, as cov(D_1, D_f) = v_f."""
+    """Return the log precision of m D_1 + (1 - m) D_f, variance m^2 v_1 + (1 - m^2) v_f as cov(D_1, D_f) = v_f."""
     widest = jnp.minimum(first, joined)  # log precision of the larger variance
-    variances = [jnp.exp(jnp.maximum(widest - one, -_MOST)) for one in (first, joined)]
+    variances = [jnp.exp(jnp.maximum(widest - own, -_MOST)) for own in (first, joined)]
     return widest - jnp.log(dynamic * dynamic * variances[0] + (1 - dynamic * dynamic) * variances[1])
 
 
 def _ratio(
     first: Float[Array, "H W"], second: Float[Array, "H W"], correlation: Float[Array, ""]
 ) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:
-    """Return q, the smaller standard deviation over the larger, and 1 + q^2 - 2 correlation q."""
+    """Return q, the smaller standard deviation over the larger one, and 1 + q^2 - 2 correlation q."""
     ratio = jnp.exp(-jnp.abs(first - second) / 2)
     return ratio, 1 + ratio * ratio - 2 * correlation * ratio
 
@@ -244,9 +238,9 @@ def _ratio(
 def _excess(
     first: Float[Array, "H W"], second: Float[Array, "H W"], correlation: Float[Array, ""], apart: Float[Array, "H W"]
 ) -> Float[Array, "H W"]:
-    """Return by how much the squared difference of the depths exceeds its expectation, in units of that; 0 if not.
+    """Return the excess of the squared difference of the depths over its expectation, relative to that; at least 0.
 
-    With one such difference it is chi^2 - 1, so inflation 1 multiplies the variance by the squared Birge ratio.
+    For one difference this is chi^2 - 1, so inflation 1 multiplies the variance by the squared Birge ratio.
     """
     _, left = _ratio(first, second, correlation)
     log_expected = jnp.log(left) - jnp.minimum(first, second)  # of the difference's variance
@@ -254,8 +248,8 @@ def _excess(
     return jnp.maximum(jnp.expm1(jnp.clip(log_square - log_expected, -_MOST, _MOST / 2)), 0)
 
 
-def _seen_by_gate(seen: Observations) -> Float[Array, "H W C"]:
-    """What the gate reads: of order one, whatever comes in."""
+def _gate_inputs(seen: Observations) -> Float[Array, "H W C"]:
+    """Return the inputs of the gate, of order one for any depths and confidences."""
     depths = [jnp.log(jnp.maximum(depth, 1e-6)) for depth in (seen.depth1, seen.depth2)]
     maps = [
         jnp.tanh(seen.log_confidence1 / 4),

@@ -1,4 +1,4 @@
-"""The dynamic mask as objects: regions of each frame, followed from frame to frame by where they should be."""
+"""The dynamic mask as objects: regions of each frame, matched to objects at their expected places."""
 
 from __future__ import annotations
 
@@ -12,47 +12,47 @@ from scipy.optimize import linear_sum_assignment
 from vggtjax.errors import InputError
 
 MOST = 255  # objects: ids fit the palette of a picture
-LEAST_SHARE = 5e-4  # of a frame's pixels, which a region must fill to be an object
+LEAST_SHARE = 5e-4  # of a frame's pixels, for a region to be an object
 GAP = 1  # frames for which an object may be lost
-_REACH = 2.0  # sizes of an object by which it may miss the place where it is expected
+_REACH = 2.0  # largest distance of a region from the expected place of its object, in sizes of the object
 _NEIGHBOURS = np.ones((3, 3), bool)
-_PART = 0.5  # of a region, which lies where an object is expected: then it is a part of that object
+_PART = 0.5  # share of a region at the expected place of an object that makes the region a part of that object
 
 
 @dataclass
 class _Object:
-    """What is known of an object so far."""
+    """The state of an object after some frames."""
 
     id: int
-    frame: int  # that it was last seen in
+    frame: int  # the last one with the object
     centre: Float64[np.ndarray, " 2"]
-    velocity: Float64[np.ndarray, " 2"]  # pixels a frame; 0 until it was seen twice
-    pixels: Int[np.ndarray, "N 2"]  # then
-    volume: int  # pixels of all frames
+    velocity: Float64[np.ndarray, " 2"]  # pixels per frame; 0 until the second frame with the object
+    pixels: Int[np.ndarray, "N 2"]  # in that frame
+    volume: int  # number of pixels in all frames
 
     def expected(self, frame: int) -> Float64[np.ndarray, " 2"]:
-        """Return by how much it should have moved since it was last seen."""
+        """Return the expected movement since the last frame with the object."""
         return self.velocity * (frame - self.frame)
 
 
 def find_instances(
     dynamic_mask: Bool[np.ndarray, "S H W"], *, gap: int = GAP, least_share: float = LEAST_SHARE
 ) -> UInt8[np.ndarray, "S H W"]:
-    """Tell moving objects apart, with the same id in all frames.
+    """Return the ids of moving objects, the same in all frames.
 
-    The connected regions of a frame are matched one to one with the objects so far, so that the squared distances from
-    where each should be (its last place, moved on at its last speed), in sizes of the object, are least in sum. A
-    region without a match that mostly lies where a matched object should be is a part of it; any other is a new object.
-    Objects that touch are one region, which goes on as one of them. Two that look alike are told apart as long as none
-    moves by much more than its own size from one frame to the next.
+    The connected regions of a frame are matched one to one with the earlier objects, with the least sum of squared
+    distances from the expected places (last place plus last velocity), in sizes of the object. A region without a match
+    that mostly covers the expected place of a matched object is a part of it; any other region is a new object. Objects
+    that touch are one region, which continues one of them. Objects are told apart if none moves by much more than its
+    own size between two frames.
 
     Args:
-        dynamic_mask: True where the world moves.
-        gap: frames for which an object may vanish, and keep its id when it comes back to where it should be.
-        least_share: of a frame's pixels that a region must fill; smaller ones are no objects.
+        dynamic_mask: True on dynamic pixels.
+        gap: frames for which an object may vanish and keep its id.
+        least_share: least share of a frame's pixels for a region to be an object.
 
     Returns:
-        0 where nothing moves and for what is too small, else the object: 1 fills most pixels of the clip, 255 fewest.
+        0 on static pixels and in small regions, else the id of the object: 1 fills most pixels of the clip, 255 fewest.
 
     Raises:
         InputError: a mask that is not bool [S, H, W], or a value out of range.
@@ -65,7 +65,7 @@ def find_instances(
     objects: list[_Object] = []
     for frame, mask in enumerate(dynamic_mask):
         regions = _regions(mask, max(1, least_share * mask.size))
-        known = [one for one in objects if frame - one.frame <= 1 + gap]
+        known = [owner for owner in objects if frame - owner.frame <= 1 + gap]
         owners = _matched(known, regions, frame)
         expected = _painted([owner for owner in owners if owner is not None], frame, mask.shape)
         for number, region in enumerate(regions):
@@ -79,8 +79,8 @@ def find_instances(
             owner.volume += len(region)
             ids[frame, region[:, 0], region[:, 1]] = owner.id
     names = np.zeros(len(objects) + 1, np.uint8)
-    for name, one in enumerate(sorted(objects, key=lambda one: -one.volume)[:MOST], 1):
-        names[one.id] = name
+    for name, owner in enumerate(sorted(objects, key=lambda owner: -owner.volume)[:MOST], 1):
+        names[owner.id] = name
     return names[ids]
 
 
@@ -97,15 +97,15 @@ def _regions(mask: Bool[np.ndarray, "H W"], least: float) -> list[Int[np.ndarray
 
 
 def _matched(known: list[_Object], regions: list[Int[np.ndarray, "N 2"]], frame: int) -> list[_Object | None]:
-    """Return the object that each region is of, None for one that is nobody's."""
+    """Return the object of each region, None for a region without a match."""
     owners: list[_Object | None] = [None] * len(regions)
     if not known or not regions:
         return owners
-    expected = np.stack([one.centre + one.expected(frame) for one in known])
+    expected = np.stack([owner.centre + owner.expected(frame) for owner in known])
     centres = np.stack([region.mean(axis=0) for region in regions])
-    size = np.sqrt([[max(len(one.pixels), len(region)) for region in regions] for one in known])
+    size = np.sqrt([[max(len(owner.pixels), len(region)) for region in regions] for owner in known])
     distance = np.linalg.norm(expected[:, None] - centres[None], axis=2) / size
-    cost = np.minimum(distance, _REACH) ** 2  # too far is as dear as no match
+    cost = np.minimum(distance, _REACH) ** 2  # a region beyond the reach costs as much as no match
     for i, j in zip(*linear_sum_assignment(cost), strict=True):
         if distance[i, j] < _REACH:
             owners[j] = known[i]
@@ -113,9 +113,9 @@ def _matched(known: list[_Object], regions: list[Int[np.ndarray, "N 2"]], frame:
 
 
 def _painted(owners: list[_Object], frame: int, size: tuple[int, ...]) -> Int[np.ndarray, "H W"]:
-    """Return the ids of objects at the pixels where they should be, 0 elsewhere; small ones lie over large ones."""
+    """Return the ids of objects at their expected pixels, 0 elsewhere; small objects lie over large ones."""
     ids = np.zeros(size, np.int32)
-    for owner in sorted(owners, key=lambda one: -len(one.pixels)):
+    for owner in sorted(owners, key=lambda owner: -len(owner.pixels)):
         places = np.rint(owner.pixels + owner.expected(frame)).astype(int)
         places = places[((places >= 0) & (places < size)).all(axis=1)]
         ids[places[:, 0], places[:, 1]] = owner.id
@@ -125,7 +125,7 @@ def _painted(owners: list[_Object], frame: int, size: tuple[int, ...]) -> Int[np
 def _part_of(
     region: Int[np.ndarray, "N 2"], expected: Int[np.ndarray, "H W"], objects: list[_Object]
 ) -> _Object | None:
-    """Return the object that should be at most of a region's pixels."""
+    """Return the object that is expected at most of a region's pixels."""
     counts = np.bincount(expected[region[:, 0], region[:, 1]])
     counts[0] = 0
     most = int(counts.argmax())

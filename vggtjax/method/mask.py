@@ -13,7 +13,7 @@ from vggtjax.options import Threshold, check_smooth_frames
 
 BINS = 256
 MOST_CLASSES = 4  # of multi-Otsu
-CONSTANT = 1e-6  # a clip whose saliency spans less than this has nothing that moves
+CONSTANT = 1e-6  # nothing moves in a clip whose saliency has a smaller range
 
 
 def upsample(saliency: Float[Array, "B S h w"], size: tuple[int, int]) -> Float[Array, "B S H W"]:
@@ -22,10 +22,10 @@ def upsample(saliency: Float[Array, "B S h w"], size: tuple[int, int]) -> Float[
 
 
 def otsu_threshold(values: Float[Array, ...], bins: int = BINS) -> Float[Array, ""]:
-    """Return Otsu's threshold: the bin centre that maximises the variance between the two classes it makes.
+    """Return Otsu's threshold: the bin centre of the largest variance between the two classes.
 
-    The histogram has `bins` bins from the smallest to the largest value, as scikit-image's `threshold_otsu`; of
-    equally good centres the lowest is taken. Constant values give that value.
+    The histogram has `bins` bins from the smallest to the largest value, as scikit-image's `threshold_otsu`. Of equal
+    centres the lowest is returned; of constant values, the value.
     """
     values = values.ravel()
     low, high = values.min(), values.max()
@@ -44,9 +44,9 @@ def otsu_threshold(values: Float[Array, ...], bins: int = BINS) -> Float[Array, 
 def dynamic_pixels(
     saliency: Float[Array, "B S h w"], size: tuple[int, int], *, threshold: Threshold = "otsu"
 ) -> Bool[Array, "B S H W"]:
-    """Return the dynamic pixels of every clip, cut at one threshold over all its pixels.
+    """Return the dynamic pixels of every clip by one threshold for all pixels of the clip.
 
-    A clip of constant saliency (one frame, or nothing moves) has none.
+    A clip of constant saliency (one frame, or nothing moves) has no dynamic pixels.
 
     Args:
         saliency: of every patch, in [0, 1].
@@ -73,7 +73,7 @@ def mine_mask(
     threshold: Threshold = "otsu",
     smooth_frames: int = 1,
 ) -> Bool[Array, "B S H W"]:
-    """Return a method's dynamic pixels: the saliency, averaged within clusters if there are any, cut at a threshold.
+    """Return a method's dynamic pixels: the saliency, averaged within clusters if requested, above a threshold.
 
     No gradient passes: a mask is a decision.
 
@@ -83,7 +83,7 @@ def mine_mask(
         size: height and width of the mask.
         clusters: number of clusters of `smooth_by_clusters`; 0 for none.
         threshold: "otsu" or "multi-otsu".
-        smooth_frames: frames that the saliency is averaged over before it is cut, an odd number (see
+        smooth_frames: odd number of frames over which the saliency is averaged before the threshold (see
             `smooth_over_time`; not in the papers).
     """
     saliency, patch_tokens = jax.lax.stop_gradient((saliency, patch_tokens))
@@ -100,7 +100,7 @@ def smooth_by_clusters(
 
     Args:
         saliency: of every patch, in [0, 1].
-        patch_tokens: the backbone's features, which all frames of a clip are clustered by together.
+        patch_tokens: the backbone's features; all frames of a clip are clustered together.
         clusters: number of clusters.
         seed: of k-means.
     """
@@ -114,11 +114,11 @@ def smooth_by_clusters(
 
 
 def smooth_over_time(saliency: Float[Array, "B S h w"], frames: int) -> Float[Array, "B S h w"]:
-    """Average every patch over so many frames, itself in the middle; at the ends, over those that there are.
+    """Average every patch over `frames` frames around its own; at the ends of the clip, over the existing ones.
 
-    Patches stay where they are in the picture: sensible where the clip is dense and the camera slow.
+    Patches are averaged at fixed places in the picture, which suits dense clips of slow cameras.
 
-    Raises InputError for a number that is not odd.
+    Raises InputError for an even number.
     """
     check_smooth_frames(frames)
     if frames == 1:
@@ -141,8 +141,8 @@ def cluster_means(saliency: Float[Array, "S h w"], labels: Int[Array, "S h w"], 
 def multi_otsu_threshold(values: np.ndarray) -> float:
     """Return the highest threshold of Otsu's best partition into two to four classes (VGGT4D), on the host.
 
-    The number of classes is that of the largest variance of the classes' means over the root of the number. Constant
-    values give that value; fewer distinct values than classes rule a number out.
+    The number of classes K is that of the largest variance of the classes' means over sqrt(K), among numbers up to that
+    of distinct values. Of constant values, the value is returned.
     """
     from skimage.filters import threshold_multiotsu
 
@@ -164,13 +164,13 @@ def multi_otsu_threshold(values: np.ndarray) -> float:
 
 def _multi_otsu(values: np.ndarray) -> np.ndarray:
     values = np.asarray(values)
-    threshold = multi_otsu_threshold(values) if np.isfinite(values).all() else np.nan  # above NaN is nothing
+    threshold = multi_otsu_threshold(values) if np.isfinite(values).all() else np.nan  # no value is above NaN
     return np.asarray(threshold, np.float32)
 
 
 def dynamic_tokens(
     mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"], patch_size: int
 ) -> Bool[Array, "B S h w"] | Float[Array, "B S h w"]:
-    """Return the tokens any pixel of which is dynamic; of shares in [0, 1], the largest of each token's pixels."""
+    """Return the tokens with at least one dynamic pixel; of shares in [0, 1], the largest of each token's pixels."""
     B, S, H, W = mask.shape
     return mask.reshape(B, S, H // patch_size, patch_size, W // patch_size, patch_size).max(axis=(3, 5))

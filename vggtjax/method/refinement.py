@@ -1,12 +1,11 @@
-"""Mask refinement by projection (VGGT4D, stage 3): what agrees with the static scene in other frames does not move.
+"""Mask refinement by projection (VGGT4D, stage 3): points that agree with the static pixels of other frames are static.
 
-Per frame, the points under the coarse mask are grouped by k-means; every group is projected into all other frames, and
-compared there in depth and colour with what those frames show on static pixels. Groups that agree leave the mask.
+In each frame, the points under the coarse mask are grouped by k-means. Every group is projected into all other frames
+and compared with their static pixels in depth and colour. Groups that agree are removed from the mask.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -22,32 +21,33 @@ from vggtjax.errors import InputError
 from vggtjax.method.clustering import kmeans, nearest_centre
 from vggtjax.network.precision import full_precision
 from vggtjax.network.sampling import bilinear
+from vggtjax.progress import Progress
 
 CLUSTERS = 30
 RESTARTS = 4  # of k-means
-FITTED = 4096  # points of a frame, evenly drawn, that the centres of its clusters are fitted to; all are labelled
-NEIGHBOURS = 20  # of a point, itself among them
+FITTED = 4096  # points of a frame, evenly drawn, for fitting the cluster centres; all points are labelled
+NEIGHBOURS = 20  # of a point, including itself
 OUTLIER_SIGMA = 2.5
-LEAST_SHARE = 0.05  # of a group's projections that must count
+LEAST_SHARE = 0.05  # of a group's projections that must be comparable
 MOST_LOSS = 0.1
-OCCLUSION = 0.01  # depth by which a point may lie behind what its target pixel shows
-TOO_FEW = 1e10  # loss of a group of which too little can be compared
-SAMPLES_AT_ONCE = 1 << 21  # projections of points, which bounds the memory
+OCCLUSION = 0.01  # depth by which a point may lie behind the depth of its target pixel
+TOO_FEW = 1e10  # loss of a group with too few comparable projections
+SAMPLES_AT_ONCE = 1 << 21  # projected points, a bound on memory
 _BUCKET = 2048  # points are padded to a multiple, so that masks of similar size share a compilation
 _CLOSING = np.array([[0, 0, 1, 0, 0], [1] * 5, [1] * 5, [1] * 5, [0, 0, 1, 0, 0]], bool)  # OpenCV's 5 x 5 ellipse
 
 
 class ClusterLosses(NamedTuple):
-    """How far every cluster is from what other frames show: means over its projections that count."""
+    """Differences of every cluster from other frames: means over its comparable projections."""
 
     depth: Float[Array, "S K"]
     rgb: Float[Array, "S K"]  # absolute difference, summed over the channels
-    counted: Int[Array, "S K"]  # projections that count
+    counted: Int[Array, "S K"]  # comparable projections
     points: Int[Array, "S K"]
 
     @property
     def total(self) -> Float[Array, "S K"]:
-        """Depth plus mean over channels of colour; TOO_FEW where too little counts."""
+        """Depth plus mean over channels of colour; TOO_FEW for too few comparable projections."""
         S = self.depth.shape[0]
         enough = (self.counted >= LEAST_SHARE * (S - 1) * self.points) & (self.counted > 0)
         return jnp.where(enough, self.depth + self.rgb / 3, TOO_FEW)
@@ -63,22 +63,22 @@ def refine_masks(
     valid: Bool[np.ndarray, "S H W"] | None = None,
     clusters: int = CLUSTERS,
     seed: int = 0,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> Bool[np.ndarray, "S H W"]:
-    """Return the dynamic mask without what agrees with other frames, closed and dilated (VGGT4D, stage 3).
+    """Return the dynamic mask without points that agree with other frames, closed and dilated (VGGT4D, stage 3).
 
     Args:
         images: RGB in [0, 1].
         depth: z in the camera, in VGGT's unit: scenes are about 1 away, and the thresholds are lengths.
-        dynamic_mask: the coarse mask; an empty one stays empty.
-        camera_from_world, intrinsics: OpenCV cameras, as steady as can be had; intrinsics in pixels.
-        valid: False on padding, which is neither compared nor dynamic; None for none.
+        dynamic_mask: the coarse mask; an empty mask stays empty.
+        camera_from_world, intrinsics: OpenCV cameras of little noise; intrinsics in pixels.
+        valid: False on padding, which is neither compared nor dynamic; None without padding.
         clusters: groups per frame.
         seed: of k-means.
-        progress: called with frames done and frames in all, while outliers are looked for.
+        progress: called with the frames searched for outliers and their number.
 
     Raises:
-        InputError: arrays whose shapes or types do not fit together.
+        InputError: inconsistent shapes, or wrong types.
     """
     _check(images, depth, dynamic_mask, camera_from_world, intrinsics, valid)
     S = len(depth)
@@ -99,7 +99,7 @@ def refine_masks(
     count = min(-(-most // _BUCKET) * _BUCKET, depth[0].size)
     index, weight = _packed(inside, count)
     chosen = np.take_along_axis(points.reshape(S, -1, 3), index[..., None], axis=1)
-    chosen[~weight] = 0  # where there is nothing, depth may not even be a number
+    chosen[~weight] = 0  # depth outside the mask may be NaN
     labels = cluster_points(jax.random.key(seed), chosen, weight, clusters)
     hidden = dynamic_mask | ~valid
     losses = cluster_losses(images, depth, hidden, camera_from_world, intrinsics, index, weight, labels, clusters)
@@ -115,7 +115,7 @@ def statistical_outliers(
 ) -> Bool[np.ndarray, "H W"]:
     """Return the points whose mean distance to their nearest neighbours is 2.5 standard deviations above the mean.
 
-    Points that are not finite, or not `valid`, are outliers too, and nobody's neighbours.
+    Invalid points and points that are not finite are outliers too, and not neighbours of other points.
     """
     flat = points.reshape(-1, 3)
     outlier = np.logical_not(np.isfinite(flat).all(axis=1, keepdims=True))[:, 0]
@@ -135,15 +135,15 @@ def statistical_outliers(
 def cluster_points(
     key: Array, points: Float[Array, "S N 3"], weight: Bool[Array, "S N"], clusters: int = CLUSTERS
 ) -> Int[Array, "S N"]:
-    """Group every frame's points by k-means, frame by frame; those of weight 0 are labelled but move nothing."""
+    """Group the points of every frame by k-means; points of weight 0 are labelled but move no centre."""
     keys = jax.random.split(key, points.shape[0])
     fitted = min(FITTED, points.shape[1])
 
     def one_frame(frame: tuple[Array, Array, Array]) -> Int[Array, " N"]:
-        key, points, there = frame
-        count = jnp.maximum(there.sum(), 1)  # those that are there come first
+        key, points, is_real = frame
+        count = jnp.maximum(is_real.sum(), 1)  # real points come first
         drawn = jnp.where(count > fitted, (jnp.arange(fitted) * (count / fitted)).astype(jnp.int32), jnp.arange(fitted))
-        centres = kmeans(key, points[drawn], clusters, there[drawn], restarts=RESTARTS).centres
+        centres = kmeans(key, points[drawn], clusters, is_real[drawn], restarts=RESTARTS).centres
         return nearest_centre(points, centres)
 
     return jax.lax.map(one_frame, (keys, points, weight))
@@ -162,16 +162,16 @@ def cluster_losses(
     labels: Int[Array, "S N"],
     clusters: int = CLUSTERS,
 ) -> ClusterLosses:
-    """Compare every cluster with what the other frames show on static pixels.
+    """Compare every cluster with the static pixels of the other frames.
 
-    A projection counts if it falls inside the frame, in front of the camera, not behind what is seen there, and on a
-    static pixel. Depth is sampled at the nearest pixel, colour and mask bilinearly.
+    A projection is comparable on a static pixel inside the frame, in front of the camera, and not behind the pixel's
+    depth. Depth is sampled at the nearest pixel, colour and mask bilinearly.
 
     Args:
         images, depth, dynamic_mask, camera_from_world, intrinsics: as for `refine_masks`.
-        index: pixels of the points, row after row.
-        weight: whether there is such a point at all.
-        labels: its cluster.
+        index: pixels of the points, in row-major order.
+        weight: False for padding.
+        labels: cluster of each point.
         clusters: number of clusters (static).
     """
     S, H, W = depth.shape
@@ -183,29 +183,29 @@ def cluster_losses(
     targets = jax.tree.map(lambda x: x.reshape(S // at_once, at_once, *x.shape[1:]), targets)
 
     def one_frame(source):
-        frame, pixels, there, label = source
+        frame, pixels, is_real, label = source
         points = unproject(depth[frame], intrinsics[frame], camera_from_world[frame], pixel_offset=0.5)
         world = points.reshape(-1, 3)[pixels]
         colour = images[frame].reshape(-1, 3)[pixels]
-        member = jax.nn.one_hot(label, clusters) * there[:, None]
+        member = jax.nn.one_hot(label, clusters) * is_real[:, None]
 
         def one_target(target):
-            number, shown, seen_depth, pose, camera = target
-            seen = world @ pose[:, :3].T + pose[:, 3][None]
-            projected = seen @ camera.T
+            number, shown, target_depth, pose, camera = target
+            local = world @ pose[:, :3].T + pose[:, 3][None]
+            projected = local @ camera.T
             u, v = projected[:, 0] / projected[:, 2], projected[:, 1] / projected[:, 2]
-            inside = (u > 0) & (u < W) & (v > 0) & (v < H) & (seen[:, 2] > 0)
+            inside = (u > 0) & (u < W) & (v > 0) & (v < H) & (local[:, 2] > 0)
             u, v = jnp.where(inside, u, 0), jnp.where(inside, v, 0)
-            sampled_depth = _nearest(seen_depth, u, v)
+            sampled_depth = _nearest(target_depth, u, v)
             sampled = bilinear(shown, jnp.stack([u, v], axis=-1))
-            counts = inside & (seen[:, 2] - OCCLUSION < sampled_depth) & (sampled_depth < jnp.inf)
+            counts = inside & (local[:, 2] - OCCLUSION < sampled_depth) & (sampled_depth < jnp.inf)
             counts &= (sampled[:, 3] <= 0.5) & (number != frame)
-            off = jnp.abs(sampled_depth - seen[:, 2])
-            faded = jnp.abs(sampled[:, :3] - colour).sum(axis=-1)
-            values = jnp.stack([jnp.ones_like(off), off, faded], axis=-1)
+            depth_error = jnp.abs(sampled_depth - local[:, 2])
+            rgb_error = jnp.abs(sampled[:, :3] - colour).sum(axis=-1)
+            values = jnp.stack([jnp.ones_like(depth_error), depth_error, rgb_error], axis=-1)
             return jnp.einsum("nk,nv->kv", member, jnp.where(counts[:, None], values, 0))
 
-        sums = jax.lax.map(lambda some: jax.vmap(one_target)(some).sum(axis=0), targets).sum(axis=0)
+        sums = jax.lax.map(lambda batch: jax.vmap(one_target)(batch).sum(axis=0), targets).sum(axis=0)
         return sums, member.sum(axis=0)
 
     sums, points = jax.lax.map(one_frame, (jnp.arange(S), index, weight, labels))
@@ -214,7 +214,7 @@ def cluster_losses(
 
 
 def _nearest(image: Float[Array, "H W"], u: Float[Array, " N"], v: Float[Array, " N"]) -> Float[Array, " N"]:
-    """Sample where u and v count pixel centres from 0; 0 outside."""
+    """Sample at pixel centres u, v that count from 0; 0 outside."""
     H, W = image.shape
     column, row = jnp.round(u).astype(jnp.int32), jnp.round(v).astype(jnp.int32)
     inside = (column < W) & (row < H)
@@ -238,15 +238,15 @@ def _check(images, depth, dynamic_mask, camera_from_world, intrinsics, valid) ->
 
 
 def _packed(inside: Bool[np.ndarray, "S H W"], count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels of every frame's mask as indices [S, count], and which of them are real.
+    """Return the pixels of every frame's mask as indices [S, count], and which of the indices are real.
 
-    The others are distinct pixels outside the mask, so that every pixel is named at most once.
+    Padding names distinct pixels outside the mask, so that every pixel is named at most once.
     """
     order = np.argsort(~inside.reshape(len(inside), -1), axis=1, kind="stable")[:, :count]
     return order.astype(np.int32), np.take_along_axis(inside.reshape(len(inside), -1), order, axis=1)
 
 
 def _smoothed(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Close with OpenCV's 5 x 5 ellipse, then dilate with a full 3 x 3; beyond the edge is neither."""
+    """Close with OpenCV's 5 x 5 ellipse, then dilate with a full 3 x 3; pixels beyond the edge change neither."""
     closed = ndimage.binary_erosion(ndimage.binary_dilation(mask, _CLOSING), _CLOSING, border_value=1)
     return ndimage.binary_dilation(closed, np.ones((3, 3), bool))
