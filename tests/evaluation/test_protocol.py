@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from tests.scored_room import room_and_truth
 from vggtjax import cameras as geometry
 from vggtjax.evaluation.metrics.video_depth import Align
-from vggtjax.evaluation.protocol import TruthAtPixels, depth_at_source, score
+from vggtjax.evaluation.protocol import depth_at_source, score
+from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
 
 POINTS = [
     f"{name}_{kind}"

@@ -13,5 +13,5 @@ from .metrics.trajectory import associate as associate
 from .metrics.trajectory import trajectory_errors as trajectory_errors
 from .metrics.uncertainty import uncertainty_scores as uncertainty_scores
 from .metrics.video_depth import video_depth_errors as video_depth_errors
-from .protocol import TruthAtPixels as TruthAtPixels
 from .protocol import score as score
+from .truth_at_pixels import TruthAtPixels as TruthAtPixels

@@ -16,9 +16,10 @@ from vggtjax.errors import InputError, VggtjaxError, one_line
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.metrics.masks import Empty
 from vggtjax.evaluation.metrics.video_depth import Align
-from vggtjax.evaluation.protocol import TruthAtPixels, score
+from vggtjax.evaluation.protocol import score
 from vggtjax.evaluation.records import Record, Records, shown_name
 from vggtjax.evaluation.sources import ResultSource
+from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
 from vggtjax.progress import OnStage, Progress
 from vggtjax.results.reconstruction import Reconstruction
 
@@ -198,9 +199,9 @@ class _Steps:
     def __init__(self, progress: Progress | None, names: int) -> None:
         self._progress, self._total, self._done = progress, _STEPS * names, 0
 
-    def within(self, done: int, total: int) -> None:
+    def within(self, done: int, total: int | None) -> None:
         if self._progress is not None:
-            self._progress(self._done + _STEPS * done // max(total, 1), self._total)
+            self._progress(self._done + _STEPS * done // (total or 1), self._total)
 
     def next(self) -> None:
         self.within(1, 1)

@@ -182,7 +182,7 @@ def dataset_passes(
     """
     from vggtjax.clips.sampling import Sampling
     from vggtjax.evaluation.datasets import DATASETS, find_sequences
-    from vggtjax.evaluation.protocol import TruthAtPixels
+    from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
 
     side = model.config.image_size if size is None else size
     openers, used = find_sequences(dataset, root, sampling=Sampling(max_frames=max_frames)), 0

@@ -103,10 +103,8 @@ def _source_frame(result: Result, frame: int, picture: UInt8[np.ndarray, "h w 3"
     kind, shape = getattr(picture, "dtype", type(picture).__name__), getattr(picture, "shape", None)
     if shape != (height, width, 3) or kind != np.uint8:
         raise InputError(f"the picture of frame {frame} is {kind} {shape}; expected uint8 {(height, width, 3)}")
-    x = (np.arange(width) + 0.5 - offset[0]) / scale[0]
-    y = (np.arange(height) + 0.5 - offset[1]) / scale[1]
+    x, y, seen = source_pixels(result, frame)
     left, top, right, bottom = (int(side) for side in result.valid_box[frame])
-    seen = ((y >= top) & (y <= bottom))[:, None] & ((x >= left) & (x <= right))[None]
     column = np.clip(np.floor(x).astype(int), left, right - 1)
     row = np.clip(np.floor(y).astype(int), top, bottom - 1)
     nearest = np.ix_(row, column)
@@ -124,6 +122,21 @@ def _source_frame(result: Result, frame: int, picture: UInt8[np.ndarray, "h w 3"
         intrinsics=intrinsics,
         camera_from_world=result.camera_from_world[frame],
     )
+
+
+def source_pixels(
+    result: Result, frame: int
+) -> tuple[Float64[np.ndarray, " w"], Float64[np.ndarray, " h"], Bool[np.ndarray, "h w"]]:
+    """Return where the pixels of a frame's source lie in the frame (x, y; edges at whole numbers), and which are seen.
+
+    Cut off pixels lie outside the valid box and are not seen.
+    """
+    height, width = result.source_size[frame]
+    scale, offset = result.source_scale[frame], result.source_offset[frame]
+    x = (np.arange(width) + 0.5 - offset[0]) / scale[0]
+    y = (np.arange(height) + 0.5 - offset[1]) / scale[1]
+    left, top, right, bottom = result.valid_box[frame]
+    return x, y, ((y >= top) & (y <= bottom))[:, None] & ((x >= left) & (x <= right))[None]
 
 
 def enlarged_depth(

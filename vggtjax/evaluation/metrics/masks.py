@@ -98,7 +98,7 @@ def mask_scores(
     Raises:
         InputError: masks that are not bool [S, H, W] of one shape, no frame or no pixel, an unknown `empty`.
     """
-    return _scores(frame_scores(predicted, truth, empty=empty))
+    return mask_statistics(frame_scores(predicted, truth, empty=empty))
 
 
 def pooled_scores(
@@ -119,7 +119,7 @@ def pooled_scores(
     if not len(sequences):
         raise InputError("there are no sequences to pool; expected at least 1")
     frames = [frame_scores(predicted, truth, empty=empty) for predicted, truth in sequences]
-    return _scores(FrameScores(*(np.concatenate(values) for values in zip(*frames, strict=True))))
+    return mask_statistics(FrameScores(*(np.concatenate(values) for values in zip(*frames, strict=True))))
 
 
 def frame_scores(
@@ -164,7 +164,8 @@ def boundary(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     return (here ^ beyond[:-1, 1:]) | (here ^ beyond[1:, :-1]) | (here ^ beyond[1:, 1:])
 
 
-def _scores(frames: FrameScores) -> MaskScores:
+def mask_statistics(frames: FrameScores) -> MaskScores:
+    """Return mean, recall and decay of the J and F of frames."""
     return MaskScores(*_statistics(frames.j), *_statistics(frames.f))
 
 

@@ -10,8 +10,7 @@ from jaxtyping import Float, Float64, Int
 from scipy.spatial import KDTree
 
 from vggtjax.errors import InputError
-
-Progress = Callable[[int, int], object]
+from vggtjax.progress import Progress
 
 _CHUNK = 2**20  # points that are in hand at a time
 _LEAF = 20  # points in a leaf of the tree: the fastest of 10, 20 and 40
