@@ -41,7 +41,7 @@ _STEPS = ("trace", "lower", "XLA")
 _IMPORTED = "import sys, atexit; atexit.register(lambda: sys.stderr.write(str('jax' in sys.modules))); "
 _STARTS = {
     "import vggtjax": "import vggtjax",
-    "vggtjax --help": "from vggtjax.cli import main; sys.exit(main(['--help']))",
+    "vggtjax --help": "from vggtjax.commands.main import main; sys.exit(main(['--help']))",
 }
 
 

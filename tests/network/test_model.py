@@ -12,6 +12,7 @@ from benchmarks.seeded import seeded_images
 from vggtjax import VGGTConfig, encode, forward
 from vggtjax.errors import InputError
 from vggtjax.network.model import parameter_shapes
+from vggtjax.network.suppression import Suppression
 
 SIZE = (28, 42)
 
@@ -142,6 +143,8 @@ def test_bfloat16_is_near_float32(params, config, images):
         ({"dynamic_tokens": np.zeros((1, 2, 3, 2), bool)}, r"expected \(1, 2, 2, 3\)"),
         ({"outputs": ("camera", "tracks")}, "tracks"),
         ({"suppress": "forget"}, "'zero' or 'drop'"),
+        ({"suppression": Suppression(mask_pairs=-1)}, "at least 0"),
+        ({"frame_count": np.array([2, 2])}, r"frame_count has shape \(2,\); expected \(1,\)"),
         ({"compute_dtype": "float16"}, "bfloat16"),
     ],
 )
@@ -149,6 +152,26 @@ def test_bad_arguments_are_named(params, config, change, sentence):
     arguments = {"images": np.zeros((1, 2, 28, 42, 3)), **change}
     with pytest.raises(InputError, match=sentence):
         forward(params, config=config, **arguments)
+
+
+def test_an_unknown_keyword_is_a_type_error(params, config):
+    with pytest.raises(TypeError, match="supress"):
+        forward(params, np.zeros((1, 2, 28, 42, 3)), config, supress="drop")  # pyright: ignore[reportCallIssue]
+
+
+def test_a_suppression_is_the_same_as_its_keywords(params, config, images, mask):
+    """Also where it is traced: one compilation serves all numbers of pairs."""
+    traces = []
+
+    @jax.jit
+    def run(suppression):
+        traces.append(suppression)
+        return forward(params, images, config, outputs=("camera",), suppression=suppression)
+
+    for pairs in (1, 3):
+        flat = _forward(params, images, config, dynamic_tokens=mask, mask_pairs=pairs, outputs=("camera",))
+        assert close(run(Suppression(mask, mask_pairs=pairs)).pose_encoding, flat.pose_encoding)
+    assert len(traces) == 1
 
 
 def test_full_size_parameters():

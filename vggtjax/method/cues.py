@@ -1,8 +1,8 @@
 """Motion cues from Gram similarities of q and k, and their saliency (4DVGGT-D, stage 1; the cues are VGGT4D's).
 
 A mean map needs no Gram matrix: mean_{s,j} q_i . q_sj = q_i . mean_{s,j} q_sj. A std map needs one P x P product
-per frame, of its rows with keys averaged over the source frames. Both are exact, and both are accumulated inside the
-layer scan, so that q and k of no layer are kept.
+per frame, of its rows with keys averaged over the source frames. Both are exact. Both are accumulated inside the layer
+scan, so that q and k of no layer are stored.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ Sums = tuple[Array, ...]
 
 @dataclass(frozen=True)
 class GramCues:
-    """The table of cues for a model with `depth` pairs and one similarity. The sums are a tuple, one entry per cue."""
+    """An `Accumulator` of a table of cues, for a model with `depth` pairs and one similarity; one sum per cue."""
 
     motion: MotionConfig
     depth: int
     gram: Gram = "cosine"
 
     def layer_counts(self) -> np.ndarray:
-        """Return int [depth, cues]: how often a cue reads a pair; never or once, unless layers were scaled down."""
+        """Return int [depth, cues]: how often a cue reads a pair; more than once only in models with fewer layers."""
         return np.array([[self._layers(cue).count(layer) for cue in self.motion.cues] for layer in range(self.depth)])
 
     def zeros(self, B: int, S: int, P: int) -> Sums:
@@ -47,10 +47,10 @@ class GramCues:
         k: Float[Array, "B S T N D"],
         frame_count: Int[Array, " B"] | None = None,
     ) -> Sums:
-        """Add one pair's q and k (after norm and rotation) to the cues whose layers it belongs to.
+        """Return the sums after adding one pair's q and k (after norm and rotation) to the cues that read this pair.
 
-        The patches are the last tokens of a frame; what comes before them is left out. Of clips with a `frame_count`
-        only the first so many frames are sources, and each of them must have one at the offsets.
+        The patches are the last tokens of a frame; the tokens before them are excluded. Of clips with a `frame_count`
+        only the real frames are sources, and each of them must have one at the offsets.
         """
         B, S = q.shape[:2]
         index, weights = sources(S, self.motion.offsets)
@@ -104,8 +104,7 @@ class GramCues:
     def saliency(self, sums: Sums, exponents: Float[Array, " cues"] | None = None) -> Float[Array, "B S P"]:
         """Return the product of the cues' maps, inverted where the table says so, min-max normalised per frame.
 
-        A single frame has nothing to compare with and gets saliency 0. Every map, inverted or not, can be raised to an
-        exponent of its own (1 in the papers).
+        The saliency of a single frame is 0. Every map, inverted or not, is raised to its exponent (1 in the papers).
         """
         maps = self.maps(sums)
         product = jnp.ones_like(next(iter(maps.values())))
@@ -126,8 +125,8 @@ class GramCues:
 def sources(S: int, offsets: tuple[int, ...]) -> tuple[Int[np.ndarray, "S m"], Float[np.ndarray, "S m"]]:
     """Return the source frames of every frame and their weights: the mean over the frames r + offset that exist.
 
-    A frame for which none exists (as in clips of one to three frames) is compared with every other frame. Where a frame
-    has fewer sources than others, it is listed itself, with weight 0.
+    A frame without such a frame (as in clips of one to three frames) is compared with every other frame. Rows with
+    fewer sources than the longest are padded with the frame itself, with weight 0.
     """
     rows = [[r + offset for offset in offsets if 0 <= r + offset < S] for r in range(S)]
     rows = [row or [s for s in range(S) if s != r] for r, row in enumerate(rows)]
@@ -138,7 +137,7 @@ def sources(S: int, offsets: tuple[int, ...]) -> tuple[Int[np.ndarray, "S m"], F
 
 
 def _over_frames(function, frames):
-    """Map a function over frames, a few of them vectorised at a time: a clip's worth of what it needs is much."""
+    """Map a function over frames, a few of them vectorised at a time, which bounds the memory."""
     return jax.lax.map(function, frames, batch_size=FRAMES_AT_ONCE)
 
 
@@ -161,12 +160,12 @@ def _unit(x: Float[Array, "... D"]) -> Float[Array, "... D"]:
 
 
 def _power(x: Float[Array, "B S P"], exponent: Float[Array, ""]) -> Float[Array, "B S P"]:
-    """x ** exponent for x in [0, 1]; next to 0, where the slope has no bound, it is x itself."""
+    """Return x ** exponent for x in [0, 1]; close to 0, where the slope is unbounded, x."""
     return jnp.where(x > _EPSILON, jnp.maximum(x, _EPSILON) ** exponent, x)
 
 
 def _sample_std(x: Float[Array, "... J"]) -> Float[Array, ...]:
-    """Unbiased standard deviation over the last axis; 0 where there is a single token."""
+    """Unbiased standard deviation over the last axis; 0 for a single token."""
     centred = x - x.mean(axis=-1, keepdims=True)
     variance = jnp.sum(centred * centred, axis=-1) / max(x.shape[-1] - 1, 1)
-    return jnp.sqrt(jnp.maximum(variance, 1e-30))  # the floor keeps the gradient finite where all agree
+    return jnp.sqrt(jnp.maximum(variance, 1e-30))  # the floor keeps the gradient finite where all values are equal

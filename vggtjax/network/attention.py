@@ -1,4 +1,4 @@
-"""Scaled dot-product attention, as each platform computes it best."""
+"""Scaled dot-product attention, with the fastest implementation for each platform."""
 
 from __future__ import annotations
 
@@ -14,83 +14,83 @@ from vggtjax.network.pieces import largest_divisor
 from vggtjax.network.precision import widened
 
 QUERIES_AT_ONCE = 800
-LOGITS_AT_ONCE = 320**2  # queries times keys of a head up to which all heads go at once on a CPU
-LOGITS_ELSEWHERE = 2**28  # logits of all clips and heads up to which they are held at once on other platforms
-_TPU_BLOCK = 128  # tokens that the kernel for TPUs takes at once: lengths are multiples of it
+LOGITS_AT_ONCE = 320**2  # on a CPU, at most so many logits of a head (queries times keys) for all heads at once
+LOGITS_ELSEWHERE = 2**28  # on other platforms, at most so many logits of all clips and heads in memory
+_TPU_BLOCK = 128  # tokens in a block of the kernel for TPUs: lengths are multiples of it
 
 
 def attention(
     q: Float[Array, "B T N D"],
     k: Float[Array, "B K N D"],
     v: Float[Array, "B K N D"],
-    kept: Bool[Array, "B K"] | None = None,
+    visible: Bool[Array, "B K"] | None = None,
 ) -> Float[Array, "B T N D"]:
-    """Return softmax(q k^T / sqrt(D)) v; keys that are not `kept` leave the softmax, and one at least is.
+    """Return softmax(q k^T / sqrt(D)) v; only `visible` keys enter the softmax, at least one of every clip.
 
-    A CPU works on one head and a few hundred queries at a time, which is several times faster there than all at once
-    and needs little memory. NVIDIA GPUs take cuDNN's flash attention for bfloat16 and TPUs jax's own kernel; float32
-    on a GPU is computed at once where it fits, and in chunks where it would not.
+    A CPU computes one head and a few hundred queries at a time: several times faster than all at once, in little
+    memory. NVIDIA GPUs use cuDNN's flash attention for bfloat16, TPUs jax's own kernel. Float32 on a GPU is computed at
+    once where the logits fit in memory, otherwise in chunks.
     """
     branches: dict[str, Any] = {"cpu": _in_chunks, "default": _at_once_or_in_chunks}
     D = q.shape[-1]
     if q.dtype == jnp.bfloat16 and D % 8 == 0 and D <= 128 and cudnn_works():
         branches["cuda"] = functools.partial(_packed, implementation="cudnn")
     if jax.default_backend() == "tpu" and jax.device_count() == 1 and (D <= 128 or D % 128 == 0):
-        branches["tpu"] = _on_tpu  # of several devices, jax cannot divide the kernel's work
-    return jax.lax.platform_dependent(q, k, v, kept, **branches)
+        branches["tpu"] = _on_tpu  # jax cannot divide the kernel's work among several devices
+    return jax.lax.platform_dependent(q, k, v, visible, **branches)
 
 
 @functools.cache
 def cudnn_works() -> bool:
-    """Return whether cuDNN's attention runs here, with its gradient; tried once, on the first NVIDIA GPU if any."""
+    """Return whether cuDNN's attention and its gradient run on the first NVIDIA GPU, if any; tried once."""
     try:
         device = jax.local_devices(backend="cuda")[0]
     except RuntimeError:
         return False
     with jax.ensure_compile_time_eval(), jax.default_device(device):
         try:
-            x, kept = jnp.ones((2, 13, 1, 64), jnp.bfloat16), jnp.ones((2, 13), bool)
-            gradient = jax.grad(lambda x: _packed(x, x, x, kept, implementation="cudnn").sum())
+            x, visible = jnp.ones((2, 13, 1, 64), jnp.bfloat16), jnp.ones((2, 13), bool)
+            gradient = jax.grad(lambda x: _packed(x, x, x, visible, implementation="cudnn").sum())
             jax.block_until_ready(gradient(x))
-        except (RuntimeError, NotImplementedError, ValueError):  # no cuDNN, too old a one, or too old a GPU
+        except (RuntimeError, NotImplementedError, ValueError):  # no cuDNN, or too old, or too old a GPU
             return False
     return True
 
 
-def _at_once_or_in_chunks(q, k, v, kept):
-    clips = LOGITS_ELSEWHERE // (q.shape[2] * q.shape[1] * k.shape[1])  # as many fit at once
+def _at_once_or_in_chunks(q, k, v, visible):
+    clips = LOGITS_ELSEWHERE // (q.shape[2] * q.shape[1] * k.shape[1])  # at once
     if clips >= q.shape[0]:
-        return _at_once(q, k, v, kept)
+        return _at_once(q, k, v, visible)
     if clips == 0:
-        return _in_chunks(q, k, v, kept)
+        return _in_chunks(q, k, v, visible)
     clips = largest_divisor(q.shape[0], clips)
-    pieces = jax.tree.map(lambda x: x.reshape(-1, clips, *x.shape[1:]), (q, k, v, kept))
-    return jax.lax.map(lambda some: _at_once(*some), pieces).reshape(q.shape)
+    pieces = jax.tree.map(lambda x: x.reshape(-1, clips, *x.shape[1:]), (q, k, v, visible))
+    return jax.lax.map(lambda piece: _at_once(*piece), pieces).reshape(q.shape)
 
 
-def _at_once(q, k, v, kept):
-    return jax.nn.dot_product_attention(q, k, v, mask=None if kept is None else kept[:, None, None, :])
+def _at_once(q, k, v, visible):
+    return jax.nn.dot_product_attention(q, k, v, mask=None if visible is None else visible[:, None, None, :])
 
 
-def _packed(q, k, v, kept, *, implementation):
-    """Kept keys and values first, and their number: a fused kernel stops there, where a mask would be a dense bias."""
-    if kept is None:
+def _packed(q, k, v, visible, *, implementation):
+    """Order visible keys and values first: a fused kernel stops after their number; a mask would be a dense bias."""
+    if visible is None:
         return jax.nn.dot_product_attention(q, k, v, implementation=implementation)
-    order = jnp.argsort(~kept, axis=1, stable=True)[:, :, None, None]
+    order = jnp.argsort(~visible, axis=1, stable=True)[:, :, None, None]
     k, v = (jnp.take_along_axis(x, order, axis=1) for x in (k, v))
-    lengths = kept.sum(axis=1, dtype=jnp.int32)
+    lengths = visible.sum(axis=1, dtype=jnp.int32)
     return jax.nn.dot_product_attention(
         q,
         k,
         v,
-        query_seq_lengths=lengths * 0 + q.shape[1],  # made of the others, so that vmap sees both
+        query_seq_lengths=lengths * 0 + q.shape[1],  # computed from `lengths`, so that vmap batches both
         key_value_seq_lengths=lengths,
         implementation=implementation,
     )
 
 
-def _on_tpu(q, k, v, kept):
-    """jax's flash attention for TPUs; a key that is dropped, or only fills the last block, is of another segment."""
+def _on_tpu(q, k, v, visible):
+    """Run jax's flash attention for TPUs; invisible keys, and the padding of the last block, are another segment."""
     from jax.experimental.pallas.ops.tpu.flash_attention import SegmentIds, flash_attention
 
     T, K = q.shape[1], k.shape[1]
@@ -99,18 +99,18 @@ def _on_tpu(q, k, v, kept):
         return jnp.pad(x, ((0, 0), (0, -x.shape[1] % _TPU_BLOCK), *((0, 0),) * (x.ndim - 2)))
 
     queries, keys, values = (padded(x).swapaxes(1, 2) for x in (q, k, v))
-    there = padded(jnp.ones((len(k), K), jnp.int32) if kept is None else kept.astype(jnp.int32))
-    segments = SegmentIds(jnp.ones((len(q), queries.shape[2]), jnp.int32), there)
-    exact = "highest" if q.dtype == jnp.float32 else "default"  # there are no products of bfloat16 beyond the default
+    segment = padded(jnp.ones((len(k), K), jnp.int32) if visible is None else visible.astype(jnp.int32))
+    segments = SegmentIds(jnp.ones((len(q), queries.shape[2]), jnp.int32), segment)
+    exact = "highest" if q.dtype == jnp.float32 else "default"  # bfloat16 products have only the default precision
     with jax.default_matmul_precision(exact):
         out = flash_attention(queries, keys, values, segment_ids=segments, sm_scale=q.shape[-1] ** -0.5)
     return out.swapaxes(1, 2)[:, :T]
 
 
-def _in_chunks(q, k, v, kept):
+def _in_chunks(q, k, v, visible):
     T, D = q.shape[1], q.shape[-1]
-    bias = None if kept is None else jnp.where(kept, 0.0, -jnp.inf)  # [B, K]
-    if T * k.shape[1] <= LOGITS_AT_ONCE:  # short clips: a loop over heads would cost more than it saves
+    bias = None if visible is None else jnp.where(visible, 0.0, -jnp.inf)  # [B, K]
+    if T * k.shape[1] <= LOGITS_AT_ONCE:  # short clips: a loop over heads would be slower
         queries, keys, values = (x.swapaxes(1, 2) for x in (q * D**-0.5, k, v))
         return _attended(queries, keys, values, None if bias is None else bias[:, None]).swapaxes(1, 2)
     return _head_by_head(q, k, v, bias)
@@ -120,12 +120,12 @@ def _in_chunks(q, k, v, kept):
 def _head_by_head(q, k, v, bias):
     B, T, N, D = q.shape
 
-    def one_head(out, index):  # what a head attended to takes the place of its queries: nothing is laid out anew
+    def one_head(out, index):  # a head's output overwrites its queries, which saves a transposed copy
         clip, head = index // N, index % N
         queries, keys, values = (x[clip, :, head] for x in (out, k, v))
-        mine = None if bias is None else bias[clip]
-        made = jax.lax.map(lambda some: _attended(some, keys, values, mine), _chunks(queries * D**-0.5))
-        return out.at[clip, :, head].set(made.reshape(-1, D)[:T]), None
+        own_bias = None if bias is None else bias[clip]
+        outputs = jax.lax.map(lambda chunk: _attended(chunk, keys, values, own_bias), _chunks(queries * D**-0.5))
+        return out.at[clip, :, head].set(outputs.reshape(-1, D)[:T]), None
 
     return jax.lax.scan(one_head, q, jnp.arange(B * N))[0]
 
@@ -145,16 +145,16 @@ def _head_by_head_backward(residuals, gradient):
     def one_head(head):
         q, k, v, bias, out, gradient = head
 
-        def some(sums, chunk):
-            to_queries, *more, _ = _backward((chunk[0], k, v, bias, chunk[1]), chunk[2])
-            return [total + part for total, part in zip(sums, more, strict=True)], to_queries
+        def step(sums, chunk):
+            to_queries, *to_others, _ = _backward((chunk[0], k, v, bias, chunk[1]), chunk[2])
+            return [total + part for total, part in zip(sums, to_others, strict=True)], to_queries
 
         chunks = tuple(_chunks(x) for x in (q * D**-0.5, out, gradient))
-        (to_k, to_v), to_q = jax.lax.scan(some, [jnp.zeros_like(k), jnp.zeros_like(v)], chunks)
+        (to_k, to_v), to_q = jax.lax.scan(step, [jnp.zeros_like(k), jnp.zeros_like(v)], chunks)
         return to_q.reshape(-1, D)[:T] * D**-0.5, to_k, to_v
 
-    mine = None if bias is None else jnp.repeat(bias, N, axis=0)
-    heads = jax.lax.map(one_head, (by_head(q), by_head(k), by_head(v), mine, by_head(out), by_head(gradient)))
+    biases = None if bias is None else jnp.repeat(bias, N, axis=0)
+    heads = jax.lax.map(one_head, (by_head(q), by_head(k), by_head(v), biases, by_head(out), by_head(gradient)))
     to_q, to_k, to_v = (x.reshape(B, N, -1, D).swapaxes(1, 2) for x in heads)
     return to_q, to_k, to_v, None if bias is None else jnp.zeros_like(bias)
 
@@ -163,7 +163,7 @@ _head_by_head.defvjp(_head_by_head_forward, _head_by_head_backward)
 
 
 def _chunks(x: Float[Array, "T D"]) -> Float[Array, "c R D"]:
-    """Cut the queries of a head, or what belongs to them, into chunks; zeros fill the last."""
+    """Cut the queries of a head, or arrays of equal length, into chunks; zeros pad the last chunk."""
     chunks = math.ceil(len(x) / QUERIES_AT_ONCE)
     return jnp.pad(x, ((0, -len(x) % chunks), (0, 0))).reshape(chunks, -1, x.shape[1])
 
@@ -181,7 +181,7 @@ def _attended(
 
 
 def _weights(queries, keys, bias):
-    """Attention weights up to their sum over the keys."""
+    """Return the attention weights before division by their sum over the keys."""
     wide = jnp.promote_types(queries.dtype, jnp.float32)
     logits = jnp.matmul(queries, keys.swapaxes(-1, -2), preferred_element_type=wide)
     logits = logits if bias is None else logits + bias[..., None, :]
@@ -194,7 +194,7 @@ def _forward(queries, keys, values, bias):
 
 
 def _backward(residuals, gradient):
-    """The weights are computed again: to keep them costs more than they do."""
+    """Compute the weights again, which is faster than storing them."""
     queries, keys, values, bias, out = residuals
     weights = _weights(queries, keys, bias)
     weights = weights / weights.sum(axis=-1, keepdims=True)

@@ -1,4 +1,4 @@
-"""DINOv2 vision transformer: images -> patch tokens. It does not depend on the dynamic mask."""
+"""DINOv2 vision transformer: images -> patch tokens, independent of the dynamic mask."""
 
 from __future__ import annotations
 
@@ -35,14 +35,13 @@ def encode(
         images: RGB in [0, 1]; H and W are multiples of the patch size.
         config: the model's configuration.
         compute_dtype: dtype of matrix products; the residual stream and norms stay float32.
-        remat: keep one block's input for the gradient, and compute what is inside again.
+        remat: store only the input of every block for the gradient, and compute its activations again.
 
     Returns:
-        Tokens in row-major patch order, float32 (float64 if they were computed in it). They are the same
-        for both passes: compute them once.
+        Tokens in row-major patch order, in float32 (float64 for compute_dtype "float64"). Both passes share them.
 
     Raises:
-        InputError: images of a shape that does not fit, or an unknown compute_dtype.
+        InputError: an invalid shape of the images, or an unknown compute_dtype.
     """
     check_compute_dtype(compute_dtype)
     params = params["backbone"]
@@ -68,7 +67,7 @@ def encode(
 
 
 def patch_grid(images: Float[Array, "B S H W 3"], config: VGGTConfig) -> tuple[int, int]:
-    """Return the rows and columns of patches; InputError if the images have none, or not a whole number."""
+    """Return the rows and columns of patches. Raises InputError unless these are whole numbers of at least 1."""
     size = config.patch_size
     if images.ndim != 5 or images.shape[-1] != 3 or 0 in images.shape:
         raise InputError(f"images have shape {tuple(images.shape)}; expected [B, S, H, W, 3] with at least one frame")

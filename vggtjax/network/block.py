@@ -19,7 +19,7 @@ from vggtjax.network.suppression import SuppressedKeys, suppressed_attention
 class Block:
     """A block as a function of its parameters. The residual stream keeps the input's dtype.
 
-    Only attention looks at several tokens; what comes before and after it runs over pieces of them.
+    Only attention mixes tokens; the layers before and after it run over pieces of the tokens.
     """
 
     num_heads: int
@@ -35,10 +35,10 @@ class Block:
         suppressed: SuppressedKeys | None = None,
         is_real: Bool[Array, "B L"] | None = None,
     ) -> tuple[Float[Array, "B L C"], Float[Array, "B L N D"], Float[Array, "B L N D"]]:
-        """Return the tokens after the block, and q and k after norm and rotation, which the motion cues read.
+        """Return the tokens after the block, and q and k after norm and rotation, for the motion cues.
 
         Args:
-            params: what `declare` declares.
+            params: the block's own, as `declare` declares them.
             x: B sequences of L tokens.
             rope: the angles of T tokens, where L is a multiple of T; or None.
             suppressed: the keys to suppress, or None.

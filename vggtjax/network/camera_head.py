@@ -32,8 +32,8 @@ def predict_pose(
         params: the model's parameter tree (`camera_head` is read).
         camera_tokens: token 0 of every frame after the last pair, E = 2C.
         config: the model's configuration.
-        frame_count: number of frames of each clip that are real, its first ones; None for all.
-        stop_gradient: whether each iteration sees the previous estimate as a constant, as in VGGT's training.
+        frame_count: number of real frames of each clip, its first ones; None for all.
+        stop_gradient: treat the previous estimate as a constant in each iteration, as in VGGT's training.
     """
     params = params["camera_head"]
     E = config.tap_dim
@@ -44,8 +44,8 @@ def predict_pose(
     empty = jnp.broadcast_to(params["empty_pose"], (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
 
     def iteration(estimates, _):
-        pose, seen = estimates  # the sum of all updates so far, and what this iteration is shown
-        embedded = apply(nn.Dense(E), params["pose_embedding"], seen)
+        pose, previous = estimates  # sum of all updates so far; input of this iteration
+        embedded = apply(nn.Dense(E), params["pose_embedding"], previous)
         modulation = apply(nn.Dense(3 * E), params["modulation"], nn.silu(embedded))
         shift, scale, gate = jnp.split(modulation, 3, axis=-1)
         x = tokens + gate * (normed * (1 + scale) + shift)

@@ -31,7 +31,7 @@ class TapProjection(nn.Module):
 
 
 class DepthToSpace(nn.Module):
-    """Transposed convolution whose stride is its kernel size: every input pixel becomes its own square."""
+    """Transposed convolution whose stride is its kernel size: every input pixel becomes a separate square."""
 
     factor: int
 
@@ -46,7 +46,7 @@ class DepthToSpace(nn.Module):
 
 
 class ResidualUnit(nn.Module):
-    """Two convolutions around a skip that adds relu(x), as the published weights were trained with."""
+    """Two convolutions and a skip that adds relu(x), as in the training of the published weights."""
 
     @nn.compact
     def __call__(self, x: Float[Array, "F h w C"]) -> Float[Array, "F h w C"]:
@@ -114,7 +114,7 @@ CHANNELS = {"depth": 2, "points": 4}  # values and confidence logit of the heads
 
 
 def project_tap(params: Params, tokens: Float[Array, "... E"], slot: int, config: VGGTConfig) -> Float[Array, "... F"]:
-    """Return what a head reads of the tap in `slot`: all that needs to be stored of it."""
+    """Return a head's projection of the tap in `slot`; nothing else of the tap needs to be stored."""
     weights = {"norm": params["norm"], "projection": params[f"projection{slot}"]}
     return apply(TapProjection(config.dpt_channels[slot]), weights, tokens)
 
@@ -127,7 +127,7 @@ def predict_dense(
 
     Args:
         params: the head's parameters (`depth_head` or `point_head` of the model's tree).
-        taps: what `project_tap` returned for the four taps.
+        taps: outputs of `project_tap` for the four taps.
         config: the model's configuration.
         grid: rows and columns of patches.
         kind: "depth" (V = 1, exp(x)) or "points" (V = 3, sign(x) (exp|x| - 1)).
@@ -152,10 +152,10 @@ def predict_dense(
 def frames_at_once(
     some_frames: Callable[[list[Array]], Array], taps: list[Float[Array, "B S P F"]], pixels: int
 ) -> Float[Array, "BS ..."]:
-    """Map `some_frames` over the frames of all clips, as many at a time as `pixels` of each allow.
+    """Map `some_frames` over the frames of all clips; `pixels` of a frame decide how many frames are computed at once.
 
-    Frames share the batch axis of the convolutions, and small maps need no loop: mapped one by one, or inside a loop,
-    the gradient by a kernel is a convolution for which XLA has but a plain implementation on a CPU.
+    Frames share the batch axis of the convolutions, and small maps need no loop: inside a loop or a map over single
+    frames, the gradient with respect to a kernel is a convolution with only a slow implementation in XLA for CPUs.
     """
     frames = [tap.reshape(-1, *tap.shape[2:]) for tap in taps]
     count, most = frames[0].shape[0], max(PIXELS_AT_ONCE // pixels, 1)
@@ -167,13 +167,13 @@ def frames_at_once(
 
 
 def declare_dense_head(config: VGGTConfig, kind: str) -> Params:
-    """Declare the parameters of a head that regresses a dense map."""
+    """Declare the parameters of a dense head."""
     x = jnp.zeros((1, 1, 1, config.dpt_features // 2))
     return declare_features(config, _features(config)) | {"regression": declare(Regression(CHANNELS[kind]), x)}
 
 
 def declare_features(config: VGGTConfig, features: DPTFeatures) -> Params:
-    """Declare the parameters of the tap projections and of the reassembly that follows them."""
+    """Declare the parameters of the tap projections and of the reassembly after them."""
     params = {"features": declare(features, [jnp.zeros((1, 1, 1, channels)) for channels in config.dpt_channels])}
     for slot, channels in enumerate(config.dpt_channels):
         weights = declare(TapProjection(channels), jnp.zeros((1, config.tap_dim)))
@@ -201,7 +201,7 @@ def _resize_axis_forward(x, axis: int, length: int):
 
 
 def _resize_axis_backward(axis: int, length: int, size: int, gradient):
-    """A product with the transposed interpolation: the gather's own gradient scatters, which a CPU does one by one."""
+    """Multiply by the transposed interpolation: the gather's own gradient is a scatter, which is slow on a CPU."""
     low, high, fraction = _neighbours(size, length)
     weights = np.zeros((length, size), np.float32)
     np.add.at(weights, (np.arange(length), low), 1 - fraction)
@@ -235,9 +235,9 @@ def add_positions(x: Float[Array, "F h w C"], aspect: float, weight: float = 0.1
         angles = position[:, None] * frequencies
         return np.concatenate([np.sin(angles), np.cos(angles)], axis=-1)
 
-    none = np.zeros((1, C // 2))  # a constant of the map's own size would be hundreds of megabytes in the program
-    across = np.concatenate([waves(u), np.repeat(none, w, axis=0)], axis=-1)  # [w, C]
-    down = np.concatenate([np.repeat(none, h, axis=0), waves(v)], axis=-1)  # [h, C]
+    zeros = np.zeros((1, C // 2))  # a constant of the map's size would add hundreds of megabytes to the program
+    across = np.concatenate([waves(u), np.repeat(zeros, w, axis=0)], axis=-1)  # [w, C]
+    down = np.concatenate([np.repeat(zeros, h, axis=0), waves(v)], axis=-1)  # [h, C]
     return x + jnp.asarray(weight * across, x.dtype)[None, None] + jnp.asarray(weight * down, x.dtype)[None, :, None]
 
 

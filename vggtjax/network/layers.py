@@ -1,4 +1,4 @@
-"""The leaves of the network as linen modules, and how they are applied and declared."""
+"""The leaves of the network as linen modules; how to apply and declare them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DType = Any
 
 
 class LayerNorm(nn.LayerNorm):
-    """Layer norm as PyTorch computes it: two passes for the variance, epsilon 1e-5 unless said otherwise."""
+    """Layer norm as PyTorch computes it: two passes for the variance, epsilon 1e-5 by default."""
 
     epsilon: float = 1e-5
     use_fast_variance: bool = False
@@ -24,7 +24,7 @@ class MLP(nn.Module):
 
     hidden: int
     features: int
-    dtype: DType = None  # that of what comes in, and of the parameters if that is wider
+    dtype: DType = None  # None: the wider type of inputs and parameters
 
     @nn.compact
     def __call__(self, x: Float[Array, "... C"]) -> Float[Array, "... F"]:
@@ -33,13 +33,14 @@ class MLP(nn.Module):
 
 
 def apply(module: nn.Module, params: Params, *inputs: Any) -> Any:
-    """Run a module on its own parameters."""
+    """Run a module with the given parameters."""
     return module.apply({"params": params}, *inputs)
 
 
 def declare(module: nn.Module, *inputs: Any) -> Params:
     """Return a module's parameters for inputs of these shapes.
 
-    Only names and shapes count: `model.parameter_shapes` evaluates this without computing, `model.init_params` draws.
+    Only names and shapes are used: `model.parameter_shapes` evaluates them abstractly, `model.init_params` draws the
+    values.
     """
     return dict(module.init(jax.random.key(0), *inputs)["params"])

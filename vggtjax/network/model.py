@@ -1,4 +1,4 @@
-"""The whole network as one pure function: images and patch tokens -> pose encoding, depth, points, tracks."""
+"""The network as one pure function: images and patch tokens -> pose encoding, depth, points, tracks."""
 
 from __future__ import annotations
 
@@ -167,7 +167,7 @@ def predict(
 
 
 def parameter_shapes(config: VGGTConfig) -> Params:
-    """Return the parameter tree's shapes and dtypes (`jax.ShapeDtypeStruct` leaves) without making any array."""
+    """Return the parameter tree's shapes and dtypes (`jax.ShapeDtypeStruct` leaves) without allocating arrays."""
 
     declarations = {
         "camera": declare_camera_head,
@@ -186,10 +186,10 @@ def parameter_shapes(config: VGGTConfig) -> Params:
 def init_params(seed: int, config: VGGTConfig) -> Params:
     """Return random parameters to start training from: nested dicts with Flax names, layers stacked on axis 0.
 
-    Values are drawn on the host, leaf by leaf: compiling jax's generator for every shape takes a minute, this a second.
+    Values are drawn on the host, which takes a second; compiling jax's generator for every shape takes a minute.
     Kernels have variance 1 / fan-in, tables 0.02^2; LayerScale starts as in VGGT (1 in the backbone, 0.01 elsewhere),
     the camera head near no motion and a field of view of 1 rad, the dense heads near depth 1 and confidence 2, the
-    track head near no motion too.
+    track head near no motion.
     """
     generator = np.random.default_rng(seed)
 
@@ -213,10 +213,10 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
         start = np.array([0, 0, 0, 0, 0, 0, 1, 1, 1]) / ITERATIONS  # every iteration adds it
         pose = params["camera_head"]["pose_branch"]["fc2"]
         pose |= {"kernel": 0.1 * pose["kernel"], "bias": jnp.asarray(start, jnp.float32)}
-    for name in DENSE_HEADS.keys() & set(config.heads):  # exp of what comes in at full size would overflow
+    for name in DENSE_HEADS.keys() & set(config.heads):  # exp of full-size inputs would overflow
         params[DENSE_HEADS[name]]["regression"]["conv2"]["kernel"] *= 0.01
     if "tracks" in config.heads:
-        params["track_head"]["flow_projection"]["kernel"] *= 0.01  # tracks start by standing still
+        params["track_head"]["flow_projection"]["kernel"] *= 0.01  # tracks start without motion
     return params
 
 

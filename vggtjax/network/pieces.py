@@ -1,4 +1,4 @@
-"""Mapping a function of single rows over many of them, as many at a time as the platform works well with."""
+"""Map a function of single rows over many rows, in pieces of a size that suits the platform."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-ROWS_ON_CPU = 1600  # the hidden rows of an MLP (26 MB for VGGT) stay in the cache, and products are at their fastest
+ROWS_ON_CPU = 1600  # the hidden rows of an MLP (26 MB for VGGT) stay in the cache, where products are fastest
 ROWS_ELSEWHERE = 2**15
 
 _Rows = TypeVar("_Rows")
-_Made = TypeVar("_Made")
+_Outputs = TypeVar("_Outputs")
 
 
-def in_pieces(function: Callable[[_Rows], _Made], rows: _Rows) -> _Made:
-    """Return what `function` makes of `rows`, a tree of arrays [R, ...], without holding all that it needs in between.
+def in_pieces(function: Callable[[_Rows], _Outputs], rows: _Rows) -> _Outputs:
+    """Return `function(rows)` for a tree of arrays [R, ...], with the intermediate values of one piece at a time.
 
-    The function must treat every row by itself. Few rows go in one call, without a loop.
+    The function must treat every row independently. Few rows take a single call, without a loop.
     """
 
-    if _count(rows) <= ROWS_ON_CPU:  # what follows is traced for every platform
+    if _count(rows) <= ROWS_ON_CPU:  # the code below is traced for every platform
         return function(rows)
 
-    def at_most(most: int) -> Callable[[_Rows], _Made]:
-        def made(rows):
+    def at_most(most: int) -> Callable[[_Rows], _Outputs]:
+        def mapped(rows):
             if (size := piece_size(_count(rows), most)) is None:
                 return function(rows)
-            made = jax.lax.map(function, _cut(rows, size))
-            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: _count(rows)], made)
+            outputs = jax.lax.map(function, _cut(rows, size))
+            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: _count(rows)], outputs)
 
-        return made
+        return mapped
 
     return _by_platform(at_most, rows)
 
@@ -40,13 +40,13 @@ def in_pieces(function: Callable[[_Rows], _Made], rows: _Rows) -> _Made:
 def replaced_in_pieces(
     function: Callable[[Float[Array, "r C"], _Rows], Float[Array, "r C"]], x: Float[Array, "R C"], others: _Rows
 ) -> Float[Array, "R C"]:
-    """Return `function(x, others)` as `in_pieces` does; each piece takes the place of what it was made of."""
+    """Return `function(x, others)` as `in_pieces` does; each piece overwrites its own input."""
 
     if len(x) <= ROWS_ON_CPU:
         return function(x, others)
 
     def at_most(most: int):
-        def made(rows):
+        def replaced(rows):
             if (size := piece_size(len(x), most)) is None:
                 return function(*rows)
             pieces, others = _cut(rows, size)
@@ -58,20 +58,20 @@ def replaced_in_pieces(
             pieces, _ = jax.lax.scan(step, pieces, (jnp.arange(len(pieces)), others))
             return pieces.reshape(-1, x.shape[1])[: len(x)]
 
-        return made
+        return replaced
 
     return _by_platform(at_most, (x, others))
 
 
 def largest_divisor(count: int, most: int) -> int:
-    """Return the largest divisor of `count` up to `most`: so many at a time leave no remainder to compile apart."""
+    """Return the largest divisor of `count` up to `most`: equal pieces need no second compilation for a remainder."""
     return max(n for n in range(1, min(count, most) + 1) if count % n == 0)
 
 
 def piece_size(count: int, most: int) -> int | None:
-    """Return the size of equal pieces of `count` rows, or None if they need not be cut.
+    """Return the size of equal pieces of `count` rows, or None for a single piece.
 
-    A divisor between `most` / 3 and `most`, which spares a padded copy, or else the size of the fewest pieces.
+    A divisor between `most` / 3 and `most`, which avoids a padded copy, or else the size of the fewest pieces.
     """
     if count <= most:
         return None

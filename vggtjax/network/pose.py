@@ -13,8 +13,8 @@ def decode_pose(
 ) -> tuple[Float[Array, "... 3 4"], Float[Array, "... 3 3"]]:
     """Return camera_from_world [..., 3, 4] and intrinsics [..., 3, 3] in pixels of an image of `size` (H, W).
 
-    The quaternion need not be of unit length. Exact for any field of view: 0 gives an infinite focal length, one
-    beyond pi a negative one; nothing is clamped here.
+    The quaternion can have any length. Exact for any field of view: 0 gives an infinite focal length, more than pi a
+    negative one; nothing is clamped.
     """
     translation, quaternion = pose_encoding[..., :3], pose_encoding[..., 3:7]
     camera_from_world = jnp.concatenate([quaternion_to_matrix(quaternion), translation[..., None]], axis=-1)
@@ -33,7 +33,7 @@ def encode_pose(
 ) -> Float[Array, "... 9"]:
     """Return the pose encoding of cameras: the inverse of `decode_pose` up to the quaternion's length and sign.
 
-    The quaternion has unit length and w >= 0. The principal point is taken to be the image centre.
+    The quaternion has unit length and w >= 0. The principal point is assumed at the image centre.
     """
     H, W = size
     fov_h = 2 * jnp.arctan2(jnp.asarray(H / 2), intrinsics[..., 1, 1])
@@ -57,8 +57,8 @@ def quaternion_to_matrix(quaternion: Float[Array, "... 4"]) -> Float[Array, "...
 def matrix_to_quaternion(rotation: Float[Array, "... 3 3"]) -> Float[Array, "... 4"]:
     """Return the unit quaternion xyzw with w >= 0 of a rotation.
 
-    Of the four ways to solve for it, each dividing by another component, the one that divides by the largest is
-    taken, so the result and its gradient are stable everywhere.
+    Each of the four solutions divides by another component. The largest divisor is chosen, so the result and its
+    gradient are stable everywhere.
     """
     r = [[rotation[..., i, j] for j in range(3)] for i in range(3)]
     squares = jnp.stack(  # 4 x^2, 4 y^2, 4 z^2, 4 w^2

@@ -21,7 +21,7 @@ class Rope(NamedTuple):
 def rope_table(grid: tuple[int, int], special_tokens: int, head_dim: int) -> Rope:
     """Return the angles of `special_tokens` tokens at position 0 followed by a grid of patches counted from 1.
 
-    The first half of a head turns with y, the second with x.
+    The first half of a head rotates with y, the second with x.
     """
     rows, columns = grid
     y, x = np.meshgrid(np.arange(1, rows + 1), np.arange(1, columns + 1), indexing="ij")

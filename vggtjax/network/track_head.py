@@ -22,16 +22,16 @@ VIRTUAL_TRACKS = 64
 HEADS = 8
 ITERATIONS = 4
 STRIDE = 2  # pixels of the image to one of the feature maps
-FLOW_SCALE = 518.0  # pixels of the feature maps; the published weights know flows in this unit
-FLOATS_AT_ONCE = 1 << 24  # of feature windows, which bounds the memory of the correlations
+FLOW_SCALE = 518.0  # pixels of the feature maps: the unit of flows in the published weights
+FLOATS_AT_ONCE = 1 << 24  # in feature windows; bounds the memory of the correlations
 
 
 class Tracks(NamedTuple):
-    """Where every query point is in every frame."""
+    """The position of every query point in every frame."""
 
     positions: Float[Array, "B S Q 2"]  # x, y in pixels; those of the first frame are the queries
-    visibility: Float[Array, "B S Q"]  # probability that the point is seen
-    confidence: Float[Array, "B S Q"]  # probability that the position is near the truth
+    visibility: Float[Array, "B S Q"]  # probability that the point is visible
+    confidence: Float[Array, "B S Q"]  # probability that the position is close to the truth
 
 
 @full_precision
@@ -45,12 +45,12 @@ def predict_tracks(
     """Return the tracks of points of the first frame.
 
     Every iteration compares each track's features with the feature maps around its position, at every level of a
-    pyramid, and lets a transformer over time and over tracks update position and features. Correlations go over a few
-    queries at a time; the transformer sees all of them, since tracks look at each other.
+    pyramid; a transformer over time and over tracks then updates position and features. Correlations are computed for
+    a few queries at a time, the transformer for all of them, since tracks attend to each other.
 
     Args:
         params: the head's parameters (`track_head` of the model's tree).
-        taps: what `project_tap` returned for the four taps.
+        taps: outputs of `project_tap` for the four taps.
         query_points: x, y in pixels of the first frame.
         config: the model's configuration.
         grid: rows and columns of patches.
@@ -72,10 +72,12 @@ def predict_tracks(
     def iteration(state, _):
         positions, features = state
         positions = jax.lax.stop_gradient(positions)  # as in VGGT's training
-        seen = jax.vmap(_correlations, (0, 0, 0, None, None))(pyramid, features, positions, size, config)
-        seen = apply(MLP(config.track_hidden, F), params["correlation_mlp"], seen)
+        similar = jax.vmap(_correlations, (0, 0, 0, None, None))(pyramid, features, positions, size, config)
+        similar = apply(MLP(config.track_hidden, F), params["correlation_mlp"], similar)
         flow = positions - positions[:, :1]
-        x = jnp.concatenate([_flow_embedding(flow, F // 2), flow / FLOW_SCALE, flow / FLOW_SCALE, seen, features], -1)
+        x = jnp.concatenate(
+            [_flow_embedding(flow, F // 2), flow / FLOW_SCALE, flow / FLOW_SCALE, similar, features], -1
+        )
         x = x.swapaxes(1, 2) + place + kind  # [B, Q, S, E]
         delta = _updates(params, x, config).swapaxes(1, 2)  # [B, S, Q, 2 + F]
         update = apply(LayerNorm(), params["feature_norm"], delta[..., 2:])
@@ -91,7 +93,7 @@ def predict_tracks(
 
 
 def smallest_side(config: VGGTConfig) -> int:
-    """Return the smallest side of an image, in pixels, of which every level of the pyramid still has something."""
+    """Return the smallest side of an image, in pixels, with at least one pixel on every level of the pyramid."""
     return STRIDE * 2 ** (config.track_corr_levels - 1)
 
 
@@ -111,10 +113,10 @@ def _feature_maps(params: Params, taps: list[Array], config: VGGTConfig, grid: t
 
 
 def _pyramid(maps: Float[Array, "B S H W F"], levels: int, radius: int) -> list[Float[Array, "B S h w F"]]:
-    """Return the maps at every level, each half the size of the one before, with a border for windows that reach out.
+    """Return the maps at every level, each half the size of the previous one, with a border for windows at the edge.
 
-    What lies outside is 0; an axis of a single pixel is that pixel everywhere, as in the public code, whose
-    coordinates from -1 to 1 all mean the same there.
+    The border is 0. An axis of a single pixel repeats that pixel, as in the public code, where all coordinates from -1
+    to 1 are the same pixel.
     """
     pyramid = []
     for level in range(levels):
@@ -140,7 +142,8 @@ def _correlations(
 ) -> Float[Array, "S Q L"]:
     """Return q . f / sqrt(F) at (2 r + 1)^2 places around each position on every level; x runs slowest.
 
-    Between pixels f is bilinear, and so is the product with it: products with the pixels of a window come first.
+    Between pixels f is bilinear, and so is its product with q: products with the pixels of a window are computed
+    first, then interpolated.
     """
     S, Q, F = features.shape
     window = 2 * config.track_corr_radius + 2
@@ -159,8 +162,8 @@ def _correlations(
             levels.append(_level(maps, features, positions / 2**level, (sides[0], sides[1]), window))
         return jnp.concatenate(levels, axis=-1)
 
-    found = jax.lax.map(some_queries, (chunks(features), chunks(positions)))
-    return found.swapaxes(0, 1).reshape(S, Q + padding, -1)[:, :Q] / F**0.5
+    products = jax.lax.map(some_queries, (chunks(features), chunks(positions)))
+    return products.swapaxes(0, 1).reshape(S, Q + padding, -1)[:, :Q] / F**0.5
 
 
 def _level(maps, features, positions, size: tuple[int, int], window: int) -> Float[Array, "S n L"]:
@@ -182,7 +185,7 @@ def _level(maps, features, positions, size: tuple[int, int], window: int) -> Flo
 
 
 def _position_embedding(query: Float[Array, "B Q 2"], size: tuple[int, int], E: int) -> Float[Array, "B Q E"]:
-    """Sinusoids of x, then of y, at whole pixels and linear between them, as a sampled table of them is."""
+    """Return sinusoids of x, then of y, exact at whole pixels and linearly interpolated, as from a sampled table."""
     low, high, fraction = neighbours(query, size)
     frequencies = jnp.asarray(1.0 / 10000 ** (np.arange(E // 4) / (E / 4)), jnp.float32)
 
@@ -195,16 +198,17 @@ def _position_embedding(query: Float[Array, "B Q 2"], size: tuple[int, int], E: 
 
 
 def _flow_embedding(flow: Float[Array, "... 2"], channels: int) -> Float[Array, "... C2"]:
-    """Sines and cosines of x, by turns, then of y: `channels` each."""
+    """Return alternating sines and cosines of x, then of y: `channels` each."""
     frequencies = jnp.asarray(np.arange(0, channels, 2) * (1000.0 / channels), jnp.float32)
     angle = flow[..., None] * frequencies.reshape((1,) * flow.ndim + (-1,))  # [..., 2, channels/2]
     return jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1).reshape(*flow.shape[:-1], 2 * channels)
 
 
 def _updates(params: Params, x: Float[Array, "B Q S E"], config: VGGTConfig) -> Float[Array, "B Q S O"]:
-    """The transformer: by turns over time, within every track, and over tracks, within every frame.
+    """Return the transformer's output: layers alternate over time in every track and over tracks in every frame.
 
-    Tracks see each other through the virtual ones: these look at all tracks, at one another, and are looked at.
+    Tracks attend to each other through virtual tracks: these attend to all tracks and to one another, and all tracks
+    attend to them.
     """
     C, Q = config.track_hidden, x.shape[1]
     start = apply(nn.Dense(C), params["input_projection"], apply(LayerNorm(), params["input_norm"], x))
@@ -229,15 +233,15 @@ def _updates(params: Params, x: Float[Array, "B Q S E"], config: VGGTConfig) -> 
 
 
 def _block(params: Params, x: Float[Array, "B G T C"], context: Float[Array, "B G K C"] | None = None) -> Array:
-    """Attention and MLP; attention is to `context` if there is one. The skip starts after the first norm."""
+    """Return attention, to `context` if given, and MLP. The skip starts after the first norm."""
     B, G, T, C = x.shape
     x = apply(LayerNorm(), params["norm1"], x)
-    seen: Array = x if context is None else apply(LayerNorm(), params["norm_context"], context)
+    source: Array = x if context is None else apply(LayerNorm(), params["norm_context"], context)
     kernels = jnp.split(params["attention"]["qkv"]["kernel"], 3, axis=1)
     biases = jnp.split(params["attention"]["qkv"]["bias"], 3)
     q, k, v = (
         (part @ kernel + bias[None, None, None]).reshape(B * G, -1, HEADS, C // HEADS)
-        for part, kernel, bias in zip((x, seen, seen), kernels, biases, strict=True)
+        for part, kernel, bias in zip((x, source, source), kernels, biases, strict=True)
     )
     out = attention(q, k, v).reshape(B, G, T, C)
     x = x + apply(nn.Dense(C), params["attention"]["projection"], out)
