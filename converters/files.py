@@ -1,4 +1,4 @@
-"""Files of PyTorch weights: chosen by name, known by their content, read through memory maps."""
+"""Files of PyTorch weights: chosen by name, recognised by content, read through memory maps."""
 
 from __future__ import annotations
 
@@ -20,16 +20,17 @@ Tensor = np.ndarray | StoredTensor
 
 
 class StateDict(NamedTuple):
-    """Tensors by name, not yet read from their files, and what is wrong with the way they are stored."""
+    """Tensors by name, not yet read from their files, and problems of their storage."""
 
     tensors: Mapping[str, Tensor]
     problems: Sequence[str] = ()
 
 
 def choose_file(names: Sequence[str], place: str) -> str:
-    """Return which of the files of a folder or repository to read: safetensors before the index of shards before torch.
+    """Return the file of weights to read in a folder or repository.
 
-    Raises CheckpointError if there is none, or no telling which.
+    model.safetensors comes first, then the index of shards, other .safetensors files, and torch files. Raises
+    CheckpointError if the first kind that exists has several files, or if no kind exists.
     """
     names = sorted(name for name in names if not name.startswith(".") and "/" not in name)
     groups = [
@@ -38,41 +39,41 @@ def choose_file(names: Sequence[str], place: str) -> str:
         [name for name in names if name.endswith(".safetensors")],
         [name for name in names if name.endswith((".pt", ".pth"))],
     ]
-    found = next((group for group in groups if group), [])
-    if len(found) != 1:
-        said = f"{len(found)} files of weights ({', '.join(found[:5])})" if found else "no weights"
-        raise CheckpointError(f"{place} holds {said}; expected one of {', '.join('*' + s for s in SUFFIXES)}")
-    return found[0]
+    candidates = next((group for group in groups if group), [])
+    if len(candidates) != 1:
+        held = f"{len(candidates)} files of weights ({', '.join(candidates[:5])})" if candidates else "no weights"
+        raise CheckpointError(f"{place} holds {held}; expected one of {', '.join('*' + s for s in SUFFIXES)}")
+    return candidates[0]
 
 
 def weight_files(path: Path) -> list[Path]:
-    """Return the files that `read_state_dict` reads: the given one and, if that is an index, its shards."""
+    """Return the files that `read_state_dict` reads: `path` and, if `path` is an index, its shards."""
     if not path.name.endswith(INDEX):
         return [path]
     return [path, *(path.parent / shard for shard in sorted(set(_weight_map(path).values())))]
 
 
 def read_state_dict(path: Path) -> StateDict:
-    """Find the tensors of a file of weights, by its content.
+    """Return the tensors of a file of weights, whose format is recognised by content.
 
     Raises:
-        CheckpointError: it cannot be read, or is none of the formats.
-        MissingExtraError: it is a torch file, and torch is not installed.
+        CheckpointError: the file cannot be read, or has another format.
+        MissingExtraError: the file is a torch file, and torch is not installed.
     """
     if path.name.endswith(INDEX):
         return _read_shards(path)
     if is_tensor_file(path):
         tensors, metadata = read_tensors(path)
         if metadata.get("format") == "vggtjax":
-            raise CheckpointError(f"{path} is a checkpoint of this library already; there is nothing to convert")
+            raise CheckpointError(f"{path} is already a checkpoint of this library; use it without conversion")
         return StateDict(tensors)
     with path.open("rb") as file:
         start = file.read(64)
-    if start.startswith((b"PK\x03\x04", b"\x80")):  # an archive, or before torch 1.6 a pickle
+    if start.startswith((b"PK\x03\x04", b"\x80")):  # an archive, or a pickle of torch before 1.6
         from converters.torch_file import read_torch
 
         return StateDict(*read_torch(path))
-    raise CheckpointError(f"{path} is {_nature(start)}, not weights; copy or download it again")
+    raise CheckpointError(f"{path} is {_describe(start)}, not weights; copy or download it again")
 
 
 def _read_shards(index: Path) -> StateDict:
@@ -80,7 +81,7 @@ def _read_shards(index: Path) -> StateDict:
     shards = sorted(set(weight_map.values()))
     missing = [f"missing shard {name}" for name in shards if not (index.parent / name).is_file()]
     if missing:
-        raise CheckpointError(problems_sentence(f"{index} names shards that are not beside it", missing))
+        raise CheckpointError(problems_sentence(f"{index} names shards that are not in its folder", missing))
     tensors: dict[str, StoredTensor] = {}
     holders: dict[str, list[str]] = {name: [] for name in weight_map}
     for shard in shards:
@@ -88,13 +89,13 @@ def _read_shards(index: Path) -> StateDict:
             tensors.setdefault(name, tensor)
             holders.setdefault(name, []).append(shard)
     problems = []
-    for name, found in holders.items():
-        if not found:
+    for name, shards in holders.items():
+        if not shards:
             problems.append(f"key {name} of the index is in no shard")
-        elif len(found) > 1:
-            problems.append(f"duplicate key {name} in {' and '.join(found)}")
-        elif weight_map.get(name) != found[0]:
-            problems.append(f"key {name} is in {found[0]}, but in {weight_map.get(name, 'none')} by the index")
+        elif len(shards) > 1:
+            problems.append(f"duplicate key {name} in {' and '.join(shards)}")
+        elif weight_map.get(name) != shards[0]:
+            problems.append(f"key {name} is in {shards[0]}; the index says {weight_map.get(name, 'nothing')}")
     return StateDict(tensors, problems)
 
 
@@ -102,10 +103,10 @@ def _weight_map(index: Path) -> dict[str, str]:
     content = read_json(index, dict[str, Any], "the index", error=CheckpointError)
     weight_map = content.get("weight_map")
     if not isinstance(weight_map, dict) or not weight_map:
-        raise CheckpointError(f"{index} has no weight_map from keys to shards")
-    strange = sorted({str(shard)[:100] for shard in weight_map.values() if not _is_file_name(shard)})
-    if strange:
-        raise CheckpointError(f"{index} names shards {strange[:3]}; expected names of files beside it")
+        raise CheckpointError(f"{index} has no weight_map; expected one from keys to shards")
+    invalid = sorted({str(shard)[:100] for shard in weight_map.values() if not _is_file_name(shard)})
+    if invalid:
+        raise CheckpointError(f"{index} names shards {invalid[:3]}; expected names of files in its folder")
     return weight_map
 
 
@@ -113,11 +114,11 @@ def _is_file_name(name: object) -> bool:
     return isinstance(name, str) and re.fullmatch(r"(?!\.)[^/\\:\x00-\x1f]{1,255}", name) is not None
 
 
-def _nature(start: bytes) -> str:
+def _describe(start: bytes) -> str:
     if not start:
         return "empty"
     if start.startswith(b"version https://git-lfs"):
-        return "a pointer of Git LFS to the file that was meant"
+        return "a Git LFS pointer"
     if start.lstrip().startswith(b"<"):
         return "a web page"
     return f"a file that starts with {start[:8]!r}"

@@ -1,20 +1,20 @@
-"""Weights from the Hugging Face hub, in its own cache and with its own token."""
+"""Weights from the Hugging Face hub, through the hub's cache and with the user's token."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from converters.files import SUFFIXES, choose_file, weight_files
-from vggtjax.errors import CheckpointError, MissingExtraError
+from vggtjax.errors import CheckpointError, MissingExtraError, one_line
 
 
 def download(hub_id: str, file: str | None = None) -> Path:
-    """Return the file of weights of a hub repository in the hub's cache, downloaded if it is not there.
+    """Return the file of weights of a hub repository in the hub's cache; download it unless cached.
 
-    A cached copy does without the network. Unless `file` names one, safetensors comes first, see `choose_file`.
+    A cached file needs no network. Without `file`, `choose_file` chooses the file.
 
     Raises:
-        CheckpointError: the repository is missing, gated, out of reach, or holds no weights.
+        CheckpointError: the repository is missing, gated, unreachable, or holds no weights.
         MissingExtraError: huggingface_hub is not installed.
     """
     try:
@@ -29,15 +29,15 @@ def download(hub_id: str, file: str | None = None) -> Path:
         raise
     except errors.GatedRepoError as error:
         raise CheckpointError(
-            f"the hub's '{hub_id}' is gated; ask for access on its page, then log in with 'hf auth login'"
+            f"the hub's '{hub_id}' is gated; request access on its page, then log in with 'hf auth login'"
         ) from error
     except errors.RepositoryNotFoundError as error:
         raise CheckpointError(
-            f"'{hub_id}' is neither a path here nor a repository on the hub that you can see; check the spelling, "
-            "or log in with 'hf auth login' if it is private"
+            f"'{hub_id}' is neither an existing path nor a visible repository on the hub; check the spelling, "
+            "or log in with 'hf auth login' if the repository is private"
         ) from error
     except (HTTPError, OSError, ValueError) as error:
-        reason = str(error).strip().split("\n")[0].rstrip(".") or type(error).__name__
+        reason = one_line(str(error).strip().split("\n")[0]).rstrip(".") or type(error).__name__
         raise CheckpointError(
             f"'{hub_id}' is not in the hub's cache and cannot be downloaded ({reason}); check the network and try again"
         ) from error
@@ -54,7 +54,7 @@ def _download(hub_id: str, file: str | None) -> Path:
     cached = False
     try:
         names = [file.rfilename for file in hub.model_info(hub_id).siblings or []]
-    except (HTTPError, OSError) as error:  # out of reach, or closed to us: what was downloaded before still serves
+    except (HTTPError, OSError) as error:  # unreachable or gated: use the cached files
         try:
             folder = Path(hub.snapshot_download(hub_id, allow_patterns=[], local_files_only=True))
         except LocalEntryNotFoundError:
@@ -65,12 +65,12 @@ def _download(hub_id: str, file: str | None) -> Path:
         listed = ", ".join(name for name in sorted(names) if name.endswith(SUFFIXES)) or "none"
         if cached:
             raise CheckpointError(
-                f"the hub is out of reach, and of '{hub_id}' its cache has no {file}, only {listed}; check the network"
+                f"the hub is unreachable, and its cache of '{hub_id}' holds no {file}, only {listed}; check the network"
             )
         raise CheckpointError(f"the hub's '{hub_id}' has no file {file}; its files of weights are {listed}")
     name = file or choose_file(names, f"the hub's '{hub_id}'")
     path = Path(hub.hf_hub_download(hub_id, name, local_files_only=cached))
     for shard in weight_files(path)[1:]:
         if Path(hub.hf_hub_download(hub_id, shard.name, local_files_only=cached)) != shard:
-            raise CheckpointError(f"the hub's '{hub_id}' changed while it was downloaded; try again")
+            raise CheckpointError(f"the hub's '{hub_id}' changed during the download; try again")
     return path

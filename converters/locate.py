@@ -15,18 +15,18 @@ _HUB_ID = re.compile(r"([A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})(?:/([A-
 
 
 class Weights(NamedTuple):
-    """A file of weights (for sharded ones, their index), and what to call the model."""
+    """A file of weights (for shards, their index), and the model's name."""
 
     path: Path
     name: str
 
 
 def locate(source: str | Path) -> Weights:
-    """Return the file that a path or hub id stands for, downloaded if need be.
+    """Return the file of weights of a path or hub id; the latter is downloaded unless cached.
 
     Raises:
-        CheckpointError: there is no such file, or a folder or hub repository holds none, or several to choose from.
-        MissingExtraError: a hub id, and huggingface_hub is not installed.
+        CheckpointError: the file is missing, or a folder or hub repository holds no weights or several ones.
+        MissingExtraError: the source is a hub id, and huggingface_hub is not installed.
     """
     path = Path(source).expanduser()
     try:
@@ -37,14 +37,14 @@ def locate(source: str | Path) -> Weights:
             return Weights(path, path.name.removesuffix(INDEX).removesuffix(path.suffix))
     except OSError as error:
         raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
-    near = len(path.parts) > 1 and path.parent.is_dir()  # then it is a path, mistyped
-    if isinstance(source, str) and not near and (match := _HUB_ID.fullmatch(source)):
+    is_path = len(path.parts) > 1 and path.parent.is_dir()  # a mistyped one
+    if isinstance(source, str) and not is_path and (match := _HUB_ID.fullmatch(source)):
         hub_id, file = match.groups()
         if (not hub_id.endswith(SUFFIXES)) if file is None else file.endswith(SUFFIXES):
             refuse_strangers(source)
             return Weights(download(hub_id, file), source)
     raise CheckpointError(
         f"there are no weights at {source}; expected a file (.safetensors, .pt, .pth), the index or folder of sharded "
-        ".safetensors, a hub id such as 'facebook/VGGT-1B', with '/' and a file if it has several, or, to load rather "
-        "than convert, 'demo'"
+        ".safetensors, a hub id such as 'facebook/VGGT-1B' ('/FILE' appended if the repository holds several), or "
+        "'demo', which can be loaded but not converted"
     )

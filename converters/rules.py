@@ -1,4 +1,4 @@
-"""The table that maps every tensor of a PyTorch VGGT checkpoint to its place in the parameter tree."""
+"""The table from tensors of a PyTorch VGGT checkpoint to arrays of the parameter tree."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class Transform:
     drop: int = 0
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
-        """Return the view of a source tensor that goes into the parameter tree."""
+        """Return the view of a source tensor for the parameter tree."""
         return (x if self.axes is None else x.transpose(self.axes))[(0,) * self.drop]
 
     def source_shape(self, shape: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the shape of a source tensor that becomes `shape`."""
+        """Return the shape of the source tensor of a target of this shape."""
         shape = (1,) * self.drop + tuple(shape)
         return shape if self.axes is None else tuple(shape[self.axes.index(axis)] for axis in range(len(shape)))
 
@@ -35,9 +35,9 @@ TRACKS = Transform((0, 2, 1, 3), drop=2)  # virtual tracks (1, n, 1, C) -> (n, C
 
 @dataclass(frozen=True)
 class Rule:
-    """A source name, in which `{layer}` stands for an index on axis 0 of the target; its target path; its transform.
+    """A source name, its target path and transform; `{layer}` in the name is the index on axis 0 of the target.
 
-    Two rules with one path are two names of the same parameter.
+    Two rules with the same path are two names of one parameter.
     """
 
     source: str
@@ -46,7 +46,7 @@ class Rule:
 
     @property
     def stacked(self) -> bool:
-        """Whether the target holds all layers, each a source tensor of its own."""
+        """Whether the target stacks all layers, one source tensor each."""
         return "{layer}" in self.source
 
 
@@ -108,7 +108,7 @@ _DPT = [
     *(
         row
         for i in range(4)
-        for unit in (1, 2)[i == 3 :]  # the deepest level has nothing to fuse with, hence no first unit
+        for unit in (1, 2)[i == 3 :]  # the deepest level fuses no other, and has no first unit
         for c in (1, 2)
         for row in _affine(
             f"scratch.refinenet{i + 1}.resConfUnit{unit}.conv{c}", f"features.fusion{i}.residual{unit}.conv{c}", CONV

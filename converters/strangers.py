@@ -1,4 +1,4 @@
-"""Checkpoints of VGGT's relatives, which other networks run: known by what sets them apart, and refused by name."""
+"""Checkpoints of networks related to VGGT: recognised by keys, names or sha256, and refused."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from vggtjax.errors import CheckpointError
 
 
 class Stranger(NamedTuple):
-    """A relative, and what tells its checkpoints from VGGT's: a key or, where all keys are VGGT's, name or content."""
+    """A related network, and how to recognise its checkpoints: by a key or, if all keys are VGGT's, name or sha256."""
 
     name: str
-    difference: str  # what its network does that VGGT's does not
-    key: str = r"(?!)"  # pattern that some key begins with
-    source: str = r"(?!)"  # pattern somewhere in the name, in lower case
+    difference: str  # of its network from VGGT's
+    key: str = r"(?!)"  # pattern at the start of a key
+    source: str = r"(?!)"  # pattern in the name, in lower case
     sha256: tuple[str, ...] = ()  # of published files
 
 
-# Read off the projects' public code; that of StreamVGGT loads VGGT's own weights strictly, so the keys are the same.
+# From the projects' public code. StreamVGGT's code loads VGGT's weights strictly, so the keys are equal.
 STRANGERS = (
     Stranger(
         "StreamVGGT",
-        "its keys are VGGT's, but its global attention is causal, each frame seeing only those before it",
+        "its keys are VGGT's, but its global attention is causal: a frame reads earlier frames only",
         source=r"stream[-_]?vggt",
         sha256=("3d3d914d09609fdb485e16947c4885cca0e5ea4e5557598a3b3ffb1cfe0a2f59",),
     ),
     Stranger("STream3R", "its keys are VGGT's, but its global attention is causal", source=r"stream3r"),
     Stranger(
         "PAGE-4D",
-        "its aggregator has a network that predicts what moves and masks attention with it",
+        "its aggregator masks attention by predicted motion",
         r"aggregator\.spatial_mask_head\.",
     ),
     Stranger(
         "VGGT-Omega",
-        "its aggregator and heads are others than VGGT's",
+        "its aggregator and heads differ from VGGT's",
         r"aggregator\.inter_frame_blocks\.|dense_head\.|camera_head\.camera_branch\.",
     ),
     Stranger(
@@ -43,8 +43,8 @@ STRANGERS = (
         "its aggregator takes depth and cameras as inputs",
         r"aggregator\.(depth_placeholder|camera_adapters\.|pose_embeddings\.|depth_patch_embed)",
     ),
-    Stranger("Pi3", "it has an encoder and decoders of its own, no first frame", r"(point|conf|camera)_decoder\."),
-    Stranger("MapAnything", "it encodes images and geometry by itself", r"(model\.)?(info_sharing\.|scale_token)"),
+    Stranger("Pi3", "it has other decoders, and no reference frame", r"(point|conf|camera)_decoder\."),
+    Stranger("MapAnything", "it has another encoder of images and geometry", r"(model\.)?(info_sharing\.|scale_token)"),
     Stranger("Depth Anything 3", "it has one plain transformer", r"(model\.)?(da3\.|backbone\.pretrained\.)"),
     Stranger("AnySplat", "it predicts Gaussians", r"encoder\.(aggregator|gaussian_param_head)\."),
     Stranger("HunyuanWorld-Mirror", "it takes priors and predicts Gaussians", r"visual_geometry_transformer\."),
@@ -52,19 +52,19 @@ STRANGERS = (
 
 
 def refuse_strangers(source: str, keys: Iterable[str] = (), sha256: Mapping[str, str] | None = None) -> None:
-    """Raise CheckpointError if a checkpoint is known to be of a relative of VGGT.
+    """Raise CheckpointError for a checkpoint of a network related to VGGT.
 
     Args:
-        source: name of the weights: a hub id, or that of their file or folder.
-        keys: of its tensors.
-        sha256: of its files.
+        source: name of the weights: a hub id, or the name of their file or folder.
+        keys: of the tensors.
+        sha256: of the files.
     """
     keys = list(keys)
     for stranger in STRANGERS:
-        named = re.search(stranger.source, source.lower())
-        same = set((sha256 or {}).values()) & set(stranger.sha256)
-        if named or same or any(re.match(stranger.key, key) for key in keys):
+        has_its_name = re.search(stranger.source, source.lower())
+        has_its_content = set((sha256 or {}).values()) & set(stranger.sha256)
+        if has_its_name or has_its_content or any(re.match(stranger.key, key) for key in keys):
             raise CheckpointError(
-                f"{source} is a checkpoint of {stranger.name}, not of VGGT: {stranger.difference}, which this library "
-                "does not run; expected weights of VGGT" + ("; if they are, give them another name" if named else "")
+                f"{source} is a checkpoint of {stranger.name}, not of VGGT: {stranger.difference}; expected weights "
+                "of VGGT" + ("; rename them if they are weights of VGGT" if has_its_name else "")
             )

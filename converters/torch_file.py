@@ -1,4 +1,4 @@
-"""State dicts of torch files, without running code that may be in them."""
+"""State dicts of torch files, read without running pickled code."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from typing import Any
 import ml_dtypes
 import numpy as np
 
-from vggtjax.errors import CheckpointError, MissingExtraError
+from vggtjax.errors import CheckpointError, MissingExtraError, one_line
 
-_WRAPPERS = ("model", "state_dict")  # what trainers call the weights beside their own state
+_WRAPPERS = ("model", "state_dict")  # keys of the weights in training checkpoints
 
 logger = logging.getLogger(__name__)
 
 
 def read_torch(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the tensors of a torch file, mapped into memory where its format allows, and what else is among them.
+    """Return the tensors of a torch file, mapped into memory if the format permits, and the problems of its entries.
 
     Raises:
-        CheckpointError: the file is damaged, would run code, or holds no state dict.
+        CheckpointError: the file is damaged, contains code, or holds no state dict.
         MissingExtraError: torch is not installed.
     """
     state_dict = _load(path)
@@ -53,39 +53,39 @@ def _load(path: Path) -> Any:
     except ImportError as error:
         raise MissingExtraError(f"reading the torch file {path}", "convert") from error
 
-    if path.suffix == ".safetensors":  # torch goes by the name
+    if path.suffix == ".safetensors":  # torch chooses the format by the name
         raise CheckpointError(f"{path} is a torch file by its content; rename it to .pt")
     with path.open("rb") as file:
         mapped = file.read(4) == b"PK\x03\x04"
     if not mapped:
-        logger.warning("%s is of torch's old format, before 1.6: all of it is read into memory", path)
+        logger.warning("%s has the format of torch before 1.6: the whole file is read into memory", path)
     try:
         if mapped:
             _check_archive(path)
-        with warnings.catch_warnings():  # about pickles of other programs, which are about to be refused
+        with warnings.catch_warnings():  # about pickles of other programs, which are refused below
             warnings.simplefilter("ignore")
             return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as error:
         raise CheckpointError(
-            f"{path} is damaged, or holds Python objects that could run code and is not opened for that reason; "
-            "save the state dict alone, best as .safetensors"
+            f"{path} is damaged, or holds Python objects that could run code, and is not opened; save the state dict "
+            "alone, preferably as .safetensors"
         ) from error
     except CheckpointError:
         raise
-    except Exception as error:  # a damaged stream makes the unpickler raise anything
-        reason = str(error).strip().split("\n")[0][:200] or type(error).__name__
+    except Exception as error:  # the unpickler raises any exception for a damaged stream
+        reason = one_line(str(error).strip().split("\n")[0]) or type(error).__name__
         raise CheckpointError(f"{path} is not a whole torch file ({reason}); copy or download it again") from error
 
 
 def _check_archive(path: Path) -> None:
-    """Refuse compressed entries: they would be mapped as they are, and can be vast."""
+    """Refuse compressed entries: a memory map would show compressed bytes, and the contents can be huge."""
     with zipfile.ZipFile(path) as archive:
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
             raise CheckpointError(f"{path} is a compressed archive; expected a torch file as torch.save writes it")
 
 
 def _array(value: Any) -> np.ndarray | None:
-    """Return a tensor's values without a copy, or None for anything else."""
+    """Return a tensor's values without a copy; None for other values."""
     import torch
 
     if not isinstance(value, torch.Tensor):

@@ -1,4 +1,4 @@
-"""PyTorch VGGT weights -> parameter tree, by the rule table and strictly checked: in memory, or file to file."""
+"""PyTorch VGGT weights -> parameter tree by the rule table, checked strictly: in memory, or file to file."""
 
 from __future__ import annotations
 
@@ -27,25 +27,23 @@ from vggtjax.storage.tensor_file import Spec
 
 _STACKED = {rule.path for rule in RULES if rule.stacked}
 _FLOATS = tuple(np.dtype(kind) for kind in (np.float32, ml_dtypes.bfloat16, np.float16, np.float64))
-
-
-_DIGEST_BLOCK = 2**20  # bytes of a source that count as a step of progress
+_DIGEST_BLOCK = 2**20  # bytes of a source file per step of progress
 
 
 class Conversion(NamedTuple):
-    """What a conversion read and wrote."""
+    """Outcome of a conversion."""
 
-    path: Path  # of the file written
+    path: Path  # of the checkpoint
     config: VGGTConfig
-    tensors: int  # of the source, that were converted
-    left_out: tuple[str, ...]  # names of the source's other tensors: of heads not asked for, of DINOv2's pre-training
+    tensors: int  # converted tensors of the source
+    left_out: tuple[str, ...]  # names of the other tensors: of omitted heads, and of DINOv2's pre-training
     parameters: int
-    bytes: int  # of the file written
+    bytes: int  # of the checkpoint
     dtype: str
-    sha256: Mapping[str, str]  # of the source's files, by name
+    sha256: Mapping[str, str]  # of the source files, by name
 
     def summary(self) -> dict[str, Any]:
-        """Return what a person asks about a conversion, as plain values."""
+        """Return the conversion's facts for display, as plain values."""
         heads = sorted({name.split(".")[0] for name in self.left_out if name not in IGNORED})
         return {
             "wrote": str(self.path),
@@ -60,21 +58,21 @@ class Conversion(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """One source tensor of a target array: one layer of a stacked one, or all of it."""
+    """One source tensor of a target array: one layer of a stacked array, or the whole array."""
 
     source: str
     transform: Transform
 
 
 class Target(NamedTuple):
-    """One array of the parameter tree and the tensors that it is made of, in order of layers."""
+    """One array of the parameter tree and its source tensors, in order of layers."""
 
     shape: tuple[int, ...]
     pieces: list[Piece]
     stacked: bool
 
     def parts(self, tensors: Mapping[str, Tensor]) -> Iterator[np.ndarray]:
-        """Yield the target's parts, consecutive on axis 0, as views of their sources, which are mapped one by one."""
+        """Yield the target's parts, consecutive on axis 0, as views of the sources; one source is mapped at a time."""
         for piece in self.pieces:
             part = piece.transform(np.asarray(tensors[piece.source]))
             yield part[None] if self.stacked else part
@@ -84,12 +82,12 @@ def convert_state_dict(state_dict: Mapping[str, np.ndarray], config: VGGTConfig)
     """Return the parameter tree (nested dicts of numpy arrays) of a PyTorch state dict.
 
     Args:
-        state_dict: PyTorch parameter names -> arrays, of any float dtype, which is kept.
+        state_dict: PyTorch parameter name -> array of any float type, which is kept.
         config: the model's configuration.
 
     Raises:
-        CheckpointError: lists every unknown, missing, duplicate and mis-shaped key, and types other than float; or says
-            which relative of VGGT the state dict is of.
+        CheckpointError: lists every unknown, missing, duplicate and mis-shaped key, and types other than float; or
+            names the other network of the state dict.
     """
     refuse_strangers("the state dict", state_dict)
     tensors = {name: np.asarray(value) for name, value in state_dict.items()}
@@ -107,22 +105,21 @@ def convert(
     heads: Sequence[str] | None = None,
     progress: Progress | None = None,
 ) -> Conversion:
-    """Write the checkpoint of a PyTorch VGGT as one file of this library; say what was read and written.
-
-    One source tensor is in memory at a time.
+    """Convert weights of a PyTorch VGGT to a checkpoint of this library; memory holds one source tensor at a time.
 
     Args:
-        source: a .safetensors file, a sharded one (its index file or folder), a .pt or .pth file, or a hub id.
-        destination: the file to write; one that is there is replaced.
-        dtype: of the parameters in the file.
-        config: the model's configuration; None for VGGT-1B. Head counts cannot be read off the weights.
-        heads: those to convert, in any order; None for all that the configuration has. The source may lack the others.
-        progress: called with the steps done and their number: tensors, and blocks of the source whose sum is taken.
+        source: a .safetensors file, the index or folder of shards, a .pt or .pth file, or a hub id.
+        destination: the file to write; an existing file is replaced.
+        dtype: of the parameters in the checkpoint.
+        config: the model's configuration; None for VGGT-1B. Weights do not tell the numbers of attention heads.
+        heads: names of the heads to convert, in any order; None for all heads of the configuration. The source may lack
+            the other heads.
+        progress: called with the number of steps done and the total: tensors, and hashed blocks of the source.
 
     Raises:
-        CheckpointError: the source cannot be read, does not fit the configuration (all problems at once), or is of a
-            relative of VGGT.
-        InputError: a head that there is not.
+        CheckpointError: the source cannot be read, does not fit the configuration (the message lists all problems), or
+            belongs to another network.
+        InputError: an unknown head, or the destination is the source.
         OutputError: the destination cannot be written.
         MissingExtraError: the source needs torch or huggingface_hub, which is not installed.
     """
@@ -142,11 +139,11 @@ def convert_weights(
     config: VGGTConfig,
     progress: Progress | None = None,
 ) -> Conversion:
-    """Do what `convert` does with weights that are located."""
+    """Convert located weights as `convert` does."""
     kind = numpy_dtype(dtype)
     destination = Path(destination).expanduser()
     if os.path.isfile(destination) and os.path.samefile(destination, weights.path):  # noqa: PTH113, PTH121
-        raise InputError(f"the destination {destination} is the source itself; choose another name")
+        raise InputError(f"the destination {destination} is the source; choose another name")
     tensors, problems = read_state_dict(weights.path)
     refuse_strangers(weights.name, tensors)
     targets = plan_conversion(tensors, config, problems)
@@ -183,12 +180,12 @@ def convert_weights(
 def plan_conversion(
     tensors: Mapping[str, Tensor], config: VGGTConfig, problems: Sequence[str] = ()
 ) -> dict[str, Target]:
-    """Match every tensor with the rule table; return flat target names -> what each is made of.
+    """Match every tensor with the rule table; return flat target name -> its sources.
 
     Args:
-        tensors: by source name; their shapes and types alone are looked at.
-        config: the model that the tensors are said to be.
-        problems: what the reader found already.
+        tensors: by source name; only their shapes and types are read.
+        config: the expected configuration.
+        problems: of the reader.
 
     Raises:
         CheckpointError: lists `problems` and every unknown, missing, duplicate and mis-shaped key.
@@ -201,17 +198,17 @@ def plan_conversion(
         pieces = []
         for key in keys:
             known |= set(key.names)
-            found = [name for name in key.names if name in tensors]
-            if not found:
+            names = [name for name in key.names if name in tensors]
+            if not names:
                 problems.append(f"missing key {key.names[0]}")
-            elif len(found) > 1:
-                problems.append(f"duplicate keys {' and '.join(found)}: one parameter under two names")
-            for name in found:
+            elif len(names) > 1:
+                problems.append(f"duplicate keys {' and '.join(names)}: one parameter under two names")
+            for name in names:
                 if tensors[name].shape != key.shape:
                     problems.append(f"mis-shaped key {name}: {list(tensors[name].shape)}, expected {list(key.shape)}")
                 if tensors[name].dtype not in _FLOATS:
                     problems.append(f"key {name} has type {tensors[name].dtype}, expected floating point")
-            pieces += [Piece(name, key.transform) for name in found]
+            pieces += [Piece(name, key.transform) for name in names]
         targets[path] = Target(shapes[path], pieces, stacked=path in _STACKED)
     problems += [f"unknown key {name}" for name in tensors if name not in known]
     if problems:
@@ -222,26 +219,26 @@ def plan_conversion(
 
 
 def source_shapes(config: VGGTConfig) -> dict[str, tuple[int, ...]]:
-    """Return the PyTorch state dict's names -> shapes of a model, as published and without the ignored ones."""
+    """Return name -> shape of the tensors in a published state dict, without the ignored ones."""
     expected = (key for keys in _expected(flat_shapes(config)).values() for key in keys)
     return {key.names[0]: key.shape for key in expected}
 
 
 def _keys_of_other_heads(config: VGGTConfig) -> set[str]:
-    """Return the names of the tensors that a model with all heads has and this one has not."""
+    """Return the source names of the heads that the model lacks."""
     whole = flat_shapes(dataclasses.replace(config, heads=HEAD_NAMES))
     absent = {path: shape for path, shape in whole.items() if path not in flat_shapes(config)}
     return {name for keys in _expected(absent).values() for key in keys for name in key.names}
 
 
 def _hint(tensors: Mapping[str, Tensor], config: VGGTConfig) -> str:
-    """Return what to do about heads that the source lacks altogether."""
+    """Return advice if the source lacks whole heads, else an empty text."""
     modules = {name.split(".")[0] for name in tensors}
     expected = dict.fromkeys(name.split(".")[0] for name in source_shapes(config))
     absent = [name for name in expected if name not in modules]
     if not modules & set(expected) or not absent:
         return ""
-    return f" (it has no {', '.join(absent)}: leave their heads out, see --heads)"
+    return f" (it has no {', '.join(absent)}: omit these heads by --heads)"
 
 
 def _digest(file: Path, advance: Callable[[], None]) -> str:
@@ -257,7 +254,7 @@ def _digest(file: Path, advance: Callable[[], None]) -> str:
 
 
 class _Key(NamedTuple):
-    """One source tensor: its possible names, its transform, its shape."""
+    """One source tensor: possible names, transform and shape."""
 
     names: list[str]
     transform: Transform
@@ -265,7 +262,7 @@ class _Key(NamedTuple):
 
 
 def _expected(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, list[_Key]]:
-    """Return the source tensors of every target, in order of layers."""
+    """Return target path -> source tensors, in order of layers."""
     rules: dict[str, list[Rule]] = {}
     for rule in RULES:
         rules.setdefault(rule.path, []).append(rule)

@@ -230,7 +230,7 @@ def test_unprintable_name_is_replaced_by_the_files(saved_once, tmp_path):
 def test_configuration_given_must_be_the_files(saved_once, config):
     assert load_model(saved_once, config=config).config == config
     other = dataclasses.replace(config, num_heads=1)
-    assert "knows its configuration" in refusal(saved_once, config=other)
+    assert "another configuration" in refusal(saved_once, config=other)
 
 
 def test_reading_torch_layout_as_own_is_refused(shapes, tmp_path):
@@ -249,7 +249,7 @@ def test_demo_model(monkeypatch, tmp_path):
     again = load_model("demo")
     assert jax.tree.all(jax.tree.map(np.array_equal, model.params, again.params))
     assert load_model("demo", dtype="bfloat16").dtype == "bfloat16"
-    assert "knows its configuration" in refusal("demo", config=dataclasses.replace(model.config, camera_num_heads=1))
+    assert "another configuration" in refusal("demo", config=dataclasses.replace(model.config, camera_num_heads=1))
 
 
 # PyTorch weights
@@ -270,6 +270,13 @@ def test_torch_weights_are_converted_once(shapes, tree, config, tmp_path, cache,
     with monkeypatch.context() as patch:
         patch.setattr(converters.torch_to_flax, "convert_weights", None)
         assert load_model(source, config=config).path == model.path
+
+    assert model.path is not None
+    whole = model.path.read_bytes()
+    model.path.unlink()
+    model.path.write_bytes(whole[:-100])  # damaged
+    load_model(source, config=config)
+    assert model.path.read_bytes() == whole
 
     make_checkpoint(source, shapes, seed=1)  # another file of that name
     changed = load_model(source, config=config)
@@ -298,6 +305,12 @@ def test_folder_of_shards(shapes, tree, config, tmp_path, cache):
     assert jax.tree.all(jax.tree.map(np.array_equal, model.params, tree))
     make_checkpoint(tmp_path / "sharded", shapes, shards=2, seed=1)
     assert load_model(tmp_path / "sharded", config=config).path != model.path
+
+
+def test_missing_shard(shapes, config, tmp_path, cache):
+    make_checkpoint(tmp_path / "sharded", shapes, shards=2)
+    next((tmp_path / "sharded").glob("*-00002-of-*")).unlink()
+    assert "No such file or directory; copy or download" in refusal(tmp_path / "sharded", config=config)
 
 
 def test_folder_of_an_own_file(saved_once, cache):

@@ -40,10 +40,10 @@ Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
 
 @dataclass(frozen=True)
 class ModelIdentity:
-    """What tells a model from all others: two models of one identity compute the same."""
+    """Name and digest of a model: two models of equal identity compute equal results."""
 
     name: str
-    sha256: str  # of the file, if the model is as it was read from there; else of configuration and parameters
+    sha256: str  # of the file, if the model is unchanged since reading; else of configuration and parameters
 
     def to_json(self) -> dict[str, str]:
         """Return the identity as plain values, for the settings and records of results."""
@@ -57,15 +57,15 @@ class Model:
     config: VGGTConfig
     params: Params = field(repr=False)  # nested dicts of arrays with Flax names, layers stacked on axis 0
     name: str = ""
-    path: Path | None = None  # the file that the parameters are in
-    trained: bool = True  # False: random parameters, whose results mean nothing
-    origin: Mapping[str, str] = field(default_factory=dict)  # files that it was converted from -> their sha256
-    note: str = ""  # what users of the model must know; part of every result's settings
+    path: Path | None = None  # file of the parameters
+    trained: bool = True  # False: random parameters, meaningless results
+    origin: Mapping[str, str] = field(default_factory=dict)  # names of the source files of a conversion -> sha256
+    note: str = ""  # for users of the model; part of the settings of its results
     _file: _FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets it
 
     @cached_property
     def identity(self) -> ModelIdentity:
-        """Name and digest of the model. The first use reads all parameters, or the file that they are in."""
+        """Name and digest of the model; the first use reads all parameters, or their file."""
         in_file = self._file is not None and self._file == _file_facts(self._file.path)
         return ModelIdentity(self.name, _file_digest(self._file) if in_file else _params_digest(self))
 
@@ -76,12 +76,12 @@ class Model:
 
     @property
     def parameter_bytes(self) -> int:
-        """Bytes that the parameters take."""
+        """Bytes of all parameters."""
         return sum(leaf.nbytes for leaf in jax.tree.leaves(self.params))
 
     @property
     def dtype(self) -> str:
-        """Type of the parameters, or of most of them."""
+        """Type of most parameters."""
         sizes = Counter[str]()
         for leaf in jax.tree.leaves(self.params):
             sizes[str(leaf.dtype)] += leaf.size
@@ -89,11 +89,11 @@ class Model:
 
     @property
     def heads(self) -> tuple[str, ...]:
-        """Names of the heads that the model has."""
+        """Names of the model's heads."""
         return self.config.heads
 
     def summary(self) -> dict[str, Any]:
-        """Return what a person asks about a model, as plain values."""
+        """Return the model's facts for display, as plain values."""
         return {
             "name": self.name,
             "path": None if self.path is None else str(self.path),
@@ -112,35 +112,35 @@ class Model:
 
 
 def is_checkpoint(path: str | Path) -> bool:
-    """Return whether a file is one of this library, by its content."""
+    """Return whether a file is a checkpoint of this library, by its content."""
     return is_tensor_file(path) and read_tensors(path).metadata.get("format") == FORMAT
 
 
 def read_model(path: str | Path, *, dtype: DType | None = None, name: str | None = None, note: str = "") -> Model:
-    """Read a file of this library.
+    """Read a checkpoint of this library.
 
     Args:
         path: the file.
-        dtype: of the parameters; None keeps the types of the file.
-        name: of the model; None keeps the name in the file.
-        note: what users of the model must know; see `Model`.
+        dtype: of the parameters; None for the types in the file.
+        name: of the model; None for the name in the file.
+        note: for users of the model; see `Model`.
 
     Raises:
-        CheckpointError: the file is no whole checkpoint of this library, or does not fit the configuration in it; all
-            problems at once.
+        CheckpointError: the file is not a whole checkpoint of this library, or does not fit its own configuration; the
+            message lists all problems.
     """
     path = Path(path)
     facts = _file_facts(path)
     tensors, metadata = read_tensors(path)
     config = _config(path, metadata)
-    _check(f"{path} does not fit the configuration in it", tensors, config)
+    _check(f"{path} does not fit its own configuration", tensors, config)
     content = np.asarray(np.memmap(path, np.uint8, mode="r"))
     flat = {}
     for key, stored in tensors.items():
         tensor = stored.within(content)
         if dtype is not None:
             tensor = tensor.astype(numpy_dtype(dtype), copy=False)
-        flat[key] = jax.device_put(tensor).block_until_ready()  # on a CPU a view of the file, if aligned there
+        flat[key] = jax.device_put(tensor).block_until_ready()  # on a CPU, a view of the file if aligned
     stored_name = metadata.get("name", "")
     is_valid = stored_name.isprintable() and 0 < len(stored_name) <= _MOST_NAME_LETTERS
     name = name or (stored_name if is_valid else path.stem)
@@ -152,16 +152,16 @@ def read_model(path: str | Path, *, dtype: DType | None = None, name: str | None
 
 
 def save_model(path: str | Path, params: Params, config: VGGTConfig, *, name: str | None = None) -> Path:
-    """Write parameters as a file of this library, with their types; return its path.
+    """Write parameters, with their types, as a checkpoint of this library; return its path.
 
     Args:
-        path: the file; one that is there is replaced.
+        path: the file; an existing file is replaced.
         params: nested dicts of float32 or bfloat16 arrays.
-        config: the model that they are of.
+        config: the model's configuration.
         name: the model's name; None for the file's stem.
 
     Raises:
-        CheckpointError: the parameters are not those of the configuration; all problems at once.
+        CheckpointError: the parameters do not fit the configuration; the message lists all problems.
         OutputError: the file cannot be written.
     """
     flat: dict[str, Any] = flatten_dict(params, sep=".")
@@ -179,9 +179,9 @@ def write_checkpoint(
     name: str | None = None,
     origin: Mapping[str, str] | None = None,
 ) -> Path:
-    """Write a file of this library piece by piece, as `write_tensors` does; return its path.
+    """Write a checkpoint of this library piece by piece, as `write_tensors` does; return its path.
 
-    `origin` names the files that the parameters were converted from and their sha256.
+    `origin` gives the names and sha256 of the source files of a conversion.
     """
     path = Path(path)
     metadata = {"format": FORMAT, "version": VERSION, "config": config.to_json(), "name": name or path.stem}
@@ -193,18 +193,18 @@ def write_checkpoint(
 
 @lru_cache(maxsize=8)
 def flat_shapes(config: VGGTConfig) -> Mapping[str, tuple[int, ...]]:
-    """Return flat dotted names -> shapes of a model's parameters."""
+    """Return flat dotted name -> shape of a model's parameters."""
 
-    def made() -> str:
+    def shapes_text() -> str:
         flat: dict[str, Any] = flatten_dict(parameter_shapes(config), sep=".")
         return json.dumps({path: leaf.shape for path, leaf in flat.items()})
 
-    shapes = json.loads(kept_text(f"shapes {config.to_json()}", made))
+    shapes = json.loads(kept_text(f"shapes {config.to_json()}", shapes_text))
     return MappingProxyType({path: tuple(shape) for path, shape in shapes.items()})
 
 
 def numpy_dtype(dtype: DType) -> np.dtype:
-    """Return the numpy type of a parameter type's name, or raise InputError for another name."""
+    """Return the numpy type of a parameter type's name; raise InputError for other names."""
     if dtype not in _DTYPES:
         raise InputError(f"dtype is {dtype!r}; expected one of {tuple(_DTYPES)}")
     return _DTYPES[dtype]
@@ -238,7 +238,7 @@ def _config(path: Path, metadata: Mapping[str, str]) -> VGGTConfig:
 
 
 class _FileFacts(NamedTuple):
-    """What changes when a file does."""
+    """Facts that change when the content of a file changes."""
 
     path: Path
     size: int
@@ -256,7 +256,7 @@ def _file_facts(path: Path) -> _FileFacts | None:
 
 @lru_cache(maxsize=64)
 def _file_digest(facts: _FileFacts) -> str:
-    """Return the sha256 of a file, also of an earlier process where programs are kept: hashing 5 GB takes seconds."""
+    """Return the sha256 of a file, computed once and kept with the programs: hashing 5 GB takes seconds."""
 
     def digest() -> str:
         with facts.path.open("rb") as file:

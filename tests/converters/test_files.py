@@ -222,7 +222,7 @@ def header(content: bytes) -> bytes:
     [
         (b"", "is empty"),
         (b"<!doctype html><html>", "is a web page"),
-        (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "is a pointer of Git LFS"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "is a Git LFS pointer"),
         (b"\x93NUMPY\x01\x00v\x00{", "is a file that starts with"),
         ((2**40).to_bytes(8, "little") + b"{}", "claims 1099511627776 bytes"),
         ((2**63).to_bytes(8, "little") + b"{}", "is a file that starts with"),
@@ -274,9 +274,9 @@ class Code:
 def test_pickled_code_is_not_run(tmp_path, monkeypatch, archive):
     monkeypatch.chdir(tmp_path)
     torch.save({"a": torch.ones(2), "b": Code()}, "evil.pt", _use_new_zipfile_serialization=archive)
-    assert "could run code and is not opened" in refusal(tmp_path / "evil.pt")
+    assert "could run code, and is not opened" in refusal(tmp_path / "evil.pt")
     (tmp_path / "plain.pt").write_bytes(pickle.dumps({"b": Code()}))
-    assert "could run code and is not opened" in refusal(tmp_path / "plain.pt")
+    assert "could run code, and is not opened" in refusal(tmp_path / "plain.pt")
     assert not (tmp_path / "ran").exists()
 
 
@@ -306,7 +306,7 @@ def test_entries_that_are_not_tensors(tensors, config, tmp_path):
 
 def test_own_checkpoint_is_not_converted_again(expected, config, tmp_path):
     save_model(tmp_path / "ours.safetensors", expected, config)
-    assert "is a checkpoint of this library already" in refusal(tmp_path / "ours.safetensors")
+    assert "is already a checkpoint of this library" in refusal(tmp_path / "ours.safetensors")
 
 
 def test_unsupported_type(tmp_path):
@@ -332,7 +332,7 @@ def test_torch_is_an_extra(tmp_path, monkeypatch):
 def test_index_stays_in_its_folder(few, name):
     (few.parent / "x.safetensors").write_bytes(b"outside")
     path = edit_index(few, lambda index: index["weight_map"].update({KEY: name}))
-    assert "expected names of files beside it" in refusal(path)
+    assert "expected names of files in its folder" in refusal(path)
 
 
 @pytest.mark.parametrize(
@@ -369,8 +369,8 @@ def test_index_and_shards_disagree(sharded, config, tmp_path):
     edit_index(sharded, change)
     message = refusal(sharded, lambda path: convert(path, tmp_path / "x.safetensors", config=config))
     assert "3 problems" in message
-    assert f"is in {SHARDS[0]}, but in none by the index" in message
-    assert f"is in {SHARDS[0]}, but in {SHARDS[1]} by the index" in message
+    assert f"is in {SHARDS[0]}; the index says nothing" in message
+    assert f"is in {SHARDS[0]}; the index says {SHARDS[1]}" in message
     assert "key ghost.weight of the index is in no shard" in message
 
 

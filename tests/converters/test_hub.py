@@ -156,15 +156,15 @@ def test_out_of_reach(hub, monkeypatch):
 
 
 def test_missing_and_gated(hub, repository):
-    assert "'maker/none' is neither a path here nor a repository" in refusal("maker/none")
+    assert "'maker/none' is neither an existing path nor a visible repository" in refusal("maker/none")
     hub.repositories["maker/gated"] = "GatedRepo"
-    assert "'maker/gated' is gated; ask for access" in refusal("maker/gated")
+    assert "'maker/gated' is gated; request access" in refusal("maker/gated")
     assert "the hub's 'maker/tiny' holds no weights" in refusal("maker/tiny")
 
 
 def test_files_of_the_repository_are_not_trusted(hub, repository):
     (repository / INDEX).write_text(json.dumps({"weight_map": {"a": "../../secret.safetensors"}}))
-    assert "expected names of files beside it" in refusal("maker/tiny")
+    assert "expected names of files in its folder" in refusal("maker/tiny")
 
 
 def test_hub_is_an_extra(monkeypatch):
@@ -184,7 +184,7 @@ def test_one_of_several_files(hub, repository, shapes, expected, config):
     hub.repositories["maker/tiny"] = "Down"
     assert locate("maker/tiny/a_e20.pt").path.name == "a_e20.pt"
     message = refusal("maker/tiny/a_e30.pt")
-    assert "the hub is out of reach, and of 'maker/tiny' its cache has no a_e30.pt, only a_e20.pt" in message
+    assert "the hub is unreachable, and its cache of 'maker/tiny' holds no a_e30.pt, only a_e20.pt" in message
 
 
 def test_a_mistyped_path_stays_here(hub, tmp_path, monkeypatch):

@@ -41,7 +41,7 @@ def test_streamvggt_is_known_by_its_name_or_its_content(state_dict, config, tmp_
         locate("lch01/StreamVGGT")  # before anything is downloaded
     path = tmp_path / "stream_vggt.safetensors"
     save_file(state_dict, path)
-    with pytest.raises(CheckpointError, match="if they are, give them another name"):
+    with pytest.raises(CheckpointError, match="rename them if they are weights of VGGT"):
         convert(path, tmp_path / "x.safetensors", config=config)
     path = path.rename(tmp_path / "checkpoints.safetensors")
     digest = convert(path, tmp_path / "x.safetensors", config=config).sha256["checkpoints.safetensors"]

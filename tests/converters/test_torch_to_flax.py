@@ -183,9 +183,9 @@ def test_some_heads_of_a_source_that_has_no_others(state_dict, config, tmp_path)
     save_file(camera, tmp_path / "camera.safetensors")
     model = load_model(convert(tmp_path / "camera.safetensors", tmp_path / "x", config=config, heads=["camera"]).path)
     assert model.heads == ("camera",)
-    with pytest.raises(InputError, match=r"outputs has \['depth'\], and this model has only the heads \('camera',\)"):
+    with pytest.raises(InputError, match=r"outputs has \['depth'\]; this model has only the heads \('camera',\)"):
         forward(model.params, jnp.zeros((1, 2, 56, 56, 3)), model.config)
-    with pytest.raises(CheckpointError, match="it has no depth_head, point_head, track_head: leave their heads out"):
+    with pytest.raises(CheckpointError, match="it has no depth_head, point_head, track_head: omit these heads"):
         convert(tmp_path / "camera.safetensors", tmp_path / "y", config=config)
     with pytest.raises(InputError, match=r"heads has \['depht'\]; expected some of \('camera'"):
         convert(tmp_path / "camera.safetensors", tmp_path / "y", config=config, heads=["depht"])
@@ -247,7 +247,7 @@ def test_interrupted_conversion_leaves_nothing(source, config, tmp_path, failure
 
 
 def test_convert_checks_its_arguments(source, config, tmp_path):
-    with pytest.raises(InputError, match=r"tiny\.safetensors is the source itself"):
+    with pytest.raises(InputError, match=r"tiny\.safetensors is the source; choose another name"):
         convert(source, source, config=config)
     with pytest.raises(InputError, match="dtype is 'float16'; expected one of"):
         convert(source, tmp_path / "x.safetensors", config=config, dtype="float16")  # pyright: ignore[reportArgumentType]

@@ -1,4 +1,4 @@
-"""What `vggtjax demo` runs: the embedded model, and an embedded clip with its truth. Both are files of the package."""
+"""Input of `vggtjax demo`: the embedded model, and the embedded clip with its truth. Both are files of the package."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from vggtjax.storage.writing import writing
 MODEL = Path(__file__).with_name("model.safetensors")
 CLIP = MODEL.with_name("clip.npz")
 NOTE = "small demonstration model, trained on generated scenes; not for real footage"
-SCENE_SEED = 100  # of the held-out dynamic scenes that the clip is the first of; no evaluation takes this seed
+SCENE_SEED = 100  # of held-out dynamic scenes; the clip is the first of them; no evaluation uses this seed
 _NEAREST = np.float32(1e-3)  # metres
-_STEP = 5e-4  # of the logarithm of depth that 16 bits count
+_STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
 
 
 def demo_model(dtype: DType = "float32") -> Model:
-    """Return the embedded model, trained on generated static scenes; see docs/model.md for how, and how well it does.
+    """Return the embedded model, trained on generated static scenes; docs/model.md has its training and accuracy.
 
     Raises:
-        CheckpointError: the installation lacks the file.
+        CheckpointError: the file is missing.
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
@@ -32,10 +32,10 @@ def demo_model(dtype: DType = "float32") -> Model:
 
 
 def demo_clip() -> Truth:
-    """Return the embedded clip with its truth: a generated dynamic scene that no training has seen.
+    """Return the embedded clip with its truth: a generated dynamic scene, not used in training.
 
     Raises:
-        ClipError: the installation lacks the file.
+        ClipError: the file is missing.
     """
     if not CLIP.is_file():
         raise ClipError(f"the embedded clip {CLIP} is missing; install vggtjax again")
@@ -43,7 +43,7 @@ def demo_clip() -> Truth:
 
 
 def read_demo_clip(path: Path) -> Truth:
-    """Read what `write_demo_clip` wrote."""
+    """Read a file of `write_demo_clip`."""
     with np.load(path, allow_pickle=False) as stored:
         depth = _NEAREST * np.exp(stored["log_depth"].astype(np.float32) * np.float32(_STEP))
         mask = np.unpackbits(stored["dynamic_mask"], count=depth.size).astype(bool).reshape(depth.shape)
@@ -52,7 +52,7 @@ def read_demo_clip(path: Path) -> Truth:
 
 
 def write_demo_clip(path: Path, truth: Truth) -> None:
-    """Write a clip as the file that `demo_clip` reads: colours in 8 bits, depth in 16, the mask in one."""
+    """Write a clip for `demo_clip`: colours in 8 bits, depth in 16 bits, the mask in 1 bit."""
     steps = np.log(np.maximum(truth.depth, _NEAREST) / _NEAREST) / _STEP
     content = io.BytesIO()
     np.savez_compressed(

@@ -1,4 +1,4 @@
-"""A model by its path or name; PyTorch weights are converted once and kept."""
+"""Models by path or name; PyTorch weights are converted once and kept."""
 
 from __future__ import annotations
 
@@ -29,24 +29,24 @@ def load_model(
 ) -> Model:
     """Load a model by path or name.
 
-    PyTorch weights are converted once, into the folder that VGGTJAX_CACHE names or else the user's cache; after that
-    the conversion is loaded, as long as the source does not change. On a CPU the parameters stay in the file, which is
-    mapped into memory: replace it, but never write into it, while the model is in use.
+    PyTorch weights are converted once, into the folder that VGGTJAX_CACHE names, else into the user's cache; later
+    calls load the conversion unless the source changed. On a CPU the parameters stay in the file, which is mapped into
+    memory: the file may be replaced, but not written in place, while the model is in use.
 
     Args:
-        name_or_path: "demo" (the small model in the package), a file of this library, PyTorch weights (.safetensors, a
-            sharded one's index or folder, .pt, .pth), or a hub id such as "facebook/VGGT-1B".
-        config: the configuration of PyTorch weights; None for VGGT-1B. A file of this library knows its own.
-        dtype: of the parameters; None keeps the file's, and makes float32 of PyTorch weights.
-        progress: called during a conversion with the steps done and their number.
+        name_or_path: "demo" (the small model in the package), a checkpoint of this library, PyTorch weights
+            (.safetensors, index or folder of shards, .pt, .pth), or a hub id such as "facebook/VGGT-1B".
+        config: the configuration of PyTorch weights; None for VGGT-1B. A checkpoint of this library contains its own.
+        dtype: of the parameters; None for the types in the checkpoint, and float32 for PyTorch weights.
+        progress: called during a conversion with the number of steps done and the total.
 
     Raises:
-        CheckpointError: nothing is there, or it cannot be read, or does not fit the configuration.
+        CheckpointError: the weights are missing, cannot be read, or do not fit the configuration.
         MissingExtraError: the weights need torch or huggingface_hub, which is not installed.
     """
     model = load_weights(name_or_path, config=config, dtype=dtype, progress=progress)
     if config not in (None, model.config):
-        raise CheckpointError(f"{name_or_path} knows its configuration, and it is not the one given; leave that out")
+        raise CheckpointError(f"{name_or_path} has another configuration than the argument config; omit config")
     return model
 
 
@@ -57,7 +57,7 @@ def load_weights(
     dtype: DType | None = None,
     progress: Progress | None = None,
 ) -> Model:
-    """Load a model as `load_model`, but let a file of this library have another configuration than `config`."""
+    """Load a model as `load_model` does, but accept a checkpoint of this library with another configuration."""
     if dtype is not None:
         numpy_dtype(dtype)
     if str(name_or_path) == "demo":
@@ -70,13 +70,25 @@ def load_weights(
 
 
 def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:
-    """Return the conversion of PyTorch weights in the cache, made now if it is not there."""
-    stats = [(file.resolve(), file.stat()) for file in weight_files(path)]
+    """Return the conversion of PyTorch weights in the cache; convert them if it is missing or damaged."""
+    try:
+        stats = [(file.resolve(), file.stat()) for file in weight_files(path)]
+    except OSError as error:
+        raise CheckpointError(
+            f"cannot read {error.filename}: {error.strerror}; copy or download {path} again"
+        ) from error
     facts = [VERSION, dtype, config.to_json(), *(f"{file} {stat.st_size} {stat.st_mtime_ns}" for file, stat in stats)]
     key = hashlib.sha256("\n".join(facts).encode("utf-8", "surrogateescape")).hexdigest()[:16]
     destination = cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', name)[:80]}-{key}.safetensors"
-    if not destination.exists():
-        logger.info("converting %s to %s, this once", path, destination)
+    if not _is_whole(destination):
+        logger.info("converting %s to %s, once", path, destination)
         convert_weights(Weights(path, name), destination, dtype=dtype, config=config, progress=progress)
     logger.info("loading %s", destination)
     return destination
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        return is_checkpoint(path)
+    except CheckpointError:
+        return False

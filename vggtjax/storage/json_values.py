@@ -1,7 +1,7 @@
-"""JSON of strangers -> checked dataclasses, and the same checks for dataclasses that Python code makes.
+"""JSON of strangers -> checked dataclasses, and the same checks for dataclasses built in Python.
 
 The annotation of a field spells its constraint once, such as `Annotated[int, Meta(ge=1)]` or a name below. Every
-problem becomes one sentence with the place in the document, the value, and what was expected. Does not import jax.
+problem is one sentence with the place in the document, the value, and the expected values. Does not import jax.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import msgspec
 from msgspec import Meta
 from msgspec import inspect as kinds
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, one_line
 
-MOST_BYTES = 2**24  # of a file or text, unless the caller says otherwise
+MOST_BYTES = 2**24  # of a file or text, by default
 MOST_LEVELS = 64  # of nesting
 _MOST_INT = 2**63
 
@@ -33,6 +33,7 @@ NotNegative = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 
 T = TypeVar("T")
+_type_info = lru_cache(maxsize=512)(kinds.type_info)
 
 _ITEMS = (kinds.VarTupleType, kinds.ListType)
 _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
@@ -52,7 +53,7 @@ class _MisfitError(Exception):
 def read_json(
     path: str | Path, kind: type[T], what: str, *, most_bytes: int = MOST_BYTES, error: type[InputError] = InputError
 ) -> T:
-    """Read a JSON file as `parse_json` reads text; raises `error` for a file that cannot be read, too."""
+    """Read a JSON file; raises `error` for an unreadable file and for the problems of `parse_json`."""
     try:
         with Path(path).open("rb") as file:
             text = file.read(most_bytes + 1)
@@ -68,14 +69,14 @@ def parse_json(
 
     Args:
         text: JSON; bytes are UTF-8.
-        kind: its annotations name the types and ranges; lists become tuples where the annotation is a tuple.
-        what: subject of the sentence of an error, such as "recipe runs/a.json".
+        kind: its annotations give types and ranges; lists become tuples if annotated as tuples.
+        what: subject of an error, such as "recipe runs/a.json".
         most_bytes: of the text.
         error: class of the exception.
 
     Raises:
-        `error` for text that is too long or is not JSON, for more than MOST_LEVELS levels, unknown or missing keys,
-        numbers that are not finite or need more than 64 bits, other types, and values out of range.
+        error: the text is too long or not JSON, has more than MOST_LEVELS levels, unknown or missing keys, infinite
+            numbers or numbers of more than 64 bits, wrong types, or values out of range.
     """
     if len(text) > most_bytes:
         raise error(f"{what} has more than {most_bytes} bytes")
@@ -91,13 +92,13 @@ def parse_json(
 
 
 def check_fields(instance: Any, what: str = "", *, error: type[InputError] = InputError) -> None:
-    """Check the fields of a frozen dataclass in its `__post_init__`, and bring them to the annotated types.
+    """Check the fields of a frozen dataclass in its `__post_init__`, and convert them to the annotated types.
 
-    Lists become tuples, whole numbers become floats, and mappings become dataclasses where the annotation says so.
+    Lists become tuples, whole numbers become floats, and mappings become dataclasses, if so annotated.
 
     Args:
         instance: the dataclass.
-        what: subject of the sentence of an error, such as "optimiser": it says "optimiser.b1 is 2; expected ...".
+        what: prefix of the field in an error, such as "optimiser" for "optimiser.b1 is 2; expected ...".
         error: class of the exception.
     """
     for name, hint in _hints(type(instance)).items():
@@ -115,27 +116,27 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _converted(value: Any, kind: Any) -> Any:
-    info = kinds.type_info(kind)
+    info = _type_info(kind)
     _check_values(value)
     _check_keys(value, info)
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         words, _, place = str(error).removesuffix("`").partition(" - at `$")
-        if error.__cause__ is not None:  # of a __post_init__
+        if error.__cause__ is not None:  # raised by a __post_init__
             raise _MisfitError(f"{place}:", str(error.__cause__)) from None
         if missing := re.fullmatch("Object missing required field `(.*?)`?", words):
             raise _MisfitError(place, f"lacks the field {missing[1]!r}") from None
         for step in re.findall(r"\.\w+|\[[^]]*\]", place):
             matches = [child for child in _children(value, info) if child[0] == step]
-            if not matches:  # within a mapping, whose keys the message does not name
+            if not matches:  # in a dict, whose key is not in the message
                 raise _MisfitError(place, f"is invalid: {words}") from None
             _, value, info = matches[0]
         raise _MisfitError(place, f"is {_short(value)}; expected {_expected(info)}") from None
 
 
 def _check_values(value: Any, levels: int = 0) -> None:
-    """Raise _MisfitError for numbers that are not finite or are huge, and for values that are nested too deeply."""
+    """Raise _MisfitError for infinite and huge numbers, and for too many levels."""
     if isinstance(value, float) and not math.isfinite(value):
         raise _MisfitError("", f"is {value}; expected a finite number")
     if isinstance(value, int) and abs(value) > _MOST_INT:
@@ -153,7 +154,7 @@ def _check_values(value: Any, levels: int = 0) -> None:
 
 
 def _check_keys(value: Any, info: kinds.Type) -> None:
-    """Raise _MisfitError for keys of an object that its dataclass does not have."""
+    """Raise _MisfitError for keys that are not fields of the dataclass."""
     for option in info.types if isinstance(info, kinds.UnionType) else (info,):
         if isinstance(option, kinds.DataclassType) and isinstance(value, Mapping):
             known = [field.name for field in option.fields]
@@ -167,7 +168,7 @@ def _check_keys(value: Any, info: kinds.Type) -> None:
 
 
 def _children(value: Any, info: kinds.Type) -> Iterator[tuple[str, Any, kinds.Type]]:
-    """Yield step, value and type of everything one level down."""
+    """Yield step, value and type of the items one level down."""
     if isinstance(info, kinds.UnionType):
         for option in info.types:
             yield from _children(value, option)
@@ -207,8 +208,4 @@ def _expected(info: kinds.Type) -> str:
 
 
 def _short(value: Any) -> str:
-    try:
-        text = _SHORT.repr(value)
-    except ValueError:  # more digits than Python prints
-        return "a huge number"
-    return "".join(letter if letter.isprintable() else "?" for letter in text)
+    return one_line(_SHORT.repr(value))
