@@ -9,6 +9,7 @@ from tests.tiny import tiny_config
 from vggtjax.config import VGGTConfig
 from vggtjax.training.loop import Task
 from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
+from vggtjax.training.state import Metrics, TrainingState, apply_gradient, loss_and_gradient
 
 CONFIG = tiny_config(
     image_size=28,
@@ -48,6 +49,12 @@ def objective(trained, batch, config, weights, *, compute_dtype, remat):
     pose_loss = jnp.mean((pose["kernel"] - colour.mean()) ** 2) + jnp.mean(pose["bias"] ** 2)
     loss = weights.translation * colour_loss + weights.rotation * pose_loss
     return loss, {"colour_loss": colour_loss, "pose_loss": pose_loss}
+
+
+def train_step(state: TrainingState, batch, recipe: Recipe, objective) -> tuple[TrainingState, Metrics]:
+    """Do one step of training."""
+    metrics, gradient = loss_and_gradient(state.trained, batch, recipe, objective)
+    return apply_gradient(state, gradient, metrics, recipe)
 
 
 TASK = Task(jnp.float32(1), make_batch, init_probes, objective)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective
+from tests.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective, train_step
 from vggtjax.checkpoint import read_model, save_model
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError
@@ -16,7 +16,7 @@ from vggtjax.training.objective import LossWeights
 from vggtjax.training.objective import init_probes as scenes_probes
 from vggtjax.training.objective import objective as scenes_objective
 from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
-from vggtjax.training.state import TrainingState, compute_dtype, exported, initial_state, state_shapes, train_step
+from vggtjax.training.state import TrainingState, compute_dtype, exported, initial_state, state_shapes
 
 
 @pytest.fixture(scope="module")

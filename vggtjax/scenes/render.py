@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtjax.network.precision import full_precision
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.sampling import sample_scene
-from vggtjax.scenes.scene import ROOM_FACES, Scene, camera_pose, part_poses
+from vggtjax.scenes.scene import ROOM_FACES, Scene, camera_pose, compose, invert, part_poses
 from vggtjax.scenes.shapes import SHAPES
 from vggtjax.scenes.textures import Textures, sample
 
@@ -115,7 +115,7 @@ def _frame(scene: Scene, textures: Textures, config: SceneConfig, time: Array, s
     objects = np.concatenate([[0], np.asarray(config.objects) + 1])
     moving = jnp.concatenate([jnp.zeros(1, bool), scene.moving])[objects]
     poses, later = (_poses_with_room(scene, config, t) for t in (time, time + step))
-    motion = _compose(later, _invert(poses))  # [1 + K, 3, 4]
+    motion = compose(later, invert(poses))  # [1 + K, 3, 4]
     chosen = _one_hot(truth.part_ids, len(objects)).T @ motion.reshape(len(objects), 12)  # [P, 12]
     chosen = chosen.reshape(-1, 3, 4)
     flow = jnp.einsum("pij,jp->pi", chosen[..., :3] - jnp.eye(3)[None], truth.point) + chosen[..., 3]
@@ -212,12 +212,3 @@ def _poses_with_room(scene: Scene, config: SceneConfig, time: Array) -> Float[Ar
     rotation, centre = part_poses(scene, config, time)
     poses = jnp.concatenate([rotation, centre[..., None]], axis=-1)
     return jnp.concatenate([jnp.eye(3, 4)[None], poses])
-
-
-def _invert(pose: Float[Array, "N 3 4"]) -> Float[Array, "N 3 4"]:
-    rotation = pose[..., :3].swapaxes(-1, -2)
-    return jnp.concatenate([rotation, -rotation @ pose[..., 3:]], axis=-1)
-
-
-def _compose(a: Float[Array, "N 3 4"], b: Float[Array, "N 3 4"]) -> Float[Array, "N 3 4"]:
-    return jnp.concatenate([a[..., :3] @ b[..., :3], a[..., :3] @ b[..., 3:] + a[..., 3:]], axis=-1)

@@ -97,3 +97,14 @@ def rotation_y(angle: Float[Array, " N"]) -> Float[Array, "N 3 3"]:
 def rotation_x(angle: Float[Array, " N"]) -> Float[Array, "N 3 3"]:
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros_like(angle), jnp.ones_like(angle)
     return jnp.stack([one, zero, zero, zero, c, -s, zero, s, c], axis=-1).reshape(-1, 3, 3)
+
+
+def invert(pose: Float[Array, "*B 3 4"]) -> Float[Array, "*B 3 4"]:
+    """Return the inverse of rigid transforms."""
+    rotation = pose[..., :3].swapaxes(-1, -2)
+    return jnp.concatenate([rotation, -rotation @ pose[..., 3:]], axis=-1)
+
+
+def compose(a: Float[Array, "*B 3 4"], b: Float[Array, "*B 3 4"]) -> Float[Array, "*B 3 4"]:
+    """Return the rigid transforms that apply `b`, then `a`."""
+    return jnp.concatenate([a[..., :3] @ b[..., :3], a[..., :3] @ b[..., 3:] + a[..., 3:]], axis=-1)

@@ -133,12 +133,6 @@ def apply_gradient(
     return next_state, {name: jnp.asarray(value, jnp.float32) for name, value in found.items()}
 
 
-def train_step(state: TrainingState, batch: Any, recipe: Recipe, objective: Objective) -> tuple[TrainingState, Metrics]:
-    """Do one step of training: `loss_and_gradient`, then `apply_gradient`. Pure."""
-    metrics, gradient = loss_and_gradient(state.trained, batch, recipe, objective)
-    return apply_gradient(state, gradient, metrics, recipe)
-
-
 def exported(state: TrainingState, recipe: Recipe) -> Params:
     """Return the model's averaged parameters."""
     _, frozen = split(state.trained, recipe)
