@@ -226,14 +226,14 @@ def test_bad_input_is_one_sentence_before_anything_is_drawn(tmp_path, monkeypatc
 def test_other_peoples_files_are_not_touched(tmp_path, monkeypatch):
     monkeypatch.setattr(dataset, "_draw", None)
     (tmp_path / "scene_0004").mkdir()
-    with pytest.raises(OutputError, match=r"scene_0004 exists, but no index.json beside it"):
+    with pytest.raises(OutputError, match=r"scene_0004 exists without index.json beside it"):
         write_scenes(tmp_path, CONFIG, count=1)
     for text, says in (
-        ("{", "is not the index of a set of scenes"),
-        ("[" * 100_000, "is not the index of a set of scenes"),
-        ('["vggtjax scenes"]', "is not the index of a set of scenes"),
+        ("{", "is not JSON that can be read"),
+        ("[" * 100_000, "is not JSON that can be read"),
+        ('["vggtjax scenes"]', r"index of scenes .*; expected an object"),
         ('{"format": "vggtjax scenes", "version": 2}', "has version 2; expected 1"),
-        (" " * (dataset._INDEX_BYTES + 1), "bytes; expected the index of a set of scenes"),
+        (" " * (dataset._INDEX_BYTES + 1), "has more than 4194304 bytes"),
     ):
         (tmp_path / "index.json").write_text(text)
         with pytest.raises(InputError, match=says):

@@ -1,4 +1,4 @@
-"""Generated dynamic scenes with exact truth: a ray-casting renderer as pure JAX functions."""
+"""Generated dynamic scenes with exact truth: a ray-casting renderer in pure JAX functions."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The configuration of generated scenes: size, frames, what stands and moves in a room, and how images are drawn."""
+"""The configuration of generated scenes: size, frames, objects, camera motion and rendering."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ BODY = (("box", 1), ("ellipsoid", 1), ("cylinder", 4))  # parts of the articulat
 
 @dataclass(frozen=True)
 class SceneConfig:
-    """What to draw and how. Static under jit.
+    """Content and rendering of generated clips. Static under jit.
 
     Attributes:
         height, width: of the images, in pixels.
         frames: at equal steps of the clip's time from 0 to 1.
         dynamic: share of clips in which one to three objects move; False and True are 0 and 1.
         boxes, ellipsoids, cylinders: most objects of a scene besides the articulated figure; each is present or absent.
-        motion: range of the camera's share of its largest path.
+        motion: range of the camera's share of its largest path, in [0, 2].
         static_camera: share of clips whose camera stands still.
-        field_of_view: range of the horizontal one, in degrees.
+        field_of_view: range of the horizontal field of view, in degrees.
         samples: rays per pixel along each side, averaged in the image; truth is that of the pixel's centre.
         shutter: share of the time between frames that the shutter is open (motion blur), in `exposures` steps.
         noise: largest standard deviation of the sensor's noise.
         flicker: standard deviation of the logarithm of the exposure from frame to frame.
-        frozen: what moves stands where it is in the middle of the clip; masks still name it.
+        frozen: moving objects keep their place of the middle of the clip; masks still show them.
     """
 
     height: Side = 64

@@ -1,18 +1,18 @@
-"""Writing generated scenes as a data set for others.
+"""Write generated scenes as a data set.
 
 In the folder:
 
-    index.json              what the set is: conventions, files, settings, and the scenes that are whole
-    preview.png             some scenes at a glance
-    scene_0000/             a scene, there only when it is whole; with a frame's number as its file name
+    index.json              conventions, files, settings, and the complete scenes
+    preview.png             an overview of some scenes
+    scene_0000/             a scene, renamed into place when complete; files are named by frame number
         images/             .png, 8 bits
         depth/              .npy float32 metres along z, and 16-bit .png in millimetres
-        mask/               .png, 255 where the pixel is on something that moves, else 0
+        mask/               .png, 255 on pixels of moving parts, else 0
         parts/              .png, number of the rigid part, 0 for the room
-        flow/               .npy float32, where the pixel's point is a frame later, minus where it is
-        part_poses.npy      float32 [S, K, 3, 4], world from part by number: the way of every point to every frame
-        trajectory.txt      camera poses, TUM format, as a result has it; the frame number stands for the time
-        intrinsics.txt      fx fy cx cy of every frame, in pixels, as a result has it
+        flow/               .npy float32, position of the pixel's point a frame later, minus its position
+        part_poses.npy      float32 [S, K, 3, 4], world from part by number: the motion of every point
+        trajectory.txt      camera poses, TUM format, as in a result; times are frame numbers
+        intrinsics.txt      fx fy cx cy of every frame, in pixels, as in a result
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -30,19 +29,21 @@ import jax
 import numpy as np
 from PIL import Image
 
+from vggtjax.cameras import world_from_camera
 from vggtjax.errors import InputError, OutputError
+from vggtjax.progress import Progress
 from vggtjax.results.export import encode_depth, write_intrinsics
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.held_out import Kind
 from vggtjax.scenes.render import SyntheticClip, generate
 from vggtjax.scenes.sheet import draw_sheet
 from vggtjax.scenes.textures import Split, load_textures
+from vggtjax.storage.json_values import read_json
 from vggtjax.storage.trajectories import write_trajectory
 from vggtjax.storage.writing import staging, writing
 
 INDEX, PREVIEW = "index.json", "preview.png"
-MOST = 10_000  # scenes of a set
+_MOST_SCENES = 10_000
 _FORMAT_VERSION = 1
 _STREAM = 0x73657473  # folded into the seed's key, so that no other use of a seed draws these scenes
 _MILLIMETRES = 1000.0
@@ -61,27 +62,27 @@ def write_scenes(
     kind: Kind = "dynamic",
     split: Split = "training",
     seed: int = 0,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> list[Path]:
-    """Generate scenes into a folder; scenes that are there already are kept, so an interrupted set goes on.
+    """Generate scenes into a folder; existing scenes are kept, so the same call resumes an interrupted set.
 
     A scene depends on the settings and on its number, not on `count`.
 
     Args:
         out: folder of the set, made if missing.
-        config: size, frames and how images are drawn. Its `dynamic` follows from `kind`.
+        config: size, frames and rendering. `kind` replaces its `dynamic`.
         count: number of scenes, at most 10 000.
-        kind: "static", or "dynamic" where one to three things move, which the camera need not see.
+        kind: "static", or "dynamic" where one to three objects move, not always in view.
         split: of the textures.
         seed: different seeds share no scene.
-        progress: called with the number of scenes written and wanted.
+        progress: called with the number of complete scenes and `count`.
 
     Returns:
         The folders of the scenes.
 
     Raises:
         InputError: a value out of range, motion blur without exposures, or a folder with a set of other settings.
-        OutputError: the folder cannot be written, or holds files of our names that are no set.
+        OutputError: the folder cannot be written, or holds scenes or a preview without an index.
     """
     out = Path(out)
     _check(config, count, kind, split, seed)
@@ -91,7 +92,7 @@ def write_scenes(
     textures = load_textures(split)
     stream = jax.random.fold_in(jax.random.key(seed), _STREAM)
     folders = [out / f"scene_{number:04d}" for number in range(count)]
-    _write_index(out, index)  # comes first, so that no scene is ever without it
+    _write_index(out, index)  # first, so that no scene is ever without an index
     missing = [number for number in range(count) if not folders[number].is_dir()]
     for done, number in enumerate(missing, start=count - len(missing)):
         if progress is not None:
@@ -111,20 +112,10 @@ def write_scenes(
 
 
 def read_index(out: str | Path) -> dict[str, Any]:
-    """Return what index.json of a set says. Raises InputError where there is none of this format."""
+    """Return the content of a set's index.json. Raises InputError unless it is an index of this format."""
     path = Path(out) / INDEX
-    try:
-        size = path.stat().st_size
-        text = path.read_bytes() if size <= _INDEX_BYTES else b""
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}; expected the folder of a set of scenes") from None
-    if size > _INDEX_BYTES:
-        raise InputError(f"{path} is {size} bytes; expected the index of a set of scenes")
-    try:
-        index = json.loads(text)
-    except (ValueError, RecursionError):  # not JSON, or not text
-        index = None
-    if not isinstance(index, dict) or index.get("format") != "vggtjax scenes":
+    index = read_json(path, dict[str, Any], "index of scenes", most_bytes=_INDEX_BYTES)
+    if index.get("format") != "vggtjax scenes":
         raise InputError(f"{path} is not the index of a set of scenes; choose another folder")
     if index.get("version") != _FORMAT_VERSION:
         raise InputError(f"{path} has version {index.get('version')!r}; expected {_FORMAT_VERSION}")
@@ -135,8 +126,8 @@ def _check(config: SceneConfig, count: int, kind: str, split: str, seed: int) ->
     for name, value, names in (("kind", kind, get_args(Kind)), ("split", split, get_args(Split))):
         if value not in names:
             raise InputError(f"{name} is {value!r}; expected one of {names}")
-    if type(count) is not int or not 1 <= count <= MOST:
-        raise InputError(f"count is {count!r}; expected a whole number from 1 to {MOST}")
+    if type(count) is not int or not 1 <= count <= _MOST_SCENES:
+        raise InputError(f"count is {count!r}; expected a whole number from 1 to {_MOST_SCENES}")
     if type(seed) is not int or not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed!r}; expected a whole number in [0, 2**31)")
     if (config.shutter > 0) != (config.exposures > 1):
@@ -147,17 +138,17 @@ def _check(config: SceneConfig, count: int, kind: str, split: str, seed: int) ->
 
 
 def _check_folder(out: Path, index: dict[str, Any]) -> None:
-    """Raise unless `out` is free, or holds scenes of the same settings."""
+    """Raise unless `out` holds no scenes, or scenes of the same settings."""
     if not os.path.lexists(out / INDEX):
         taken = [*out.glob(PREVIEW), *out.glob("scene_*")]
         if taken:
-            raise OutputError(f"{taken[0]} exists, but no {INDEX} beside it; choose another folder or move it away")
+            raise OutputError(f"{taken[0]} exists without {INDEX} beside it; choose another folder or move it away")
         return
-    there = read_index(out)
-    other = [name for name in ("kind", "split", "seed", "config") if there.get(name) != index[name]]
+    existing = read_index(out)
+    other = [name for name in ("kind", "split", "seed", "config") if existing.get(name) != index[name]]
     if other:
-        said = ", ".join(f"{name} {there.get(name)!r} instead of {index[name]!r}" for name in other)
-        raise InputError(f"{out} holds scenes with {said}; choose another folder, or the same settings to go on")
+        values = ", ".join(f"{name} {existing.get(name)!r} instead of {index[name]!r}" for name in other)
+        raise InputError(f"{out} holds scenes with {values}; choose another folder, or the same settings to resume")
 
 
 def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str, Any]:
@@ -204,50 +195,27 @@ def _write_index(out: Path, index: dict[str, Any]) -> None:
 
 def _write_scene(folder: Path, clip: SyntheticClip) -> None:
     """Write a clip [S, ...] of numpy arrays into the empty `folder`."""
-    truth = _as_result(clip)
-    S, H, W = truth.depth.shape
-    write_trajectory(folder / "trajectory.txt", truth.world_from_camera, np.arange(S, dtype=np.float64))
-    write_intrinsics(folder / "intrinsics.txt", list(truth.intrinsics), [(H, W)] * S)
-    np.save(folder / "part_poses.npy", clip.world_from_part.astype(np.float32), allow_pickle=False)
+    S, H, W = clip.depth.shape
+    poses = world_from_camera(np.asarray(clip.camera_from_world))
+    write_trajectory(folder / "trajectory.txt", poses, np.arange(S, dtype=np.float64))
+    write_intrinsics(folder / "intrinsics.txt", list(np.asarray(clip.intrinsics)), [(H, W)] * S)
+    np.save(folder / "part_poses.npy", np.asarray(clip.world_from_part, np.float32), allow_pickle=False)
     for name in ("images", "depth", "mask", "parts", "flow"):
         (folder / name).mkdir()
+    frames = [jax.tree.map(lambda array, frame=frame: np.asarray(array)[frame], clip) for frame in range(S)]
     with ThreadPoolExecutor(min(_WORKERS, os.cpu_count() or 1)) as pool:
-        for _ in pool.map(partial(_write_frame, folder, clip, truth), range(len(truth.depth))):
+        for _ in pool.map(partial(_write_frame, folder), range(S), frames):
             pass
 
 
-def _write_frame(folder: Path, clip: SyntheticClip, truth: Reconstruction, frame: int) -> None:
-    name, depth = f"{frame:05d}", truth.depth[frame]
-    _write_png(folder / f"images/{name}.png", truth.images[frame])
+def _write_frame(folder: Path, number: int, frame: SyntheticClip) -> None:
+    name, depth = f"{number:05d}", np.asarray(frame.depth)
+    _write_png(folder / f"images/{name}.png", np.rint(255 * frame.images).astype(np.uint8))
     np.save(folder / f"depth/{name}.npy", depth, allow_pickle=False)
     _write_png(folder / f"depth/{name}.png", encode_depth(depth, depth > 0, _MILLIMETRES))
-    _write_png(folder / f"mask/{name}.png", truth.dynamic_mask[frame].astype(np.uint8) * 255)
-    _write_png(folder / f"parts/{name}.png", np.asarray(clip.part_ids)[frame].astype(np.uint8))
-    np.save(folder / f"flow/{name}.npy", np.asarray(clip.scene_flow)[frame].astype(np.float32), allow_pickle=False)
-
-
-def _as_result(clip: SyntheticClip) -> Reconstruction:
-    """Return the truth as the result that a perfect method would have: what writes results writes it too."""
-    S, H, W = clip.depth.shape
-    mask = np.asarray(clip.dynamic_mask)
-    return Reconstruction(
-        depth=np.asarray(clip.depth),
-        depth_confidence=np.ones((S, H, W), np.float32),
-        saliency=mask.astype(np.float32),
-        dynamic_mask=mask,
-        camera_from_world=np.asarray(clip.camera_from_world),
-        intrinsics=np.asarray(clip.intrinsics),
-        images=np.rint(255 * np.asarray(clip.images)).astype(np.uint8),
-        frame_names=tuple(f"{frame:05d}" for frame in range(S)),
-        timestamps=None,
-        method="truth",
-        model_name="none",
-        settings={},
-        source_size=np.tile([H, W], (S, 1)),
-        source_scale=np.ones((S, 2)),
-        source_offset=np.zeros((S, 2)),
-        valid_box=np.tile([0, 0, W, H], (S, 1)),
-    )
+    _write_png(folder / f"mask/{name}.png", np.asarray(frame.dynamic_mask, np.uint8) * 255)
+    _write_png(folder / f"parts/{name}.png", np.asarray(frame.part_ids, np.uint8))
+    np.save(folder / f"flow/{name}.npy", np.asarray(frame.scene_flow, np.float32), allow_pickle=False)
 
 
 def _write_png(path: Path, pixels: np.ndarray) -> None:

@@ -1,10 +1,9 @@
-"""Fixed test scenes that are not easy: keys and textures that training never draws, kept by what their truth shows."""
+"""Fixed hard test scenes: keys and textures that training never draws, selected by their truth."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Literal, NamedTuple, get_args
 
 import jax
@@ -12,26 +11,27 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vggtjax.errors import InputError
+from vggtjax.progress import Progress
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.render import SyntheticClip, generate
 from vggtjax.scenes.textures import Textures, load_textures
 
 Kind = Literal["static", "dynamic"]
-STREAM = 0x7E57_7E57  # folded into every key; training folds in step numbers, which stay far below
+STREAM = 0x7E57_7E57  # folded into every key; training folds in step numbers, which are far smaller
 MIN_FRAMES = 12
 MIN_PATH = 0.15  # of the camera's centres, in median depths
 MIN_BEND = 0.1  # largest distance of the path from its chord, as a share of its length
 MIN_TURN = 10.0  # degrees between two frames of the clip
 MIN_SPREAD = 2.0  # 90th to 10th percentile of depth
-MIN_LAYERS = 3  # things and room surfaces at different depths that each cover a share of the pixels
+MIN_LAYERS = 3  # depths at which parts or the room cover at least LAYER_SHARE of the pixels
 LAYER_SHARE = 0.03
-MOVERS = (0.03, 0.30)  # share of the pixels that move, on average over the frames
-SIZE = 48  # pixels at which candidates are judged, so that every image size meets the same scenes
+MOVERS = (0.03, 0.30)  # range of the share of moving pixels, averaged over the frames
+SIZE = 48  # pixels of the images that decide, so that every image size has the same scenes
 _AT_ONCE = 16
 
 
 class Hardness(NamedTuple):
-    """What a clip asks of a method, each [N]."""
+    """The difficulty of clips, each field [N]."""
 
     path: Float[np.ndarray, " N"]
     bend: Float[np.ndarray, " N"]
@@ -41,7 +41,7 @@ class Hardness(NamedTuple):
     movers: Float[np.ndarray, " N"]
 
     def kept(self, kind: Kind) -> Bool[np.ndarray, " N"]:
-        """Return which clips are hard enough to be test scenes."""
+        """Return which clips are hard enough for test scenes."""
         hard = (self.path >= MIN_PATH) & (self.bend >= MIN_BEND) & (self.turn >= MIN_TURN)
         hard &= (self.spread >= MIN_SPREAD) & (self.layers >= MIN_LAYERS)
         return hard & (self.movers >= MOVERS[0]) & (self.movers <= MOVERS[1]) if kind == "dynamic" else hard
@@ -53,18 +53,17 @@ def held_out_scenes(
     config: SceneConfig | None = None,
     *,
     seed: int = 0,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> SyntheticClip:
     """Return the test scenes of a seed, with a leading axis of `count`, as numpy arrays.
 
     Args:
-        kind: "static", or "dynamic" where things move.
+        kind: "static", or "dynamic" with moving objects.
         count: number of scenes; a larger count begins with the scenes of a smaller one.
-        config: size and frames; 12 frames of 112 x 112 pixels by default. Its `dynamic` follows from `kind`. Which
-            scenes are taken depends on the seed, the kind and the number of frames, not on the image size nor on
-            whether they are frozen.
-        seed: of a set; different seeds share no scene.
-        progress: called with the number of scenes found and wanted.
+        config: size and frames; 12 frames of 112 x 112 pixels by default. `kind` replaces its `dynamic`. The selection
+            of scenes depends on the seed, the kind and the number of frames, not on the image size or `frozen`.
+        seed: of the set; different seeds share no scene.
+        progress: called with the number of selected scenes and `count`.
 
     Raises:
         InputError: an unknown kind, a count below 1, or fewer than 12 frames.
@@ -85,7 +84,7 @@ def held_out_scenes(
 
 
 def hardness(clips: SyntheticClip) -> Hardness:
-    """Measure clips [N, S, ...] by their truth (numpy)."""
+    """Measure the difficulty of clips [N, S, ...] by their truth (numpy)."""
     N = len(clips.depth)
     pose = np.asarray(clips.camera_from_world, np.float64)
     depth = np.asarray(clips.depth, np.float64).reshape(N, -1)
@@ -110,29 +109,29 @@ def hardness(clips: SyntheticClip) -> Hardness:
 
 
 def _layers(part_ids: np.ndarray, depth: np.ndarray) -> int:
-    """Count depths, each at least 1.25 times the next nearer one, at which parts or the room cover enough pixels."""
+    """Count median depths of parts that cover enough pixels, each at least 1.25 times the next nearer depth."""
     parts, inverse, counts = np.unique(part_ids, return_inverse=True, return_counts=True)
     medians = [np.median(depth.ravel()[inverse.ravel() == i]) for i in range(len(parts))]
-    found, last = 0, 0.0
+    count, last = 0, 0.0
     for median in sorted(m for m, n in zip(medians, counts, strict=True) if n >= LAYER_SHARE * part_ids.size):
         if median >= 1.25 * last:
-            found, last = found + 1, median
-    return found
+            count, last = count + 1, median
+    return count
 
 
 def _hard_keys(kind: Kind, count: int, config: SceneConfig, seed: int, textures: Textures, progress):
-    """Return the first `count` keys of the seed whose scenes are hard, judged at a small size."""
+    """Return the first `count` keys of the seed with hard scenes, measured at a small size."""
     small = dataclasses.replace(config, height=SIZE, width=SIZE, samples=1, exposures=1, frozen=False)
     stream = jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), STREAM), get_args(Kind).index(kind))
-    kept, candidate = [], 0
-    while len(kept) < count:
+    selected, candidate = [], 0
+    while len(selected) < count:
         keys = jax.vmap(lambda i: jax.random.fold_in(stream, i))(jax.numpy.arange(candidate, candidate + _AT_ONCE))
         hard = hardness(jax.device_get(_generate(keys, textures, small))).kept(kind)
-        kept += [keys[i] for i in np.flatnonzero(hard)]
+        selected += [keys[i] for i in np.flatnonzero(hard)]
         candidate += _AT_ONCE
         if progress is not None:
-            progress(min(len(kept), count), count)
-    return jax.numpy.stack(kept[:count])
+            progress(min(len(selected), count), count)
+    return jax.numpy.stack(selected[:count])
 
 
 @functools.partial(jax.jit, static_argnums=2)

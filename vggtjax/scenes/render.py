@@ -1,4 +1,4 @@
-"""Ray casting: a scene at a time, seen from its camera -> image, depth, parts, and the way of every point."""
+"""Ray casting: a scene at a time, seen from its camera -> image, depth, parts and motion of every point."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vggtjax.scenes.scene import ROOM_FACES, Scene, camera_pose, compose, invert
 from vggtjax.scenes.shapes import SHAPES
 from vggtjax.scenes.textures import Textures, sample
 
-_SELF = 1e-3  # share of the way to the light within which a surface does not shade itself
+_SELF = 1e-3  # share of the ray to the light in which a surface does not shade itself
 
 
 class SyntheticClip(NamedTuple):
@@ -25,16 +25,16 @@ class SyntheticClip(NamedTuple):
     images: Float[Array, "*B S H W 3"]  # RGB in [0, 1]
     depth: Float[Array, "*B S H W"]  # along z
     object_ids: Int[Array, "*B S H W"]  # 0 is the room
-    part_ids: Int[Array, "*B S H W"]  # 0 is the room; every rigid part has its own
+    part_ids: Int[Array, "*B S H W"]  # 0 is the room; every rigid part has its own number
     dynamic_mask: Bool[Array, "*B S H W"]
-    scene_flow: Float[Array, "*B S H W 3"]  # world axes: where the pixel's point is a frame later, minus where it is
+    scene_flow: Float[Array, "*B S H W 3"]  # world axes: the pixel's point a frame later, minus the point
     camera_from_world: Float[Array, "*B S 3 4"]
     intrinsics: Float[Array, "*B S 3 3"]
     world_from_part: Float[Array, "*B S K 3 4"]  # indexed by part_ids; row 0 is the identity
 
 
 class Surface(NamedTuple):
-    """What rays hit first."""
+    """The first hits of rays."""
 
     depth: Float[Array, " P"]
     part_ids: Int[Array, " P"]
@@ -69,21 +69,21 @@ def intrinsics_of(scene: Scene, config: SceneConfig) -> Float[Array, "3 3"]:
 def cast(
     scene: Scene, textures: Textures, config: SceneConfig, time: Float[Array, ""], pixels: Float[Array, "P 2"]
 ) -> Surface:
-    """Return what the camera at `time` sees at image positions (x, y) in pixels; centres are at + 0.5."""
+    """Return the surfaces that the camera at `time` sees at image positions (x, y) in pixels; centres are at + 0.5."""
     rotation, origin = camera_pose(scene.camera, time)
     focal = config.width / 2 / jnp.tan(scene.camera.half_angle)
     x, y = pixels[:, 0], pixels[:, 1]
     rays = jnp.stack([(x - config.width / 2) / focal, (y - config.height / 2) / focal, jnp.ones_like(x)])
-    direction = rotation @ rays  # [3, P]: z is 1 in the camera, so the way along the ray is the depth
+    direction = rotation @ rays  # [3, P]: z is 1 in the camera, so the distance along the ray is the depth
     poses = part_poses(scene, config, time)
     enter, _ = _intervals(scene, config, poses, origin[:, None], direction)
     step = jnp.where(jnp.abs(direction) < 1e-9, 1e-9, direction)
-    ways = jnp.maximum((scene.room_low - origin)[:, None] / step, (scene.room_high - origin)[:, None] / step)
-    depths = jnp.concatenate([ways.min(axis=0, keepdims=True), enter])  # [1 + K, P]
+    walls = jnp.maximum((scene.room_low - origin)[:, None] / step, (scene.room_high - origin)[:, None] / step)
+    depths = jnp.concatenate([walls.min(axis=0, keepdims=True), enter])  # [1 + K, P]
     part_ids = jnp.argmin(depths, axis=0)
     depth = depths.min(axis=0)
     point = origin[:, None] + depth[None] * direction
-    normal, local, material = _hit(scene, config, poses, part_ids, ways, direction, point)
+    normal, local, material = _hit(scene, config, poses, part_ids, walls, direction, point)
     colour = _albedo(textures, material, local, normal[1], depth / focal, direction, normal[0])
     light = scene.light[:, None] - point
     shaded = _shaded(scene, config, poses, point, light)
@@ -105,11 +105,11 @@ def _frame(scene: Scene, textures: Textures, config: SceneConfig, time: Array, s
         pairs = [(o, t) for o in offsets.astype(np.float32) for t in opened.astype(np.float32)]
 
         def one(total, pair):
-            offset, late = pair
-            return total + cast(scene, textures, config, time + late, jnp.asarray(corners) + offset[None]).colour, None
+            offset, delay = pair
+            return total + cast(scene, textures, config, time + delay, jnp.asarray(corners) + offset[None]).colour, None
 
-        ways = tuple(jnp.asarray(np.stack(column)) for column in zip(*pairs, strict=True))
-        colour = jax.lax.scan(one, jnp.zeros_like(colour), ways)[0] / len(pairs)
+        columns = tuple(jnp.asarray(np.stack(column)) for column in zip(*pairs, strict=True))
+        colour = jax.lax.scan(one, jnp.zeros_like(colour), columns)[0] / len(pairs)
     colour = jnp.clip(colour * jnp.exp(scene.exposure.at(time))[:, None], 0, 1)
 
     objects = np.concatenate([[0], np.asarray(config.objects) + 1])
@@ -134,7 +134,7 @@ def _frame(scene: Scene, textures: Textures, config: SceneConfig, time: Array, s
 
 
 def _intervals(scene: Scene, config: SceneConfig, poses, origin, direction):
-    """Enter and leave every part: [K, P] each; never for parts that are absent."""
+    """Return where rays enter and leave every part, [K, P] each; rays never enter absent parts."""
     rotation, centre = poses
     kinds = np.asarray(config.kinds)
     enter, leave = [], []
@@ -152,13 +152,13 @@ def _intervals(scene: Scene, config: SceneConfig, poses, origin, direction):
 
 
 def _shaded(scene: Scene, config: SceneConfig, poses, point, light) -> Bool[Array, " P"]:
-    """Whether a part stands between each point and the light."""
+    """Return whether a part stands between each point and the light."""
     _, (near, far) = _intervals(scene, config, poses, point, light)
     return ((jnp.maximum(near, 0) + _SELF) < jnp.minimum(far, 1)).any(axis=0)
 
 
-def _hit(scene: Scene, config: SceneConfig, poses, part_ids, ways, direction, point):
-    """Gather of the part that was hit: normals in world and local axes, local position, material [12, P]."""
+def _hit(scene: Scene, config: SceneConfig, poses, part_ids, walls, direction, point):
+    """Gather from the hit parts: normals in world and local axes, local position, material [12, P]."""
     rotation, centre = poses
     K = len(config.kinds)
     shape = np.asarray([list(SHAPES).index(kind) for kind in config.kinds])
@@ -173,9 +173,9 @@ def _hit(scene: Scene, config: SceneConfig, poses, part_ids, ways, direction, po
     normals = jnp.stack([normal(local, size) for _, normal in SHAPES.values()])  # [shapes, 3, P]
     normal = _dot(normals, kind[:, None])
     in_room = part_ids == 0
-    axis = jnp.argmin(ways, axis=0)
-    wall = jnp.arange(3)[:, None] == axis[None]
-    normal = jnp.where(in_room[None], jnp.where(wall, -jnp.sign(direction), 0), normal)
+    axis = jnp.argmin(walls, axis=0)
+    is_wall = jnp.arange(3)[:, None] == axis[None]
+    normal = jnp.where(in_room[None], jnp.where(is_wall, -jnp.sign(direction), 0), normal)
     upper = jnp.take_along_axis(direction, axis[None], axis=0)[0] > 0
     surface = jnp.where(in_room, K + 2 * axis + upper, part_ids - 1)
     material = scene.material.T @ _one_hot(surface, K + ROOM_FACES)
@@ -183,7 +183,7 @@ def _hit(scene: Scene, config: SceneConfig, poses, part_ids, ways, direction, po
 
 
 def _albedo(textures: Textures, material, local, normal, width, direction, world_normal) -> Float[Array, "3 P"]:
-    """Texture by projection along the dominant axis of the local normal, in the material's scale, turn and colours."""
+    """Return the texture, projected along the main axis of the local normal, in the material's scale and colours."""
     tile, repeat, cos, sin, *offset = material[:6]
     x, y, z = jnp.abs(normal)
     flat = (y >= x) & (y >= z)

@@ -1,4 +1,4 @@
-"""A scene and its motion: a room, things that stand or move in it, materials, a light and a hand-held camera."""
+"""A scene and its motion: a room with objects, materials, a light and a hand-held camera."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ROOM_FACES = 6
 
 
 class Wave(NamedTuple):
-    """A smooth path: slope (t - 1/2) + amplitude sin(2 pi frequency t + phase), each component by itself."""
+    """A smooth path: slope (t - 1/2) + amplitude sin(2 pi frequency t + phase), for each component."""
 
     slope: Float[Array, "... C"]
     amplitude: Float[Array, "... C"]
@@ -26,7 +26,7 @@ class Wave(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """A hand-held camera that looks at a wandering point: azimuth, elevation, log distance, roll; target; shake."""
+    """A hand-held camera and its wandering target; `start` and `orbit` hold azimuth, elevation, log distance, roll."""
 
     start: Float[Array, 4]
     orbit: Wave
@@ -37,7 +37,7 @@ class Camera(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """All that a clip is drawn from. Metres, y down; the point of interest is the origin."""
+    """The content of a clip. Metres, y down; the origin is the point of interest."""
 
     size: Float[Array, "K 3"]
     present: Bool[Array, " K"]

@@ -1,4 +1,4 @@
-"""Rays against convex shapes: the interval inside each. Components come first, so that pixels are long vectors."""
+"""Intervals of rays inside convex shapes. Components come first, so that pixels are long vectors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _TINY = 1e-9  # a ray parallel to a face is turned by this much
 
 
 def box(origin: Float[Array, "K 3 #P"], direction: Float[Array, "K 3 P"], size: Float[Array, "K 3"]) -> Interval:
-    """Return where rays enter and leave boxes of half extents `size`; a ray that misses leaves before it enters."""
+    """Return where rays enter and leave boxes of half extents `size`; rays that miss leave before they enter."""
     step = jnp.where(jnp.abs(direction) < _TINY, _TINY, direction)
     low = (-size[..., None] - origin) / step
     high = (size[..., None] - origin) / step
@@ -65,7 +65,7 @@ SHAPES = {  # name -> the interval of a ray inside it, its normal
 
 
 def _quadratic(a: Array, b: Array, c: Array) -> Interval:
-    """Return the roots of a t^2 + 2 b t + c; where there are none, an empty interval."""
+    """Return the roots of a t^2 + 2 b t + c; an empty interval without roots."""
     discriminant = b * b - a * c
     root = jnp.sqrt(jnp.maximum(discriminant, 0))
     hit = discriminant > 0

@@ -1,4 +1,4 @@
-"""One picture of a set of scenes for people: frames, and the truth of the middle one. Does not import jax."""
+"""The preview of a set of scenes: frames, and the truth of the middle frame. Does not import jax."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _THUMBNAIL = (260, 200)  # widest and highest
 _MARGIN, _GAP, _HEADER, _LABEL = 24, 6, 76, 108
 _REST = np.array([48, 48, 54], np.uint8)
 _COLUMNS = ("first", "middle", "last", "depth", "dynamic", "parts", "flow")
-_UNMIXED = ("parts", "flow")  # colours that say nothing when they are mixed
+_UNMIXED = ("parts", "flow")  # mixed colours have no meaning
 
 
 def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
@@ -25,7 +25,7 @@ def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
 
     Args:
         scenes: folders that `write_scenes` wrote, of images of one size.
-        title: what the set is.
+        title: of the preview.
     """
     chosen = [scenes[i] for i in np.linspace(0, len(scenes) - 1, min(len(scenes), _MOST_ROWS)).round().astype(int)]
     rows = [_row(scene) for scene in chosen]
@@ -54,7 +54,7 @@ def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
 
 
 def color_parts(part_ids: Int[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Give every part a colour of its own, the same in all pictures; the room is grey."""
+    """Colour every part by its number, alike in all pictures; the room is grey."""
     hues = [colorsys.hsv_to_rgb((0.618034 * n) % 1, 0.55 + 0.4 * (n % 2), 0.95 - 0.25 * (n % 3)) for n in range(256)]
     colors = (255 * np.array(hues)).round().astype(np.uint8)
     colors[0] = _REST
@@ -62,7 +62,7 @@ def color_parts(part_ids: Int[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def color_flow(flow: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Show flow along x, y and z as red, green and blue about a mid grey, the fastest at full colour; rest is dark."""
+    """Colour flow along x, y, z as red, green, blue around mid grey; the fastest has full colour, rest is dark."""
     fastest = np.abs(flow).max()
     moving = np.linalg.norm(flow, axis=-1) > 1e-4
     colors = (255 * (0.5 + 0.5 * flow / max(float(fastest), 1e-4))).round().astype(np.uint8)

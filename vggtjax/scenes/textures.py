@@ -1,4 +1,4 @@
-"""Textures of the generated scenes: photographs and materials that ship with scikit-image, and procedural ones."""
+"""Textures of the generated scenes: photographs and materials from scikit-image, and procedural textures."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ PHOTOGRAPHS = (
     "gravel.png", "hubble_deep_field.jpg", "ihc.png", "moon.png", "motorcycle_left.png", "page.png", "retina.jpg",
     "rocket.jpg", "text.png",
 )  # fmt: skip
-SHARES = {"training": (0.0, 0.62), "test": (0.66, 1.0)}  # of a photograph's width: the splits see disjoint crops
+SHARES = {"training": (0.0, 0.62), "test": (0.66, 1.0)}  # of a photograph's width: the crops are disjoint
 CROPS = {"training": 3, "test": 2}  # per photograph
 PROCEDURAL = 16  # tiles per split
 SEEDS = {"training": 0, "test": 1}
 
 
 class Textures(NamedTuple):
-    """Square RGB tiles with their pyramids, in one row of texels: level by level, in each tile by tile."""
+    """Square RGB tiles with their pyramids, in one row of texels: level by level, in each level tile by tile."""
 
     texels: UInt8[Array, "N 3"]
 
     @property
     def tiles(self) -> int:
-        """Number of tiles, known from the shape."""
+        """Number of tiles, from the shape."""
         return self.texels.shape[0] // sum(side * side for side in SIDES)
 
 
@@ -59,8 +59,8 @@ def sample(
     Args:
         textures: the tiles.
         tile: index of the tile of every pixel.
-        uv: position in units of a tile's side; beyond it the tile is repeated, mirrored.
-        footprint: size of a pixel on the tile, in the same units, which picks the level of the pyramid.
+        uv: position in units of a tile's side; outside [0, 1] the tile repeats, mirrored.
+        footprint: size of a pixel on the tile, in the same units; it decides the level of the pyramid.
     """
     level = jnp.log2(jnp.maximum(footprint * SIDES[0], 1e-6))
     level = jnp.clip(jnp.round(level), 0, len(SIDES) - 1).astype(jnp.int32)
@@ -99,7 +99,7 @@ def _crops(name: str, split: Split, generator: np.random.Generator) -> list[UInt
 
 
 def _procedural(generator: np.random.Generator, kind: int) -> UInt8[np.ndarray, "256 256 3"]:
-    """Return a tile of coloured noise, tiles, stripes or dots between two random colours."""
+    """Return a tile of noise, squares, stripes or dots between two random colours."""
     side = SIDES[0]
     y, x = np.mgrid[0:side, 0:side] / side
     noise = np.zeros((side, side))
