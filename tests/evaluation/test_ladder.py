@@ -186,8 +186,8 @@ def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):
     [
         ({"methods": ["vgtt"]}, "unknown method 'vgtt'"),
         ({"masks": ["guessed"]}, "guessed.*expected 'mined' or 'true'"),
-        ({"mask_pairs": [-1]}, "mask_pairs has .-1."),
-        ({"suppress": ["hide"]}, "suppress has .'hide'."),
+        ({"mask_pairs": [-1]}, "mask_pairs is -1"),
+        ({"suppress": ["hide"]}, "suppress is 'hide'"),
         ({"gram": "sine"}, "gram is 'sine'"),
         ({"batch_size": 0}, "batch_size is 0"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -16,6 +17,7 @@ from vggtjax.errors import InputError
 from vggtjax.options import METHODS, MethodName, Options, find_method
 
 if TYPE_CHECKING:
+    from vggtjax.evaluation.records import Record
     from vggtjax.evaluation.sources import FolderSource, ModelSource
 
 
@@ -126,7 +128,7 @@ def evaluate(
             from vggtjax import __version__
             from vggtjax.evaluation.datasets import DATASETS, find_sequences
             from vggtjax.evaluation.page import check_report, write_report
-            from vggtjax.evaluation.records import Records, summary
+            from vggtjax.evaluation.records import Records
             from vggtjax.evaluation.run import Scoring
             from vggtjax.evaluation.run import evaluate as run
 
@@ -163,13 +165,20 @@ def evaluate(
         records = run(found, source, store, settings, scoring, on_stage=report.stage)
         with report.stage("draw"):
             write_report(out, records, store, settings, warnings=source.warnings)
+    _print(report, out, records, source.warnings)
+
+
+def _print(report: Report, out: Path, records: Sequence[Record], warnings: Sequence[str]) -> None:
+    """Print the means, each failure, notes and warnings; raises InputError where nothing could be scored."""
+    from vggtjax.evaluation.records import summary
+
     report.means(summary(records))
     for record in records:
         if record.status == "failed":
             report.line(f"{record.name}, {record.method}: failed: {record.reason}")
     for note in dict.fromkeys(note for record in records for note in record.notes):
         report.line(f"note: {note}")
-    for warning in source.warnings:
+    for warning in warnings:
         report.line(warning)
     report.line(f"Look at {out / 'index.html'}")
     if all(record.status == "failed" for record in records):

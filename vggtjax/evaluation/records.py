@@ -88,7 +88,7 @@ class Records:
 def shown_name(name: str) -> str:
     """Return a printable name of one line: the name itself if it is one, else with a digest of its bytes."""
     line = one_line(name, _MOST_LETTERS)
-    return name if line == name else f"{line}-{_digest(name)}"
+    return name if name and line == name else f"{line}-{_digest(name)}"
 
 
 def safe_name(name: str) -> str:

@@ -13,6 +13,7 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.pictures import picture_size
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.foreign_frames import placed
+from vggtjax.evaluation.records import shown_name
 from vggtjax.options import Options
 from vggtjax.progress import OnStage
 from vggtjax.results.foreign import check_quaternion
@@ -57,7 +58,7 @@ class ModelSource:
     """Results of a model by several methods; methods with the same masks share one run of the passes.
 
     Raises:
-        InputError: an unknown method or mode, or a value outside its range.
+        InputError: an unknown method, or a size that is not a multiple of the patch size.
     """
 
     model: Model
@@ -78,7 +79,8 @@ class ModelSource:
     @property
     def settings(self) -> dict[str, Any]:
         """What the results depend on besides the sequence, as JSON values."""
-        settings = {"model": _identity(self.model), "mode": self._fitter.mode, "size": self._fitter.size}
+        model = self.model.identity.to_json() | {"trained": self.model.trained}
+        settings = {"model": model, "mode": self._fitter.mode, "size": self._fitter.size}
         settings |= {name: value for name, value in self.options.to_json().items() if name != "method"}
         if self.fusion is not None:
             from vggtjax.method.fusion_file import fusion_digest
@@ -125,16 +127,18 @@ class FolderSource:
     """Results in folders: `folders[name] / sequence` holds one result.
 
     Raises:
-        InputError: an order of quaternions that `layout` lacks, or needs.
+        InputError: a name that is not printable or too long, or an order of quaternions that `format` lacks or needs.
     """
 
     folders: Mapping[str, Path]
-    layout: str = "vggtjax"  # of the program that wrote the folders
+    format: str = "vggtjax"  # of the program that wrote the folders
     quaternion: Quaternion | None = None
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_quaternion(self.layout, self.quaternion)
+        check_quaternion(self.format, self.quaternion)
+        if wrong := [name for name in self.folders if shown_name(name) != name]:
+            raise InputError(f"results cannot be named {shown_name(wrong[0])}; expected a short printable name")
 
     @property
     def names(self) -> Sequence[str]:
@@ -147,7 +151,7 @@ class FolderSource:
     @property
     def settings(self) -> dict[str, Any]:
         """What the numbers depend on besides the files, as JSON values."""
-        return {"format": self.layout, "quaternion": self.quaternion}
+        return {"format": self.format, "quaternion": self.quaternion}
 
     def fingerprint(self, name: str, sequence: LabelledSequence) -> str:
         """Return a digest of the names, sizes and dates of the result's files; "" where there are none."""
@@ -166,22 +170,13 @@ class FolderSource:
     def results(
         self, names: Sequence[str], sequence: LabelledSequence, on_stage: OnStage
     ) -> Mapping[str, Reconstruction]:
-        """Load the results of one group, with the place of their frames in the sequence's pictures."""
+        """Load the results of one group, and place their frames in the sequence's pictures."""
         del on_stage
         sizes = [picture_size(path) for path in sequence.pictures]
         stems = [path.stem for path in sequence.pictures]
         results = {}
         for name in names:
             folder = self.folders[name] / sequence.name
-            result = Reconstruction.load(folder, layout=self.layout, quaternion=self.quaternion)
-            results[name] = placed(result, self.layout, sizes, stems)
+            result = Reconstruction.load(folder, format=self.format, quaternion=self.quaternion)
+            results[name] = placed(result, self.format, sizes, stems)
         return results
-
-
-def _identity(model: Model) -> dict[str, Any]:
-    """Return what tells models apart: the name, and the digest of the file."""
-    digest = None
-    if model.path is not None:
-        with model.path.open("rb") as file:
-            digest = hashlib.file_digest(file, "sha256").hexdigest()
-    return {"name": model.name, "parameters": model.parameter_count, "sha256": digest, "trained": model.trained}

@@ -1,0 +1,43 @@
+"""Sources of results: what they depend on, and what they refuse."""
+
+import dataclasses
+
+import jax
+import pytest
+
+from tests.tiny import tiny_config
+from vggtjax import Model, init_params
+from vggtjax.checkpoint import read_model, save_model
+from vggtjax.errors import InputError
+from vggtjax.evaluation.sources import FolderSource, ModelSource
+
+
+@pytest.mark.parametrize("stored", [False, True])
+def test_retrained_weights_are_another_model(tmp_path, stored):
+    config = tiny_config()
+    params = init_params(0, config)
+
+    def settings(params):
+        if stored:
+            return ModelSource(read_model(save_model(tmp_path / "m.safetensors", params, config)), ["vggt"]).settings
+        return ModelSource(Model(config, params, "m"), ["vggt"]).settings
+
+    before, again = settings(params), settings(params)
+    after = settings(jax.tree.map(lambda leaf: leaf * 1.001, params))
+    assert before == again
+    assert after["model"].pop("sha256") != before["model"].pop("sha256")
+    assert after == before
+
+
+def test_changed_weights_of_a_file_are_another_model(tmp_path):
+    config = tiny_config()
+    model = read_model(save_model(tmp_path / "m.safetensors", init_params(0, config), config))
+    tuned = dataclasses.replace(model, params=jax.tree.map(lambda leaf: leaf * 1.001, model.params))
+    assert ModelSource(tuned, ["vggt"]).settings != ModelSource(model, ["vggt"]).settings
+
+
+@pytest.mark.parametrize("name", ["caf\udce9", "two\nlines", "n" * 300, ""])
+def test_names_of_results_are_short_and_printable(tmp_path, name):
+    with pytest.raises(InputError, match="expected a short printable name") as error:
+        FolderSource({name: tmp_path})
+    assert str(error.value).isprintable()
