@@ -35,6 +35,7 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 T = TypeVar("T")
 _type_info = lru_cache(maxsize=512)(kinds.type_info)
 
+_ANY = kinds.AnyType()
 _ITEMS = (kinds.VarTupleType, kinds.ListType)
 _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 _WORDS = {kinds.StrType: "text", kinds.BoolType: "true or false", kinds.NoneType: "null", kinds.DictType: "an object"}
@@ -117,8 +118,7 @@ def _hints(kind: type) -> dict[str, Any]:
 
 def _converted(value: Any, kind: Any) -> Any:
     info = _type_info(kind)
-    _check_values(value)
-    _check_keys(value, info)
+    _check(value, info)
     try:
         return msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
@@ -128,59 +128,53 @@ def _converted(value: Any, kind: Any) -> Any:
         if missing := re.fullmatch("Object missing required field `(.*?)`?", words):
             raise _MisfitError(place, f"lacks the field {missing[1]!r}") from None
         for step in re.findall(r"\.\w+|\[[^]]*\]", place):
-            matches = [child for child in _children(value, info) if child[0] == step]
-            if not matches:  # in a dict, whose key is not in the message
+            children = {_step(key): (child, child_info) for key, child, child_info in _children(value, info)}
+            if step not in children:  # in a dict, whose key is not in the message
                 raise _MisfitError(place, f"is invalid: {words}") from None
-            _, value, info = matches[0]
+            value, info = children[step]
         raise _MisfitError(place, f"is {_short(value)}; expected {_expected(info)}") from None
 
 
-def _check_values(value: Any, levels: int = 0) -> None:
-    """Raise _MisfitError for infinite and huge numbers, and for too many levels."""
+def _check(value: Any, info: kinds.Type, levels: int = 0) -> None:
+    """Raise _MisfitError for infinite and huge numbers, keys that are no field of a dataclass, and too many levels."""
     if isinstance(value, float) and not math.isfinite(value):
         raise _MisfitError("", f"is {value}; expected a finite number")
     if isinstance(value, int) and abs(value) > _MOST_INT:
         raise _MisfitError("", "is a number of more than 64 bits")
-    if not isinstance(value, Mapping | list | tuple):
+    if value is None or isinstance(value, float | int | str):
         return
-    if levels == MOST_LEVELS:
-        raise _MisfitError("", f"is nested more than {MOST_LEVELS} levels deep")
-    for key, child in value.items() if isinstance(value, Mapping) else enumerate(value):
+    if isinstance(value, Mapping) and isinstance(info := _option(info, value), kinds.DataclassType):
+        known = [field.name for field in info.fields]
+        if unknown := sorted(str(key) for key in value if key not in known):
+            raise _MisfitError("", f"has unknown fields {_short(unknown)}; expected some of {known}")
+    for key, child, child_info in _children(value, info):
+        if levels == MOST_LEVELS:
+            raise _MisfitError("", f"is nested more than {MOST_LEVELS} levels deep")
         try:
-            _check_values(child, levels + 1)
+            _check(child, child_info, levels + 1)
         except _MisfitError as misfit:
             place = "" if "nested" in misfit.words else _step(key) + misfit.place
             raise _MisfitError(place, misfit.words) from None
 
 
-def _check_keys(value: Any, info: kinds.Type) -> None:
-    """Raise _MisfitError for keys that are not fields of the dataclass."""
-    for option in info.types if isinstance(info, kinds.UnionType) else (info,):
-        if isinstance(option, kinds.DataclassType) and isinstance(value, Mapping):
-            known = [field.name for field in option.fields]
-            if unknown := sorted(str(key) for key in value if key not in known):
-                raise _MisfitError("", f"has unknown fields {_short(unknown)}; expected some of {known}")
-    for step, child, kind in _children(value, info):
-        try:
-            _check_keys(child, kind)
-        except _MisfitError as misfit:
-            raise _MisfitError(step + misfit.place, misfit.words) from None
+def _option(info: kinds.Type, value: Any) -> kinds.Type:
+    """Return the option of a union that fits a container; types other than unions are returned as they are."""
+    options = info.types if isinstance(info, kinds.UnionType) else (info,)
+    wanted = (kinds.DataclassType, kinds.DictType) if isinstance(value, Mapping) else (kinds.TupleType, *_ITEMS)
+    return next((option for option in options if isinstance(option, wanted)), info)
 
 
-def _children(value: Any, info: kinds.Type) -> Iterator[tuple[str, Any, kinds.Type]]:
-    """Yield step, value and type of the items one level down."""
-    if isinstance(info, kinds.UnionType):
-        for option in info.types:
-            yield from _children(value, option)
-    elif isinstance(value, Mapping):
-        if isinstance(info, kinds.DataclassType):
-            yield from ((f".{f.name}", value[f.name], f.type) for f in info.fields if f.name in value)
-        elif isinstance(info, kinds.DictType):
-            yield from ((_step(key), child, info.value_type) for key, child in value.items())
+def _children(value: Any, info: kinds.Type) -> Iterator[tuple[Any, Any, kinds.Type]]:
+    """Yield key or index, value and type of the items of a container; of other values, nothing."""
+    info = _option(info, value)
+    if isinstance(value, Mapping):
+        fields = {field.name: field.type for field in info.fields} if isinstance(info, kinds.DataclassType) else {}
+        other = info.value_type if isinstance(info, kinds.DictType) else _ANY
+        yield from ((key, child, fields.get(key, other)) for key, child in value.items())
     elif isinstance(value, list | tuple):
         types = info.item_types if isinstance(info, kinds.TupleType) else ()
-        types = len(value) * (info.item_type,) if isinstance(info, _ITEMS) else types
-        yield from ((_step(index), *pair) for index, pair in enumerate(zip(value, types, strict=False)))
+        other = info.item_type if isinstance(info, _ITEMS) else _ANY
+        yield from ((i, child, types[i] if i < len(types) else other) for i, child in enumerate(value))
 
 
 def _step(key: object) -> str:
