@@ -95,3 +95,13 @@ def test_an_upward_import_and_a_circle_are_found(graph, layer):
 
 def test_the_root_is_small():
     assert len(list((ROOT / "vggtjax").glob("*.py"))) <= 8
+
+
+def test_the_page_names_every_file():
+    rows = re.findall(r"^\| `([\w/]+)/` \| (.*) \|$", (ROOT / "docs" / "layout.md").read_text(), flags=re.MULTILINE)
+    named = {folder: sorted(re.findall(r"`(\w+)`", files)) for folder, files in rows}
+    files: dict[str, list[str]] = {}
+    for path in sorted([*(ROOT / "vggtjax").rglob("*.py"), *(ROOT / "converters").rglob("*.py")]):
+        if not path.stem.startswith("__"):
+            files.setdefault(str(path.parent.relative_to(ROOT)), []).append(path.stem)
+    assert named == files

@@ -78,9 +78,8 @@ def test_all_of_it(dataset, evaluated, capsys):
 
 @pytest.mark.filterwarnings("ignore:the field of view")
 def test_results_of_a_folder(dataset, tmp_path, capsys):
-    code, _, err = run(
-        capsys, "reconstruct", dataset / "first/rgb", "--out", tmp_path / "theirs/first", "--format", "vggt4d"
-    )
+    arguments = ("--model", "demo", "--out", tmp_path / "theirs/first", "--format", "vggt4d")
+    code, _, err = run(capsys, "reconstruct", dataset / "first/rgb", *arguments)
     assert code == 0, err
     arguments = ("evaluate", "plain", dataset, "--results", f"ours={tmp_path / 'theirs'}", "--out", tmp_path / "out")
     code, out, err = run(capsys, *arguments)

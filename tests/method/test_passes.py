@@ -169,7 +169,7 @@ def test_running_out_of_memory_is_one_sentence(params, config, images, monkeypat
     def exhausted(*_, **__):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
 
-    monkeypatch.setattr(run, "compile_stages", exhausted)
+    monkeypatch.setattr(run, "run_stages", exhausted)
     with pytest.raises(DeviceMemoryError, match="4 frames of 140 x 140 pixels do not fit"):
         reconstruct(Model(config, params, "tiny"), load_clip(images[0], size=140))
 
