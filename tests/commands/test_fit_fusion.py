@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from vggtjax.commands import main as cli
+from vggtjax.commands.fit_fusion import aligned
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.learning.ablation import CHOSEN, split_clips
@@ -96,13 +97,13 @@ def test_passes_and_fits_are_kept(dataset, cache, tmp_path, monkeypatch, capsys)
 @pytest.mark.filterwarnings("ignore:the field of view")
 def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset, tmp_path, capsys, caplog):
     frames = dataset / "clip0" / "rgb"
-    common = ["--size", 64, "--max-frames", 3]
     (tmp_path / "link.safetensors").symlink_to(MODEL)
+    model = ["--model", tmp_path / "link.safetensors"]
+    common = ["--size", 64, "--max-frames", 3, *model]
     results = {}
     save_fusion(tmp_path / "paper.safetensors", identity())
     files = {"none": [], "paper": ["--fusion", tmp_path / "paper.safetensors"]}
     files["fitted"] = ["--fusion", fitted / "families" / "scale.safetensors"]
-    files["fitted"] += ["--model", tmp_path / "link.safetensors"]
     for name, option in files.items():
         assert run("reconstruct", frames, "--out", tmp_path / name, *common, *option) == 0
         results[name] = Reconstruction.load(tmp_path / name)
@@ -113,11 +114,22 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
     assert run("batch", frames, "--out", tmp_path / "batch", *common, *files["fitted"]) == 0
     batched = Reconstruction.load(tmp_path / "batch" / "rgb")
     assert np.allclose(batched.depth, results["fitted"].depth, rtol=1e-5)
-    arguments = ["evaluate", "plain", dataset, "--out", tmp_path / "scores", "--size", 64, "--sequences", "clip0"]
+    arguments = [
+        "evaluate",
+        "plain",
+        dataset,
+        "--out",
+        tmp_path / "scores",
+        "--size",
+        64,
+        "--sequences",
+        "clip0",
+        *model,
+    ]
     assert run(*arguments, "--methods", "hard-replacement,4dvggt-d", *files["fitted"]) == 0
     assert "was fitted with" not in caplog.text  # the same model by another path
     capsys.readouterr()
-    assert run("reconstruct", frames, "--out", tmp_path / "x", "--method", "vggt", *files["fitted"]) == 2
+    assert run("reconstruct", frames, "--out", tmp_path / "x", "--method", "vggt", *common, *files["fitted"]) == 2
     assert "method 'vggt' does not fuse; expected 4dvggt-d" in capsys.readouterr().err
     assert run(*arguments, "--methods", "vggt", *files["fitted"]) == 2
     assert "does not fuse" in capsys.readouterr().err
@@ -129,7 +141,7 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
         (["--data", "scenes"], "expected generated=N or DATASET=FOLDER"),
         (["--data", "generated=many"], "expected a number of scenes"),
         (["--data", "nothing=."], "expected generated=N, or one of"),
-        (["--data", "plain=/nowhere"], "/nowhere is no folder"),
+        (["--data", "plain=/nowhere"], "/nowhere is not a folder"),
         (["--family", "best"], "there is no 'best'"),
         (["--seeds", "0"], "seeds is 0"),
         (["--steps", "0"], "steps is 0"),
@@ -182,6 +194,13 @@ def test_clips_of_several_sizes_are_stacked():
     assert fit_clips([clips[0]] * 2, [seen[0]] * 2).view is not None
     with pytest.raises(InputError, match="no pixel with a true depth"):
         fit_clips([clips[0]._replace(truth=np.zeros((2, 28, 28), np.float32))], seen[:1], pixels=10)
+
+
+def test_aligned_clips_have_depth_and_cameras_of_one_unit():
+    clip = clip_of(3, 28, 0)._replace(camera_from_world=np.ones((3, 3, 4), np.float32))
+    clip = aligned(clip._replace(depth2=clip.depth1 / 2))
+    assert np.allclose(clip.depth2, clip.depth1)
+    assert clip.camera_from_world[0].tolist() == [[1, 1, 1, 2]] * 3
 
 
 def test_frames_are_taken_where_there_is_truth():
