@@ -3,6 +3,7 @@
 from contextlib import contextmanager
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -21,10 +22,12 @@ from vggtjax import (
     load_clip,
     motion_saliency,
     reconstruct,
+    run_passes,
 )
 from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.method.fusion import scale_between
 from vggtjax.method.mask import dynamic_pixels, dynamic_tokens, mine_mask
+from vggtjax.options import Options
 from vggtjax.pipeline import run
 from vggtjax.results.result import FieldOfViewWarning
 
@@ -129,7 +132,7 @@ def test_the_staged_pipeline_equals_the_single_jit(params, config, images, infer
 
 
 def test_a_batch_of_clips_under_one_jit(params, config, images, inferred):
-    pair = np.concatenate([images, images[:, ::-1]])
+    pair = jnp.concatenate([images, images[:, ::-1]])
     batch, passes = infer(params, pair, config)
     alone, alone_passes = inferred
     assert np.abs(np.asarray(passes.saliency[:1] - alone_passes.saliency)).max() < 1e-4
@@ -165,6 +168,20 @@ def test_unknown_names(params, config, images, inferred):
         motion_saliency(params, images, config, gram="sine")  # pyright: ignore[reportArgumentType]
 
 
+def test_passes_take_options_or_their_fields(params, config, images):
+    def shapes(**options):
+        return jax.eval_shape(lambda images: run_passes(params, images, config, **options), images)
+
+    assert shapes() == shapes(options=Options(gram="dot"), mask_pairs=2, clusters=8, threshold="otsu")
+    assert shapes(method="vggt").second is None
+    assert shapes(second=()).second is None
+    assert shapes(method="vggt4d").second == shapes(second=("camera",)).second
+    with pytest.raises(TypeError, match="grams"):
+        shapes(grams="dot")
+    with pytest.raises(InputError, match="mask_pairs is -1"):
+        shapes(mask_pairs=-1)
+
+
 def test_running_out_of_memory_is_one_sentence(params, config, images, monkeypatch):
     def exhausted(*_, **__):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
@@ -193,6 +210,7 @@ def test_the_row_of_vggt4d_is_what_is_run(params, config, images, inferred):
     assert (np.asarray(passes.dynamic_mask) == np.asarray(mask)).mean() > 0.99
     patches = dynamic_tokens(passes.dynamic_mask, config.patch_size)
     run = jax.jit(forward, static_argnames=("config", "suppress"))
+    assert passes.second is not None
     made = run(params, images, config, dynamic_tokens=patches, suppress="drop")
     assert np.abs(np.asarray(passes.second.pose_encoding - made.pose_encoding)).max() < 1e-4
 

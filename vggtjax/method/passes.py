@@ -1,15 +1,15 @@
-"""The two passes and what is made of them: the stages of 4DVGGT-D as pure functions (arXiv 2605.12027)."""
+"""The two passes and the methods assembled from them: the stages of 4DVGGT-D as pure functions (2605.12027)."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, Unpack
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtjax.config import Gram, MotionConfig, Suppress, VGGTConfig
+from vggtjax.config import Gram, MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
 from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
@@ -19,16 +19,16 @@ from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions, predict
 from vggtjax.network.pose import decode_pose
-from vggtjax.network.precision import FLOAT32, Compute
-from vggtjax.network.suppression import NOTHING_SUPPRESSED, Suppression
+from vggtjax.network.precision import Compute
+from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
-from vggtjax.options import Threshold, find_method
+from vggtjax.options import OptionChanges, Options, Threshold, find_method
 
 _Value = TypeVar("_Value")
 
 
 class Passes(NamedTuple):
-    """Both passes over clips, and the mask between them. `second` is None where no second pass was run."""
+    """Both passes over clips, and the mask between them. `second` is None without a second pass."""
 
     first: Predictions
     second: Predictions | None
@@ -44,7 +44,7 @@ class Cameras(NamedTuple):
 
 
 class Assembly(NamedTuple):
-    """What a method returns: depth up to scale, its confidence, and the cameras."""
+    """A method's result: depth up to scale, its confidence, and the cameras."""
 
     depth: Float[Array, "B S H W"]
     confidence: Float[Array, "B S H W"]
@@ -69,7 +69,7 @@ def first_pass(
     exponents: Float[Array, " cues"] | None = None,
     outputs: tuple[str, ...] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
-    compute: Compute = FLOAT32,
+    compute: Compute = Compute(),
 ) -> tuple[Predictions, Float[Array, "B S h w"]]:
     """Run the plain pass and mine the motion saliency inside it; with `query_points`, track them too.
 
@@ -99,9 +99,9 @@ def second_pass(
     config: VGGTConfig,
     *,
     plain: Predictions | None = None,
-    suppression: Suppression = NOTHING_SUPPRESSED,
+    suppression: Suppression = Suppression(),
     outputs: tuple[str, ...] = ("camera", "depth"),
-    compute: Compute = FLOAT32,
+    compute: Compute = Compute(),
 ) -> Predictions:
     """Run the mask-aware pass: the keys of dynamic tokens are suppressed in the first pairs of blocks.
 
@@ -139,7 +139,7 @@ def track_from(
     frame: Int[Array, ""],
     config: VGGTConfig,
     *,
-    compute: Compute = FLOAT32,
+    compute: Compute = Compute(),
 ) -> Tracks:
     """Track points of any frame: the clip is rolled so that the frame comes first, and its tracks are rolled back.
 
@@ -165,7 +165,7 @@ def motion_saliency(
     gram: Gram = "cosine",
     motion: MotionConfig | None = None,
 ) -> Float[Array, "B S h w"]:
-    """Return how much each patch seems to move, in [0, 1]: the product of the five Gram maps.
+    """Return the motion saliency of each patch, in [0, 1]: the product of the five Gram maps.
 
     Args:
         params: the model's parameter tree.
@@ -182,51 +182,54 @@ def run_passes(
     images: Float[Array, "B S H W 3"],
     config: VGGTConfig,
     *,
-    gram: Gram = "cosine",
-    suppress: Suppress = "zero",
-    mask_pairs: int = 5,
+    options: Options = Options(),
     motion: MotionConfig | None = None,
-    compute_dtype: str = "float32",
-    clusters: int = 0,
-    threshold: Threshold = "otsu",
-    smooth_frames: int = 1,
-    second: tuple[str, ...] = ("camera", "depth"),
+    clusters: int | None = None,
+    threshold: Threshold | None = None,
+    second: tuple[str, ...] | None = None,
+    **changes: Unpack[OptionChanges],
 ) -> Passes:
-    """Run both passes once, sharing the backbone's features; `assemble` makes a method's result of them.
+    """Run both passes once with shared backbone features, for `assemble`.
 
-    The defaults serve all methods of `LADDER` at once; "vggt4d" wants passes of its own, made as its row of `METHODS`
-    says (`infer` does).
+    The passes of the default options serve all methods of `LADDER`; "vggt4d" needs its own (`method="vggt4d"`).
 
     Args:
         params: the model's parameter tree.
         images: RGB in [0, 1]; any batch and any number of frames.
         config: the model's configuration.
-        gram: similarity of the motion cues, "cosine" or "dot".
-        suppress: how keys of dynamic tokens are suppressed, "zero" or "drop".
-        mask_pairs: number of pairs in which they are.
+        options: how motion is mined and keys are suppressed; masks are not refined.
         motion: the table of cues; the configuration's own if None.
-        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products.
-        clusters, threshold, smooth_frames: how the mask is made of the saliency, as for `mine_mask`.
-        second: what the second pass shall predict; () for no second pass.
+        clusters, threshold: how the mask is mined from the saliency, as for `mine_mask`; the method's own if None.
+        second: outputs of the second pass, () for no second pass; the outputs that the method needs if None.
+        changes: fields of `options` by name, such as `gram="dot"`.
     """
-    patch_tokens = encode(params, images, config, compute_dtype=compute_dtype)
-    clips, compute = ClipBatch(images, patch_tokens), Compute(compute_dtype)
-    first, saliency = first_pass(params, clips, config, gram=gram, motion=motion, compute=compute)
-    size = (images.shape[2], images.shape[3])
-    mining = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames}
-    mask = mine_mask(saliency, patch_tokens, size, **mining)
+    options = options.changed(**changes)
+    method, compute = options.row, Compute(options.compute_dtype)
+    if second is None:
+        second = method.second_outputs(options.align_scale) if method.needs_second_pass else ()
+    patch_tokens = encode(params, images, config, compute_dtype=options.compute_dtype)
+    clips = ClipBatch(images, patch_tokens)
+    first, saliency = first_pass(params, clips, config, gram=method.gram, motion=motion, compute=compute)
+    mask = mine_mask(
+        saliency,
+        patch_tokens,
+        (images.shape[2], images.shape[3]),
+        clusters=method.clusters if clusters is None else clusters,
+        threshold=threshold or method.threshold,
+        smooth_frames=options.smooth_frames,
+    )
     if not second:
         return Passes(first, None, saliency, mask)
-    suppression = Suppression(suppress=suppress, mask_pairs=mask_pairs)
-    options = {"plain": first, "suppression": suppression, "outputs": second, "compute": compute}
-    return Passes(first, second_pass(params, clips, mask, config, **options), saliency, mask)
+    suppression = Suppression(suppress=method.suppress, mask_pairs=options.mask_pairs)
+    masking = {"plain": first, "suppression": suppression, "outputs": second, "compute": compute}
+    return Passes(first, second_pass(params, clips, mask, config, **masking), saliency, mask)
 
 
 def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False) -> Assembly:
-    """Make a method's depth, confidence and cameras of two passes; the methods of `LADDER` share one run of them.
+    """Return a method's depth, confidence and cameras from two passes; the methods of `LADDER` share one run of them.
 
     Args:
-        passes: what `run_passes` returned for cues, suppression and mask as the method has them, which is not checked.
+        passes: what `run_passes` returned for the method's own cues, suppression and mask; this is not checked.
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
             pixels before it is used. Not in the paper.
@@ -239,19 +242,18 @@ def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = Fa
     if align_scale and passes.second is not None:
         scale = scale_between(_present(first.depth), _present(second.depth), passes.dynamic_mask)
 
-    def depth_of(predictions: Predictions, scale: Array) -> tuple[Array, Array]:
-        return _present(predictions.depth) * scale[:, None, None, None], _present(predictions.depth_confidence)
+    def of_first() -> tuple[Array, Array]:
+        return _present(first.depth), _present(first.depth_confidence)
 
-    def of_both() -> tuple[Array, Array, Array, Array, Array]:
-        return (*depth_of(first, jnp.ones_like(scale)), *depth_of(second, scale), passes.dynamic_mask)
+    def of_second() -> tuple[Array, Array]:
+        return _present(second.depth) * scale[:, None, None, None], _present(second.depth_confidence)
 
-    makers = {
-        "first": lambda: (_present(first.depth), _present(first.depth_confidence)),
-        "second": lambda: depth_of(second, scale),
-        "replaced": lambda: replace_depth(*of_both()),
-        "fused": lambda: fuse_depth(*of_both()),
-    }
-    depth, confidence = makers[row.depth]()
+    depth, confidence = {
+        "first": of_first,
+        "second": of_second,
+        "replaced": lambda: replace_depth(*of_first(), *of_second(), passes.dynamic_mask),
+        "fused": lambda: fuse_depth(*of_first(), *of_second(), passes.dynamic_mask),
+    }[row.depth]()
     size = (depth.shape[2], depth.shape[3])
     extrinsics, intrinsics = decode_pose(_present(second.pose_encoding), size)
     cameras = {

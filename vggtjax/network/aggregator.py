@@ -14,9 +14,9 @@ from vggtjax.config import VGGTConfig
 from vggtjax.network.block import Block
 from vggtjax.network.clip_batch import real_frames
 from vggtjax.network.layers import Params
-from vggtjax.network.precision import FLOAT32, Compute, full_precision, widened
+from vggtjax.network.precision import Compute, full_precision, widened
 from vggtjax.network.rope import rope_table
-from vggtjax.network.suppression import NOTHING_SUPPRESSED, SuppressedKeys, Suppression
+from vggtjax.network.suppression import SuppressedKeys, Suppression
 
 REGISTERS = 4
 SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
@@ -66,8 +66,8 @@ def aggregate(
     captures: Sequence[Capture],
     accumulator: Accumulator | None = None,
     frame_count: Int[Array, " B"] | None = None,
-    suppression: Suppression = NOTHING_SUPPRESSED,
-    compute: Compute = FLOAT32,
+    suppression: Suppression = Suppression(),
+    compute: Compute = Compute(),
 ) -> tuple[Float[Array, "B S E"], tuple[Any, ...], Any]:
     """Run the alternating blocks; return the last pair's camera tokens, the captured taps, and the accumulated sums.
 

@@ -20,8 +20,8 @@ from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_tap
 from vggtjax.network.layers import Params
-from vggtjax.network.precision import FLOAT32, Compute, full_precision
-from vggtjax.network.suppression import NOTHING_SUPPRESSED, Suppression
+from vggtjax.network.precision import Compute, full_precision
+from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import declare_track_head, predict_tracks, smallest_side
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
@@ -64,7 +64,7 @@ def forward(
     outputs: Sequence[str] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
     cues: Accumulator | None = None,
-    suppression: Suppression = NOTHING_SUPPRESSED,
+    suppression: Suppression = Suppression(),
     **changes: Unpack[ForwardChanges],
 ) -> Predictions:
     """Run VGGT on clips, optionally with the keys of dynamic tokens suppressed.
@@ -109,8 +109,8 @@ def predict(
     outputs: Sequence[str] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
     accumulator: Accumulator | None = None,
-    suppression: Suppression = NOTHING_SUPPRESSED,
-    compute: Compute = FLOAT32,
+    suppression: Suppression = Suppression(),
+    compute: Compute = Compute(),
 ) -> Predictions:
     """Run the network as `forward`, whose keywords travel here as values: a batch of clips, a suppression, a compute.
 

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtjax.config import Suppress
 from vggtjax.errors import InputError
 from vggtjax.network.attention import attention
+from vggtjax.options import check_mask_pairs
 
 
 @partial(
@@ -41,14 +42,13 @@ class Suppression:
 
     def check(self, shape: tuple[int, ...], depth: int) -> None:
         """Raise InputError unless the values fit patches of shape (B, S, h, w) and a model with `depth` pairs."""
-        tokens, strength, pairs = self.dynamic_tokens, self.strength, self.mask_pairs
+        tokens, strength = self.dynamic_tokens, self.strength
         if tokens is not None and tuple(tokens.shape) != shape:
             raise InputError(f"dynamic_tokens have shape {tuple(tokens.shape)}; expected {shape}")
         shares = tokens is not None and jnp.issubdtype(tokens.dtype, jnp.floating)
         if tokens is not None and tokens.dtype != bool and not shares:
             raise InputError(f"dynamic_tokens have type {tokens.dtype}; expected bool, or shares as floats")
-        if isinstance(pairs, int | float) and (pairs != int(pairs) or pairs < 0):
-            raise InputError(f"mask_pairs is {pairs}; expected a whole number of at least 0")
+        check_mask_pairs(self.mask_pairs)
         if self.suppress not in ("zero", "drop"):
             raise InputError(f"suppress is {self.suppress!r}; expected 'zero' or 'drop'")
         if self.suppress != "zero" and (shares or strength is not None):
@@ -75,9 +75,6 @@ class Suppression:
         pairs = jnp.arange(depth) < self.mask_pairs
         tokens = self.dynamic_tokens
         return pairs if tokens is None or tokens.dtype == bool else pairs.astype(tokens.dtype)
-
-
-NOTHING_SUPPRESSED = Suppression()
 
 
 @dataclass(frozen=True)

@@ -67,21 +67,7 @@ def infer(
 def _infer(
     params: Params, images: Array, config: VGGTConfig, options: Options, motion: MotionConfig | None
 ) -> tuple[Assembly, Passes]:
-    method = options.row
-    passes = run_passes(
-        params,
-        images,
-        config,
-        gram=method.gram,
-        suppress=method.suppress,
-        mask_pairs=options.mask_pairs,
-        motion=motion,
-        compute_dtype=options.compute_dtype,
-        clusters=method.clusters,
-        threshold=method.threshold,
-        smooth_frames=options.smooth_frames,
-        second=method.second_outputs(options.align_scale) if method.needs_second_pass else (),
-    )
+    passes = run_passes(params, images, config, options=options, motion=motion)
     return assemble(passes, options.method, align_scale=options.align_scale), passes
 
 

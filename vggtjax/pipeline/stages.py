@@ -222,11 +222,12 @@ def run_stages(
         all_outputs: run the second pass with depth even if the method does not need it.
     """
     points = dict(inputs.query_points)
-    clips = ClipBatch(inputs.images, stages.image_features(params, inputs.images), inputs.frame_count)
+    patch_tokens = stages.image_features(params, inputs.images)
+    clips = ClipBatch(inputs.images, patch_tokens, inputs.frame_count)
     first, saliency = stages.first_pass(params, clips, points.pop(0, None))
     mask = inputs.dynamic_mask
     if mask is None:
-        mask = stages.dynamic_mask(saliency, clips.patch_tokens)
+        mask = stages.dynamic_mask(saliency, patch_tokens)
     second = first if stages.options.row.needs_second_pass else None
     if second is not None and inputs.moves:
         second = stages.second_pass(params, clips, mask, first, all_outputs=all_outputs)
