@@ -335,7 +335,7 @@ def test_cache_is_the_users(shapes, config, tmp_path, monkeypatch):
     assert path.name.startswith("my-weights-")
 
 
-def test_nothing_there(tmp_path):
+def test_missing_weights(tmp_path):
     message = refusal(tmp_path / "missing.safetensors")
     for part in ("missing.safetensors", ".pt", "index", "facebook/VGGT-1B", "'demo'"):
         assert part in message

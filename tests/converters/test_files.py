@@ -197,7 +197,7 @@ def test_choice_among_files():
 
 
 @pytest.mark.parametrize("source", ["nowhere.pt", "weights/missing.safetensors", "./a/b", "demo2", "x" * 5000, "a\0b"])
-def test_nothing_there(source, tmp_path, monkeypatch):
+def test_missing_weights(source, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     message = refusal(source, locate)
     assert "there are no weights at" in message or "File name too long" in message
@@ -258,7 +258,7 @@ def test_truncated_files(small, tmp_path):
         {"a": [8, 0], "b": [8, 16]},  # backwards
     ],
 )
-def test_places_that_lie(tmp_path, spans):
+def test_wrong_offsets(tmp_path, spans):
     header = json.dumps({name: {"dtype": "F32", "shape": [2], "data_offsets": span} for name, span in spans.items()})
     path = tmp_path / "model.safetensors"
     path.write_bytes(len(header).to_bytes(8, "little") + header.encode() + bytes(20))
@@ -271,7 +271,7 @@ class Code:
 
 
 @pytest.mark.parametrize("archive", [True, False])
-def test_pickled_code_is_not_run(tmp_path, monkeypatch, archive):
+def test_pickled_code_never_runs(tmp_path, monkeypatch, archive):
     monkeypatch.chdir(tmp_path)
     torch.save({"a": torch.ones(2), "b": Code()}, "evil.pt", _use_new_zipfile_serialization=archive)
     assert "could run code, and is not opened" in refusal(tmp_path / "evil.pt")
@@ -347,7 +347,7 @@ def test_index_stays_in_its_folder(few, name):
         ('{"weight_map": []}', "no weight_map"),
     ],
 )
-def test_index_that_is_none(few, content, reason):
+def test_invalid_index(few, content, reason):
     (few / INDEX).write_text(content)
     assert reason in refusal(few / INDEX)
 

@@ -1,4 +1,4 @@
-"""The user's cache: where it is, and that commands keep what jax compiles there."""
+"""The user's cache: its folder, and the compiled programs that commands keep there."""
 
 import os
 import subprocess
@@ -31,7 +31,7 @@ def compiled(environment, folder: Path) -> int:
     return len(list(folder.glob("*-cache"))) if folder.is_dir() else 0
 
 
-def test_what_is_compiled_is_kept_unless_the_user_has_said_otherwise(tmp_path):
+def test_compiled_programs_are_kept_where_the_user_says(tmp_path):
     own = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     own |= {"VGGTJAX_CACHE": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     assert compiled(own, tmp_path / "compiled") > 0
@@ -57,7 +57,7 @@ def test_damaged_entries_are_made_anew(tmp_path):
 
 
 @pytest.mark.skipif("jax" not in sys.modules, reason="nothing here has imported jax")
-def test_it_comes_too_late_once_jax_is_there(monkeypatch):
+def test_nothing_changes_once_jax_is_imported(monkeypatch):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     assert not keep_compilations()
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ

@@ -1,4 +1,4 @@
-"""Programs that are kept: traced once, the same numbers afterwards, and made anew where a file is not whole."""
+"""Kept programs: traced once, equal numbers afterwards, made anew if a file is damaged."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -41,7 +41,7 @@ def counted():
 X = jnp.arange(6.0).reshape(2, 3)
 
 
-def test_another_process_need_not_trace(folder):
+def test_a_second_process_does_not_trace(folder):
     (first, second, _), traced = counted()
     made = first(Pair(X), None, power=2, factor=3.0)
     again = second(Pair(X), None, power=2, factor=3.0)
@@ -61,7 +61,7 @@ def test_another_process_need_not_trace(folder):
     assert len(traced) == 5
 
 
-def test_compiled_programs_are_what_calls_find(folder):
+def test_calls_use_compiled_programs(folder):
     (first, second, _), traced = counted()
     shape = jax.ShapeDtypeStruct((2, 3), jnp.float32)
     for program in (first, second):
@@ -86,7 +86,7 @@ def test_damaged_programs_are_made_anew(folder, place):
     assert traced == [2, 2]
 
 
-def test_what_cannot_be_kept_runs_all_the_same(folder):
+def test_programs_that_cannot_be_kept_run(folder):
     def called(x):
         return jax.pure_callback(lambda x: np.asarray(x) + 1, jax.ShapeDtypeStruct(x.shape, x.dtype), x)
 
@@ -97,7 +97,7 @@ def test_what_cannot_be_kept_runs_all_the_same(folder):
     assert np.array_equal(gradient, 2 * X)
 
 
-def test_a_cache_that_cannot_be_written_is_none(folder):
+def test_an_unwritable_cache_is_not_used(folder):
     folder.parent.mkdir(exist_ok=True)
     folder.write_text("a file where the folder would be")
     (program, *_), _ = counted()
