@@ -1,1 +1,1 @@
-"""Which layers' motion cues tell what moves is a property of a checkpoint: measure it, choose a table, store it."""
+"""Choice of motion cues for a checkpoint: measure the maps of every pair, choose a table, store it in the model."""

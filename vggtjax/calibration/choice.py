@@ -1,4 +1,4 @@
-"""A table of cues for a checkpoint: greedy choice on half of the clips, confirmed by the other half."""
+"""A table of cues for a checkpoint: a greedy choice on half of the clips, confirmed by the other half."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32, Int8
 
-from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Progress, Sweep, token_auc
+from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Sweep, token_auc
 from vggtjax.config import Cue, Gram, MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.method.cues import normalise
+from vggtjax.progress import Progress
 
 MAX_TERMS = 5  # as many as VGGT4D's table has
 MIN_GAIN = 0.001
@@ -35,12 +36,12 @@ class Step(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """A chosen table, and what it is worth."""
+    """A chosen table and its ratings."""
 
     motion: MotionConfig
     gram: Gram
     steps: tuple[Step, ...]  # one per cue of the table
-    refused: Step | None  # the next best cue, which the held-out half did not confirm
+    refused: Step | None  # the next best cue, not confirmed by the held-out half
     table: Rating  # of the sweep's own table
 
 
@@ -52,23 +53,23 @@ def choose(
     min_gain: float = MIN_GAIN,
     progress: Progress | None = None,
 ) -> Choice:
-    """Choose cues whose product tells what moves.
+    """Choose cues whose product separates moving from static tokens.
 
-    Every second clip, from the first on, is the calibration half; the others are held out. The start is the map that is
-    best alone; then, again and again, the map, plain or inverted, that raises the product's area under the ROC curve on
-    the calibration half most. The product is that of `GramCues.saliency`. It ends where the held-out half gains nothing
-    or less than `min_gain`. As that half decides how many cues there are, the rating on it is slightly optimistic.
-    Candidates are all maps of one pair, and the means over two or three neighbouring pairs.
+    The first, third, ... clips are the calibration half; the others are held out. Each step adds the map, plain or
+    inverted, with the largest area under the ROC curve of the product (as in `GramCues.saliency`) on the calibration
+    half. The choice ends where the held-out half gains nothing or less than `min_gain`. As that half decides the number
+    of cues, the rating on it is slightly optimistic. Candidates are all maps of one pair, and the means over two or
+    three neighbouring pairs.
 
     Args:
-        sweep: what `sweep` returned.
-        gram: the similarity that the table is for.
-        max_terms: number of cues at most.
-        min_gain: what a further cue must add to the area on the held-out half.
-        progress: called with the candidates tried and the largest number of them.
+        sweep: result of `sweep`.
+        gram: similarity of the table.
+        max_terms: largest number of cues.
+        min_gain: smallest gain in area on the held-out half for another cue.
+        progress: called with the number of tried candidates and the largest possible number.
 
     Raises:
-        InputError: a half lacks tokens that move or tokens that do not, or an argument is out of range.
+        InputError: a half without moving or without static tokens, or an argument out of range.
     """
     if gram not in GRAMS:
         raise InputError(f"gram is {gram!r}; expected one of {GRAMS}")
@@ -108,7 +109,7 @@ def choose(
 
 
 def halves(sweep: Sweep) -> tuple[Sweep, Sweep]:
-    """Return the clips to choose by (the first, third, ...) and those to confirm with."""
+    """Return the calibration half (the first, third, ... clips) and the held-out half."""
 
     def part(start: int) -> Sweep:
         every_second = slice(start, None, 2)
@@ -122,19 +123,19 @@ def halves(sweep: Sweep) -> tuple[Sweep, Sweep]:
 
 
 def candidates(depth: int) -> tuple[Cue, ...]:
-    """Return the cues to choose from, not inverted: every map of one pair, then means over neighbouring pairs."""
+    """Return the candidates, not inverted: every map of one pair, then means over neighbouring pairs."""
 
-    def found() -> Iterator[Cue]:
+    def cues() -> Iterator[Cue]:
         for count in range(1, _MOST_NEIGHBOURS + 1):
             for kind in KINDS:
-                if count > 1 and kind.statistic == "std":  # is made of the averaged Gram map, not of averaged maps
+                if count > 1 and kind.statistic == "std":  # of the averaged Gram map, not an average of maps
                     continue
                 for first in range(depth - count + 1):
                     layers = tuple(range(first, first + count))
                     place = f"layer{first}" if count == 1 else f"layers{first}to{layers[-1]}"
                     yield dataclasses.replace(kind, name=f"{place}_{kind.name}", layers=layers)
 
-    return tuple(found())
+    return tuple(cues())
 
 
 def _check_truth(name: str, half: Sweep) -> None:
@@ -142,7 +143,7 @@ def _check_truth(name: str, half: Sweep) -> None:
         if not (half.truth == value).any():
             raise InputError(
                 f"the {len(half.truth)} clips of the {name} half have no {kind} token; "
-                "take clips in which some patches move and others do not"
+                "use clips with moving and static patches"
             )
 
 
@@ -152,7 +153,7 @@ def _term(sweep: Sweep, gram: Gram, cue: Cue) -> Float32[np.ndarray, "N S P"]:
 
 
 def _product(sweep: Sweep, gram: Gram, cues: Sequence[Cue]) -> Float32[np.ndarray, "N S P"]:
-    """The product of maps that the method normalises only at its end."""
+    """Return the product of maps, not normalised."""
     product = np.ones(sweep.truth.shape, np.float32)
     for cue in cues:
         product = product * _term(sweep, gram, cue)

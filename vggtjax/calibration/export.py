@@ -1,10 +1,10 @@
-"""Writing a calibration as files.
+"""Write a calibration as files.
 
 In the folder:
 
-    model.safetensors       the model with the chosen table in its configuration; load_model reads it
-    sweep.png               how well each pair's maps tell what moves, the chosen ones outlined
-    calibration.json        the numbers: sweep, choice, clips; written last, so its presence says that all is whole
+    model.safetensors       the model with the chosen table in its configuration, for load_model
+    sweep.png               the quality of each pair's maps; chosen maps are outlined
+    calibration.json        the numbers: sweep, choice, clips; written last, when the other files are complete
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ def save_calibration(
 
     Args:
         folder: made if missing; an earlier calibration in it is replaced.
-        model: the one that was swept.
-        sweep: what `sweep` returned.
-        choice: what `choose` returned.
-        source: plain values that say where the clips are from, for calibration.json.
+        model: the calibrated model.
+        sweep: result of `sweep`.
+        choice: result of `choose`.
+        source: JSON values that describe the clips, for calibration.json.
 
     Raises:
-        OutputError: the folder cannot be written, or holds files of our names that are no earlier calibration.
+        OutputError: the folder cannot be written, or holds files with these names of another origin.
     """
     folder = Path(folder)
     check_folder(folder)
@@ -61,7 +61,7 @@ def save_calibration(
 
 
 def check_folder(folder: Path) -> None:
-    """Make sure that a calibration can be saved in `folder`, before it is made; OutputError as `save_calibration`."""
+    """Check before the work that a calibration can be saved in `folder`; OutputError as `save_calibration`."""
     replaced = says_format(folder / NUMBERS, FORMAT)
     check_free(folder, (NUMBERS, MODEL, PICTURE), replaced=replaced, what="calibration")
 

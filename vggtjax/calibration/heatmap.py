@@ -1,4 +1,4 @@
-"""The sweep as a picture: one cell per map, coloured by how well it tells what moves."""
+"""The sweep as a picture: one cell per map, coloured by its area under the ROC curve."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _DARK, _OUTLINE = (20, 20, 24), (30, 200, 90)
 _CELL, _GAP, _MARGIN = (46, 30), 26, 24  # width and height; between the similarities; around everything
 _LABEL_WIDTH, _HEADER_HEIGHT, _LINE, _LEGEND = 150, 96, 22, (256, 12)
 _COLUMNS = (_MARGIN, 600, 700)  # left edges of the table below the cells
-_LEAST_WIDTH = 800  # pixels; what the title, the legend and that table need
+_LEAST_WIDTH = 800  # pixels; enough for the title, the legend and that table
 _MOST_LETTERS = 32  # of the title
-_LEAST_REACH = 0.1  # of the colours from one half, so that noise looks pale
+_LEAST_REACH = 0.1  # smallest range of the colours on either side of 0.5, so that noise looks pale
 
 
 def draw_sweep(auc: Float64[np.ndarray, "G C L"], choice: Choice, *, title: str = "") -> UInt8[np.ndarray, "H W 3"]:
@@ -38,7 +38,7 @@ def draw_sweep(auc: Float64[np.ndarray, "G C L"], choice: Choice, *, title: str 
     large, small, tiny = (ImageFont.load_default(size) for size in (22, 15, 12))
     title = title if len(title) <= _MOST_LETTERS else f"{title[: _MOST_LETTERS - 1]}…"
     draw.text((_MARGIN, _MARGIN), f"Motion cues of {title or 'the model'}", TEXT, large)
-    draw.text((_MARGIN, _MARGIN + 32), "area under the ROC curve of every pair's map against what moves", FAINT, small)
+    draw.text((_MARGIN, _MARGIN + 32), "area under the ROC curve of every pair's map for moving tokens", FAINT, small)
     _draw_legend(sheet, draw, small, reach, width)
 
     for layer in range(L):
@@ -86,4 +86,4 @@ def _draw_legend(sheet: Image.Image, draw: ImageDraw.ImageDraw, font, reach: flo
     for share, anchor in ((0, "la"), (0.5, "ma"), (1, "ra")):
         text = f"{0.5 + (share - 0.5) * 2 * reach:.2f}"
         draw.text((x + share * _LEGEND[0], y + _LEGEND[1] + 4), text, FAINT, font, anchor)
-    draw.text((x + _LEGEND[0], y + _LEGEND[1] + 24), "below 0.5 the inverted map, 1 - m, tells it", FAINT, font, "ra")
+    draw.text((x + _LEGEND[0], y + _LEGEND[1] + 24), "below 0.5 the inverted map, 1 - m, is better", FAINT, font, "ra")

@@ -1,9 +1,9 @@
-"""Every pair's motion maps on clips whose moving pixels are known, and how well each map tells them."""
+"""Motion maps of every pair on clips with known moving pixels, and the quality of each map."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
@@ -19,6 +19,7 @@ from vggtjax.evaluation.metrics.masks import auc
 from vggtjax.method.cues import GramCues, Sums, normalise
 from vggtjax.network.layers import Params
 from vggtjax.network.model import forward
+from vggtjax.progress import Progress
 
 GRAMS: tuple[Gram, ...] = ("cosine", "dot")
 _GRAM_MAPS: tuple[tuple[Literal["q", "k"], Literal["q", "k"]], ...] = (("q", "q"), ("k", "k"), ("q", "k"))
@@ -30,15 +31,13 @@ KINDS = tuple(
 )
 STATIC, DYNAMIC, UNCLEAR = 0, 1, -1
 
-Progress = Callable[[int, int | None], object]
-
 
 class Sweep(NamedTuple):
     """The maps of every pair over clips, and the truth. G counts `GRAMS`, C `KINDS`, L pairs, N clips."""
 
-    maps: Float32[np.ndarray, "G C L N S P"]  # before they are normalised, so that neighbouring pairs can be averaged
+    maps: Float32[np.ndarray, "G C L N S P"]  # not normalised, so that neighbouring pairs can be averaged
     truth: Int8[np.ndarray, "N S P"]  # STATIC, DYNAMIC or UNCLEAR
-    table: MotionConfig  # what a chosen table is compared with: the default cues, the model's own offsets
+    table: MotionConfig  # for comparison with the chosen table: the default cues, the model's own offsets
     table_saliency: Float32[np.ndarray, "G N S P"]
 
     @property
@@ -47,17 +46,17 @@ class Sweep(NamedTuple):
         return self.maps.shape[2]
 
     def map(self, gram: Gram, cue: Cue) -> Float32[np.ndarray, "N S P"]:
-        """Return a cue's map as `GramCues` makes it: averaged over its layers, min-max normalised per frame.
+        """Return a cue's map as in `GramCues`: averaged over its layers, min-max normalised per frame.
 
-        Raises InputError for a std over several layers: it is no average of the maps of each.
+        Raises InputError for a std over several layers, as it is not the average of the maps of single layers.
         """
         if cue.statistic == "std" and len(cue.layers) > 1:
-            raise InputError(f"cue '{cue.name}' is a std over layers {cue.layers}; a sweep knows those of one layer")
+            raise InputError(f"cue '{cue.name}' is a std over layers {cue.layers}; expected a single layer")
         maps = self.maps[GRAMS.index(gram), kind_index(cue)]
         return np.asarray(normalise(jnp.asarray(sum(maps[layer] for layer in cue.layers) / len(cue.layers))))
 
     def auc(self) -> Float64[np.ndarray, "G C L"]:
-        """Return each map's area under the ROC curve over all clips; of the inverted map it is 1 minus that."""
+        """Return each map's area under the ROC curve over all clips; the inverted map has 1 minus this area."""
         result = np.empty(self.maps.shape[:3])
         for place in np.ndindex(result.shape):
             result[place] = token_auc(np.asarray(normalise(jnp.asarray(self.maps[place]))), self.truth)
@@ -66,7 +65,7 @@ class Sweep(NamedTuple):
 
 @dataclass(frozen=True)
 class SweepCues(GramCues):
-    """The cues of `KINDS` of every pair by itself, next to those of a table, for both similarities: all in one pass.
+    """The cues of `KINDS` of every pair, and the cues of a table, for both similarities, in one pass.
 
     `measured` reads the sums; `maps`, `saliency` and `gram` do not apply.
     """
@@ -85,14 +84,14 @@ class SweepCues(GramCues):
         k: Float[Array, "B S T N D"],
         frame_count: Int[Array, " B"] | None = None,
     ) -> Sums:
-        """Put the maps of the next pair in their place, and add it to the table's sums."""
+        """Store the maps of the next pair, and add the pair to the table's sums."""
         pair, every, *_ = sums
         single = MotionConfig(KINDS, self.motion.offsets, reference_depth=1)
-        made = [
+        maps = [
             jnp.stack(cues.add(cues.zeros(*every.shape[3:]), jnp.ones(len(KINDS), int), q, k, frame_count))
             for cues in (GramCues(single, 1, gram) for gram in GRAMS)
         ]
-        every = every.at[:, :, pair].set(jnp.stack(made))
+        every = every.at[:, :, pair].set(jnp.stack(maps))
         tables = [
             total
             for cues, totals in zip(self._tables(), self._split(sums), strict=True)
@@ -121,20 +120,20 @@ def sweep(
     progress: Progress | None = None,
     total: int | None = None,
 ) -> Sweep:
-    """Measure the maps of every pair on clips of known truth.
+    """Measure the maps of every pair on clips with known truth.
 
-    One clip at a time is on the device. The maps stay on the host: 48 x depth bytes for every token of every clip.
+    One clip at a time is on the device. The maps are on the host: 48 x depth bytes for every token of every clip.
 
     Args:
         params: the model's parameter tree.
         clips: pictures, RGB in [0, 1], and their dynamic pixels; all clips of one shape.
         config: the model's configuration.
         progress: called with the clips done and `total`.
-        total: number of clips, if it is known.
+        total: number of clips, if known.
 
     Raises:
-        InputError: fewer than two clips or two frames, shapes that do not fit, or a model that gives no numbers.
-        DeviceMemoryError: a clip does not fit.
+        InputError: fewer than two clips or two frames, clips of other shapes, or a model with non-finite maps.
+        DeviceMemoryError: a clip does not fit in the device's memory.
     """
     default = MotionConfig()
     table = dataclasses.replace(config.motion, cues=default.cues, reference_depth=default.reference_depth)
@@ -145,7 +144,7 @@ def sweep(
         _check_clip(shapes, tuple(mask.shape))
         truths.append(token_truth(np.asarray(mask), config.patch_size))
         try:
-            made, saliency = jax.device_get(_measure(params, jnp.asarray(images)[None], config, cues))
+            clip_maps, saliency = jax.device_get(_measure(params, jnp.asarray(images)[None], config, cues))
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
@@ -154,24 +153,24 @@ def sweep(
                 f"{S} frames of {W} x {H} pixels do not fit in the memory of the device; take fewer frames or a "
                 "smaller size"
             ) from error
-        if not np.isfinite(made).all():
+        if not np.isfinite(clip_maps).all():
             raise InputError("the model's motion maps are not finite; its weights cannot be calibrated")
-        maps.append(made[..., 0, :, :])
+        maps.append(clip_maps[..., 0, :, :])
         saliencies.append(saliency[:, 0])
         if progress is not None:
             progress(done, total)
     if len(maps) < 2:
-        raise InputError(f"{len(maps)} clips; expected at least two, one to choose the cues and one to confirm them")
+        raise InputError(f"{len(maps)} clips; expected at least two, one to choose cues and one to confirm them")
     return Sweep(np.stack(maps, axis=3), np.stack(truths), table, np.stack(saliencies, axis=1))
 
 
 def kind_index(cue: Cue) -> int:
-    """Return the place in `KINDS` of a cue's Gram map and statistic."""
+    """Return the index in `KINDS` of a cue's Gram map and statistic."""
     return [(kind.rows, kind.columns, kind.statistic) for kind in KINDS].index((cue.rows, cue.columns, cue.statistic))
 
 
 def token_truth(mask: Bool[np.ndarray, "S H W"], patch_size: int) -> Int8[np.ndarray, "S P"]:
-    """Return DYNAMIC for patches at least half of whose pixels move, STATIC where none does, else UNCLEAR."""
+    """Return DYNAMIC for patches with at least half of their pixels moving, STATIC for none moving, else UNCLEAR."""
     if mask.ndim != 3 or mask.dtype != bool or mask.shape[1] % patch_size or mask.shape[2] % patch_size:
         raise InputError(
             f"a mask has shape {mask.shape} and type {mask.dtype}; expected bool [S, H, W] with H and W multiples of "

@@ -28,16 +28,16 @@ def calibrate_cues(
     max_terms: int = 5,
     seed: int = 0,
 ) -> None:
-    """Choose a model's motion cues on generated scenes, and save it with them.
+    """Choose a model's motion cues on generated scenes, and save the model with them.
 
     Args:
         model: a converted .safetensors, a PyTorch checkpoint, or a hub id such as facebook/VGGT-1B.
         out: folder for model.safetensors, sweep.png and calibration.json; an earlier calibration is replaced.
         scenes: number of scenes; every second one is held out.
         frames: of each scene.
-        size: side in pixels to run at; the model's own by default.
-        gram: similarity that the cues are chosen for.
-        max_terms: choose so many cues at most.
+        size: side of the images in pixels; the model's own by default.
+        gram: similarity of the cues.
+        max_terms: largest number of cues.
         seed: another seed draws other scenes.
     """
     if scenes < 2:
@@ -74,18 +74,18 @@ def calibrate_cues(
         for step in choice.steps
         for calibration, held_out in [step.rating]
     }
-    report.line("AUC of the product up to each cue, on the calibration half and on the held-out one:")
+    report.line("AUC of the product up to each cue, on the calibration half and on the held-out half:")
     report.table(rows | {"default table": "{:.3f}   {:.3f}".format(*choice.table), "model": path})
     if choice.steps[-1].rating.held_out < choice.table.held_out:
-        report.line("On the held-out half the default table is better than the chosen one; try more scenes.")
+        report.line("On the held-out half the default table is better than the chosen table; try more scenes.")
     if not loaded.trained:
-        report.line("The weights of this model are untrained, so its cues mean nothing.")
+        report.line("The weights of this model are untrained, so its cues have no meaning.")
 
 
 def generated_clips(
     scenes: int, frames: int, size: int, seed: int
 ) -> Iterator[tuple[Float32[np.ndarray, "S H W 3"], Bool[np.ndarray, "S H W"]]]:
-    """Yield pictures and dynamic pixels of generated scenes with training textures, one scene at a time."""
+    """Yield images and dynamic pixels of generated scenes with training textures, one scene at a time."""
     import jax
 
     from vggtjax.scenes import SceneConfig, generate, load_textures

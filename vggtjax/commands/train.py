@@ -1,4 +1,4 @@
-"""What `vggtjax train` does: a recipe from a file, progress on the terminal, a model at the end."""
+"""The command `vggtjax train`. Does not import jax before it is needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checkpoints of a training run: its whole state, written so that an interrupted write leaves the one before."""
+"""Checkpoints of a training run: its complete state; an interrupted write leaves the previous checkpoint."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from vggtjax.errors import CheckpointError, OutputError, VggtjaxError
 from vggtjax.training.recipe import Recipe
 from vggtjax.training.state import TrainingState
 
-KEPT = 2
+KEPT = 2  # newest checkpoints; older ones are removed
 
 _STATE, _RUN = "state", "run"
 
 
 class Restored(NamedTuple):
-    """What a checkpoint holds: the state, the recipe that it was written under, and the loop's own notes."""
+    """The content of a checkpoint: state, recipe, and notes of the run."""
 
     state: TrainingState
     recipe: Recipe
@@ -29,7 +29,7 @@ class Restored(NamedTuple):
 
 
 def latest(folder: str | Path) -> int | None:
-    """Return the step of the newest whole checkpoint in `folder`; None if there is none."""
+    """Return the step of the newest complete checkpoint in `folder`; None without a checkpoint."""
     folder = Path(folder)
     if not folder.is_dir():
         return None
@@ -38,15 +38,13 @@ def latest(folder: str | Path) -> int | None:
 
 
 def save(folder: str | Path, state: TrainingState, recipe: Recipe, notes: dict[str, Any] | None = None) -> None:
-    """Write a checkpoint of a step, and remove all but the newest `KEPT`.
-
-    A checkpoint of this step that is there already is left as it is.
+    """Write a checkpoint of a step, unless it exists, and remove all but the newest `KEPT`.
 
     Args:
         folder: of this run's checkpoints, made if missing.
-        state: the state to write.
-        recipe: written beside it, as JSON.
-        notes: plain values of JSON to keep with it.
+        state: of the run.
+        recipe: of the run, written as JSON.
+        notes: JSON values, written beside the state.
 
     Raises:
         OutputError: the folder cannot be written or the disk is full.
@@ -65,16 +63,16 @@ def save(folder: str | Path, state: TrainingState, recipe: Recipe, notes: dict[s
 
 
 def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe, *, step: int | None = None) -> Restored:
-    """Read a checkpoint onto the default device, whatever device it was written from.
+    """Read a checkpoint onto the default device.
 
     Args:
         folder: of a run's checkpoints.
         shapes: the recipe's state as shapes and dtypes (`state_shapes`).
-        recipe: the recipe to go on with. Stages, learning rate or losses may differ from those of the checkpoint.
+        recipe: of the resumed run. Phases, learning rate and losses may differ from those of the checkpoint.
         step: of the checkpoint; None for the newest.
 
     Raises:
-        CheckpointError: there is no checkpoint, it cannot be read, or its state has another form.
+        CheckpointError: no checkpoint, an unreadable checkpoint, or a state of other parameters.
     """
     folder = Path(folder)
     step = latest(folder) if step is None else step
@@ -95,11 +93,11 @@ def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe, *, step: 
             if old != new:
                 raise CheckpointError(
                     f"{place} is a checkpoint of the recipe '{written.name}' with another {name}; choose another "
-                    "folder for this run, or go on with that recipe"
+                    "folder for this run, or resume with that recipe"
                 )
         _check_shapes(place, manager.item_metadata(step)[_STATE], shapes)
-        found = manager.restore(step, args=orbax.args.Composite(**{_STATE: orbax.args.StandardRestore(target)}))
-    return Restored(found[_STATE], written, dict(run["notes"]))
+        items = manager.restore(step, args=orbax.args.Composite(**{_STATE: orbax.args.StandardRestore(target)}))
+    return Restored(items[_STATE], written, dict(run["notes"]))
 
 
 @contextmanager
@@ -124,7 +122,7 @@ def _explaining(place: Path) -> Iterator[None]:
 
 
 def _check_shapes(place: Path, metadata: Any, shapes: TrainingState) -> None:
-    """Compare leaf by leaf, by path: what is stored has lost the types of its containers."""
+    """Compare leaf by leaf, by path: a stored state has lost the types of its containers."""
 
     def flat(tree: Any) -> dict[str, tuple[int, ...]]:
         leaves = jax.tree_util.tree_flatten_with_path(tree)[0]

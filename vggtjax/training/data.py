@@ -1,4 +1,4 @@
-"""Batches of generated clips: drawn on the device, from one key, as the training run goes."""
+"""Batches of generated clips, drawn on the device from one key for each step."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vggtjax.scenes.textures import Textures
 from vggtjax.training.recipe import Phase
 
 GREY = 0.1  # share of clips without colour
-IN_ORDER = 0.5  # share of clips whose frames stay in the order of time
+IN_ORDER = 0.5  # share of clips with frames in order of time
 
 
 def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> SyntheticClip:
@@ -38,7 +38,7 @@ def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> Syn
 
 
 def _recolour(key: Array, images: Array) -> Array:
-    """Gain per channel, a gamma, sometimes no colour: the same for all frames of a clip."""
+    """Return images with another gain per channel and gamma, or grey; the same for all frames of a clip."""
     draw = jax.random.uniform(key, (5,))
     grey = images.mean(axis=-1, keepdims=True)
     images = jnp.where(draw[0] < GREY, grey, images)

@@ -1,4 +1,4 @@
-"""Where a run computes: parameters on every device, clips spread over them."""
+"""Devices of a run: parameters on every device, clips spread over the devices."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from vggtjax.training.recipe import Recipe
 
 
 class Placement(NamedTuple):
-    """Shardings of what every device holds whole, and of arrays whose first axis is the batch."""
+    """Shardings of replicated arrays, and of arrays with the batch as first axis."""
 
     whole: NamedSharding
     by_clip: NamedSharding
 
 
 def placement(recipe: Recipe) -> Placement:
-    """Return shardings over as many of this machine's devices as divide the batch of every phase.
+    """Return shardings over the largest number of this machine's devices that divides the batch of every phase.
 
-    A CPU counts as one device unless XLA_FLAGS=--xla_force_host_platform_device_count=N makes more of it, which keeps
-    more of its cores busy with small models.
+    A CPU counts as one device unless XLA_FLAGS=--xla_force_host_platform_device_count=N splits it, which keeps more of
+    its cores busy with small models.
     """
     devices = jax.local_devices()
     batches = math.gcd(*(phase.batch for phase in recipe.stages))

@@ -1,4 +1,4 @@
-"""True matches as a target of global attention: it finds correspondence long before the heads' losses would."""
+"""True matches as a target of global attention: attention learns them long before the heads' losses fall."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class MatchSums(NamedTuple):
 
 
 class MatchLoss:
-    """Accumulates, inside the scan over pairs of blocks, how well q and k of the global blocks find true matches.
+    """Accumulates, inside the scan over pairs of blocks, the loss of q and k of the global blocks on true matches.
 
-    Goes in the place of the motion cues (the same methods). The first half of the heads is to attend from every patch
-    to its match in the first frame, among the patches of all frames; the other half to its match in each other frame,
+    Has the methods of motion cues and takes their place. The first half of the heads learns to attend from every patch
+    to its match in the first frame, among the patches of all frames; the second half to its match in each other frame,
     among that frame's patches.
     """
 
@@ -31,11 +31,11 @@ class MatchLoss:
         self._matches, self._layers, self._depth = matches, layers, depth
 
     def layer_counts(self) -> Int[np.ndarray, " L"]:
-        """Return 1 for the layers that are supervised."""
+        """Return 1 for supervised layers, else 0."""
         return np.isin(np.arange(self._depth), self._layers).astype(np.int32)
 
     def zeros(self, B: int, S: int, P: int) -> MatchSums:
-        """Return the sums to start from."""
+        """Return empty sums."""
         del B, S, P
         return MatchSums(jnp.zeros(()), jnp.zeros(()))
 
@@ -47,14 +47,14 @@ class MatchLoss:
         k: Float[Array, "B S T N D"],
         frame_count: Int[Array, " B"] | None = None,
     ) -> MatchSums:
-        """Add a layer's loss if it is supervised; a real branch, so that other layers cost nothing.
+        """Add the loss of a supervised layer; a branch skips the computation for other layers.
 
-        The patches are the last tokens of a frame. Frames that are not real have no matches that are visible.
+        The patches are the last tokens of a frame. Padded frames have no visible matches.
         """
         del frame_count
         P = self._matches.patch.shape[-1]
 
-        @jax.checkpoint  # else the scan keeps room for the logits of every layer
+        @jax.checkpoint  # otherwise the scan stores the logits of every layer
         def layer(sums: MatchSums, q: Array, k: Array) -> MatchSums:
             loss, accuracy = match_loss(self._matches, q[:, :, -P:], k[:, :, -P:])
             return MatchSums(sums.loss + loss / len(self._layers), sums.accuracy + accuracy / len(self._layers))
@@ -65,7 +65,7 @@ class MatchLoss:
 def match_loss(
     matches: Matches, q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the cross-entropy of attention against true matches, and the share of patches whose match is found."""
+    """Return the cross-entropy of attention against true matches, and the share of correctly matched patches."""
     B, S, P, N, D = q.shape
     half = N // 2
     logits = jnp.einsum("brpnd,bsjnd->bnrpsj", q, k) / D**0.5
@@ -79,8 +79,8 @@ def match_loss(
     index = matches.patch.swapaxes(2, 3)  # [B, R, P, S]
     other = matches.visible.swapaxes(2, 3) & ~jnp.eye(S, dtype=bool)[None, :, None, :]
     picked = jnp.take_along_axis(each, index[..., None], axis=-1)[..., 0]
-    found = jnp.argmax(each, axis=-1) == index
-    return loss - _mean(picked, other), _mean(found.astype(jnp.float32), other)
+    correct = jnp.argmax(each, axis=-1) == index
+    return loss - _mean(picked, other), _mean(correct.astype(jnp.float32), other)
 
 
 def _mean(values: Array, weight: Array) -> Float[Array, ""]:

@@ -1,4 +1,4 @@
-"""The numbers of a training run: averages per interval in metrics.csv, and their curves in metrics.png."""
+"""The metrics of a training run: averages per interval in metrics.csv, and their curves in metrics.png."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from vggtjax.storage.writing import writing
 
 Row = dict[str, float]
 
-COLUMNS = ("step", "stage", "seconds", "samples")  # of every row, before the metrics
-COMPARED = {  # metric -> what it has to beat, the value of predicting no motion
+COLUMNS = ("step", "stage", "seconds", "samples")  # of every row, before the metrics; "stage" is the phase
+COMPARED = {  # error -> the error of a prediction without motion
     "rotation_error": "rotation_identity",
     "centre_error": "centre_identity",
 }
@@ -27,19 +27,19 @@ _LABELS = {
     "centre_identity": "identity",
 }
 _OPTIMISATION = ("learning_rate", "grad_norm")
-_LOG = ("loss", "error", "probe", "grad_norm", "learning_rate")  # names with one of these get a log axis
+_LOG = ("loss", "error", "probe", "grad_norm", "learning_rate")  # metrics whose names contain these get a log axis
 _MOST_BYTES = 1 << 28
 
 
 @dataclass
 class Averages:
-    """Means of metrics since the last row. Plain numbers, which go into a checkpoint and come back unchanged."""
+    """Means of metrics since the last row: plain numbers that a checkpoint keeps unchanged."""
 
     sums: dict[str, float] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
 
     def add(self, metrics: Mapping[str, float], *, finite_only: bool = False) -> None:
-        """Take in one step's metrics; of a step that was skipped, only the finite ones."""
+        """Add one step's metrics; `finite_only` leaves out the infinite values of a skipped step."""
         for name, value in metrics.items():
             if finite_only and not math.isfinite(value):
                 continue
@@ -47,17 +47,17 @@ class Averages:
             self.counts[name] = self.counts.get(name, 0) + 1
 
     def take(self) -> Row:
-        """Return the means and start again."""
+        """Return the means and reset them."""
         row = {name: self.sums[name] / self.counts[name] for name in self.sums}
         self.sums, self.counts = {}, {}
         return row
 
 
 class MetricsFile:
-    """metrics.csv of a run: a row is appended at a time; the header grows when a new metric comes up."""
+    """metrics.csv of a run: rows are appended one at a time; the header grows with new metrics."""
 
     def __init__(self, path: str | Path, *, last_step: int) -> None:
-        """Open the file of a run that goes on from `last_step`: rows past it are dropped, as they will come again."""
+        """Open the file of a run that resumes from `last_step`: later rows are dropped, as the run repeats them."""
         self.path = Path(path)
         self.rows = [row for row in read_metrics(self.path) if row["step"] <= last_step] if self.path.exists() else []
         self.names = _header(self.rows)
@@ -85,9 +85,9 @@ class MetricsFile:
 
 
 def read_metrics(path: str | Path) -> list[Row]:
-    """Read metrics.csv; a last line that was cut short is left out.
+    """Read metrics.csv without an incomplete last line.
 
-    Raises InputError for a file that cannot be read or is none of these.
+    Raises InputError for an unreadable file or a file of another kind.
     """
     path = Path(path)
     try:
@@ -109,7 +109,7 @@ def read_metrics(path: str | Path) -> list[Row]:
             row = {name: float(cell) for name, cell in zip(lines[0], line, strict=True) if cell}
             row |= {name: int(row[name]) for name in ("step", "stage", "samples")}
         except (ValueError, KeyError, OverflowError):
-            if number == len(lines):  # the machine stopped while it was written
+            if number == len(lines):  # the run was killed while it wrote
                 break
             raise InputError(f"{path} has a line {number} that is not a row of numbers") from None
         rows.append(row)
@@ -117,9 +117,9 @@ def read_metrics(path: str | Path) -> list[Row]:
 
 
 def plot(table: str | Path, picture: str | Path) -> None:
-    """Draw the curves of metrics.csv as a PNG: losses, errors against what predicting no motion gives, the rest.
+    """Draw the curves of metrics.csv as a PNG: losses, errors compared with no motion, other metrics.
 
-    Raises InputError for a table that cannot be read, OutputError where the picture cannot be written.
+    Raises InputError for an unreadable table, OutputError where the picture cannot be written.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -155,13 +155,13 @@ def plot(table: str | Path, picture: str | Path) -> None:
 
 
 def _panels(names: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Group metrics: losses, probes, an error with what it has to beat; every other one is by itself."""
+    """Group metrics: losses, probes, each error with its comparison; every other metric is alone."""
     losses = [name for name in names if "loss" in name]
     panels = [("losses", losses)] if losses else []
     for name, reference in COMPARED.items():
-        pair = [found for found in (name, reference) if found in names]
+        pair = [member for member in (name, reference) if member in names]
         if pair:
-            panels.append((f"{_LABELS[name]}, against no motion", pair))
+            panels.append((f"{_LABELS[name]}, compared with no motion", pair))
     probes = [name for name in names if name.startswith("probe_")]
     panels += [("probes", probes)] if probes else []
     grouped = {name for _, group in panels for name in group} | set(_OPTIMISATION)
@@ -170,7 +170,7 @@ def _panels(names: Sequence[str]) -> list[tuple[str, list[str]]]:
 
 
 def _header(rows: Sequence[Row], start: Sequence[str] = COLUMNS) -> list[str]:
-    """Return `start` and the names of the rows' metrics after it, in the order in which they came up."""
+    """Return `start`, then the names of the rows' metrics in order of appearance."""
     names: dict[str, Any] = dict.fromkeys(start)
     for row in rows:
         names |= dict.fromkeys(row)

@@ -1,4 +1,4 @@
-"""The training objective: VGGT's losses, and supervision that finds geometry across frames from little data."""
+"""The training objective: VGGT's losses, and terms that teach geometry across frames from little data."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ CONFIDENCE = 0.2  # weight of the logarithm of confidence, as in VGGT
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the terms; a term of weight 0 does not count.
+    """Weights of the terms; terms of weight 0 are not part of the loss.
 
     Attributes:
         translation, rotation, field_of_view: L1 or Huber distance of the pose encoding's parts.
         huber: half width of the quadratic zone of the camera loss; 0 for L1.
         depth, points: confidence-weighted L1 of the dense heads; `gradient` is the share of the gradient term.
         match: cross-entropy of attention in `match_layers` against true matches.
-        probe: linear read-outs of the tapped tokens (positions, depths, points, poses), which serve training alone.
-        moments: another one of the camera tokens: means of the flow from which their camera's motion can be solved.
+        probe: linear read-outs of the tapped tokens (positions, depths, points, poses), used in training only.
+        moments: linear read-outs of the camera tokens: means of the flow that determine the camera's motion.
     """
 
     translation: NotNegative = 1.0
@@ -58,7 +58,7 @@ class LossWeights:
 
 
 def init_probes(seed: int, config: VGGTConfig) -> Params:
-    """Return the parameters of the linear read-outs of the taps: zero, so that they start by saying nothing."""
+    """Return the parameters of the linear read-outs of the taps, all 0."""
     del seed
     E, taps = config.tap_dim, len(config.taps)
     return {
@@ -77,10 +77,10 @@ def objective(
     compute_dtype: str = "float32",
     remat: bool = False,
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
-    """Return the loss of a batch of clips and what to log.
+    """Return the loss of a batch of clips, and the metrics to log.
 
     Args:
-        trained: {"model": the model's parameters, "probes": what `init_probes` returned}.
+        trained: {"model": the model's parameters, "probes": result of `init_probes`}.
         batch: clips of equal size, with a batch axis.
         config: the model's configuration.
         weights: of the terms (static).
@@ -96,18 +96,18 @@ def objective(
     matching = MatchLoss(paired, weights.match_layers, config.depth) if weights.match else None
 
     def capture(slot: int):
-        @jax.checkpoint  # else the scan keeps room for this in every layer
-        def kept(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
+        @jax.checkpoint  # otherwise the scan stores this in every layer
+        def captured(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
             patches = tokens[:, :, SPECIAL_TOKENS:]
-            found = {name: project_tap(model[DENSE_HEADS[name]], patches, slot, config) for name in dense}
+            outputs = {name: project_tap(model[DENSE_HEADS[name]], patches, slot, config) for name in dense}
             if weights.probe or weights.moments:
-                found |= {
+                outputs |= {
                     "patch_probe": _probe(probes["patch"], slot, patches),
                     "camera_probe": _probe(probes["camera"], slot, tokens[:, :, 0]),
                 }
-            return found
+            return outputs
 
-        return kept
+        return captured
 
     def network(model: Params):
         tokens = encode(model, images, config, compute_dtype=compute_dtype)
@@ -137,13 +137,13 @@ def objective(
         terms["match"] = weights.match * sums.loss
         metrics["match_accuracy"] = sums.accuracy
     if weights.probe or weights.moments:
-        found = _probe_terms(taps, truth, paired, config.patch_size)
-        metrics |= {f"probe_{name}": value for name, value in found.items()}
-        moments = found.pop("moments")
+        probe_terms = _probe_terms(taps, truth, paired, config.patch_size)
+        metrics |= {f"probe_{name}": value for name, value in probe_terms.items()}
+        moments = probe_terms.pop("moments")
         if weights.moments:
             terms["moments"] = weights.moments * moments
         if weights.probe:
-            terms["probe"] = weights.probe * sum(found.values(), start=jnp.zeros(()))
+            terms["probe"] = weights.probe * sum(probe_terms.values(), start=jnp.zeros(()))
     loss = sum(terms.values(), start=jnp.zeros(()))
     return loss, {"loss": loss} | {f"loss_{name}": value for name, value in terms.items()} | metrics
 
@@ -159,8 +159,8 @@ def dense_loss(
     loss = (confidence * error - CONFIDENCE * jnp.log(confidence)).mean()
     for axis in (2, 3) if gradient else ():
         step = jnp.diff(values, axis=axis) - jnp.diff(truth, axis=axis)
-        kept = jax.lax.slice_in_dim(confidence, 1, None, axis=axis)
-        loss = loss + gradient * (kept * jnp.abs(step).mean(axis=-1)).mean()
+        weight = jax.lax.slice_in_dim(confidence, 1, None, axis=axis)
+        loss = loss + gradient * (weight * jnp.abs(step).mean(axis=-1)).mean()
     return loss
 
 
@@ -173,7 +173,7 @@ def _camera_terms(pose: Array, truth: Array, weights: LossWeights) -> dict[str, 
 
 
 def _camera_metrics(pose: Array, truth: Array) -> dict[str, Array]:
-    """Errors against the truth, next to those of a camera that does not move: the honest sign of geometry."""
+    """Return errors against the truth, and the errors of a camera without motion, for comparison."""
     rotation, right = (quaternion_to_matrix(x[:, 1:, 3:7]) for x in (pose, truth))
     relative = rotation @ quaternion_to_matrix(pose[:, :1, 3:7]).swapaxes(-1, -2)
     centre = -jnp.einsum("bsji,bsj->bsi", rotation, pose[:, 1:, :3])
@@ -187,14 +187,14 @@ def _camera_metrics(pose: Array, truth: Array) -> dict[str, Array]:
 
 
 def _angle(a: Float[Array, "B S 3 3"], b: Float[Array, "B S 3 3"]) -> Float[Array, ""]:
-    """Mean angle between rotations, in degrees."""
+    """Return the mean angle between rotations, in degrees."""
     chord = jnp.sqrt(jnp.sum((a - b) ** 2, axis=(-1, -2)))  # 2 sqrt(2) sin(angle / 2)
     return jnp.rad2deg(2 * jnp.arcsin(jnp.clip(chord / 8**0.5, 0, 1))).mean()
 
 
 def _depth_error(depth: Float[Array, "B S H W"], truth: Float[Array, "B S H W"]) -> Float[Array, ""]:
-    """Mean absolute relative error after alignment of every clip's medians."""
-    depth = jnp.clip(depth, 1e-6, 1e6)  # a head at its start says anything
+    """Return the mean absolute relative error after alignment of every clip's medians."""
+    depth = jnp.clip(depth, 1e-6, 1e6)  # an untrained head can give any depth
     ratio = (jnp.log(truth) - jnp.log(depth)).reshape(depth.shape[0], -1)
     scale = jnp.exp(jnp.median(ratio, axis=-1))[:, None, None, None]
     return (jnp.abs(scale * depth - truth) / truth).mean()
@@ -213,39 +213,39 @@ def _probe_terms(taps, truth: Targets, paired: Matches, patch_size: int) -> dict
     depth = jnp.log(truth.depth[:, :, middle, middle]).reshape(B, S, -1)
     points = truth.points[:, :, middle, middle].reshape(B, S, -1, 3)
     position = paired.position[:, :, 0]  # [B, R, P, 2]
-    seen = paired.visible[:, :, 0][..., None]
-    own = paired.position[:, :1, 0]  # of the first frame's patches in itself: where patches are
-    moments, known = _flow_moments(position - own, own, jnp.exp(-depth), seen)
-    found: dict[str, Array] = {name: jnp.zeros(()) for name in ("position", "depth", "points", "camera", "moments")}
+    visible = paired.visible[:, :, 0][..., None]
+    own = paired.position[:, :1, 0]  # of the first frame's patches in the first frame: the patch centres
+    moments, known = _flow_moments(position - own, own, jnp.exp(-depth), visible)
+    terms: dict[str, Array] = {name: jnp.zeros(()) for name in ("position", "depth", "points", "camera", "moments")}
     for tap in taps:
         patch, camera = tap["patch_probe"], tap["camera_probe"]
-        away = jnp.abs(patch[..., :2] - position) * seen
-        found["position"] += away.sum() / jnp.maximum(2 * seen.sum(), 1)
-        found["depth"] += jnp.abs(patch[..., 2] - depth).mean()
-        found["points"] += jnp.abs(patch[..., 3:] - points).mean()
-        off = jnp.abs(camera[..., :7] - truth.pose_encoding[..., :7])
-        found["camera"] += off[..., :3].mean() + 5 * off[..., 3:].mean()
-        found["moments"] += (jnp.abs(camera[..., 7:] - moments).mean(axis=-1) * known).mean()
-    return {name: value / len(taps) for name, value in found.items()}
+        error = jnp.abs(patch[..., :2] - position) * visible
+        terms["position"] += error.sum() / jnp.maximum(2 * visible.sum(), 1)
+        terms["depth"] += jnp.abs(patch[..., 2] - depth).mean()
+        terms["points"] += jnp.abs(patch[..., 3:] - points).mean()
+        error = jnp.abs(camera[..., :7] - truth.pose_encoding[..., :7])
+        terms["camera"] += error[..., :3].mean() + 5 * error[..., 3:].mean()
+        terms["moments"] += (jnp.abs(camera[..., 7:] - moments).mean(axis=-1) * known).mean()
+    return {name: value / len(taps) for name, value in terms.items()}
 
 
 def _flow_moments(
     flow: Float[Array, "B S P 2"],
-    place: Float[Array, "B 1 P 2"],
+    position: Float[Array, "B 1 P 2"],
     inverse_depth: Float[Array, "B S P"],
-    seen: Bool[Array, "B S P 1"],
+    visible: Bool[Array, "B S P 1"],
 ) -> tuple[Float[Array, "B S 10"], Bool[Array, "B S"]]:
-    """Return means over patches that tell a camera's turn from its travel, and where enough is seen for them.
+    """Return means over visible patches that separate a camera's rotation from its translation; valid from 3 patches.
 
     To first order the flow of a static scene is w A t + B r: linear in translation t and rotation r, with inverse depth
-    w and matrices of the position alone (Longuet-Higgins and Prazdny 1980). Its normal equations are made of means of
-    products of flow, inverse depth and position; these are those of lowest order: the flow by itself, times inverse
-    depth and times position, and inverse depth and its square. Turn and travel can cancel in the mean flow, so a camera
-    token that knows no more than that knows neither. Things that move are among the patches.
+    w and matrices A, B of the position alone (Longuet-Higgins and Prazdny 1980). Its normal equations consist of means
+    of products of flow, inverse depth and position. The ten means are those of lowest order: the flow, the flow times
+    inverse depth, the flow times position, inverse depth and its square. In the mean flow alone, rotation and
+    translation can cancel. Patches on moving objects are included.
     """
     w = jnp.minimum(inverse_depth, 4.0)[..., None]
-    factors = jnp.concatenate([jnp.ones_like(w), w, jnp.broadcast_to(place, flow.shape)], axis=-1)  # [B, S, P, 4]
+    factors = jnp.concatenate([jnp.ones_like(w), w, jnp.broadcast_to(position, flow.shape)], axis=-1)  # [B, S, P, 4]
     products = (flow[..., None, :] * factors[..., None]).reshape(*w.shape[:3], 8)
     values = jnp.concatenate([products, w, w**2], axis=-1)
-    count = seen.sum(axis=(2, 3))
-    return (values * seen).sum(axis=2) / jnp.maximum(count, 1)[..., None], count >= 3
+    count = visible.sum(axis=(2, 3))
+    return (values * visible).sum(axis=2) / jnp.maximum(count, 1)[..., None], count >= 3

@@ -13,18 +13,18 @@ from vggtjax.network.layers import Params
 from vggtjax.training.recipe import OptimiserConfig, Recipe
 
 _MUON_DECAY = 0.95  # of its momentum
-_ADAM_RMS = 0.2  # root mean square of Adam's updates, which Muon's are brought to (arXiv 2502.16982, section 2.2)
+_ADAM_RMS = 0.2  # root mean square of Adam's updates and of the scaled Muon updates (arXiv 2502.16982, section 2.2)
 
 
 def make_optimiser(recipe: Recipe) -> optax.GradientTransformation:
-    """Return the optimiser of a recipe; its updates are to be added to the parameters.
+    """Return the optimiser of a recipe; its updates are added to the parameters.
 
     "adamw" is AdamW. "muon" gives the kernels of the transformer blocks, which are stacked on axis 0, the
-    orthogonalised momentum of Muon instead of Adam's direction, each layer and each of q, k and v by itself, scaled to
-    the size of Adam's updates so that one learning rate serves all; every other parameter keeps AdamW.
+    orthogonalised momentum of Muon instead of Adam's direction, each layer and each of q, k and v separately, scaled to
+    the size of Adam's updates so that one learning rate fits both; every other parameter keeps AdamW.
 
-    Only kernels decay: no biases, norms, LayerScales, tokens or position embeddings; and none that the loss does not
-    reach, such as those of a head without a loss.
+    Only kernels with a gradient decay: no biases, norms, LayerScales, tokens or position embeddings, and no kernels of
+    a head without a loss.
     """
     config = recipe.optimiser
     direction = optax.scale_by_adam(config.b1, config.b2)
@@ -52,14 +52,14 @@ def make_schedule(config: OptimiserConfig, total_steps: int) -> optax.Schedule:
 
 
 def split(trained: Params, recipe: Recipe) -> tuple[Params, Params]:
-    """Return the parameters that are optimised, and the modules of the model that stay as they are."""
+    """Return the optimised parameters, and the frozen modules of the model."""
     model = trained["model"]
     moving = {name: module for name, module in model.items() if name not in recipe.frozen}
     return {**trained, "model": moving}, {name: model[name] for name in recipe.frozen}
 
 
 def join(moving: Params, frozen: Params) -> Params:
-    """Put the two parts of `split` together again."""
+    """Return the parameters that `split` separated."""
     return {**moving, "model": {**moving["model"], **frozen}}
 
 
@@ -71,7 +71,7 @@ def decays(path: tuple[Any, ...]) -> bool:
 def _decay_kernels(weight_decay: float) -> optax.GradientTransformation:
     def update(updates: Any, state: Any, params: Any = None):
         def decayed(path, update, param):
-            # The direction is exactly zero where no gradient has ever come.
+            # The direction is exactly 0 without any gradient so far.
             return update + weight_decay * jnp.where(update == 0, 0, param) if decays(path) else update
 
         return jax.tree_util.tree_map_with_path(decayed, updates, params), state
@@ -81,7 +81,7 @@ def _decay_kernels(weight_decay: float) -> optax.GradientTransformation:
 
 def _muon() -> optax.GradientTransformation:
     def dimensions(tree: Any) -> Any:
-        # Axes that are neither of these, the layers and q, k, v, are batch axes.
+        # All other axes (layers; q, k, v) are batch axes.
         return jax.tree.map(lambda leaf: MuonDimensionNumbers(_input_axis(leaf), leaf.ndim - 1), tree)
 
     def sized(updates: Any, state: Any, params: Any = None):
@@ -110,7 +110,7 @@ def _kinds(tree: Any) -> Any:
 
 
 def _per_projection(inner: optax.GradientTransformation) -> optax.GradientTransformation:
-    """Show `inner` the fused q, k, v kernels [layer, in, 3 out] as [layer, in, 3, out]."""
+    """Reshape the fused q, k, v kernels [layer, in, 3 out] to [layer, in, 3, out] for `inner`."""
 
     def apart(tree: Any) -> Any:
         def one(path, leaf):
@@ -120,7 +120,7 @@ def _per_projection(inner: optax.GradientTransformation) -> optax.GradientTransf
         return jax.tree_util.tree_map_with_path(one, tree)
 
     def update(updates: Any, state: Any, params: Any = None):
-        found, state = inner.update(apart(updates), state, None if params is None else apart(params))
-        return jax.tree.map(lambda new, old: new.reshape(old.shape), found, updates), state
+        separate, state = inner.update(apart(updates), state, None if params is None else apart(params))
+        return jax.tree.map(lambda new, old: new.reshape(old.shape), separate, updates), state
 
     return optax.GradientTransformation(lambda params: inner.init(apart(params)), update)

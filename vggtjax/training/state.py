@@ -26,13 +26,13 @@ Metrics = dict[str, Float[Array, ""]]
 
 
 class TrainingState(NamedTuple):
-    """Everything that a step reads and replaces."""
+    """The input and output of a step."""
 
     step: Int[Array, ""]  # steps done
     trained: Params  # {"model": ..., "probes": ...}
-    ema: Params  # exponential moving average of the parameters that are optimised
+    ema: Params  # exponential moving average of the optimised parameters
     optimiser: Any
-    skipped: Int[Array, ""]  # steps whose loss or gradient was not finite: they changed nothing
+    skipped: Int[Array, ""]  # steps without effect, as the loss or the gradient was not finite
 
 
 def initial_state(recipe: Recipe, probes: Params, init: Params | None = None) -> TrainingState:
@@ -40,7 +40,7 @@ def initial_state(recipe: Recipe, probes: Params, init: Params | None = None) ->
 
     Args:
         recipe: the run's recipe.
-        probes: parameters that serve the objective alone.
+        probes: parameters of the objective alone.
         init: the model's parameters to start from; None for random ones.
 
     Raises:
@@ -50,7 +50,7 @@ def initial_state(recipe: Recipe, probes: Params, init: Params | None = None) ->
         init = start_params(recipe)
     else:
         _check(init, recipe)
-    # Copies: a step consumes its state, and whoever gave the parameters keeps them.
+    # Copies: a step consumes its state, and the caller keeps the parameters.
     trained = jax.tree.map(lambda leaf: jnp.array(leaf, jnp.float32), {"model": init, "probes": probes})
     moving, _ = split(trained, recipe)
     ema = jax.tree.map(jnp.copy, moving)
@@ -58,18 +58,18 @@ def initial_state(recipe: Recipe, probes: Params, init: Params | None = None) ->
 
 
 def state_shapes(recipe: Recipe, probes: Params) -> TrainingState:
-    """Return shapes and dtypes of a recipe's state without making its arrays; of `probes` only the shapes are read."""
+    """Return shapes and dtypes of a recipe's state without its arrays; reads only the shapes of `probes`."""
     return jax.eval_shape(
         lambda model, probes: initial_state(recipe, probes, model), parameter_shapes(recipe.model), probes
     )
 
 
 def loss_and_gradient(trained: Params, batch: Any, recipe: Recipe, objective: Objective) -> tuple[Metrics, Params]:
-    """Return the objective's metrics with the loss, and its gradient by the parameters that are optimised.
+    """Return the objective's metrics with the loss, and its gradient by the optimised parameters.
 
     Args:
         trained: {"model": ..., "probes": ...}.
-        batch: what the objective takes: clips [B, S, ...].
+        batch: second argument of the objective: clips [B, S, ...].
         recipe: the run's recipe (static under jit).
         objective: (trained, batch, config, weights, *, compute_dtype, remat) -> loss, metrics (static under jit).
     """
@@ -94,19 +94,19 @@ def apply_gradient(
 ) -> tuple[TrainingState, Metrics]:
     """Update the state by a gradient; pure, for `jax.jit` with the state donated.
 
-    A step whose loss or gradient norm is not finite leaves parameters, averages and optimiser as they are, and counts
-    as skipped. The average forgets with min(ema_decay, (1 + t) / (10 + t)) after t updates, so that it leaves its start
-    behind early.
+    A step with a loss or gradient norm that is not finite is skipped: parameters, averages and optimiser stay
+    unchanged. The decay of the average is min(ema_decay, (1 + t) / (10 + t)) after t updates, so that the start has
+    little weight early.
 
     Args:
-        state: what the last step returned.
-        gradient: by the parameters that are optimised.
+        state: result of the last step.
+        gradient: by the optimised parameters.
         metrics: with the loss.
         recipe: the run's recipe (static under jit).
 
     Returns:
         The next state; and the metrics, in float32, with grad_norm (before clipping), learning_rate and skipped (1 for
-        a step that was skipped, else 0).
+        a skipped step, else 0).
     """
     norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(norm)
@@ -117,20 +117,20 @@ def apply_gradient(
     decay = jnp.minimum(recipe.optimiser.ema_decay, (1 + done) / (10 + done))
     ema = jax.tree.map(lambda average, new: decay * average + (1 - decay) * new, state.ema, moved)
 
-    def kept(new: Any, old: Any) -> Any:
+    def chosen(new: Any, old: Any) -> Any:
         return jax.tree.map(lambda new, old: jnp.where(finite, new, old), new, old)
 
     skipped = 1 - finite.astype(jnp.int32)
     next_state = TrainingState(
         step=state.step + 1,
-        trained=join(kept(moved, moving), frozen),
-        ema=kept(ema, state.ema),
-        optimiser=kept(optimiser_state, state.optimiser),
+        trained=join(chosen(moved, moving), frozen),
+        ema=chosen(ema, state.ema),
+        optimiser=chosen(optimiser_state, state.optimiser),
         skipped=state.skipped + skipped,
     )
     rate = make_schedule(recipe.optimiser, recipe.total_steps)(done)
-    found = {**metrics, "grad_norm": norm, "learning_rate": rate, "skipped": skipped}
-    return next_state, {name: jnp.asarray(value, jnp.float32) for name, value in found.items()}
+    logged = {**metrics, "grad_norm": norm, "learning_rate": rate, "skipped": skipped}
+    return next_state, {name: jnp.asarray(value, jnp.float32) for name, value in logged.items()}
 
 
 def exported(state: TrainingState, recipe: Recipe) -> Params:
