@@ -51,7 +51,7 @@ def unproject(
         intrinsics: focal lengths and principal point in pixels of `depth`; skew is not used.
         camera_from_world: rigid transforms.
         pixel_offset: where in its cell a pixel is seen. 0.5, the centre, is right for principal points at (W/2, H/2);
-            0.0, the corner, is what VGGT's public code does and shifts the points by half a pixel.
+            0.0, the corner, is used by VGGT's public code and shifts the points by half a pixel.
     """
     xp: Any = depth.__array_namespace__()
     *frames, H, W = depth.shape
@@ -94,7 +94,7 @@ def clamp_field_of_view(fov: Float[np.ndarray, "S 2"]) -> tuple[Float[np.ndarray
 def clamp_intrinsics(
     intrinsics: Float32[np.ndarray, "S 3 3"], height: int, width: int
 ) -> tuple[Float32[np.ndarray, "S 3 3"], tuple[int, ...]]:
-    """Clamp the fields of view behind focal lengths; see `clamp_field_of_view` for what is returned and raised.
+    """Clamp the fields of view behind focal lengths; returns and raises what `clamp_field_of_view` does.
 
     A field of view of 0 arrives as an infinite focal length and one beyond pi as a negative one. The principal
     points are expected at (W/2, H/2) and stay as they are.

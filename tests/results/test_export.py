@@ -106,11 +106,11 @@ def test_trajectory_has_the_clips_times_or_else_frame_numbers(saved, tmp_path):
 
 
 def test_the_note_of_a_model_is_in_the_text_files_and_the_sheet(saved, tmp_path):
-    settings = {"model_note": "small demonstration model;\nnot for real footage"}
+    settings = {"model_note": "small demonstration model;\nnot for real footage\ud800"}
     make_room(settings=settings).save(tmp_path)
     for name in ("trajectory.txt", "intrinsics.txt", "depth/scale.txt"):
         lines = (tmp_path / name).read_text().splitlines()
-        assert lines[1] == "# small demonstration model; not for real footage"
+        assert lines[1] == "# small demonstration model; not for real footage?"
         np.testing.assert_array_equal(np.loadtxt(tmp_path / name), np.loadtxt(saved / name))
     with Image.open(tmp_path / "preview/sheet.png") as noted, Image.open(saved / "preview/sheet.png") as plain:
         assert np.any(np.asarray(noted)[70:90] != np.asarray(plain)[70:90])

@@ -1,9 +1,9 @@
 """Replacing the files of an earlier result as a whole, however the process ends.
 
 The new files are written in a hidden folder beside the old ones. Once they are whole, that folder is renamed to
-`.replacing`, which holds new/ and old/. Then the old files move to old/, the archive first, and the new files to their
-places, the archive last. A killed process leaves `.replacing` at one of these steps: the next process goes on from
-there, and until then the archive in new/ is read where the folder has none.
+`.replacing`, with new/ and old/ in it. Then the old files move to old/, the archive first, and the new files into the
+folder, the archive last. A killed process leaves `.replacing` at one of these steps: the next save continues from this
+step, and until then the archive in new/ is read unless the folder has one.
 """
 
 from __future__ import annotations
@@ -66,10 +66,10 @@ def replacing(folder: Path, optional: Sequence[str]) -> Iterator[Path]:
 
 
 def _swap(folder: Path) -> None:
-    """Do the moves of a replacement that are left to do; undo them if one fails."""
+    """Do the remaining moves of a replacement; undo them if one fails."""
     new, old = folder / _REPLACING / "new", folder / _REPLACING / "old"
     moves = [(new / name, folder / name) for name in (*NAMES, *OPTIONAL_FILES, ARCHIVE_NAME)]
-    if os.path.lexists(new / NAMES[0]):  # the first to arrive: what is in the folder is old
+    if os.path.lexists(new / NAMES[0]):  # it moves first: all files in the folder are old
         archive = next((path for path in (old / ARCHIVE_NAME, folder / ARCHIVE_NAME) if path.is_file()), None)
         earlier = () if archive is None else (ARCHIVE_NAME, *NAMES, *saved_files(archive))
         moves = [(folder / name, old / name) for name in earlier] + moves
@@ -88,6 +88,6 @@ def _swap(folder: Path) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """Remove what a replacement has left; by a rename first, so that no half of it is ever taken for a step of one."""
+    """Remove the folder of a replacement; it is renamed first, as a half removed one would look like a step."""
     with staging(folder) as rubbish:
         (folder / _REPLACING).rename(rubbish / "replaced")

@@ -117,7 +117,7 @@ def check_format(format: str, quaternion: str | None) -> None:
 
 
 def check_quaternion(format: str, quaternion: str | None) -> None:
-    """Raise InputError where a format needs the order of its quaternions, or has none."""
+    """Raise InputError for an order of quaternions that is missing, unknown, or given for a format with matrices."""
     if quaternion is None and format in _WITH_TRAJECTORY:
         raise InputError(
             f"pred_traj.txt of {format} does not say the order of its quaternions; give quaternion='wxyz' (as VGGT4D, "
@@ -142,7 +142,7 @@ def _read_folder(folder: Path, files: _Folder, quaternion: Quaternion | None) ->
     if confidence is not None and files.logarithmic:
         if padded := sorted(path.name for path in folder.glob("conf_0[0-9]*.npy")):
             raise ResultError(
-                f"{padded[0]} is numbered as VGGT4D does, whose confidence is no logarithm; load it as that"
+                f"{padded[0]} is numbered as VGGT4D does, whose confidence is no logarithm; load it as vggt4d"
             )
         with np.errstate(over="ignore"):
             confidence = np.exp(confidence).clip(0, np.finfo(np.float32).max)
@@ -159,16 +159,14 @@ def _read_folder(folder: Path, files: _Folder, quaternion: Quaternion | None) ->
 def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
     """Return the files of a folder by the number in their names."""
     parent, _, name = pattern.rpartition("/")
-    place = folder / parent if parent else folder
+    folder = folder / parent
     try:
-        found = (
-            [(re.fullmatch(name, entry.name, re.ASCII), entry) for entry in place.iterdir()] if place.is_dir() else []
-        )
+        entries = list(folder.iterdir()) if folder.is_dir() else []
     except OSError as error:
         raise ResultError(f"it cannot be read ({error.strerror or error})") from error
     files: dict[int, Path] = {}
-    for match, entry in found:
-        if match:
+    for entry in entries:
+        if match := re.fullmatch(name, entry.name, re.ASCII):
             number = int(match[1])
             if number in files:
                 raise ResultError(f"{files[number].name} and {entry.name} are both of frame {number}")
@@ -179,14 +177,14 @@ def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
 def _stacked(
     files: dict[int, Path], numbers: Sequence[int], read: Callable[[Path], np.ndarray], shape: tuple[int, ...] | None
 ) -> Any:
-    """Return the files of all frames as one array, or None where there is not a single one."""
+    """Return the files of all frames as one array, or None without files."""
     if not files:
         return None
     if missing := [number for number in numbers if number not in files]:
-        like = next(iter(files.values())).name
-        raise ResultError(f"frame {missing[0]} has depth, but no file like {like}; expected one for every frame")
+        example = next(iter(files.values())).name
+        raise ResultError(f"frame {missing[0]} has depth, but no file like {example}; expected one for every frame")
     arrays = None
-    for place, number in enumerate(numbers):
+    for index, number in enumerate(numbers):
         array = read(files[number])
         shape = shape or array.shape
         if array.shape != shape:
@@ -195,7 +193,7 @@ def _stacked(
             if len(numbers) * array.nbytes > SIZE_LIMIT:
                 raise ResultError(f"{len(numbers)} frames of {shape} take more than {SIZE_LIMIT} bytes")
             arrays = np.empty((len(numbers), *shape), array.dtype)
-        arrays[place] = array
+        arrays[index] = array
     return arrays
 
 
@@ -220,7 +218,7 @@ def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion |
             raise ResultError(
                 f"{name} has {len(array)} lines for {len(numbers)} frames of depth; expected one for each"
             )
-    return Cameras(world_from_camera(poses[:, :3])[:, :3], intrinsics)  # the inverse, whichever way
+    return Cameras(world_from_camera(poses[:, :3])[:, :3], intrinsics)
 
 
 def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
@@ -236,11 +234,8 @@ def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | 
 
 
 def _read_da3(path: Path) -> dict[str, Any]:
-    places = [
-        path,
-        *(path / below / "results.npz" for below in ("", "exports/npz", "exports/mini_npz", "npz", "mini_npz")),
-    ]
-    file = next((place for place in places if place.is_file()), None)
+    folders = [path / name for name in ("", "exports/npz", "exports/mini_npz", "npz", "mini_npz")]
+    file = next((file for file in (path, *(folder / "results.npz" for folder in folders)) if file.is_file()), None)
     if file is None:
         raise ResultError("it has no results.npz; export with the format 'npz' or 'mini_npz'")
     shape = read_headers(file).get("depth", Header(np.dtype(float), ())).shape
@@ -263,9 +258,9 @@ def _read_da3(path: Path) -> dict[str, Any]:
 def _read_some(
     file: Path, needed: Mapping[str, tuple[tuple[int, ...], ...]], others: Mapping[str, tuple[tuple[int, ...], ...]]
 ) -> dict[str, np.ndarray]:
-    """Return the arrays of these names, of one of the shapes given for each; `others` need not be there.
+    """Return the arrays of these names, each of one of its shapes; the `others` may be missing.
 
-    Headers are looked at first, so that nothing larger is ever read. All are floating point but `image`, 8 bits.
+    Headers are checked first, so that no larger array is read. All arrays are floating point but `image`, 8 bits.
     """
     headers = read_headers(file)
     for name, shapes in {**needed, **others}.items():

@@ -14,12 +14,12 @@ from vggtjax.cameras import frustum_corners
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.result import Result
 
-POINT_LIMIT = 1_000_000  # points that viewers in a browser still turn smoothly
+POINT_LIMIT = 1_000_000  # viewers in a browser still turn so many points smoothly
 _TO_GLTF = np.array([1, -1, -1], np.float32)  # half a turn about x: y down and z forward become y up and z backward
 _CAMERA_SIZE = 0.06  # of the median distance from the middle of the cameras to the points
 _BAR_SIZE = 0.015  # of a camera: half the thickness of its edges
 
-# What `frustum_corners` returns: 0 the centre, then 1 top left, 2 top right, 3 bottom right, 4 bottom left.
+# Corners of `frustum_corners`: 0 the centre, then 1 top left, 2 top right, 3 bottom right, 4 bottom left.
 _FRUSTUM_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 # A bar between two squares of corners 0-3 and 4-7.
 _BAR_FACES = np.array([[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])
@@ -30,10 +30,10 @@ def build_scene(
 ) -> trimesh.Scene:
     """Return the scene, with y up.
 
-    Nodes: `static`, `dynamic_000000` for each frame that has moving points, and `cameras`: a frustum a frame, open
-    toward what it sees, with a filled triangle on its upper edge, coloured from the first frame to the last, and
-    the path between them. Of more than `point_limit` points every cloud keeps the same share, drawn with a fixed
-    seed. Colours are linear, as glTF has it.
+    Nodes: `static`, `dynamic_000000` for each frame with moving points, and `cameras`: a frustum per frame, open in the
+    viewing direction, with a filled triangle on its upper edge, coloured from the first frame to the last, and the path
+    between them. Of more than `point_limit` points every cloud keeps the same share, drawn with a fixed seed. Colours
+    are linear, as glTF requires.
     """
     clouds = {"static": static} | {f"dynamic_{frame:06d}": cloud for frame, cloud in enumerate(dynamic)}
     share = min(1.0, point_limit / max(1, sum(map(len, clouds.values()))))
@@ -42,9 +42,9 @@ def build_scene(
     distances = []
     scene = trimesh.Scene()
     for name, cloud in clouds.items():
-        kept = random.choice(len(cloud), int(share * len(cloud)), replace=False, shuffle=False)
-        if kept.size:
-            points, colors = cloud.points[kept], _linear(cloud.colors[kept])
+        chosen = random.choice(len(cloud), int(share * len(cloud)), replace=False, shuffle=False)
+        if chosen.size:
+            points, colors = cloud.points[chosen], _linear(cloud.colors[chosen])
             scene.add_geometry(trimesh.PointCloud(points * _TO_GLTF, colors), node_name=name, geom_name=name)
             distances.append(np.linalg.norm(points - middle, axis=-1))
     size = _CAMERA_SIZE * (float(np.median(np.concatenate(distances))) if distances else 1.0)
@@ -79,22 +79,22 @@ def _cameras(result: Result, size: float) -> trimesh.Trimesh:
 def _bars(
     edges: Float[np.ndarray, "E 2 3"], half_thickness: float
 ) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"], Int[np.ndarray, " B"]]:
-    """Return vertices (eight a bar) and faces of square bars along the edges that have a length, and those edges."""
+    """Return vertices (eight per bar) and faces of square bars along the edges longer than 0, and these edges."""
     along = edges[:, 1] - edges[:, 0]
     lengths = np.linalg.norm(along, axis=-1)
-    (kept,) = np.nonzero(lengths > 0)
-    along = along[kept] / lengths[kept, None]
+    (used,) = np.nonzero(lengths > 0)
+    along = along[used] / lengths[used, None]
     across = np.cross(along, np.eye(3)[np.abs(along).argmin(axis=-1)])  # with the axis least along the edge
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
     up = np.cross(along, across)
     square = half_thickness * np.stack([across + up, up - across, -across - up, across - up], axis=1)  # [B, 4, 3]
-    vertices = (edges[kept][:, :, None] + square[:, None]).reshape(-1, 3)
-    faces = (8 * np.arange(len(kept))[:, None, None] + _BAR_FACES).reshape(-1, 3)
-    return vertices, faces, kept
+    vertices = (edges[used][:, :, None] + square[:, None]).reshape(-1, 3)
+    faces = (8 * np.arange(len(used))[:, None, None] + _BAR_FACES).reshape(-1, 3)
+    return vertices, faces, used
 
 
 def _linear(colors: UInt8[np.ndarray, "N 3"]) -> UInt8[np.ndarray, "N 3"]:
-    """Return sRGB colours as the linear ones that glTF expects of vertices."""
+    """Return sRGB colours as linear colours, which glTF expects of vertices."""
     value = np.arange(256) / 255
     table = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     return (table * 255).round().astype(np.uint8)[colors]

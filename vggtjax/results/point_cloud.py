@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float32, UInt8
 
 from vggtjax.results.frame import Frame, LeastConfidence
 from vggtjax.results.result import Result
-from vggtjax.results.saving import Saving
 
 _VERTEX = np.dtype([("points", "<f4", 3), ("colors", "u1", 3), ("alpha", "u1")])
 _HEADER = """ply
@@ -40,16 +39,11 @@ class PointCloud:
         return len(self.points)
 
 
-def check_percentile(confidence_percentile: float) -> None:
-    """Raise InputError for a percentile outside [0, 100)."""
-    Saving(confidence_percentile)
-
-
 def least_confidence(result: Result, confidence_percentile: float) -> LeastConfidence:
     """Return the confidence that `confidence_percentile` percent of the clip's valid pixels do not reach.
 
     Static and dynamic pixels have a percentile each, over all frames at the model's size: fused confidence is the sum
-    of two passes in static pixels and of one in dynamic pixels, so a common percentile would leave out what moves.
+    of two passes in static pixels and of one in dynamic pixels, so a common percentile would remove moving points.
     """
 
     def percentile(pixels: Bool[np.ndarray, "S H W"]) -> float:

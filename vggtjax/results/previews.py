@@ -1,4 +1,4 @@
-"""Pictures of a result for people: coloured depth, masks over the frames, and a sheet that sums up the clip."""
+"""Pictures of a result: coloured depth, masks over the frames, and a contact sheet of the clip."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vggtjax.results.result import Result
 _DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm
 _SALIENCY_COLORS = (Colormap("inferno").lut(256)[:, :3] * 255).round().astype(np.uint8)
 _NO_DEPTH = np.array([40, 40, 46], np.uint8)
-# Of objects by id: hues that the golden ratio keeps apart; black for what is none.
+# Of objects by id: hues spaced by the golden ratio; black for no object.
 INSTANCE_COLORS = np.array(
     [(0, 0, 0), (255, 40, 90)]
     + [tuple(round(255 * c) for c in hsv_to_rgb((0.96 + 0.618034 * i) % 1, 0.84, 1)) for i in range(1, 255)],
@@ -24,15 +24,15 @@ INSTANCE_COLORS = np.array(
 _OUTLINE = np.array([255, 235, 60], np.uint8)
 
 _SHEET_FRAMES = 8
-_SHEET_WIDTH = 1800  # pixels that the columns share
-_TITLE_WIDTH = 700  # pixels that the title has at least
+_SHEET_WIDTH = 1800  # pixels of all columns
+_TITLE_WIDTH = 700  # least pixels of the title
 _THUMBNAIL = (480, 300)  # widest and highest
 _MARGIN, _GAP, _LABEL_WIDTH, _LEGEND_WIDTH, _HEADER_HEIGHT = 24, 6, 150, 120, 88
 BACKGROUND, TEXT, FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)  # of every sheet
 
 
 def inverse_depth_range(depth: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]) -> tuple[float, float]:
-    """Return the 2nd and 98th percentile of 1/depth over the valid pixels of a clip, (0, 1) where there are none."""
+    """Return the 2nd and 98th percentile of 1/depth over the valid pixels of a clip, (0, 1) without any."""
     if not valid.any():
         return 0.0, 1.0
     with np.errstate(over="ignore"):
@@ -55,9 +55,9 @@ def overlay(
     image: UInt8[np.ndarray, "H W 3"],
     moving: Bool[np.ndarray, "H W"] | UInt8[np.ndarray, "H W"],
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Tint and outline what moves, a mask or objects by id, each in a colour of its own.
+    """Tint and outline moving pixels, of a mask or of objects by id, each in a colour of its own.
 
-    The rest loses half of its colour, so that the tint shows on any hue.
+    Static pixels lose half of their colour, so that the tint shows on any hue.
     """
     grey = image.mean(axis=-1, keepdims=True)
     ids = moving.astype(np.uint8)
@@ -68,12 +68,12 @@ def overlay(
 
 
 def moving_ids(mask: Bool[np.ndarray, ...], instances: UInt8[np.ndarray, ...]) -> UInt8[np.ndarray, ...]:
-    """Return the objects' ids, and the last of all where something moves that is too small for an object."""
+    """Return the objects' ids, and the last id for moving regions too small for an object."""
     return np.where(mask & (instances == 0), len(INSTANCE_COLORS) - 1, instances).astype(np.uint8)
 
 
 def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw up to eight frames, evenly spread: columns of picture, depth, saliency where known, and what moves."""
+    """Draw up to eight frames, evenly spread: columns of picture, depth, saliency where known, and moving objects."""
     frames, height, width = result.depth.shape
     shown = np.linspace(0, frames - 1, min(frames, _SHEET_FRAMES)).round().astype(int)
     scale = min(_THUMBNAIL[0] / width, _THUMBNAIL[1] / height, _SHEET_WIDTH / len(shown) / width)

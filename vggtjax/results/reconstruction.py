@@ -42,7 +42,7 @@ class Reconstruction(Result):
 
         Args:
             folder: may be missing.
-            saving: what to leave out of the point clouds, the size of the files, the format.
+            saving: share left out of the point clouds, size of the files, format.
             pictures: for the resolution "original", the source's (`Clip.pictures()`); by default the model's enlarged.
             progress: called with the number of steps done, and of all.
             changes: single values of `saving`, such as `resolution="original"`; `layout` is the old name of `format`.

@@ -1,4 +1,4 @@
-"""The fields of a reconstructed clip, their checks, and what follows from them."""
+"""The fields of a reconstructed clip, their checks, and derived values."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ class Result:
                 raise ResultError(f"{name} holds {value[~np.isfinite(value)][0]}; expected finite numbers")
 
     def _check_places(self) -> None:
-        """Check what says where things lie: sizes of the sources, frames of the tracks, boxes inside the padding."""
+        """Check the sizes of the sources, the frames of the tracks and the boxes inside the padding."""
         sides = self.source_size
         outside = (sides < 1).any() or (sides > _MOST_SIDE).any() or (sides.prod(axis=1) > _MOST_PIXELS).any()
         if outside or (self.source_scale <= 0).any():
@@ -192,8 +192,8 @@ class Result:
 
     @property
     def model_note(self) -> str:
-        """What readers of the files should know of the model, on one line; empty where there is nothing to say."""
-        return " ".join(str(self.settings.get("model_note", "")).split())
+        """A caution about the model for readers of the files, on one line; empty for most models."""
+        return " ".join(str(self.settings.get("model_note", "")).split()).encode(errors="replace").decode()
 
     def world_points(self, *, pixel_offset: float = 0.5) -> Float32[np.ndarray, "S H W 3"]:
         """Lift every pixel to its point in the world, padding and unsure pixels too.

@@ -1,4 +1,4 @@
-"""Tracks for people: drawn over the frames as a strip of pictures and as a video."""
+"""Pictures of tracks: drawn over the frames as a strip and as a video."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from vggtjax.results.result import Result
 
 SEEN = 0.5  # visibility from which a point is drawn filled
 _COLORS = (Colormap("gist_rainbow").lut(256)[:, :3] * 255).round().astype(int)
-_TAIL = 8  # frames that a point's past is drawn over
+_TAIL = 8  # frames of a point's past that are drawn
 _STRIP_FRAMES, _STRIP_WIDTH = 6, 1800
-_VIDEO_SIDE = 720  # pixels of the video's longer side, at least; frames are enlarged by whole numbers
+_VIDEO_SIDE = 720  # least pixels of the video's longer side; frames are enlarged by whole numbers
 _FRAMES_PER_SECOND = 10
 _MARGIN, _GAP = 24, 6
 
@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 
 def track_strip(result: Result) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw up to six frames, evenly spread, with every track: its place, and where it came from."""
+    """Draw up to six frames, evenly spread, with the position and the past of every track."""
     S, H, W = result.depth.shape
     shown = np.linspace(0, S - 1, min(S, _STRIP_FRAMES)).round().astype(int)
     scale = max(_STRIP_WIDTH / len(shown) / W, 1e-3)
@@ -43,7 +43,7 @@ def track_strip(result: Result) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def write_track_video(path: Path, result: Result) -> bool:
-    """Write the clip with its tracks as an mp4; return False, with a note logged, where PyAV or its encoder lacks."""
+    """Write the clip with its tracks as an mp4; return False and log a note without PyAV or an encoder."""
     try:
         import av
     except ImportError:
@@ -51,7 +51,7 @@ def write_track_video(path: Path, result: Result) -> bool:
         return False
     _, H, W = result.depth.shape
     factor = max(1, -(-_VIDEO_SIDE // max(H, W)))
-    size = (W * factor // 2 * 2, H * factor // 2 * 2)  # H.264 wants even sides
+    size = (W * factor // 2 * 2, H * factor // 2 * 2)  # H.264 needs even sides
     codec = next((name for name in ("libx264", "mpeg4") if name in av.codecs_available), None)
     if codec is None:
         logger.info("tracks are drawn as pictures only; this PyAV has no encoder for an mp4")
@@ -66,7 +66,7 @@ def write_track_video(path: Path, result: Result) -> bool:
 
 
 def _drawn(result: Result, frame: int, size: tuple[int, int]) -> Image.Image:
-    """Return a frame, greyed and enlarged, with the tracks over it; points that are hidden are rings."""
+    """Return a frame, greyed and enlarged, with the tracks over it; hidden points are rings."""
     positions, visibility = _present(result.track_positions), _present(result.track_visibility)
     _, H, W = result.depth.shape
     scale = np.array(size) / (W, H)
@@ -86,7 +86,7 @@ def _drawn(result: Result, frame: int, size: tuple[int, int]) -> Image.Image:
 
 
 def _colors(result: Result) -> list[tuple[int, int, int]]:
-    """Return a colour per track by the direction in which it lies from the middle of the first frame."""
+    """Return a colour per track by its direction from the middle of the first frame."""
     _, H, W = result.depth.shape
     x, y = (_present(result.track_positions)[0] - [W / 2, H / 2]).T
     angle = (np.arctan2(y, x) / (2 * np.pi)) % 1
