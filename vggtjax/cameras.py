@@ -6,7 +6,7 @@ Axes are OpenCV's: x right, y down, z forward. Pixel coordinates put edges at in
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -20,6 +20,13 @@ _Array = TypeVar("_Array", np.ndarray, "jax.Array")
 
 FIELD_OF_VIEW_RANGE = (0.01, 3.1)  # radians; beyond it a pinhole camera has no usable focal length
 _FIELD_OF_VIEW_SLACK = 1e-6  # radians; a clamped camera that went through float32 is not clamped again
+
+
+class Cameras(NamedTuple):
+    """Cameras of frames, of numpy or jax; intrinsics are in pixels."""
+
+    camera_from_world: Float[Any, "*F 3 4"]
+    intrinsics: Float[Any, "*F 3 3"]
 
 
 def camera_centres(camera_from_world: Float32[np.ndarray, "S 3 4"]) -> Float32[np.ndarray, "S 3"]:

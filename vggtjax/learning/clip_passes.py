@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, jaxtyped
 
+from vggtjax.cameras import Cameras
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, load_clip
 from vggtjax.errors import InputError, OutputError, ResultError
@@ -24,7 +25,7 @@ from vggtjax.learning.fit import FitClips
 from vggtjax.learning.objectives import View
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.fusion_rule import Observations
-from vggtjax.method.passes import Cameras, Passes
+from vggtjax.method.passes import Passes
 from vggtjax.network.model import Predictions
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.progress import OnStage, Progress
@@ -293,7 +294,7 @@ def _whole(clip: ClipPasses, seen: Observations, frames: int | None) -> FitClips
     best = int(np.argmax(known[count:] - known[: S - count + 1]))
     part = slice(best, best + count)
     seen = jax.tree.map(lambda x: x[part], seen)
-    cameras = Cameras(clip.camera_from_world[part], clip.intrinsics[part])  # pyright: ignore[reportArgumentType]
+    cameras = Cameras(clip.camera_from_world[part], clip.intrinsics[part])
     view = View(clip.images[part].astype(np.float32) / 255, cameras)  # pyright: ignore[reportArgumentType]
     return FitClips(seen, clip.truth[part], view)  # pyright: ignore[reportArgumentType]
 

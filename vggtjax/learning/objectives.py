@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.cameras import unproject
+from vggtjax.cameras import Cameras, unproject
 from vggtjax.method.fusion_rule import Fused, FusionParams, Observations, fuse, log_precisions
-from vggtjax.method.passes import Cameras
 from vggtjax.network.precision import full_precision
 from vggtjax.network.sampling import bilinear
 

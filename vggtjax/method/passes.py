@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtjax.cameras import Cameras
 from vggtjax.config import Gram, MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
@@ -34,13 +35,6 @@ class Passes(NamedTuple):
     second: Predictions | None
     saliency: Float[Array, "B S h w"]
     dynamic_mask: Bool[Array, "B S H W"]
-
-
-class Cameras(NamedTuple):
-    """OpenCV cameras: x right, y down, z forward; intrinsics in pixels."""
-
-    camera_from_world: Float[Array, "B S 3 4"]
-    intrinsics: Float[Array, "B S 3 3"]
 
 
 class Assembly(NamedTuple):

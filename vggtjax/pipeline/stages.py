@@ -12,11 +12,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtjax.cameras import Cameras
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.method.fusion_inputs import apply_fusion
 from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.method.mask import mine_mask
-from vggtjax.method.passes import Assembly, Cameras, Passes, assemble, first_pass, second_pass, track_from
+from vggtjax.method.passes import Assembly, Passes, assemble, first_pass, second_pass, track_from
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.layers import Params

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from PIL import Image
 
-from vggtjax.cameras import world_from_camera
+from vggtjax.cameras import Cameras, world_from_camera
 from vggtjax.clips.images import read_image
 from vggtjax.clips.masks import read_mask
 from vggtjax.errors import InputError, ResultError
@@ -55,13 +55,6 @@ def write_cameras(
     np.savetxt(folder / "pred_intrinsics.txt", np.stack(intrinsics).reshape(-1, 9), fmt="%.9g")
     numbers = np.arange(len(world_from_camera), dtype=np.float64)
     write_trajectory(folder / "pred_traj.txt", world_from_camera, numbers, quaternion="wxyz")
-
-
-class Cameras(NamedTuple):
-    """Cameras of S frames."""
-
-    camera_from_world: Float[np.ndarray, "S 3 4"]
-    intrinsics: Float[np.ndarray, "S 3 3"]
 
 
 class _Folder(NamedTuple):
