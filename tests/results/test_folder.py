@@ -60,7 +60,7 @@ def test_a_killed_replacement_is_finished_by_the_next(tmp_path, optional):
     (tmp_path / "old").mkdir()
     if optional is not None:
         save(tmp_path / "old", 1, optional)
-    lengths = set()
+    lengths, n, folder = set(), 0, tmp_path
     for n in range(60):
         folder = tmp_path / str(n)
         shutil.copytree(tmp_path / "old", folder)
