@@ -191,7 +191,7 @@ def test_pickles_are_refused(stored, tmp_path):
 
     with zipfile.ZipFile(path, "a") as file, file.open("trap.npy", "w") as member:
         np.lib.format.write_array(member, np.array([Trap()], object), allow_pickle=True)
-    with pytest.raises(ResultError, match="holds Python objects .*, which are never loaded"):
+    with pytest.raises(ResultError, match=r"holds Python objects .*, which are never loaded"):
         Reconstruction.load(path)
     assert not ran.exists()
 
