@@ -97,7 +97,7 @@ def test_intrinsics_follow_the_size_of_the_pictures(tmp_path):
     write(folder / "camera" / "0_00000.json", camera_json(radial_distortion=[0, 0.1, 0], **changes))
     (sequence,) = opened("dycheck", tmp_path, gt="lidar")
     assert np.allclose(sequence.intrinsics[0], [[8, 0.5, 2.25], [0, 10, 1.75], [0, 0, 1]])
-    assert "apple: lens distortion is left as it is, the intrinsics do not have it" in sequence.notes
+    assert "apple: lens distortion is not undone, and not part of the intrinsics" in sequence.notes
     write(folder / "camera" / "0_00000.json", camera_json(image_size=[8, 8]))
     with pytest.raises(InputError, match=r"for pictures of 8 x 8 and the picture is 4 x 3"):
         opened("dycheck", tmp_path, gt="lidar")
@@ -165,7 +165,7 @@ def test_broken_splits_are_refused(tmp_path, content, message):
         ("{}", "no numbers under 'orientation'"),
         ("[1, 2]", r"is \[1, 2\]; expected an object"),
         (camera_json(orientation=[1, 2, 3]), r"'orientation' of shape \(3,\)"),
-        (camera_json(orientation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "poses that are none"),
+        (camera_json(orientation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "invalid poses"),
         (camera_json(orientation=[[1, 0], [0]]), "no numbers under 'orientation'"),
         (camera_json(position=["x", 0, 0]), "no numbers under 'position'"),
         (camera_json(position=[float("nan"), 0, 0]), "is not JSON that can be read"),
@@ -268,9 +268,9 @@ def test_broken_colmap_models_are_refused(tmp_path):
         with pytest.raises(InputError, match=r"images\.bin ends"):
             read_views(tmp_path)
     for images, message in (
-        ([(*IMAGE[:3], 9, "a.png")], "of camera 9, which cameras.bin does not have"),
+        ([(*IMAGE[:3], 9, "a.png")], "of camera 9; cameras.bin has no such camera"),
         ([(7, (2, 0, 0, 0), *IMAGE[2:])], "a quaternion of length 1"),
-        ([(7, (1, 0, 0, 0), (float("nan"), 0, 0), *IMAGE[3:])], "a pose of 'a.png' that is none"),
+        ([(7, (1, 0, 0, 0), (float("nan"), 0, 0), *IMAGE[3:])], "an invalid pose of 'a.png'"),
     ):
         model(tmp_path, [camera], images)
         with pytest.raises(InputError, match=message):

@@ -51,7 +51,7 @@ def test_tum(tmp_path):
     # points are of whole pixel numbers, so half a pixel is added
     assert np.array_equal(sequence.intrinsics[2], [[535.4, 0, 320.6], [0, 539.2, 248.1], [0, 0, 1]])
     assert len(sequence.notes) == 1
-    assert sequence.notes[0].startswith("7 of 8 published sequences of tum are not there: freiburg3_sitting_static")
+    assert sequence.notes[0].startswith("7 of 8 published sequences of tum are missing: freiburg3_sitting_static")
 
 
 def test_tum_takes_frames_with_a_pose_then_every_third_then_ninety(tmp_path):
@@ -62,8 +62,8 @@ def test_tum_takes_frames_with_a_pose_then_every_third_then_ninety(tmp_path):
     assert np.allclose(sequence.timestamps, times[there][::3][:90], atol=1e-6)
     assert np.allclose(sequence.world_from_camera[:, 0, 3], np.arange(298)[::3][:90])  # the number of the pose
     assert sequence.notes[1:] == (
-        f"fr2_desk: 2 of 300 frames have no pose within 0.02 s and are left out, {times[4]:.6f} first",
-        "fr2_desk: lens distortion is left as it is, the intrinsics do not have it",
+        f"fr2_desk: 2 of 300 frames have no pose within 0.02 s and are skipped, {times[4]:.6f} first",
+        "fr2_desk: lens distortion is not undone, and not part of the intrinsics",
     )
     assert sequence.intrinsics[0, 0].tolist() == [520.9, 0, 325.6]
     assert np.allclose(opened("tum", tmp_path, stride=30)[0].timestamps, times[there][::30], atol=1e-6)
@@ -76,7 +76,7 @@ def test_tum_without_partners(tmp_path):
     assert sequence.world_from_camera is sequence.intrinsics is None
     assert [note.removeprefix("somewhere: ") for note in sequence.notes[1:]] == [
         "no frame has a pose within 0.02 s",
-        "which camera took it is not known; name the folder after it, or put fx fy cx cy in calibration.txt",
+        "its camera is unknown; name the folder after the camera, or put fx fy cx cy in calibration.txt",
         "2 of 4 frames have no depth, 50.200000 first",
     ]
     assert sequence.depth(1).any()
@@ -98,7 +98,7 @@ def test_tum_without_partners(tmp_path):
         ("rgb.txt", "1.0 C:\\secret.png\n", "names the file 'C:"),
         ("rgb.txt", "1.0 ..\\secret.png\n", "expected a path inside"),
         ("depth.txt", "1.0 ../depth/1.png\n", "expected a path inside"),
-        ("rgb.txt", "1.0 rgb/nothing.png\n" * 40, "nothing.png is not there"),
+        ("rgb.txt", "1.0 rgb/nothing.png\n" * 40, "nothing.png is missing"),
         ("rgb.txt", "soon rgb/1.png\n", "in line 1; expected a timestamp and a path"),
         ("rgb.txt", "# only\n1.0\n", "in line 2; expected a timestamp and a path"),
         ("rgb.txt", "nan rgb/1.png\n", "in line 1; expected a timestamp and a path"),
@@ -159,7 +159,7 @@ def test_bonn(tmp_path):
     assert np.allclose(sequence.timestamps, times[30:140], atol=1e-6)
     assert sequence.depth(0)[0, 3] == np.float32(5031 / 5000)
     assert sequence.notes[0] == (
-        "4 of 5 published sequences of bonn are not there: balloon2, crowd3, person_tracking2, synchronous"
+        "4 of 5 published sequences of bonn are missing: balloon2, crowd3, person_tracking2, synchronous"
     )
     # https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset: camera calibration, and the way from markers to camera
     assert np.allclose(sequence.intrinsics[0], [[542.822841, 0, 316.09352], [0, 542.57687, 238.256098], [0, 0, 1]])
@@ -311,7 +311,7 @@ def test_kitti_takes_the_first_110_and_names_what_is_missing(tmp_path):
     (tmp_path / "2011_09_26" / "calib_cam_to_cam.txt").unlink()
     (sequence,) = opened("kitti", tmp_path)
     assert [int(path.stem) for path in sequence.pictures] == [i for i in range(5, 115) if i not in (7, 9)]
-    assert f"{DRIVE}: 2 of 110 frames have no picture and are left out, 0000000007 first" in sequence.notes
+    assert f"{DRIVE}: 2 of 110 frames have no picture and are skipped, 0000000007 first" in sequence.notes
     assert f"{DRIVE}: it has no calib_cam_to_cam.txt, so no intrinsics" in sequence.notes
     assert np.allclose(sequence.depth(2)[0], [0, 1, 0.5, 265 / 256])  # frame 8
 
@@ -366,7 +366,7 @@ def test_seven_scenes(tmp_path):
     assert np.allclose(sequence.world_from_camera[2], [[0, 0, 1, 2], [0, 1, 0, 0.5], [-1, 0, 0, -1], [0, 0, 0, 1]])
     assert np.array_equal(sequence.intrinsics[0], [[585, 0, 320.5], [0, 585, 240.5], [0, 0, 1]])
     assert sequence.notes == (
-        "chess/seq-10: its depth is not registered to its pictures; the intrinsics are the depth camera's",
+        "chess/seq-10: depth is not registered to the pictures; the intrinsics are the depth camera's",
     )
     assert [s.name for s in opened("7scenes", tmp_path / "chess")] == ["seq-02", "seq-10"]
     assert [s.name for s in opened("7scenes", tmp_path / "chess" / "seq-02")] == ["seq-02"]
@@ -379,7 +379,7 @@ def test_seven_scenes_with_missing_and_broken_poses(tmp_path):
         ("1 0 0 0\n0 1 0 0\n0 0 1 0\n", r"pose\.txt has 3 rows; expected a pose of 4 rows"),
         ("1 0 0\n0 1 0\n0 0 1\n0 0 0\n", r"pose\.txt has 3 numbers"),
         ("1 0 0 inf\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", r"pose\.txt holds inf"),
-        ("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", r"pose\.txt holds poses that are none"),
+        ("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", r"pose\.txt has invalid poses"),
     ):
         write(pose, content)
         with pytest.raises(InputError, match=message):

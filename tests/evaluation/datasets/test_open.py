@@ -65,7 +65,7 @@ def test_frames_are_a_window_then_a_stride_then_a_cap():
     assert FrameChoice(slice(30, 140)).of(range(100), "a") == list(range(30, 100))
     assert FrameChoice(slice(30, 140)).shortage(100) == ("it has 100 frames; the protocol takes 30 to 139",)
     assert FrameChoice(slice(30, 140)).shortage(140) == FrameChoice().shortage(1) == ()
-    with pytest.raises(InputError, match="sequence a has 30 frames, and none of them from 30 on"):
+    with pytest.raises(InputError, match="sequence a has 30 frames, none of them from frame 30 on"):
         FrameChoice(slice(30, 140)).of(range(30), "a")
 
 
@@ -198,11 +198,11 @@ def test_arguments_that_cannot_work(tmp_path):
         opened("imagenet", tmp_path)
     with pytest.raises(InputError, match="is not a folder"):
         opened("plain", tmp_path / "nowhere")
-    with pytest.raises(InputError, match=r"'other' of plain is not in .*; expected of clip"):
+    with pytest.raises(InputError, match=r"'other' of plain is not in .*; it has clip"):
         opened("plain", tmp_path, sequences=["clip", "other"])
-    with pytest.raises(InputError, match="none twice"):
+    with pytest.raises(InputError, match="each once"):
         opened("plain", tmp_path, sequences=["clip", "clip"])
-    with pytest.raises(InputError, match="one name at least"):
+    with pytest.raises(InputError, match="at least one name"):
         opened("plain", tmp_path, sequences=[])
     with pytest.raises(InputError, match="stride is 0"):
         opened("plain", tmp_path, stride=0)
@@ -275,9 +275,9 @@ def test_published_sequences_that_are_absent_are_named_and_logged(tmp_path, capl
         sequences = opened("davis", tmp_path)
     assert [sequence.name for sequence in sequences] == ["camel", "soapbox"]
     absent, left = sequences[0].notes
-    assert absent.startswith("18 of 20 published sequences of davis are not there: blackswan, bmx-trees")
+    assert absent.startswith("18 of 20 published sequences of davis are missing: blackswan, bmx-trees")
     assert absent.endswith("paragliding-launch, parkour, scooter-black")
-    assert left == "left out, as the published protocol of davis does: bear"
+    assert left == "skipped, as in the published protocol of davis: bear"
     assert caplog.messages == [absent, left]
     assert [sequence.name for sequence in opened("davis", tmp_path, sequences=["bear"])] == ["bear"]
 
@@ -285,7 +285,7 @@ def test_published_sequences_that_are_absent_are_named_and_logged(tmp_path, capl
 def test_without_published_sequences_all_are_taken(tmp_path, caplog):
     sequences = opened("davis", davis_folder(tmp_path, "bear", "boat"))
     assert [sequence.name for sequence in sequences] == ["bear", "boat"]
-    assert sequences[1].notes == ("none of the 20 published sequences of davis is there; took all found",)
+    assert sequences[1].notes == ("none of the 20 published sequences of davis is present; took all others",)
     assert caplog.messages == list(sequences[1].notes)
 
 

@@ -1,4 +1,4 @@
-"""Data sets with ground truth: a table of what is known of each, and one way to open them. Does not import jax."""
+"""Data sets with ground truth: a table of the known data sets, and one function to open them. Does not import jax."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vggtjax.evaluation.datasets.folders import listed
 from vggtjax.evaluation.datasets.frames import EVERY_FRAME, FrameChoice
 from vggtjax.evaluation.datasets.kitti import kitti
 from vggtjax.evaluation.datasets.plain import plain
-from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener, Reader
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Reader
 from vggtjax.evaluation.datasets.seven_scenes import seven_scenes
 from vggtjax.evaluation.datasets.sintel import sintel
 from vggtjax.evaluation.datasets.tum import bonn, tum
@@ -28,22 +28,19 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Dataset:
-    """A data set: how it is read, and which of it the published protocol takes.
-
-    `frames` are a window of frames, then every so many of them, then at most so many.
-    """
+    """A data set: its reader, and the sequences and frames of the published protocol."""
 
     reader: Reader
     description: str
-    truth: tuple[str, ...]  # of "depth", "poses", "intrinsics", "masks"; what a sequence lacks is in its notes
+    truth: tuple[str, ...]  # of "depth", "poses", "intrinsics", "masks"; the notes of a sequence say what it lacks
     frames: FrameChoice = EVERY_FRAME
     sequences: tuple[str, ...] | None = None  # of the published protocol
-    max_depth: float | None = None  # metres; farther pixels do not count in video depth
-    gt: tuple[str, ...] = ()  # ground truths to choose from, the first one unless told
+    max_depth: float | None = None  # metres; the depth of farther pixels counts as unknown
+    gt: tuple[str, ...] = ()  # names of ground truths, the default first; empty for a single ground truth
 
     @property
     def gt_default(self) -> str | None:
-        """The ground truth that is taken unless another is asked for; None where there is one only."""
+        """The name of the default ground truth; None for a data set with a single one."""
         return self.gt[0] if self.gt else None
 
 
@@ -72,20 +69,20 @@ def find_sequences(
     sampling: Sampling = Sampling(),
     gt: str | None = None,
 ) -> dict[str, Callable[[], LabelledSequence]]:
-    """Find sequences of a data set, each to be opened by a call: what is wrong with one shows only then.
+    """Find sequences of a data set; a call opens each of them, and raises errors of that sequence alone.
 
     Args:
         name: one of DATASETS.
         root: the data set's folder; for "plain", "tum", "bonn", "dycheck" and "7scenes", one sequence's folder too.
-        sequences: names of those to open, in order. None takes the published ones that are there, or all where none
-            of them is; what that leaves out is in the notes of every sequence, and logged.
-        sampling: which frames of each sequence; its stride replaces the data set's own, a window or cap of the data set
+        sequences: names of the sequences to open, in order. None takes the published sequences in the root, or all
+            sequences if it has none of them; the notes of every sequence and the log name missing and skipped ones.
+        sampling: frames of each sequence; its stride replaces the data set's own, a window or cap of the data set
             stays. Pictures have no `fps`.
-        gt: which ground truth, where the data set has several; None takes the first.
+        gt: name of a ground truth, for a data set with several; the first if None.
 
     Raises:
-        InputError: a name, sequence or ground truth that is not known, or a root without sequences; and from the calls,
-            files that are missing in the middle of a sequence or do not hold what they should.
+        InputError: an unknown name, sequence or ground truth, or a root without sequences. The calls raise it for
+            missing or invalid files of their sequence.
     """
     if name not in DATASETS:
         raise InputError(f"data set {name!r} is not known; expected one of {', '.join(DATASETS)}")
@@ -96,17 +93,17 @@ def find_sequences(
         raise InputError(f"fps is {sampling.fps}, but pictures have no presentation times; use stride")
     root = Path(root)
     if not root.is_dir():
-        raise InputError(f"{root} is not a folder; expected that of the data set {name}")
+        raise InputError(f"{root} is not a folder; expected the folder of the data set {name}")
     gt = gt or dataset.gt_default
-    found = dataset.reader(root, gt) if gt else dataset.reader(root)
-    chosen, notices = _chosen(name, root, found, sequences)
+    openers = dataset.reader(root, gt) if gt else dataset.reader(root)
+    chosen, notices = _chosen(name, root, list(openers), sequences)
     for notice in notices:
         logger.warning("%s", notice)
     frames = dataset.frames.sampled(sampling)
 
     def opened(name: str) -> LabelledSequence:
         try:
-            sequence = found[name](frames)
+            sequence = openers[name](frames)
         except OSError as error:
             raise InputError(f"cannot read sequence {name}: {error.strerror or error}") from error
         return dataclasses.replace(sequence, notes=(*notices, *(f"{sequence.name}: {note}" for note in sequence.notes)))
@@ -123,36 +120,36 @@ def open_dataset(
     max_frames: int | None = None,
     gt: str | None = None,
 ) -> list[LabelledSequence]:
-    """Open sequences of a data set: cameras are read, pictures, depth and masks when they are asked for.
+    """Open sequences of a data set. Cameras are read at once; pictures, depth and masks at their first use.
 
     Arguments and errors are those of `find_sequences`; `stride` and `max_frames` are those of its `sampling`.
     """
     sampling = Sampling(stride=stride, max_frames=max_frames)
-    found = find_sequences(name, root, sequences=sequences, sampling=sampling, gt=gt)
-    return [opener() for opener in found.values()]
+    openers = find_sequences(name, root, sequences=sequences, sampling=sampling, gt=gt)
+    return [opener() for opener in openers.values()]
 
 
 def _chosen(
-    name: str, root: Path, found: Mapping[str, Opener], sequences: Iterable[str] | None
+    name: str, root: Path, available: list[str], sequences: Iterable[str] | None
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Return the names of the sequences to open, and notices on those that are left out or missing."""
+    """Return the names of the sequences to open, and notices on skipped and missing sequences."""
     if sequences is not None:
         wanted = [sequences] if isinstance(sequences, str) else list(sequences)
-        if unknown := [sequence for sequence in wanted if sequence not in found]:
-            raise InputError(f"sequence {unknown[0]!r} of {name} is not in {root}; expected of {listed(list(found))}")
+        if unknown := [sequence for sequence in wanted if sequence not in available]:
+            raise InputError(f"sequence {unknown[0]!r} of {name} is not in {root}; it has {listed(available)}")
         if not wanted or len(set(wanted)) < len(wanted):
-            raise InputError(f"sequences are {wanted}; expected one name at least, none twice")
+            raise InputError(f"sequences are {wanted}; expected at least one name, each once")
         return wanted, ()
     published = DATASETS[name].sequences
     if published is None:
-        return list(found), ()
-    there = [sequence for sequence in published if sequence in found]
-    if not there:
-        return list(found), (f"none of the {len(published)} published sequences of {name} is there; took all found",)
+        return available, ()
+    present = [sequence for sequence in published if sequence in available]
+    if not present:
+        return available, (f"none of the {len(published)} published sequences of {name} is present; took all others",)
     notices: tuple[str, ...] = ()
-    if absent := [sequence for sequence in published if sequence not in found]:
-        notices += (f"{len(absent)} of {len(published)} published sequences of {name} are not there: "
+    if absent := [sequence for sequence in published if sequence not in available]:
+        notices += (f"{len(absent)} of {len(published)} published sequences of {name} are missing: "
                     f"{', '.join(absent)}",)  # fmt: skip
-    if others := [sequence for sequence in found if sequence not in published]:
-        notices += (f"left out, as the published protocol of {name} does: {listed(others)}",)
-    return there, notices
+    if others := [sequence for sequence in available if sequence not in published]:
+        notices += (f"skipped, as in the published protocol of {name}: {listed(others)}",)
+    return present, notices

@@ -10,7 +10,8 @@ from jaxtyping import Float, Float64
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.trajectory import checked_poses
 
-PIXEL_CENTRE = 0.5  # where the centre of the first pixel is; 0 for data sets that count from the centre
+DISTORTED = "lens distortion is not undone, and not part of the intrinsics"  # a note
+PIXEL_CENTRE = 0.5  # of the first pixel; 0 for data sets that count from the centre
 
 
 def intrinsics_matrix(
@@ -29,7 +30,7 @@ def checked_intrinsics(matrices: Float64[np.ndarray, "*S 3 3"], source: Path | s
     """Return intrinsics, or raise InputError where they are not finite or a focal length is not above 0."""
     focal = matrices[..., [0, 1], [0, 1]]
     if not np.isfinite(matrices).all() or (focal <= 0).any() or not (matrices[..., 2, :] == [0, 0, 1]).all():
-        raise InputError(f"{source} has intrinsics that are none; expected focal lengths above 0 and a last row 0 0 1")
+        raise InputError(f"{source} has invalid intrinsics; expected focal lengths above 0 and a last row 0 0 1")
     return matrices
 
 
@@ -38,7 +39,7 @@ def resized_intrinsics(
 ) -> Float64[np.ndarray, "3 3"]:
     """Return intrinsics of pictures of one (width, height) at another; raises InputError for another shape."""
     scale = np.array(picture) / np.array(size)
-    if abs(size[0] * picture[1] - size[1] * picture[0]) > max(picture):  # a pixel is no other shape
+    if abs(size[0] * picture[1] - size[1] * picture[0]) > max(picture):  # one pixel of difference is rounding
         raise InputError(
             f"{source} is for pictures of {size[0]:g} x {size[1]:g} and the picture is {picture[0]} x {picture[1]}; "
             "expected the same shape"
@@ -54,9 +55,9 @@ def checked_world_from_camera(poses: Float[np.ndarray, "S 4 4"], source: Path | 
     try:
         checked_poses(poses[:, :3])
     except InputError as error:
-        raise InputError(f"{source} holds poses that are none: {error}") from None
+        raise InputError(f"{source} has invalid poses: {error}") from None
     if not np.allclose(poses[:, 3], [0, 0, 0, 1]):
-        raise InputError(f"{source} holds poses that are none: their last row is not 0 0 0 1")
+        raise InputError(f"{source} has invalid poses: their last row is not 0 0 0 1")
     return poses
 
 

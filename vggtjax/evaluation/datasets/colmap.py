@@ -21,13 +21,13 @@ from vggtjax.evaluation.datasets.folders import read_bytes
 
 
 class Model(NamedTuple):
-    """A camera model: what each of its first parameters is, and how many parameters there are."""
+    """A camera model: its first parameters, and the number of its parameters."""
 
     pinhole: str  # "f" for one focal length, "ff" for two; the principal point follows
     parameters: int
 
 
-# By COLMAP's numbers. Fisheye models are left out: their K alone is no camera.
+# By COLMAP's numbers, without fisheye models: K alone does not describe their cameras.
 _MODELS = {
     0: Model("f", 3),  # SIMPLE_PINHOLE
     1: Model("ff", 4),  # PINHOLE
@@ -40,11 +40,11 @@ _POINT_BYTES = 24  # of an observation in images.bin: x, y, the point's number
 
 
 class View(NamedTuple):
-    """A registered image: its camera in pixels, the size its pixels are of, and its pose."""
+    """A registered image: its camera in pixels, the size of its picture, and its pose."""
 
     intrinsics: Float64[np.ndarray, "3 3"]
     size: tuple[int, int]  # width, height
-    distorted: bool  # the lens has a distortion that the intrinsics do not have
+    distorted: bool  # the lens has a distortion, which the intrinsics lack
     camera_from_world: Float64[np.ndarray, "3 4"]
 
 
@@ -57,7 +57,7 @@ class _Camera(NamedTuple):
 def read_views(folder: Path) -> dict[str, View]:
     """Return the registered images of a model by name.
 
-    Raises InputError for files that end early, cameras of another kind, or numbers that are no camera.
+    Raises InputError for files that end early, other camera models, and invalid cameras.
     """
     cameras = _read_cameras(folder / "cameras.bin")
     reader = _Reader(folder / "images.bin")
@@ -68,9 +68,9 @@ def read_views(folder: Path) -> dict[str, View]:
         reader.skip(_POINT_BYTES * reader.next("<Q")[0])
         quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
         if camera not in cameras:
-            raise InputError(f"{reader.path} has {name!r} of camera {camera}, which cameras.bin does not have")
+            raise InputError(f"{reader.path} has {name!r} of camera {camera}; cameras.bin has no such camera")
         if not np.isfinite(pose).all() or abs(np.linalg.norm(quaternion) - 1) > 0.01:
-            raise InputError(f"{reader.path} has a pose of {name!r} that is none; expected a quaternion of length 1")
+            raise InputError(f"{reader.path} has an invalid pose of {name!r}; expected a quaternion of length 1")
         rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
         views[name] = View(*cameras[camera], np.column_stack([rotation, translation]))
     return views
@@ -95,7 +95,7 @@ def _read_cameras(path: Path) -> dict[int, _Camera]:
 
 
 class _Reader:
-    """Reads numbers from a file in turn, none past its end."""
+    """Reads records from a file one after the other, and never past its end."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

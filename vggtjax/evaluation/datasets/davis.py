@@ -1,6 +1,6 @@
 """DAVIS 2016 and 2017 at 480p: JPEGImages/480p/<sequence>/%05d.jpg, Annotations/480p/<sequence>/%05d.png.
 
-What moves is any label above 0. https://davischallenge.org/davis2017/code.html. Does not import jax.
+Any label above 0 is dynamic. https://davischallenge.org/davis2017/code.html. Does not import jax.
 """
 
 from __future__ import annotations
@@ -19,10 +19,9 @@ _RESOLUTION = "480p"
 
 def davis(root: Path) -> dict[str, Opener]:
     """Find the sequences of the folder that holds JPEGImages and Annotations."""
-    if found := {
-        child.name: partial(_read, root, child.name) for child in subfolders(root / "JPEGImages" / _RESOLUTION)
-    }:
-        return found
+    folders = subfolders(root / "JPEGImages" / _RESOLUTION)
+    if folders:
+        return {folder.name: partial(_read, root, folder.name) for folder in folders}
     raise InputError(f"{root} holds no sequence of DAVIS; expected JPEGImages/{_RESOLUTION} with folders of frames")
 
 

@@ -20,7 +20,7 @@ _SIXTEEN_BITS = ("I;16", "I;16B", "I")
 def read_png(path: Path, per_metre: float, invalid: int = 0) -> Float32[np.ndarray, "h w"]:
     """Read a PNG of 16 bits: metres, 0 where the file has 0 or `invalid`.
 
-    Raises InputError for a file that is no such PNG.
+    Raises InputError for any other file.
     """
     with opening(path, PNG) as image:
         if image.mode not in _SIXTEEN_BITS:
@@ -45,7 +45,7 @@ def read_dpt(path: Path) -> Float32[np.ndarray, "h w"]:
 
 
 def read_npy(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Read an .npy of shape (h, w) or (h, w, 1), as it is; raises InputError for anything else."""
+    """Read an .npy of shape (h, w) or (h, w, 1) without a unit; raises InputError for anything else."""
     values = read_array(path)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]

@@ -20,6 +20,7 @@ from jaxtyping import Float32, Float64
 
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.cameras import (
+    DISTORTED,
     checked_intrinsics,
     checked_world_from_camera,
     resized_intrinsics,
@@ -42,7 +43,6 @@ _ALIGNED = Path("flow3d_preprocessed/aligned_depth_anything_colmap/1x")
 _MODEL = Path("flow3d_preprocessed/colmap/sparse")
 _LEAST_DISPARITY = 1e-3
 _FARTHEST = 2.5  # times the median over the frames of their largest depth
-_DISTORTION = "lens distortion is left as it is, the intrinsics do not have it"
 
 
 class _Cameras(NamedTuple):
@@ -62,12 +62,12 @@ def _read(folder: Path, name: str, gt: str, frames: FrameChoice) -> LabelledSequ
     chosen = frames.of(names, name)
     pictures = [inside(folder / _PICTURES, f"{frame}.png", folder / _SPLIT) for frame in chosen]
     if absent := [path for path in pictures if not path.is_file()]:
-        raise InputError(f"{absent[0]} is not there, and {folder / _SPLIT} names its frame; get the sequence whole")
+        raise InputError(f"{absent[0]} is missing, but {folder / _SPLIT} names its frame; get the sequence whole")
     easi3r = gt == EASI3R
     cameras = (_colmap_cameras if easi3r else _json_cameras)(folder, chosen, pictures)
-    there = files(folder / (_ALIGNED if easi3r else _LIDAR), ".npy")
-    read = _from_disparity([there[frame] for frame in names if frame in there]) if easi3r else read_npy
-    depth, notes = depth_reader(pictures, [there.get(frame) for frame in chosen], read)
+    maps = files(folder / (_ALIGNED if easi3r else _LIDAR), ".npy")
+    read = _from_disparity([maps[frame] for frame in names if frame in maps]) if easi3r else read_npy
+    depth, notes = depth_reader(pictures, [maps.get(frame) for frame in chosen], read)
     return LabelledSequence(
         name,
         tuple(pictures),
@@ -90,7 +90,7 @@ def _frame_names(path: Path) -> list[str]:
 
 
 def _from_disparity(paths: list[Path]) -> Callable[[Path], Float32[np.ndarray, "h w"]]:
-    """Return a reader of depth, 1 / disparity, that cuts it as Shape of Motion does: over all frames of the split."""
+    """Return a reader of depth, 1 / disparity, with Shape of Motion's largest depth over all frames of the split."""
 
     @cache
     def farthest() -> float:
@@ -121,7 +121,7 @@ def _colmap_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _C
         for view, path in zip(taken, pictures, strict=True)
     ]
     poses = world_from_camera_of(np.stack([view.camera_from_world for view in taken]), source)
-    return _Cameras(poses, np.stack(intrinsics), (_DISTORTION,) * any(view.distorted for view in taken))
+    return _Cameras(poses, np.stack(intrinsics), (DISTORTED,) * any(view.distorted for view in taken))
 
 
 def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cameras:
@@ -147,7 +147,7 @@ def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cam
         intrinsics.append(resized_intrinsics(matrix, (width, height), picture_size(picture), path))
         for key, count in (("radial_distortion", 3), ("tangential_distortion", 2)):
             distorted |= bool(_numbers(camera, key, (count,), path).any())
-    return _Cameras(np.stack(poses), np.stack(intrinsics), (_DISTORTION,) * distorted)
+    return _Cameras(np.stack(poses), np.stack(intrinsics), (DISTORTED,) * distorted)
 
 
 def _numbers(camera: Mapping[str, Any], key: str, shape: tuple[int, ...], path: Path) -> Float64[np.ndarray, ...]:

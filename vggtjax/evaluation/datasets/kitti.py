@@ -1,6 +1,6 @@
 """KITTI's annotated depth with the pictures of the raw drives, left colour camera. Does not import jax.
 
-Depth is val/<drive>/proj_depth/groundtruth/image_02/%010d.png, of 16 bits, 256 to the metre, 0 where it is not known
+Depth is val/<drive>/proj_depth/groundtruth/image_02/%010d.png, of 16 bits, 256 to the metre, 0 where it is unknown
 (the depth benchmark's readme); its pictures are <date>/<drive>/image_02/data or val/<drive>/image_02/data. MonST3R's
 gathered folders are read too: image_gathered/<drive>_02 and groundtruth_depth_gathered/<drive>_02. Intrinsics are
 P_rect_02 of <date>/calib_cam_to_cam.txt. KITTI does not say from where its pixels count: as in OpenCV, whose
@@ -33,32 +33,32 @@ _PROJECTION = "P_rect_02"
 
 
 def kitti(root: Path) -> dict[str, Opener]:
-    """Find the drives of a folder that holds val/, or of MonST3R's folder of gathered ones."""
-    found: dict[str, Opener] = {}
+    """Find the drives of a folder with val/, or of MonST3R's folder of gathered drives."""
+    openers: dict[str, Opener] = {}
     for drive in subfolders(root / "val"):
         if (drive / _TRUTH).is_dir():
             date = root / drive.name[:_DATE]
             places = (date / drive.name / _PICTURES, drive / _PICTURES)
             pictures = next((place for place in places if place.is_dir()), places[0])
-            found[drive.name] = partial(_read, drive.name, drive / _TRUTH, pictures, date / _CALIBRATION)
+            openers[drive.name] = partial(_read, drive.name, drive / _TRUTH, pictures, date / _CALIBRATION)
     for drive in subfolders(root / _GATHERED):
         name = drive.name.removesuffix("_02")
-        if name not in found:
+        if name not in openers:
             pictures = root / "image_gathered" / drive.name
-            found[name] = partial(_read, name, drive, pictures, root / _CALIBRATION)
-    if not found:
+            openers[name] = partial(_read, name, drive, pictures, root / _CALIBRATION)
+    if not openers:
         raise InputError(f"{root} holds no drive of KITTI; expected val/<drive>/{_TRUTH} or {_GATHERED}/<drive>_02")
-    return found
+    return openers
 
 
 def _read(name: str, truth: Path, folder: Path, calibration: Path, frames: FrameChoice) -> LabelledSequence:
     depths, pictures = files(truth, ".png"), files(folder, ".png")
     if not depths or not pictures:
         raise InputError(f"{folder if depths else truth} holds no .png; the drive {name} needs pictures and depth")
-    chosen = frames.of(list(depths), name)  # the frames with depth: the first and last few of a drive have none
+    chosen = frames.of(list(depths), name)  # frames with depth: the first and the last few of a drive have none
     notes: tuple[str, ...] = ()
     if missing := [frame for frame in chosen if frame not in pictures]:
-        notes += (f"{len(missing)} of {len(chosen)} frames have no picture and are left out, {missing[0]} first",)
+        notes += (f"{len(missing)} of {len(chosen)} frames have no picture and are skipped, {missing[0]} first",)
         chosen = [frame for frame in chosen if frame in pictures]
     taken = [pictures[frame] for frame in chosen]
     depth, more = depth_reader(taken, [depths[frame] for frame in chosen], partial(read_png, per_metre=_PER_METRE))

@@ -1,4 +1,4 @@
-"""Depth maps and masks of a sequence: read when they are asked for, of their pictures' size. Does not import jax."""
+"""Readers of the depth maps and masks of a sequence, at their pictures' size. Does not import jax."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from vggtjax.evaluation.datasets.sequence import DepthReader, MaskReader
 def depth_reader(
     pictures: Sequence[Path], paths: Sequence[Path | None], read: Callable[[Path], Float32[np.ndarray, "h w"]]
 ) -> tuple[DepthReader | None, tuple[str, ...]]:
-    """Return a reader of the frames' depth, and notes on frames without: their depth is 0, not known, throughout.
+    """Return a reader of the frames' depth, 0 where it is unknown, and notes on frames without depth.
 
-    The reader is None where no frame has depth. It raises InputError for maps that are not of their picture's size,
-    and for files that cannot be read. What is not finite or not above 0 is not known, and becomes 0.
+    The reader is None if no frame has depth. It raises InputError for unreadable files and for maps of another size
+    than their picture. Depth that is not finite or not above 0 counts as unknown.
     """
     missing = [picture.stem for picture, path in zip(pictures, paths, strict=True) if path is None]
     if len(missing) == len(pictures):
@@ -41,23 +41,23 @@ def depth_reader(
 def mask_reader(
     pictures: Sequence[Path], paths: Sequence[Path | None], read: Callable[[Path], Bool[np.ndarray, "h w"]]
 ) -> tuple[MaskReader | None, tuple[str, ...]]:
-    """Return a reader of the frames' masks, or None and a note where some frame has none: nothing marks it unknown."""
-    there = [path for path in paths if path is not None]
-    if len(there) < len(pictures):
-        return None, (f"{len(there) or 'none'} of {len(pictures)} frames have a mask, so it has no masks",)
-    return lambda frame: _of_picture_size(read(there[frame]), there[frame], pictures[frame]), ()
+    """Return a reader of the frames' masks, or None and a note unless every frame has a mask: masks have no unknown."""
+    masks = [path for path in paths if path is not None]
+    if len(masks) < len(pictures):
+        return None, (f"{len(masks) or 'none'} of {len(pictures)} frames have a mask, so it has no masks",)
+    return lambda frame: _of_picture_size(read(masks[frame]), masks[frame], pictures[frame]), ()
 
 
 def read_labels(path: Path) -> Bool[np.ndarray, "h w"]:
-    """Read a picture of labels: True where one is above 0, whether it is a palette's, a brightness or a colour.
+    """Read a picture of labels (palette, brightness or colour): True where a label is above 0.
 
-    Raises InputError for a file that is no picture.
+    Raises InputError for any other file.
     """
     with opening(path, PNG) as image:
         labels = np.asarray(image)
         mode = image.mode
     if mode in ("LA", "RGBA"):
-        labels = labels[..., :-1]  # opacity is no label
+        labels = labels[..., :-1]  # without opacity
     above = np.asarray(labels > 0)
     return above if above.ndim == 2 else np.asarray(above.any(axis=2))
 

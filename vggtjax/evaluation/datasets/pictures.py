@@ -1,4 +1,4 @@
-"""Pictures of a data set as they are stored: depth, labels, sizes. Does not import jax."""
+"""Stored pictures of a data set: depth, labels, sizes. Does not import jax."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from vggtjax.clips.images import UNREADABLE, known_formats
 from vggtjax.errors import InputError
 
 PNG = ("PNG",)
-_ORIENTATION = 0x0112  # EXIF; from 5 on, width and height change places
+_ORIENTATION = 0x0112  # EXIF; from 5 on, width and height are swapped
 _FIRST_TURNED = 5
 _BROKEN = (*UNREADABLE, Image.DecompressionBombWarning)
 
 
 @contextmanager
 def opening(path: Path, formats: tuple[str, ...]) -> Iterator[Image.Image]:
-    """Open a picture as it is stored; raises InputError for a file that is none, then or when it is decoded."""
+    """Open a picture without turning it; raises InputError for any other file, also while it is decoded."""
     try:
         with Image.open(path, formats=formats) as image:
             yield image
@@ -31,7 +31,7 @@ def opening(path: Path, formats: tuple[str, ...]) -> Iterator[Image.Image]:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Return width and height of a picture, upright; raises InputError for a file that is none."""
+    """Return width and height of an upright picture; raises InputError for any other file."""
     with opening(path, known_formats()) as image:
         width, height = image.size
         return (height, width) if image.getexif().get(_ORIENTATION, 1) >= _FIRST_TURNED else (width, height)

@@ -1,9 +1,9 @@
-"""Plain folders: rgb/, and depth/, mask/, K.txt and world_from_camera.txt where they are known. Does not import jax.
+"""Plain folders: rgb/, and optionally depth/, mask/, K.txt and world_from_camera.txt. Does not import jax.
 
-Depth is PNG of 16 bits in millimetres, 0 where it is not known; masks are pictures, bright where the world moves. K.txt
+Depth is PNG of 16 bits in millimetres, 0 where it is unknown; masks are pictures, bright where the world moves. K.txt
 has three rows of three numbers for all frames, or three rows for each; world_from_camera.txt a row of 16 numbers for
-each frame, in metres. The intrinsics pass as they are, without a shift by half a pixel: nothing says from where those
-of the HoloLens count, and half a pixel is below what its poses and depth can tell.
+each frame, in metres. Intrinsics are not shifted by half a pixel: the pixel origin of the HoloLens is unknown, and half
+a pixel is below the accuracy of its poses and depth.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from vggtjax.evaluation.datasets.maps import depth_reader, mask_reader
 from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
 from vggtjax.storage.trajectories import read_numbers
 
-_NEW_TAKE = 10.0  # times the median step of the camera: a jump between takes in one folder
+_NEW_TAKE = 10.0  # times the median step of the camera: a jump between two takes
 _PER_METRE = 1000.0
 
 
 def plain(root: Path) -> dict[str, Opener]:
-    """Find plain folders; one with several takes, between which the camera jumps, gives a sequence for each."""
+    """Find plain folders; a folder with several takes, between which the camera jumps, has a sequence for each take."""
     openers: dict[str, Opener] = {}
     for name, folder in sequence_folders(root, lambda folder: (folder / "rgb").is_dir(), "a folder rgb").items():
         try:
@@ -49,7 +49,7 @@ def plain(root: Path) -> dict[str, Opener]:
 
 
 def takes(centres: Float64[np.ndarray, "S 3"]) -> list[range]:
-    """Return the stretches of frames without a cut: no step ten times as long as the median one, pauses aside."""
+    """Return the ranges of frames without a cut, a step ten times as long as the median step; pauses do not count."""
     steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
     moving = steps[steps > 0]
     cuts = 1 + np.flatnonzero(steps > _NEW_TAKE * np.median(moving)) if moving.size else np.zeros(0, int)

@@ -1,7 +1,7 @@
-"""The sequences that published protocols take. Does not import jax.
+"""The sequences of published protocols. Does not import jax.
 
-Those of the evaluation code of MonST3R, which CUT3R and Easi3R go by (Sintel, TUM dynamics, Bonn, KITTI), of the
-validation lists of DAVIS (ImageSets/480p/val.txt of 2016, ImageSets/2017/val.txt), and of the release of DyCheck's
+From the evaluation code of MonST3R, which CUT3R and Easi3R follow (Sintel, TUM dynamics, Bonn, KITTI), the validation
+lists of DAVIS (ImageSets/480p/val.txt of 2016, ImageSets/2017/val.txt), and of the release of DyCheck's
 sequences with Shape of Motion.
 """
 

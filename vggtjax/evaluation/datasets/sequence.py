@@ -1,4 +1,4 @@
-"""A sequence of a data set: its pictures, and what is known of them, at the pictures' own pixels."""
+"""A sequence of a data set: its pictures, and their ground truth at the pictures' own pixels."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ MaskReader = Callable[[int], Bool[np.ndarray, "h w"]]
 
 @dataclass(frozen=True, eq=False)
 class LabelledSequence:
-    """Frames in order, and ground truth where the data set has it: units are metres and seconds, axes OpenCV's.
+    """Frames in order, and the ground truth that the data set has: metres, seconds, OpenCV's axes.
 
-    Depth and masks are read when they are asked for, by the frame's index. Intrinsics put the outer corner of the first
-    pixel at (0, 0) and its centre at (0.5, 0.5): a data set that counts from the centre is shifted when it is read.
+    Depth and masks are read at each use, by the frame's index. Intrinsics put the outer corner of the first pixel at
+    (0, 0) and its centre at (0.5, 0.5); readers shift the intrinsics of data sets that count from the centre.
     """
 
     name: str
     pictures: tuple[Path, ...]
-    depth: DepthReader | None = None  # along z, 0 where it is not known; of the pictures' size
-    mask: MaskReader | None = None  # True where the world moves; of the pictures' size
+    depth: DepthReader | None = None  # along z, 0 where it is unknown; at the pictures' size
+    mask: MaskReader | None = None  # True where the world moves; at the pictures' size
     world_from_camera: Float64[np.ndarray, "S 4 4"] | None = None
     intrinsics: Float64[np.ndarray, "S 3 3"] | None = None
     timestamps: Float64[np.ndarray, " S"] | None = None
-    notes: tuple[str, ...] = ()  # what is missing or was left out, a sentence each
+    notes: tuple[str, ...] = ()  # a sentence for each missing or skipped part
 
     def __post_init__(self) -> None:
         if not self.pictures:
-            raise InputError(f"sequence {self.name} has no frames; expected one at least")
+            raise InputError(f"sequence {self.name} has no frames; expected at least one")
         for name, shape in (("world_from_camera", (4, 4)), ("intrinsics", (3, 3)), ("timestamps", ())):
             value = getattr(self, name)
             if value is not None and np.shape(value) != (len(self), *shape):

@@ -1,9 +1,9 @@
 """7-Scenes: seq-XX/frame-%06d.color.png, .depth.png and .pose.txt. Does not import jax.
 
-Depth is PNG of 16 bits in millimetres, 65535 and 0 where it is not known; poses are camera-to-world, 4 x 4, in metres.
-The page says that colour and depth have not been calibrated, so that depth is not at the very pixels of the pictures,
-and gives one camera, KinectFusion's default for the depth: focal length 585, principal point (320, 240). It does not
-say from where pixels count; the centre of the first is taken to be 0.
+Depth is PNG of 16 bits in millimetres, 65535 and 0 where it is unknown; poses are camera-to-world, 4 x 4, in metres.
+The page says that colour and depth are not calibrated, so depth is not at exactly the pixels of the pictures, and gives
+one camera, KinectFusion's default for the depth: focal length 585, principal point (320, 240). Its pixel origin is
+unknown; the centre of the first pixel is taken to be 0.
 https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/
 """
 
@@ -31,7 +31,7 @@ _PICTURE, _DEPTH, _POSE = ".color.png", ".depth.png", ".pose.txt"
 
 
 def seven_scenes(root: Path) -> dict[str, Opener]:
-    """Find the sequences of a scene, "seq-01", or of a folder of scenes, "chess/seq-01"."""
+    """Find the sequences of a scene (names such as "seq-01") or of a folder of scenes ("chess/seq-01")."""
     folders = sequence_folders(root, lambda folder: bool(files(folder, _PICTURE)), f"frames *{_PICTURE}", levels=2)
     return {name: partial(_read, folder, name) for name, folder in folders.items()}
 
@@ -48,7 +48,7 @@ def _read(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     else:
         poses = np.stack([_pose(pose_files[frame]) for frame in chosen])
     intrinsics = np.broadcast_to(intrinsics_matrix(*_CAMERA, first_pixel=0, source="7-Scenes"), (len(taken), 3, 3))
-    notes += ("its depth is not registered to its pictures; the intrinsics are the depth camera's",)
+    notes += ("depth is not registered to the pictures; the intrinsics are the depth camera's",)
     return LabelledSequence(name, tuple(taken), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes)
 
 

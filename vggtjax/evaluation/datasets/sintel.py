@@ -26,15 +26,15 @@ _CAM_BYTES = 4 + 8 * (9 + 12)
 
 
 def sintel(root: Path) -> dict[str, Opener]:
-    """Find the sequences of a folder that holds training/, or is it."""
+    """Find the sequences of the folder training/, or of the folder around it."""
     for folder in (root / "training", root):
-        if found := {child.name: partial(_read, folder, child.name) for child in subfolders(folder / "final")}:
-            return found
+        if names := [child.name for child in subfolders(folder / "final")]:
+            return {name: partial(_read, folder, name) for name in names}
     raise InputError(f"{root} holds no sequence of Sintel; expected training/final with folders of frames")
 
 
 def read_cam(path: Path) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3 4"]]:
-    """Read a camera: K as the file has it, pixels counted from the centre of the first, and camera-from-world."""
+    """Read a camera: K, with pixels counted from the centre of the first, and camera-from-world."""
     data = read_bytes(path)
     if data[:4] != SINTEL_TAG or len(data) != _CAM_BYTES:
         raise InputError(

@@ -1,8 +1,8 @@
 """The TUM RGB-D benchmark and Bonn RGB-D Dynamic, which has the same layout. Does not import jax.
 
 A folder holds rgb.txt and depth.txt, of lines "timestamp path", and groundtruth.txt, of lines "timestamp tx ty tz qx qy
-qz qw"; depth is PNG of 16 bits, 5000 to the metre, 0 where it is not known, at the pixels of the pictures. Both count
-pixels from the centre of the first (the benchmark's page takes whole numbers of pixels to points).
+qz qw"; depth is PNG of 16 bits, 5000 to the metre, 0 where it is unknown, at the pixels of the pictures. Both count
+pixels from the centre of the first (the benchmark's page lifts whole pixel numbers to points).
 TUM: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
 Bonn: https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/
 """
@@ -20,7 +20,7 @@ from jaxtyping import Float, Float64, Int
 
 from vggtjax.clips.sources import natural_key
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.cameras import intrinsics_matrix
+from vggtjax.evaluation.datasets.cameras import DISTORTED, intrinsics_matrix
 from vggtjax.evaluation.datasets.depth_files import read_png
 from vggtjax.evaluation.datasets.folders import inside, read_text, sequence_folders
 from vggtjax.evaluation.datasets.frames import FrameChoice
@@ -30,9 +30,9 @@ from vggtjax.evaluation.metrics.trajectory import associate
 from vggtjax.storage.trajectories import read_numbers, read_trajectory
 
 _PER_METRE = 5000.0
-_APART = 0.02  # seconds; from this on, two timestamps do not belong together
+_TOLERANCE = 0.02  # seconds between the timestamps of a picture and of its depth or pose
 _CAMERA = re.compile(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)")
-# fx fy cx cy of the colour cameras. Those of freiburg3 are of pictures without distortion.
+# fx fy cx cy of the colour cameras. The pictures of freiburg3 have no distortion.
 _FREIBURG = {
     "1": (517.3, 516.5, 318.6, 255.3),
     "2": (520.9, 521.0, 325.1, 249.7),
@@ -40,8 +40,8 @@ _FREIBURG = {
 }
 _DISTORTED = ("1", "2")
 _BONN = (542.822841, 542.576870, 315.593520, 237.756098)
-# Bonn tracks markers on the camera. Its page takes a point of the camera to the world by ROS T ROS MARKERS, T what
-# groundtruth.txt says. The 3 x 3 part of MARKERS is a rotation times 1.059; the rotation alone goes into the poses.
+# Bonn tracks markers on the camera. Its page takes a point of the camera to the world by ROS T ROS MARKERS, with T from
+# groundtruth.txt. The 3 x 3 part of MARKERS is a rotation times 1.059; the poses take the rotation alone.
 _ROS = np.array([[-1, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
 _MARKERS = np.array(
     [
@@ -54,7 +54,7 @@ _MARKERS = np.array(
 
 
 class Files(NamedTuple):
-    """What a list names: files, and the second each was taken in, in order of time."""
+    """Files of a list and their times in seconds, in order of time."""
 
     times: Float64[np.ndarray, " N"]
     paths: list[Path]
@@ -63,29 +63,29 @@ class Files(NamedTuple):
 def tum(root: Path) -> dict[str, Opener]:
     """Find sequences of the TUM RGB-D benchmark, named without "rgbd_dataset_".
 
-    Frames without a pose are left out before the stride and the cap, as MonST3R does. Intrinsics are those of the
-    camera that the folder's name tells (freiburg1, fr1, ...), or of a file calibration.txt: fx fy cx cy.
+    Frames without a pose are skipped before the stride and the cap, as in MonST3R. Intrinsics are from the file
+    calibration.txt (fx fy cx cy), or those of the camera in the folder's name (freiburg1, fr1, ...).
     """
-    return {name: partial(_read_tum, folder, name) for name, folder in _found(root, "rgbd_dataset_").items()}
+    return {name: partial(_read_tum, folder, name) for name, folder in _folders(root, "rgbd_dataset_").items()}
 
 
 def bonn(root: Path) -> dict[str, Opener]:
     """Find sequences of Bonn RGB-D Dynamic, named without "rgbd_bonn_".
 
-    The window is one of all pictures, as MonST3R takes it for depth; poses are given where every frame has one.
+    The window counts all pictures, as in MonST3R's evaluation of depth. Poses are missing unless every frame has one.
     """
-    return {name: partial(_read_bonn, folder, name) for name, folder in _found(root, "rgbd_bonn_").items()}
+    return {name: partial(_read_bonn, folder, name) for name, folder in _folders(root, "rgbd_bonn_").items()}
 
 
 def partners(first: Float[np.ndarray, " N"], second: Float[np.ndarray, " M"]) -> Int[np.ndarray, " N"]:
     """Return for each time of `first` the index of its partner in `second` by the benchmark's rule, or -1."""
-    found = np.full(len(first), -1)
-    pairs = associate(first, second, _APART)
-    found[pairs[:, 0]] = pairs[:, 1]
-    return found
+    indices = np.full(len(first), -1)
+    pairs = associate(first, second, _TOLERANCE)
+    indices[pairs[:, 0]] = pairs[:, 1]
+    return indices
 
 
-def _found(root: Path, prefix: str) -> dict[str, Path]:
+def _folders(root: Path, prefix: str) -> dict[str, Path]:
     folders = sequence_folders(
         root, lambda folder: (folder / "rgb.txt").is_file(), "rgb.txt, depth.txt, groundtruth.txt"
     )
@@ -98,12 +98,12 @@ def _read_tum(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     notes: tuple[str, ...] = ()
     candidates = np.arange(len(pictures.paths))
     if poses is None or (posed < 0).all():
-        notes += ("it has no groundtruth.txt" if poses is None else f"no frame has a pose within {_APART} s",)
+        notes += ("it has no groundtruth.txt" if poses is None else f"no frame has a pose within {_TOLERANCE} s",)
         poses = None
     elif (lost := np.flatnonzero(posed < 0)).size:
         candidates = np.flatnonzero(posed >= 0)
         notes += (
-            f"{len(lost)} of {len(posed)} frames have no pose within {_APART} s and are left out, "
+            f"{len(lost)} of {len(posed)} frames have no pose within {_TOLERANCE} s and are skipped, "
             f"{pictures.paths[lost[0]].stem} first",
         )
     chosen = frames.of(candidates.tolist(), name)
@@ -117,20 +117,20 @@ def _read_tum(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
 def _read_bonn(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     pictures = _listed(folder, "rgb.txt")
     chosen = frames.of(range(len(pictures.paths)), name)
-    notes = (*frames.shortage(len(pictures.paths)), "lens distortion is left as it is, the intrinsics do not have it")
+    notes = (*frames.shortage(len(pictures.paths)), DISTORTED)
     poses, posed = _poses(folder, pictures.times)
     if poses is None:
         notes += ("it has no groundtruth.txt",)
     elif lost := [frame for frame in chosen if posed[frame] < 0]:
         first = pictures.paths[lost[0]].stem
-        notes += (f"{len(lost)} of {len(chosen)} frames have no pose within {_APART} s, {first} first; no poses",)
+        notes += (f"{len(lost)} of {len(chosen)} frames have no pose within {_TOLERANCE} s, {first} first; no poses",)
         poses = None
     if poses is not None:
         left, _, right = np.linalg.svd(_MARKERS[:3, :3])
         markers = _MARKERS.copy()
         markers[:3, :3] = left @ right
         poses = _ROS @ poses[posed[chosen]] @ _ROS @ markers
-        notes += ("poses are those of the markers, taken to the camera with the data set's calibration",)
+        notes += ("poses are of the markers, moved to the camera by the data set's calibration",)
     intrinsics = intrinsics_matrix(*_BONN, first_pixel=0, source="Bonn")
     return _sequence(folder, name, pictures, chosen, poses, intrinsics, notes)
 
@@ -148,12 +148,12 @@ def _sequence(
     maps: list[Path | None] = [None] * len(taken)
     if (folder / "depth.txt").is_file():
         depths = _listed(folder, "depth.txt")
-        # Partners are found among all pictures: which frames are taken does not change whose a depth map is.
+        # Partners are sought among all pictures, so that a choice of frames does not change the owner of a depth map.
         owners = partners(pictures.times, depths.times)[chosen]
         maps = [depths.paths[owner] if owner >= 0 else None for owner in owners]
     for path in (*taken, *(path for path in maps if path is not None)):
         if not path.is_file():
-            raise InputError(f"{path} is not there, and {folder / 'rgb.txt'} or depth.txt names it; get it whole")
+            raise InputError(f"{path} is missing, but rgb.txt or depth.txt names it; get the sequence whole")
     depth, more = depth_reader(taken, maps, partial(read_png, per_metre=_PER_METRE))
     return LabelledSequence(
         name,
@@ -205,9 +205,7 @@ def _tum_intrinsics(folder: Path) -> tuple[Float64[np.ndarray, "3 3"] | None, tu
         fx, fy, cx, cy = rows[0].tolist()
         return intrinsics_matrix(fx, fy, cx, cy, first_pixel=0, source=path), ()
     if not (match := _CAMERA.search(folder.resolve().name.lower())):
-        return None, (
-            "which camera took it is not known; name the folder after it, or put fx fy cx cy in calibration.txt",
-        )
+        return None, ("its camera is unknown; name the folder after the camera, or put fx fy cx cy in calibration.txt",)
     camera = match[1]
     matrix = intrinsics_matrix(*_FREIBURG[camera], first_pixel=0, source=f"freiburg{camera}")
-    return matrix, ("lens distortion is left as it is, the intrinsics do not have it",) * (camera in _DISTORTED)
+    return matrix, (DISTORTED,) * (camera in _DISTORTED)
