@@ -1,4 +1,4 @@
-"""Learning how to fuse: a family of rules with the paper's as its default, soft masks, objectives and fits."""
+"""Learned fusion: a family of rules with the paper's rule as its default, soft masks, objectives and fits."""
 
 import lazy_loader
 

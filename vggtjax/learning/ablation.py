@@ -215,7 +215,7 @@ def table(scores: Sequence[RuleScore]) -> dict[str, dict[str, tuple[float, float
 
 
 def gains(scores: Sequence[RuleScore], against: str = PAPER) -> dict[str, dict[str, tuple[float, float, int]]]:
-    """Return every rule's metrics minus those of another rule: mean, standard deviation, number of lower seeds."""
+    """Return every rule's metrics minus those of another rule: mean, standard deviation, number of seeds below 0."""
     by_rule = _by_rule(scores)
     base = by_rule.pop(against)
     rows: dict[str, dict[str, tuple[float, float, int]]] = {}

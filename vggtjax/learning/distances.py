@@ -1,4 +1,4 @@
-"""Differentiable distances between what was found and what is true: camera poses and point clouds."""
+"""Differentiable distances between predictions and the truth: camera poses and point clouds."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _TINY = 1e-12
 
 
 class PoseError(NamedTuple):
-    """Of cameras relative to the first one."""
+    """Errors of cameras relative to the first camera."""
 
     rotation: Float[Array, ""]  # radians, root mean square over frames
     translation: Float[Array, ""]  # RMSE of the centres over the root mean square of the true ones, after one scale
@@ -23,9 +23,9 @@ class PoseError(NamedTuple):
 
 @full_precision
 def pose_error(found: Float[Array, "S 3 4"], truth: Float[Array, "S 3 4"]) -> PoseError:
-    """Return how far cameras (camera_from_world) are from the true ones, relative to the first frame of each.
+    """Return the errors of cameras (camera_from_world), each relative to the first frame; at least two frames.
 
-    Differentiable everywhere but at no error at all, where the slope is taken to be 0. Needs two frames at least.
+    Differentiable; the gradient at an error of 0 is 0.
     """
     rotations, centres = zip(*(_relative(poses) for poses in (found, truth)), strict=True)
     difference = jnp.einsum("sij,sik->sjk", rotations[0], rotations[1])
@@ -55,8 +55,8 @@ def point_cloud_distance(found: Float[Array, "N 3"], truth: Float[Array, "M 3"])
 def nearest_distance(points: Float[Array, "N 3"], others: Float[Array, "M 3"]) -> Float[Array, " N"]:
     """Return every point's distance to the nearest of the others, differentiable by both clouds.
 
-    Exact, by comparing all pairs, some hundred points at a time: memory grows with M. Which point is the nearest is a
-    decision without a gradient.
+    Exact: all pairs are compared, 64 points at a time, so memory grows with M. No gradient passes through the choice of
+    the nearest point.
     """
     fixed = jax.lax.stop_gradient(others)
 
@@ -68,7 +68,7 @@ def nearest_distance(points: Float[Array, "N 3"], others: Float[Array, "M 3"]) -
 
 
 def _relative(poses: Float[Array, "S 3 4"]) -> tuple[Float[Array, "S 3 3"], Float[Array, "S 3"]]:
-    """Return rotations relative to the first frame, and centres in its axes, counted from it."""
+    """Return rotations relative to the first frame, and centres relative to it in its axes."""
     rotation = poses[..., :3]
     centres = -jnp.einsum("sji,sj->si", rotation, poses[..., 3])
     return (

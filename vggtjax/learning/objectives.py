@@ -1,4 +1,4 @@
-"""What a fit minimises: likelihoods of true depth, and how frames of a clip agree where there is no truth."""
+"""Objectives of fits: likelihoods of true depth, and the agreement of frames where the truth is unknown."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from vggtjax.network.sampling import bilinear
 Likelihood = Literal["gaussian", "laplace"]
 _MOST = 80.0
 _FURTHEST = 1e12  # standard deviations
-_NEAREST = 1e-6  # depth that a logarithm is taken of
+_NEAREST = 1e-6  # least depth for a logarithm
 _TINY = 1e-12
 _LOG_2PI = 1.8378770664093453
 _LOG_2 = 0.6931471805599453
 
 
 class View(NamedTuple):
-    """Frames that look at the same world: their pictures and cameras, beside a fused depth of the same shape."""
+    """Frames of one scene: pictures and cameras, of the shape of a fused depth."""
 
     images: Float[Array, "S H W 3"]
     cameras: Cameras  # [S, 3, 4] and [S, 3, 3]
@@ -32,14 +32,14 @@ class View(NamedTuple):
 def negative_log_likelihood(
     fused: Fused, truth: Float[Array, "*F H W"], kind: Likelihood = "gaussian"
 ) -> Float[Array, ""]:
-    """Return the mean negative log likelihood of a clip's true depth, in nats a pixel.
+    """Return the mean negative log likelihood of a clip's true depth, in nats per pixel.
 
-    The truth is brought to the prediction's unit by the factor of greatest likelihood (a weighted mean of squares for
-    the Gaussian, a weighted median for the Laplace distribution, through which no gradient passes: there its own is 0).
+    The truth is scaled to the prediction's unit by the factor of greatest likelihood: a weighted mean of squares for
+    "gaussian", a weighted median for "laplace". No gradient passes through the median, whose own gradient is 0.
 
     Args:
         fused: depth and its precision, of one clip.
-        truth: depth; not above 0 or not finite where it is not known.
+        truth: depth; at most 0, or not finite, where it is unknown.
         kind: "gaussian", or "laplace" with the same variance.
     """
     known = (truth > 0) & jnp.isfinite(truth)
@@ -59,11 +59,11 @@ def negative_log_likelihood(
 def joint_negative_log_likelihood(
     params: FusionParams, seen: Observations, truth: Float[Array, "*F H W"]
 ) -> Float[Array, ""]:
-    """Return the mean negative log likelihood of both passes' errors, jointly normal, in nats a pixel.
+    """Return the mean negative log likelihood of both passes' errors, jointly normal, in nats per pixel.
 
-    It is what measures their correlation: the likelihood of what is fused sees it through the fused precision alone.
-    Where the mask says that something moves, pass 1 stands alone. Soft masks and robust parts (inflation, distrust) do
-    not enter. Arguments as for `fuse` and `negative_log_likelihood`, whose alignment it has.
+    This objective measures the correlation of the errors; the likelihood of the fused depth depends on the correlation
+    through the fused precision alone. On dynamic pixels only pass 1 counts. Soft masks and robust parts (inflation,
+    distrust) do not enter. Arguments as for `fuse`, alignment as for `negative_log_likelihood`.
     """
     known = (truth > 0) & jnp.isfinite(truth)
     truth = jnp.where(known, truth, 1)
@@ -77,8 +77,8 @@ def joint_negative_log_likelihood(
     first, second = (jnp.clip(x, -_FURTHEST, _FURTHEST) for x in (first, second))
     left = 1 - rho * rho
     alone = (_LOG_2PI - claims[0] + first * first) / 2
-    given = second - rho * first  # of pass 2 once pass 1 is known, with variance 1 - rho^2
-    other = (_LOG_2PI - claims[1] + jnp.log(left) + given * given / left) / 2
+    residual = second - rho * first  # of pass 2 conditional on pass 1, with variance 1 - rho^2
+    other = (_LOG_2PI - claims[1] + jnp.log(left) + residual * residual / left) / 2
     loss = alone + (1 - seen.dynamic) * other
     return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1)
 
@@ -86,7 +86,7 @@ def joint_negative_log_likelihood(
 def unit_factor(
     fused: Fused, truth: Float[Array, "*F H W"], known: Bool[Array, "*F H W"], kind: Likelihood = "gaussian"
 ) -> Float[Array, ""]:
-    """Return the factor that takes true depth to the unit of a prediction: that of greatest likelihood."""
+    """Return the factor of greatest likelihood from true depth to the unit of a prediction."""
     top = jax.lax.stop_gradient(jnp.where(known, fused.log_precision, -jnp.inf).max())
     top = jnp.where(jnp.isfinite(top), top, 0)  # of a clip without truth
     weight = jnp.where(known, jnp.exp(jnp.where(known, fused.log_precision, top) - top), 0)  # the largest is 1
@@ -100,17 +100,17 @@ def unit_factor(
 
 @full_precision
 def photometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
-    """Return how much pictures differ when each is looked up where the fused depth of another puts its pixels.
+    """Return the difference of pictures after reprojection by the fused depth.
 
-    Mean absolute difference of the colours (in [0, 1]) between frames `step` apart, both ways, over what does not move
-    and is seen by both.
+    Mean absolute difference of the colours (in [0, 1]) between frames `step` apart, in both directions, over static
+    pixels that both frames see.
     """
 
     def pair(depth, static, image, other, here, there):
-        place, z = _reproject(depth, here, there)
-        seen, inside = _sample(other, place)
+        position, z = _reproject(depth, here, there)
+        colour, inside = _sample(other, position)
         weight = static * inside * (z > 0)
-        difference = jnp.abs(image - seen).mean(axis=-1)
+        difference = jnp.abs(image - colour).mean(axis=-1)
         return jnp.sum(weight * difference), jnp.sum(weight)
 
     return _over_pairs(pair, fused, view, step)
@@ -118,22 +118,22 @@ def photometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""
 
 @full_precision
 def geometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
-    """Return how unlikely the depths of frames find each other: a fit of precision without any truth.
+    """Return the negative log likelihood of the depths of frames given each other, for fits without any truth.
 
-    The logarithm of the depth of a frame's pixels in another frame's camera, minus that of the other frame's own depth
-    there, has the relative variance of both; the mean of its negative log likelihood (Laplace) is over what does not
-    move, is seen by both, and is not far behind what the other frame sees. The unit of depth does not matter. Errors
-    that all frames share are not noticed.
+    The logarithm of the depth of a frame's pixels in the camera of another frame, minus that of the other frame's depth
+    there, has the relative variance of both depths. The mean of its negative log likelihood (Laplace) is over static
+    pixels that both frames see and that are not far behind the depth of the other frame. The unit of depth has no
+    effect, nor have errors that all frames share.
     """
 
     def pair(depth, static, image, other, here, there):
         del image
-        place, z = _reproject(depth[..., 0], here, there)
-        seen, inside = _sample(other, place)
-        valid = inside & (z > _NEAREST) & (seen[..., 0] > _NEAREST) & (z < 1.2 * seen[..., 0])
+        position, z = _reproject(depth[..., 0], here, there)
+        sampled, inside = _sample(other, position)
+        valid = inside & (z > _NEAREST) & (sampled[..., 0] > _NEAREST) & (z < 1.2 * sampled[..., 0])
         weight = static * valid
-        logs = [jnp.log(jnp.where(valid, value, 1)) for value in (z, seen[..., 0])]
-        log_variance = jnp.logaddexp(-depth[..., 1] - 2 * logs[0], -seen[..., 1] - 2 * logs[1])
+        logs = [jnp.log(jnp.where(valid, value, 1)) for value in (z, sampled[..., 0])]
+        log_variance = jnp.logaddexp(-depth[..., 1] - 2 * logs[0], -sampled[..., 1] - 2 * logs[1])
         log_width = (log_variance - _LOG_2) / 2
         size = jnp.log(jnp.abs(logs[0] - logs[1]) + _TINY)
         loss = _LOG_2 + log_width + jnp.exp(jnp.minimum(size - log_width, _MOST))
@@ -163,7 +163,7 @@ def _over_pairs(pair, fused: Fused, view: View, step: int, depth: Array | None =
 def _reproject(
     depth: Float[Array, "H W"], here: Cameras, there: Cameras
 ) -> tuple[Float[Array, "H W 2"], Float[Array, "H W"]]:
-    """Return where another camera sees a frame's pixels (x, y in pixels), and their depth in it."""
+    """Return the positions (x, y in pixels) and depths of a frame's pixels in another camera."""
     points = unproject(depth, here.intrinsics, here.camera_from_world, pixel_offset=0.5)
     pose, K = there
     moved = points @ pose[:, :3].T + pose[:, 3][None, None]
@@ -173,11 +173,11 @@ def _reproject(
 
 
 def _sample(
-    maps: Float[Array, "H W C"], place: Float[Array, "H W 2"]
+    maps: Float[Array, "H W C"], position: Float[Array, "H W 2"]
 ) -> tuple[Float[Array, "H W C"], Bool[Array, "H W"]]:
-    """Return maps at places (bilinear, differentiable by both), and which places lie between pixel centres."""
+    """Return maps at positions, and which positions lie between pixel centres; differentiable by both arguments."""
     H, W = maps.shape[:2]
-    place = jnp.where(jnp.isfinite(place), place, -1) - 0.5
-    x, y = place[..., 0], place[..., 1]
+    position = jnp.where(jnp.isfinite(position), position, -1) - 0.5
+    x, y = position[..., 0], position[..., 1]
     inside = (x >= 0) & (x <= W - 1) & (y >= 0) & (y <= H - 1)
-    return bilinear(maps, jnp.where(inside[..., None], place, 0)), inside
+    return bilinear(maps, jnp.where(inside[..., None], position, 0)), inside

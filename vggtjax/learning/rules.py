@@ -1,4 +1,4 @@
-"""The fusion rules of `vggtjax.method`, handed on: what is fitted here is applied there."""
+"""The fusion rules of `vggtjax.method` as names of this package."""
 
 from vggtjax.method.fusion_file import load_fusion as load_fusion
 from vggtjax.method.fusion_file import save_fusion as save_fusion

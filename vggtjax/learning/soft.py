@@ -1,4 +1,4 @@
-"""The whole method with soft decisions, so that gradients flow from depth, cameras and points back to all its knobs."""
+"""The whole method with soft masks: gradients of depth, cameras and points by all parameters of the method."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from vggtjax.network.suppression import Suppression
 
 
 class SoftMasking(NamedTuple):
-    """What decides on masks: all of it can be differentiated. `soft_masking` gives the paper's values."""
+    """Differentiable parameters of the masks; `soft_masking` returns the paper's values."""
 
     offset: Float[Array, ""]  # added to Otsu's threshold tau of the saliency
     temperature: Float[Array, ""]  # T of sigmoid((saliency - tau) / T); 0 for the hard mask
@@ -33,20 +33,20 @@ class SoftMasking(NamedTuple):
 
 
 class SoftReconstruction(NamedTuple):
-    """What the method makes of clips, softly."""
+    """The results of the method with soft masks."""
 
     depth: Float[Array, "B S H W"]
     log_precision: Float[Array, "B S H W"]
     cameras: Cameras
     points: Float[Array, "B S H W 3"]  # in the world, of pixel centres
-    dynamic: Float[Array, "B S H W"]  # share of each pixel that moves
+    dynamic: Float[Array, "B S H W"]  # dynamic share of each pixel
     passes: Passes
 
 
 def soft_masking(
     config: VGGTConfig, *, temperature: float = 0.0, mask_pairs: int = 5, motion: MotionConfig | None = None
 ) -> SoftMasking:
-    """Return what the paper decides: Otsu's threshold, suppression in the first pairs, the plain product of cues."""
+    """Return the paper's values: Otsu's threshold, suppression in the first pairs, the plain product of cues."""
     return SoftMasking(
         jnp.zeros(()),
         jnp.asarray(temperature, float),
@@ -69,19 +69,19 @@ def reconstruct_softly(
     compute_dtype: str = "float32",
     remat: bool = False,
 ) -> SoftReconstruction:
-    """Run 4dvggt-d with soft masks and a rule of fusion: at temperature 0 and the paper's rule, the method itself.
+    """Run 4dvggt-d with soft masks and a fusion rule; temperature 0 and the paper's rule give the method itself.
 
     Pure: jit with `config`, `gram`, `motion` and the options static. Gradients flow to the masking, the fusion, the
-    images and the network's parameters; what is not asked for costs nothing: the gradient by `fusion` alone never goes
-    back through the network.
+    images and the network's parameters. Gradients that are not requested are not computed: the gradient by `fusion`
+    alone never goes back through the network.
 
     Args:
         params: the model's parameter tree.
         images: RGB in [0, 1].
         config: the model's configuration.
         masking: see `soft_masking`.
-        fusion: a tree of the family; the paper's rule if None. Its own offset and temperature apply on top: they blend,
-            those of the masking suppress.
+        fusion: a tree of the family; the paper's rule if None. Its offset and temperature blend the depths of the
+            passes; those of the masking suppress keys.
         gram, motion, compute_dtype: as for `run_passes`.
         stop_camera_gradient, remat: as for `forward`.
     """
@@ -103,7 +103,7 @@ def reconstruct_softly(
 def soft_pixels(
     saliency: Float[Array, "B S h w"], size: tuple[int, int], masking: SoftMasking
 ) -> Float[Array, "B S H W"]:
-    """Return the share of every pixel that moves; none of a clip of constant saliency."""
+    """Return the dynamic share of every pixel; 0 in a clip of constant saliency."""
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Float[Array, "S H W"]:
         varies = pixels.max() - pixels.min() >= CONSTANT
