@@ -10,8 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Float64
 
-from vggtjax.clips.truth import Truth
-from vggtjax.evaluation.blind import (
+from benchmarks.blind import (
     best_angular_velocity,
     line_centre_error,
     mean_angular_velocity,
@@ -19,6 +18,7 @@ from vggtjax.evaluation.blind import (
     still_centre_error,
     turning,
 )
+from vggtjax.clips.truth import Truth
 from vggtjax.evaluation.ladder import LadderRow
 from vggtjax.evaluation.metrics.depth import depth_errors, mean_depth_map
 from vggtjax.evaluation.metrics.trajectory import rotation_error

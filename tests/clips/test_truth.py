@@ -85,7 +85,6 @@ def test_truth_gets_a_batch_axis_and_is_checked():
 def test_metrics_do_not_import_jax():
     names = (
         "evaluation.metrics.trajectory",
-        "evaluation.blind",
         "evaluation.metrics.depth",
         "evaluation.metrics.masks",
     )

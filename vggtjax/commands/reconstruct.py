@@ -23,28 +23,35 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Masks:
-    """What moves, if you know it. Raises InputError where both options are given."""
+class Known:
+    """What you know of the clip. Raises InputError for options that exclude each other."""
 
     masks: Path | None = None
     """folder of pictures, bright where something moves, one per frame; mined from the clip by default"""
     no_masks: tyro.conf.FlagCreatePairsOff[bool] = False
     """nothing moves: one pass is enough"""
+    tracks: str | None = None
+    """points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and, optionally,
+    frame, in pixels of the source"""
 
     def __post_init__(self) -> None:
         if self.masks is not None and self.no_masks:
             raise InputError("--masks and --no-masks are opposites; give one of them")
 
     def check(self, options: Options) -> None:
-        """Raise InputError for a missing folder, or for options that need mined masks."""
+        """Raise InputError for missing files, or for options that need mined masks."""
         if options.smooth_frames != 1 and (self.masks is not None or self.no_masks):
             raise InputError("--smooth-frames is for mined masks; leave it out with --masks and --no-masks")
         if self.masks is not None:
             from vggtjax.clips.sources import open_source
 
             open_source(str(self.masks))
+        if self.tracks is not None:
+            from vggtjax.clips.queries import check_words
 
-    def of(self, clip: Clip) -> np.ndarray | None:
+            check_words(self.tracks)
+
+    def masks_of(self, clip: Clip) -> np.ndarray | None:
         """Return the masks at the clip's frames, or None where they are mined."""
         import numpy as np
 
@@ -62,12 +69,11 @@ def reconstruct(
     *,
     model: str | None = None,
     config: Path | None = None,
-    tracks: str | None = None,
     fusion: Path | None = None,
     sampling: Sampling = Sampling(),
     framing: Framing = Framing(),
     options: Options = Options(),
-    masks: Masks = Masks(),
+    known: Known = Known(),
     saving: Saving = Saving(),
 ) -> None:
     """Cameras, depth, dynamic masks and a 4-D point cloud of a clip.
@@ -78,13 +84,11 @@ def reconstruct(
         model: a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or "demo", the small
             demonstration model, which is not for real footage.
         config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
-        tracks: points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and,
-            optionally, frame, in pixels of the source.
         fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default.
         sampling: frames
         framing: size
         options: method
-        masks: masks
+        known: masks, points
         saving: output
     """
     if not source:
@@ -95,12 +99,8 @@ def reconstruct(
         from vggtjax.clips.sources import open_source
 
         opened = open_source(frames)  # before the model is loaded, which takes longer
-        masks.check(options)
+        known.check(options)
         check_output(out)
-        if tracks is not None:
-            from vggtjax.clips.queries import check_words
-
-            check_words(tracks)
         fitted = FittedFusion(fusion, [options.method])
         network = load(report, model, config)
         fitted.warn(network, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
@@ -110,8 +110,8 @@ def reconstruct(
 
             fitter = framing.fitter(size=network.config.image_size, patch=network.config.patch_size)
             clip = read_clip(opened, sampling, fitter, progress)
-            given = masks.of(clip)
-            queries = None if tracks is None else parse_queries(tracks, clip)
+            masks = known.masks_of(clip)
+            queries = None if known.tracks is None else parse_queries(known.tracks, clip)
         from vggtjax.pipeline.run import reconstruct as run
 
         result = run(
@@ -119,7 +119,7 @@ def reconstruct(
             clip,
             options=options,
             size=fitter.size,
-            masks=given,
+            masks=masks,
             tracks=queries,
             fusion=fitted.params,
             on_stage=report.stage,
@@ -128,7 +128,7 @@ def reconstruct(
             pictures = clip.pictures() if saving.resolution == "original" else None
             result.save(out, saving=saving, pictures=pictures, progress=progress)
     report.summary(result, out, network)
-    if tracks is not None and network.note:
+    if known.tracks is not None and network.note:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")
 
 

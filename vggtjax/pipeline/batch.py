@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import shutil
 from collections import deque
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Unpack
@@ -19,7 +16,7 @@ from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.preprocessing import Fitter, Framing, FramingChanges
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
-from vggtjax.errors import InputError, OutputError, VggtjaxError
+from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.options import OptionChanges, Options
@@ -168,8 +165,11 @@ class _Run:
 
     def write(self, name: str, clip: Clip, result: Reconstruction, folder: Path) -> ClipOutcome:
         pictures = clip.pictures() if self.saving.resolution == "original" else None
-        with _arriving(folder) as arriving:
-            result.save(arriving, saving=self.saving, pictures=pictures)
+        if folder.exists():
+            result.save(folder, saving=self.saving, pictures=pictures)
+        else:
+            with writing(folder) as temporary:  # the folder appears whole or not at all
+                result.save(temporary, saving=self.saving, pictures=pictures)
         return ClipOutcome(name, "done", frames=len(clip))
 
 
@@ -242,27 +242,6 @@ def _length(source: ClipSource, sampling: Sampling) -> int | None:
         return open_source(source).total(sampling)
     except VggtjaxError:
         return 0
-
-
-@contextmanager
-def _arriving(folder: Path) -> Iterator[Path]:
-    """Yield a new folder that is renamed to `folder` at the end; `folder` itself if it exists.
-
-    The remains of a killed run are removed first. Raises OutputError if the new folder cannot be renamed.
-    """
-    if os.path.lexists(folder):
-        yield folder
-        return
-    part = folder.with_name(f".{folder.name}.partial")
-    try:
-        shutil.rmtree(part, ignore_errors=True)
-        yield part
-        try:
-            part.rename(folder)
-        except OSError as error:
-            raise OutputError(f"cannot write {folder}: {error.strerror}") from error
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
 
 
 def _written(name: str, write: Future[ClipOutcome]) -> ClipOutcome:

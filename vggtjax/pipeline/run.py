@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from functools import partial
@@ -33,8 +32,6 @@ from vggtjax.options import OptionChanges, Options
 from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress
 from vggtjax.results.reconstruction import Reconstruction
-
-logger = logging.getLogger(__name__)
 
 
 def infer(
@@ -140,19 +137,13 @@ def reconstruct(
     passes = jax.tree.map(lambda x: np.asarray(x)[:, : len(clip)], passes)
     result = Reconstruction(
         **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
+        **_clip_fields(clip),
+        **({} if tracks is None else _track_fields(tracks, by_frame, len(clip))),
         saliency=passes.saliency[0],
         dynamic_mask=passes.dynamic_mask[0],
-        images=np.round(clip.images * 255).astype(np.uint8),
-        frame_names=tuple(clip.frame_names),
-        timestamps=clip.timestamps,
         method=options.method,
         model_name=model.name,
         settings=_settings(model, clip, options, masks is not None, fusion),
-        source_size=clip.source_size,
-        source_scale=clip.source_scale,
-        source_offset=clip.source_offset,
-        valid_box=clip.valid_box,
-        **({} if tracks is None else _track_fields(tracks, by_frame, len(clip))),
         passes=passes if keep_passes else None,
     )
     if options.refine_mask:
@@ -255,6 +246,14 @@ def _fitted(
 def _stages(model: Model, options: Options, shape: tuple[int, ...]) -> Stages:
     frames, height, width = shape
     return Stages(model.config, options, frames, (height, width))
+
+
+def _clip_fields(clip: Clip) -> dict[str, Any]:
+    """Return the fields of a Reconstruction that the clip gives."""
+    names = ("timestamps", "source_size", "source_scale", "source_offset", "valid_box")
+    fields = {name: getattr(clip, name) for name in names}
+    images = np.round(clip.images * 255).astype(np.uint8)
+    return {**fields, "images": images, "frame_names": tuple(clip.frame_names)}
 
 
 def _settings(

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from vggtjax.errors import InputError
-from vggtjax.evaluation.blind import (
+from benchmarks.blind import (
     best_angular_velocity,
     line_centre_error,
     mean_angular_velocity,
@@ -16,6 +15,7 @@ from vggtjax.evaluation.blind import (
     still_centre_error,
     turning,
 )
+from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.trajectory import (
     Similarity,
     align,
