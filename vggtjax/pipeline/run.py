@@ -92,12 +92,11 @@ def reconstruct(
         size: side in pixels to run at, a multiple of the patch size; the model's own if None.
         masks: what moves, instead of the mined masks: boolean at the size of the clip's frames or of the source's
             pictures, or a folder of pictures. If no pixel moves, the second pass is not run.
-        tracks: points to follow, in pixels of the clip's frames. Points of the first frame are tracked by the first
-            pass; each other frame with points costs a pass over the clip, rolled so that this frame comes first.
+        tracks: points to follow, in pixels of the clip's frames. Each frame with points, except the first, costs a pass.
         fusion: how the two passes are fused, as `load_fusion` returns it; the paper's rule if None. The confidence is
             then the fused precision.
-        pad_frames: pad the clip to one of a few lengths (`padded_frames`), so that clips of similar length share
-            compiled programs; the result is the same to rounding. Not for clips with tracks.
+        pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs; the
+            result is the same to rounding. Not for clips with tracks.
         keep_passes: keep both passes on the result, as `.passes`.
         on_stage: called with the name of each stage, returns a context in which the stage runs.
         changes: fields of `options` by name, such as `method="vggt4d"`.
@@ -251,7 +250,7 @@ def _stages(model: Model, options: Options, shape: tuple[int, ...]) -> Stages:
 def _clip_fields(clip: Clip) -> dict[str, Any]:
     """Return the fields of a Reconstruction that the clip gives."""
     names = ("timestamps", "source_size", "source_scale", "source_offset", "valid_box")
-    fields = {name: getattr(clip, name) for name in names}
+    fields: dict[str, Any] = {name: getattr(clip, name) for name in names}
     images = np.round(clip.images * 255).astype(np.uint8)
     return {**fields, "images": images, "frame_names": tuple(clip.frame_names)}
 
