@@ -92,9 +92,8 @@ def reconstruct(
         size: side in pixels to run at, a multiple of the patch size; the model's own if None.
         masks: what moves, instead of the mined masks: boolean at the size of the clip's frames or of the source's
             pictures, or a folder of pictures. If no pixel moves, the second pass is not run.
-        tracks: points to follow, in pixels of the clip's frames. Each frame with points, except the first, costs a pass.
-        fusion: how the two passes are fused, as `load_fusion` returns it; the paper's rule if None. The confidence is
-            then the fused precision.
+        tracks: points to follow, in pixels of the frames; each frame with points, except the first, costs a pass.
+        fusion: a fitted rule (`load_fusion`), whose confidence is the fused precision; None: the paper's rule.
         pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs; the
             result is the same to rounding. Not for clips with tracks.
         keep_passes: keep both passes on the result, as `.passes`.
@@ -134,10 +133,10 @@ def reconstruct(
             run(dataclasses.replace(stages, run=Compile()))
         passes, assembly, by_frame = run(dataclasses.replace(stages, run=Execute(on_stage)))
     passes = jax.tree.map(lambda x: np.asarray(x)[:, : len(clip)], passes)
+    fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, len(clip)))
     result = Reconstruction(
         **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
-        **_clip_fields(clip),
-        **({} if tracks is None else _track_fields(tracks, by_frame, len(clip))),
+        **fields,
         saliency=passes.saliency[0],
         dynamic_mask=passes.dynamic_mask[0],
         method=options.method,
@@ -193,7 +192,7 @@ def compile_ahead(
     return compiler.memory
 
 
-def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, np.ndarray]:
+def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:
     """Return a method's depth, confidence and cameras of the first clip; the pass `source` gave the intrinsics."""
     depth, confidence, camera_from_world, intrinsics = (np.array(x)[0] for x in jax.tree.leaves(assembly))
     fields_of_view = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
