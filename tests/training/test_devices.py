@@ -21,8 +21,8 @@ def test_one_device():
     assert len(where.whole.device_set) == 1
 
 
-def test_as_many_devices_as_divide_every_batch():
-    """The recipe's stages have batches of 2 and 1: one device. With batches of 4 and 2, two of three."""
+def test_the_most_devices_that_divide_every_batch():
+    """The phases have batches of 2 and 1: one device. With batches of 4 and 2, two of three."""
     code = CODE.replace("placement(RECIPE)", "placement(dataclasses.replace(RECIPE, stages=STAGES))")
     stages = "import dataclasses\nSTAGES = tuple(dataclasses.replace(s, batch=2 * s.batch) for s in RECIPE.stages)\n"
     code = code.replace("where =", stages + "where =", 1)
@@ -37,6 +37,6 @@ def test_as_many_devices_as_divide_every_batch():
     assert made.stdout.split("\n")[0] == "2 (2, 3)"
 
 
-def test_every_stage_counts():
+def test_every_phase_counts():
     alone = dataclasses.replace(RECIPE, stages=RECIPE.stages[:1])
     assert placement(alone).whole.mesh.axis_names == ("clips",)

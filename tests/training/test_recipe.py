@@ -12,7 +12,7 @@ from vggtjax.errors import InputError
 from vggtjax.training.objective import LossWeights
 from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe, read_recipe
 
-STAGE = {"steps": 5, "batch": 2, "frames": [2, 4], "height": 28, "width": 42}
+PHASE = {"steps": 5, "batch": 2, "frames": [2, 4], "height": 28, "width": 42}
 
 
 def changed(**values) -> str:
@@ -28,15 +28,15 @@ def test_json_round_trip():
     assert isinstance(again.stages[0].frames, tuple)
 
 
-def test_only_name_and_stages_are_needed():
-    values = {"name": "short", "stages": [STAGE], "optimiser": {"warmup_steps": 1, "decay_steps": 2}}
+def test_only_name_and_stages_are_required():
+    values = {"name": "short", "stages": [PHASE], "optimiser": {"warmup_steps": 1, "decay_steps": 2}}
     recipe = Recipe.from_json(json.dumps(values))
     assert recipe.model == VGGTConfig()
     assert recipe.stages == (Phase(5, 2, (2, 4), 28, 42),)
     assert recipe.optimiser == OptimiserConfig(warmup_steps=1, decay_steps=2)
 
 
-def test_stages_follow_each_other():
+def test_phases_follow_each_other():
     assert RECIPE.total_steps == 6
     assert [RECIPE.phase_at(step)[0] for step in range(8)] == [0, 0, 0, 0, 1, 1, 1, 1]
     assert RECIPE.phase_at(4)[1] is RECIPE.stages[1]
@@ -77,22 +77,22 @@ def test_whole_numbers_become_floats():
         (changed(optimiser={"kind": []}), r"optimiser.kind is \[\]; expected one of"),
         (changed(seed=2**40), "recipe: seed is 1099511627776; expected a whole number of at least 0 and less than"),
         (changed(stages=3), "recipe: stages is 3; expected a list"),
-        (changed(stages=[STAGE | {"speed": 2}]), r"stages\[0\] has unknown fields \['speed'\]"),
-        (changed(stages=[STAGE | {"steps": 0}]), r"stages\[0\].steps is 0; expected a whole number of at least 1"),
-        (changed(stages=[STAGE | {"steps": 2.5}]), r"stages\[0\].steps is 2.5; expected a whole number"),
-        (changed(stages=[STAGE | {"steps": True}]), r"stages\[0\].steps is True; expected a whole number"),
-        (changed(stages=[STAGE | {"batch": "2"}]), r"stages\[0\].batch is '2'; expected a whole number"),
-        (changed(stages=[STAGE | {"frames": []}]), r"stages\[0\].frames is \[\]; expected a list of at least 1"),
+        (changed(stages=[PHASE | {"speed": 2}]), r"stages\[0\] has unknown fields \['speed'\]"),
+        (changed(stages=[PHASE | {"steps": 0}]), r"stages\[0\].steps is 0; expected a whole number of at least 1"),
+        (changed(stages=[PHASE | {"steps": 2.5}]), r"stages\[0\].steps is 2.5; expected a whole number"),
+        (changed(stages=[PHASE | {"steps": True}]), r"stages\[0\].steps is True; expected a whole number"),
+        (changed(stages=[PHASE | {"batch": "2"}]), r"stages\[0\].batch is '2'; expected a whole number"),
+        (changed(stages=[PHASE | {"frames": []}]), r"stages\[0\].frames is \[\]; expected a list of at least 1"),
         (
-            changed(stages=[STAGE | {"frames": [2, -1]}]),
+            changed(stages=[PHASE | {"frames": [2, -1]}]),
             r"stages\[0\]: frames is -1; expected a whole number",
         ),
-        (changed(stages=[STAGE | {"frames": 2}]), r"stages\[0\].frames is 2; expected a list"),
+        (changed(stages=[PHASE | {"frames": 2}]), r"stages\[0\].frames is 2; expected a list"),
         (
-            changed(stages=[STAGE | {"dynamic": 1.5}]),
+            changed(stages=[PHASE | {"dynamic": 1.5}]),
             r"stages\[0\]: dynamic is 1.5; expected a number",
         ),
-        (changed(stages=[STAGE | {"height": 30}]), "multiples of the model's patch_size 14"),
+        (changed(stages=[PHASE | {"height": 30}]), "multiples of the model's patch_size 14"),
         (changed(optimiser={"learning_rate": 0}), "optimiser.learning_rate is 0; expected a number of more than 0"),
         (changed(optimiser={"learning_rate": float("nan")}), "is not JSON"),
         (changed(optimiser={"learning_rate": 10**400}), "optimiser.learning_rate is a number of more than 64 bits"),

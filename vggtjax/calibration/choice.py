@@ -91,7 +91,7 @@ def choose(
             for inverted in (False, True):
                 candidate = dataclasses.replace(cue, inverted=inverted)
                 value = _product_auc(product * _term(calibration, gram, candidate), calibration.truth)
-                if value > best and cue.name not in [taken.name for taken in chosen]:
+                if value > best and cue.name not in [other.name for other in chosen]:
                     best_cue, best = candidate, value
             if progress is not None:
                 progress(len(steps) * len(pool) + tried, max_terms * len(pool))

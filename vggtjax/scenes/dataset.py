@@ -140,9 +140,9 @@ def _check(config: SceneConfig, count: int, kind: str, split: str, seed: int) ->
 def _check_folder(out: Path, index: dict[str, Any]) -> None:
     """Raise unless `out` holds no scenes, or scenes of the same settings."""
     if not os.path.lexists(out / INDEX):
-        taken = [*out.glob(PREVIEW), *out.glob("scene_*")]
-        if taken:
-            raise OutputError(f"{taken[0]} exists without {INDEX} beside it; choose another folder or move it away")
+        leftovers = [*out.glob(PREVIEW), *out.glob("scene_*")]
+        if leftovers:
+            raise OutputError(f"{leftovers[0]} exists without {INDEX} beside it; choose another folder or move it away")
         return
     existing = read_index(out)
     other = [name for name in ("kind", "split", "seed", "config") if existing.get(name) != index[name]]

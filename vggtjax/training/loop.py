@@ -31,7 +31,7 @@ from vggtjax.training.run import Run
 from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient
 
 _AHEAD = 2  # steps that the host may prepare while the device computes
-_TIMED = 2  # steps of each interval in which rendering is timed by itself
+_TIMED = 2  # steps of each interval in which rendering is timed separately
 
 # Apart, so that the optimiser, whose shapes are always the same, is compiled once and not for every size of batch.
 _loss_and_gradient = jax.jit(loss_and_gradient, static_argnums=(2, 3))
