@@ -16,7 +16,7 @@ from vggtjax.evaluation.foreign_frames import placed
 from vggtjax.evaluation.records import shown_name
 from vggtjax.options import Options
 from vggtjax.progress import OnStage
-from vggtjax.results.foreign import check_quaternion
+from vggtjax.results.foreign import check_format
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.trajectories import Quaternion
 
@@ -136,7 +136,7 @@ class FolderSource:
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_quaternion(self.format, self.quaternion)
+        check_format(self.format, self.quaternion)
         if wrong := [name for name in self.folders if shown_name(name) != name]:
             raise InputError(f"results cannot be named {shown_name(wrong[0])}; expected a short printable name")
 

@@ -103,14 +103,9 @@ def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict
 
 
 def check_format(format: str, quaternion: str | None) -> None:
-    """Raise InputError for an unknown format, or an order of quaternions that is unknown, missing or not wanted."""
-    if format not in FORMATS:
+    """Raise InputError for an unknown format, or an order of quaternions that is missing, unknown or not wanted."""
+    if format not in ("vggtjax", *FORMATS):
         raise InputError(f"format is {format!r}; expected one of vggtjax, {', '.join(FORMATS)}")
-    check_quaternion(format, quaternion)
-
-
-def check_quaternion(format: str, quaternion: str | None) -> None:
-    """Raise InputError for an order of quaternions that is missing, unknown, or given for a format with matrices."""
     if quaternion is None and format in _WITH_TRAJECTORY:
         raise InputError(
             f"pred_traj.txt of {format} does not say the order of its quaternions; give quaternion='wxyz' (as VGGT4D, "
