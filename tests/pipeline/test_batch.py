@@ -271,7 +271,7 @@ def test_what_is_wrong_for_all_clips_is_said_once(model, clips, tmp_path, wrong,
 
 
 def test_what_is_no_clip(clips, tmp_path):
-    with pytest.raises(ClipError, match="is no clip and holds none"):
+    with pytest.raises(ClipError, match="is not a clip and holds no clips"):
         clips_by_name([str(tmp_path)])
     with pytest.raises(ClipError, match="two clips are named clip0"):
         clips_by_name([str(clips), str(clips / "clip0")])

@@ -1,4 +1,4 @@
-"""Frames that are arrays in memory, and values of any depth as 8 bits. Does not import jax."""
+"""Frames in memory as arrays, and values of 8, 16 or 32 bits as 8 bits. Does not import jax."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class ArrayFrames:
 
 
 def frame_name(index: int) -> str:
-    """Return the name of a frame that has none of its own: its index in the source."""
+    """Return the name of a frame without a file name: its index in the source."""
     return f"{index:06d}"
 
 

@@ -15,22 +15,13 @@ from vggtjax.clips.arrays import eight_bit
 from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.errors import ClipError
 
-# Formats of still pictures only: Pillow also knows some that start other programs (EPS) or are no pictures.
+# Formats of still pictures only: for others (EPS) Pillow starts another program.
 FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP", "PPM", "WEBP", "TGA", "JPEG2000", "AVIF", "HEIF")
 
 # What Pillow's decoders raise on broken files; its size limit is DecompressionBombError.
 UNREADABLE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    IndexError,
-    KeyError,
-    RuntimeError,
-    EOFError,
-    OverflowError,
-    struct.error,
-    Image.DecompressionBombError,
+    *(OSError, SyntaxError, ValueError, TypeError, IndexError, KeyError, RuntimeError, EOFError, OverflowError),
+    *(struct.error, Image.DecompressionBombError),
 )
 
 
@@ -63,7 +54,7 @@ def read_image(path: Path) -> Image.Image:
     8 bits and floating-point values must lie in [0, 1].
 
     Raises:
-        ClipError: the file is missing, is not an image, is truncated or corrupt, or is absurdly large.
+        ClipError: the file is missing, is not an image, is truncated or corrupt, or has more pixels than Pillow's limit.
     """
     try:
         with Image.open(path, formats=known_formats()) as image:
@@ -80,7 +71,7 @@ def read_image(path: Path) -> Image.Image:
 
 
 def to_rgb(image: Image.Image, name: str) -> Image.Image:
-    """Return an image of any mode as RGB, as `read_image` says; `name` is for the error."""
+    """Return an image of any mode as RGB, as `read_image` does; errors say `name`."""
     if image.mode == "I" or image.mode == "F" or image.mode.startswith("I;16"):
         values = np.asarray(image)
         if image.mode == "I":  # 32 bits that hold 16
@@ -96,7 +87,7 @@ def to_rgb(image: Image.Image, name: str) -> Image.Image:
 
 @functools.cache
 def known_formats() -> tuple[str, ...]:
-    """Return those of FORMATS that this Pillow can read: what files of strangers may be opened as."""
+    """Return the FORMATS that this Pillow can read; files of strangers are opened as no other format."""
     Image.init()
     return tuple(name for name in FORMATS if name in Image.OPEN)
 

@@ -1,4 +1,4 @@
-"""Masks that a user brings, as the clip's frames see them. Does not import jax."""
+"""Given masks, at the pixels of the clip's frames. Does not import jax."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
     takes the value at the place in the source that its centre shows, and padding is static.
 
     Args:
-        folder: a picture per frame. Names decide which is whose (`frame_3.png` for `frame_3.jpg`); where no name is
-            that of a frame, there must be as many as frames, in the same order.
+        folder: a picture per frame, matched by name (`frame_3.png` for `frame_3.jpg`). If no picture is named like a
+            frame, there must be as many pictures as frames, in the same order.
         clip: what `load_clip` returned.
 
     Raises:
-        ClipError: a folder without pictures, pictures that cannot be told to frames, of another shape than theirs, or
+        ClipError: a folder without pictures, pictures that match no frames, or of another shape than the frames, or
             too dark to be a mask.
     """
     source = open_source(str(folder))
     if not isinstance(source, ImageFiles):
-        raise ClipError(f"{folder} is no folder of pictures; masks need one picture per frame")
+        raise ClipError(f"{folder} is not a folder of pictures; masks need one picture per frame")
     names = Counter(path.stem for path in source.paths)
     by_name = {path.stem: path for path in source.paths}
     named = [name for name in clip.frame_names if name in by_name]
@@ -97,9 +97,9 @@ def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
-    """Read a picture of what moves: bright and opaque, or with a palette any value but 0.
+    """Read a mask: pixels that are bright and opaque, or in a picture with a palette not 0.
 
-    Raises ClipError for a file that is no picture, or too dark to be a mask.
+    Raises ClipError for an unreadable picture, or one too dark to be a mask.
     """
     shown = read_image(path)  # says what is wrong with a file that is no picture
     with Image.open(path, formats=known_formats()) as picture:

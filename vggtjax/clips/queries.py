@@ -1,4 +1,4 @@
-"""Points to track, asked for at any frame, and their tracks through the whole clip."""
+"""Points to track, each given in one frame of the clip. Does not import jax."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Queries:
 
 
 def check_words(text: str) -> None:
-    """Raise InputError now for words that `parse_queries` would refuse whatever the clip."""
+    """Raise InputError for words that `parse_queries` refuses for every clip."""
     if text.startswith("grid:"):
         _grid_side(text)
     elif not Path(text).is_file():
@@ -70,7 +70,7 @@ def check_words(text: str) -> None:
 
 
 def parse_queries(text: str, clip: Clip) -> Queries:
-    """Return the points that a command line asks for.
+    """Return the points to track that the words of a command line name.
 
     Args:
         text: "grid:N" for N x N points spread over the first frame, or a CSV file with columns x, y and, if wanted,

@@ -1,4 +1,4 @@
-"""What the user names as the source of a clip: files, folders, patterns or arrays. Does not import jax."""
+"""Sources of a clip: files, folders, patterns or arrays. Does not import jax."""
 
 from __future__ import annotations
 
@@ -19,21 +19,14 @@ from vggtjax.clips.sampling import Source
 from vggtjax.clips.video import VideoFile, is_video_name
 from vggtjax.errors import ClipError
 
-ClipSource: TypeAlias = (
-    str
-    | os.PathLike[str]
-    | Sequence[str | os.PathLike[str]]
-    | Sequence[Image.Image]
-    | Sequence[np.ndarray]
-    | np.ndarray
-)
+Name: TypeAlias = str | os.PathLike[str]
+ClipSource: TypeAlias = Name | Sequence[Name] | Sequence[Image.Image] | Sequence[np.ndarray] | np.ndarray
 
 
 def open_source(source: ClipSource) -> Source:
-    """Return the frames that `source` names, found but not read; see `load_clip` for what it can be.
+    """Return the source of frames that `source` names, without reading the frames; `load_clip` lists what it can be.
 
-    Raises:
-        ClipError: nothing is there, or nothing that frames can come from.
+    Raises ClipError for a missing source, or one without frames.
     """
     if isinstance(source, (str, os.PathLike)):
         return _from_path(os.fspath(source))
@@ -58,16 +51,13 @@ def open_source(source: ClipSource) -> Source:
 
 
 def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
-    """Return the clips that paths name, by the name of each: folders of images and videos, or folders of such.
+    """Return the paths of clips by name. `paths` are folders of images, videos, or folders that hold such clips.
 
-    A clip is named after its folder, or its video without the ending.
-
-    Raises:
-        ClipError: nothing is there, or two clips have the same name.
+    A clip is named after its folder, or its video without the suffix. Raises ClipError for a path without clips, or
+    two clips of one name.
     """
     found: dict[str, str] = {}
-    for given in paths:
-        path = Path(given)
+    for path in map(Path, paths):
         try:
             entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
             whole = not path.is_dir() or any(is_image_name(entry) for entry in entries)
@@ -75,9 +65,7 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
             raise ClipError(f"cannot look for clips in {path}: {error.strerror}; check the path") from error
         clips = [path] if whole else [entry for entry in entries if _may_be_clip(entry)]
         if not clips or not path.exists():
-            raise ClipError(
-                f"{path} is no clip and holds none; expected folders of images, videos, or a folder of such"
-            )
+            raise ClipError(f"{path} is not a clip and holds no clips; expected folders of images, or videos")
         for clip in clips:
             name = clip.resolve().name if clip.is_dir() else clip.stem
             if name in found:
@@ -93,7 +81,7 @@ def _may_be_clip(path: Path) -> bool:
 
 
 def natural_key(path: Path) -> list[list[str | int]]:
-    """Return the key that sorts frame_2 before frame_10: runs of digits in each part of the path are numbers."""
+    """Return a key that sorts frame_2 before frame_10: runs of digits in each part of the path are numbers."""
     return [
         [int(piece) if piece.isdecimal() else piece.casefold() for piece in re.split(r"(\d+)", part)]
         for part in path.parts
@@ -130,7 +118,9 @@ def _from_folder(folder: Path) -> Source:
     entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
     images = _images(entries)
     if not images:
-        raise ClipError(f"folder {folder} holds no images but {_inventory(entries)}; name what the frames are in")
+        raise ClipError(
+            f"folder {folder} holds no images but {_inventory(entries)}; name the folder or file with the frames"
+        )
     return ImageFiles(images)
 
 
@@ -144,8 +134,8 @@ def _from_pattern(pattern: str) -> Source:
 
 def _from_list(paths: list[Path]) -> Source:
     for path in paths:
-        if not os.path.isfile(path):  # noqa: PTH113 - an over-long or forbidden path is no file, not an error
-            raise ClipError(f"image {path} does not exist or is no file; check the list of frames")
+        if not os.path.isfile(path):  # noqa: PTH113 - False, not an error, for an over-long or forbidden path
+            raise ClipError(f"image {path} does not exist or is not a file; check the list of frames")
     return ImageFiles(tuple(path.absolute() for path in paths))
 
 
@@ -156,7 +146,7 @@ def _images(paths: Iterable[Path]) -> tuple[Path, ...]:
 
 
 def _inventory(entries: list[Path]) -> str:
-    """Return in words what else there is: folders and videos by name, other files by ending."""
+    """Return in words the folders and videos by name, and other files by suffix."""
     folders = sorted((entry for entry in entries if entry.is_dir()), key=natural_key)
     videos = sorted((entry for entry in entries if entry.is_file() and is_video_name(entry)), key=natural_key)
     endings = Counter(entry.suffix or "no ending" for entry in entries if entry.is_file() and not is_video_name(entry))

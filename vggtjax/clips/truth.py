@@ -1,4 +1,4 @@
-"""What an evaluation knows of a clip, and ground truth at the pixels of a clip. Does not import jax."""
+"""Ground truth of a clip, and of its source at the pixels of the clip. Does not import jax."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Truth(NamedTuple):
 
 
 def batched_truth(truth: ClipTruth) -> Truth:
-    """Return truth on the host with a batch axis, or raise InputError where its shapes do not belong together."""
+    """Return truth on the host with a batch axis. Raises InputError for shapes that do not fit together."""
     arrays = Truth(*(np.asarray(getattr(truth, name)) for name in Truth._fields))
     if arrays.images.ndim == 4:
         arrays = Truth(*(array[None] for array in arrays))

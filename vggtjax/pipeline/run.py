@@ -273,7 +273,7 @@ def _points_by_frame(queries: Queries) -> dict[int, Float[Array, "1 Q 2"]]:
     }
 
 
-def _track_fields(queries: Queries, by_frame: dict[int, Tracks], frames: int) -> dict[str, np.ndarray]:
+def _track_fields(queries: Queries, by_frame: dict[int, Tracks], frames: int) -> dict[str, Any]:
     """Return the tracks of all query frames in the order of the queries, as fields of a Reconstruction."""
     Q = len(queries.frames)
     fields = {
