@@ -54,7 +54,7 @@ def read_image(path: Path) -> Image.Image:
     8 bits and floating-point values must lie in [0, 1].
 
     Raises:
-        ClipError: the file is missing, is not an image, is truncated or corrupt, or has more pixels than Pillow's limit.
+        ClipError: the file is missing, is not an image, is truncated or corrupt, or exceeds Pillow's limit of pixels.
     """
     try:
         with Image.open(path, formats=known_formats()) as image:
