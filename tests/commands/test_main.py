@@ -211,6 +211,15 @@ def test_commands_that_reconstruct_have_all_options(command, capsys):
     assert {f"--{name.replace('_', '-')}" for name in names} <= flags
 
 
+def test_foreign_files_are_said_before_the_model_is_loaded(tmp_path, capsys, frames):
+    (tmp_path / "vggt4d").mkdir()
+    code, out, err = run(
+        capsys, "reconstruct", frames, "--model", "none.safetensors", "--out", tmp_path, "--format", "vggt4d"
+    )
+    assert code == 2
+    assert "vggt4d exists and is not part of an earlier result" in err
+
+
 def test_version(capsys):
     assert run(capsys, "--version") == (0, f"vggtjax {vggtjax.__version__}\n", "")
 

@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 import tyro
 
 from vggtjax.commands.models import load, read_config
-from vggtjax.commands.reconstruct import check_output
 from vggtjax.commands.report import Report
 from vggtjax.results.saving import Saving
 
@@ -61,9 +60,10 @@ def import_result(
     saving = Saving(confidence_percentile=confidence_percentile)
     report = Report()
     with report.running():
+        from vggtjax.results.folder import check_folder
         from vggtjax.results.reconstruction import Reconstruction
 
-        check_output(out)
+        check_folder(out)
         with report.stage("read"):
             result = Reconstruction.load(source, layout=layout, quaternion=quaternion)
         with report.stage("write") as progress:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from vggtjax.commands.models import load
-from vggtjax.commands.reconstruct import check_output
 from vggtjax.commands.report import Report
 from vggtjax.options import MethodName, Options
 
@@ -19,7 +18,9 @@ def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-d") ->
     """
     report = Report()
     with report.running():
-        check_output(out)
+        from vggtjax.results.folder import check_folder
+
+        check_folder(out)
         model = load(report, "demo")
         with report.stage("load clip"):
             from vggtjax.clips.clip import load_clip

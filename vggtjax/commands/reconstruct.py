@@ -97,10 +97,12 @@ def reconstruct(
     report = Report()
     with report.running():
         from vggtjax.clips.sources import open_source
+        from vggtjax.results.folder import check_folder
 
         opened = open_source(frames)  # before the model is loaded, which takes longer
         known.check(options)
-        check_output(out)
+        optional = {"tracks.npz": known.tracks is not None, "vggt4d": saving.format == "vggt4d"}
+        check_folder(out, [name for name, is_written in optional.items() if is_written])
         fitted = FittedFusion(fusion, [options.method])
         network = load(report, model, config)
         fitted.warn(network, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
@@ -130,10 +132,3 @@ def reconstruct(
     report.summary(result, out, network)
     if known.tracks is not None and network.note:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")
-
-
-def check_output(out: Path) -> None:
-    """Raise OutputError now for a folder that cannot take a result, rather than after minutes of work."""
-    from vggtjax.results.folder import check_folder
-
-    check_folder(out)
