@@ -213,7 +213,7 @@ def test_commands_that_reconstruct_have_all_options(command, capsys):
 
 def test_foreign_files_are_said_before_the_model_is_loaded(tmp_path, capsys, frames):
     (tmp_path / "vggt4d").mkdir()
-    code, out, err = run(
+    code, _, err = run(
         capsys, "reconstruct", frames, "--model", "none.safetensors", "--out", tmp_path, "--format", "vggt4d"
     )
     assert code == 2
