@@ -1,4 +1,4 @@
-"""What a guess that sees no image scores against a true trajectory. Does not import jax."""
+"""Guesses of a trajectory that see no image, and their scores. Does not import jax."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.trajectory import centres, checked_poses, from_first
 
 _TOLERANCE = 1e-8  # radians per frame
-_FIRST_STEP = 0.02  # radians per frame; how far from its start the search looks first
+_FIRST_STEP = 0.02  # radians per frame; first step of the search
 
 
 def still(frames: int) -> Float64[np.ndarray, "S 3 4"]:
@@ -36,8 +36,8 @@ def mean_angular_velocity(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Floa
 def best_angular_velocity(truth: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarray, " 3"]:
     """Return the rate w, radians per frame, whose R_i = exp(i w) has the smallest rotation error against the truth.
 
-    An oracle, as it looks at the truth. Nelder-Mead (the mean angle has kinks) from the rate that ends where the
-    truth ends, from the mean of the steps, and from none; the best of the three is kept.
+    An oracle, because it reads the truth. The best of three searches by Nelder-Mead (the mean angle has kinks): from
+    the rate with the truth's last rotation, from the mean of the steps, and from 0.
     """
     rotations = from_first(_several(truth))
     quaternions = rotations.as_quat()  # [S - 1, 4], xyzw
@@ -52,21 +52,21 @@ def best_angular_velocity(truth: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarr
     def descend(start: Float64[np.ndarray, " 3"]) -> tuple[float, Float64[np.ndarray, " 3"]]:
         simplex = start + _FIRST_STEP * np.eye(4, 3, -1)
         options = {"initial_simplex": simplex, "xatol": _TOLERANCE, "fatol": _TOLERANCE, "maxiter": 2000}
-        found = minimize(error, start, method="Nelder-Mead", options=options)
-        return float(found.fun), np.asarray(found.x, np.float64)
+        optimum = minimize(error, start, method="Nelder-Mead", options=options)
+        return float(optimum.fun), np.asarray(optimum.x, np.float64)
 
     starts = (rotations[-1].as_rotvec() / len(rotations), mean_angular_velocity(truth), np.zeros(3))
-    return min((descend(start) for start in starts), key=lambda found: found[0])[1]
+    return min((descend(start) for start in starts), key=lambda optimum: optimum[0])[1]
 
 
 def still_centre_error(truth: Float[np.ndarray, "S 3 4"]) -> float:
-    """Return the RMSE of centres that all coincide: every similarity leaves the spread about the mean."""
+    """Return the RMSE of centres that all coincide: no similarity reduces the spread about their mean."""
     points = centres(_several(truth))
     return float(np.sqrt(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))
 
 
 def line_centre_error(truth: Float[np.ndarray, "S 3 4"]) -> float:
-    """Return the RMSE of centres on a line at equal steps, after Sim(3) alignment: what linear regression leaves."""
+    """Return the RMSE of centres on a line at equal steps, after Sim(3) alignment: that of linear regression."""
     points = centres(_several(truth))
     times = np.arange(len(points)) - (len(points) - 1) / 2
     offsets = points - points.mean(axis=0)

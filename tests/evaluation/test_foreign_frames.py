@@ -79,5 +79,5 @@ def test_frames_that_cannot_come_from_these_pictures(layout):
 
 
 def test_another_number_of_frames():
-    with pytest.raises(InputError, match="the result has 2 frames and the sequence 3; expected a result for every"):
+    with pytest.raises(InputError, match="the result has 2 frames, the sequence 3; expected equal numbers"):
         placed(of_size(512, 384), "cut3r", [(640, 480)] * 3, ["a", "b", "c"])

@@ -1,6 +1,6 @@
-"""Metrics, data sets, and evaluations of methods on them; what a blind guess scores; the ladder of methods."""
+"""Metrics, data sets, evaluations of methods on them, blind guesses, and the ladder of methods."""
 
 import lazy_loader
 
-# Names and their modules stand in __init__.pyi; each is imported when it is first used.
+# __init__.pyi lists the names; each module is imported at the first use of its names.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

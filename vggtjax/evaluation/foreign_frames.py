@@ -1,4 +1,4 @@
-"""Where the frames of another project's result lie in the pictures of the data set. Does not import jax."""
+"""The place of the frames of another project's result in the pictures of a data set. Does not import jax."""
 
 from __future__ import annotations
 
@@ -13,48 +13,48 @@ from vggtjax.results.reconstruction import Reconstruction
 
 Place = tuple[tuple[float, float], tuple[float, float]]  # scale and offset: source (x, y) = scale * (x, y) + offset
 _SAME: Place = ((1.0, 1.0), (0.0, 0.0))
-_MULTIPLE = 16  # of sides, to which MonST3R and CUT3R cut their frames
+_MULTIPLE = 16  # MonST3R and CUT3R cut the sides of their frames to multiples of it
 
 
 def placed(
-    result: Reconstruction, layout: str, sizes: Sequence[tuple[int, int]], names: Sequence[str]
+    result: Reconstruction, format: str, sizes: Sequence[tuple[int, int]], names: Sequence[str]
 ) -> Reconstruction:
-    """Return a result that knows how its frames lie in pictures of these sizes.
+    """Return a result with the place of its frames in pictures of these sizes.
 
-    Each project has its own way from picture to frame, which its folder does not tell: VGGT4D resizes to a width and
-    cuts tall frames; Depth Anything 3 resizes to both sides; MonST3R and CUT3R resize the long side and cut both to
-    multiples of 16 about the middle. Our own results know by themselves.
+    Folders of other projects do not record this place; it follows from the project: VGGT4D resizes to a width and cuts
+    tall frames; Depth Anything 3 resizes both sides; MonST3R and CUT3R resize the long side and cut both sides to
+    multiples of 16 about the middle. Results of vggtjax record the place themselves.
 
     Args:
-        result: as it was loaded.
-        layout: whose it is.
+        result: the loaded result.
+        format: of its folder, such as "vggt4d".
         sizes: width and height of each picture.
-        names: of the pictures, without endings; our own results remember theirs.
+        names: of the pictures, without endings, to compare with the frames of results of vggtjax.
 
     Raises:
-        InputError: another number of pictures than frames, or frames that do not come from such pictures in this way.
+        InputError: different numbers of pictures and frames, or frames of other pictures.
     """
     S, H, W = result.depth.shape
     if len(sizes) != S:
-        raise InputError(f"the result has {S} frames and the sequence {len(sizes)}; expected a result for every frame")
-    if layout == "vggtjax":
+        raise InputError(f"the result has {S} frames, the sequence {len(sizes)}; expected equal numbers")
+    if format == "vggtjax":
         if result.frame_names != tuple(names):
             raise InputError(
                 f"the result is of frames {', '.join(result.frame_names[:3])}, ... and the sequence has "
-                f"{', '.join(names[:3])}, ...; expected a result of these very pictures"
+                f"{', '.join(names[:3])}, ...; expected a result of the sequence's pictures"
             )
         if wrong := [i for i, (w, h) in enumerate(sizes) if tuple(result.source_size[i]) != (h, w)]:
             height, width = result.source_size[wrong[0]]
             raise InputError(
                 f"frame {wrong[0]} of the result was {width} x {height}, the sequence's picture is {sizes[wrong[0]]}; "
-                "expected a result of these very pictures"
+                "expected a result of the sequence's pictures"
             )
         return result
-    places = [_SAME if size == (W, H) else _WAYS[layout](*size, W, H) for size in sizes]
+    places = [_SAME if size == (W, H) else _PLACES[format](*size, W, H) for size in sizes]
     for place, (width, height) in zip(places, sizes, strict=True):
         if place is None:
             raise InputError(
-                f"frames of {W} x {H} do not come from pictures of {width} x {height} as {layout} makes them"
+                f"frames of {W} x {H} do not come from pictures of {width} x {height} as {format} makes them"
             )
     return dataclasses.replace(
         result,
@@ -65,7 +65,7 @@ def placed(
 
 
 def _resized_and_cut(width: int, height: int, W: int, H: int) -> Place | None:
-    """VGGT's: the width becomes W, the height what goes with it in whole patches, cut to W if it is more."""
+    """VGGT's way: the width becomes W, the height follows in whole patches and is cut to at most W."""
     try:
         fit = Fitter("crop", W, 14 if W % 14 == 0 else 1).fit(width, height, "0")
     except ClipError:
@@ -80,18 +80,18 @@ def _stretched(width: int, height: int, W: int, H: int) -> Place | None:
 
 
 def _cut_about_the_middle(width: int, height: int, W: int, H: int) -> Place | None:
-    """The long side to that of the frame, then both cut about the middle: by a multiple, or squares to 4 : 3."""
+    """The long side is resized, then both sides are cut about the middle: to multiples, and squares to 4 : 3."""
     long = max(width, height)
     resized = tuple(round(side * max(W, H) / long) for side in (width, height))
     cut = (resized[0] // 2 - W // 2, resized[1] // 2 - H // 2)
-    small = all(0 <= side - kept < _MULTIPLE for side, kept in zip(resized, (W, H), strict=True))
-    if not small and not (width == height and 4 * H == 3 * W):
+    trimmed = all(0 <= side - cut_side < _MULTIPLE for side, cut_side in zip(resized, (W, H), strict=True))
+    if not trimmed and not (width == height and 4 * H == 3 * W):
         return None
     scale = (width / resized[0], height / resized[1])
     return scale, (cut[0] * scale[0], cut[1] * scale[1])
 
 
-_WAYS: dict[str, Callable[[int, int, int, int], Place | None]] = {
+_PLACES: dict[str, Callable[[int, int, int, int], Place | None]] = {
     "vggt4d": _resized_and_cut,
     "da3": _stretched,
     "monst3r": _cut_about_the_middle,

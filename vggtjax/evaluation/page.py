@@ -1,4 +1,4 @@
-"""An evaluation as files for people and programs: results.json, results.csv, two tables, and a page with pictures."""
+"""The files of an evaluation: results.json, results.csv, two tables, and a page with pictures."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def check_report(out: Path, store: Records) -> None:
         OutputError: the folder cannot be written, or holds files that are not of an evaluation.
     """
     check_extra("drawing an evaluation", "evaluate", "matplotlib", "jinja2")
-    replaced = is_report(out / "results.json") or store.is_there()
+    replaced = is_report(out / "results.json") or store.exists()
     check_free(out, (*NAMES, FOLDER), replaced=replaced, what="evaluation")
 
 
@@ -49,9 +49,9 @@ def write_report(
     Args:
         out: folder.
         records: one per sequence and method.
-        store: where their curves are.
-        settings: what the numbers depend on.
-        warnings: what a reader must know first.
+        store: folder with their curves.
+        settings: everything that the numbers depend on.
+        warnings: sentences at the top of the page.
     """
     means = summary(records)
     values = {

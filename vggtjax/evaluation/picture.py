@@ -1,4 +1,4 @@
-"""A picture of a result next to the truth: depth, mask, and the way of the cameras from above."""
+"""A picture of a result beside the truth: depth, mask, and the path of the cameras from above."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ _TRUE, _FOUND = (120, 200, 255), (255, 150, 60)
 
 
 def truth_sheet(result: Reconstruction, truth: Truth) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw frames of a result with exact truth: picture, depth found and true, mask found and true; cameras from above.
+    """Draw frames of a result with exact truth: pictures, depth and masks (found and true), cameras from above.
 
-    Depth found is brought to the truth's scale by the ratio of medians, the cameras by a similarity of their centres.
+    The result's depth is scaled to the truth by the median ratio, its cameras are aligned by a similarity.
     """
     S, H, W = result.depth.shape
     shown = np.linspace(0, S - 1, min(S, _FRAMES)).round().astype(int)

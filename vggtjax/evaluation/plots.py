@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Curves = Mapping[str, Mapping[str, np.ndarray]]  # by method
-_ERROR_SHOWN = 0.5  # relative error of depth at full colour
+_MOST_ERROR = 0.5  # relative error of depth at full colour
 _DPI = 110
-_UNKNOWN = "#6f7480"  # where there is no true depth
+_UNKNOWN = "#6f7480"  # colour of pixels without true depth
 
 
 def draw_sequence(folder: Path, curves: Curves) -> list[tuple[str, str]]:
-    """Draw what the curves of a sequence's methods allow; return names of the files in `folder`, and their titles."""
+    """Draw the plots of a sequence that its methods have curves for; return file names in `folder` and titles."""
     drawn = []
     for name, (title, needs, draw) in PLOTS.items():
-        there = {method: own for method, own in curves.items() if needs <= set(own)}
-        if there:
+        complete = {method: own for method, own in curves.items() if needs <= set(own)}
+        if complete:
             with writing(folder / f"{name}.png") as path:
-                draw(there).savefig(path, dpi=_DPI)
+                draw(complete).savefig(path, dpi=_DPI)
             drawn.append((f"{name}.png", title))
     return drawn
 
@@ -44,8 +44,8 @@ def _paths(curves: Curves) -> Figure:
     middle = true.mean(axis=0)
     axes = np.linalg.svd(true - middle)[2]  # first along the path, last across it
     figure = _figure(9, 4)
-    for place, (across, labels) in enumerate(((1, ("first", "second")), (2, ("first", "third")))):
-        axis = figure.add_subplot(1, 2, place + 1)
+    for column, (across, labels) in enumerate(((1, ("first", "second")), (2, ("first", "third")))):
+        axis = figure.add_subplot(1, 2, column + 1)
         ways = {"truth": true} | {method: own["centres"] for method, own in curves.items()}
         for method, centres in ways.items():
             x, y = (centres - middle) @ axes[0], (centres - middle) @ axes[across]
@@ -60,7 +60,7 @@ def _paths(curves: Curves) -> Figure:
 
 
 def _error_maps(curves: Curves) -> Figure:
-    """Draw picture, true depth and, for every method, the relative error of its depth."""
+    """Draw pictures, true depth and the relative error of each method's depth."""
     first = next(iter(curves.values()))
     shown, true = first["shown"], first["true_depth"]
     known = true > 0
@@ -77,7 +77,7 @@ def _error_maps(curves: Curves) -> Figure:
     for row, (axes, (name, pictures)) in enumerate(zip(grid, rows.items(), strict=True)):
         for axis, picture, frame in zip(axes, pictures, shown, strict=True):
             drawn = axis.imshow(
-                picture, **({} if picture.ndim == 3 else {"vmin": 0, "vmax": _ERROR_SHOWN, "cmap": "magma"})
+                picture, **({} if picture.ndim == 3 else {"vmin": 0, "vmax": _MOST_ERROR, "cmap": "magma"})
             )
             image = drawn if picture.ndim == 2 else image
             axis.set_xticks([])
@@ -118,7 +118,7 @@ def _masks(curves: Curves) -> Figure:
 
 
 def _distances(curves: Curves) -> Figure:
-    """Draw how far points are from the nearest ones of the other cloud."""
+    """Draw the distances of points to the nearest points of the other cloud."""
     figure = _figure(9, 3.4)
     for place, (kind, title) in enumerate(
         (("accuracy", "accuracy: predicted to true"), ("completeness", "completeness: true to predicted"))
@@ -133,7 +133,7 @@ def _distances(curves: Curves) -> Figure:
 
 
 def _calibration(curves: Curves) -> Figure:
-    """Draw whether confidence tells errors apart (sparsification), and whether it states their size (reliability)."""
+    """Draw how well confidence orders errors (sparsification) and states their size (reliability)."""
     figure = _figure(9, 3.8)
     left, right = figure.subplots(1, 2)
     for number, (method, own) in enumerate(curves.items()):
@@ -154,7 +154,7 @@ def _calibration(curves: Curves) -> Figure:
     return figure
 
 
-# File name -> title, the curves that it needs, and what draws it.
+# File name -> title, required curves, and function that draws the plot.
 PLOTS: dict[str, tuple[str, set[str], Callable[[Curves], Figure]]] = {
     "paths": ("Camera paths after Sim(3)", {"centres", "true_centres"}, _paths),
     "depth": ("Depth", {"error_maps", "true_depth", "images", "shown"}, _error_maps),

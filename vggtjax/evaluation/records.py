@@ -45,17 +45,17 @@ class Records:
     def __init__(self, folder: Path) -> None:
         self.folder = folder / FOLDER
 
-    def is_there(self) -> bool:
-        """Return whether the folder holds records of an evaluation."""
+    def exists(self) -> bool:
+        """Return whether the folder has records of an evaluation."""
         return (self.folder / _MARK).is_file()
 
     def begin(self) -> None:
-        """Make the folder, with a mark that it is one of records."""
+        """Make the folder, with a file that marks it as a folder of records."""
         with writing(self.folder / _MARK) as path:
             path.write_text('{"format": "records of vggtjax evaluate"}\n', encoding="utf-8")
 
     def kept(self, name: str, method: str, settings: Mapping[str, Any]) -> Record | None:
-        """Return the record of an earlier run, if it succeeded with the very same settings; else None."""
+        """Return the record of an earlier successful run with equal settings; None if there is no such record."""
         try:
             record = read_json(self._path(name, method, "json"), Record, "record")
             self.curves(record)
@@ -102,49 +102,48 @@ def _digest(name: str) -> str:
 
 
 def summary(records: Sequence[Record]) -> dict[str, dict[str, float]]:
-    """Return the means of every method over the sequences that it did not fail on.
+    """Return the means of every method over its successful sequences with ground truth for the metric.
 
-    Sequences weigh the same, as the protocols have it, but for video depth, where they weigh as they have valid pixels.
-    `sequences` counts them, `failed` the others. A metric's mean is over the sequences that have the ground truth.
+    Sequences weigh the same, as in the protocols; video depth weighs them by valid pixels. `sequences` and `failed` are
+    the numbers of successful and failed sequences.
     """
     means: dict[str, dict[str, float]] = {}
     for method in dict.fromkeys(record.method for record in records):
         own = [record for record in records if record.method == method]
         good = [record for record in own if record.status == "ok"]
-        row: dict[str, float] = {"sequences": len(good), "failed": len(own) - len(good)}
-        for metric in dict.fromkeys(metric for record in good for metric in record.metrics):
-            if metric == "depth_pixels":
-                continue
-            values = [(record.metrics[metric], _weight(record, metric)) for record in good if metric in record.metrics]
-            row[metric] = math.fsum(v * w for v, w in values) / math.fsum(w for _, w in values)
-        for metric, pooled in (("j_mean", "j_pooled"), ("f_mean", "f_pooled")):  # over the frames of all sequences
-            values = [(record.metrics[metric], record.frames) for record in good if metric in record.metrics]
-            if values:
-                row[pooled] = math.fsum(v * w for v, w in values) / sum(w for _, w in values)
-        means[method] = row
+        means[method] = {"sequences": len(good), "failed": len(own) - len(good)}
+        metrics = dict.fromkeys(metric for record in good for metric in record.metrics if metric != "depth_pixels")
+        for metric in metrics:
+            weights = [r.metrics.get("depth_pixels", 1.0) if metric in _VIDEO_DEPTH else 1.0 for r in good]
+            means[method][metric] = _mean(good, metric, weights)
+        for metric, pooled in _POOLED.items():
+            if metric in metrics:
+                means[method][pooled] = _mean(good, metric, [record.frames for record in good])
     return means
 
 
-VIDEO_DEPTH = ("abs_rel", "rmse", "delta1", "delta2", "delta3")
+_VIDEO_DEPTH = ("abs_rel", "rmse", "delta1", "delta2", "delta3")
+_POOLED = {"j_mean": "j_pooled", "f_mean": "f_pooled"}  # metric -> its mean over the frames of all sequences
 
 
-def _weight(record: Record, metric: str) -> float:
-    return record.metrics.get("depth_pixels", 1.0) if metric in VIDEO_DEPTH else 1.0
+def _mean(records: Sequence[Record], metric: str, weights: Sequence[float]) -> float:
+    values = [(r.metrics[metric], weight) for r, weight in zip(records, weights, strict=True) if metric in r.metrics]
+    return math.fsum(v * w for v, w in values) / math.fsum(w for _, w in values)
 
 
 def costs(records: Sequence[Record]) -> dict[str, dict[str, float]]:
-    """Return the mean seconds of each stage by method; what methods share is in the time of each of them.
+    """Return the mean seconds of each stage by method; shared stages count for each of their methods.
 
-    `both passes over one` is the time of image features and both passes over that of features and the first one.
+    `both passes over one` is the time of image features and both passes over the time of features and first pass.
     """
-    found: dict[str, dict[str, float]] = {}
+    means: dict[str, dict[str, float]] = {}
     for method in dict.fromkeys(record.method for record in records):
         own = [record.seconds for record in records if record.method == method and record.seconds]
         stages = dict.fromkeys(stage for seconds in own for stage in seconds)
-        row = {stage: float(np.mean([seconds.get(stage, 0.0) for seconds in own])) for stage in stages}
-        one = row.get("image features", 0.0) + row.get("first pass", 0.0)
-        if one and "second pass" in row:
-            row[BOTH_OVER_ONE] = (one + row["second pass"]) / one
-        if row:
-            found[method] = row
-    return found
+        mean = {stage: float(np.mean([seconds.get(stage, 0.0) for seconds in own])) for stage in stages}
+        one = mean.get("image features", 0.0) + mean.get("first pass", 0.0)
+        if one and "second pass" in mean:
+            mean[BOTH_OVER_ONE] = (one + mean["second pass"]) / one
+        if mean:
+            means[method] = mean
+    return means

@@ -12,12 +12,12 @@ from vggtjax.evaluation.records import Record
 
 
 class Column(NamedTuple):
-    """How a metric is shown."""
+    """A metric as a column."""
 
     group: str
     metric: str
     heading: str
-    better: str  # "lower" or "higher"; "" where neither is meant
+    better: str  # "lower" or "higher"; "" if neither
     form: str = ".3f"
 
 
@@ -55,22 +55,22 @@ _LATEX_ARROWS = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}
 
 
 def shown_columns(means: Mapping[str, Mapping[str, float]]) -> list[Column]:
-    """Return the columns that at least one method has a value for."""
+    """Return the columns in which at least one method has a value."""
     return [column for column in COLUMNS if any(column.metric in row for row in means.values())]
 
 
 def grouped(columns: Sequence[Column]) -> dict[str, list[Column]]:
-    """Return columns by the protocol that they are of."""
+    """Return columns by protocol."""
     return {name: [c for c in columns if c.group == name] for name in dict.fromkeys(c.group for c in columns)}
 
 
 def cell(row: Mapping[str, float], column: Column) -> str:
-    """Return a value as text, a dash where there is none."""
+    """Return a value as text; a missing value is a dash."""
     return format(row[column.metric], column.form) if column.metric in row else "-"
 
 
 def best(means: Mapping[str, Mapping[str, float]], column: Column) -> set[str]:
-    """Return the methods that no other is better than in this column, by the digits shown; none where all are equal."""
+    """Return the best methods of a column by the digits shown; none if all are equal."""
     values = {method: float(cell(row, column)) for method, row in means.items() if column.metric in row}
     if len(set(values.values())) < 2 or not column.better:
         return set()
@@ -109,7 +109,7 @@ def latex(means: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def comma_separated(records: Sequence[Record]) -> str:
-    """Return every record as a line: sequence, method, status, all metrics in full, and why it failed."""
+    """Return every record as a line: sequence, method, status, all metrics in full, and the reason of a failure."""
     metrics = list(dict.fromkeys(metric for record in records for metric in record.metrics))
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -122,7 +122,7 @@ def comma_separated(records: Sequence[Record]) -> str:
 
 
 def failed(row: Mapping[str, float]) -> str:
-    """Return on how many sequences of how many a method failed."""
+    """Return the number of failed sequences of all sequences."""
     return f"{int(row['failed'])} of {int(row['sequences'] + row['failed'])}"
 
 
@@ -131,7 +131,7 @@ def _plain(text: str) -> str:
 
 
 def _inert(text: str) -> str:
-    """Return text that no spreadsheet takes for a formula."""
+    """Return text that spreadsheets do not read as a formula."""
     return f"'{text}" if text[:1] in ("=", "+", "-", "@") else text
 
 

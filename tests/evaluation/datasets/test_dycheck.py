@@ -210,7 +210,7 @@ def test_disparity_that_is_not_finite_and_depth_of_another_size(tmp_path):
     path = folder / "flow3d_preprocessed" / "aligned_depth_anything_colmap" / "1x" / "0_00010.npy"
     write(path, npy(np.full((3, 4), np.nan, np.float32)))
     (sequence,) = opened("dycheck", folder)
-    with pytest.raises(InputError, match=r"0_00010\.npy holds values that are not finite"):
+    with pytest.raises(InputError, match=r"0_00010\.npy has values that are not finite"):
         sequence.depth(0)  # the cut is over all frames
     write(path, npy(np.ones((4, 3), np.float32)))
     assert sequence.depth(0).shape == (3, 4)

@@ -211,7 +211,7 @@ def test_clouds_that_cannot_be_compared_are_one_sentence(predicted, truth, sente
         ((np.ones((2, 3)), np.ones((3, 3))), r"predicted normals have shape \(2, 3\); expected \(3, 3\)"),
         ((np.eye(3), np.diag([1, 1, 2.0])), "true normal of point 2 has length 2; expected 1"),
         ((np.eye(3), np.zeros((3, 3))), "true normal of point 0 has length 0"),
-        ((np.eye(3), np.full((3, 3), np.nan)), "no two nearest neighbours both have a normal"),
+        ((np.eye(3), np.full((3, 3), np.nan)), "no nearest neighbours both have a normal"),
     ],
 )
 def test_normals_that_cannot_be_compared_are_one_sentence(normals, sentence):

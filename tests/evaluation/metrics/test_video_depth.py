@@ -147,7 +147,7 @@ def test_all_frames_share_one_alignment():
     [
         (np.ones((2, 1, 3)), TRUTH, {}, "resize the prediction first"),
         (np.ones((1, 2)), TRUTH[0], {}, r"expected a sequence \[S, H, W\]"),
-        (np.ones((2, 1, 2)), 0 * TRUTH, {}, "no pixel has a true depth above 0; nothing"),
+        (np.ones((2, 1, 2)), 0 * TRUTH, {}, "no pixel has a true depth above 0 to compare with"),
         (np.ones((2, 1, 2)), TRUTH, {"max_depth": 1}, "no pixel has a true depth above 0 below 1"),
         (np.ones((2, 1, 2)), TRUTH, {"max_depth": -1}, "max_depth is -1"),
         (np.full((2, 1, 2), np.inf), TRUTH, {}, "3 predicted depths are not finite"),

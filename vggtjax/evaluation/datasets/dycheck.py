@@ -103,7 +103,7 @@ def _from_disparity(paths: list[Path]) -> Callable[[Path], Float32[np.ndarray, "
 def _inverse(path: Path) -> Float32[np.ndarray, "h w"]:
     disparity = read_npy(path)
     if not np.isfinite(disparity).all():
-        raise InputError(f"{path} holds values that are not finite; expected disparity")
+        raise InputError(f"{path} has values that are not finite; expected disparity")
     return 1 / np.maximum(disparity, np.float32(_LEAST_DISPARITY))
 
 

@@ -24,15 +24,15 @@ def median_scale(
     truth: Float[np.ndarray, "*S H W"],
     valid: Bool[np.ndarray, "*S H W"] | None = None,
 ) -> float:
-    """Return the factor that takes a clip's predicted depth to the truth: the median of truth / predicted.
+    """Return the factor from a clip's predicted depth to the truth: the median of truth / predicted.
 
     Args:
         predicted: depth up to scale, above 0.
-        truth: depth; a value that is not above 0 and finite is not measured and never counts.
-        valid: pixels to use; all that are measured if None.
+        truth: depth; values that are not finite and above 0 are unknown and do not count.
+        valid: pixels to use; all pixels with a known depth if None.
 
     Raises:
-        InputError: shapes that differ, no pixel to use, or a predicted depth that is not above 0 and finite on one.
+        InputError: different shapes, no pixel to use, or a predicted depth there that is not finite and above 0.
     """
     predicted, truth = _used(predicted, truth, valid)
     return float(np.median(truth / predicted))
@@ -49,8 +49,8 @@ def depth_errors(
 
     Args:
         predicted, truth, valid: as for `median_scale`.
-        scale: factor to put on `predicted`; `median_scale` of the same pixels if None. Give the whole clip's scale
-            to see how well a part of it is placed among the rest.
+        scale: factor of `predicted`; `median_scale` of the same pixels if None. The whole clip's scale shows how well a
+            part of the clip is placed among the rest.
 
     Raises:
         InputError: as `median_scale`.
@@ -62,32 +62,31 @@ def depth_errors(
 
 
 def measured(truth: Float[np.ndarray, "*S H W"]) -> Bool[np.ndarray, "*S H W"]:
-    """Return where a depth is there: finite and above 0."""
+    """Return where depth is known: finite and above 0."""
     truth = np.asarray(truth)
     return np.isfinite(truth) & (truth > 0)
 
 
 def mean_depth_map(clips: Float[np.ndarray, "N S H W"]) -> Float64[np.ndarray, "H W"]:
-    """Return the mean depth of every pixel over the frames of all clips: a guess that sees no image.
+    """Return the mean known depth of every pixel over the frames of all clips: a guess that sees no image.
 
-    Broadcast to a clip's frames, it goes through the same alignment as a prediction. Depths that are not measured
-    do not count.
+    Broadcast to a clip's frames, it is aligned like a prediction.
 
     Raises:
-        InputError: another number of axes than 4, or a pixel that is measured nowhere.
+        InputError: another number of axes than 4, or a pixel without depth in every frame.
     """
     clips = np.asarray(clips)
     if clips.ndim != 4:
         raise InputError(f"depths have shape {clips.shape}; expected clips [N, S, H, W]")
-    there = measured(clips)
-    counts = there.sum(axis=(0, 1))
+    known = measured(clips)
+    counts = known.sum(axis=(0, 1))
     if not counts.all():
-        raise InputError(f"{int((counts == 0).sum())} pixels have no depth in any frame; expected one at least in each")
-    return np.where(there, clips, 0).sum(axis=(0, 1), dtype=np.float64) / counts
+        raise InputError(f"{int((counts == 0).sum())} pixels have no depth in any frame; expected at least one")
+    return np.where(known, clips, 0).sum(axis=(0, 1), dtype=np.float64) / counts
 
 
 def _used(predicted, truth, valid) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
-    """Return the depths of the pixels that count."""
+    """Return predicted and true depths of the pixels to use."""
     predicted, truth = np.asarray(predicted), np.asarray(truth)
     if predicted.shape != truth.shape:
         raise InputError(f"predicted depth has shape {predicted.shape} and the truth {truth.shape}; expected the same")
@@ -100,7 +99,7 @@ def _used(predicted, truth, valid) -> tuple[Float64[np.ndarray, " N"], Float64[n
             )
         used &= valid
     if not used.any():
-        raise InputError("no pixel has a true depth; nothing can be compared")
+        raise InputError("no pixel has a true depth to compare with")
     if (wrong := int((~measured(predicted[used])).sum())) > 0:
-        raise InputError(f"{wrong} predicted depths are not finite and above 0; expected all of them to be")
+        raise InputError(f"{wrong} predicted depths are not finite and above 0; expected all to be")
     return predicted[used].astype(np.float64), truth[used].astype(np.float64)

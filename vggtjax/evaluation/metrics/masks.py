@@ -15,13 +15,13 @@ from vggtjax.errors import InputError
 Empty = Literal["davis", "vggt4d"]
 
 _EMPTY_J = {"davis": 1.0, "vggt4d": 0.0}  # J of a frame in which neither mask has a pixel
-_RECALLED = 0.5  # a frame counts as found above this score
+_RECALLED = 0.5  # score above which a frame counts for the recall
 _BINS = 4  # of a sequence, for the decay
-_BOUNDARY_WIDTH = 0.008  # how far boundaries may be apart, in diagonals of the frame
+_BOUNDARY_WIDTH = 0.008  # largest distance of matched boundaries, in diagonals of the frame
 
 
 class PrecisionRecall(NamedTuple):
-    """Share of the predicted pixels that are right, and share of the right pixels that are predicted."""
+    """Correct share of the predicted pixels, and predicted share of the true pixels."""
 
     precision: float
     recall: float
@@ -31,7 +31,7 @@ class MaskScores(NamedTuple):
     """DAVIS' statistics of J (intersection over union) and F (boundaries) over frames.
 
     Mean and recall (the share of frames above 0.5) lie in 0 to 1; the decay is the mean of the first of four bins of
-    frames minus that of the last.
+    frames minus the mean of the last.
     """
 
     j_mean: float
@@ -50,22 +50,22 @@ class FrameScores(NamedTuple):
 
 
 def auc(saliency: Float[np.ndarray, "*S H W"], mask: Bool[np.ndarray, "*S H W"]) -> float:
-    """Return the area under the ROC curve: how often a dynamic pixel has the higher saliency of a random pair.
+    """Return the area under the ROC curve: how often, in a random pair, the dynamic pixel has the higher saliency.
 
     Exact, by ranks; a tie counts one half.
 
     Raises:
-        InputError: shapes that differ, saliency that is not finite, or a mask that is all dynamic or all static.
+        InputError: different shapes, saliency that is not finite, or a mask that is all dynamic or all static.
     """
     saliency, mask = np.asarray(saliency), _mask("mask", mask)
     if saliency.shape != mask.shape:
         raise InputError(f"saliency has shape {saliency.shape} and the mask {mask.shape}; expected the same")
     if not np.isfinite(saliency).all():
-        raise InputError("the saliency holds values that are not finite")
+        raise InputError("the saliency has values that are not finite")
     dynamic = int(mask.sum())
     static = mask.size - dynamic
     if not dynamic or not static:
-        raise InputError(f"the mask has {dynamic} dynamic and {static} static pixels; expected some of both")
+        raise InputError(f"the mask has {dynamic} dynamic and {static} static pixels; expected both")
     ranks = rankdata(saliency.ravel())[mask.ravel()]
     return float((ranks.sum() - dynamic * (dynamic + 1) / 2) / dynamic / static)
 
@@ -80,9 +80,9 @@ def jaccard(predicted: Bool[np.ndarray, "*S H W"], truth: Bool[np.ndarray, "*S H
 def precision_recall(predicted: Bool[np.ndarray, "*S H W"], truth: Bool[np.ndarray, "*S H W"]) -> PrecisionRecall:
     """Return precision and recall; the precision of an empty prediction and the recall of an empty truth are 1."""
     predicted, truth = _masks(predicted, truth)
-    right = int((predicted & truth).sum())
-    found, sought = int(predicted.sum()), int(truth.sum())
-    return PrecisionRecall(right / found if found else 1.0, right / sought if sought else 1.0)
+    correct = int((predicted & truth).sum())
+    positives, true_pixels = int(predicted.sum()), int(truth.sum())
+    return PrecisionRecall(correct / positives if positives else 1.0, correct / true_pixels if true_pixels else 1.0)
 
 
 def mask_scores(
@@ -91,9 +91,9 @@ def mask_scores(
     """Return mean, recall and decay of J and F of a sequence (Perazzi et al. 2016).
 
     Args:
-        predicted, truth: masks of the same frames, at one size. DAVIS itself leaves out the first and the last frame
-            where the first is given to the method; all that are here count.
-        empty: J of a frame in which both masks are empty: "davis" 1, "vggt4d" 0. F is 1 there with both.
+        predicted, truth: masks of the same frames, at one size. All frames count; DAVIS itself skips the first and the
+            last frame if the method gets the first mask.
+        empty: J of a frame with two empty masks: 1 ("davis") or 0 ("vggt4d"). Its F is 1.
 
     Raises:
         InputError: masks that are not bool [S, H, W] of one shape, no frame or no pixel, an unknown `empty`.
@@ -104,10 +104,9 @@ def mask_scores(
 def pooled_scores(
     sequences: Sequence[tuple[Bool[np.ndarray, "S H W"], Bool[np.ndarray, "S H W"]]], *, empty: Empty = "davis"
 ) -> MaskScores:
-    """Return the scores over all frames of all sequences in a row, so that long sequences weigh more.
+    """Return the scores over the joined frames of all sequences: long sequences weigh more.
 
-    The decay over that row compares the first quarter of all frames with the last, and depends on the sequences'
-    order.
+    The decay compares the first quarter of all frames with the last, and depends on the order of the sequences.
 
     Args:
         sequences: predicted and true masks of each.
@@ -117,7 +116,7 @@ def pooled_scores(
         InputError: no sequence, or as `mask_scores`.
     """
     if not len(sequences):
-        raise InputError("there are no sequences to pool; expected at least 1")
+        raise InputError("no sequences to pool; expected at least 1")
     frames = [frame_scores(predicted, truth, empty=empty) for predicted, truth in sequences]
     return mask_statistics(FrameScores(*(np.concatenate(values) for values in zip(*frames, strict=True))))
 
@@ -130,7 +129,7 @@ def frame_scores(
         raise InputError(f"empty is {empty!r}; expected one of {', '.join(_EMPTY_J)}")
     predicted, truth = _masks(predicted, truth)
     if truth.ndim != 3 or not truth.size:
-        raise InputError(f"the masks have shape {truth.shape}; expected [S, H, W] with a frame and a pixel at least")
+        raise InputError(f"the masks have shape {truth.shape}; expected [S, H, W] with at least one frame and pixel")
     union = (predicted | truth).sum(axis=(1, 2))
     both = (predicted & truth).sum(axis=(1, 2))
     j = np.where(union > 0, both / np.maximum(union, 1), _EMPTY_J[empty])
@@ -140,28 +139,28 @@ def frame_scores(
 def _boundary_f(predicted: Bool[np.ndarray, "H W"], truth: Bool[np.ndarray, "H W"]) -> float:
     """Return the F-measure of the boundaries, each matched within a disk around the pixels of the other.
 
-    A mask that fills the frame has no boundary, like one that is empty.
+    A mask that fills the frame has no boundary, like an empty mask.
     """
     radius = np.ceil(_BOUNDARY_WIDTH * np.hypot(*truth.shape))
-    found, sought = boundary(predicted), boundary(truth)
-    if not found.any() or not sought.any():
-        return float(found.any() == sought.any())
-    # A disk x^2 + y^2 <= r^2 around every pixel of a boundary covers what is at most r away from one.
-    precision = float((np.asarray(distance_transform_edt(~sought))[found] <= radius).mean())
-    recall = float((np.asarray(distance_transform_edt(~found))[sought] <= radius).mean())
+    predicted, truth = boundary(predicted), boundary(truth)
+    if not predicted.any() or not truth.any():
+        return float(predicted.any() == truth.any())
+    # Disks x^2 + y^2 <= r^2 around the pixels of a boundary cover all pixels at most r away from it.
+    precision = float((np.asarray(distance_transform_edt(~truth))[predicted] <= radius).mean())
+    recall = float((np.asarray(distance_transform_edt(~predicted))[truth] <= radius).mean())
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
 def boundary(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
-    """Return the boundary of a mask, one pixel wide, as DAVIS draws it.
+    """Return the boundary of a mask, one pixel wide, as in DAVIS.
 
-    A pixel belongs to it that differs from its right, its lower or its lower right neighbour: the true
-    edge, moved up and left by half a pixel. In the last row only the right neighbour counts, in the last column
-    only the lower one, and the last pixel of all is none: the frame's own edge is no boundary.
+    Its pixels differ from their right, their lower or their lower right neighbour: the true edge, moved up and left by
+    half a pixel. The last row has only right neighbours, the last column only lower ones, and the last pixel of all
+    has none: the frame's own edge is not a boundary.
     """
-    beyond = np.pad(_mask("mask", mask), ((0, 1), (0, 1)), mode="edge")  # what is outside never differs
-    here = beyond[:-1, :-1]
-    return (here ^ beyond[:-1, 1:]) | (here ^ beyond[1:, :-1]) | (here ^ beyond[1:, 1:])
+    padded = np.pad(_mask("mask", mask), ((0, 1), (0, 1)), mode="edge")  # padding never differs
+    inner = padded[:-1, :-1]
+    return (inner ^ padded[:-1, 1:]) | (inner ^ padded[1:, :-1]) | (inner ^ padded[1:, 1:])
 
 
 def mask_statistics(frames: FrameScores) -> MaskScores:
@@ -170,7 +169,7 @@ def mask_statistics(frames: FrameScores) -> MaskScores:
 
 
 def _statistics(values: Float64[np.ndarray, " S"]) -> tuple[float, float, float]:
-    """Return mean, recall and decay; neighbouring bins share the frame between them, as in DAVIS."""
+    """Return mean, recall and decay; neighbouring bins share a frame, as in DAVIS."""
     # Edges are rounded half up, 1.5 to 2; numpy rounds half to even.
     edges = np.floor(np.linspace(1, len(values), _BINS + 1) + 0.5 + 1e-10).astype(int) - 1
     first, last = values[: edges[1] + 1], values[edges[-2] :]

@@ -12,9 +12,9 @@ from scipy.spatial import KDTree
 from vggtjax.errors import InputError
 from vggtjax.progress import Progress
 
-_CHUNK = 2**20  # points that are in hand at a time
+_CHUNK = 2**20  # points of one look-up
 _LEAF = 20  # points in a leaf of the tree: the fastest of 10, 20 and 40
-_NOT_UNIT = 1e-2  # how far the squared length of a normal may be from 1
+_NOT_UNIT = 1e-2  # largest difference of the squared length of a normal from 1
 
 
 class Statistics(NamedTuple):
@@ -25,7 +25,7 @@ class Statistics(NamedTuple):
 
 
 class PointCloudErrors(NamedTuple):
-    """How two clouds differ; the distances are in the unit of the points.
+    """Differences of two clouds; the distances are in the unit of the points.
 
     Attributes:
         accuracy: of the distance from every predicted point to the nearest true one.
@@ -41,7 +41,7 @@ class PointCloudErrors(NamedTuple):
 
 
 class _Direction(NamedTuple):
-    """What the search from one cloud into the other gives."""
+    """The result of a search from one cloud in the other."""
 
     distance: Statistics
     normal_consistency: float | None
@@ -56,19 +56,19 @@ def point_cloud_errors(
 ) -> PointCloudErrors:
     """Return accuracy, completeness and their mean, by exact nearest neighbours in float64.
 
-    The tree of one cloud is in memory at a time: about 50 bytes for each of its points, and 8 more for each point
-    of the other.
+    The tree of one cloud is in memory at a time: about 50 bytes for each of its points, and 8 for each point of the
+    other.
 
     Args:
-        predicted, truth: points in one world and one unit; nothing is aligned, left out or thinned here.
+        predicted, truth: points in one world and one unit; they are not aligned, filtered or thinned here.
         normals: unit normals of the predicted and of the true points, as from `normals_of`. The consistency is the
             mean |cosine| from prediction to truth and the mean from truth to prediction, averaged. Their sign does
-            not matter, and pairs in which one is NaN do not count.
-        progress: called with the points that were looked up and the number of all, N + M.
+            not matter, and pairs with a NaN do not count.
+        progress: called with the number of points looked up and of all points, N + M.
 
     Raises:
-        InputError: a cloud that is empty, not [N, 3] or not finite; normals of another shape or length than 1, or
-            none that can be compared.
+        InputError: a cloud that is empty, not [N, 3] or not finite; normals of another shape, of another length than 1,
+            or without a pair to compare.
     """
     predicted, truth = _cloud("predicted", predicted), _cloud("true", truth)
     predicted_normals, true_normals = (None, None) if normals is None else normals
@@ -96,12 +96,12 @@ def point_cloud_errors(
 
 
 def paired_distance(predicted: Float[np.ndarray, "N 3"], truth: Float[np.ndarray, "N 3"]) -> Statistics:
-    """Return mean and median of ||X_truth - X_predicted|| of points that belong to the same pixel.
+    """Return mean and median of ||X_truth - X_predicted|| of the points of one pixel.
 
-    Its mean is never below the mean accuracy or completeness, as a nearest neighbour is at most as far.
+    Its mean is never below the mean accuracy or completeness, as a nearest neighbour is at most as far away.
 
     Raises:
-        InputError: as `point_cloud_errors`, and another number of one than of the other.
+        InputError: as `point_cloud_errors`, and different numbers of points.
     """
     predicted, truth = _cloud("predicted", predicted), _cloud("true", truth)
     if len(predicted) != len(truth):
@@ -115,9 +115,9 @@ def paired_distance(predicted: Float[np.ndarray, "N 3"], truth: Float[np.ndarray
 def normals_of(points: Float[np.ndarray, "S H W 3"]) -> Float[np.ndarray, "S H W 3"]:
     """Return unit normals of points on the pixel grid: the cross product of central differences, right x down.
 
-    Computed in float64, returned in the type of the points. NaN where they are not defined: on the border of a frame,
-    next to a point that is not finite (set those to NaN that the mask leaves out), and where the neighbours are on
-    one line. As the differences step over the pixel itself, its own point does not count.
+    Computed in float64, returned in the type of the points. NaN where undefined: on the border of a frame, next to a
+    point that is not finite (so set points outside a mask to NaN), and where the neighbours are on one line. The
+    differences step over the pixel, whose own point does not count.
 
     Raises:
         InputError: another shape than [S, H, W, 3].
@@ -127,11 +127,11 @@ def normals_of(points: Float[np.ndarray, "S H W 3"]) -> Float[np.ndarray, "S H W
         raise InputError(f"points have shape {points.shape}; expected one for each pixel, [S, H, W, 3]")
     kind = points.dtype if np.issubdtype(points.dtype, np.floating) else np.float64
     normals = np.full(points.shape, np.nan, kind)
-    for frame, made in zip(points, normals, strict=True):
+    for frame, frame_normals in zip(points, normals, strict=True):
         exact = np.where(np.isfinite(frame), frame, np.nan).astype(np.float64)
         cross = np.cross(exact[1:-1, 2:] - exact[1:-1, :-2], exact[2:, 1:-1] - exact[:-2, 1:-1])
         length = np.linalg.norm(cross, axis=2, keepdims=True)
-        made[1:-1, 1:-1] = cross / np.where(length > 0, length, np.nan)
+        frame_normals[1:-1, 1:-1] = cross / np.where(length > 0, length, np.nan)
     return normals
 
 
@@ -140,7 +140,7 @@ def nearest_distances(
 ) -> Float64[np.ndarray, " N"]:
     """Return the distance from every point to the nearest of the others; progress and errors as `point_cloud_errors`.
 
-    Accuracy is the `statistics` of those from prediction to truth.
+    Accuracy is the `statistics` of the distances from prediction to truth.
     """
     points, others = _cloud("first", points), _cloud("second", others)
 
@@ -155,35 +155,35 @@ def statistics(distances: Float[np.ndarray, " N"]) -> Statistics:
     """Return mean and median of distances.
 
     Raises:
-        InputError: no distance at all.
+        InputError: no distance.
     """
     distances = np.asarray(distances, np.float64)
     if not distances.size:
-        raise InputError("there are no distances; expected at least 1")
+        raise InputError("no distances; expected at least 1")
     return Statistics(float(distances.mean()), float(np.median(distances)))
 
 
 def _nearest(
     source, target, source_normals, target_normals, advance: Callable[[int], None]
 ) -> tuple[Float64[np.ndarray, " N"], float | None]:
-    """Look every point of `source` up in a tree of `target`; return the distances and the consistency of normals."""
+    """Look up every point of `source` in a tree of `target`; return distances and the consistency of normals."""
     tree = KDTree(target, leafsize=_LEAF, balanced_tree=False)  # cells cut in the middle: twice as fast to build
     distances = np.empty(len(source))
     cosines, counted = 0.0, 0
     for part in _chunks(len(source)):
-        distances[part], found = tree.query(source[part], workers=-1)
-        neighbours = np.asarray(found)
+        distances[part], indices = tree.query(source[part], workers=-1)
+        neighbours = np.asarray(indices)
         if source_normals is not None:
             cosine = _cosines(source_normals[part], target_normals, neighbours)
             cosines, counted = cosines + float(cosine.sum()), counted + len(cosine)
         advance(part.stop)
     if source_normals is not None and not counted:
-        raise InputError("no two nearest neighbours both have a normal; expected some that are not NaN")
+        raise InputError("no nearest neighbours both have a normal; expected some that are not NaN")
     return distances, cosines / counted if counted else None
 
 
 def _cosines(normals, others, neighbours: Int[np.ndarray, " N"]) -> Float64[np.ndarray, " K"]:
-    """Return |cosine| of the pairs of normals that are both there; rounding does not take it beyond 1."""
+    """Return |cosine| of the pairs of normals without NaN, at most 1."""
     cosine = np.einsum("ni,ni->n", normals.astype(np.float64), others[neighbours])
     return np.minimum(np.abs(cosine[~np.isnan(cosine)]), 1)
 
@@ -199,7 +199,7 @@ def _cloud(name: str, points) -> Float[np.ndarray, "N 3"]:
     if not len(points):
         raise InputError(f"the {name} cloud has no points; expected at least 1")
     if (wrong := sum(int((~np.isfinite(points[part]).all(axis=1)).sum()) for part in _chunks(len(points)))) > 0:
-        raise InputError(f"{wrong} of {len(points)} {name} points are not finite; leave them out of both clouds")
+        raise InputError(f"{wrong} of {len(points)} {name} points are not finite; remove them from both clouds")
     return points
 
 

@@ -14,9 +14,9 @@ Alignment = Literal["sim3", "se3", "first"]
 
 FEWEST_POSES = 3  # fewer centres can always be aligned exactly
 _NO_MOTION = 1e-6  # a spread of centres below this share of their distance from the origin is float32's rounding
-_NO_WIDTH = 1e-6  # centres whose second extent is below this share of the first are a line
-_NOT_RIGID = 1e-2  # how far R^T R may be from the identity
-_WIDER = 1.01  # than the tolerance is where partners are looked for: sums of times are rounded
+_NO_WIDTH = 1e-6  # of a line: its second extent is below this share of the first
+_NOT_RIGID = 1e-2  # largest difference of R^T R from the identity
+_WIDER = 1.01  # times the tolerance is the search range for partners: sums of times are rounded
 _MOST_CANDIDATES = 10_000_000  # pairs of timestamps within the tolerance; 160 MB of indices
 
 
@@ -33,7 +33,7 @@ class Similarity(NamedTuple):
 
 
 class TrajectoryErrors(NamedTuple):
-    """RMSE of the centres, and of the steps between consecutive frames; `trajectory_errors` says how."""
+    """RMSE of the centres, and of the steps between consecutive frames; see `trajectory_errors`."""
 
     ate: float  # in the truth's unit
     rte: float  # in the truth's unit
@@ -53,34 +53,34 @@ def umeyama_sim3(
     allow_line: bool = False,
     with_scale: bool = True,
 ) -> Similarity:
-    """Return the similarity that takes `source` to `target` with the least squared error (Umeyama 1991).
+    """Return the similarity from `source` to `target` with the least squared error (Umeyama 1991).
 
     Args:
         source, target: corresponding points.
-        allow_line: accept points on one line, around which the rotation is arbitrary: one of the equally good ones is
-            returned. Scale and remaining error do not depend on it.
+        allow_line: accept points on one line. The rotation around the line is then arbitrary; scale and remaining error
+            do not depend on it.
         with_scale: False keeps the scale at 1: the best rotation and translation, SE(3).
 
     Raises:
-        InputError: shapes that differ, values that are not finite, fewer than 3 points, points that all coincide, or
+        InputError: different shapes, values that are not finite, fewer than 3 points, points that all coincide, or
             (unless allowed) points on one line.
     """
     source, target = (_points(name, points) for name, points in (("source", source), ("target", target)))
     if len(source) != len(target):
-        raise InputError(f"source has {len(source)} points and target {len(target)}; expected as many of both")
+        raise InputError(f"source has {len(source)} points and target {len(target)}; expected equal numbers")
     mean_source, mean_target = source.mean(axis=0), target.mean(axis=0)
     left, values, right = np.linalg.svd((target - mean_target).T @ (source - mean_source) / len(source))
     for name, points, mean in (("source", source, mean_source), ("target", target, mean_target)):
         extents = np.linalg.svd(points - mean, compute_uv=False)
         if not moves(points):
-            raise InputError(f"the {len(points)} {name} points all coincide: without motion there is nothing to align")
+            raise InputError(f"the {len(points)} {name} points all coincide; an alignment needs motion")
         if not allow_line and extents[1] < _NO_WIDTH * extents[0]:
-            raise InputError(f"the {name} points lie on one line, around which no rotation can be found")
+            raise InputError(f"the {name} points lie on one line; the rotation around it is unknown")
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
     rotation = left @ (signs[:, None] * right)
     scale = float(values @ signs / ((source - mean_source) ** 2).sum(axis=1).mean()) if with_scale else 1.0
     if scale <= 0:
-        raise InputError("source and target points are not correlated: no positive scale takes one to the other")
+        raise InputError("source and target points are not correlated: no positive scale fits")
     return Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
 
 
@@ -102,7 +102,7 @@ def centre_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray,
 
 
 def point_error(predicted: Float[np.ndarray, "N 3"], truth: Float[np.ndarray, "N 3"]) -> float:
-    """Return the RMSE of points after Sim(3) alignment, in the truth's unit; raises as `umeyama_sim3`, lines pass."""
+    """Return the RMSE of points after Sim(3) alignment, in the truth's unit; raises as `umeyama_sim3` with lines."""
     aligned = umeyama_sim3(predicted, truth, allow_line=True).apply(predicted)
     return float(np.sqrt(((aligned - truth) ** 2).sum(axis=1).mean()))
 
@@ -113,7 +113,7 @@ def rotation_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarra
     Both trajectories are expressed relative to their own first frame; nothing is aligned.
 
     Raises:
-        InputError: fewer than 2 poses, or another number of one than of the other.
+        InputError: fewer than 2 poses, or different numbers of poses.
     """
     predicted, truth = _pair(predicted, truth, 2)
     return float(np.degrees((from_first(predicted) * from_first(truth).inv()).magnitude().mean()))
@@ -135,13 +135,12 @@ def trajectory_errors(
 
     Args:
         predicted, truth: rigid transforms, world from camera, of the same frames.
-        align: what is fitted to the centres before: "sim3" rotation, translation and scale (Umeyama 1991), "se3" the
-            same without scale; or "first": the prediction is moved so that its first pose is the true one, and
-            keeps its scale.
+        align: "sim3" fits rotation, translation and scale to the centres first (Umeyama 1991), "se3" rotation and
+            translation; "first" moves the first predicted pose to the true one and keeps the scale.
 
     Raises:
-        InputError: poses that are not rigid [S, 4, 4], another number of one than of the other, an unknown alignment.
-            With "sim3" and "se3" also fewer than 3 poses or cameras that do not move, with "first" fewer than 2.
+        InputError: poses that are not rigid [S, 4, 4], different numbers of poses, an unknown alignment. With "sim3"
+            and "se3" also fewer than 3 poses or cameras that do not move, with "first" fewer than 2 poses.
     """
     if align not in get_args(Alignment):
         raise InputError(f"align is {align!r}; expected one of {', '.join(get_args(Alignment))}")
@@ -155,23 +154,23 @@ def trajectory_errors(
 def associate(
     times: Float[np.ndarray, " N"], other_times: Float[np.ndarray, " M"], tolerance: float = 0.02
 ) -> Int[np.ndarray, "K 2"]:
-    """Return which timestamps belong together, as TUM's tools for RGB-D sequences pair them.
+    """Return pairs of timestamps, as TUM's tools for RGB-D sequences pair them.
 
-    Of all pairs that are less than `tolerance` apart the closest is taken first, then the closest of those whose
-    timestamps are both still free, and so on.
+    Of all pairs less than `tolerance` apart the closest comes first, then the closest pair of unpaired timestamps, and
+    so on.
 
     Args:
         times, other_times: seconds, in any order.
-        tolerance: seconds; a pair that is exactly as far apart does not count.
+        tolerance: seconds; a pair exactly as far apart does not count.
 
     Returns:
-        Indices into `times` and `other_times`, in the order of `times`; none where nothing is close enough.
+        Indices into `times` and `other_times`, in the order of `times`; empty if no pair is close enough.
 
     Raises:
-        InputError: times that are not a finite row, a tolerance that is not above 0, or one so large that more than
-            ten million pairs lie within.
+        InputError: times that are not finite or not one-dimensional, a tolerance that is not above 0, or more than ten
+            million pairs within the tolerance.
     """
-    first, second = (_timestamps(name, row) for name, row in (("times", times), ("other_times", other_times)))
+    first, second = (_timestamps(name, values) for name, values in (("times", times), ("other_times", other_times)))
     if not tolerance > 0:
         raise InputError(f"tolerance is {tolerance}; expected seconds above 0")
     order = np.argsort(second, kind="stable")
@@ -190,9 +189,9 @@ def associate(
     for i, j in zip(left[near].tolist(), right[near].tolist(), strict=True):
         if partner[i] < 0 and not taken[j]:
             partner[i], taken[j] = j, True
-    found = np.flatnonzero(partner >= 0)
-    found = found[np.argsort(first[found], kind="stable")]
-    return np.stack([found, partner[found]], axis=1)
+    paired = np.flatnonzero(partner >= 0)
+    paired = paired[np.argsort(first[paired], kind="stable")]
+    return np.stack([paired, partner[paired]], axis=1)
 
 
 def _step_errors(aligned: Float64[np.ndarray, "S 3 4"], truth: Float64[np.ndarray, "S 3 4"]) -> tuple[float, float]:
@@ -204,12 +203,12 @@ def _step_errors(aligned: Float64[np.ndarray, "S 3 4"], truth: Float64[np.ndarra
 
 
 def checked_poses(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarray, "S 3 4"]:
-    """Return poses in float64, or raise InputError where they are not rigid transforms [S, 3, 4]."""
+    """Return poses in float64; raises InputError unless they are rigid transforms [S, 3, 4]."""
     poses = np.asarray(camera_from_world, np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (3, 4):
         raise InputError(f"camera poses have shape {poses.shape}; expected [S, 3, 4]")
     if not np.isfinite(poses).all():
-        raise InputError("camera poses hold values that are not finite; expected rotations and translations")
+        raise InputError("camera poses have values that are not finite; expected rotations and translations")
     rotation = poses[:, :, :3]
     skewed = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2)) > _NOT_RIGID
     if (wrong := np.flatnonzero(skewed | (np.linalg.det(rotation) < 0))).size:
@@ -218,7 +217,7 @@ def checked_poses(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.n
 
 
 def _camera_from_world(name: str, world_from_camera) -> Float64[np.ndarray, "S 3 4"]:
-    """Return inverted poses [S, 3, 4], rotations made exact."""
+    """Return inverted poses [S, 3, 4] with exact rotations."""
     poses = np.asarray(world_from_camera, np.float64)
     if poses.ndim != 3 or poses.shape[1:] != (4, 4):
         raise InputError(f"the {name} poses have shape {poses.shape}; expected world-from-camera [S, 4, 4]")
@@ -240,14 +239,14 @@ def _onto(predicted: Float64[np.ndarray, "S 3 4"], truth: Float64[np.ndarray, "S
 def _timestamps(name: str, times) -> Float64[np.ndarray, " N"]:
     times = np.asarray(times, np.float64)
     if times.ndim != 1 or not np.isfinite(times).all():
-        raise InputError(f"{name} has shape {times.shape}; expected a row of finite seconds")
+        raise InputError(f"{name} has shape {times.shape}; expected finite seconds [N]")
     return times
 
 
 def _pair(predicted, truth, fewest: int) -> tuple[Float64[np.ndarray, "S 3 4"], Float64[np.ndarray, "S 3 4"]]:
     predicted, truth = checked_poses(predicted), checked_poses(truth)
     if len(predicted) != len(truth):
-        raise InputError(f"{len(predicted)} predicted poses and {len(truth)} true ones; expected as many of both")
+        raise InputError(f"{len(predicted)} predicted poses and {len(truth)} true ones; expected equal numbers")
     if len(truth) < fewest:
         raise InputError(f"a trajectory of {len(truth)} poses; expected at least {fewest}")
     return predicted, truth
@@ -257,18 +256,18 @@ def _pair_of_centres(predicted, truth) -> tuple[Float64[np.ndarray, "S 3"], Floa
     predicted, truth = (centres(poses) for poses in _pair(predicted, truth, FEWEST_POSES))
     for name, points in (("predicted", predicted), ("true", truth)):
         if not moves(points):
-            raise InputError(f"the {name} cameras do not move: their centres cannot be aligned")
+            raise InputError(f"the {name} cameras do not move; their centres cannot be aligned")
     return predicted, truth
 
 
 def moves(points: Float[np.ndarray, "N 3"]) -> bool:
-    """Return whether points differ by more than rounding."""
+    """Return whether points differ by more than rounding errors."""
     points = np.asarray(points, np.float64)
     return bool(np.linalg.norm(points - points.mean(axis=0)) > _NO_MOTION * np.linalg.norm(points))
 
 
 def _steps(camera_from_world: Float64[np.ndarray, "S 3 4"]) -> tuple[Rotation, Float64[np.ndarray, "S-1 3"]]:
-    """Return P_i^-1 P_i+1 of world-from-camera poses P: the next camera as seen from this one."""
+    """Return P_i^-1 P_i+1 of world-from-camera poses P: each camera relative to the camera before it."""
     rotations, positions = _rotations(camera_from_world), centres(camera_from_world)
     return rotations[:-1] * rotations[1:].inv(), rotations[:-1].apply(np.diff(positions, axis=0))
 
@@ -284,5 +283,5 @@ def _points(name: str, points: Float[np.ndarray, "N 3"]) -> Float64[np.ndarray, 
     if len(points) < FEWEST_POSES:
         raise InputError(f"{len(points)} {name} points; expected at least {FEWEST_POSES}")
     if not np.isfinite(points).all():
-        raise InputError(f"{name} points hold values that are not finite")
+        raise InputError(f"{name} points have values that are not finite")
     return points

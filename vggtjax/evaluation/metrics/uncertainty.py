@@ -1,4 +1,4 @@
-"""Whether a claimed precision of depth is true: sparsification, likelihood, calibration. Does not import jax.
+"""Scores of a claimed precision of depth: sparsification, likelihood, calibration. Does not import jax.
 
 A precision is an inverse variance up to one factor: sigma^2 = scale / precision.
 """
@@ -16,7 +16,7 @@ from vggtjax.evaluation.metrics.depth import measured
 
 
 class Sparsification(NamedTuple):
-    """Mean |error| of what remains when a share of the pixels is removed."""
+    """Mean |error| of the remaining pixels after a share of the pixels is removed."""
 
     fractions: Float64[np.ndarray, " K"]  # removed: 0, 1 / K, ..., 1 - 1 / K
     remaining: Float64[np.ndarray, " K"]  # the least confident first
@@ -24,20 +24,20 @@ class Sparsification(NamedTuple):
 
 
 class Reliability(NamedTuple):
-    """How many errors lie within the central interval that a Gaussian claims for a share."""
+    """Shares of errors within the central intervals of a Gaussian."""
 
     levels: Float64[np.ndarray, " K"]  # claimed, 0 to 1
     shares: Float64[np.ndarray, " K"]  # observed
 
 
 class UncertaintyScores(NamedTuple):
-    """Scores of a claimed precision; lower is better, `scale` aside.
+    """Scores of a claimed precision; lower is better except for `scale`.
 
     Attributes:
         ause: area between the sparsification curve and the oracle's, over the mean |error|.
-        nll: mean negative log likelihood per pixel with the precision as it is, in nats.
+        nll: mean negative log likelihood per pixel with the given precision, in nats.
         nll_calibrated: the same with the scale of maximum likelihood.
-        ece: expected calibration error with the precision as it is, 0 to 1.
+        ece: expected calibration error with the given precision, 0 to 1.
         ece_calibrated: the same with the scale of maximum likelihood.
         scale: that scale.
     """
@@ -53,15 +53,15 @@ class UncertaintyScores(NamedTuple):
 def uncertainty_scores(
     predicted: Float[np.ndarray, "*S"], truth: Float[np.ndarray, "*S"], precision: Float[np.ndarray, "*S"]
 ) -> UncertaintyScores:
-    """Return how well a precision tells the errors of depth, over the pixels with a true depth.
+    """Return scores of a precision against the errors of depth, over the pixels with a true depth.
 
     Args:
         predicted: depth, aligned to the truth by the caller.
-        truth: depth; a value that is not above 0 and finite does not count.
-        precision: above 0 where there is a true depth.
+        truth: depth; values that are not finite and above 0 are unknown and do not count.
+        precision: above 0 at pixels with a true depth.
 
     Raises:
-        InputError: shapes that differ, no pixel with a true depth, values that are not finite, a precision that is not
+        InputError: different shapes, no pixel with a true depth, values that are not finite, a precision that is not
             above 0, or errors that are all 0, for which no Gaussian has a likelihood.
     """
     predicted, truth, precision = (np.asarray(values) for values in (predicted, truth, precision))
@@ -75,7 +75,7 @@ def uncertainty_scores(
     claimed = precision[valid].astype(np.float64)
     scale = calibrated_scale(errors, claimed)
     if scale == 0:
-        raise InputError("all errors are 0: no scale of the precision has a likelihood, nothing can be calibrated")
+        raise InputError("all errors are 0; no scale of the precision has a likelihood")
     return UncertaintyScores(
         ause(errors, claimed),
         gaussian_nll(errors, claimed, 1.0),
@@ -89,17 +89,17 @@ def uncertainty_scores(
 def sparsification_curve(
     errors: Float[np.ndarray, "*S"], confidence: Float[np.ndarray, "*S"], steps: int = 20
 ) -> Sparsification:
-    """Return the mean |error| of what remains when the least confident pixels are removed, share by share.
+    """Return the mean |error| of the remaining pixels after shares of the least confident pixels are removed.
 
-    Pixels of one confidence share their mean error, so that the curve does not depend on their order.
+    Pixels of one confidence share their mean error, so the curve does not depend on their order.
 
     Args:
         errors: prediction minus truth; the sign does not matter.
-        confidence: larger where the error should be smaller; only its order matters.
-        steps: K; the shares are k / K, rounded to whole pixels, and one pixel remains at least.
+        confidence: larger for smaller expected errors; only its order matters.
+        steps: K; the shares are k / K, rounded to whole pixels, and at least one pixel remains.
 
     Raises:
-        InputError: shapes that differ, no pixel, values that are not finite, or fewer than 2 steps.
+        InputError: different shapes, no pixel, values that are not finite, or fewer than 2 steps.
     """
     size, confidence = _pair(errors, confidence, "confidence")
     size = np.abs(size)
@@ -116,8 +116,8 @@ def sparsification_curve(
 def ause(errors: Float[np.ndarray, "*S"], confidence: Float[np.ndarray, "*S"]) -> float:
     """Return the area between the sparsification curve and the oracle's, divided by the mean |error|.
 
-    Both curves have 20 steps; the area is that of trapezoids over the removed shares 0 to 0.95. 0 is the oracle's own
-    order, and what errors that are all 0 score (Ilg et al. 2018; the curve is of |error|).
+    Both curves have 20 steps; the area is the sum of trapezoids over the removed shares 0 to 0.95. 0 is the score of
+    the oracle's own order, and of errors that are all 0 (Ilg et al. 2018, with |error|).
 
     Raises:
         InputError: as `sparsification_curve`.
@@ -131,7 +131,7 @@ def calibrated_scale(errors: Float[np.ndarray, "*S"], precision: Float[np.ndarra
     """Return the c of maximum likelihood for errors with sigma^2 = c / precision: the mean of precision * error^2.
 
     Raises:
-        InputError: shapes that differ, no pixel, values that are not finite, a precision that is not above 0.
+        InputError: different shapes, no pixel, values that are not finite, a precision that is not above 0.
     """
     errors, precision = _claimed(errors, precision)
     return float((precision * errors**2).mean())
@@ -151,12 +151,12 @@ def gaussian_nll(errors: Float[np.ndarray, "*S"], precision: Float[np.ndarray, "
 def reliability_curve(
     errors: Float[np.ndarray, "*S"], precision: Float[np.ndarray, "*S"], scale: float = 1.0, bins: int = 10
 ) -> Reliability:
-    """Return for levels p the share of pixels with |error| <= z_p sigma, which is p where a Gaussian is right.
+    """Return for levels p the share of pixels with |error| <= z_p sigma: p for Gaussian errors.
 
     z_p is the quantile of the standard normal at (1 + p) / 2, and sigma^2 = scale / precision.
 
     Args:
-        errors, precision: prediction minus truth, and what was claimed for it.
+        errors, precision: prediction minus truth, and its claimed precision.
         scale: of the variance.
         bins: number of levels; they are the middles (k + 1/2) / bins of equal parts of 0 to 1.
 
@@ -175,13 +175,13 @@ def reliability_curve(
 def expected_calibration_error(
     errors: Float[np.ndarray, "*S"], precision: Float[np.ndarray, "*S"], scale: float = 1.0, bins: int = 10
 ) -> float:
-    """Return the mean of |observed share - p| over the levels of `reliability_curve`; errors as there."""
+    """Return the mean of |observed share - p| over the levels of `reliability_curve`; raises the same errors."""
     curve = reliability_curve(errors, precision, scale, bins)
     return float(np.abs(curve.shares - curve.levels).mean())
 
 
 def _remaining(ordered: Float64[np.ndarray, " N"], removed) -> Float64[np.ndarray, " K"]:
-    """Return the mean of what follows the first so many."""
+    """Return the mean of the values after the first `removed`."""
     sums = np.cumsum(ordered[::-1])[::-1]
     return sums[removed] / (len(ordered) - removed)
 
@@ -195,7 +195,7 @@ def _checked_scale(scale: float) -> float:
 def _claimed(errors, precision) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
     errors, precision = _pair(errors, precision, "precision")
     if (wrong := int((precision <= 0).sum())) > 0:
-        raise InputError(f"{wrong} of {len(precision)} precisions are not above 0; expected all of them to be")
+        raise InputError(f"{wrong} of {len(precision)} precisions are not above 0; expected all to be")
     return errors, precision
 
 
@@ -204,8 +204,8 @@ def _pair(errors, other, name: str) -> tuple[Float64[np.ndarray, " N"], Float64[
     if errors.shape != other.shape:
         raise InputError(f"errors have shape {errors.shape} and the {name} {other.shape}; expected the same")
     if not errors.size:
-        raise InputError("there are no errors to compare; expected at least one pixel with a true depth")
+        raise InputError("no errors to compare; expected at least one pixel with a true depth")
     for what, values in (("errors", errors), (name, other)):
         if (wrong := int((~np.isfinite(values)).sum())) > 0:
-            raise InputError(f"{wrong} values of the {what} are not finite; expected all of them to be")
+            raise InputError(f"{wrong} values of the {what} are not finite; expected all to be")
     return errors.ravel(), other.ravel()

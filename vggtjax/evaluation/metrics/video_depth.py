@@ -1,4 +1,4 @@
-"""Depth of a video against the truth after one alignment for all its frames. Does not import jax."""
+"""Depth of a video against the truth, with one alignment for all frames. Does not import jax."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ Align = Literal["metric", "median", "scale", "scale-shift"]
 
 _SCALE_ROUNDS = 10
 _SHIFT_ROUNDS = 40
-_SHRINK = 0.6  # of the floor below which a residual gets no more weight, from round to round
-_LEAST = 1e-8  # a residual, in the truth's unit, that keeps a weight finite
+_SHRINK = 0.6  # of the smallest residual of a weight, from round to round
+_LEAST = 1e-8  # residual of the largest weight, in the truth's unit
 
 
 class VideoDepthErrors(NamedTuple):
@@ -27,7 +27,7 @@ class VideoDepthErrors(NamedTuple):
     delta1: float  # share of pixels with max(d / g, g / d) < 1.25
     delta2: float  # < 1.25^2
     delta3: float  # < 1.25^3
-    pixels: int  # that are valid: the weight of this sequence in a mean over several
+    pixels: int  # valid pixels: the weight of this sequence in a mean over several
 
 
 class DepthLine(NamedTuple):
@@ -47,28 +47,28 @@ def video_depth_errors(
     """Return the errors of a sequence's depth after one alignment over all valid pixels of all frames.
 
     Args:
-        predicted: depth at the truth's size, finite wherever the truth is valid. A depth that is
-            not above 0 after the alignment is counted like any other in AbsRel and RMSE, and is within no delta.
+        predicted: depth at the truth's size, finite wherever the truth is valid. Aligned depth that is not above 0
+            counts in AbsRel and RMSE, and is within no delta.
         truth: depth; valid where it is finite, above 0 and below `max_depth`.
         align: "metric" changes nothing; "median" scales by median g / median d; "scale" by the least absolute error,
             as MonST3R and CUT3R do it: from mean g / mean d, ten rounds of least squares with weights
             1 / (|s d - g| + 1e-8); "scale-shift" by s d + t of the least absolute error, as `_least_absolute_line`
             says.
-        max_depth: in the truth's unit; none if None.
+        max_depth: in the truth's unit; no limit if None.
 
     Raises:
-        InputError: shapes that differ or are not [S, H, W], no valid pixel, a prediction that is not finite on one, an
-            unknown alignment, a `max_depth` that is not above 0, or a prediction that cannot be aligned: its mean or
-            median is not above 0, or with "scale-shift" it is the same everywhere.
+        InputError: different shapes or shapes other than [S, H, W], no valid pixel, a prediction there that is not
+            finite, an unknown alignment, a `max_depth` that is not above 0, or a prediction that cannot be aligned: its
+            mean or median is not above 0, or with "scale-shift" it is constant.
     """
     if np.ndim(truth) != 3:
         raise InputError(f"the true depth has shape {np.shape(truth)}; expected a sequence [S, H, W]")
     predicted, truth = _valid_pixels(predicted, truth, max_depth)
     scale, shift = _line(predicted, truth, align)
     aligned = scale * predicted + shift
-    apart = np.abs(aligned - truth)
-    abs_rel, rmse = float((apart / truth).mean()), float(np.sqrt((apart**2).mean()))
-    del apart
+    errors = np.abs(aligned - truth)
+    abs_rel, rmse = float((errors / truth).mean()), float(np.sqrt((errors**2).mean()))
+    del errors
     low, high = np.minimum(aligned, truth), np.maximum(aligned, truth)
     deltas = (float((high < DELTA**power * low).mean()) for power in (1, 2, 3))  # never where `low` is not above 0
     return VideoDepthErrors(abs_rel, rmse, *deltas, pixels=len(truth))
@@ -81,10 +81,7 @@ def depth_alignment(
     *,
     max_depth: float | None = None,
 ) -> DepthLine:
-    """Return the scale and the shift that `video_depth_errors` puts on a prediction; arguments and errors as there.
-
-    Any shape will do, one number of axes of both.
-    """
+    """Return the scale and the shift of `video_depth_errors`; arguments and errors are the same, for any shape."""
     return _line(*_valid_pixels(predicted, truth, max_depth), align)
 
 
@@ -105,15 +102,15 @@ def _least_absolute_line(predicted: Float64[np.ndarray, " N"], truth: Float64[np
     """Return s and t of the least sum of |s d + t - g|, by reweighted least squares.
 
     The start is the least squares line. Forty rounds follow, each the least squares line with weights
-    1 / max(|r|, floor) of the residuals r of the round before; the floor begins at their mean and shrinks by 0.6 from
-    round to round, down to 1e-8, so that no pixel that happens to lie on an early line holds it there. Of all these
-    lines the one with the least sum is kept.
+    1 / max(|r|, floor) of the residuals r of the round before; the floor starts at their mean and shrinks by 0.6 from
+    round to round, down to 1e-8, so that a pixel on an early line does not hold the line. The line with the least sum
+    is returned.
     """
     middle = float(predicted.mean())
     centred = predicted - middle  # the normal equations stay well conditioned
     spread = float(np.abs(centred).max())
     if spread <= 1e-9 * abs(middle) or spread == 0:
-        raise InputError(f"the predicted depth is {middle:.6g} in all valid pixels; scale and shift cannot be found")
+        raise InputError(f"the predicted depth is {middle:.6g} in all valid pixels; scale and shift are undefined")
     weights = np.ones(len(truth))
     best, least, floor = DepthLine(1.0), np.inf, 0.0
     for round_ in range(_SHIFT_ROUNDS + 1):
@@ -121,14 +118,14 @@ def _least_absolute_line(predicted: Float64[np.ndarray, " N"], truth: Float64[np
         mean, true_mean = float(weights @ centred / total), float(weights @ truth / total)
         weighted = weights * (centred - mean)
         if (variance := float(weighted @ centred)) <= 0:
-            break  # all the weight is on one depth: the line is as good as found
+            break  # all the weight is on one depth
         scale = float(weighted @ truth / variance)
         line = DepthLine(scale, true_mean - scale * mean)
-        apart = np.abs(line.scale * centred + line.shift - truth)
-        if (error := float(apart.sum())) < least:
+        residuals = np.abs(line.scale * centred + line.shift - truth)
+        if (error := float(residuals.sum())) < least:
             best, least = line, error
         floor = error / len(truth) if round_ == 0 else floor * _SHRINK
-        weights = 1 / np.maximum(apart, max(floor, _LEAST))
+        weights = 1 / np.maximum(residuals, max(floor, _LEAST))
     return DepthLine(best.scale, best.shift - best.scale * middle)
 
 
@@ -148,7 +145,7 @@ def _line(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]
 
 def _ratio(name: str, predicted: float, truth: float) -> float:
     if predicted <= 0:
-        raise InputError(f"the {name} of the predicted depth is {predicted:.6g}; expected it above 0 to find a scale")
+        raise InputError(f"the {name} of the predicted depth is {predicted:.6g}; expected it above 0")
     return truth / predicted
 
 
@@ -165,10 +162,8 @@ def _valid_pixels(predicted, truth, max_depth) -> tuple[Float64[np.ndarray, " N"
         valid &= truth < max_depth
     if not valid.any():
         below = "" if max_depth is None else f" below {max_depth}"
-        raise InputError(f"no pixel has a true depth above 0{below}; nothing can be compared")
-    found = predicted[valid].astype(np.float64)
-    if (wrong := int((~np.isfinite(found)).sum())) > 0:
-        raise InputError(
-            f"{wrong} predicted depths are not finite where the truth is valid; expected all of them to be"
-        )
-    return found, truth[valid].astype(np.float64)
+        raise InputError(f"no pixel has a true depth above 0{below} to compare with")
+    predicted = predicted[valid].astype(np.float64)
+    if (wrong := int((~np.isfinite(predicted)).sum())) > 0:
+        raise InputError(f"{wrong} predicted depths are not finite where the truth is valid; expected all to be")
+    return predicted, truth[valid].astype(np.float64)
