@@ -1,7 +1,7 @@
-"""Many clips in one call beside the same clips one by one: python -m benchmarks batch.
+"""Many clips in one call compared with one call per clip: python -m benchmarks batch.
 
-Both sides run in this process with the model loaded. Cold runs begin with no compiled programs, neither in memory nor
-on disk, and compile every shape of clip once; warm runs find them all. The sides take turns in going first.
+Both sides run in this process with the model loaded. Cold runs start without compiled programs in memory or
+on disk, and compile every shape of clip once; warm runs find all programs compiled. The sides alternate in order.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ def batch(
     """Time reconstruct_many over clips of mixed size and length, one of them corrupt, and the sum of single runs.
 
     Args:
-        clips: their number, the corrupt one among them; two at least.
+        clips: number of clips, with the corrupt one; at least two.
         model: "demo", or weights as for vggtjax reconstruct.
         method: which passes give depth and cameras.
-        lengths: of the clips, in frames, in turn.
-        repeats: runs of each side, cold and warm; the table has their medians.
+        lengths: frames of the clips, in turn.
+        repeats: runs of each side, cold and warm; the table shows their medians.
         seed: another seed draws other scenes.
         out: JSON file for the settings, every run's seconds and the ratios.
     """
@@ -63,7 +63,7 @@ def batch(
         if value < least:
             raise InputError(f"{name} is {value}; expected at least {least}")
     keep_freed_memory()  # as commands do
-    jax.config.update("jax_enable_compilation_cache", False)  # of programs on disk
+    jax.config.update("jax_enable_compilation_cache", False)  # no programs from disk
     console = Console()
     loaded = load_model(model)
     seconds: dict[str, dict[str, list[float]]] = {state: {side: [] for side in SIDES} for state in ("cold", "warm")}
@@ -72,7 +72,7 @@ def batch(
         with console.status("clips"):
             frames = write_clips(folder / "clips", clips, _ENLARGED * loaded.config.image_size, lengths, seed)
         sources = clips_by_name([str(folder / "clips")])
-        _one_by_one(loaded, dict(list(sources.items())[:1]), folder / "before", method)  # what is imported late
+        _one_by_one(loaded, dict(list(sources.items())[:1]), folder / "before", method)  # late imports
         for state in seconds:
             for repeat in range(repeats):
                 for side in list(SIDES)[:: 1 if repeat % 2 == 0 else -1]:
@@ -104,13 +104,13 @@ def batch(
 
 
 def write_clips(folder: Path, count: int, side: int, lengths: tuple[int, ...], seed: int) -> int:
-    """Write generated clips, a folder of pictures each; the last picture of the one in the middle is cut off.
+    """Write generated clips, a folder of pictures each; the last picture of the middle clip is truncated.
 
     Args:
-        folder: for the folders.
-        count: of clips.
+        folder: parent of the clips' folders.
+        count: number of clips.
         side: largest side of the pictures, in pixels.
-        lengths: of the clips, in frames, in turn; each length comes with every shape of pictures.
+        lengths: frames of the clips, in turn; each length occurs with every shape of pictures.
         seed: of the scenes.
 
     Returns:
@@ -149,7 +149,7 @@ def _one_by_one(model: Model, sources: dict[str, str], out: Path, method: Method
 
 
 def _batch(model: Model, sources: dict[str, str], out: Path, method: MethodName) -> set[str]:
-    """Do so in one call; return the names of those that fail."""
+    """Load, reconstruct and save all clips in one call; return the names of those that fail."""
     outcomes = reconstruct_many(model, sources, out, options={"method": method})
     return {outcome.name for outcome in outcomes if outcome.status == "failed"}
 

@@ -1,4 +1,4 @@
-"""What guesses that see no image score on clips with truth, and how a model compares with them."""
+"""Scores of guesses without images on clips with truth, and a model compared with these guesses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Progress = Callable[[int, int], object]
 
 
 class Prior(NamedTuple):
-    """What the training scenes are like on average."""
+    """Averages of the training scenes."""
 
     depth: Float64[np.ndarray, "H W"]  # metres
     angular_velocity: Float64[np.ndarray, " 3"]  # radians per frame
@@ -42,23 +42,23 @@ class Guess:
     mean_depth_map: float
     no_rotation: float
     mean_rate: float  # the training scenes' mean angular velocity
-    best_rate: float  # an oracle: the constant rate that fits this clip's truth best
+    best_rate: float  # an oracle: the constant rate with the least error on this clip's truth
     no_motion: float
-    line: float  # at constant speed, along the direction that fits this clip's truth best
+    line: float  # constant speed along the direction with the least error on this clip's truth
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The model's mean error over clips against a guess's."""
+    """The model's mean error over clips compared with a guess's."""
 
     metric: str
     guess: str
-    model_error: float | None  # mean over the clips that have one
+    model_error: float | None  # mean over the clips with a number
     guess_error: float
     ratio: float | None
-    better: float  # share of the clips on which the model's error is the smaller one
+    better: float  # share of the clips with a smaller error of the model
     clips: int
-    failed: int  # clips without a number of the model
+    failed: int  # clips without a number for the model
     threshold: float
 
     @property
@@ -83,7 +83,7 @@ def training_prior(config: SceneConfig, scenes: int, *, batch: int = 8, progress
     @jax.jit
     def draw(keys, textures):
         clips = jax.vmap(lambda key: generate(key, textures, config))(keys)
-        return clips.depth, clips.camera_from_world  # what is not asked for is not drawn
+        return clips.depth, clips.camera_from_world  # other fields are not computed
 
     keys = jax.random.split(jax.random.key(0), -(-scenes // batch) * batch)
     total, rates = np.zeros((config.height, config.width)), []

@@ -1,4 +1,4 @@
-"""How good a model is on generated scenes that it has not seen, and on filmed ones: python -m benchmarks demo-model."""
+"""A model's errors on held-out generated scenes and on filmed clips: python -m benchmarks demo-model."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from benchmarks.blind_guesses import Comparison, Guess, Prior, compare, guesses, training_prior
-from benchmarks.plots import check_matplotlib, plot_ladder, plot_rotations, plot_sweep
+from benchmarks.plots import plot_ladder, plot_rotations, plot_sweep
 from benchmarks.real_clips import is_clip_folder, load_windows
 from benchmarks.summaries import Spread, Summary, comparison_table, ladder_table, saliency_auc, summarise
 from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth, batched_truth
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_extra
 from vggtjax.evaluation.ladder import LadderRow, ladder
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
@@ -43,17 +43,17 @@ class Compared:
 
 @dataclasses.dataclass(frozen=True)
 class Laddered:
-    """Clips with something that moves, on which every method was run."""
+    """Dynamic clips, on which every method was run."""
 
     rows: list[list[LadderRow]]  # of each seed
-    summaries: list[Summary]  # with the number of pairs that was asked for
-    sweep: list[Summary]  # with every number of pairs, over the seeds on which all were tried
+    summaries: list[Summary]  # for the requested number of pairs
+    sweep: list[Summary]  # for every number of pairs, over the seeds of the sweep
     saliency_auc: Spread | None
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """What was asked for; see `demo_model`."""
+    """The settings; see `demo_model`."""
 
     static: int
     dynamic: int
@@ -92,26 +92,26 @@ def demo_model(
     batch: int = 4,
     dtype: Literal["float32", "bfloat16"] = "float32",
 ) -> None:
-    """Measure a model against guesses that see no image, and the methods against each other.
+    """Compare a model with guesses without images, and the methods with each other.
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.
         out: folder for report.json, report.md and figures.
-        static: held-out scenes in which nothing moves; 0 leaves them out.
-        dynamic: held-out scenes of each seed in which things move; 0 leaves them out.
-        seeds: draws of dynamic scenes, for the spread.
+        static: number of held-out static scenes.
+        dynamic: number of held-out dynamic scenes of each seed.
+        seeds: number of draws of dynamic scenes, for the spread.
         frames: frames of a scene, and of a window of a filmed clip.
         mask_pairs: pairs in which keys are suppressed.
         sweep: further numbers of pairs to try.
-        sweep_seeds: draws of dynamic scenes on which they are tried.
-        training_scenes: scenes of the training split that the blind guesses know.
-        clips: folder with hololens/ and composite/ inside; what is absent is left out.
-        batch: clips that go through the network together.
-        dtype: of the blocks' matrix products.
+        sweep_seeds: number of draws of dynamic scenes for the sweep.
+        training_scenes: number of training scenes behind the blind guesses.
+        clips: folder with hololens/ and composite/ inside; absent folders are skipped.
+        batch: clips per run of the network.
+        dtype: type of the blocks' matrix products.
     """
     settings = Settings(static, dynamic, seeds, frames, mask_pairs, sweep, sweep_seeds, training_scenes, batch, dtype)
-    check_matplotlib()
-    with staging(out):  # a folder that cannot be written is told now
+    check_extra("plotting", "train", "matplotlib")  # before hours of measuring
+    with staging(out):  # an unwritable folder fails now
         pass
     loaded = load_model(model)
     bench = _Bench(loaded, settings)

@@ -1,4 +1,4 @@
-"""Put a trained model, and a clip that it has never seen, into the package: what `vggtjax demo` runs."""
+"""Put a trained model and a held-out clip into the package, for `vggtjax demo`."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def embed(model: str, /, *, frames: int = 16, scene: int = 0, image_size: int | 
     """Write the model, in bfloat16, and a held-out dynamic clip into the package.
 
     Args:
-        model: a .safetensors of this library, as `vggtjax train` or `vggtjax calibrate-cues` wrote it.
+        model: a .safetensors written by `vggtjax train` or `vggtjax calibrate-cues`.
         frames: of the clip.
         scene: index of the held-out scene.
         image_size: side in pixels that the model was last trained at, which becomes its own and the clip's; the
@@ -51,7 +51,7 @@ def embed(model: str, /, *, frames: int = 16, scene: int = 0, image_size: int | 
 
 
 def _at_size(backbone: Params, config: VGGTConfig, network: VGGTConfig) -> Params:
-    """Return the backbone with its positions resized, as it resizes them itself for images of that size."""
+    """Return the backbone with its positions resized, as `encode` resizes them for images of that size."""
     positions = jax.numpy.asarray(backbone["position_embedding"], jax.numpy.float32)
     grid = (network.grid_size, network.grid_size)
     patches = patch_positions(positions[1:], config.grid_size, grid)

@@ -1,4 +1,4 @@
-"""What a gradient costs beside the two passes that it is of: python -m benchmarks gradient."""
+"""The cost of a gradient compared with its two passes: python -m benchmarks gradient."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ def gradient(
     repeats: int = 3,
     out: Path | None = None,
 ) -> None:
-    """Time both passes with soft masks, and their gradient by the fusion's parameters and by what decides on masks.
+    """Time both passes with soft masks, and their gradients with respect to the fusion's and the masking's parameters.
 
     Args:
         size: of the model.
-        weights: a converted checkpoint to take for full.
+        weights: a converted checkpoint for size full.
         frames: numbers of frames.
         height: of a frame, in pixels; the size's own by default.
         width: of a frame, in pixels; the size's own by default.
-        dtype: of the products in the blocks.
-        masking: whether to measure the gradient by the masking, which goes back through the second pass.
-        repeats: timed runs of each, after one that warms up.
+        dtype: type of the products in the blocks.
+        masking: also measure the gradient with respect to the masking, through the second pass.
+        repeats: timed runs of each, after a warm-up.
         out: JSON file for the results.
     """
     check_counts(frames, repeats)

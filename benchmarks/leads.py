@@ -1,7 +1,7 @@
-"""What a CPU does how fast, and which way of doing it pays: python -m benchmarks leads.
+"""Rates of alternative implementations on a CPU: python -m benchmarks leads.
 
-Every row is one way to do a piece of VGGT-1B's work in float32 (unless it says bfloat16), in operations per second that
-the piece needs, however it is done. Choices in `vggtjax.network` rest on these.
+Every row is one implementation of a piece of VGGT-1B's work, in float32 unless named bfloat16. Rates count the
+operations that the piece requires, not those executed. Choices in `vggtjax.network` follow these rates.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ Way = tuple[str, str, float, Callable[..., Any], tuple]  # piece, way, operation
 
 
 def leads(*, frames: int = 2, tokens: int = 782, repeats: int = 5) -> None:
-    """Measure ways to do the pieces of a pass.
+    """Measure implementations of the pieces of a pass.
 
     Args:
-        frames: of a clip.
-        tokens: of a frame; 782 are those of 518 x 294 pixels.
+        frames: frames of a clip.
+        tokens: tokens of a frame; 782 for 518 x 294 pixels.
         repeats: timed runs of each; the fastest counts.
     """
     if min(frames, tokens, repeats) < 1:

@@ -32,9 +32,9 @@ def main(
     """Write seeded weights, one tensor in memory at a time.
 
     Args:
-        out: the file to write, or the folder where there are several shards.
-        shapes: JSON object of parameter names -> shapes; VGGT-1B unless said otherwise.
-        format: what the file is; pt needs as much space again while it writes.
+        out: file to write, or folder for several shards.
+        shapes: JSON object of parameter names -> shapes; VGGT-1B by default.
+        format: of the file; pt needs twice the space while it is written.
         shards: number of safetensors files, with an index.
         seed: of the weights.
     """
@@ -96,7 +96,7 @@ def _write_torch(path: Path, shapes: Shapes, make: Make) -> None:
 
     tensors = {}
     with staging(path.parent) as folder, writing(path) as temporary:
-        for number, (name, shape) in enumerate(shapes.items()):  # each lies in a file, not in memory, until saved
+        for number, (name, shape) in enumerate(shapes.items()):  # each stays in a file, not in memory, until saved
             tensors[name] = torch.from_file(f"{folder}/{number}", shared=True, size=prod(shape)).reshape(tuple(shape))
             tensors[name].copy_(torch.from_numpy(make(name)))
         torch.save(tensors, temporary)

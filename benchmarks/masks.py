@@ -1,4 +1,4 @@
-"""Which masks are right: mined, smoothed over time, refined by projection: python -m benchmarks masks."""
+"""Accuracy of masks: mined, smoothed over time, refined by projection: python -m benchmarks masks."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ def masks(
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.
-        methods: whose masks.
+        methods: methods whose masks are measured.
         scenes: held-out dynamic scenes.
         frames: of a scene, and of a window of a filmed clip.
-        smooth: numbers of frames that the saliency is averaged over.
+        smooth: numbers of frames over which the saliency is averaged.
         clips: folder of folders with rgb/, depth/, mask/, K.txt, world_from_camera.txt; none by default.
         seed: another seed draws other scenes.
     """
     if clips is not None and not clips.is_dir():
-        raise InputError(f"{clips} is no folder; name one of folders with rgb/, depth/, mask/ and cameras")
+        raise InputError(f"{clips} is not a folder; expected a folder of folders with rgb/, depth/, mask/ and cameras")
     if scenes < 1:
         raise InputError(f"scenes is {scenes}; expected at least 1")
     loaded, console = load_model(model), Console()
@@ -83,7 +83,7 @@ def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int
             mask = made.dynamic_mask
             if source is not None:
                 depth, poses, intrinsics = geometry[source]
-                known = depth > 0  # filmed depth has holes, about which nothing can be said
+                known = depth > 0  # filmed depth has holes without truth
                 mask = refine_masks(clip.images, depth, mask, poses, intrinsics, valid=known) | (mask & ~known)
             scores[name].append(
                 (jaccard(mask, clip.dynamic_mask), *precision_recall(mask, clip.dynamic_mask), mask.mean())
@@ -97,7 +97,7 @@ def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int
 
 
 def _in_units(clip: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return true depth, 0 where it is not known, and cameras, with the scene about 1 away as VGGT has it."""
+    """Return true depth, 0 where unknown, and cameras, scaled to a distance of about 1 as in VGGT."""
     unit = np.median(clip.depth[clip.depth > 0])
     poses = np.concatenate([clip.camera_from_world[..., :3], clip.camera_from_world[..., 3:] / unit], axis=-1)
     return (

@@ -9,7 +9,6 @@ import numpy as np
 
 from benchmarks.blind_guesses import Guess
 from benchmarks.summaries import AGAINST_FIRST, METRICS, Summary
-from vggtjax.errors import MissingExtraError
 from vggtjax.evaluation.ladder import LadderRow
 from vggtjax.storage.writing import writing
 
@@ -18,16 +17,8 @@ _COLOURS = {None: "0.55", "mined": "tab:blue", "true": "tab:orange"}
 _NAMES = {None: "no mask", "mined": "mined mask", "true": "true mask"}
 
 
-def check_matplotlib() -> None:
-    """Raise MissingExtraError now where plotting would fail after hours of measuring."""
-    try:
-        import matplotlib as _  # noqa: F401
-    except ImportError:
-        raise MissingExtraError("plotting", "train") from None
-
-
 def plot_rotations(path: Path, rows: dict[str, tuple[Sequence[LadderRow], Sequence[Guess]]]) -> None:
-    """Draw each clip's rotation error over that of no rotation; below the dashed line it is less than half."""
+    """Draw each clip's rotation error relative to no rotation; the dashed line is one half."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5, 5), layout="constrained")
@@ -82,7 +73,7 @@ def plot_ladder(path: Path, summaries: Sequence[Summary], title: str) -> None:
 
 
 def plot_sweep(path: Path, summaries: Sequence[Summary], method: str) -> None:
-    """Draw a method's errors over the number of pairs with suppressed keys; dotted is the plain pass."""
+    """Draw a method's errors over the number of pairs with suppressed keys; dotted: the plain pass."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4 * len(SHOWN), 4), layout="constrained")

@@ -1,4 +1,4 @@
-"""What comparing two large point clouds takes: python -m benchmarks point-clouds."""
+"""Time and memory of comparing two large point clouds: python -m benchmarks point-clouds."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.point_clouds import point_cloud_errors
 
 ROOM = np.array([5.0, 2.6, 7.0])  # metres: width, height, length
-PIXELS = (294, 518)  # of a frame: points come in the order of its rows, as those of a clip do
+PIXELS = (294, 518)  # of a frame: points are in the order of its rows, as in a clip
 RELIEF = 0.03  # metres; furniture and folds
 
 
 def point_clouds(*, points: int = 40_000_000, noise: float = 0.01, repeats: int = 1, seed: int = 0) -> None:
-    """Time `point_cloud_errors` on the surfaces of a made-up room, seen twice by a camera that walks through it.
+    """Time `point_cloud_errors` on the surfaces of a synthetic room, sampled twice by a walking camera.
 
     Args:
-        points: of each cloud.
-        noise: metres by which the predicted points are off, standard deviation in each direction.
+        points: points of each cloud.
+        noise: standard deviation of the predicted points in each direction, in metres.
         repeats: runs.
         seed: another seed draws another relief, walk and noise.
     """
@@ -65,9 +65,9 @@ def room(points: int, *, seed: int, shift: float = 0.0) -> Float32[np.ndarray, "
     """Return points on the walls of a room with some relief, frame by frame in the order of pixels.
 
     Args:
-        points: their number.
+        points: number of points.
         seed: of the relief and the walk.
-        shift: pixels by which the rays are moved; another shift samples the same surfaces in other places.
+        shift: shift of the rays in pixels; another shift samples other points of the same surfaces.
     """
     generator = np.random.default_rng(seed)
     phases = generator.uniform(0, 2 * np.pi, 3)
@@ -96,6 +96,6 @@ def room(points: int, *, seed: int, shift: float = 0.0) -> Float32[np.ndarray, "
 
 
 def peak_memory() -> float:
-    """Return the largest memory that this process has held, in GB."""
+    """Return the peak memory of this process, in GB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak / 1e9 if sys.platform == "darwin" else peak * 1024 / 1e9  # macOS counts bytes, Linux KiB

@@ -17,7 +17,7 @@ from vggtjax.evaluation.datasets.plain import takes
 
 
 class Windows(NamedTuple):
-    """Stretches of a folder's clips, all of one shape: truth [B, S, ...] and what each is called."""
+    """Windows of a folder's clips, all of one shape: truth [B, S, ...] and the name of each."""
 
     names: list[str]
     truth: Truth
@@ -53,7 +53,7 @@ def load_windows(folders: list[Path], config: VGGTConfig, frames: int) -> Window
 
 
 def window_starts(count: int, frames: int) -> list[int]:
-    """Return where the fewest windows of `frames` that cover `count` frames start, evenly spread."""
+    """Return the starts of the fewest windows of `frames` that cover `count` frames, evenly spread."""
     windows = -(-count // frames)
     return np.linspace(0, count - frames, windows).round().astype(int).tolist()
 

@@ -1,4 +1,4 @@
-"""How long mask refinement takes: python -m benchmarks refinement."""
+"""Time of mask refinement: python -m benchmarks refinement."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from vggtjax.scenes.render import generate
 
 
 def refinement(*, frames: int = 32, height: int = 294, width: int = 518, grow: int = 12, repeats: int = 3) -> None:
-    """Time mask refinement on a generated clip whose true mask has grown by some pixels.
+    """Time mask refinement on a generated clip with an enlarged true mask.
 
     Args:
-        frames: of the clip.
+        frames: frames of the clip.
         height: of a frame, in pixels.
         width: of a frame, in pixels.
-        grow: pixels by which the mask is larger than the truth on every side.
-        repeats: runs after the one that compiles.
+        grow: pixels added to the true mask on every side.
+        repeats: runs after the one with compilation.
     """
     from scipy.ndimage import binary_dilation
 

@@ -1,4 +1,4 @@
-"""How depth at the source's size is best made of the model's: python -m benchmarks resolution."""
+"""Ways to enlarge depth to the source's size, compared: python -m benchmarks resolution."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ Axis = Float[np.ndarray, " n"]
 
 
 def resolution(*, clips: Path, factors: tuple[float, ...] = (1.24, 1.65, 1.85, 3.7), every: int = 4) -> None:
-    """Shrink measured depth to the pixels of a smaller picture, enlarge it again, and compare with what was measured.
+    """Shrink measured depth to the pixels of a smaller picture, enlarge it again, and compare it with the original.
 
     Args:
-        clips: folder below which there are folders with depth/: pictures of one channel, in any unit, 0 where unknown.
+        clips: folder of folders with depth/: pictures of one channel, in any unit, 0 where unknown.
         factors: by which the depth is shrunk, every small pixel taking the depth at its centre; by default what takes
             frames of 518 pixels to pictures of 640, 854, 960 and 1920.
-        every: take every so many-th frame.
+        every: step between the frames used.
     """
     if min(*factors, every, 2) < 1 or not factors:
         raise InputError(f"factors are {factors} and every is {every}; expected whole numbers above 0")
     folders = sorted(folder.parent for folder in clips.rglob("depth") if any(folder.glob("*.png")))
     if not folders:
-        raise InputError(f"there are no clips below {clips}; expected folders with pictures in depth/")
+        raise InputError(f"{clips} has no clips; expected folders with pictures in depth/")
     console = Console()
     for factor in factors:
         table = Table(title=f"enlarged {factor:g} times", title_justify="left", box=None, pad_edge=False)
@@ -61,7 +61,7 @@ def _errors(path: Path, way: Callable[[np.ndarray, Axis, Axis], np.ndarray], fac
     height, width = (int(count * factor) for count in small.shape)
     true = true[:height, :width]
     x, y = ((np.arange(side) + 0.5) / factor for side in (width, height))
-    known = (true > 0) & (_bilinear((small > 0).astype(np.float64), x, y) > 0.999)  # with all four pixels around it
+    known = (true > 0) & (_bilinear((small > 0).astype(np.float64), x, y) > 0.999)  # all four neighbours are known
     return np.abs(way(small, x, y)[known] - true[known]) / true[known]
 
 
@@ -77,7 +77,7 @@ def _bilinear(depth: np.ndarray, x: Axis, y: Axis) -> np.ndarray:
 
 
 def _bilinear_inverse(depth: np.ndarray, x: Axis, y: Axis) -> np.ndarray:
-    return 1 / _bilinear(1 / np.where(depth > 0, depth, 1), x, y)  # what is unknown is not compared
+    return 1 / _bilinear(1 / np.where(depth > 0, depth, 1), x, y)  # unknown pixels are not compared
 
 
 WAYS = {

@@ -1,8 +1,8 @@
-"""What the second pass does to the cameras, taken apart: python -m benchmarks second-pass.
+"""Effects of the second pass on the cameras: python -m benchmarks second-pass.
 
-Every dynamic scene has a frozen twin: the same room, camera and textures, but what moves stands still. Plain passes
-over both say what motion costs. The second pass over the moving scene says what suppression does in all, over the
-frozen one what it does where there is nothing to repair, and with another scene's mask what it does anywhere.
+Every dynamic scene has a frozen twin: the same room, camera and textures, with its movers standing still. Plain passes
+over both measure the cost of motion. The second pass measures the total effect of suppression on the moving scene, its
+effect without motion on the frozen scene, and the effect of an arbitrary mask with another scene's mask.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ def second_pass(
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.
-        scenes: held-out dynamic scenes; two at least.
-        frames: of a scene.
+        scenes: number of held-out dynamic scenes, at least two.
+        frames: frames of a scene.
         seed: another seed draws other scenes.
         pairs: numbers of pairs in which keys are suppressed.
-        suppress: how they are.
+        suppress: how keys are suppressed.
     """
     if scenes < 2:
-        raise InputError(f"scenes is {scenes}; expected at least 2, one to lend the other its mask")
+        raise InputError(f"scenes is {scenes}; expected at least 2: each scene uses the mask of another")
     loaded = load_model(model)
     config = loaded.config
     side = config.image_size
@@ -103,7 +103,7 @@ def _table(errors: dict[tuple[str, str, int], np.ndarray], suppress: str) -> Tab
     difference = errors["moving", "none", 0] - errors["frozen", "none", 0]
     mean, spread = difference.mean(axis=0), difference.std(axis=0, ddof=1) / len(difference) ** 0.5
     table.caption = (
-        f"what motion costs the plain pass: rotation {mean[0]:+.2f} ± {spread[0]:.2f} degrees, centres {mean[1]:+.4f} "
+        f"cost of motion in the plain pass: rotation {mean[0]:+.2f} ± {spread[0]:.2f} degrees, centres {mean[1]:+.4f} "
         f"± {spread[1]:.4f} median depths (standard errors over scenes)"
     )
     return table

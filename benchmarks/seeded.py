@@ -1,4 +1,4 @@
-"""Seeded weights and images: a tensor depends on its own name and shape alone, so that goldens need no weights file."""
+"""Seeded weights and images: a tensor depends only on its name and shape, so goldens need no weights file."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def seeded_tensor(name: str, shape: Sequence[int], seed: int = 0) -> np.ndarray:
     values = generator.standard_normal(tuple(shape), dtype=np.float32)
     mean, scale = _moments(name, shape)
     if mean is None:
-        if ".flow_head." in name:  # small updates, or the tracker's iterations run away
+        if ".flow_head." in name:  # small updates keep the tracker's iterations stable
             values *= np.float32(0.1)
         values /= np.float32(scale)
     else:
@@ -54,7 +54,7 @@ def seeded_state_dict(shapes: Mapping[str, Sequence[int]], seed: int = 0) -> dic
 
 
 def seeded_images(frames: int, height: int, width: int, seed: int = 0) -> np.ndarray:
-    """Return noisy sums of drifting waves: RGB in [0, 1], float32, [frames, 3, height, width] as PyTorch has them."""
+    """Return noisy sums of drifting waves: RGB in [0, 1], float32, [frames, 3, height, width] as in PyTorch."""
     generator = np.random.Generator(np.random.PCG64(1_000 + seed))
 
     def draw(count: int) -> np.ndarray:

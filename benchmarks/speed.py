@@ -1,4 +1,4 @@
-"""Passes beside the public PyTorch code, in one run on one machine: python -m benchmarks speed."""
+"""Passes compared with the public PyTorch code, in one run on one machine: python -m benchmarks speed."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Worker:
         self._answer()
 
     def run(self, *, keep: str | None = None, mask: str | None = None, **task: Any) -> Answer:
-        """Run passes; return what main() of the worker answers: seconds, bytes of memory, reads of a disk."""
+        """Run passes; return the worker's answer: seconds, bytes of memory, reads of a disk."""
         self._process.stdin.write(json.dumps({**task, "keep": keep, "mask": mask}) + "\n")
         self._process.stdin.flush()
         return self._answer()
@@ -53,7 +53,7 @@ class Worker:
     def _answer(self) -> Answer:
         line = self._process.stdout.readline()
         if not line:
-            raise InputError(f"the process of {self._process.args[3]!r} ended; what it said is above")
+            raise InputError(f"the process of {self._process.args[3]!r} ended; its output is above")
         return json.loads(line)
 
 
@@ -69,7 +69,7 @@ def speed(
     repeats: int = 3,
     out: Path | None = None,
 ) -> None:
-    """Time passes in float32 here and in the public code, one after the other, again and again.
+    """Time passes in float32 here and in the public code, alternately.
 
     A plain pass gives cameras and depth in both. Both passes are our methods vggt4d and 4dvggt-d, each beside stages 1
     and 2 of VGGT4D: its model, maps, clusters and threshold. Its model has all heads in both passes; the second pass
@@ -80,29 +80,27 @@ def speed(
     public code all heads, as its `from_pretrained` loads them. In what is timed both sides map their weights.
 
     Args:
-        weights: PyTorch weights of VGGT-1B's layout, such as make-checkpoint writes.
-        converted: the same weights as vggtjax convert writes them.
+        weights: PyTorch weights in VGGT-1B's layout, such as those of make-checkpoint.
+        converted: the same weights, written by vggtjax convert.
         peer: checkout of the public code: a folder with the package vggt, and with vggt4d for both passes.
         frames: numbers of frames of a plain pass.
         both: numbers of frames of both passes; VGGT4D's cues need four.
         height: of a frame, in pixels.
         width: of a frame, in pixels.
-        repeats: timed runs of each, after one that warms up.
-        out: JSON file for what every run took.
+        repeats: timed runs of each, after a warm-up.
+        out: JSON file for the figures of every run.
     """
     for path in (weights, converted, peer / "vggt", *[peer / "vggt4d"] * bool(both)):
         if not path.exists():
-            raise InputError(f"{path} does not exist; see --help for what it should be")
+            raise InputError(f"{path} does not exist; see --help for the expected file")
     if both and min(both) < 4:
-        raise InputError(
-            f"both has {min(both)}; expected at least 4 frames, without which VGGT4D's cues are not numbers"
-        )
+        raise InputError(f"both has {min(both)}; expected at least 4 frames, since VGGT4D's cues are NaN for fewer")
     if repeats < 1:
         raise InputError(f"repeats is {repeats}; expected at least 1")
     public = ("peer", str(weights.resolve()), str(peer.resolve()))
     jobs = [(("pass",), count) for count in frames] + [(("vggt4d", "4dvggt-d"), count) for count in both]
     console, rows = Console(), []
-    console.width = max(console.width, _COLUMNS)  # of a file, rich assumes 80
+    console.width = max(console.width, _COLUMNS)  # rich assumes 80 for a file
     for works, count in jobs:
         task: dict[str, Any] = {"frames": count, "height": height, "width": width}
         status = console.status(f"{_TITLES[works[0]]}, {count} frames")
@@ -127,9 +125,9 @@ def speed(
 
 
 def _apart(sides: tuple[Worker, Worker], work: str, task: dict[str, int]) -> tuple[float, list[Answer]]:
-    """Return how far the outputs are apart at most, in standard deviations of the other's array, and the first runs.
+    """Return the largest difference of the outputs, in standard deviations of the other's array, and the first runs.
 
-    Too far apart is an error.
+    Raises InputError for too large a difference.
     Two-pass masks come from k-means with different generators, so the second pass is compared under the other's mask.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -143,9 +141,9 @@ def _apart(sides: tuple[Worker, Worker], work: str, task: dict[str, int]) -> tup
         if work != "pass":
             Path(files[1]).rename(f"{folder}/mask.npz")
             if not np.load(f"{folder}/mask.npz")["mask"].any():
-                raise InputError(f"nothing moves by VGGT4D's mask of {task['frames']} frames; take another number")
+                raise InputError(f"VGGT4D's mask is empty for {task['frames']} frames; choose another number")
             second, _ = compared(mask=f"{folder}/mask.npz")
-            apart = float(np.max([apart, second]))  # unlike max(), keeps what is no number
+            apart = float(np.max([apart, second]))  # unlike max(), keeps NaN
     if not apart <= _AGREE:
         raise InputError(f"the outputs of {work!r} differ by {apart:.1e} of their spread; expected at most {_AGREE}")
     return apart, firsts
@@ -166,7 +164,7 @@ def _table(rows: list[dict[str, Any]], title: str) -> Table:
     for row in rows:
         cells = []
         for key, which, unit in _COMPARED.values():
-            if not row["ours"][which]:  # the process has run another method before
+            if not row["ours"][which]:  # an earlier run of another method hides the peak
                 cells += ["-"] * 3
                 continue
             ours, theirs = (float(np.median([run[key] for run in row[side][which]])) for side in ("ours", "public"))

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.blind_guesses import Comparison
 from vggtjax.evaluation.ladder import LadderRow
 
-METRICS = {  # fields of LadderRow, and what tables and plots call them
+METRICS = {  # fields of LadderRow, and their names in tables and plots
     "abs_rel": "AbsRel",
     "abs_rel_static": "AbsRel static",
     "abs_rel_dynamic": "AbsRel dynamic",
@@ -53,9 +53,9 @@ class Summary:
     mask_pairs: int | None
     suppress: str | None
     clips: int
-    failed: int  # clips on which something could not be computed
+    failed: int  # clips with a failed metric
     scores: dict[str, Spread]
-    ratios: dict[str, Spread]  # mean error over that of the plain pass on the same clips
+    ratios: dict[str, Spread]  # mean error relative to the plain pass on the same clips
 
 
 def spread(values: Sequence[float]) -> Spread:
@@ -147,7 +147,7 @@ def _mean(rows: Sequence[LadderRow], name: str) -> float | None:
 
 
 def _ratio(rows: Sequence[LadderRow], plain: Sequence[LadderRow], name: str) -> float | None:
-    """Return the mean error of rows over that of the plain pass, on the clips where both have one."""
+    """Return the mean error of rows relative to the plain pass, on the clips where both have one."""
     first = {row.clip: getattr(row, name) for row in plain}
     pairs = [(getattr(row, name), first.get(row.clip)) for row in rows]
     there = [(ours, theirs) for ours, theirs in pairs if ours is not None and theirs is not None]

@@ -1,8 +1,8 @@
-"""One side of a comparison: a process that holds a model and runs a pass, or two, whenever it is told to.
+"""One side of a comparison: a process that holds a model and runs one or both passes on request.
 
 python -m benchmarks.worker ours WEIGHTS, or python -m benchmarks.worker peer WEIGHTS CHECKOUT [mapped]; then a line of
 JSON on standard input for every run: {"work": "pass", "vggt4d" or "4dvggt-d", "frames", "height", "width", "keep": a
-file for the outputs or null, "mask": a file with the mask that the second pass shall have, or null}.
+file for the outputs or null, "mask": a file with the mask of the second pass, or null}.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def ours(weights: Path) -> Run:
             return _outputs(made.pose_encoding, made.depth, made.depth_confidence)
         assembly, passes = call(infer, x, method=work)
         first = passes.first
-        if work == "vggt4d":  # what the public code has at this point
+        if work == "vggt4d":  # the public code's outputs
             return {"saliency": np.asarray(passes.saliency[0]), "mask": np.asarray(passes.dynamic_mask[0])} | _outputs(
                 first.pose_encoding, first.depth, first.depth_confidence
             )
@@ -74,9 +74,9 @@ def ours(weights: Path) -> Run:
 def peer(weights: Path, checkout: Path, *, mapped: bool) -> Run:
     """Return the passes of the public PyTorch code, from a checkout: VGGT's, or stages 1 and 2 of VGGT4D.
 
-    The plain pass runs the same heads as ours and no others; VGGT4D runs its own model and its own functions, whose
-    one demand for CUDA is answered with the CPU. The weights of all heads are loaded as `from_pretrained` does it; or
-    else mapped, as ours are, and for a plain pass only those of its heads.
+    The plain pass runs the same heads as ours and no others; VGGT4D runs its own model and its own functions, with
+    the CPU in place of CUDA. The weights of all heads are loaded as by `from_pretrained`; with `mapped` they are mapped
+    as ours, and for a plain pass only those of its heads.
     """
     sys.path.insert(0, str(checkout))
     import torch
@@ -149,9 +149,7 @@ def _outputs(pose, depth, confidence) -> Outputs:
 
 
 class PeakMemory:
-    """The most memory that the process holds while the context lasts, sampled; `own` leaves out what files it maps.
-
-    Both are 0 where that is not known."""
+    """Sample the peak memory of the process inside the context; `own` excludes mapped files. Both are 0 if unknown."""
 
     def __enter__(self) -> PeakMemory:
         self.total = self.own = 0
@@ -173,17 +171,17 @@ class PeakMemory:
 
 
 def disk_reads() -> int:
-    """Return how often this process has waited for a page from a disk, as where mapped weights are driven out."""
+    """Return how often this process has read a page from a disk, such as evicted pages of mapped weights."""
     import resource
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_majflt
 
 
 def main(side: str, weights: str, *rest: str) -> None:
-    """Load a model, say so, and run passes until standard input ends."""
+    """Load a model, report it, and run passes until standard input ends."""
     run = ours(Path(weights)) if side == "ours" else peer(Path(weights), Path(rest[0]), mapped="mapped" in rest[1:])
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # whatever else is printed is no answer
+    os.dup2(2, 1)  # other prints must not mix with answers
     answers.write('{"ready": true}\n')
     answers.flush()
     for line in sys.stdin:

@@ -1,1 +1,1 @@
-"""How fast the parts of vggtjax are, beside what the machine could do at best: suite, memory, gpu-targets."""
+"""Speed and memory of the parts of vggtjax, compared with the machine's best: suite, memory, gpu-targets."""

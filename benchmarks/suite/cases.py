@@ -1,4 +1,4 @@
-"""The models that are measured, and what they are given."""
+"""The measured models and their inputs."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ def config_of(size: Size) -> VGGTConfig:
 
 
 def load(size: Size, weights: Path | None = None) -> tuple[VGGTConfig, Params]:
-    """Return a model: the embedded one, a converted file's, or one that is drawn; every page of it is in memory."""
+    """Return the embedded model, a converted one or a random one, with all its pages in memory."""
     if weights is not None:
         if not weights.is_file():
-            raise InputError(f"{weights} is not there; expected a .safetensors file as vggtjax convert writes it")
+            raise InputError(f"{weights} does not exist; expected a .safetensors file written by vggtjax convert")
         model = load_model(weights)
     elif size == "demo":
         model = demo_model()
@@ -75,13 +75,13 @@ def load(size: Size, weights: Path | None = None) -> tuple[VGGTConfig, Params]:
         config = config_of(size)
         return config, init_params(0, config)
     if jax.default_backend() == "cpu":
-        for leaf in jax.tree.leaves(model.params):  # mapped files are read when they are first looked at
+        for leaf in jax.tree.leaves(model.params):  # mapped files are read at the first access
             np.asarray(leaf).reshape(-1).view(np.uint8)[::_PAGE].sum()
     return model.config, model.params
 
 
 def frame_size(size: Size, config: VGGTConfig, height: int | None, width: int | None) -> tuple[int, int]:
-    """Return height and width in pixels: those given, or else the size's own."""
+    """Return height and width in pixels; the defaults of `size` where None."""
     own = _FULL_FRAME if size == "full" else (config.image_size, config.image_size)
     sides = (own[0] if height is None else height, own[1] if width is None else width)
     for name, side in zip(("height", "width"), sides, strict=True):
@@ -91,7 +91,7 @@ def frame_size(size: Size, config: VGGTConfig, height: int | None, width: int | 
 
 
 def check_counts(frames: tuple[int, ...], repeats: int = 1) -> None:
-    """Raise InputError for numbers of frames or of runs that cannot be."""
+    """Raise InputError for invalid numbers of frames or of runs."""
     if not frames or min(frames) < 1:
         raise InputError(f"frames is {list(frames)}; expected numbers of at least 1")
     if repeats < 1:

@@ -1,7 +1,7 @@
-"""What this machine does at best of each kind of work, at the shapes that the network gives it.
+"""Ceilings: the best rates of this machine for each kind of work, at the shapes of the network.
 
-A machine whose cores others use as well is not equally fast all the time, so it is looked at before and after every
-timed run, and what a run could have taken at least is told from the looks beside it.
+The speed of a shared machine varies, so ceilings are measured before and after every timed run, and the floor of a run
+follows from the measurements around it.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ class Probe(NamedTuple):
 
 
 class Ceilings:
-    """FLOP, functions of a number and bytes per second, by kind of work, of every look."""
+    """Rates in FLOP, scalar functions or bytes per second, by kind of work, of every measurement."""
 
     def __init__(self, config: VGGTConfig, grid: Grid, dtype: str) -> None:
-        """Make ready to look. Small shapes are made so many that what a call costs does not count.
+        """Compile the programs to measure, with enough work in each that the overhead of a call is negligible.
 
-        What is looked at stays in memory: for VGGT-1B about 1 GB on a CPU, most of it the camera head's weights.
+        Their inputs stay in memory: for VGGT-1B about 1 GB on a CPU, mostly the camera head's weights.
 
         Args:
-            config: the model whose channels are taken.
-            grid: rows and columns of patches, of which the convolution's map is four times as large.
-            dtype: of products in the blocks; heads are float32.
+            config: the model, whose numbers of channels are used.
+            grid: rows and columns of patches; the convolution's map has four times as many of each.
+            dtype: type of products in the blocks; heads are float32.
         """
-        small = jax.default_backend() == "cpu"  # as much as stays in the cache; elsewhere, enough for all cores
+        small = jax.default_backend() == "cpu"  # small enough for the cache; elsewhere, enough for all cores
         rows, queries, keys, values, pixels = (
             (1600, 800, 1600, 2**20, 2**14) if small else (2**15, 4096, 4096, 2**26, 2**17)
         )
@@ -57,35 +57,35 @@ class Ceilings:
             "convolution": _convolution(pixels, (4 * grid[0], 4 * grid[1]), config.dpt_features),
             "weights": _reading(12 * config.camera_depth, config.tap_dim),
         }
-        self.looks: dict[str, list[float]] = {kind: [] for kind in self._probes}
+        self.measurements: dict[str, list[float]] = {kind: [] for kind in self._probes}
 
-    def look(self) -> dict[str, float]:
-        """Measure all kinds of work once more, and return that."""
+    def measure(self) -> dict[str, float]:
+        """Measure all kinds of work once more; return the rates."""
         rates = {probe: probe.amount / probe.program.seconds() for probe in set(self._probes.values())}
-        look = {kind: rates[probe] for kind, probe in self._probes.items()}
-        for kind, rate in look.items():
-            self.looks[kind].append(rate)
-        return look
+        measured = {kind: rates[probe] for kind, probe in self._probes.items()}
+        for kind, rate in measured.items():
+            self.measurements[kind].append(rate)
+        return measured
 
 
 class Rounds:
-    """Numbers to loop over, one per timed run, with a look at the ceilings before the first and after each."""
+    """Numbers to loop over, one per timed run; ceilings are measured before the first run and after each run."""
 
     def __init__(self, count: int, ceilings: Ceilings) -> None:
         self._count, self._ceilings = count, ceilings
-        self.rates: list[dict[str, float]] = []  # the better of the looks before and after every run
+        self.rates: list[dict[str, float]] = []  # the better of the measurements before and after every run
 
     def __iter__(self) -> Iterator[int]:
-        before = self._ceilings.look()
+        before = self._ceilings.measure()
         for number in range(self._count):
             yield number
-            after = self._ceilings.look()
+            after = self._ceilings.measure()
             self.rates.append({kind: max(rate, after[kind]) for kind, rate in before.items()})
             before = after
 
 
 def _linear(rows: int, C: int, dtype: str) -> Probe:
-    """The four products of a block: q, k and v, projection, and both of the MLP."""
+    """Return the four products of a block: qkv, projection, and both products of the MLP."""
     shapes = ((C, 3 * C), (C, C), (C, 4 * C), (4 * C, C))
     inputs = [_drawn((rows, shape[0]), dtype) for shape in shapes]
     kernels = [_drawn(shape, dtype) for shape in shapes]
@@ -97,7 +97,7 @@ def _linear(rows: int, C: int, dtype: str) -> Probe:
 
 
 def _attention(heads: int, queries: int, keys: int, D: int, dtype: str, *, loop: bool) -> Probe:
-    """Both products of attention, without the softmax between them."""
+    """Return both products of attention, without the softmax."""
 
     def one_head(inputs):
         q, k, v = inputs
@@ -112,7 +112,7 @@ def _attention(heads: int, queries: int, keys: int, D: int, dtype: str, *, loop:
 
 
 def _repeated(function: Callable[[Array], Array], count: int) -> Probe:
-    """A function of single numbers, again and again of the same array."""
+    """Return a scalar function, applied to the same array repeatedly."""
 
     def repeated(x):
         return jax.lax.fori_loop(0, _IN_A_ROW, lambda _, x: function(x), x)
@@ -121,7 +121,7 @@ def _repeated(function: Callable[[Array], Array], count: int) -> Probe:
 
 
 def _convolution(pixels: int, size: tuple[int, int], F: int) -> Probe:
-    """A 3 x 3 convolution of as many maps of this size as have about so many pixels, one at least."""
+    """Return a 3 x 3 convolution of maps of this size, with about `pixels` pixels in all, at least one map."""
     frames = max(pixels // math.prod(size), 1)
 
     def convolved(x, kernel):
@@ -132,7 +132,7 @@ def _convolution(pixels: int, size: tuple[int, int], F: int) -> Probe:
 
 
 def _reading(matrices: int, E: int) -> Probe:
-    """A product with a vector, over as many weights as the camera head's blocks have."""
+    """Return a product with a vector, with as many weights as the camera head's blocks."""
     weights = _drawn((matrices * E, E))
 
     def products(weights, x):

@@ -1,4 +1,4 @@
-"""How long everything takes, and how near that is to what the machine could do: python -m benchmarks suite."""
+"""Times of all parts, compared with what the machine could reach: python -m benchmarks suite."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from pathlib import Path
 
 from rich.progress import Progress
 
-from benchmarks.plots import check_matplotlib
 from benchmarks.suite import report
 from benchmarks.suite.cases import Case, DType, Size, check_counts, frame_size, load
 from benchmarks.suite.ceilings import Ceilings, Rounds
@@ -14,7 +13,7 @@ from benchmarks.suite.measure import compiling_anew, without_memory
 from benchmarks.suite.report import Row
 from benchmarks.suite.workloads import WORKLOADS, Workload
 from vggtjax.commands.process import keep_freed_memory
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_extra
 from vggtjax.storage.writing import writing
 
 
@@ -33,34 +32,34 @@ def suite(
     against: Path | None = None,
     plots: Path | None = None,
 ) -> None:
-    """Time named workloads beside a floor: their work over what this machine does at best of each kind of work.
+    """Time named workloads beside a floor: their work divided by the best rates of this machine.
 
     Args:
         workloads: their names; all by default.
-        sizes: of the model. tiny: for trying this out. demo: the embedded model. full: VGGT-1B with drawn weights.
-        weights: a converted checkpoint to take for full.
+        sizes: of the model. tiny: for a quick trial. demo: the embedded model. full: VGGT-1B with random weights.
+        weights: a converted checkpoint for size full.
         frames: numbers of frames.
         height: of a frame, in pixels; 56, 64 and 294 for the three sizes by default.
         width: of a frame, in pixels; 56, 64 and 518 by default.
-        dtype: of the products in the blocks.
-        repeats: timed runs of each, after one that warms up.
+        dtype: type of the products in the blocks.
+        repeats: timed runs of each workload, after a warm-up.
         out: JSON file for the results.
-        markdown: the same tables in a file.
-        against: JSON file of an earlier run, to compare the medians with.
+        markdown: file for the same tables.
+        against: JSON file of an earlier run to compare the medians with.
         plots: folder for roofline.png and scaling.png.
     """
     if unknown := [name for name in workloads if name not in WORKLOADS]:
         raise InputError(f"workloads has {unknown}; expected some of {list(WORKLOADS)}")
     if weights is not None and "full" not in sizes:
-        raise InputError(f"weights is {weights} and sizes has no full, which they are for; add it, or leave them out")
+        raise InputError(f"weights is {weights} and sizes is {list(sizes)}; expected full among the sizes")
     check_counts(frames, repeats)
     stored = None if against is None else report.read_stored(against)
     if plots is not None:
-        check_matplotlib()
+        check_extra("plotting", "train", "matplotlib")
     keep_freed_memory()
     rows: list[Row] = []
     sheets: list[report.Sheet] = []
-    looks: dict[str, dict[str, list[float]]] = {}
+    measurements: dict[str, dict[str, list[float]]] = {}
     screen = report.console()
 
     def run(size: Size, progress: Progress) -> None:
@@ -82,8 +81,8 @@ def suite(
         rows.extend(found)
         title = f"{size}, {shape[1]} x {shape[0]} pixels, {dtype}"
         if ceilings is not None:
-            looks[size] = ceilings.looks
-            sheets.append(report.ceiling_sheet(title, ceilings.looks))
+            measurements[size] = ceilings.measurements
+            sheets.append(report.ceiling_sheet(title, ceilings.measurements))
         sheets.append(report.row_sheet(f"{title}, {repeats} runs", found))
 
     with compiling_anew(), Progress(console=screen, transient=True) as progress:
@@ -96,7 +95,7 @@ def suite(
         sheet.show(screen)
     screen.print(here, highlight=False)
     if out is not None:
-        report.write_rows(out, rows, ceilings=looks, repeats=repeats)
+        report.write_rows(out, rows, ceilings=measurements, repeats=repeats)
     if markdown is not None:
         with writing(markdown) as temporary:
             temporary.write_text("\n".join([here + "\n", *(sheet.markdown() for sheet in sheets)]), encoding="utf-8")
@@ -110,7 +109,7 @@ def suite(
 def measured_rows(
     name: str, workload: Workload, case: Case, repeats: int, ceilings: Ceilings | None = None
 ) -> list[Row]:
-    """Measure a workload; return a row for each of its results, beside the ceilings if its work is known."""
+    """Measure a workload; return a row for each of its results, with ceilings if its work is known."""
     parts = workload.parts(case) if workload.parts else []
     rounds = Rounds(repeats, ceilings) if parts and ceilings else range(repeats)
     size = None if workload.scope == "process" else case.size

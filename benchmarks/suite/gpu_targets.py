@@ -1,4 +1,4 @@
-"""The times and memory that are wanted on an H200 beside those found: python -m benchmarks gpu-targets."""
+"""Target and measured times and memory on an H200: python -m benchmarks gpu-targets."""
 
 from __future__ import annotations
 
@@ -48,23 +48,23 @@ def gpu_targets(
     repeats: int = 5,
     out: Path | None = None,
 ) -> None:
-    """Measure aggregator, depth head, two passes and memory beside their targets and what VGGT has published.
+    """Measure aggregator, depth head, two passes and memory beside their targets and VGGT's published figures.
 
     Memory is the most that one of the three takes beyond weights and inputs: the device's own count, or XLA's analysis
     where there is none. Targets are shown on an H200, published figures for the full model, at 518 x 392 in bfloat16.
 
     Args:
         size: of the model.
-        weights: a converted checkpoint to take for full; weights are drawn by default.
+        weights: a converted checkpoint for size full; random weights by default.
         frames: numbers of frames.
         height: of a frame, in pixels; 392 for full by default.
         width: of a frame, in pixels; 518 for full by default.
-        dtype: of the products in the blocks.
-        repeats: timed runs of each, after one that warms up.
+        dtype: type of the products in the blocks.
+        repeats: timed runs of each, after a warm-up.
         out: JSON file for the results.
     """
     if weights is not None and size != "full":
-        raise InputError(f"weights is {weights} and size is {size}; expected full, which they are for")
+        raise InputError(f"weights is {weights} and size is {size}; weights are for size full")
     check_counts(frames, repeats)
     keep_freed_memory()
     screen = console()
@@ -94,7 +94,7 @@ def gpu_targets(
     title = f"{size}, {shape[1]} x {shape[0]} pixels, {dtype}, medians of {repeats}"
     Sheet(title, tuple(headings), [tuple(cells) for cells in rows]).show(screen)
     if comparable:
-        screen.print("VGGT's figures are those it publishes for an H100; its memory includes the weights.")
+        screen.print("VGGT's figures are published ones for an H100; their memory includes the weights.")
     screen.print(describe(here), highlight=False)
     if out is not None:
         measured = [row for programs in found.values() for row in programs.values()]
@@ -102,7 +102,7 @@ def gpu_targets(
 
 
 def _shown(name: str, count: int, programs: dict[str, Row]) -> str:
-    """Return a figure in the unit of its heading, or why there is none."""
+    """Return a figure in the unit of its heading, or the reason for its absence."""
     results = [row.measured for row in programs.values()] if name == "memory" else [programs[name].measured]
     if failures := [result.failure for result in results if result.failure]:
         return failures[0]

@@ -1,4 +1,4 @@
-"""Timing, and memory: XLA's own analysis, the process's high water, and the device's."""
+"""Timing, and memory: XLA's own analysis, and the peaks of the process and of the device."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _SUSTAINED = 0.05  # seconds
 
 @dataclass(frozen=True)
 class Measured:
-    """What a run took; None where that is not known here."""
+    """Time and memory of a workload; None where unknown on this platform."""
 
     seconds: tuple[float, ...] = ()  # of the timed runs
     compile_seconds: float | None = None
     temp_bytes: int | None = None  # by XLA's analysis
     output_bytes: int | None = None
-    host_bytes: int | None = None  # most that the process took in a run beyond what it had, its weights included
-    device_bytes: int | None = None  # the same of the device; None too where an earlier run took more
+    host_bytes: int | None = None  # peak of the process in a run above its start, with weights loaded in the run
+    device_bytes: int | None = None  # peak of the device; None also if an earlier run had a higher peak
     failure: str = ""
 
     @property
@@ -44,7 +44,7 @@ class Measured:
 
 
 def measure_program(function: Callable[..., Any], arguments: tuple, rounds: Iterable[int]) -> Measured:
-    """Compile a function of arrays, run it once for its memory, then time it once a round."""
+    """Compile a function of arrays, run it once for its memory, then time one run per round."""
     (compiled,), compile_seconds = timed(lambda: (jax.jit(function).lower(*arguments).compile(),))
     temp, output = analysed(compiled)
 
@@ -56,7 +56,7 @@ def measure_program(function: Callable[..., Any], arguments: tuple, rounds: Iter
 
 
 def measure_calls(call: Callable[[], object], rounds: Iterable[int], *, compiles: bool = False) -> Measured:
-    """Call once to warm up, once for its memory, then time it; if it `compiles`, the first takes that much longer."""
+    """Call once to warm up, once for its memory, then time it; `compiles`: report the first call's extra time."""
     first = timed(call)[1]
     host, device = memory_of(call)
     seconds = tuple(timed(call)[1] for _ in rounds)
@@ -65,14 +65,14 @@ def measure_calls(call: Callable[[], object], rounds: Iterable[int], *, compiles
 
 
 def timed(call: Callable[[], Any]) -> tuple[Any, float]:
-    """Return what a call returns, and its seconds."""
+    """Return a call's result and its seconds."""
     began = time.perf_counter()
-    made = call()
-    return made, time.perf_counter() - began
+    result = call()
+    return result, time.perf_counter() - began
 
 
 class Sustained:
-    """A function of arrays, compiled, and run in series that are each long enough for the clock."""
+    """A compiled function of arrays, run in series long enough for the clock."""
 
     def __init__(self, function: Callable[..., Any], arguments: tuple) -> None:
         self._arguments = arguments
@@ -81,7 +81,7 @@ class Sustained:
         self._count = min(max(math.ceil(_SUSTAINED / self._series(1)), 1), 1000)
 
     def seconds(self, repeats: int = 5) -> float:
-        """Return the least seconds of a run out of several series."""
+        """Return the seconds of a run in the fastest of several series."""
         return min(self._series(self._count) for _ in range(repeats))
 
     def _series(self, count: int) -> float:
@@ -96,7 +96,7 @@ def analysed(compiled: Any) -> tuple[int | None, int | None]:
 
 
 def memory_of(run: Callable[[], object]) -> tuple[int | None, int | None]:
-    """Run; return the most bytes that the process and the device had meanwhile, beyond what they had before."""
+    """Run; return the peak bytes of the process and of the device, minus their bytes before."""
     gc.collect()
     _give_back()
     had, device_had = reset_high_water(), _device_memory()
@@ -108,7 +108,7 @@ def memory_of(run: Callable[[], object]) -> tuple[int | None, int | None]:
 
 
 def without_memory(call: Callable[[], dict[str, Measured]]) -> dict[str, Measured]:
-    """Return what a call returns, or one failure where the memory does not suffice."""
+    """Return a call's result, or one failure if memory runs out."""
     try:
         return call()
     except MemoryError:
@@ -121,7 +121,7 @@ def without_memory(call: Callable[[], dict[str, Measured]]) -> dict[str, Measure
 
 @contextmanager
 def compiling_anew() -> Iterator[None]:
-    """Keep jax from finding programs in a cache on disk, where one is set."""
+    """Compile without jax's cache on disk."""
     before = jax.config.values["jax_enable_compilation_cache"]
     jax.config.update("jax_enable_compilation_cache", False)
     try:
@@ -131,7 +131,7 @@ def compiling_anew() -> Iterator[None]:
 
 
 def _give_back() -> None:
-    """Have glibc return what is freed, so that the next run's memory shows."""
+    """Make glibc return freed memory, so that the next run's memory is visible."""
     if sys.platform.startswith("linux") and hasattr(ctypes.CDLL(None), "malloc_trim"):
         ctypes.CDLL(None).malloc_trim(0)
 

@@ -1,4 +1,4 @@
-"""How memory grows with frames, by XLA's own analysis: python -m benchmarks memory. Nothing is run."""
+"""Growth of memory with frames, by XLA's own analysis without a run: python -m benchmarks memory."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from rich.progress import Progress
 
-from benchmarks.plots import check_matplotlib
 from benchmarks.suite.cases import DType, Size, check_counts, config_of, frame_size
 from benchmarks.suite.measure import analysed, compiling_anew
 from benchmarks.suite.report import Sheet, console, describe, machine, number, write_json
 from vggtjax.config import VGGTConfig
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_extra
 from vggtjax.method.passes import first_pass, run_passes
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.clip_batch import ClipBatch
@@ -41,22 +40,22 @@ def memory(
     out: Path | None = None,
     plots: Path | None = None,
 ) -> None:
-    """Compile passes for more and more frames, and fit the growth of temporary and output memory.
+    """Compile passes for several numbers of frames, and fit the growth of temporary and output memory.
 
     Args:
-        frames: numbers of frames, two at least.
+        frames: numbers of frames, at least two.
         size: of the model; no weights are needed.
         height: of a frame, in pixels; 294 for full by default.
         width: of a frame, in pixels; 518 for full by default.
-        dtype: of the products in the blocks; one or both.
+        dtype: types of the products in the blocks; one or both.
         out: JSON file for the results.
         plots: folder for memory.png.
     """
     check_counts(frames)
     if len(set(frames)) < 2:
-        raise InputError(f"frames is {list(frames)}; expected two different numbers at least, to fit a slope")
+        raise InputError(f"frames is {list(frames)}; expected at least two different numbers, to fit a slope")
     if plots is not None:
-        check_matplotlib()
+        check_extra("plotting", "train", "matplotlib")
     config = config_of(size)
     shape = frame_size(size, config, height, width)
     params = parameter_shapes(config)

@@ -1,4 +1,4 @@
-"""Figures of the suite: where the time goes beside the floor, and how time and memory grow with frames."""
+"""Figures of the suite: times beside their floors, and the growth of time and memory with frames."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MEGABYTE = 1e6
 
 
 def plot_roofline(path: Path, rows: Sequence[Row], caption: str) -> None:
-    """Draw a bar per row, 100 % its median time: in colour what the floor says each kind of work takes at least."""
+    """Draw a bar per row, 100 % its median time: in colour the floor of each kind of work."""
     from matplotlib.figure import Figure
 
     rows = [row for row in rows if row.floor and row.measured.seconds]
@@ -75,7 +75,7 @@ def plot_growth(
     Args:
         path: the file to write.
         lines: label -> frames, bytes.
-        kept: bytes that the public code keeps of every frame.
+        kept: bytes per frame in the public code.
         caption: below the axes.
     """
     from matplotlib.figure import Figure

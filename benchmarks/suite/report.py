@@ -1,4 +1,4 @@
-"""Rows of measurements: as tables, as JSON, and beside those of an earlier run."""
+"""Rows of measurements: as tables, as JSON, and compared with an earlier run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from benchmarks.suite.work import UNITS, Work, floor_by_kind, flop
 from vggtjax.errors import InputError
 from vggtjax.storage.writing import writing
 
-_MOST_BYTES = 2**24  # of a stored run that are read
+_MOST_BYTES = 2**24  # read of a stored run
 _WIDTH = 150  # of tables, in letters, where the terminal is narrower
 
 Key = tuple[str | int | None, ...]
@@ -31,7 +31,7 @@ Key = tuple[str | int | None, ...]
 
 @dataclass(frozen=True)
 class Row:
-    """One workload at one shape; None for what it does not depend on."""
+    """One workload at one shape; None for values on which it does not depend."""
 
     workload: str
     size: str | None
@@ -40,17 +40,17 @@ class Row:
     width: int | None
     dtype: str
     measured: Measured
-    parts: Sequence[Work] = ()  # the work that it is, if that is known
-    rates: Sequence[Mapping[str, float]] = ()  # what the machine could do around every timed run
+    parts: Sequence[Work] = ()  # its work, if known
+    rates: Sequence[Mapping[str, float]] = ()  # ceilings around every timed run
 
     @property
     def key(self) -> Key:
-        """What a row of another run must have in common to be compared."""
+        """The values that rows of two runs must share to be compared."""
         return tuple(getattr(self, name) for name in _KEY)
 
     @property
     def floors(self) -> list[dict[str, float]]:
-        """What every timed run could have taken at least, in seconds by kind of work."""
+        """The floor of every timed run, in seconds by kind of work."""
         return [floor_by_kind(self.parts, rates) for rates in self.rates]
 
     @property
@@ -73,7 +73,7 @@ class Row:
 
     @property
     def share_of_floor(self) -> float | None:
-        """Floor over seconds, by the median of the runs: 1 where nothing but the counted work takes time."""
+        """Floor over seconds, the median of the runs: 1 if only the counted work takes time."""
         runs = zip(self.floors, self.measured.seconds, strict=True)
         shares = [sum(floor.values()) / seconds for floor, seconds in runs] if self.rates else []
         return float(np.median(shares)) if shares else None
@@ -90,7 +90,7 @@ class Sheet(NamedTuple):
     rows: list[tuple[str, ...]]
 
     def show(self, console: Console) -> None:
-        """Print; columns that are empty in every row are left out."""
+        """Print the table without empty columns."""
         columns = [i for i in range(len(self.headings)) if any(row[i] for row in self.rows)]
         table = Table(title=self.title, title_justify="left", box=None, min_width=len(self.title))
         for i in columns:
@@ -106,17 +106,17 @@ class Sheet(NamedTuple):
 
 
 def console() -> Console:
-    """Return a console that is wide enough for the tables."""
-    found = Console()
-    return found if found.width >= _WIDTH else Console(width=_WIDTH)
+    """Return a console wide enough for the tables."""
+    terminal = Console()
+    return terminal if terminal.width >= _WIDTH else Console(width=_WIDTH)
 
 
 def machine() -> dict[str, Any]:
-    """Return what the figures depend on besides the code."""
+    """Return the properties of the machine that figures depend on."""
     device = jax.local_devices()[0]
     try:
         memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):  # not on every system
+    except (AttributeError, OSError, ValueError):  # unknown on some systems
         memory = None
     return {
         "cpu": _cpu(),
@@ -141,13 +141,13 @@ def describe(machine: dict[str, Any]) -> str:
     )
 
 
-def ceiling_sheet(title: str, looks: Mapping[str, Sequence[float]]) -> Sheet:
-    """Return a table of what the machine did at best in all looks, and in the middle one."""
+def ceiling_sheet(title: str, measurements: Mapping[str, Sequence[float]]) -> Sheet:
+    """Return a table of the machine's best and median rates over all measurements."""
     rows = [
         (kind, f"{max(rates) / 1e9:.4g}", f"{np.median(rates) / 1e9:.4g}", f"G{UNITS[kind]}/s", str(len(rates)))
-        for kind, rates in looks.items()
+        for kind, rates in measurements.items()
     ]
-    return Sheet(f"{title}: ceilings", ("kind", "at best", "median", "unit", "looks"), rows)
+    return Sheet(f"{title}: ceilings", ("kind", "best", "median", "unit", "measurements"), rows)
 
 
 def row_sheet(title: str, rows: Sequence[Row]) -> Sheet:
@@ -179,20 +179,20 @@ def _cells(row: Row) -> tuple[str, ...]:
 
 
 def comparison_sheet(rows: Sequence[Row], stored: dict[Key, float], path: Path) -> Sheet:
-    """Return medians beside the stored ones; a ratio below 1 is faster than it was."""
-    found = []
+    """Return medians beside the stored ones; a ratio below 1 means faster than the stored run."""
+    compared = []
     for row in rows:
         now, then = row.measured.median, stored.get(row.key)
         if now is not None and then is not None:
             pixels = f"{row.width} x {row.height}" if row.width else ""
             names = (row.workload, row.size or "", str(row.frames or ""), pixels)
-            found.append((*names, number(now), number(then), f"{now / then:.3f}"))
-    title = f"against {path}: {len(found)} of {len(rows)} rows are there too"
-    return Sheet(title, ("workload", "size", "frames", "pixels", "median s", "stored s", "ratio"), found)
+            compared.append((*names, number(now), number(then), f"{now / then:.3f}"))
+    title = f"against {path}: {len(compared)} of {len(rows)} rows are in both"
+    return Sheet(title, ("workload", "size", "frames", "pixels", "median s", "stored s", "ratio"), compared)
 
 
 def write_rows(path: Path, rows: Sequence[Row], **more: Any) -> None:
-    """Write a run as JSON: the machine, the rows, and whatever else is given."""
+    """Write a run as JSON: the machine, the rows, and the values of `more`."""
 
     def plain(row: Row) -> dict[str, Any]:
         values = {name: value for name, value in asdict(row).items() if name not in ("measured", "parts")} | {
@@ -215,7 +215,7 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 def read_stored(path: Path) -> dict[Key, float]:
     """Return the medians of a run that `write_rows` wrote, by row.
 
-    Raises InputError for a file that is not one.
+    Raises InputError for an invalid file.
     """
     try:
         with path.open("rb") as file:

@@ -1,8 +1,8 @@
-"""How much work each part of the network is, counted by kind from its shapes alone: two FLOP per multiply-add.
+"""The work of each part of the network by kind, counted from its shapes alone: two FLOP per multiply-add.
 
-What is counted is what a product of matrices, a convolution, an exponential, a GELU or the reading of weights cannot do
-without; norms, other activations, resizing and copies are free here. Work over ceilings is a floor: seconds that no
-implementation of the same arithmetic by the same compiler can beat on that machine.
+Counted are matrix products, convolutions, exponentials, GELUs and the reading of weights; norms, other activations,
+resizing and copies are not. Work divided by ceilings is a floor: a time that no implementation of the same arithmetic
+by the same compiler can beat on that machine.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Grid = tuple[int, int]  # rows and columns of patches
 
 UNITS = {  # kinds of work, and the unit of each
     "linear": "FLOP",  # products with weights in the blocks, in the dtype of the run
-    "linear, float32": "FLOP",  # those of the heads and of the cues
+    "linear, float32": "FLOP",  # products of the heads and of the cues
     "attention": "FLOP",
     "exp": "exp",
     "GELU": "GELU",
@@ -95,9 +95,14 @@ def track_head(config: VGGTConfig, S: int, grid: Grid, Q: int) -> list[Work]:
     levels, radius = config.track_corr_levels, config.track_corr_radius
     E, window, seen = 3 * F + 4, (2 * radius + 2) ** 2, levels * (2 * radius + 1) ** 2
     rows = 2.0 * S * Q * (levels * window * F + seen * C + C * F + E * C + C * (F + 2) + F * F)
-    looks = ((Q + V, S, S), (S, V, Q), (S, V, V), (S, Q, V))  # over time; virtual to points, virtual, points to virtual
+    attended = (
+        (Q + V, S, S),
+        (S, V, Q),
+        (S, V, V),
+        (S, Q, V),
+    )  # over time; virtual to points, virtual, points to virtual
     total = Counter({"linear, float32": rows})
-    for sequences, queries, keys in looks:
+    for sequences, queries, keys in attended:
         total.update(_attended(tracker.LAYERS * sequences, queries, keys, C, tracker.HEADS, "linear, float32"))
     return [_features(config, S, grid, F, F), {kind: n * amount for kind, amount in total.items()}]
 

@@ -1,4 +1,4 @@
-"""What is measured, by name."""
+"""The workloads, by name."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _STARTS = {
 
 
 class Workload(NamedTuple):
-    """How to measure something, and how much work it is. Several results have names of their own."""
+    """A measurement and its work. If there are several results, each has a name."""
 
     about: str
     measure: Callable[[Case, Iterable[int]], dict[str, Measured]]  # a case, a round per timed run -> results by name
@@ -74,7 +74,7 @@ def plain_pass(case: Case) -> Program:
 
 
 def cue_sums(case: Case) -> Program:
-    """The cues of every layer that has some, all on the same q and k."""
+    """The cues of every layer with cues, all on the same q and k."""
     cues = GramCues(case.config.motion, case.config.depth)
     counts = cues.layer_counts()
     S, P, N = case.frames, case.grid[0] * case.grid[1], case.config.num_heads
@@ -96,7 +96,7 @@ def two_passes(case: Case) -> Program:
 
 
 def depth_head(case: Case) -> Program:
-    """Depth and confidence of what four pairs of blocks put out."""
+    """Depth and confidence from the outputs of four pairs of blocks."""
 
     def run(params, tokens, shifts):
         return predict_dense(params, _taps(params, tokens, shifts, case), case.config, case.grid, "depth")
@@ -105,7 +105,7 @@ def depth_head(case: Case) -> Program:
 
 
 def tracks(case: Case) -> Program:
-    """Tracks of points of the first frame, of what four pairs of blocks put out."""
+    """Tracks of points of the first frame, from the outputs of four pairs of blocks."""
 
     def run(params, tokens, shifts, points):
         return predict_tracks(params, _taps(params, tokens, shifts, case), points, case.config, case.grid)
@@ -121,7 +121,7 @@ def _tapped(case: Case) -> tuple[Any, Any]:
 
 
 def _taps(params, tokens, shifts, case: Case) -> list[Any]:
-    """Four taps of one array, made different, so that the compiler does not share their norm."""
+    """Return four different taps from one array; equal taps would share one norm in the compiled program."""
     return [project_tap(params, tokens + shifts[slot], slot, case.config) for slot in range(4)]
 
 

@@ -85,15 +85,15 @@ def test_floors_by_hand():
     assert work.flop([computing, reading]) == 40
 
 
-def test_a_run_is_beside_the_better_of_the_looks_around_it():
-    class Looked(Ceilings):
+def test_a_run_is_compared_with_the_better_ceilings_around_it():
+    class Scripted(Ceilings):
         def __init__(self):
             self.rates = iter([4.0, 2.0, 1.0])
 
-        def look(self):
+        def measure(self):
             return {"linear": next(self.rates)}
 
-    rounds = Rounds(2, Looked())
+    rounds = Rounds(2, Scripted())
     assert list(rounds) == [0, 1]
     assert rounds.rates == [{"linear": 4}, {"linear": 2}]
     row = Row("pass", "tiny", 2, 56, 56, "float32", Measured((4.0, 10.0)), [{"linear": 8.0}], rounds.rates)
@@ -131,16 +131,16 @@ def test_what_does_not_fit_is_a_row_and_not_the_end():
                 fails()
         return {}
 
-    class Looked(Ceilings):
+    class Scripted(Ceilings):
         def __init__(self):
             pass
 
-        def look(self):
+        def measure(self):
             return {"linear": 1.0}
 
     case = Case("tiny", TINY, {}, 2, 56, 56, "float32")
     workload = workloads.Workload("fails in its second run", later, lambda case: [{"linear": 1.0}])
-    (row,) = measured_rows("pass", workload, case, 2, Looked())
+    (row,) = measured_rows("pass", workload, case, 2, Scripted())
     assert row.measured.failure == "out of memory"
     assert row.share_of_floor is row.floor_seconds is None
 
@@ -153,7 +153,7 @@ def test_what_does_not_fit_is_a_row_and_not_the_end():
 
 @pytest.fixture(scope="module", autouse=True)
 def quickly():
-    """Programs are compiled sooner and run slower, and ceilings are rough: no test looks at how fast anything is."""
+    """Programs are compiled sooner and run slower, and ceilings are rough: no test checks speed."""
     jax.config.update("jax_disable_most_optimizations", True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measure, "_SUSTAINED", 1e-3)
@@ -176,7 +176,7 @@ def test_every_workload_runs(run, capsys):
     assert code == 0, shown.err
     stored = json.loads((run / "a.json").read_text())
     assert stored["machine"]["jax"] == jax.__version__
-    assert all(min(looks) > 0 for looks in stored["ceilings"]["tiny"].values())
+    assert all(min(rates) > 0 for rates in stored["ceilings"]["tiny"].values())
     rows = stored["rows"]
     assert {row["workload"].split(":")[0] for row in rows} == set(names)
     for row in rows:
@@ -272,8 +272,8 @@ def test_targets_go_on_where_memory_ends(monkeypatch, capsys):
         ("suite --frames 0", "frames is [0]"),
         ("suite --repeats 0", "repeats is 0"),
         ("suite --height 57 --sizes tiny", "height is 57; expected a multiple of 14"),
-        ("suite --weights none.safetensors", "sizes has no full"),
-        ("suite --weights none.safetensors --sizes full", "none.safetensors is not there"),
+        ("suite --weights none.safetensors", "expected full among the sizes"),
+        ("suite --weights none.safetensors --sizes full", "none.safetensors does not exist"),
         ("suite --against none.json", "cannot read none.json"),
         ("memory --frames 2", "two different numbers"),
         ("memory --size tiny --width -14", "width is -14"),
