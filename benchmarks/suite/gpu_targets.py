@@ -64,7 +64,7 @@ def gpu_targets(
         out: JSON file for the results.
     """
     if weights is not None and size != "full":
-        raise InputError(f"weights is {weights} and size is {size}; weights are for size full")
+        raise InputError(f"weights is {weights} and size is {size}; expected size full")
     check_counts(frames, repeats)
     keep_freed_memory()
     screen = console()
