@@ -113,7 +113,7 @@ def test_an_interrupted_fit_goes_on_exactly(tmp_path):
     whole = fit_fusion(clips, held_out, config)
     path = tmp_path / "state.npz"
 
-    def stop(done: int, total: int) -> None:
+    def stop(done: int, total: int | None) -> None:
         assert total == 60
         if done == 30:
             raise KeyboardInterrupt

@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -41,7 +42,7 @@ def test_the_embedded_model_starts_its_last_recipe():
     jax.eval_shape(lambda params: initial_state(recipe, init_probes(0, recipe.model), params), params)
     same = adapted(model, dataclasses.replace(recipe.model, image_size=model.config.image_size))
     assert jax.tree.all(jax.tree.map(np.array_equal, same, model.params))
-    images = np.random.default_rng(0).uniform(size=(1, 1, 112, 112, 3)).astype(np.float32)
+    images = jnp.asarray(np.random.default_rng(0).uniform(size=(1, 1, 112, 112, 3)), jnp.float32)
     tokens = [
         encode(weights, images, config) for weights, config in ((model.params, model.config), (params, recipe.model))
     ]
