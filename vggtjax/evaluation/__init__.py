@@ -1,4 +1,4 @@
-"""Metrics, data sets, evaluations of methods on them, blind guesses, and the ladder of methods."""
+"""Metrics, data sets, evaluations of methods on them, and the ladder of methods."""
 
 import lazy_loader
 
