@@ -60,6 +60,7 @@ class Model:
     path: Path | None = None  # file of the parameters
     trained: bool = True  # False: random parameters, meaningless results
     origin: Mapping[str, str] = field(default_factory=dict)  # names of the source files of a conversion -> sha256
+    untrained_heads: tuple[str, ...] = ()  # heads with random parameters in a trained model
     note: str = ""  # for users of the model; part of the settings of its results
     _file: _FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets it
 
@@ -101,7 +102,7 @@ class Model:
             "parameters": self.parameter_count,
             "bytes": self.parameter_bytes,
             "dtype": self.dtype,
-            "heads": list(self.heads),
+            "heads": [f"{head} (untrained)" if head in self.untrained_heads else head for head in self.heads],
             **{f"sha256 of {file}": digest for file, digest in self.origin.items()},
             "pairs": self.config.depth,
             "embed_dim": self.config.embed_dim,
@@ -116,14 +117,13 @@ def is_checkpoint(path: str | Path) -> bool:
     return is_tensor_file(path) and read_tensors(path).metadata.get("format") == FORMAT
 
 
-def read_model(path: str | Path, *, dtype: DType | None = None, name: str | None = None, note: str = "") -> Model:
+def read_model(path: str | Path, *, dtype: DType | None = None, **fields: Any) -> Model:
     """Read a checkpoint of this library.
 
     Args:
         path: the file.
         dtype: of the parameters; None for the types in the file.
-        name: of the model; None for the name in the file.
-        note: for users of the model; see `Model`.
+        fields: fields of `Model` that the file does not know: name, note, untrained_heads.
 
     Raises:
         CheckpointError: the file is not a whole checkpoint of this library, or does not fit its own configuration; the
@@ -143,9 +143,8 @@ def read_model(path: str | Path, *, dtype: DType | None = None, name: str | None
         flat[key] = jax.device_put(tensor).block_until_ready()  # on a CPU, a view of the file if aligned
     stored_name = metadata.get("name", "")
     is_valid = stored_name.isprintable() and 0 < len(stored_name) <= _MOST_NAME_LETTERS
-    name = name or (stored_name if is_valid else path.stem)
-    origin = _origin(path, metadata)
-    model = Model(config, unflatten_dict(flat, sep="."), name, path, origin=origin, note=note)
+    fields = {"name": stored_name if is_valid else path.stem, "origin": _origin(path, metadata)} | fields
+    model = Model(config, unflatten_dict(flat, sep="."), path=path, **fields)
     if all(flat[key].dtype == stored.dtype for key, stored in tensors.items()):
         object.__setattr__(model, "_file", facts)
     return model

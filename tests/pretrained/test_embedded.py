@@ -26,6 +26,7 @@ def test_the_model_is_the_documented_one():
     assert digest in (DOCS / "model.md").read_text()
     model = demo.demo_model()
     assert model.trained
+    assert model.summary()["heads"] == ["camera", "depth", "points (untrained)", "tracks (untrained)"]
     assert model.dtype == "float32"
     assert all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(model.params))
 

@@ -130,5 +130,5 @@ def reconstruct(
             pictures = clip.pictures() if saving.resolution == "original" else None
             result.save(out, saving=saving, pictures=pictures, progress=progress)
     report.summary(result, out, network)
-    if known.tracks is not None and network.note:
+    if known.tracks is not None and "tracks" in network.untrained_heads:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")

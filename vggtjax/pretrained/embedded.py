@@ -28,7 +28,7 @@ def demo_model(dtype: DType = "float32") -> Model:
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
-    return read_model(MODEL, dtype=dtype, name="demo", note=NOTE)
+    return read_model(MODEL, dtype=dtype, name="demo", note=NOTE, untrained_heads=("points", "tracks"))
 
 
 def demo_clip() -> Truth:
