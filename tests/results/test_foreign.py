@@ -135,7 +135,7 @@ def save(name, array):
         (remove("frame_0001.npy"), "pred_traj.txt has 3 lines for 2 frames of depth"),
         (remove("conf_0001.npy"), "frame 1 has depth, but no file like conf_"),
         (remove("pred_intrinsics.txt"), "cannot read .*pred_intrinsics"),
-        (write("frame_0002.npy", b"\x93NUMPY\x01\x00"), r"frame_0002\.npy is not a whole \.npy file"),
+        (write("frame_0002.npy", b"\x93NUMPY\x01\x00"), r"frame_0002\.npy has an invalid header"),
         (write("frame_0002.npy", b"nothing"), r"frame_0002\.npy is not a whole \.npy file"),
         (save("frame_0002.npy", np.array([{}, 1], object)), "holds Python objects"),
         (save("frame_0002.npy", np.ones((28, 41), np.float32)), r"has shape \(28, 41\); expected \(28, 42\)"),

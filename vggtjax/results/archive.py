@@ -75,8 +75,8 @@ def _check_headers(headers: Mapping[str, Header]) -> None:
     if wrong:
         raise ResultError(f"arrays are missing or unknown: {', '.join(wrong)}")
     for name, header in headers.items():
-        if name in ARRAYS and header.dtype != np.dtype(ARRAYS[name][0]):
-            raise ResultError(f"{name} has type {header.dtype}; expected {np.dtype(ARRAYS[name][0])}")
+        if name in ARRAYS and header.dtype != ARRAYS[name][0]:
+            raise ResultError(f"{name} has type {header.dtype}; expected {ARRAYS[name][0]}")
         if name in STRINGS and header.dtype.kind != "U":
             raise ResultError(f"{name} has type {header.dtype}; expected text")
     check_shapes({name: header.shape for name, header in headers.items() if name not in ("format_version", "files")})

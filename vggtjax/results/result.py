@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
@@ -17,29 +17,6 @@ from vggtjax.errors import ResultError
 from vggtjax.method.instances import find_instances
 
 _MOST_SIDE, _MOST_PIXELS = 1 << 20, 1 << 28  # of a source's picture
-
-# Arrays: type and dimensions. depth binds S, H, W, saliency h, w and track_frames Q; the others must agree.
-ARRAYS: dict[str, tuple[type, tuple[str | int, ...]]] = {
-    "depth": (np.float32, ("S", "H", "W")),
-    "depth_confidence": (np.float32, ("S", "H", "W")),
-    "saliency": (np.float32, ("S", "h", "w")),
-    "dynamic_mask": (np.bool_, ("S", "H", "W")),
-    "camera_from_world": (np.float32, ("S", 3, 4)),
-    "intrinsics": (np.float32, ("S", 3, 3)),
-    "images": (np.uint8, ("S", "H", "W", 3)),
-    "source_size": (np.int64, ("S", 2)),
-    "source_scale": (np.float64, ("S", 2)),
-    "source_offset": (np.float64, ("S", 2)),
-    "valid_box": (np.int64, ("S", 4)),
-    "timestamps": (np.float64, ("S",)),
-    "track_positions": (np.float32, ("S", "Q", 2)),
-    "track_visibility": (np.float32, ("S", "Q")),
-    "track_confidence": (np.float32, ("S", "Q")),
-    "track_frames": (np.int64, ("Q",)),
-}
-TRACKS = frozenset(name for name in ARRAYS if name.startswith("track_"))  # all are given, or none
-OPTIONAL = TRACKS | {"timestamps", "saliency"}
-STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": (), "model_name": (), "settings": ()}
 
 
 class FieldOfViewWarning(UserWarning):
@@ -97,9 +74,9 @@ class Result:
         if (self.dynamic_mask & padding).any():
             self._set("dynamic_mask", self.dynamic_mask & ~padding)
         if clamped:
-            lowest, highest = FIELD_OF_VIEW_RANGE
+            listed = ", ".join(map(str, clamped[:10])) + (f" and {len(clamped) - 10} more" if len(clamped) > 10 else "")
             warnings.warn(
-                f"the field of view of frames {_listed(clamped)} was clamped to [{lowest}, {highest}] rad; "
+                f"the field of view of frames {listed} was clamped to {list(FIELD_OF_VIEW_RANGE)} rad; "
                 "their cameras and points are not to be trusted",
                 FieldOfViewWarning,
                 stacklevel=3,
@@ -204,6 +181,22 @@ class Result:
         return unproject(self.depth, self.intrinsics, self.camera_from_world, pixel_offset=pixel_offset)
 
 
+def _arrays() -> dict[str, tuple[np.dtype, tuple[str | int, ...]]]:
+    """Return name -> type and dimensions of the fields of `Result` annotated as arrays."""
+    hints = {name: (get_args(hint) or (hint,))[0] for name, hint in get_type_hints(Result).items()}
+    return {
+        name: (np.dtype(hint.dtypes[0]), tuple(int(side) if side.isdigit() else side for side in hint.dim_str.split()))
+        for name, hint in hints.items()
+        if hasattr(hint, "dim_str")
+    }
+
+
+ARRAYS = _arrays()  # depth binds S, H, W, saliency h, w and track_frames Q; the others must agree
+TRACKS = frozenset(name for name in ARRAYS if name.startswith("track_"))  # all are given, or none
+OPTIONAL = TRACKS | {"timestamps", "saliency"}
+STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": (), "model_name": (), "settings": ()}
+
+
 def inside_box(box: Int[np.ndarray, "*F 4"], size: tuple[int, ...]) -> Bool[np.ndarray, "*F H W"]:
     """Return the pixels of a picture of this height and width that lie in a box of left, top, right, bottom."""
     rows, columns = np.arange(size[0])[:, None], np.arange(size[1])
@@ -243,10 +236,10 @@ def check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:
         )
 
 
-def _cast(name: str, value: Any, dtype: type) -> np.ndarray:
+def _cast(name: str, value: Any, dtype: np.dtype) -> np.ndarray:
     array = np.asarray(value)
     if not np.can_cast(array.dtype, dtype, "same_kind"):
-        raise ResultError(f"{name} has type {array.dtype}; expected {np.dtype(dtype)}")
+        raise ResultError(f"{name} has type {array.dtype}; expected {dtype}")
     return array.astype(dtype, copy=False)
 
 
@@ -258,8 +251,3 @@ def _json_values(settings: Any) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ResultError(f"settings is a {type(settings).__name__}; expected a dictionary")
     return values
-
-
-def _listed(frames: tuple[int, ...], shown: int = 10) -> str:
-    listed = ", ".join(map(str, frames[:shown]))
-    return f"{listed} and {len(frames) - shown} more" if len(frames) > shown else listed

@@ -25,7 +25,7 @@ _MOST_HEADER_BYTES = 2**14
 _MOST_AXES = 32
 _DESCR = re.compile(r"[<>|=]?(?:[?biufcmM]|[SUV][1-9])\d{0,10}(\[\w{1,10}\])?")
 # Exceptions of zipfile, numpy and Python's parser for truncated or damaged files.
-_BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, SyntaxError, RuntimeError)
+_BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, SyntaxError, RuntimeError, MemoryError)
 
 
 class Header(NamedTuple):
@@ -49,24 +49,19 @@ def read_headers(path: Path) -> dict[str, Header]:
     Raises ResultError for a file that is not a whole .npz, holds Python objects, or exceeds SIZE_LIMIT. The message
     says "it"; the caller names the file.
     """
-    with _opened(path) as archive:
+    with _explaining("it", ".npz"), zipfile.ZipFile(path) as archive:
         return {name: _read_header(file, member.filename, member.file_size) for name, member, file in _members(archive)}
 
 
 def read_array(path: Path) -> np.ndarray:
     """Return the array of an .npy file; raises ResultError as `read_headers` does."""
-    try:
-        with path.open("rb") as file:
-            size = path.stat().st_size
-            if size > SIZE_LIMIT:
-                raise ResultError(f"{path.name} has {size} bytes; expected at most {SIZE_LIMIT}")
-            _read_header(file, path.name, size)
-            file.seek(0)
-            return np.lib.format.read_array(file, allow_pickle=False)
-    except OSError as error:
-        raise ResultError(f"{path.name} cannot be read ({error.strerror or error})") from error
-    except (*_BROKEN, MemoryError) as error:
-        raise ResultError(f"{path.name} is not a whole .npy file ({error})") from error
+    with _explaining(path.name, ".npy"), path.open("rb") as file:
+        size = path.stat().st_size
+        if size > SIZE_LIMIT:
+            raise ResultError(f"{path.name} has {size} bytes; expected at most {SIZE_LIMIT}")
+        _read_header(file, path.name, size)
+        file.seek(0)
+        return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
@@ -75,7 +70,7 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, n
     Check the headers of a stranger's file first: compressed, a small file can hold large arrays.
     """
     arrays = {}
-    with _opened(path) as archive:
+    with _explaining("it", ".npz"), zipfile.ZipFile(path) as archive:
         for name, member, file in _members(archive):
             if names is not None and name not in names:
                 continue
@@ -89,16 +84,15 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, n
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+def _explaining(subject: str, suffix: str) -> Iterator[None]:
     try:
-        with zipfile.ZipFile(path) as archive:
-            yield archive
+        yield
     except ResultError:
         raise
     except OSError as error:
-        raise ResultError(f"it cannot be read ({error.strerror or error})") from error
-    except (*_BROKEN, MemoryError) as error:
-        raise ResultError(f"it is not a whole .npz file ({error})") from error
+        raise ResultError(f"{subject} cannot be read ({error.strerror or error})") from error
+    except _BROKEN as error:
+        raise ResultError(f"{subject} is not a whole {suffix} file ({error})") from error
 
 
 def _members(archive: zipfile.ZipFile) -> Iterator[tuple[str, zipfile.ZipInfo, IO[bytes]]]:
@@ -109,8 +103,8 @@ def _members(archive: zipfile.ZipFile) -> Iterator[tuple[str, zipfile.ZipInfo, I
     if len({member.filename for member in members}) < len(members):
         raise ResultError("it holds two arrays of the same name")
     for member in members:
-        name, dot, suffix = member.filename.rpartition(".")
-        if not dot or suffix != "npy":
+        name = member.filename.removesuffix(".npy")
+        if name == member.filename:
             raise ResultError(f"it holds {member.filename!r}; expected arrays alone")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise ResultError(f"array '{name}' has compression type {member.compress_type}; expected numpy's: 0 or 8")
@@ -132,7 +126,7 @@ def _read_header(file: IO[bytes], name: str, length: int) -> Header:
         is_valid = not header and type(by_columns) is bool and type(shape) is tuple and len(shape) <= _MOST_AXES
         if not (is_valid and all(type(side) is int and 0 <= side <= SIZE_LIMIT for side in shape)):
             raise ValueError
-    except (*_BROKEN, MemoryError, TypeError, LookupError, AttributeError):
+    except (*_BROKEN, TypeError, LookupError, AttributeError):
         raise ResultError(f"{name} has an invalid header; expected one as numpy writes it") from None
     if type(descr) is not str or "O" in descr:
         raise ResultError(f"{name} holds Python objects or structures, which are never loaded; expected plain values")
