@@ -9,7 +9,7 @@ from typing import NamedTuple
 from converters.files import INDEX, SUFFIXES, choose_file
 from converters.hub import download
 from converters.strangers import refuse_strangers
-from vggtjax.errors import CheckpointError
+from vggtjax.errors import CheckpointError, reading
 
 _HUB_ID = re.compile(r"([A-Za-z0-9][\w.-]{0,95}/[A-Za-z0-9][\w.-]{0,95})(?:/([A-Za-z0-9][\w.-]{0,200}))?", re.ASCII)
 
@@ -24,19 +24,16 @@ class Weights(NamedTuple):
 def locate(source: str | Path) -> Weights:
     """Return the file of weights of a path or hub id; the latter is downloaded unless cached.
 
-    Raises:
-        CheckpointError: the file is missing, or a folder or hub repository holds no weights or several ones.
-        MissingExtraError: the source is a hub id, and huggingface_hub is not installed.
+    Raises CheckpointError if the file is missing, or a folder or hub repository holds no weights or several ones, and
+    MissingExtraError if the source is a hub id and huggingface_hub is not installed.
     """
     path = Path(source).expanduser()
-    try:
+    with reading(path, CheckpointError):
         if path.is_dir():
             names = [entry.name for entry in path.iterdir() if entry.is_file()]
             return Weights(path / choose_file(names, f"the folder {path}"), path.resolve().name)
         if path.is_file():
             return Weights(path, path.name.removesuffix(INDEX).removesuffix(path.suffix))
-    except OSError as error:
-        raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
     is_path = len(path.parts) > 1 and path.parent.is_dir()  # a mistyped one
     if isinstance(source, str) and not is_path and (match := _HUB_ID.fullmatch(source)):
         hub_id, file = match.groups()

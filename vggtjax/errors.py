@@ -1,6 +1,7 @@
 """Exceptions of the public boundary: one clear sentence each; the command line turns them into exit code 2."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 
 _MOST_PROBLEMS = 20  # in full, in one message
@@ -45,6 +46,15 @@ def check_extra(purpose: str, extra: str, *modules: str) -> None:
     """Raise MissingExtraError unless all modules of an extra are installed: before hours are spent."""
     if not all(find_spec(module) for module in modules):
         raise MissingExtraError(purpose, extra)
+
+
+@contextmanager
+def reading(path: object, error: type[InputError] = InputError) -> Iterator[None]:
+    """Turn an OSError of the body into `error`, which names `path` and the reason."""
+    try:
+        yield
+    except OSError as problem:
+        raise error(f"cannot read {path}: {problem.strerror or problem}") from problem
 
 
 def one_line(text: str, most: int = 300) -> str:

@@ -20,7 +20,7 @@ import msgspec
 from msgspec import Meta
 from msgspec import inspect as kinds
 
-from vggtjax.errors import InputError, one_line
+from vggtjax.errors import InputError, one_line, reading
 
 MOST_BYTES = 2**24  # of a file or text, by default
 MOST_LEVELS = 64  # of nesting
@@ -44,22 +44,15 @@ _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 80
 
 
 class _MisfitError(Exception):
-    """A place in a document, such as .stages[0].steps, and the words that follow it in the sentence."""
-
-    def __init__(self, place: str, words: str) -> None:
-        super().__init__(place, words)
-        self.place, self.words = place, words
+    """Its arguments: a place in a document, such as .stages[0].steps, and the words that follow it in the sentence."""
 
 
 def read_json(
     path: str | Path, kind: type[T], what: str, *, most_bytes: int = MOST_BYTES, error: type[InputError] = InputError
 ) -> T:
     """Read a JSON file; raises `error` for an unreadable file and for the problems of `parse_json`."""
-    try:
-        with Path(path).open("rb") as file:
-            text = file.read(most_bytes + 1)
-    except OSError as problem:
-        raise error(f"cannot read {path}: {problem.strerror or problem}") from None
+    with reading(path, error), Path(path).open("rb") as file:
+        text = file.read(most_bytes + 1)
     return parse_json(text, kind, f"{what} {path}", most_bytes=most_bytes, error=error)
 
 
@@ -88,25 +81,23 @@ def parse_json(
     try:
         return _converted(value, kind)
     except _MisfitError as misfit:
-        colon = ": " if misfit.place.startswith((".", "[")) else ""
-        raise error(f"{what}{colon}{misfit.place.removeprefix('.')} {misfit.words}") from None
+        place, words = misfit.args
+        colon = ": " if place.startswith((".", "[")) else ""
+        raise error(f"{what}{colon}{place.removeprefix('.')} {words}") from None
 
 
 def check_fields(instance: Any, what: str = "", *, error: type[InputError] = InputError) -> None:
     """Check the fields of a frozen dataclass in its `__post_init__`, and convert them to the annotated types.
 
-    Lists become tuples, whole numbers become floats, and mappings become dataclasses, if so annotated.
-
-    Args:
-        instance: the dataclass.
-        what: prefix of the field in an error, such as "optimiser" for "optimiser.b1 is 2; expected ...".
-        error: class of the exception.
+    Lists become tuples, whole numbers become floats, and mappings become dataclasses, if so annotated. `what` is the
+    prefix of the field in an `error`, such as "optimiser" for "optimiser.b1 is 2; expected ...".
     """
     for name, hint in _hints(type(instance)).items():
         try:
             value = _converted(getattr(instance, name), hint)
         except _MisfitError as misfit:
-            raise error(f"{what}{'.' if what else ''}{name}{misfit.place} {misfit.words}") from None
+            place, words = misfit.args
+            raise error(f"{what}{'.' if what else ''}{name}{place} {words}") from None
         object.__setattr__(instance, name, value)
 
 
@@ -135,30 +126,27 @@ def _converted(value: Any, kind: Any) -> Any:
         raise _MisfitError(place, f"is {_short(value)}; expected {_expected(info)}") from None
 
 
-def _check(value: Any, info: kinds.Type, levels: int = 0) -> None:
-    """Raise _MisfitError for infinite and huge numbers, keys that are no field of a dataclass, and too many levels."""
+def _check(value: Any, info: kinds.Type, keys: tuple[Any, ...] = ()) -> None:
+    """Raise _MisfitError for infinite and huge numbers, unknown fields of a dataclass, and too many levels."""
+    words = ""
+    if len(keys) > MOST_LEVELS:
+        raise _MisfitError("", f"is nested more than {MOST_LEVELS} levels deep")
     if isinstance(value, float) and not math.isfinite(value):
-        raise _MisfitError("", f"is {value}; expected a finite number")
-    if isinstance(value, int) and abs(value) > _MOST_INT:
-        raise _MisfitError("", "is a number of more than 64 bits")
-    if value is None or isinstance(value, float | int | str):
-        return
-    if isinstance(value, Mapping) and isinstance(info := _option(info, value), kinds.DataclassType):
+        words = f"is {value}; expected a finite number"
+    elif isinstance(value, int) and abs(value) > _MOST_INT:
+        words = "is a number of more than 64 bits"
+    elif isinstance(value, Mapping) and isinstance(info := _option(info, value), kinds.DataclassType):
         known = [field.name for field in info.fields]
         if unknown := sorted(str(key) for key in value if key not in known):
-            raise _MisfitError("", f"has unknown fields {_short(unknown)}; expected some of {known}")
+            words = f"has unknown fields {_short(unknown)}; expected some of {known}"
+    if words:
+        raise _MisfitError("".join(map(_step, keys)), words)
     for key, child, child_info in _children(value, info):
-        if levels == MOST_LEVELS:
-            raise _MisfitError("", f"is nested more than {MOST_LEVELS} levels deep")
-        try:
-            _check(child, child_info, levels + 1)
-        except _MisfitError as misfit:
-            place = "" if "nested" in misfit.words else _step(key) + misfit.place
-            raise _MisfitError(place, misfit.words) from None
+        _check(child, child_info, (*keys, key))
 
 
 def _option(info: kinds.Type, value: Any) -> kinds.Type:
-    """Return the option of a union that fits a container; types other than unions are returned as they are."""
+    """Return the option of a union that fits a container; return types other than unions as they are."""
     options = info.types if isinstance(info, kinds.UnionType) else (info,)
     wanted = (kinds.DataclassType, kinds.DictType) if isinstance(value, Mapping) else (kinds.TupleType, *_ITEMS)
     return next((option for option in options if isinstance(option, wanted)), info)
@@ -193,9 +181,8 @@ def _expected(info: kinds.Type) -> str:
     if isinstance(info, _ITEMS):
         return "a list" + (f" of at least {info.min_length} values" if info.min_length else "")
     if isinstance(info, kinds.IntType | kinds.FloatType):
-        bounds = [
-            f"{words} {getattr(info, name)}" for name, words in _BOUNDS.items() if getattr(info, name) is not None
-        ]
+        limits = {words: getattr(info, name) for name, words in _BOUNDS.items()}
+        bounds = [f"{words} {limit}" for words, limit in limits.items() if limit is not None]
         whole = "a whole number" if isinstance(info, kinds.IntType) else "a number"
         return whole + (f" of {' and '.join(bounds)}" if bounds else "")
     return _WORDS.get(type(info), type(info).__name__)

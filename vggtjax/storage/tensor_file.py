@@ -12,7 +12,7 @@ import ml_dtypes
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from vggtjax.errors import CheckpointError, one_line
+from vggtjax.errors import CheckpointError, one_line, reading
 from vggtjax.storage.writing import writing
 
 ALIGNMENT = 64  # bytes; XLA uses aligned tensors of a memory map without a copy
@@ -82,47 +82,40 @@ class Spec(NamedTuple):
 
 def is_tensor_file(path: str | Path) -> bool:
     """Return whether a file starts as a safetensors file does: eight bytes of length, then JSON."""
-    try:
-        with Path(path).open("rb") as file:
-            start = file.read(9)
-    except OSError as error:
-        raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
+    with reading(path, CheckpointError), Path(path).open("rb") as file:
+        start = file.read(9)
     return start[8:] == b"{" and int.from_bytes(start[:8], "little") < 2**48  # other formats begin with text
 
 
 def read_tensors(path: str | Path) -> TensorFile:
     """Read the header of a safetensors file, and check that the file is whole.
 
-    Raises:
-        CheckpointError: the file cannot be read, is not a whole safetensors file, or holds an unsupported type.
+    Raises CheckpointError if the file cannot be read, is not a whole safetensors file, or holds an unsupported type.
     """
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            length = int.from_bytes(file.read(8), "little")
-            if length > MAX_HEADER_BYTES:
-                raise CheckpointError(
-                    f"{path} is not a safetensors file of weights: its header claims {length} bytes; "
-                    f"expected at most {MAX_HEADER_BYTES}"
-                )
+    with reading(path, CheckpointError), path.open("rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+        if length > MAX_HEADER_BYTES:
+            raise CheckpointError(
+                f"{path} is not a safetensors file of weights: its header claims {length} bytes; "
+                f"expected at most {MAX_HEADER_BYTES}"
+            )
+        try:
             with safe_open(path, framework="numpy") as opened:
                 metadata = opened.metadata() or {}
                 slices = {name: opened.get_slice(name) for name in opened.offset_keys()}
                 layout = {name: (tuple(piece.get_shape()), piece.get_dtype()) for name, piece in slices.items()}
-            unsupported = sorted({code for _, code in layout.values()} - set(_DTYPES))
-            if unsupported:
-                raise CheckpointError(f"{path} has tensors of type {', '.join(unsupported)}; expected floating point")
-            # safe_open has checked that the tensors fill the file without gaps, so their sizes give their offsets.
-            offset = 8 + length
-            tensors = {}
-            for name, (shape, code) in layout.items():
-                tensors[name] = StoredTensor(path, offset, shape, _DTYPES[code])
-                offset += tensors[name].nbytes
-    except SafetensorError as error:
-        reason = one_line(str(error))
-        raise CheckpointError(f"{path} is not a whole safetensors file ({reason}); copy or download it again") from None
-    except OSError as error:
-        raise CheckpointError(f"cannot read {path}: {error.strerror or error}") from error
+        except SafetensorError as error:
+            words = f"is not a whole safetensors file ({one_line(str(error))}); copy or download it again"
+            raise CheckpointError(f"{path} {words}") from None
+    if unsupported := sorted({code for _, code in layout.values()} - set(_DTYPES)):
+        raise CheckpointError(f"{path} has tensors of type {', '.join(unsupported)}; expected floating point")
+    # safe_open has checked that the tensors fill the file without gaps, so their sizes give their offsets.
+    offset = 8 + length
+    tensors = {}
+    for name, (shape, code) in layout.items():
+        tensors[name] = StoredTensor(path, offset, shape, _DTYPES[code])
+        offset += tensors[name].nbytes
     return TensorFile(tensors, metadata)
 
 
@@ -134,14 +127,8 @@ def write_tensors(
 ) -> None:
     """Write a safetensors file with one piece in memory at a time; an interrupted run leaves no file.
 
-    Args:
-        path: the file; an existing file is replaced.
-        specs: name -> shape and type.
-        pieces: returns the parts of the tensor of a name, consecutive on axis 0, of any type: they are cast.
-        metadata: texts for the header.
-
-    Raises:
-        OutputError: the folder cannot be written or the disk is full.
+    An existing file is replaced. `pieces` returns the parts of the tensor of a name, consecutive on axis 0, of any
+    type: they are cast. Raises OutputError if the folder cannot be written or the disk is full.
     """
     sizes = {name: prod(spec.shape) * spec.dtype.itemsize for name, spec in specs.items()}
     names = sorted(specs, key=lambda name: (sizes[name] % ALIGNMENT != 0, name))  # keeps all but the last ones aligned

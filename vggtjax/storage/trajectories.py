@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from vggtjax.errors import InputError, ResultError
+from vggtjax.errors import InputError, ResultError, reading
 
 Quaternion = Literal["xyzw", "wxyz"]
 
@@ -80,17 +80,15 @@ def read_trajectory(
 def read_numbers(path: str | Path, columns: int) -> Float[np.ndarray, "S columns"]:
     """Read a text file of `columns` finite numbers per line. Raises ResultError for anything else."""
     path = Path(path)
-    try:
+    with reading(path, ResultError), path.open(encoding="utf-8") as file, warnings.catch_warnings():
         if path.stat().st_size > _MOST_BYTES:
             raise ResultError(f"{path} has {path.stat().st_size} bytes; expected at most {_MOST_BYTES}")
-        with path.open(encoding="utf-8") as file, warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of an empty file, an error below
+        warnings.simplefilter("ignore")  # of an empty file, an error below
+        try:
             array = np.loadtxt((line.replace(",", " ") for line in file), ndmin=2)
-    except OSError as error:
-        raise ResultError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:  # not text, not numbers, or lines of different length
-        reason = str(error).split(";")[0].split("\n")[0][:100]
-        raise ResultError(f"{path} is not a table of {columns} numbers a line ({reason})") from None
+        except ValueError as error:  # not text, not numbers, or lines of different length
+            reason = str(error).split(";")[0].split("\n")[0][:100]
+            raise ResultError(f"{path} is not a table of {columns} numbers a line ({reason})") from None
     if array.shape[1] != columns or not len(array):
         problem = f"has {array.shape[1]} numbers a line" if len(array) else "is empty"
         raise ResultError(f"{path} {problem}; expected {columns} numbers a line")
