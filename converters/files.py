@@ -17,6 +17,8 @@ INDEX = ".safetensors.index.json"
 SUFFIXES = (".safetensors", INDEX, ".pt", ".pth")
 
 Tensor = np.ndarray | StoredTensor
+_FILE_NAME = re.compile(r"(?!\.)[^/\\:\x00-\x1f]{1,255}")
+_OTHERS = {rb"\Z": "empty", rb"version https://git-lfs": "a Git LFS pointer", rb"\s*<": "a web page"}  # by start
 
 
 class StateDict(NamedTuple):
@@ -56,9 +58,8 @@ def weight_files(path: Path) -> list[Path]:
 def read_state_dict(path: Path) -> StateDict:
     """Return the tensors of a file of weights, whose format is recognised by content.
 
-    Raises:
-        CheckpointError: the file cannot be read, or has another format.
-        MissingExtraError: the file is a torch file, and torch is not installed.
+    Raises CheckpointError for an unreadable file and for other formats, MissingExtraError for a torch file if torch is
+    not installed.
     """
     if path.name.endswith(INDEX):
         return _read_shards(path)
@@ -73,7 +74,9 @@ def read_state_dict(path: Path) -> StateDict:
         from converters.torch_file import read_torch
 
         return StateDict(*read_torch(path))
-    raise CheckpointError(f"{path} is {_describe(start)}, not weights; copy or download it again")
+    kinds = (kind for pattern, kind in _OTHERS.items() if re.match(pattern, start))
+    kind = next(kinds, f"a file that starts with {start[:8]!r}")
+    raise CheckpointError(f"{path} is {kind}, not weights; copy or download it again")
 
 
 def _read_shards(index: Path) -> StateDict:
@@ -104,21 +107,8 @@ def _weight_map(index: Path) -> dict[str, str]:
     weight_map = content.get("weight_map")
     if not isinstance(weight_map, dict) or not weight_map:
         raise CheckpointError(f"{index} has no weight_map; expected one from keys to shards")
-    invalid = sorted({str(shard)[:100] for shard in weight_map.values() if not _is_file_name(shard)})
+    shards = weight_map.values()
+    invalid = {str(shard)[:100] for shard in shards if not (isinstance(shard, str) and _FILE_NAME.fullmatch(shard))}
     if invalid:
-        raise CheckpointError(f"{index} names shards {invalid[:3]}; expected names of files in its folder")
+        raise CheckpointError(f"{index} names shards {sorted(invalid)[:3]}; expected names of files in its folder")
     return weight_map
-
-
-def _is_file_name(name: object) -> bool:
-    return isinstance(name, str) and re.fullmatch(r"(?!\.)[^/\\:\x00-\x1f]{1,255}", name) is not None
-
-
-def _describe(start: bytes) -> str:
-    if not start:
-        return "empty"
-    if start.startswith(b"version https://git-lfs"):
-        return "a Git LFS pointer"
-    if start.lstrip().startswith(b"<"):
-        return "a web page"
-    return f"a file that starts with {start[:8]!r}"

@@ -11,15 +11,11 @@ from vggtjax.errors import CheckpointError, MissingExtraError, one_line
 def download(hub_id: str, file: str | None = None) -> Path:
     """Return the file of weights of a hub repository in the hub's cache; download it unless cached.
 
-    A cached file needs no network. Without `file`, `choose_file` chooses the file.
-
-    Raises:
-        CheckpointError: the repository is missing, gated, unreachable, or holds no weights.
-        MissingExtraError: huggingface_hub is not installed.
+    A cached file needs no network. Without `file`, `choose_file` chooses the file. Raises CheckpointError for a
+    missing, gated or unreachable repository or one without weights; MissingExtraError without huggingface_hub.
     """
     try:
         from huggingface_hub import errors
-        from huggingface_hub.errors import HTTPError  # pyright: ignore[reportPrivateImportUsage]: of httpx or httpx2
     except ImportError as error:
         raise MissingExtraError(f"downloading '{hub_id}'", "hub") from error
 
@@ -36,7 +32,7 @@ def download(hub_id: str, file: str | None = None) -> Path:
             f"'{hub_id}' is neither an existing path nor a visible repository on the hub; check the spelling, "
             "or log in with 'hf auth login' if the repository is private"
         ) from error
-    except (HTTPError, OSError, ValueError) as error:
+    except (errors.HTTPError, OSError, ValueError) as error:  # pyright: ignore[reportPrivateImportUsage]
         reason = one_line(str(error).strip().split("\n")[0]).rstrip(".") or type(error).__name__
         raise CheckpointError(
             f"'{hub_id}' is not in the hub's cache and cannot be downloaded ({reason}); check the network and try again"
@@ -44,23 +40,19 @@ def download(hub_id: str, file: str | None = None) -> Path:
 
 
 def _download(hub_id: str, file: str | None) -> Path:
-    from huggingface_hub import HfApi
-    from huggingface_hub.errors import (
-        HTTPError,  # pyright: ignore[reportPrivateImportUsage]: of httpx or httpx2
-        LocalEntryNotFoundError,
-    )
+    from huggingface_hub import HfApi, errors
 
     hub = HfApi()
     cached = False
     try:
         names = [file.rfilename for file in hub.model_info(hub_id).siblings or []]
-    except (HTTPError, OSError) as error:  # unreachable or gated: use the cached files
+    except (errors.HTTPError, OSError) as error:  # pyright: ignore[reportPrivateImportUsage]: of httpx or httpx2
+        cached = True  # the hub is unreachable, or the repository is gated
         try:
             folder = Path(hub.snapshot_download(hub_id, allow_patterns=[], local_files_only=True))
-        except LocalEntryNotFoundError:
+        except errors.LocalEntryNotFoundError:
             raise error from None
         names = [entry.name for entry in folder.iterdir()]
-        cached = True
     if file is not None and file not in names:
         listed = ", ".join(name for name in sorted(names) if name.endswith(SUFFIXES)) or "none"
         if cached:

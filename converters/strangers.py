@@ -28,11 +28,7 @@ STRANGERS = (
         sha256=("3d3d914d09609fdb485e16947c4885cca0e5ea4e5557598a3b3ffb1cfe0a2f59",),
     ),
     Stranger("STream3R", "its keys are VGGT's, but its global attention is causal", source=r"stream3r"),
-    Stranger(
-        "PAGE-4D",
-        "its aggregator masks attention by predicted motion",
-        r"aggregator\.spatial_mask_head\.",
-    ),
+    Stranger("PAGE-4D", "its aggregator masks attention by predicted motion", r"aggregator\.spatial_mask_head\."),
     Stranger(
         "VGGT-Omega",
         "its aggregator and heads differ from VGGT's",
@@ -54,10 +50,8 @@ STRANGERS = (
 def refuse_strangers(source: str, keys: Iterable[str] = (), sha256: Mapping[str, str] | None = None) -> None:
     """Raise CheckpointError for a checkpoint of a network related to VGGT.
 
-    Args:
-        source: name of the weights: a hub id, or the name of their file or folder.
-        keys: of the tensors.
-        sha256: of the files.
+    `source` is the name of the weights, a hub id or the name of their file or folder; `keys` are of the tensors,
+    `sha256` of the files.
     """
     keys = list(keys)
     for stranger in STRANGERS:

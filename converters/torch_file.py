@@ -23,9 +23,8 @@ logger = logging.getLogger(__name__)
 def read_torch(path: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     """Return the tensors of a torch file, mapped into memory if the format permits, and the problems of its entries.
 
-    Raises:
-        CheckpointError: the file is damaged, contains code, or holds no state dict.
-        MissingExtraError: torch is not installed.
+    Raises CheckpointError if the file is damaged, contains code, or holds no state dict; MissingExtraError unless torch
+    is installed.
     """
     state_dict = _load(path)
     for _ in _WRAPPERS:  # one may be inside the other

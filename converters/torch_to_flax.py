@@ -6,8 +6,9 @@ import dataclasses
 import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import count
+from itertools import count, groupby
 from math import prod
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,15 +18,15 @@ from flax.traverse_util import unflatten_dict
 
 from converters.files import Tensor, read_state_dict, weight_files
 from converters.locate import Weights, locate
-from converters.rules import IGNORED, RULES, Rule, Transform
+from converters.rules import IGNORED, RULES, Transform
 from converters.strangers import refuse_strangers
 from vggtjax.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
 from vggtjax.config import HEAD_NAMES, VGGTConfig, vggt_1b
-from vggtjax.errors import CheckpointError, InputError, problems_sentence
+from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
 from vggtjax.progress import Progress
 from vggtjax.storage.tensor_file import Spec
 
-_STACKED = {rule.path for rule in RULES if rule.stacked}
+_RULES = {path: list(rules) for path, rules in groupby(sorted(RULES, key=attrgetter("path")), attrgetter("path"))}
 _FLOATS = tuple(np.dtype(kind) for kind in (np.float32, ml_dtypes.bfloat16, np.float16, np.float64))
 _DIGEST_BLOCK = 2**20  # bytes of a source file per step of progress
 
@@ -57,37 +58,26 @@ class Conversion(NamedTuple):
         }
 
 
-class Piece(NamedTuple):
-    """One source tensor of a target array: one layer of a stacked array, or the whole array."""
-
-    source: str
-    transform: Transform
-
-
 class Target(NamedTuple):
-    """One array of the parameter tree and its source tensors, in order of layers."""
+    """One array of the parameter tree and its source tensors: one, or one per layer of a stacked array."""
 
     shape: tuple[int, ...]
-    pieces: list[Piece]
+    transform: Transform
+    sources: list[str]
     stacked: bool
 
     def parts(self, tensors: Mapping[str, Tensor]) -> Iterator[np.ndarray]:
         """Yield the target's parts, consecutive on axis 0, as views of the sources; one source is mapped at a time."""
-        for piece in self.pieces:
-            part = piece.transform(np.asarray(tensors[piece.source]))
+        for source in self.sources:
+            part = self.transform(np.asarray(tensors[source]))
             yield part[None] if self.stacked else part
 
 
 def convert_state_dict(state_dict: Mapping[str, np.ndarray], config: VGGTConfig) -> dict[str, Any]:
-    """Return the parameter tree (nested dicts of numpy arrays) of a PyTorch state dict.
+    """Return the parameter tree (nested dicts of numpy arrays) of a PyTorch state dict; types are kept.
 
-    Args:
-        state_dict: PyTorch parameter name -> array of any float type, which is kept.
-        config: the model's configuration.
-
-    Raises:
-        CheckpointError: lists every unknown, missing, duplicate and mis-shaped key, and types other than float; or
-            names the other network of the state dict.
+    Raises CheckpointError, which lists every unknown, missing, duplicate and mis-shaped key, and types other than
+    float; or names the other network of the state dict.
     """
     refuse_strangers("the state dict", state_dict)
     tensors = {name: np.asarray(value) for name, value in state_dict.items()}
@@ -132,12 +122,7 @@ def convert(
 
 
 def convert_weights(
-    weights: Weights,
-    destination: str | Path,
-    *,
-    dtype: DType,
-    config: VGGTConfig,
-    progress: Progress | None = None,
+    weights: Weights, destination: str | Path, *, dtype: DType, config: VGGTConfig, progress: Progress | None = None
 ) -> Conversion:
     """Convert located weights as `convert` does."""
     kind = numpy_dtype(dtype)
@@ -148,7 +133,7 @@ def convert_weights(
     refuse_strangers(weights.name, tensors)
     targets = plan_conversion(tensors, config, problems)
     files = weight_files(weights.path)
-    used = {piece.source for target in targets.values() for piece in target.pieces}
+    used = {source for target in targets.values() for source in target.sources}
     total = len(used) + sum(-(-file.stat().st_size // _DIGEST_BLOCK) for file in files)
     done = count(1)
 
@@ -182,20 +167,15 @@ def plan_conversion(
 ) -> dict[str, Target]:
     """Match every tensor with the rule table; return flat target name -> its sources.
 
-    Args:
-        tensors: by source name; only their shapes and types are read.
-        config: the expected configuration.
-        problems: of the reader.
-
-    Raises:
-        CheckpointError: lists `problems` and every unknown, missing, duplicate and mis-shaped key.
+    Only shapes and types of the tensors are read. Raises CheckpointError, which lists the `problems` of the reader and
+    every unknown, missing, duplicate and mis-shaped key.
     """
     shapes = flat_shapes(config)
     problems = list(problems)
     targets: dict[str, Target] = {}
     known = IGNORED | _keys_of_other_heads(config)
     for path, keys in _expected(shapes).items():
-        pieces = []
+        sources = []
         for key in keys:
             known |= set(key.names)
             names = [name for name in key.names if name in tensors]
@@ -208,13 +188,13 @@ def plan_conversion(
                     problems.append(f"mis-shaped key {name}: {list(tensors[name].shape)}, expected {list(key.shape)}")
                 if tensors[name].dtype not in _FLOATS:
                     problems.append(f"key {name} has type {tensors[name].dtype}, expected floating point")
-            pieces += [Piece(name, key.transform) for name in names]
-        targets[path] = Target(shapes[path], pieces, stacked=path in _STACKED)
+            sources += names
+        rule = _RULES[path][0]
+        targets[path] = Target(shapes[path], rule.transform, sources, rule.stacked)
     problems += [f"unknown key {name}" for name in tensors if name not in known]
     if problems:
-        raise CheckpointError(
-            problems_sentence("the checkpoint does not fit the configuration" + _hint(tensors, config), problems)
-        )
+        subject = f"the checkpoint does not fit the configuration{_hint(tensors, config)}"
+        raise CheckpointError(problems_sentence(subject, problems))
     return targets
 
 
@@ -243,39 +223,27 @@ def _hint(tensors: Mapping[str, Tensor], config: VGGTConfig) -> str:
 
 def _digest(file: Path, advance: Callable[[], None]) -> str:
     digest = hashlib.sha256()
-    try:
-        with file.open("rb") as opened:
-            while block := opened.read(_DIGEST_BLOCK):
-                digest.update(block)
-                advance()
-    except OSError as error:
-        raise CheckpointError(f"cannot read {file}: {error.strerror or error}") from error
+    with reading(file, CheckpointError), file.open("rb") as opened:
+        while block := opened.read(_DIGEST_BLOCK):
+            digest.update(block)
+            advance()
     return digest.hexdigest()
 
 
 class _Key(NamedTuple):
-    """One source tensor: possible names, transform and shape."""
+    """One source tensor: possible names, and shape."""
 
     names: list[str]
-    transform: Transform
     shape: tuple[int, ...]
 
 
 def _expected(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, list[_Key]]:
     """Return target path -> source tensors, in order of layers."""
-    rules: dict[str, list[Rule]] = {}
-    for rule in RULES:
-        rules.setdefault(rule.path, []).append(rule)
     expected = {}
     for path, shape in shapes.items():
-        first = rules[path][0]
-        layers, part = (range(shape[0]), shape[1:]) if first.stacked else (range(1), shape)
-        expected[path] = [
-            _Key(
-                [rule.source.replace("{layer}", str(layer)) for rule in rules[path]],
-                first.transform,
-                first.transform.source_shape(part),
-            )
-            for layer in layers
-        ]
+        rules = _RULES[path]
+        layers, part = (range(shape[0]), shape[1:]) if rules[0].stacked else (range(1), shape)
+        source_shape = rules[0].transform.source_shape(part)
+        names = [[rule.source.replace("{layer}", str(layer)) for rule in rules] for layer in layers]
+        expected[path] = [_Key(aliases, source_shape) for aliases in names]
     return expected
