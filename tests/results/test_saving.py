@@ -10,7 +10,7 @@ from vggtjax.results.saving import Saving
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"confidence_percentile": -1}, "confidence_percentile is -1; expected at least 0 and below 100"),
+        ({"confidence_percentile": -1}, "confidence_percentile is -1; expected a number of at least 0 and less"),
         ({"confidence_percentile": 100}, "confidence_percentile is 100"),
         ({"confidence_percentile": float("nan")}, "confidence_percentile is nan"),
         ({"resolution": "full"}, "resolution is 'full'; expected one of"),

@@ -174,7 +174,9 @@ def _write_frames(
         np.save(folder / f"depth/{name}.npy", frame.depth, allow_pickle=False)
         _write_png(folder / f"depth/{name}.png", encode_depth(frame.depth, valid, scale), depth_scale=repr(scale))
         _write_png(folder / f"mask/{name}.png", frame.dynamic_mask.astype(np.uint8) * 255)
-        _write_palette(folder / f"instances/{name}.png", frame.instances)
+        instances = Image.fromarray(frame.instances)
+        instances.putpalette(previews.INSTANCE_COLORS.ravel().tolist())
+        instances.save(folder / f"instances/{name}.png", compress_level=_PNG_LEVEL)
         _write_png(folder / f"preview/depth/{name}.png", previews.color_depth(frame.depth, valid, inverse_range))
         moving = previews.moving_ids(frame.dynamic_mask, frame.instances)
         _write_png(folder / f"preview/overlay/{name}.png", previews.overlay(frame.image, moving))
@@ -244,12 +246,6 @@ def write_intrinsics(
     of = f"{width} x {height}" if len(set(sizes)) == 1 else "each frame's depth"
     header = commented(f"fx fy cx cy in pixels of {of}", note)
     np.savetxt(path, rows, fmt="%.9g", header=header, comments="", encoding="utf-8")
-
-
-def _write_palette(path: Path, ids: UInt8[np.ndarray, "H W"]) -> None:
-    picture = Image.fromarray(ids)
-    picture.putpalette(previews.INSTANCE_COLORS.ravel().tolist())
-    picture.save(path, compress_level=_PNG_LEVEL)
 
 
 def _write_png(path: Path, pixels: np.ndarray, **texts: str) -> None:

@@ -30,16 +30,10 @@ def find_archive(folder: Path) -> Path:
 
 
 def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
-    """Make sure that a result can be saved in `folder`, before hours are spent on one.
+    """Make sure that a result with these `OPTIONAL_FILES` can be saved in `folder`, before hours are spent on one.
 
-    An interrupted replacement is finished first.
-
-    Args:
-        folder: may be missing.
-        optional: names of `OPTIONAL_FILES` that the result will have.
-
-    Raises OutputError where the folder cannot be made or written, or holds files of our names that are not part of an
-    earlier result.
+    An interrupted replacement is finished first. Raises OutputError where the folder cannot be made or written, or
+    holds files of our names that are not part of an earlier result.
     """
     if os.path.lexists(folder / _REPLACING):
         with staging(folder):

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32
 from PIL import Image
 
 from vggtjax.cameras import Cameras, world_from_camera
@@ -58,9 +58,8 @@ def write_cameras(
 
 
 class _Folder(NamedTuple):
-    """The paths of a frame's files, as patterns with the frame's number, and the reader of the cameras."""
+    """The paths of the first frame's files, and the reader of the cameras."""
 
-    example: str  # of a depth file
     depth: str
     picture: str
     confidence: str
@@ -121,7 +120,7 @@ def check_format(format: str, quaternion: str | None) -> None:
 def _read_folder(folder: Path, files: _Folder, quaternion: Quaternion | None) -> dict[str, Any]:
     depth_files = _numbered(folder, files.depth)
     if not depth_files:
-        raise ResultError(f"it has no depth; expected files like {files.example}")
+        raise ResultError(f"it has no depth; expected files like {files.depth}")
     numbers = sorted(depth_files)
     cameras = files.cameras(folder, numbers, quaternion)
     depth = _stacked(depth_files, numbers, _read_map, None)
@@ -139,22 +138,24 @@ def _read_folder(folder: Path, files: _Folder, quaternion: Quaternion | None) ->
         "depth": depth,
         "depth_confidence": confidence,
         "dynamic_mask": mask,
-        "images": _stacked(_numbered(folder, files.picture), numbers, _read_picture, (*shape, 3)),
+        "images": _stacked(
+            _numbered(folder, files.picture), numbers, lambda path: np.asarray(read_image(path)), (*shape, 3)
+        ),
         **cameras._asdict(),
     }
 
 
-def _numbered(folder: Path, pattern: str) -> dict[int, Path]:
-    """Return the files of a folder by the number in their names."""
-    parent, _, name = pattern.rpartition("/")
-    folder = folder / parent
+def _numbered(folder: Path, example: str) -> dict[int, Path]:
+    """Return the files of all frames by number, with names like the `example` of frame 0."""
+    folder = (folder / example).parent
+    pattern = re.sub("0+", r"(\\d{1,9})", re.escape(Path(example).name))
     try:
         entries = list(folder.iterdir()) if folder.is_dir() else []
     except OSError as error:
         raise ResultError(f"it cannot be read ({error.strerror or error})") from error
     files: dict[int, Path] = {}
     for entry in entries:
-        if match := re.fullmatch(name, entry.name, re.ASCII):
+        if match := re.fullmatch(pattern, entry.name, re.ASCII):
             number = int(match[1])
             if number in files:
                 raise ResultError(f"{files[number].name} and {entry.name} are both of frame {number}")
@@ -192,10 +193,6 @@ def _read_map(path: Path) -> Float32[np.ndarray, "H W"]:
     return array.astype(np.float32)
 
 
-def _read_picture(path: Path) -> UInt8[np.ndarray, "H W 3"]:
-    return np.asarray(read_image(path))
-
-
 def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
     if quaternion is None:
         raise InputError("quaternion is None; expected 'xyzw' or 'wxyz'")
@@ -210,7 +207,7 @@ def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion |
 
 
 def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
-    files = _numbered(folder, r"camera/(\d+)\.npz")
+    files = _numbered(folder, "camera/000000.npz")
     poses, intrinsics = [], []
     for number in numbers:
         if number not in files:
@@ -261,26 +258,11 @@ def _read_some(
     return read_arrays(file, {*needed, *others})
 
 
-_MONST3R = _Folder(
-    example="frame_0000.npy",
-    depth=r"frame_(\d{1,9})\.npy",
-    picture=r"frame_(\d{1,9})\.png",
-    confidence=r"conf_(\d{1,9})\.npy",
-    mask=r"dynamic_mask_(\d{1,9})\.png",
-    cameras=_text_cameras,
-    logarithmic=True,
-)
+_VGGT4D = _Folder("frame_0000.npy", "frame_0000.png", "conf_0000.npy", "dynamic_mask_0000.png", _text_cameras)
 _FOLDERS = {
-    "vggt4d": _MONST3R._replace(logarithmic=False),
-    "monst3r": _MONST3R,
-    "cut3r": _Folder(
-        example="depth/000000.npy",
-        depth=r"depth/(\d{1,9})\.npy",
-        picture=r"color/(\d{1,9})\.png",
-        confidence=r"conf/(\d{1,9})\.npy",
-        mask=None,
-        cameras=_npz_cameras,
-    ),
+    "vggt4d": _VGGT4D,
+    "monst3r": _VGGT4D._replace(logarithmic=True),
+    "cut3r": _Folder("depth/000000.npy", "color/000000.png", "conf/000000.npy", None, _npz_cameras),
 }
 FORMATS = (*_FOLDERS, "da3")
 _WITH_TRAJECTORY = tuple(name for name, files in _FOLDERS.items() if files.cameras is _text_cameras)

@@ -51,11 +51,7 @@ class Frame(NamedTuple):
 
 
 def frame_of(
-    result: Result,
-    frame: int,
-    resolution: Resolution = "model",
-    *,
-    picture: UInt8[np.ndarray, "h w 3"] | None = None,
+    result: Result, frame: int, resolution: Resolution = "model", *, picture: UInt8[np.ndarray, "h w 3"] | None = None
 ) -> Frame:
     """Return a frame at the model's size, or at its source's.
 
@@ -69,8 +65,7 @@ def frame_of(
         resolution: "model" or "original".
         picture: the source's, for "original"; by default the model's frame enlarged, and black where it was cut off.
 
-    Raises:
-        InputError: a frame out of range, an unknown resolution, or a picture of another size than the source's.
+    Raises InputError for a frame out of range, an unknown resolution, or a picture of another size than the source's.
     """
     if not 0 <= frame < len(result.depth):
         raise InputError(f"frame is {frame}; expected 0 to {len(result.depth) - 1}")
@@ -105,9 +100,7 @@ def _source_frame(result: Result, frame: int, picture: UInt8[np.ndarray, "h w 3"
         raise InputError(f"the picture of frame {frame} is {kind} {shape}; expected uint8 {(height, width, 3)}")
     x, y, seen = source_pixels(result, frame)
     left, top, right, bottom = (int(side) for side in result.valid_box[frame])
-    column = np.clip(np.floor(x).astype(int), left, right - 1)
-    row = np.clip(np.floor(y).astype(int), top, bottom - 1)
-    nearest = np.ix_(row, column)
+    nearest = np.ix_(top + _nearest(y - top, bottom - top), left + _nearest(x - left, right - left))
     depth = enlarged_depth(result.depth[frame, top:bottom, left:right], x - left, y - top)
     intrinsics = result.intrinsics[frame].astype(np.float64)
     intrinsics[:2] *= scale[:, None]
@@ -147,9 +140,7 @@ def enlarged_depth(
     Depth that is not a positive number belongs to no surface: it is never mixed.
     """
     H, W = depth.shape
-    (low_x, high_x, share_x), (low_y, high_y, share_y) = (
-        _between(position, side) for position, side in ((x, W), (y, H))
-    )
+    (low_x, high_x, share_x), (low_y, high_y, share_y) = _between(x, W), _between(y, H)
     corners = np.stack([depth[np.ix_(a, b)] for a in (low_y, high_y) for b in (low_x, high_x)])
     weights = np.stack([a[:, None] * b[None] for a in (1 - share_y, share_y) for b in (1 - share_x, share_x)])
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

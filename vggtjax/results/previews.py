@@ -52,8 +52,7 @@ def color_depth(
 
 
 def overlay(
-    image: UInt8[np.ndarray, "H W 3"],
-    moving: Bool[np.ndarray, "H W"] | UInt8[np.ndarray, "H W"],
+    image: UInt8[np.ndarray, "H W 3"], moving: Bool[np.ndarray, "H W"] | UInt8[np.ndarray, "H W"]
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Tint and outline moving pixels, of a mask or of objects by id, each in a colour of its own.
 

@@ -64,10 +64,7 @@ class Reconstruction(Result):
                 progress(total, total)
 
     def save_archive(self, path: Path, *, files: Sequence[str] = ()) -> None:
-        """Write everything but `passes` to one compressed .npz file, which `load` reads back.
-
-        `files` are the optional files beside it that are part of this result.
-        """
+        """Write all fields but `passes` to one compressed .npz file; `files` are the optional files beside it."""
         write_archive(path, self, files)
 
     @classmethod

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal, TypedDict, get_args
+from typing import Annotated, Literal, TypedDict
 
-from vggtjax.errors import InputError
+from msgspec import Meta
+
+from vggtjax.storage.json_values import check_fields
 
 Resolution = Literal["model", "original"]
 Format = Literal["vggtjax", "vggt4d"]  # of a folder of files
@@ -15,7 +17,7 @@ Format = Literal["vggtjax", "vggt4d"]  # of a folder of files
 class Saving:
     """How a result is written. Raises InputError for a percentile outside [0, 100) or an unknown name."""
 
-    confidence_percentile: float = 20.0
+    confidence_percentile: Annotated[float, Meta(ge=0, lt=100)] = 20.0
     """percent of the pixels, the least confident, to leave out of the point clouds"""
     resolution: Resolution = "model"
     """size of the written files: the model's, or the source's own, with crop, scale and padding undone"""
@@ -23,16 +25,7 @@ class Saving:
     """"vggt4d" writes, beside the files of vggtjax, the folder vggt4d/ as VGGT4D does"""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.confidence_percentile < 100:
-            raise InputError(
-                f"confidence_percentile is {self.confidence_percentile}; expected at least 0 and below 100"
-            )
-        for name, value, allowed in (
-            ("resolution", self.resolution, get_args(Resolution)),
-            ("format", self.format, get_args(Format)),
-        ):
-            if value not in allowed:
-                raise InputError(f"{name} is {value!r}; expected one of {allowed}")
+        check_fields(self)
 
     def changed(self, *, layout: Format | None = None, **changes: object) -> Saving:
         """Return a copy with other values; `layout` is the old name of `format`."""

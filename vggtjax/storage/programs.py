@@ -84,10 +84,8 @@ class Program:
     ) -> Callable[..., Any]:
         """Return the program of a file, or trace the function and write the file; on failure, the jitted function."""
         name = f"{self._function.__module__}.{self._function.__qualname__}"
-        text = "\n".join(
-            (source_digest(), name, *map(str, key), str(jax.config.values["jax_default_matmul_precision"]))
-        )
-        path = lowered_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.bin"
+        precision = jax.config.values["jax_default_matmul_precision"]
+        path = _kept_path("\n".join((source_digest(), name, *map(str, key), str(precision))), "bin")
         if (content := _read_kept(path)) is not None:
             return jax.jit(export.deserialize(bytearray(content)).call)
         shapes, named = jax.tree.map(
@@ -116,7 +114,7 @@ def kept_text(name: str, make: Callable[[], str]) -> str:
     """Return text that depends on `name` and the sources of this package alone, made once where programs are kept."""
     if not _keeping():
         return make()
-    path = lowered_folder() / f"{hashlib.sha256(f'{source_digest()} {name}'.encode()).hexdigest()[:32]}.txt"
+    path = _kept_path(f"{source_digest()} {name}", "txt")
     if (content := _read_kept(path)) is not None:
         return content.decode()
     text = make()
@@ -125,15 +123,17 @@ def kept_text(name: str, make: Callable[[], str]) -> str:
     return text
 
 
+def _kept_path(text: str, suffix: str) -> Path:
+    return lowered_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.{suffix}"
+
+
 def _read_kept(path: Path) -> bytes | None:
     """Return the content that `_keep` wrote; None for a missing file, and for a damaged file, which is removed."""
-    try:
+    with suppress(OSError):
         content = path.read_bytes()
         if content[:_DIGEST] == hashlib.sha256(content[_DIGEST:]).digest():
             return content[_DIGEST:]
         path.unlink()
-    except OSError:
-        pass
     return None
 
 
@@ -158,9 +158,8 @@ def source_digest() -> str:
 
 
 def _prune(folder: Path) -> None:
-    files = sorted(folder.glob("*.bin"), key=lambda path: path.stat().st_mtime, reverse=True)
     total = 0
-    for path in files:
+    for path in sorted(folder.glob("*.bin"), key=lambda path: path.stat().st_mtime, reverse=True):
         total += path.stat().st_size
         if total > KEPT_BYTES:
             path.unlink(missing_ok=True)
