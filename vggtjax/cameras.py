@@ -76,16 +76,10 @@ def unproject(
 
 
 def clamp_field_of_view(fov: Float[np.ndarray, "S 2"]) -> tuple[Float[np.ndarray, "S 2"], tuple[int, ...]]:
-    """Clamp fields of view to FIELD_OF_VIEW_RANGE, as untrained weights give 0 or more than pi.
+    """Clamp fields of view, two radians a frame, to FIELD_OF_VIEW_RANGE: untrained weights give 0 or more than pi.
 
-    Args:
-        fov: two angles a frame in radians; the order does not matter.
-
-    Returns:
-        The clamped angles (values inside the range are untouched), and the frames where something was clamped.
-
-    Raises:
-        ResultError: an angle is not a number.
+    Returns the angles (those inside the range are unchanged) and the frames with a clamped angle. Raises ResultError
+    for an angle that is not a number.
     """
     lowest, highest = FIELD_OF_VIEW_RANGE
     undefined = np.flatnonzero(np.isnan(fov).any(axis=-1))

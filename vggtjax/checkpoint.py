@@ -8,7 +8,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple
@@ -105,10 +105,7 @@ class Model:
             "heads": [f"{head} (untrained)" if head in self.untrained_heads else head for head in self.heads],
             **{f"sha256 of {file}": digest for file, digest in self.origin.items()},
             "pairs": self.config.depth,
-            "embed_dim": self.config.embed_dim,
-            "num_heads": self.config.num_heads,
-            "image_size": self.config.image_size,
-            "patch_size": self.config.patch_size,
+            **{size: getattr(self.config, size) for size in ("embed_dim", "num_heads", "image_size", "patch_size")},
         }
 
 
@@ -125,14 +122,13 @@ def read_model(path: str | Path, *, dtype: DType | None = None, **fields: Any) -
         dtype: of the parameters; None for the types in the file.
         fields: fields of `Model` that the file does not know: name, note, untrained_heads.
 
-    Raises:
-        CheckpointError: the file is not a whole checkpoint of this library, or does not fit its own configuration; the
-            message lists all problems.
+    Raises CheckpointError, which lists all problems, unless the file is a whole checkpoint of this library that fits
+    its own configuration.
     """
     path = Path(path)
     facts = _file_facts(path)
     tensors, metadata = read_tensors(path)
-    config = _config(path, metadata)
+    config, stored_fields = _read_metadata(path, metadata)
     _check(f"{path} does not fit its own configuration", tensors, config)
     content = np.asarray(np.memmap(path, np.uint8, mode="r"))
     flat = {}
@@ -141,27 +137,17 @@ def read_model(path: str | Path, *, dtype: DType | None = None, **fields: Any) -
         if dtype is not None:
             tensor = tensor.astype(numpy_dtype(dtype), copy=False)
         flat[key] = jax.device_put(tensor).block_until_ready()  # on a CPU, a view of the file if aligned
-    stored_name = metadata.get("name", "")
-    is_valid = stored_name.isprintable() and 0 < len(stored_name) <= _MOST_NAME_LETTERS
-    fields = {"name": stored_name if is_valid else path.stem, "origin": _origin(path, metadata)} | fields
-    model = Model(config, unflatten_dict(flat, sep="."), path=path, **fields)
+    model = Model(config, unflatten_dict(flat, sep="."), path=path, **(stored_fields | fields))
     if all(flat[key].dtype == stored.dtype for key, stored in tensors.items()):
         object.__setattr__(model, "_file", facts)
     return model
 
 
 def save_model(path: str | Path, params: Params, config: VGGTConfig, *, name: str | None = None) -> Path:
-    """Write parameters, with their types, as a checkpoint of this library; return its path.
+    """Write parameters, nested dicts of float32 or bfloat16 arrays, as a checkpoint of this library; return its path.
 
-    Args:
-        path: the file; an existing file is replaced.
-        params: nested dicts of float32 or bfloat16 arrays.
-        config: the model's configuration.
-        name: the model's name; None for the file's stem.
-
-    Raises:
-        CheckpointError: the parameters do not fit the configuration; the message lists all problems.
-        OutputError: the file cannot be written.
+    An existing file is replaced; without `name` the model is named after the file. Raises CheckpointError, which lists
+    all problems, if the parameters do not fit the configuration, and OutputError if the file cannot be written.
     """
     flat: dict[str, Any] = flatten_dict(params, sep=".")
     _check("the parameters do not fit the configuration", flat, config)
@@ -223,17 +209,22 @@ def _check(subject: str, tensors: Mapping[str, Any], config: VGGTConfig) -> None
         raise CheckpointError(problems_sentence(subject, problems))
 
 
-def _config(path: Path, metadata: Mapping[str, str]) -> VGGTConfig:
+def _read_metadata(path: Path, metadata: Mapping[str, str]) -> tuple[VGGTConfig, dict[str, Any]]:
+    """Return the configuration, and the fields of the model: its name, or the file's stem if invalid, and origin."""
     if metadata.get("format") != FORMAT:
         raise CheckpointError(f"{path} is not a checkpoint of this library; load_model converts PyTorch weights")
     if metadata.get("version") != VERSION:
         raise CheckpointError(
             f"{path} has version {metadata.get('version', '')[:20]!r} of the format; this vggtjax reads {VERSION!r}"
         )
-    subject = f"the configuration of {path}"
-    return parse_json(
-        metadata.get("config", ""), VGGTConfig, subject, most_bytes=_MOST_METADATA_LETTERS, error=CheckpointError
-    )
+    parse = partial(parse_json, most_bytes=_MOST_METADATA_LETTERS, error=CheckpointError)
+    config = parse(metadata.get("config", ""), VGGTConfig, f"the configuration of {path}")
+    origin = parse(metadata.get("origin", "{}"), dict[str, Sha256], f"the origin of {path}")
+    if not all(name.isprintable() for name in origin):
+        raise CheckpointError(f"the origin of {path} names files with unprintable letters; expected names and sha256")
+    name = metadata.get("name", "")
+    is_valid = name.isprintable() and 0 < len(name) <= _MOST_NAME_LETTERS
+    return config, {"name": name if is_valid else path.stem, "origin": origin}
 
 
 class _FileFacts(NamedTuple):
@@ -272,11 +263,3 @@ def _params_digest(model: Model) -> str:
         digest.update(f"{name} {values.dtype} {values.shape}".encode())
         digest.update(values.reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
-
-
-def _origin(path: Path, metadata: Mapping[str, str]) -> dict[str, str]:
-    text, subject = metadata.get("origin", "{}"), f"the origin of {path}"
-    origin = parse_json(text, dict[str, Sha256], subject, most_bytes=_MOST_METADATA_LETTERS, error=CheckpointError)
-    if not all(name.isprintable() for name in origin):
-        raise CheckpointError(f"{subject} names files with unprintable letters; expected names and sha256")
-    return origin

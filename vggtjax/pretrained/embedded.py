@@ -23,8 +23,7 @@ _STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
 def demo_model(dtype: DType = "float32") -> Model:
     """Return the embedded model, trained on generated static scenes; docs/model.md has its training and accuracy.
 
-    Raises:
-        CheckpointError: the file is missing.
+    Raises CheckpointError if the file is missing.
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
@@ -34,8 +33,7 @@ def demo_model(dtype: DType = "float32") -> Model:
 def demo_clip() -> Truth:
     """Return the embedded clip with its truth: a generated dynamic scene, not used in training.
 
-    Raises:
-        ClipError: the file is missing.
+    Raises ClipError if the file is missing.
     """
     if not CLIP.is_file():
         raise ClipError(f"the embedded clip {CLIP} is missing; install vggtjax again")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 import re
+from contextlib import suppress
 from pathlib import Path
 
 from converters.files import weight_files
@@ -74,9 +75,8 @@ def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress
     try:
         stats = [(file.resolve(), file.stat()) for file in weight_files(path)]
     except OSError as error:
-        raise CheckpointError(
-            f"cannot read {error.filename}: {error.strerror}; copy or download {path} again"
-        ) from error
+        reason = f"{error.filename}: {error.strerror}; copy or download {path} again"
+        raise CheckpointError(f"cannot read {reason}") from error
     facts = [VERSION, dtype, config.to_json(), *(f"{file} {stat.st_size} {stat.st_mtime_ns}" for file, stat in stats)]
     key = hashlib.sha256("\n".join(facts).encode("utf-8", "surrogateescape")).hexdigest()[:16]
     destination = cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', name)[:80]}-{key}.safetensors"
@@ -88,7 +88,6 @@ def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress
 
 
 def _is_whole(path: Path) -> bool:
-    try:
+    with suppress(CheckpointError):
         return is_checkpoint(path)
-    except CheckpointError:
-        return False
+    return False
