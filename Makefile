@@ -1,4 +1,5 @@
 # Everything in two commands on a machine with Python and git: `make demo` and `make test`.
+# While you work: `make check`, which is lint, types and the tests that run no network, in a few minutes.
 
 PYTHON ?= python3
 VENV := .venv
@@ -6,7 +7,10 @@ BIN := $(VENV)/bin
 WORKERS ?= 2
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-.PHONY: demo test lint format clean
+# Tests that compile networks take nearly all of the time.
+SLOW = parity network method pipeline training calibration learning commands benchmarks pretrained
+
+.PHONY: demo test check lint format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
@@ -14,6 +18,9 @@ demo: $(VENV)/.runtime
 test: lint
 	$(PYTEST) tests/parity
 	$(PYTEST) tests --ignore tests/parity --hasty
+
+check: lint
+	$(PYTEST) tests --hasty $(SLOW:%=--ignore tests/%)
 
 lint: $(VENV)/.development
 	$(BIN)/ruff check
