@@ -57,6 +57,19 @@ def reading(path: object, error: type[InputError] = InputError) -> Iterator[None
         raise error(f"cannot read {path}: {problem.strerror or problem}") from problem
 
 
+@contextmanager
+def device_memory_errors(advice: str, frames: int, height: int, width: int) -> Iterator[None]:
+    """Raise DeviceMemoryError with one sentence, which ends with `advice`, where the device runs out of memory."""
+    try:
+        yield
+    except RuntimeError as error:  # jax's own error is one; this module does not import jax
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        raise DeviceMemoryError(
+            f"{frames} frames of {width} x {height} pixels do not fit in the memory of the device; take {advice}"
+        ) from error
+
+
 def one_line(text: str, most: int = 300) -> str:
     """Return text for one line of a terminal, a table or a page: printable, at most `most` letters."""
     line = " ".join(text[: 4 * most].split())

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, Int8
 
 from vggtjax.config import Cue, Gram, MotionConfig, VGGTConfig
-from vggtjax.errors import DeviceMemoryError, InputError
+from vggtjax.errors import InputError, device_memory_errors
 from vggtjax.evaluation.metrics.masks import auc
 from vggtjax.method.cues import GramCues, Sums, normalise
 from vggtjax.network.layers import Params
@@ -143,16 +143,8 @@ def sweep(
         shapes.append(tuple(images.shape))
         _check_clip(shapes, tuple(mask.shape))
         truths.append(token_truth(np.asarray(mask), config.patch_size))
-        try:
+        with device_memory_errors("fewer frames or a smaller size", *mask.shape):
             clip_maps, saliency = jax.device_get(_measure(params, jnp.asarray(images)[None], config, cues))
-        except jax.errors.JaxRuntimeError as error:
-            if "RESOURCE_EXHAUSTED" not in str(error):
-                raise
-            S, H, W, _ = shapes[0]
-            raise DeviceMemoryError(
-                f"{S} frames of {W} x {H} pixels do not fit in the memory of the device; take fewer frames or a "
-                "smaller size"
-            ) from error
         if not np.isfinite(clip_maps).all():
             raise InputError("the model's motion maps are not finite; its weights cannot be calibrated")
         maps.append(clip_maps[..., 0, :, :])

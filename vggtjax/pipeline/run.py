@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
@@ -20,7 +19,7 @@ from vggtjax.clips.masks import masks_at_clip_pixels
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.sources import ClipSource
 from vggtjax.config import MotionConfig, VGGTConfig
-from vggtjax.errors import DeviceMemoryError, InputError
+from vggtjax.errors import InputError, device_memory_errors
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.method.passes import Assembly, Passes, assemble, run_passes
@@ -32,6 +31,8 @@ from vggtjax.options import OptionChanges, Options
 from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress
 from vggtjax.results.reconstruction import Reconstruction
+
+_LESS_MEMORY = "fewer frames (max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
 
 
 def infer(
@@ -128,7 +129,7 @@ def reconstruct(
         query_points={} if tracks is None else _points_by_frame(tracks),
     )
     run = partial(run_stages, params=model.params, inputs=inputs, fusion=fusion, all_outputs=keep_passes)
-    with _memory_errors(*clip.images.shape[:3]):
+    with device_memory_errors(_LESS_MEMORY, *clip.images.shape[:3]):
         with on_stage("compile"):
             run(dataclasses.replace(stages, run=Compile()))
         passes, assembly, by_frame = run(dataclasses.replace(stages, run=Execute(on_stage)))
@@ -187,7 +188,7 @@ def compile_ahead(
     )
     compiler = Compile()
     stages = dataclasses.replace(_stages(model, options, (frames, height, width)), run=compiler)
-    with _memory_errors(frames, height, width):
+    with device_memory_errors(_LESS_MEMORY, frames, height, width):
         run_stages(stages, model.params, inputs, all_outputs=keep_passes)
     return compiler.memory
 
@@ -285,17 +286,3 @@ def _track_fields(queries: Queries, by_frame: dict[int, Tracks], frames: int) ->
         for values, of_frame in zip(fields.values(), tracks, strict=True):
             values[:, queries.frames == frame] = of_frame[0]
     return fields | {"track_frames": queries.frames}
-
-
-@contextmanager
-def _memory_errors(frames: int, height: int, width: int) -> Iterator[None]:
-    """Turn the device's running out of memory into one sentence."""
-    try:
-        yield
-    except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        raise DeviceMemoryError(
-            f"{frames} frames of {width} x {height} pixels do not fit in the memory of the device; take fewer frames "
-            "(max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
-        ) from error
