@@ -17,6 +17,7 @@ INDEX = ".safetensors.index.json"
 SUFFIXES = (".safetensors", INDEX, ".pt", ".pth")
 
 Tensor = np.ndarray | StoredTensor
+_CHOICES = (r"model\.safetensors", ".*" + re.escape(INDEX), r".*\.safetensors", r".*\.pth?")  # first choice first
 _FILE_NAME = re.compile(r"(?!\.)[^/\\:\x00-\x1f]{1,255}")
 _OTHERS = {rb"\Z": "empty", rb"version https://git-lfs": "a Git LFS pointer", rb"\s*<": "a web page"}  # by start
 
@@ -35,13 +36,8 @@ def choose_file(names: Sequence[str], place: str) -> str:
     CheckpointError if the first kind that exists has several files, or if no kind exists.
     """
     names = sorted(name for name in names if not name.startswith(".") and "/" not in name)
-    groups = [
-        [name for name in names if name == "model.safetensors"],
-        [name for name in names if name.endswith(INDEX)],
-        [name for name in names if name.endswith(".safetensors")],
-        [name for name in names if name.endswith((".pt", ".pth"))],
-    ]
-    candidates = next((group for group in groups if group), [])
+    groups = ([name for name in names if re.fullmatch(kind, name, re.DOTALL)] for kind in _CHOICES)
+    candidates = next(filter(None, groups), [])
     if len(candidates) != 1:
         held = f"{len(candidates)} files of weights ({', '.join(candidates[:5])})" if candidates else "no weights"
         raise CheckpointError(f"{place} holds {held}; expected one of {', '.join('*' + s for s in SUFFIXES)}")

@@ -65,15 +65,19 @@ def _norm(name: str, path: str) -> list[Entry]:
     return [(f"{name}.weight", f"{path}.scale", SAME), (f"{name}.bias", f"{path}.bias", SAME)]
 
 
-_DINO_BLOCK = [
+_BLOCK = [  # of every transformer
     *_norm("norm1", "norm1"),
     *_norm("norm2", "norm2"),
+    *_affine("mlp.fc1", "mlp.fc1"),
+    *_affine("mlp.fc2", "mlp.fc2"),
+]
+
+_DINO_BLOCK = [
+    *_BLOCK,
     *_affine("attn.qkv", "attention.qkv"),
     *_affine("attn.proj", "attention.projection"),
     ("ls1.gamma", "scale1", SAME),
     ("ls2.gamma", "scale2", SAME),
-    *_affine("mlp.fc1", "mlp.fc1"),
-    *_affine("mlp.fc2", "mlp.fc2"),
 ]
 
 _ALTERNATING_BLOCK = [
@@ -85,13 +89,10 @@ _ALTERNATING_BLOCK = [
 
 def _update_block(attention: str) -> list[Entry]:
     return [
-        *_norm("norm1", "norm1"),
-        *_norm("norm2", "norm2"),
+        *_BLOCK,
         (f"{attention}.in_proj_weight", "attention.qkv.kernel", DENSE),
         (f"{attention}.in_proj_bias", "attention.qkv.bias", SAME),
         *_affine(f"{attention}.out_proj", "attention.projection"),
-        *_affine("mlp.fc1", "mlp.fc1"),
-        *_affine("mlp.fc2", "mlp.fc2"),
     ]
 
 

@@ -59,8 +59,11 @@ def _load(path: Path) -> Any:
     if not mapped:
         logger.warning("%s has the format of torch before 1.6: the whole file is read into memory", path)
     try:
-        if mapped:
-            _check_archive(path)
+        if mapped:  # a memory map of compressed entries would show compressed bytes, and the contents can be huge
+            with zipfile.ZipFile(path) as archive:
+                compressed = any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist())
+            if compressed:
+                raise CheckpointError(f"{path} is a compressed archive; expected a torch file as torch.save writes it")
         with warnings.catch_warnings():  # about pickles of other programs, which are refused below
             warnings.simplefilter("ignore")
             return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
@@ -74,13 +77,6 @@ def _load(path: Path) -> Any:
     except Exception as error:  # the unpickler raises any exception for a damaged stream
         reason = one_line(str(error).strip().split("\n")[0]) or type(error).__name__
         raise CheckpointError(f"{path} is not a whole torch file ({reason}); copy or download it again") from error
-
-
-def _check_archive(path: Path) -> None:
-    """Refuse compressed entries: a memory map would show compressed bytes, and the contents can be huge."""
-    with zipfile.ZipFile(path) as archive:
-        if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
-            raise CheckpointError(f"{path} is a compressed archive; expected a torch file as torch.save writes it")
 
 
 def _array(value: Any) -> np.ndarray | None:

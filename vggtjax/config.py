@@ -139,10 +139,7 @@ class VGGTConfig:
 
     @classmethod
     def from_json(cls, text: str) -> VGGTConfig:
-        """Read a configuration from JSON text, such as a checkpoint's metadata.
-
-        Raises InputError unless the text is a JSON object of known fields with valid values.
-        """
+        """Read a configuration from JSON text; raises InputError for unknown fields and invalid values."""
         return parse_json(text, cls, "configuration")
 
 

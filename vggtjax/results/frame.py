@@ -71,10 +71,8 @@ def frame_of(
         raise InputError(f"frame is {frame}; expected 0 to {len(result.depth) - 1}")
     if resolution not in ("model", "original"):
         raise InputError(f"resolution is {resolution!r}; expected 'model' or 'original'")
-    return _model_frame(result, frame) if resolution == "model" else _source_frame(result, frame, picture)
-
-
-def _model_frame(result: Result, frame: int) -> Frame:
+    if resolution == "original":
+        return _source_frame(result, frame, picture)
     return Frame(
         image=result.images[frame],
         depth=result.depth[frame],

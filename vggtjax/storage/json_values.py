@@ -59,18 +59,11 @@ def read_json(
 def parse_json(
     text: str | bytes, kind: type[T], what: str, *, most_bytes: int = MOST_BYTES, error: type[InputError] = InputError
 ) -> T:
-    """Return JSON text as `kind`: a dataclass, a builtin, or a collection of them.
+    """Return JSON text (bytes are UTF-8) as `kind`: a dataclass, a builtin, or a collection of them.
 
-    Args:
-        text: JSON; bytes are UTF-8.
-        kind: its annotations give types and ranges; lists become tuples if annotated as tuples.
-        what: subject of an error, such as "recipe runs/a.json".
-        most_bytes: of the text.
-        error: class of the exception.
-
-    Raises:
-        error: the text is too long or not JSON, has more than MOST_LEVELS levels, unknown or missing keys, infinite
-            numbers or numbers of more than 64 bits, wrong types, or values out of range.
+    The annotations of `kind` give types and ranges. Raises `error`, whose subject is `what` (such as "recipe a.json"),
+    for text that is too long or not JSON, more than MOST_LEVELS levels, unknown or missing keys, infinite numbers or
+    numbers of more than 64 bits, wrong types, and values out of range.
     """
     if len(text) > most_bytes:
         raise error(f"{what} has more than {most_bytes} bytes")

@@ -18,26 +18,14 @@ from vggtjax.storage.writing import writing
 ALIGNMENT = 64  # bytes; XLA uses aligned tensors of a memory map without a copy
 MAX_HEADER_BYTES = 2**24  # VGGT-1B needs 2**18
 
+_PLAIN = ("float64", "float32", "float16", "int64", "int32", "int16", "int8", "uint64", "uint32", "uint16", "uint8")
 _DTYPES: dict[str, np.dtype] = {
-    code: np.dtype(kind)
-    for code, kind in {
-        "F64": np.float64,
-        "F32": np.float32,
-        "F16": np.float16,
-        "BF16": ml_dtypes.bfloat16,
-        "F8_E4M3": ml_dtypes.float8_e4m3fn,
-        "F8_E5M2": ml_dtypes.float8_e5m2,
-        "C64": np.complex64,
-        "I64": np.int64,
-        "I32": np.int32,
-        "I16": np.int16,
-        "I8": np.int8,
-        "U64": np.uint64,
-        "U32": np.uint32,
-        "U16": np.uint16,
-        "U8": np.uint8,
-        "BOOL": np.bool_,
-    }.items()
+    **{f"{np.dtype(name).kind.upper()}{8 * np.dtype(name).itemsize}": np.dtype(name) for name in _PLAIN},  # F64 to U8
+    "BF16": np.dtype(ml_dtypes.bfloat16),
+    "F8_E4M3": np.dtype(ml_dtypes.float8_e4m3fn),
+    "F8_E5M2": np.dtype(ml_dtypes.float8_e5m2),
+    "C64": np.dtype(np.complex64),
+    "BOOL": np.dtype(np.bool_),
 }
 _CODES = {dtype: code for code, dtype in _DTYPES.items()}
 

@@ -50,14 +50,10 @@ def read_trajectory(
 ) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, "S 4 4"]]:
     """Read a trajectory: timestamps, and world-from-camera poses.
 
-    Args:
-        path: of a text file with eight numbers per line; text after # is a comment.
-        quaternion: order of the last four: "xyzw" is TUM's, "wxyz" that of MonST3R, CUT3R, Easi3R and VGGT4D.
-
-    Raises:
-        InputError: an unknown order.
-        ResultError: an unreadable file, a first line that names the other order, lines without eight finite numbers,
-            or quaternions not of length 1.
+    Each line has eight numbers; text after # is a comment. `quaternion` is the order of the last four: "xyzw" is TUM's,
+    "wxyz" that of MonST3R, CUT3R, Easi3R and VGGT4D. Raises InputError for an unknown order, and ResultError for an
+    unreadable file, a first line that names the other order, lines without eight finite numbers, or quaternions not of
+    length 1.
     """
     if quaternion not in ("xyzw", "wxyz"):
         raise InputError(f"quaternion is {quaternion!r}; expected 'xyzw' or 'wxyz'")
