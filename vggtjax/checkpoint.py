@@ -129,7 +129,7 @@ def read_model(path: str | Path, *, dtype: DType | None = None, **fields: Any) -
     facts = _file_facts(path)
     tensors, metadata = read_tensors(path)
     config, stored_fields = _read_metadata(path, metadata)
-    _check(f"{path} does not fit its own configuration", tensors, config)
+    check_parameters(f"{path} does not fit its own configuration", tensors, config)
     content = np.asarray(np.memmap(path, np.uint8, mode="r"))
     flat = {}
     for key, stored in tensors.items():
@@ -150,7 +150,7 @@ def save_model(path: str | Path, params: Params, config: VGGTConfig, *, name: st
     all problems, if the parameters do not fit the configuration, and OutputError if the file cannot be written.
     """
     flat: dict[str, Any] = flatten_dict(params, sep=".")
-    _check("the parameters do not fit the configuration", flat, config)
+    check_parameters("the parameters do not fit the configuration", flat, config)
     specs = {key: Spec(leaf.shape, leaf.dtype) for key, leaf in flat.items()}
     return write_checkpoint(path, specs, lambda key: [np.asarray(flat[key])], config, name=name)
 
@@ -195,7 +195,8 @@ def numpy_dtype(dtype: DType) -> np.dtype:
     return _DTYPES[dtype]
 
 
-def _check(subject: str, tensors: Mapping[str, Any], config: VGGTConfig) -> None:
+def check_parameters(subject: str, tensors: Mapping[str, Any], config: VGGTConfig) -> None:
+    """Raise CheckpointError with all problems of flat parameters (names, shapes, types) for a configuration."""
     shapes = flat_shapes(config)
     problems = [f"missing parameter {name}" for name in shapes if name not in tensors]
     for name, tensor in tensors.items():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from functools import reduce
+from itertools import product
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -86,11 +88,11 @@ def choose(
     while len(steps) < max_terms and refused is None:
         chosen = [step.cue for step in steps]
         best_cue, best = None, steps[-1].rating.calibration if steps else -1.0
-        product = _product(calibration, gram, chosen)
+        saliency = _product(calibration, gram, chosen)
         for tried, cue in enumerate(pool, 1):
             for inverted in (False, True):
                 candidate = dataclasses.replace(cue, inverted=inverted)
-                value = _product_auc(product * _term(calibration, gram, candidate), calibration.truth)
+                value = _product_auc(saliency * _term(calibration, gram, candidate), calibration.truth)
                 if value > best and cue.name not in [other.name for other in chosen]:
                     best_cue, best = candidate, value
             if progress is not None:
@@ -124,18 +126,15 @@ def halves(sweep: Sweep) -> tuple[Sweep, Sweep]:
 
 def candidates(depth: int) -> tuple[Cue, ...]:
     """Return the candidates, not inverted: every map of one pair, then means over neighbouring pairs."""
-
-    def cues() -> Iterator[Cue]:
-        for count in range(1, _MOST_NEIGHBOURS + 1):
-            for kind in KINDS:
-                if count > 1 and kind.statistic == "std":  # of the averaged Gram map, not an average of maps
-                    continue
-                for first in range(depth - count + 1):
-                    layers = tuple(range(first, first + count))
-                    place = f"layer{first}" if count == 1 else f"layers{first}to{layers[-1]}"
-                    yield dataclasses.replace(kind, name=f"{place}_{kind.name}", layers=layers)
-
-    return tuple(cues())
+    cues = []
+    for count, kind in product(range(1, _MOST_NEIGHBOURS + 1), KINDS):
+        if count > 1 and kind.statistic == "std":  # of the averaged Gram map, not an average of maps
+            continue
+        for first in range(depth - count + 1):
+            layers = tuple(range(first, first + count))
+            place = f"layer{first}" if count == 1 else f"layers{first}to{layers[-1]}"
+            cues.append(dataclasses.replace(kind, name=f"{place}_{kind.name}", layers=layers))
+    return tuple(cues)
 
 
 def _check_truth(name: str, half: Sweep) -> None:
@@ -154,10 +153,8 @@ def _term(sweep: Sweep, gram: Gram, cue: Cue) -> Float32[np.ndarray, "N S P"]:
 
 def _product(sweep: Sweep, gram: Gram, cues: Sequence[Cue]) -> Float32[np.ndarray, "N S P"]:
     """Return the product of maps, not normalised."""
-    product = np.ones(sweep.truth.shape, np.float32)
-    for cue in cues:
-        product = product * _term(sweep, gram, cue)
-    return product
+    terms = (_term(sweep, gram, cue) for cue in cues)
+    return reduce(np.multiply, terms, np.ones(sweep.truth.shape, np.float32))
 
 
 def _product_auc(product: Float32[np.ndarray, "N S P"], truth: Int8[np.ndarray, "N S P"]) -> float:

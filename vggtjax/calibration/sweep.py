@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,12 +22,13 @@ from vggtjax.network.model import forward
 from vggtjax.progress import Progress
 
 GRAMS: tuple[Gram, ...] = ("cosine", "dot")
-_GRAM_MAPS: tuple[tuple[Literal["q", "k"], Literal["q", "k"]], ...] = (("q", "q"), ("k", "k"), ("q", "k"))
-_STATISTICS: tuple[Literal["mean", "std"], ...] = ("mean", "std")
-KINDS = tuple(
-    Cue(f"{rows}{columns}_{statistic}", rows, columns, (0,), statistic)
-    for rows, columns in _GRAM_MAPS
-    for statistic in _STATISTICS
+KINDS = (
+    Cue("qq_mean", "q", "q", (0,), "mean"),
+    Cue("qq_std", "q", "q", (0,), "std"),
+    Cue("kk_mean", "k", "k", (0,), "mean"),
+    Cue("kk_std", "k", "k", (0,), "std"),
+    Cue("qk_mean", "q", "k", (0,), "mean"),
+    Cue("qk_std", "q", "k", (0,), "std"),
 )
 STATIC, DYNAMIC, UNCLEAR = 0, 1, -1
 
@@ -63,53 +64,58 @@ class Sweep(NamedTuple):
         return result
 
 
+class SweepSums(NamedTuple):
+    """The maps of every pair, and the sums of a table for each similarity."""
+
+    pairs: Int[Array, ""]  # added so far
+    maps: Float[Array, "G C L B S P"]
+    tables: tuple[Sums, ...]
+
+
 @dataclass(frozen=True)
-class SweepCues(GramCues):
-    """The cues of `KINDS` of every pair, and the cues of a table, for both similarities, in one pass.
+class SweepCues:
+    """An `Accumulator` of the cues `KINDS` of every pair, and of a table's cues, for both similarities in one pass."""
 
-    `measured` reads the sums; `maps`, `saliency` and `gram` do not apply.
-    """
+    table: MotionConfig
+    depth: int
 
-    def zeros(self, B: int, S: int, P: int) -> Sums:
-        """Return empty sums: the number of pairs added, the maps of every pair, the table's sums per similarity."""
-        every = jnp.zeros((len(GRAMS), len(KINDS), self.depth, B, S, P))
-        tables = [total for cues in self._tables() for total in cues.zeros(B, S, P)]
-        return (jnp.zeros((), jnp.int32), every, *tables)
+    def layer_counts(self) -> np.ndarray:
+        """Return int [depth, cues]: how often a cue of the table reads a pair."""
+        return self._tables()[0].layer_counts()
+
+    def zeros(self, B: int, S: int, P: int) -> SweepSums:
+        """Return empty sums."""
+        maps = jnp.zeros((len(GRAMS), len(KINDS), self.depth, B, S, P))
+        return SweepSums(jnp.zeros((), jnp.int32), maps, tuple(cues.zeros(B, S, P) for cues in self._tables()))
 
     def add(
         self,
-        sums: Sums,
+        sums: SweepSums,
         counts: Int[Array, " cues"],
         q: Float[Array, "B S T N D"],
         k: Float[Array, "B S T N D"],
         frame_count: Int[Array, " B"] | None = None,
-    ) -> Sums:
+    ) -> SweepSums:
         """Store the maps of the next pair, and add the pair to the table's sums."""
-        pair, every, *_ = sums
-        single = MotionConfig(KINDS, self.motion.offsets, reference_depth=1)
-        maps = [
-            jnp.stack(cues.add(cues.zeros(*every.shape[3:]), jnp.ones(len(KINDS), int), q, k, frame_count))
-            for cues in (GramCues(single, 1, gram) for gram in GRAMS)
+        pair, maps, tables = sums
+        kinds = MotionConfig(KINDS, self.table.offsets, reference_depth=1)
+        once = jnp.ones(len(KINDS), int)
+        of_pair = [
+            jnp.stack(cues.add(cues.zeros(*maps.shape[3:]), once, q, k, frame_count))
+            for cues in (GramCues(kinds, 1, gram) for gram in GRAMS)
         ]
-        every = every.at[:, :, pair].set(jnp.stack(maps))
-        tables = [
-            total
-            for cues, totals in zip(self._tables(), self._split(sums), strict=True)
-            for total in cues.add(totals, counts, q, k, frame_count)
-        ]
-        return (pair + 1, every, *tables)
+        tables = tuple(
+            cues.add(totals, counts, q, k, frame_count) for cues, totals in zip(self._tables(), tables, strict=True)
+        )
+        return SweepSums(pair + 1, maps.at[:, :, pair].set(jnp.stack(of_pair)), tables)
 
-    def measured(self, sums: Sums) -> tuple[Float[Array, "G C L B S P"], Float[Array, "G B S P"]]:
+    def measured(self, sums: SweepSums) -> tuple[Float[Array, "G C L B S P"], Float[Array, "G B S P"]]:
         """Return the maps of every pair, not normalised, and the table's saliency."""
-        tables = zip(self._tables(), self._split(sums), strict=True)
-        return sums[1], jnp.stack([cues.saliency(totals) for cues, totals in tables])
+        tables = zip(self._tables(), sums.tables, strict=True)
+        return sums.maps, jnp.stack([cues.saliency(totals) for cues, totals in tables])
 
     def _tables(self) -> list[GramCues]:
-        return [GramCues(self.motion, self.depth, gram) for gram in GRAMS]
-
-    def _split(self, sums: Sums) -> list[Sums]:
-        count = len(self.motion.cues)
-        return [sums[2 + g * count :][:count] for g in range(len(GRAMS))]
+        return [GramCues(self.table, self.depth, gram) for gram in GRAMS]
 
 
 def sweep(
@@ -138,10 +144,10 @@ def sweep(
     default = MotionConfig()
     table = dataclasses.replace(config.motion, cues=default.cues, reference_depth=default.reference_depth)
     cues = SweepCues(table, config.depth)
-    maps, saliencies, truths, shapes = [], [], [], []
+    maps, saliencies, truths, first_shape = [], [], [], None
     for done, (images, mask) in enumerate(clips, 1):
-        shapes.append(tuple(images.shape))
-        _check_clip(shapes, tuple(mask.shape))
+        first_shape = first_shape or images.shape
+        _check_clip(images.shape, mask.shape, first_shape)
         truths.append(token_truth(np.asarray(mask), config.patch_size))
         with device_memory_errors("fewer frames or a smaller size", *mask.shape):
             clip_maps, saliency = jax.device_get(_measure(params, jnp.asarray(images)[None], config, cues))
@@ -183,16 +189,14 @@ def token_auc(values: Float[np.ndarray, "N S P"], truth: Int8[np.ndarray, "N S P
 def _measure(
     params: Params, images: Float[Array, "B S H W 3"], config: VGGTConfig, cues: SweepCues
 ) -> tuple[Float[Array, "G C L B S P"], Float[Array, "G B S P"]]:
-    sums = forward(params, images, config, outputs=(), cues=cues).cue_sums
-    return cues.measured(sums or ())
+    return cues.measured(forward(params, images, config, outputs=(), cues=cues).cue_sums)
 
 
-def _check_clip(shapes: list[tuple[int, ...]], mask_shape: tuple[int, ...]) -> None:
-    shape = shapes[-1]
+def _check_clip(shape: tuple[int, ...], mask_shape: tuple[int, ...], first_shape: tuple[int, ...]) -> None:
     if len(shape) != 4 or shape[0] < 2 or mask_shape != shape[:3]:
         raise InputError(
             f"a clip has pictures of shape {shape} and a mask of shape {mask_shape}; expected [S, H, W, 3] and "
             "[S, H, W] with at least two frames"
         )
-    if shape != shapes[0]:
-        raise InputError(f"a clip has shape {shape}, the first one {shapes[0]}; expected clips of one shape")
+    if shape != first_shape:
+        raise InputError(f"a clip has shape {shape}, the first one {first_shape}; expected clips of one shape")

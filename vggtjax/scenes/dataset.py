@@ -4,15 +4,7 @@ In the folder:
 
     index.json              conventions, files, settings, and the complete scenes
     preview.png             an overview of some scenes
-    scene_0000/             a scene, renamed into place when complete; files are named by frame number
-        images/             .png, 8 bits
-        depth/              .npy float32 metres along z, and 16-bit .png in millimetres
-        mask/               .png, 255 on pixels of moving parts, else 0
-        parts/              .png, number of the rigid part, 0 for the room
-        flow/               .npy float32, position of the pixel's point a frame later, minus its position
-        part_poses.npy      float32 [S, K, 3, 4], world from part by number: the motion of every point
-        trajectory.txt      camera poses, TUM format, as in a result; times are frame numbers
-        intrinsics.txt      fx fy cx cy of every frame, in pixels, as in a result
+    scene_0000/             a scene, renamed into place when complete: `_FILES`, named by frame number
 """
 
 from __future__ import annotations
@@ -51,6 +43,26 @@ _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few perce
 _WORKERS = 8
 _INDEX_BYTES = 2**22
 
+_CONVENTIONS = {
+    "units": "metres",
+    "camera": "OpenCV: x right, y down, z forward; intrinsics in pixels, principal point at the image centre",
+    "pixels": "the centre of the first pixel is at (0.5, 0.5); truth is that of the pixel's centre",
+    "world": "axes of the scene, y down; the room is at rest in it",
+    "parts": "0 is the room; every rigid part has a number, and every pixel shows one",
+}
+_FILES = {
+    "images/*.png": "RGB, 8 bits",
+    "depth/*.npy": "float32 [H, W], metres along z",
+    "depth/*.png": "uint16, the same in millimetres",
+    "mask/*.png": "uint8, 255 on parts that move in the clip, else 0; shadows do not count",
+    "parts/*.png": "uint8, number of the part",
+    "flow/*.npy": "float32 [H, W, 3], world axes: where the pixel's point is a frame later, minus where it is",
+    "part_poses.npy": "float32 [S, K, 3, 4], world from part by number: "
+    "a point X of part k at frame s is at P[t, k] inverse(P[s, k]) X at frame t",
+    "trajectory.txt": "frame tx ty tz qx qy qz qw, world from camera (TUM format)",
+    "intrinsics.txt": "fx fy cx cy of every frame",
+}
+
 _draw = jax.jit(generate, static_argnums=2)
 
 
@@ -85,11 +97,11 @@ def write_scenes(
         OutputError: the folder cannot be written, or holds scenes or a preview without an index.
     """
     out = Path(out)
-    _check(config, count, kind, split, seed)
+    _check(config, count, kind, seed)
+    textures = load_textures(split)
     config = dataclasses.replace(config, dynamic=float(kind == "dynamic"))
     index = _describe(config, kind, split, seed)
     _check_folder(out, index)
-    textures = load_textures(split)
     stream = jax.random.fold_in(jax.random.key(seed), _STREAM)
     folders = [out / f"scene_{number:04d}" for number in range(count)]
     _write_index(out, index)  # first, so that no scene is ever without an index
@@ -122,10 +134,9 @@ def read_index(out: str | Path) -> dict[str, Any]:
     return index
 
 
-def _check(config: SceneConfig, count: int, kind: str, split: str, seed: int) -> None:
-    for name, value, names in (("kind", kind, get_args(Kind)), ("split", split, get_args(Split))):
-        if value not in names:
-            raise InputError(f"{name} is {value!r}; expected one of {names}")
+def _check(config: SceneConfig, count: int, kind: str, seed: int) -> None:
+    if kind not in get_args(Kind):
+        raise InputError(f"kind is {kind!r}; expected one of {get_args(Kind)}")
     if type(count) is not int or not 1 <= count <= _MOST_SCENES:
         raise InputError(f"count is {count!r}; expected a whole number from 1 to {_MOST_SCENES}")
     if type(seed) is not int or not 0 <= seed < 2**31:
@@ -153,35 +164,17 @@ def _check_folder(out: Path, index: dict[str, Any]) -> None:
 
 def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str, Any]:
     """Return the index of a set without its scenes."""
-    settings = dataclasses.asdict(config)
     return {
         "format": "vggtjax scenes",
         "version": _FORMAT_VERSION,
         "about": "Generated rooms in which things stand or move, seen by a hand-held camera, with exact truth.",
-        "conventions": {
-            "units": "metres",
-            "camera": "OpenCV: x right, y down, z forward; intrinsics in pixels, principal point at the image centre",
-            "pixels": "the centre of the first pixel is at (0.5, 0.5); truth is that of the pixel's centre",
-            "world": "axes of the scene, y down; the room is at rest in it",
-            "parts": "0 is the room; every rigid part has a number, and every pixel shows one",
-        },
-        "files": {
-            "images/*.png": "RGB, 8 bits",
-            "depth/*.npy": "float32 [H, W], metres along z",
-            "depth/*.png": "uint16, the same in millimetres",
-            "mask/*.png": "uint8, 255 on parts that move in the clip, else 0; shadows do not count",
-            "parts/*.png": "uint8, number of the part",
-            "flow/*.npy": "float32 [H, W, 3], world axes: where the pixel's point is a frame later, minus where it is",
-            "part_poses.npy": "float32 [S, K, 3, 4], world from part by number: "
-            "a point X of part k at frame s is at P[t, k] inverse(P[s, k]) X at frame t",
-            "trajectory.txt": "frame tx ty tz qx qy qz qw, world from camera (TUM format)",
-            "intrinsics.txt": "fx fy cx cy of every frame",
-        },
+        "conventions": _CONVENTIONS,
+        "files": _FILES,
         "kind": kind,
         "split": split,
         "seed": seed,
         "key": f"scene n is generate(fold_in(fold_in(key({seed}), {_STREAM}), n), textures of the split, config)",
-        "config": json.loads(json.dumps(settings)),
+        "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "objects": [0, *(1 + number for number in config.objects)],
         "about_objects": "thing that each part belongs to, by number of the part; 0 is the room, 1 the figure",
     }
@@ -202,21 +195,19 @@ def _write_scene(folder: Path, clip: SyntheticClip) -> None:
     np.save(folder / "part_poses.npy", np.asarray(clip.world_from_part, np.float32), allow_pickle=False)
     for name in ("images", "depth", "mask", "parts", "flow"):
         (folder / name).mkdir()
-    frames = [jax.tree.map(lambda array, frame=frame: np.asarray(array)[frame], clip) for frame in range(S)]
     with ThreadPoolExecutor(min(_WORKERS, os.cpu_count() or 1)) as pool:
-        for _ in pool.map(partial(_write_frame, folder), range(S), frames):
-            pass
+        list(pool.map(partial(_write_frame, folder, clip), range(S)))
 
 
-def _write_frame(folder: Path, number: int, frame: SyntheticClip) -> None:
-    name, depth = f"{number:05d}", np.asarray(frame.depth)
-    _write_png(folder / f"images/{name}.png", np.rint(255 * frame.images).astype(np.uint8))
-    np.save(folder / f"depth/{name}.npy", depth, allow_pickle=False)
-    _write_png(folder / f"depth/{name}.png", encode_depth(depth, depth > 0, _MILLIMETRES))
-    _write_png(folder / f"mask/{name}.png", np.asarray(frame.dynamic_mask, np.uint8) * 255)
-    _write_png(folder / f"parts/{name}.png", np.asarray(frame.part_ids, np.uint8))
-    np.save(folder / f"flow/{name}.npy", np.asarray(frame.scene_flow, np.float32), allow_pickle=False)
-
-
-def _write_png(path: Path, pixels: np.ndarray) -> None:
-    Image.fromarray(pixels).save(path, compress_level=_PNG_LEVEL)
+def _write_frame(folder: Path, clip: SyntheticClip, frame: int) -> None:
+    depth = np.asarray(clip.depth[frame])
+    pictures = {
+        "images": np.rint(255 * clip.images[frame]).astype(np.uint8),
+        "depth": encode_depth(depth, depth > 0, _MILLIMETRES),
+        "mask": np.uint8(255) * clip.dynamic_mask[frame],
+        "parts": np.asarray(clip.part_ids[frame], np.uint8),
+    }
+    for name, pixels in pictures.items():
+        Image.fromarray(pixels).save(folder / name / f"{frame:05d}.png", compress_level=_PNG_LEVEL)
+    for name, values in (("depth", depth), ("flow", clip.scene_flow[frame])):
+        np.save(folder / name / f"{frame:05d}.npy", np.asarray(values, np.float32), allow_pickle=False)

@@ -76,7 +76,8 @@ def cast(
     rays = jnp.stack([(x - config.width / 2) / focal, (y - config.height / 2) / focal, jnp.ones_like(x)])
     direction = rotation @ rays  # [3, P]: z is 1 in the camera, so the distance along the ray is the depth
     poses = part_poses(scene, config, time)
-    enter, _ = _intervals(scene, config, poses, origin[:, None], direction)
+    near, _ = _intervals(scene, config, poses, origin[:, None], direction)
+    enter = jnp.where(near > 0, near, jnp.inf)  # parts around the camera are invisible
     step = jnp.where(jnp.abs(direction) < 1e-9, 1e-9, direction)
     walls = jnp.maximum((scene.room_low - origin)[:, None] / step, (scene.room_high - origin)[:, None] / step)
     depths = jnp.concatenate([walls.min(axis=0, keepdims=True), enter])  # [1 + K, P]
@@ -134,26 +135,22 @@ def _frame(scene: Scene, textures: Textures, config: SceneConfig, time: Array, s
 
 
 def _intervals(scene: Scene, config: SceneConfig, poses, origin, direction):
-    """Return where rays enter and leave every part, [K, P] each; rays never enter absent parts."""
+    """Return where rays enter and leave every part, [K, P] each: at inf and -inf for missed and absent parts."""
     rotation, centre = poses
-    kinds = np.asarray(config.kinds)
-    enter, leave = [], []
-    for kind, (interval, _) in SHAPES.items():
-        rows = np.flatnonzero(kinds == kind)
+    intervals = []
+    for kind, (interval, _) in SHAPES.items():  # in the order of the parts
+        rows = np.flatnonzero(np.asarray(config.kinds) == kind)
         r, c = rotation[rows], centre[rows]
         o = jnp.einsum("kji,jp->kip", r, origin) - jnp.einsum("kji,kj->ki", r, c)[..., None]
         near, far = interval(o, jnp.einsum("kji,jp->kip", r, direction), scene.size[rows])
         hit = (near < far) & scene.present[rows][:, None]
-        enter.append((rows, jnp.where(hit & (near > 0), near, jnp.inf)))
-        leave.append((rows, jnp.where(hit, near, jnp.inf), jnp.where(hit, far, -jnp.inf)))
-    order = np.argsort(np.concatenate([rows for rows, *_ in enter]))
-    first = jnp.concatenate([near for _, near in enter])[order]
-    return first, (jnp.concatenate([n for _, n, _ in leave]), jnp.concatenate([f for *_, f in leave]))
+        intervals.append((jnp.where(hit, near, jnp.inf), jnp.where(hit, far, -jnp.inf)))
+    return tuple(jnp.concatenate(ends) for ends in zip(*intervals, strict=True))
 
 
 def _shaded(scene: Scene, config: SceneConfig, poses, point, light) -> Bool[Array, " P"]:
     """Return whether a part stands between each point and the light."""
-    _, (near, far) = _intervals(scene, config, poses, point, light)
+    near, far = _intervals(scene, config, poses, point, light)
     return ((jnp.maximum(near, 0) + _SELF) < jnp.minimum(far, 1)).any(axis=0)
 
 

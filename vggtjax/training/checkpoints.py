@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import orbax.checkpoint as orbax
 
-from vggtjax.errors import CheckpointError, OutputError, VggtjaxError
+from vggtjax.errors import CheckpointError, OutputError, one_line
 from vggtjax.training.recipe import Recipe
 from vggtjax.training.state import TrainingState
 
@@ -62,21 +62,19 @@ def save(folder: str | Path, state: TrainingState, recipe: Recipe, notes: dict[s
         raise OutputError(f"cannot write the checkpoint {folder / str(step)}: {error.strerror or error}") from error
 
 
-def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe, *, step: int | None = None) -> Restored:
-    """Read a checkpoint onto the default device.
+def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe) -> Restored:
+    """Read the newest checkpoint onto the default device.
 
     Args:
         folder: of a run's checkpoints.
         shapes: the recipe's state as shapes and dtypes (`state_shapes`).
         recipe: of the resumed run. Phases, learning rate and losses may differ from those of the checkpoint.
-        step: of the checkpoint; None for the newest.
 
     Raises:
         CheckpointError: no checkpoint, an unreadable checkpoint, or a state of other parameters.
     """
     folder = Path(folder)
-    step = latest(folder) if step is None else step
-    if step is None:
+    if (step := latest(folder)) is None:
         raise CheckpointError(f"{folder} holds no checkpoint of a training run; name the folder of one")
     place = folder / str(step)
     device = jax.sharding.SingleDeviceSharding(jax.local_devices()[0])
@@ -100,24 +98,20 @@ def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe, *, step: 
     return Restored(items[_STATE], written, dict(run["notes"]))
 
 
-@contextmanager
-def _opened(folder: Path, *, create: bool = False) -> Iterator[orbax.CheckpointManager]:
+def _opened(folder: Path, *, create: bool = False) -> orbax.CheckpointManager:
     options = orbax.CheckpointManagerOptions(max_to_keep=KEPT, create=create, enable_async_checkpointing=False)
     handlers = {_STATE: orbax.StandardCheckpointHandler(), _RUN: orbax.JsonCheckpointHandler()}
-    with orbax.CheckpointManager(folder.resolve(), options=options, item_handlers=handlers) as manager:
-        yield manager
+    return orbax.CheckpointManager(folder.resolve(), options=options, item_handlers=handlers)
 
 
 @contextmanager
 def _explaining(place: Path) -> Iterator[None]:
     try:
         yield
-    except VggtjaxError as error:
-        if isinstance(error, CheckpointError):
-            raise
-        raise CheckpointError(f"{place} cannot be used: {error}") from error
+    except CheckpointError:
+        raise
     except (OSError, ValueError, KeyError, TypeError) as error:
-        text = " ".join(str(error).split())[:300]
+        text = one_line(str(error))
         raise CheckpointError(f"{place} cannot be read as a checkpoint of a training run: {text}") from error
 
 
@@ -125,11 +119,8 @@ def _check_shapes(place: Path, metadata: Any, shapes: TrainingState) -> None:
     """Compare leaf by leaf, by path: a stored state has lost the types of its containers."""
 
     def flat(tree: Any) -> dict[str, tuple[int, ...]]:
-        leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-        return {
-            ".".join(str(getattr(k, "key", getattr(k, "idx", getattr(k, "name", k)))) for k in path): tuple(leaf.shape)
-            for path, leaf in leaves
-        }
+        leaves = jax.tree.leaves_with_path(tree)
+        return {jax.tree_util.keystr(path, simple=True, separator="."): tuple(leaf.shape) for path, leaf in leaves}
 
     stored, wanted = flat(metadata), flat(shapes)
     wrong = sorted(name for name in stored.keys() | wanted.keys() if stored.get(name) != wanted.get(name))

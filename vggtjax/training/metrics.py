@@ -6,8 +6,10 @@ import csv
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from vggtjax.errors import InputError, OutputError
 from vggtjax.storage.writing import writing
@@ -60,28 +62,26 @@ class MetricsFile:
         """Open the file of a run that resumes from `last_step`: later rows are dropped, as the run repeats them."""
         self.path = Path(path)
         self.rows = [row for row in read_metrics(self.path) if row["step"] <= last_step] if self.path.exists() else []
-        self.names = _header(self.rows)
         self._write_all()
 
     def append(self, row: Row) -> None:
         """Add a row: the columns `COLUMNS` and any metrics."""
         self.rows.append(row)
-        names = _header([*self.rows[-1:]], self.names)
-        if names != self.names:
-            self.names = names
+        if not row.keys() <= set(self.names):
             self._write_all()
             return
         try:
             with self.path.open("a", newline="", encoding="utf-8") as file:
-                csv.writer(file).writerow(_cells(row, self.names))
+                csv.DictWriter(file, self.names).writerow(row)
         except OSError as error:
             raise OutputError(f"cannot write {self.path}: {error.strerror or error}") from error
 
     def _write_all(self) -> None:
+        self.names = _header(self.rows)
         with writing(self.path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(self.names)
-            writer.writerows(_cells(row, self.names) for row in self.rows)
+            writer = csv.DictWriter(file, self.names)
+            writer.writeheader()
+            writer.writerows(self.rows)
 
 
 def read_metrics(path: str | Path) -> list[Row]:
@@ -104,8 +104,6 @@ def read_metrics(path: str | Path) -> list[Row]:
     rows: list[Row] = []
     for number, line in enumerate(lines[1:], start=2):
         try:
-            if len(line) != len(lines[0]):
-                raise ValueError
             row = {name: float(cell) for name, cell in zip(lines[0], line, strict=True) if cell}
             row |= {name: int(row[name]) for name in ("step", "stage", "samples")}
         except (ValueError, KeyError, OverflowError):
@@ -125,25 +123,25 @@ def plot(table: str | Path, picture: str | Path) -> None:
     from matplotlib.figure import Figure
 
     rows = read_metrics(table)
+    steps = np.array([row["step"] for row in rows])
     panels = _panels([name for name in _header(rows) if name not in COLUMNS])
     columns = min(3, max(len(panels), 1))
     height = -(-max(len(panels), 1) // columns)
     figure = Figure(figsize=(5 * columns, 3.4 * height), layout="constrained")
     FigureCanvasAgg(figure)
-    for index, (title, names) in enumerate(panels):
+    for index, (title, names) in enumerate(panels.items()):
         axes = figure.add_subplot(height, columns, index + 1)
         for name in names:
-            points = [(row["step"], row[name]) for row in rows if math.isfinite(row.get(name, math.nan))]
-            style = "--" if name in COMPARED.values() else "-"
+            values = np.array([row.get(name, math.nan) for row in rows])
+            known = np.isfinite(values)
             axes.plot(
-                [x for x, _ in points],
-                [y for _, y in points],
-                style,
+                steps[known],
+                values[known],
+                "--" if name in COMPARED.values() else "-",
                 label=_LABELS.get(name, name),
-                marker="." if len(points) < 3 else None,
+                marker="." if known.sum() < 3 else None,
             )
-        values = [row[name] for row in rows for name in names if math.isfinite(row.get(name, math.nan))]
-        if values and min(values) > 0 and any(part in names[0] for part in _LOG):
+        if axes.dataLim.ymin > 0 and any(part in names[0] for part in _LOG):
             axes.set_yscale("log")
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("step")
@@ -154,28 +152,18 @@ def plot(table: str | Path, picture: str | Path) -> None:
         figure.savefig(temporary, format="png", dpi=110)
 
 
-def _panels(names: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Group metrics: losses, probes, each error with its comparison; every other metric is alone."""
-    losses = [name for name in names if "loss" in name]
-    panels = [("losses", losses)] if losses else []
-    for name, reference in COMPARED.items():
-        pair = [member for member in (name, reference) if member in names]
-        if pair:
-            panels.append((f"{_LABELS[name]}, compared with no motion", pair))
-    probes = [name for name in names if name.startswith("probe_")]
-    panels += [("probes", probes)] if probes else []
-    grouped = {name for _, group in panels for name in group} | set(_OPTIMISATION)
-    panels += [(name.replace("_", " "), [name]) for name in names if name not in grouped]
-    return panels + [(name.replace("_", " "), [name]) for name in _OPTIMISATION if name in names]
+def _panels(names: Sequence[str]) -> dict[str, list[str]]:
+    """Group metrics: losses, each error with its comparison, probes; every other metric is alone."""
+    groups = {"losses": [name for name in names if "loss" in name]}
+    for pair in COMPARED.items():
+        groups[f"{_LABELS[pair[0]]}, compared with no motion"] = [name for name in pair if name in names]
+    groups["probes"] = [name for name in names if name.startswith("probe_")]
+    grouped = {name for group in groups.values() for name in group}
+    alone = [name for name in names if name not in grouped | {*_OPTIMISATION}]
+    groups |= {name.replace("_", " "): [name] for name in (*alone, *_OPTIMISATION) if name in names}
+    return {title: group for title, group in groups.items() if group}
 
 
-def _header(rows: Sequence[Row], start: Sequence[str] = COLUMNS) -> list[str]:
-    """Return `start`, then the names of the rows' metrics in order of appearance."""
-    names: dict[str, Any] = dict.fromkeys(start)
-    for row in rows:
-        names |= dict.fromkeys(row)
-    return list(names)
-
-
-def _cells(row: Row, names: Sequence[str]) -> list[str]:
-    return [repr(row[name]) if name in row else "" for name in names]
+def _header(rows: Sequence[Row]) -> list[str]:
+    """Return `COLUMNS`, then the names of the rows' metrics in order of appearance."""
+    return list(dict.fromkeys(chain(COLUMNS, *rows)))

@@ -30,11 +30,9 @@ logger = logging.getLogger(__name__)
 class Run:
     """The state and the counts of a run, and the files in its folder."""
 
-    def __init__(
-        self, recipe: Recipe, out: Path, probes: Params, init: Params | None = None, options: RunOptions | None = None
-    ) -> None:
+    def __init__(self, recipe: Recipe, out: Path, probes: Params, init: Params | None, options: RunOptions) -> None:
         """Resume from the newest checkpoint in `out`, or start with `probes` and `init` (None: random parameters)."""
-        self.recipe, self.out, self.options = recipe, out, options or RunOptions()
+        self.recipe, self.out, self.options = recipe, out, options
         self.checkpoints, self.model_path = out / "checkpoints", out / "model.safetensors"
         self.step, self.phase, self.samples, self.skipped_in_a_row = 0, 0, 0, 0
         self.averages = Averages()

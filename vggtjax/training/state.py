@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -12,9 +13,9 @@ import optax
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float, Int
 
-from vggtjax.checkpoint import Model, flat_shapes
+from vggtjax.checkpoint import Model, check_parameters
 from vggtjax.config import VGGTConfig
-from vggtjax.errors import CheckpointError, problems_sentence
+from vggtjax.errors import CheckpointError
 from vggtjax.network.backbone import patch_positions
 from vggtjax.network.layers import Params
 from vggtjax.network.model import init_params, parameter_shapes
@@ -49,7 +50,8 @@ def initial_state(recipe: Recipe, probes: Params, init: Params | None = None) ->
     if init is None:
         init = start_params(recipe)
     else:
-        _check(init, recipe)
+        subject = "the parameters to start from do not fit the recipe's model"
+        check_parameters(subject, flatten_dict(init, sep="."), recipe.model)
     # Copies: a step consumes its state, and the caller keeps the parameters.
     trained = jax.tree.map(lambda leaf: jnp.array(leaf, jnp.float32), {"model": init, "probes": probes})
     moving, _ = split(trained, recipe)
@@ -59,9 +61,7 @@ def initial_state(recipe: Recipe, probes: Params, init: Params | None = None) ->
 
 def state_shapes(recipe: Recipe, probes: Params) -> TrainingState:
     """Return shapes and dtypes of a recipe's state without its arrays; reads only the shapes of `probes`."""
-    return jax.eval_shape(
-        lambda model, probes: initial_state(recipe, probes, model), parameter_shapes(recipe.model), probes
-    )
+    return jax.eval_shape(partial(initial_state, recipe), probes, parameter_shapes(recipe.model))
 
 
 def loss_and_gradient(trained: Params, batch: Any, recipe: Recipe, objective: Objective) -> tuple[Metrics, Params]:
@@ -76,14 +76,8 @@ def loss_and_gradient(trained: Params, batch: Any, recipe: Recipe, objective: Ob
     moving, frozen = split(trained, recipe)
 
     def loss_of(moving: Params):
-        return objective(
-            join(moving, frozen),
-            batch,
-            recipe.model,
-            recipe.losses,
-            compute_dtype=compute_dtype(recipe),
-            remat=recipe.remat,
-        )
+        compute = {"compute_dtype": compute_dtype(recipe), "remat": recipe.remat}
+        return objective(join(moving, frozen), batch, recipe.model, recipe.losses, **compute)
 
     (loss, metrics), gradient = jax.value_and_grad(loss_of, has_aux=True)(moving)
     return {**metrics, "loss": loss}, gradient
@@ -116,18 +110,12 @@ def apply_gradient(
     done = state.step - state.skipped  # updates before this one
     decay = jnp.minimum(recipe.optimiser.ema_decay, (1 + done) / (10 + done))
     ema = jax.tree.map(lambda average, new: decay * average + (1 - decay) * new, state.ema, moved)
-
-    def chosen(new: Any, old: Any) -> Any:
-        return jax.tree.map(lambda new, old: jnp.where(finite, new, old), new, old)
-
-    skipped = 1 - finite.astype(jnp.int32)
-    next_state = TrainingState(
-        step=state.step + 1,
-        trained=join(chosen(moved, moving), frozen),
-        ema=chosen(ema, state.ema),
-        optimiser=chosen(optimiser_state, state.optimiser),
-        skipped=state.skipped + skipped,
+    moved, ema, optimiser_state = jax.tree.map(
+        partial(jnp.where, finite), (moved, ema, optimiser_state), (moving, state.ema, state.optimiser)
     )
+    skipped = 1 - finite.astype(jnp.int32)
+    trained = join(moved, frozen)
+    next_state = TrainingState(state.step + 1, trained, ema, optimiser_state, state.skipped + skipped)
     rate = make_schedule(recipe.optimiser, recipe.total_steps)(done)
     logged = {**metrics, "grad_norm": norm, "learning_rate": rate, "skipped": skipped}
     return next_state, {name: jnp.asarray(value, jnp.float32) for name, value in logged.items()}
@@ -176,17 +164,3 @@ def adapted(model: Model, config: VGGTConfig) -> Params:
     table = backbone["position_embedding"].astype(jnp.float32)
     patches = patch_positions(table[1:], model.config.grid_size, (side, side))
     return {**model.params, "backbone": {**backbone, "position_embedding": jnp.concatenate([table[:1], patches])}}
-
-
-def _check(params: Mapping[str, Any], recipe: Recipe) -> None:
-    flat: dict[str, Any] = flatten_dict(params, sep=".")
-    shapes = flat_shapes(recipe.model)
-    problems = [f"missing parameter {name}" for name in shapes if name not in flat]
-    problems += [f"unknown parameter {name}" for name in flat if name not in shapes]
-    problems += [
-        f"mis-shaped parameter {name}: {list(flat[name].shape)}, expected {list(shape)}"
-        for name, shape in shapes.items()
-        if name in flat and flat[name].shape != shape
-    ]
-    if problems:
-        raise CheckpointError(problems_sentence("the parameters to start from do not fit the recipe's model", problems))
