@@ -111,11 +111,9 @@ class VGGTConfig:
             ("embed_dim", "dino_num_heads", 1),
             ("tap_dim", "camera_num_heads", 1),
         ):
-            if getattr(self, channels) % (multiple * getattr(self, heads)):
-                raise InputError(
-                    f"{channels} {getattr(self, channels)} is not a multiple of {multiple} x {heads} "
-                    f"{getattr(self, heads)}"
-                )
+            width, count = getattr(self, channels), getattr(self, heads)
+            if width % (multiple * count):
+                raise InputError(f"{channels} {width} is not a multiple of {multiple} x {heads} {count}")
         if self.dpt_features % 8 or any(channels % 4 for channels in self.dpt_channels):  # sin and cos of x and of y
             raise InputError(
                 f"dpt_features {self.dpt_features} is not a multiple of 8, or dpt_channels {self.dpt_channels} of 4"

@@ -54,7 +54,7 @@ def test_a_clip_survives_the_file(tmp_path):
         intrinsics=generator.normal(size=(3, 3, 3)).astype(np.float32),
     )
     demo.write_demo_clip(tmp_path / "clip.npz", truth)
-    again = demo.read_demo_clip(tmp_path / "clip.npz")
+    again = demo.demo_clip(tmp_path / "clip.npz")
     assert np.abs(again.images - truth.images).max() <= 0.5 / 255 + 1e-6
     assert np.abs(again.depth / truth.depth - 1).max() < 4e-4
     for name in ("dynamic_mask", "camera_from_world", "intrinsics"):
@@ -63,8 +63,7 @@ def test_a_clip_survives_the_file(tmp_path):
 
 def test_a_broken_installation_says_so(monkeypatch, tmp_path):
     monkeypatch.setattr(demo, "MODEL", tmp_path / "nothing.safetensors")
-    monkeypatch.setattr(demo, "CLIP", tmp_path / "nothing.npz")
     with pytest.raises(CheckpointError, match=re.escape("is missing; install vggtjax again")):
         demo.demo_model()
     with pytest.raises(ClipError, match=re.escape("is missing; install vggtjax again")):
-        demo.demo_clip()
+        demo.demo_clip(tmp_path / "nothing.npz")

@@ -30,18 +30,13 @@ def demo_model(dtype: DType = "float32") -> Model:
     return read_model(MODEL, dtype=dtype, name="demo", note=NOTE, untrained_heads=("points", "tracks"))
 
 
-def demo_clip() -> Truth:
+def demo_clip(path: Path = CLIP) -> Truth:
     """Return the embedded clip with its truth: a generated dynamic scene, not used in training.
 
     Raises ClipError if the file is missing.
     """
-    if not CLIP.is_file():
-        raise ClipError(f"the embedded clip {CLIP} is missing; install vggtjax again")
-    return read_demo_clip(CLIP)
-
-
-def read_demo_clip(path: Path) -> Truth:
-    """Read a file of `write_demo_clip`."""
+    if not path.is_file():
+        raise ClipError(f"the embedded clip {path} is missing; install vggtjax again")
     with np.load(path, allow_pickle=False) as stored:
         depth = _NEAREST * np.exp(stored["log_depth"].astype(np.float32) * np.float32(_STEP))
         mask = np.unpackbits(stored["dynamic_mask"], count=depth.size).astype(bool).reshape(depth.shape)

@@ -75,7 +75,10 @@ def _drawn(result: Result, frame: int, size: tuple[int, int]) -> Image.Image:
     draw = ImageDraw.Draw(picture)
     places = np.nan_to_num(positions * scale).clip(-1e4, 1e4)
     radius = max(2.0, min(size) / 150)
-    for track, color in enumerate(_colors(result)):
+    x, y = (positions[0] - [W / 2, H / 2]).T  # the direction from the middle of the first frame gives the colour
+    angle = (np.arctan2(y, x) / (2 * np.pi)) % 1
+    colors = _COLORS[np.minimum((angle * 256).astype(int), 255)].tolist()
+    for track, color in enumerate(map(tuple, colors)):
         past = places[max(0, frame - _TAIL) : frame + 1, track]
         if len(past) > 1:
             draw.line([tuple(point) for point in past.tolist()], fill=color, width=max(1, round(radius / 2)))
@@ -83,14 +86,6 @@ def _drawn(result: Result, frame: int, size: tuple[int, int]) -> Image.Image:
         box = (x - radius, y - radius, x + radius, y + radius)
         draw.ellipse(box, fill=color if visibility[frame, track] >= SEEN else None, outline=color)
     return picture
-
-
-def _colors(result: Result) -> list[tuple[int, int, int]]:
-    """Return a colour per track by its direction from the middle of the first frame."""
-    _, H, W = result.depth.shape
-    x, y = (_present(result.track_positions)[0] - [W / 2, H / 2]).T
-    angle = (np.arctan2(y, x) / (2 * np.pi)) % 1
-    return [tuple(_COLORS[i].tolist()) for i in np.minimum((angle * 256).astype(int), 255)]
 
 
 def _present(value: np.ndarray | None) -> np.ndarray:
