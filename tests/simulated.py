@@ -8,9 +8,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtjax.method.fusion_rule import FEATURES, FusionParams, Observations, log_precisions
+from vggtjax.method.fusion_rule import FEATURES, FusionParams, Observations, log_precisions, projected
 
 DEEPEST, NEAREST = 3.0, 1.0
+
+
+def scattered(params: FusionParams, seed: int = 0) -> FusionParams:
+    """Return a tree with normal noise of 0.1 on every leaf, within the ranges."""
+    leaves, structure = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(seed), len(leaves))
+    noisy = [leaf + 0.1 * jax.random.normal(key, leaf.shape) for key, leaf in zip(keys, leaves, strict=True)]
+    return projected(jax.tree.unflatten(structure, noisy))
 
 
 @partial(jax.jit, static_argnames=("shape",))

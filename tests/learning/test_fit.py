@@ -9,12 +9,12 @@ import pytest
 
 from tests.generated import STATIC
 from tests.generated import clips as rendered
+from tests.learning.sandwich import clip_losses, standard_errors
 from tests.simulated import simulate
 from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError
-from vggtjax.learning.fit import FitClips, FitConfig, clip_losses, fit_fusion
+from vggtjax.learning.fit import FitClips, FitConfig, fit_fusion
 from vggtjax.learning.objectives import View, joint_negative_log_likelihood
-from vggtjax.learning.sandwich import standard_errors
 from vggtjax.method.fusion_rule import PRESETS, Observations, fuse, identity, log_precisions, parse_family
 
 TRUE = identity() | {

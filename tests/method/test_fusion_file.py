@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
+from tests.simulated import scattered
 from tests.tiny import tiny_config
 from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
-from vggtjax.method.fusion_file import load_fusion, read_fusion, save_fusion, warn_if_fitted_otherwise
+from vggtjax.method.fusion_file import load_fusion, save_fusion, warn_if_fitted_otherwise
 from vggtjax.method.fusion_rule import parse_family, start
 from vggtjax.storage.tensor_file import read_tensors
 
 
 @pytest.mark.parametrize("family", ["paper", "full", "gate"])
 def test_round_trip(tmp_path, family):
-    params = start(parse_family(family), seed=3, spread=0.1)
+    params = scattered(start(parse_family(family), seed=3))
     save_fusion(tmp_path / "a.safetensors", params, {"family": family})
     back = load_fusion(tmp_path / "a.safetensors")
     assert jax.tree.structure(back) == jax.tree.structure(params)
@@ -71,7 +72,7 @@ def test_a_malformed_origin_is_one_sentence(tmp_path, about, sentence):
     save_fusion(path, start(()))
     save_file(load_file(path), path, read_tensors(path).metadata | {"about": about})
     with pytest.raises(InputError, match=sentence):
-        read_fusion(path, ["4dvggt-d"])
+        warn_if_fitted_otherwise(path, Model(tiny_config(), {}, "mine"))
 
 
 def test_other_models_and_settings_are_warned_of(tmp_path, caplog):

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from tests.simulated import scattered
 from vggtjax import fuse_depth
 from vggtjax.errors import InputError
 from vggtjax.method import fusion_rule as family
@@ -163,7 +164,7 @@ def test_extremes_have_no_nan(name):
     """Confidence 1 and 1e30, depth 0 and 1e6, nothing and everything moving; values and gradients."""
     grid = np.array(np.meshgrid([1, 1e30], [1, 1e30], [0, 1e6], [0, 1e6], [0, 1])).reshape(5, 1, 4, 8)
     maps = seen(grid[2], grid[0], grid[3], grid[1], grid[4], jnp.ones((1, 4, 8, len(FEATURES))))
-    params = start(parse_family(name), spread=0.1)
+    params = scattered(start(parse_family(name)))
     params |= {"inflation": jnp.asarray(2.0), "distrust": jnp.asarray([0.5, 3.0]), "correlation": jnp.asarray(0.99)}
 
     def total(params, maps):

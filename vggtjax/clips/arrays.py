@@ -54,14 +54,10 @@ def frame_name(index: int) -> str:
 
 
 def eight_bit(values: np.ndarray, name: str) -> np.ndarray:
-    """Return `values` as uint8, the largest value of their kind becoming 255, rounded to nearest.
+    """Return uint8, uint16, or floating-point values in [0, 1] as uint8; the largest value of the type becomes 255.
 
-    Args:
-        values: uint8, uint16, or floating point in [0, 1].
-        name: frame, for the error.
-
-    Raises:
-        ClipError: another type, or a floating-point value that is not finite or not in [0, 1].
+    Values are rounded to nearest. Raises ClipError, with the frame's `name`, for another type, or a floating-point
+    value that is not finite or not in [0, 1].
     """
     if values.dtype == np.uint8:
         return values

@@ -69,9 +69,8 @@ class Clip:
     def refit(self, size: int, patch: int, mode: Mode | None = None) -> Clip:
         """Return the same frames, read from the source again, at another size, patch or mode.
 
-        Raises:
-            InputError: a value out of range, as in `load_clip`.
-            ClipError: the source cannot be read any more, or gives other frames than before.
+        Raises InputError for a value out of range, as in `load_clip`, and ClipError where the source cannot be read any
+        more, or gives other frames than before.
         """
         clip = read_clip(self.source, self.sampling, Fitter(mode or self.mode, size, patch))
         if clip.frame_names != self.frame_names or not np.array_equal(clip.source_size, self.source_size):

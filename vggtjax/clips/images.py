@@ -53,8 +53,7 @@ def read_image(path: Path) -> Image.Image:
     The orientation of its EXIF data is applied, transparency is composited over white, 16-bit values are scaled to
     8 bits and floating-point values must lie in [0, 1].
 
-    Raises:
-        ClipError: the file is missing, is not an image, is truncated or corrupt, or exceeds Pillow's limit of pixels.
+    Raises ClipError for a file that is missing, no image, truncated, corrupt, or above Pillow's limit of pixels.
     """
     try:
         with Image.open(path, formats=known_formats()) as image:

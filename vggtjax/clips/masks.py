@@ -31,9 +31,8 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
             frame, there must be as many pictures as frames, in the same order.
         clip: what `load_clip` returned.
 
-    Raises:
-        ClipError: a folder without pictures, pictures that match no frames, or of another shape than the frames, or
-            too dark to be a mask.
+    Raises ClipError for a folder without pictures, or pictures that match no frames, have another shape than the
+    frames, or are too dark to be a mask.
     """
     source = open_source(str(folder))
     if not isinstance(source, ImageFiles):
@@ -59,12 +58,8 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
 def masks_at_clip_pixels(masks: Bool[np.ndarray, "S h w"] | str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
     """Return masks at the pixels of the clip's frames.
 
-    Args:
-        masks: boolean, at the size of the clip's frames or of the source's pictures; or a folder for `load_masks`.
-        clip: what `load_clip` returned.
-
-    Raises:
-        InputError: masks of another type or size, or pictures that `load_masks` refuses.
+    The masks are boolean, of the size of the clip's frames or of the source's pictures, or a folder for `load_masks`.
+    Raises InputError for masks of another type or size, and what `load_masks` raises.
     """
     if isinstance(masks, str | Path):
         return load_masks(masks, clip)

@@ -70,15 +70,12 @@ def check_words(text: str) -> None:
 
 
 def parse_queries(text: str, clip: Clip) -> Queries:
-    """Return the points to track that the words of a command line name.
+    """Return the points to track in a clip that the words of a command line name.
 
-    Args:
-        text: "grid:N" for N x N points spread over the first frame, or a CSV file with columns x, y and, if wanted,
-            frame (counted in frames of the clip, 0 by default), in pixels of the source.
-        clip: where they lie.
+    "grid:N" names N x N points spread over the first frame; other words name a CSV file with columns x, y and,
+    optionally, frame (counted in frames of the clip, 0 by default), in pixels of the source.
 
-    Raises:
-        InputError: neither of these, or points outside the frames.
+    Raises InputError for other words, or points outside the frames.
     """
     return _grid(text, clip) if text.startswith("grid:") else _read(Path(text), clip)
 

@@ -41,11 +41,9 @@ class Sampling:
     """take at most this many frames"""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "start", whole_number("start", self.start, 0))
-        if self.stride is not None:
-            object.__setattr__(self, "stride", whole_number("stride", self.stride, 1))
-        if self.max_frames is not None:
-            object.__setattr__(self, "max_frames", whole_number("max_frames", self.max_frames, 1))
+        for name, lowest in (("start", 0), ("stride", 1), ("max_frames", 1)):
+            if name == "start" or getattr(self, name) is not None:
+                object.__setattr__(self, name, whole_number(name, getattr(self, name), lowest))
         if self.fps is None:
             return
         if isinstance(self.fps, bool) or not isinstance(self.fps, Real) or not 0 < self.fps < math.inf:
@@ -71,13 +69,8 @@ class Sampling:
         """Yield (index, time, item) of the frames taken; frames after the last one are not read.
 
         With `fps`, ticks are 1 / fps apart from the time of frame `start`. Each tick takes the first frame at or after
-        it, and no frame is taken twice.
-
-        Args:
-            frames: (presentation time in seconds, item) of every frame of the source, in order.
-
-        Raises:
-            ClipError: there are no frames, or none from `start` on.
+        it, and no frame is taken twice. `frames` are (presentation time in seconds, item) of every frame of the source,
+        in order. Raises ClipError if there are no frames, or none from `start` on.
         """
         count, taken, tick, begin = 0, 0, 0, 0.0
         for index, (time, item) in enumerate(frames):

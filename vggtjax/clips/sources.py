@@ -6,7 +6,7 @@ import glob
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -63,7 +63,8 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
             whole = not path.is_dir() or any(is_image_name(entry) for entry in entries)
         except OSError as error:
             raise ClipError(f"cannot look for clips in {path}: {error.strerror}; check the path") from error
-        clips = [path] if whole else [entry for entry in entries if _may_be_clip(entry)]
+        visible = [entry for entry in entries if not entry.name.startswith(".")]
+        clips = [path] if whole else [entry for entry in visible if entry.is_dir() or is_video_name(entry)]
         if not clips or not path.exists():
             raise ClipError(f"{path} is not a clip and holds no clips; expected folders of images, or videos")
         for clip in clips:
@@ -74,10 +75,6 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
     if not found:
         raise ClipError("no clips; name folders of images, videos, or a folder of such")
     return found
-
-
-def _may_be_clip(path: Path) -> bool:
-    return not path.name.startswith(".") and (path.is_dir() or is_video_name(path))
 
 
 def natural_key(path: Path) -> list[list[str | int]]:
@@ -94,13 +91,15 @@ def _from_path(name: str) -> Source:
         if not name or "\0" in name:
             raise ClipError(f"{name!r} is not a path; expected a folder, a pattern, or an image or video file")
         if path.is_dir():
-            return _from_folder(path)
+            entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
+            return _images(entries, f"folder {path} holds", "name the folder or file with the frames")
         if path.is_file():
             return _from_file(path)
         if path.exists():
             raise ClipError(f"{path} is neither a file nor a folder; expected images or a video")
         if glob.has_magic(name):
-            return _from_pattern(name)
+            matches = [Path(match) for match in glob.glob(name, recursive=True)]  # noqa: PTH207 - absolute patterns too
+            return _images(matches, f"pattern {name} matches", "expected images")
     except OSError as error:
         raise ClipError(f"cannot look for frames in {name}: {error.strerror}; check the path") from error
     raise ClipError(f"{path} does not exist; expected a folder, a pattern, or an image or video file")
@@ -114,24 +113,6 @@ def _from_file(path: Path) -> Source:
     raise ClipError(f"{path} has the name of neither an image nor a video; expected one such as .png, .jpg or .mp4")
 
 
-def _from_folder(folder: Path) -> Source:
-    entries = [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
-    images = _images(entries)
-    if not images:
-        raise ClipError(
-            f"folder {folder} holds no images but {_inventory(entries)}; name the folder or file with the frames"
-        )
-    return ImageFiles(images)
-
-
-def _from_pattern(pattern: str) -> Source:
-    matches = [Path(match) for match in glob.glob(pattern, recursive=True)]  # noqa: PTH207 - absolute patterns too
-    images = _images(matches)
-    if not images:
-        raise ClipError(f"pattern {pattern} matches no images but {_inventory(matches)}; expected images")
-    return ImageFiles(images)
-
-
 def _from_list(paths: list[Path]) -> Source:
     for path in paths:
         if not os.path.isfile(path):  # noqa: PTH113 - False, not an error, for an over-long or forbidden path
@@ -139,10 +120,12 @@ def _from_list(paths: list[Path]) -> Source:
     return ImageFiles(tuple(path.absolute() for path in paths))
 
 
-def _images(paths: Iterable[Path]) -> tuple[Path, ...]:
+def _images(paths: list[Path], place: str, advice: str) -> Source:
     """Return the image files among `paths` in natural order, absolute; names that tie keep a fixed order."""
     images = [path.absolute() for path in paths if is_image_name(path) and path.is_file()]
-    return tuple(sorted(images, key=lambda path: (natural_key(path), str(path))))
+    if not images:
+        raise ClipError(f"{place} no images but {_inventory(paths)}; {advice}")
+    return ImageFiles(tuple(sorted(images, key=lambda path: (natural_key(path), str(path)))))
 
 
 def _inventory(entries: list[Path]) -> str:

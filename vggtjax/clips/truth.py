@@ -82,8 +82,7 @@ def at_clip_pixels(clip: Placed, maps: Shaped[np.ndarray, "S h w"]) -> Shaped[np
     Each clip pixel takes the value of the source pixel in which its centre lies: depth is never averaged across an
     edge, nor with pixels that were not measured. Padding gets 0 (False).
 
-    Raises:
-        InputError: maps that are not of the source's size, frame by frame.
+    Raises InputError for maps that are not of the source's size, frame by frame.
     """
     maps = np.asarray(maps)
     sizes = {(int(height), int(width)) for height, width in clip.source_size}

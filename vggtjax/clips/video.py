@@ -18,7 +18,7 @@ from vggtjax.errors import ClipError
 if TYPE_CHECKING:
     from types import ModuleType
 
-    from av import Packet, VideoFrame, VideoStream
+    from av import VideoFrame, VideoStream
     from av.container import InputContainer
     from av.stream import Stream
 
@@ -70,14 +70,9 @@ def is_video_name(path: Path) -> bool:
 
 
 def upright(pixels: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Turn and mirror a stored frame the way it is to be shown.
+    """Return a stored frame [H, W, C] turned and mirrored the way it is to be shown, a view [H, W, C] or [W, H, C].
 
-    Args:
-        pixels: [H, W, C] as stored.
-        matrix: [2, 2] with entries of which two are 0; stored (x, y) is shown at (x, y) @ matrix, y pointing down.
-
-    Returns:
-        [H, W, C] or [W, H, C], a view of `pixels`.
+    Two entries of `matrix` [2, 2] are 0; stored (x, y) is shown at (x, y) @ matrix, y pointing down.
     """
     (a, b), (c, d) = matrix
     across, down = a, d  # x' = a x, y' = d y
@@ -147,26 +142,20 @@ def _video_stream(container: InputContainer, path: Path) -> VideoStream:
 def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
     """Yield every frame of the stream; raise EOFError where the file ends before its video does."""
     end = 0.0
-    for packet in container.demux(_timing_streams(container, stream)):
+    # Packets of all streams tell where the file ends if only the length of all together is known, as in Matroska.
+    streams: list[Stream] = [stream] if stream.duration is not None else list(container.streams)
+    for packet in container.demux(streams):
         if packet.is_corrupt:
             yield from stream.decode(None)  # the decoder runs behind the packets
             raise EOFError("the next packet is damaged or incomplete")
-        end = max(end, _packet_end(packet))
+        start = packet.dts if packet.pts is None else packet.pts
+        if start is not None:
+            end = max(end, float((start + (packet.duration or 0)) * packet.time_base))
         if packet.stream is stream:
             yield from stream.decode(packet)
     expected = _expected_end(container, stream)
     if end < expected - _MISSING_END:
         raise EOFError(f"the file ends at {end:.2f} s of {expected:.2f} s")
-
-
-def _timing_streams(container: InputContainer, stream: VideoStream) -> list[Stream]:
-    """Return the streams whose packets tell where the file ends: Matroska knows the length of all together only."""
-    return [stream] if stream.duration is not None else list(container.streams)
-
-
-def _packet_end(packet: Packet) -> float:
-    start = packet.dts if packet.pts is None else packet.pts
-    return 0.0 if start is None else float((start + (packet.duration or 0)) * packet.time_base)
 
 
 def _expected_end(container: InputContainer, stream: VideoStream) -> float:

@@ -10,7 +10,7 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.models import FittedFusion, load
+from vggtjax.commands.models import load_with_fusion
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.options import Options
@@ -53,9 +53,7 @@ def batch(
         from vggtjax.clips.sources import clips_by_name
 
         named = clips_by_name(sources)
-        fitted = FittedFusion(fusion, [options.method])
-        network = load(report, model)
-        fitted.warn(network, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
+        network, fitted = load_with_fusion(report, model, fusion, options, [options.method])
         from vggtjax.pipeline.batch import reconstruct_many
 
         outcomes = []
@@ -69,7 +67,7 @@ def batch(
                 framing=framing,
                 sampling=sampling,
                 saving=saving,
-                fusion=fitted.params,
+                fusion=fitted,
                 pad_frames=pad_frames,
                 progress=clock.progress,
             ):

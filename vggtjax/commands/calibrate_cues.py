@@ -65,10 +65,9 @@ def calibrate_cues(
         with report.stage("choose") as progress:
             choice = choose(swept, gram=gram, max_terms=max_terms, progress=progress)
         source = {"scenes": scenes, "frames": frames, "size": side, "textures": "training"}
+        source |= {"key": f"fold_in(fold_in(key({seed}), {_KEYS}), scene)"}
         with report.stage("write"):
-            path = save_calibration(
-                out, loaded, swept, choice, source=source | {"key": f"fold_in(fold_in(key({seed}), {_KEYS}), scene)"}
-            )
+            path = save_calibration(out, loaded, swept, choice, source=source)
     rows = {
         step.cue.name + (" (1 - m)" if step.cue.inverted else ""): f"{calibration:.3f}   {held_out:.3f}"
         for step in choice.steps

@@ -11,7 +11,7 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.models import FittedFusion, load
+from vggtjax.commands.models import load_with_fusion
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS, MethodName, Options, find_method
@@ -44,12 +44,10 @@ class Candidates:
         names = tuple(METHODS) if self.methods is None else _words(self.methods)
         for name in names:
             find_method(name)
-        fitted = FittedFusion(self.fusion, names)
-        network = load(report, self.model or "demo")
-        fitted.warn(network, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
+        network, fitted = load_with_fusion(report, self.model or "demo", self.fusion, options, names)
         from vggtjax.evaluation.sources import ModelSource
 
-        return ModelSource(network, names, options, framing, fitted.params)
+        return ModelSource(network, names, options, framing, fitted)
 
 
 @dataclass(frozen=True)

@@ -58,19 +58,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     try:
         _parsed(arguments)()
+        return 0
     except VggtjaxError as error:
-        sys.stderr.write(f"vggtjax: {error}\n")
-        return 2
+        message, code = str(error), 2
     except MemoryError:  # of the host
-        sys.stderr.write("vggtjax: out of memory; take fewer frames (--max-frames, --stride) or a smaller --size\n")
-        return 2
+        message, code = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size", 2
     except OSError as error:  # of a file that no other message covers
-        sys.stderr.write(f"vggtjax: {error.filename or 'a file'}: {error.strerror or error}\n")
-        return 2
+        message, code = f"{error.filename or 'a file'}: {error.strerror or error}", 2
     except KeyboardInterrupt:
-        sys.stderr.write("vggtjax: interrupted\n")
-        return 130
-    return 0
+        message, code = "interrupted", 130
+    sys.stderr.write(f"vggtjax: {message}\n")
+    return code
 
 
 def _parsed(arguments: Sequence[str]) -> Callable[[], None]:

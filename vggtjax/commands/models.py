@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
     from vggtjax.commands.report import Report
     from vggtjax.method.fusion_rule import FusionParams
+    from vggtjax.options import Options
 
 _MOST_CONFIG_BYTES = 1 << 20
 
@@ -30,24 +31,28 @@ def load(report: Report, name: str | None, config: Path | None = None) -> Model:
         return load_model(name, config=read_config(config), progress=progress)
 
 
-class FittedFusion:
-    """A fitted rule of fusion from a file; the paper's rule without a file."""
+def load_with_fusion(
+    report: Report,
+    name: str | None,
+    fusion: Path | None,
+    options: Options,
+    methods: Sequence[str],
+    config: Path | None = None,
+) -> tuple[Model, FusionParams | None]:
+    """Load a model, and a fitted rule of fusion from a file (None, the paper's rule, without a file).
 
-    def __init__(self, path: Path | None, methods: Sequence[str]) -> None:
-        """Read the file; InputError where it is invalid or no method fuses."""
-        self._path = path
-        self.params: FusionParams | None = None
-        if path is not None:
-            from vggtjax.method.fusion_file import read_fusion
+    The file is read first: InputError where it is invalid or no method fuses. A warning is logged if the rule was
+    fitted to another model or with other settings.
+    """
+    if fusion is None:
+        return load(report, name, config), None
+    from vggtjax.method.fusion_file import check_fuses, load_fusion, warn_if_fitted_otherwise
 
-            self.params = read_fusion(path, methods)
-
-    def warn(self, model: Model, **settings: Any) -> None:
-        """Log a warning if the rule was fitted to another model or with other settings."""
-        if self._path is not None:
-            from vggtjax.method.fusion_file import warn_if_fitted_otherwise
-
-            warn_if_fitted_otherwise(self._path, model, **settings)
+    check_fuses(*methods)
+    params = load_fusion(fusion)
+    model = load(report, name, config)
+    warn_if_fitted_otherwise(fusion, model, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
+    return model, params
 
 
 def read_config(path: Path | None) -> VGGTConfig | None:

@@ -10,7 +10,7 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.models import FittedFusion, load
+from vggtjax.commands.models import load_with_fusion
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.options import Options
@@ -103,9 +103,7 @@ def reconstruct(
         known.check(options)
         optional = {"tracks.npz": known.tracks is not None, "vggt4d": saving.format == "vggt4d"}
         check_folder(out, [name for name, is_written in optional.items() if is_written])
-        fitted = FittedFusion(fusion, [options.method])
-        network = load(report, model, config)
-        fitted.warn(network, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
+        network, fitted = load_with_fusion(report, model, fusion, options, [options.method], config)
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import read_clip
             from vggtjax.clips.queries import parse_queries
@@ -123,7 +121,7 @@ def reconstruct(
             size=fitter.size,
             masks=masks,
             tracks=queries,
-            fusion=fitted.params,
+            fusion=fitted,
             on_stage=report.stage,
         )
         with report.stage("write") as progress:

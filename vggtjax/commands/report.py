@@ -10,15 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    SpinnerColumn,
-    Task,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as Bars
 from rich.table import Table
 from rich.text import Text
@@ -65,7 +57,8 @@ class Report:
         yield lambda done, total: self._progress.update(task, completed=done, total=total)
         seconds = time.perf_counter() - started
         self._seconds[name] = self._seconds.get(name, 0.0) + seconds
-        self._finish(task)
+        total = next(t.total for t in self._progress.tasks if t.id == task) or 1
+        self._progress.update(task, total=total, completed=total)
         if not self._console.is_terminal:
             self.note(f"{name:<18} {seconds:8.2f} s")
 
@@ -99,7 +92,6 @@ class Report:
 
     def ladder(self, rows: Sequence[LadderRow]) -> None:
         """Print errors against the truth as a table, a row per method and mask."""
-        table = Table(title="errors against the truth", title_justify="left", box=None, pad_edge=False)
         columns = {
             "abs_rel": ("AbsRel", "{:.3f}"),
             "abs_rel_static": ("static", "{:.3f}"),
@@ -108,14 +100,14 @@ class Report:
             "centre_error_ratio": ("centres", "{:.3f}"),
             "mask_jaccard": ("mask IoU", "{:.2f}"),
         }
-        for name in ("method", "mask"):
-            table.add_column(name)
+        table = Table(
+            "method", "mask", title="errors against the truth", title_justify="left", box=None, pad_edge=False
+        )
         for heading, _ in columns.values():
             table.add_column(heading, justify="right")
         for row in rows:
-            values = [getattr(row, name) for name in columns]
-            forms = [form for _, form in columns.values()]
-            cells = ["-" if v is None else form.format(v) for v, form in zip(values, forms, strict=True)]
+            values = [(getattr(row, name), form) for name, (_, form) in columns.items()]
+            cells = ["-" if value is None else form.format(value) for value, form in values]
             table.add_row(row.method, row.mask_source or "-", *cells)
         self._out.print(table, soft_wrap=True)
         self.line(
@@ -132,10 +124,9 @@ class Report:
             table.add_column(Text(name), justify="right" if name else "left", no_wrap=True)
         for column in shown_columns(means):
             top = best(means, column)
-            cells = (
-                f"[bold]{cell(row, column)}[/]" if name in top else cell(row, column) for name, row in means.items()
-            )
-            table.add_row(f"{column.heading} {ARROWS[column.better]}", *cells)
+            cells = {name: cell(row, column) for name, row in means.items()}
+            bold = (f"[bold]{text}[/]" if name in top else text for name, text in cells.items())
+            table.add_row(f"{column.heading} {ARROWS[column.better]}", *bold)
         self._out.print(table, soft_wrap=True)
 
     def note(self, text: str) -> None:
@@ -145,10 +136,6 @@ class Report:
     def line(self, text: str) -> None:
         """Print one line."""
         self._out.print(Text(text), soft_wrap=True)
-
-    def _finish(self, task: TaskID) -> None:
-        total = next(t.total for t in self._progress.tasks if t.id == task) or 1
-        self._progress.update(task, total=total, completed=total)
 
 
 class _Count(MofNCompleteColumn):

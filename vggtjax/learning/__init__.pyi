@@ -24,7 +24,6 @@ from .rules import load_fusion as load_fusion
 from .rules import observe as observe
 from .rules import parse_family as parse_family
 from .rules import save_fusion as save_fusion
-from .sandwich import standard_errors as standard_errors
 from .soft import SoftMasking as SoftMasking
 from .soft import SoftReconstruction as SoftReconstruction
 from .soft import reconstruct_softly as reconstruct_softly

@@ -122,10 +122,10 @@ def ablate(
         For every seed the scores of the baselines and of the families, and, of several families, those of the family
         with the lowest NLL on the clips for early stopping.
     """
-    parts = {name: parse_family(name) for name in families}
+    parts = {name: family for name in families if (family := parse_family(name))}  # the paper's rule is a baseline
     scores: list[RuleScore] = []
     seen = [observations(clip, patch_size) for clip in clips]
-    total, done = len(seeds) * sum(map(bool, parts.values())), 0
+    total, done = len(seeds) * len(parts), 0
     for seed in seeds:
         split = split_clips(len(clips), seed, held_out)
 
@@ -137,8 +137,6 @@ def ablate(
         scores += [score(name, rule) for name, rule in baselines().items()]
         fitted: list[RuleScore] = []
         for name, family in parts.items():
-            if not family:
-                continue  # the paper's rule is a baseline
             settings = dataclasses.replace(config, family=family, seed=seed)
             fit = fit_split(clips, seen, split, settings, pixels=pixels, folder=folder)
             fitted.append(score(name, partial(_fused, fit.params), fit))

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float32, UInt8, jaxtyped
 
 from vggtjax.cameras import Cameras
 from vggtjax.checkpoint import Model
-from vggtjax.clips.clip import Clip, load_clip
+from vggtjax.clips.clip import load_clip
 from vggtjax.errors import InputError, OutputError, ResultError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.learning.fit import FitClips
@@ -82,11 +82,8 @@ def passes_of(
 def kept_passes(key: Mapping[str, Any], make: Callable[[], ClipPasses], folder: Path | None = None) -> ClipPasses:
     """Return the passes kept under a key, or else what `make` returns, and keep that.
 
-    Args:
-        key: plain values that name model, clip and settings. The sources of this package and the versions of other
-            packages are added.
-        make: runs the passes.
-        folder: of the kept files; the user's cache if None. Where it cannot be written, a warning is logged.
+    The key holds plain values that name model, clip and settings; the sources of this package and the versions of other
+    packages are added. The folder is the user's cache if None; if it cannot be written, a warning is logged.
     """
     versions = [version(name) for name in ("numpy", "pillow", "scipy")]
     text = json.dumps({"sources": source_digest(), "versions": versions, "method": METHOD, **key}, sort_keys=True)
@@ -225,9 +222,8 @@ def _result(
     model: Model, frames: Any, side: int, options: Mapping[str, Any] | None, on_stage: OnStage | None
 ) -> Reconstruction:
     """Reconstruct pictures or their paths, and keep the passes."""
-    clip: Clip = load_clip(frames, size=side, patch=model.config.patch_size)
-    settings = dict(options or {})
-    return reconstruct(model, clip, method=METHOD, size=side, keep_passes=True, on_stage=on_stage, **settings)
+    clip = load_clip(frames, size=side, patch=model.config.patch_size)
+    return reconstruct(model, clip, method=METHOD, size=side, keep_passes=True, on_stage=on_stage, **(options or {}))
 
 
 def observations(clip: ClipPasses, patch_size: int) -> Observations:

@@ -29,14 +29,7 @@ def pose_error(found: Float[Array, "S 3 4"], truth: Float[Array, "S 3 4"]) -> Po
     """
     rotations, centres = zip(*(_relative(poses) for poses in (found, truth)), strict=True)
     difference = jnp.einsum("sij,sik->sjk", rotations[0], rotations[1])
-    sine = jnp.stack(
-        [
-            difference[:, 2, 1] - difference[:, 1, 2],
-            difference[:, 0, 2] - difference[:, 2, 0],
-            difference[:, 1, 0] - difference[:, 0, 1],
-        ],
-        axis=-1,
-    )
+    sine = (difference - difference.mT)[:, [2, 0, 1], [1, 2, 0]]
     cosine = jnp.trace(difference, axis1=1, axis2=2) - 1
     angle = jnp.arctan2(jnp.sqrt(jnp.sum(sine * sine, axis=-1) + _TINY**2), cosine)
     size = jnp.sum(centres[0] * centres[0])

@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from vggtjax.learning.ablation import PAPER, RuleScore, Split, fit_split, gains, markdown, split_clips, table
+from vggtjax.learning.ablation import PAPER, RuleScore, fit_split, gains, markdown, split_clips, table
 from vggtjax.learning.clip_passes import ClipPasses, observations
 from vggtjax.learning.fit import FitConfig
 from vggtjax.learning.plots import draw_fits
@@ -39,7 +39,8 @@ _MARK = "fits.json"  # marks the folder of states as written by this library
 
 def check_folder(folder: Path) -> None:
     """Raise OutputError where fits cannot be saved: the folder cannot be written, or holds other files of our names."""
-    check_free(folder, (NUMBERS, FUSION, TABLE, FAMILIES, *PICTURES), replaced=_is_ours(folder), what="fit")
+    is_ours = says_format(folder / STATES / _MARK, FORMAT) or says_format(folder / NUMBERS, FORMAT)
+    check_free(folder, (NUMBERS, FUSION, TABLE, FAMILIES, *PICTURES), replaced=is_ours, what="fit")
 
 
 def save_fits(
@@ -60,7 +61,8 @@ def save_fits(
     stopping = {name: float(np.mean([o.stopping["nll"] for o in scores if o.rule == name])) for name in families}
     chosen = min(stopping, key=stopping.__getitem__) if families else PAPER
     facts = dict(about) | {"clips": list(clips), "objective": config.objective}
-    split = _final_split(len(clips), float(about["held_out"]))
+    split = split_clips(len(clips), 0, float(about["held_out"]))
+    split = split._replace(fitted=sorted([*split.fitted, *split.test]))
     all_clips = list(clips.values())
     seen = [observations(clip, patch_size) for clip in all_clips]
     trees = {PAPER: identity()}
@@ -94,38 +96,24 @@ def save_fits(
     return chosen
 
 
-def _final_split(count: int, held_out: float) -> Split:
-    """Return a split whose test clips are fitted to as well."""
-    split = split_clips(count, 0, held_out)
-    return Split(sorted([*split.fitted, *split.test]), split.validation, split.test)
-
-
 def _plain(score: RuleScore) -> dict[str, Any]:
-    fit = score.fit
-    return {
-        "rule": score.rule,
-        "seed": score.seed,
-        "metrics": score.metrics,
-        "stopping": score.stopping,
-        "reliability": score.reliability.tolist(),
-        "fit": fit
-        and {
-            "params": _values(fit.params),
-            "objective_for_stopping": fit.held_out_loss,
-            "losses": [[float(x) for x in row] for row in fit.losses],
-            "stopped_early": fit.stopped_early,
-        },
+    fit = score.fit and {
+        "params": _values(score.fit.params),
+        "objective_for_stopping": score.fit.held_out_loss,
+        "losses": score.fit.losses.tolist(),
+        "stopped_early": score.fit.stopped_early,
     }
+    names = ("rule", "seed", "metrics", "stopping")
+    plain = {name: getattr(score, name) for name in names}
+    return plain | {"reliability": score.reliability.tolist(), "fit": fit}
 
 
 def _values(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return a tree's numbers, or the number of values of a gate."""
-    return {
-        name: {"values": sum(np.size(x) for x in jax.tree.leaves(leaf))}
-        if name == "gate"
-        else np.asarray(leaf).tolist()
-        for name, leaf in tree.items()
-    }
+    values: dict[str, Any] = {name: np.asarray(leaf).tolist() for name, leaf in tree.items() if name != "gate"}
+    if "gate" in tree:
+        values["gate"] = {"values": sum(np.size(x) for x in jax.tree.leaves(tree["gate"]))}
+    return values
 
 
 def begin(folder: Path) -> Path:
@@ -133,7 +121,3 @@ def begin(folder: Path) -> Path:
     with writing(folder / STATES / _MARK) as path:
         path.write_text(json.dumps({"format": FORMAT}) + "\n", encoding="utf-8")
     return folder / STATES
-
-
-def _is_ours(folder: Path) -> bool:
-    return says_format(folder / STATES / _MARK, FORMAT) or says_format(folder / NUMBERS, FORMAT)

@@ -111,11 +111,6 @@ def clip_loss(params: FusionParams, clip: FitClips, objective: Objective) -> Flo
     return {"photometric": photometric_loss, "geometric": geometric_loss}[objective](fused, clip.view)
 
 
-def clip_losses(params: FusionParams, clips: FitClips, objective: Objective) -> Float[Array, " C"]:
-    """Return the objective of every clip."""
-    return jax.vmap(clip_loss, in_axes=(None, 0, None))(params, clips, objective)
-
-
 def fit_fusion(
     fitted: FitClips,
     held_out: FitClips,
@@ -142,7 +137,8 @@ def fit_fusion(
         raise InputError(f"{fitted.clips} clips to fit to, {held_out.clips} held out; expected at least one of each")
     if not config.family:
         raise InputError("the family has no free part; there is nothing to fit")
-    state = _initial(config)
+    plan = _Plan(config.steps, config.learning_rate, config.decay)
+    state = _initial(config, plan)
     free = jax.tree.map(jnp.asarray, is_free(state.params, config.family))
     paper = identity() | ({"gate": state.params["gate"]} if "gate" in state.params else {})
     state = _evaluated(state._replace(params=paper), fitted, held_out, config.objective)._replace(params=state.params)
@@ -152,7 +148,7 @@ def fit_fusion(
         state = _restored(checkpoint, state, digest)
     while int(state.step) < config.steps and int(state.waited) < config.patience:
         at_once = min(config.clips_at_once, fitted.clips)
-        state = _advanced(state, free, fitted, config.objective, at_once, _plan(config))
+        state = _advanced(state, free, fitted, config.objective, at_once, plan)
         state = _evaluated(state, fitted, held_out, config.objective)
         _check_finite(state, int(state.step) // _CHUNK)
         if checkpoint is not None:
@@ -172,15 +168,11 @@ def _check_finite(state: FitState, evaluation: int) -> None:
 
 
 class _Plan(NamedTuple):
-    """Settings of the optimiser; arrays, so that fits of all plans share a compilation."""
+    """Settings of the optimiser, traced, so that fits of all plans share a compilation."""
 
-    steps: Array
-    learning_rate: Array
-    decay: Array
-
-
-def _plan(config: FitConfig) -> _Plan:
-    return _Plan(jnp.asarray(config.steps), jnp.asarray(config.learning_rate), jnp.asarray(config.decay))
+    steps: Array | int
+    learning_rate: Array | float
+    decay: Array | float
 
 
 def _optimiser(plan: _Plan) -> optax.GradientTransformation:
@@ -193,12 +185,9 @@ def _optimiser(plan: _Plan) -> optax.GradientTransformation:
     def of_gate(tree):
         return {name: jax.tree.map(lambda _, name=name: name == "gate", leaf) for name, leaf in tree.items()}
 
-    def slower(updates, params=None):
-        del params
-        return {
-            name: jax.tree.map(lambda x, name=name: x * (_GATE_RATE if name == "gate" else PARTS[name].rate), leaf)
-            for name, leaf in updates.items()
-        }
+    def slower(updates, _=None):
+        rates = {name: _GATE_RATE if name == "gate" else PARTS[name].rate for name in updates}
+        return {name: jax.tree.map(lambda x, name=name: x * rates[name], leaf) for name, leaf in updates.items()}
 
     schedule: Any = rate
     return optax.chain(
@@ -210,19 +199,12 @@ def _optimiser(plan: _Plan) -> optax.GradientTransformation:
     )
 
 
-def _initial(config: FitConfig) -> FitState:
+def _initial(config: FitConfig, plan: _Plan) -> FitState:
     params = start(config.family, config.seed)
+    key = jax.random.key_data(jax.random.key(config.seed))
+    zero = jnp.zeros((), jnp.int32)
     losses = jnp.full((-(-config.steps // _CHUNK) + 1, 2), jnp.nan)
-    return FitState(
-        params,
-        _optimiser(_plan(config)).init(params),
-        jax.random.key_data(jax.random.key(config.seed)),
-        jnp.zeros((), jnp.int32),
-        params,
-        jnp.asarray(jnp.inf),
-        jnp.zeros((), jnp.int32),
-        losses,
-    )
+    return FitState(params, _optimiser(plan).init(params), key, zero, params, jnp.asarray(jnp.inf), zero, losses)
 
 
 @partial(jax.jit, static_argnames=("objective", "at_once"))

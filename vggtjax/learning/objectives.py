@@ -148,13 +148,9 @@ def _over_pairs(pair, fused: Fused, view: View, step: int, depth: Array | None =
     depth = fused.depth if depth is None else depth
     static = 1 - jax.lax.stop_gradient(fused.dynamic)
     total = weight = jnp.zeros((), fused.depth.dtype)
-    for ahead in (step, -step):
-        S = len(depth) - step
-        here = slice(0, S) if ahead > 0 else slice(step, step + S)
-        there = slice(step, step + S) if ahead > 0 else slice(0, S)
-        cameras = [
-            Cameras(view.cameras.camera_from_world[part], view.cameras.intrinsics[part]) for part in (here, there)
-        ]
+    earlier, later = slice(0, len(depth) - step), slice(step, len(depth))
+    for here, there in ((earlier, later), (later, earlier)):
+        cameras = [Cameras(*(x[part] for x in view.cameras)) for part in (here, there)]
         sums = jax.vmap(pair)(depth[here], static[here], view.images[here], view.images[there], *cameras)
         total, weight = total + sums[0].sum(), weight + sums[1].sum()
     return total / jnp.maximum(weight, 1)

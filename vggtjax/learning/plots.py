@@ -27,7 +27,7 @@ _claims = jax.jit(log_precisions)
 
 def draw_fits(
     folder: Path, scores: Sequence[RuleScore], clips: Sequence[ClipPasses], patch_size: int, shown: str
-) -> list[Path]:
+) -> None:
     """Draw all pictures into a folder, precision and calibration of the family `shown`."""
     figures = {
         "precision.png": _precision(scores, clips, patch_size, shown),
@@ -38,7 +38,6 @@ def draw_fits(
     for name, figure in figures.items():
         with writing(folder / name) as path:
             figure.savefig(path, dpi=_DPI)
-    return [folder / name for name in figures]
 
 
 def precision_by_confidence(
@@ -82,9 +81,8 @@ def _precision(scores: Sequence[RuleScore], clips: Sequence[ClipPasses], patch_s
         axis.plot(middles, middles, color="tab:orange", label="paper: the confidence itself")
         for i, line in enumerate(claimed):
             axis.plot(middles, line, color="tab:blue", alpha=0.6, label=None if i else f"{shown}, each seed")
-        axis.set(
-            xscale="log", yscale="log", xlabel="confidence", ylabel="precision of depth", title=f"pass {which + 1}"
-        )
+        axis.loglog()
+        axis.set(xlabel="confidence", ylabel="precision of depth", title=f"pass {which + 1}")
         axis.grid(alpha=0.3, which="both")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     return figure
@@ -107,23 +105,20 @@ def _calibration(scores: Sequence[RuleScore], shown: str) -> Figure:
 def _scores(scores: Sequence[RuleScore]) -> Figure:
     names = {"abs_rel": "AbsRel", "nll": "NLL, nats", "ece": "ECE"}
     rules = list(dict.fromkeys(score.rule for score in scores))
+    colors = {score.rule: "tab:blue" if score.fit is not None else "tab:gray" for score in scores}
+    colors[PAPER] = "tab:orange"
     figure = _figure(11, 0.8 + 0.34 * len(rules))
     for place, (name, title) in enumerate(names.items()):
         axis = figure.add_subplot(1, len(names), place + 1)
         for row, rule in enumerate(rules):
             values = [score.metrics[name] for score in scores if score.rule == rule]
-            color = "tab:orange" if rule == PAPER else "tab:blue" if _is_fitted(scores, rule) else "tab:gray"
-            axis.plot(values, [row] * len(values), "o", color=color, alpha=0.5, markersize=5)
-            axis.plot([np.mean(values)], [row], "|", color=color, markersize=16, markeredgewidth=2)
+            axis.plot(values, [row] * len(values), "o", color=colors[rule], alpha=0.5, markersize=5)
+            axis.plot([np.mean(values)], [row], "|", color=colors[rule], markersize=16, markeredgewidth=2)
         axis.set_yticks(range(len(rules)), rules if place == 0 else [""] * len(rules))
         axis.invert_yaxis()
         axis.set_xlabel(f"{title} (lower is better)")
         axis.grid(alpha=0.3)
     return figure
-
-
-def _is_fitted(scores: Sequence[RuleScore], rule: str) -> bool:
-    return any(score.fit is not None for score in scores if score.rule == rule)
 
 
 def _losses(scores: Sequence[RuleScore]) -> Figure:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
@@ -28,7 +27,7 @@ def fuse_depth(
     dynamic_mask: Bool[Array, "*F H W"],
     eps: float = EPSILON,
 ) -> tuple[Float[Array, "*F H W"], Float[Array, "*F H W"]]:
-    """Confidence fusion (D_3b): inverse-variance weighting with confidence as precision, vmapped over frames.
+    """Confidence fusion (D_3b): inverse-variance weighting with confidence as precision, pixel by pixel.
 
     On static pixels w = C2 / (C1 + C2 + eps), depth = (1 - w) D1 + w D2, and the fused precision is C1 + C2; on
     dynamic pixels the output is that of pass 1.
@@ -42,17 +41,11 @@ def fuse_depth(
     Returns:
         Fused depth and confidence, of the inputs' shape.
     """
-
-    def one_frame(d1, c1, d2, c2, dynamic):
-        c1, c2 = (jnp.minimum(c, jnp.finfo(c.dtype).max / 4) for c in (c1, c2))  # untrained weights can overflow
-        total = c1 + c2 + eps
-        fused = (c1 + eps) / total * d1 + c2 / total * d2  # (c1 + eps) / total is 1 - w without cancellation
-        return jnp.where(dynamic, d1, fused), jnp.where(dynamic, c1, c1 + c2)
-
-    fused = one_frame
-    for _ in range(jnp.ndim(depth1) - 2):
-        fused = jax.vmap(fused)
-    return fused(*(jnp.asarray(x) for x in (depth1, confidence1, depth2, confidence2, dynamic_mask)))
+    c1, c2 = (jnp.asarray(confidence) for confidence in (confidence1, confidence2))
+    c1, c2 = (jnp.minimum(c, jnp.finfo(c.dtype).max / 4) for c in (c1, c2))  # untrained weights can overflow
+    total = c1 + c2 + eps
+    fused = (c1 + eps) / total * depth1 + c2 / total * depth2  # (c1 + eps) / total is 1 - w without cancellation
+    return jnp.where(dynamic_mask, depth1, fused), jnp.where(dynamic_mask, c1, c1 + c2)
 
 
 def scale_between(

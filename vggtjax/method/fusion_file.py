@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,7 @@ import numpy as np
 
 from vggtjax.checkpoint import Model
 from vggtjax.errors import CheckpointError, InputError
-from vggtjax.method.fusion_gate import CHANNELS, init_gate
-from vggtjax.method.fusion_rule import FEATURES, PARTS, FusionParams, projected
+from vggtjax.method.fusion_rule import PARTS, FusionParams, projected, start
 from vggtjax.options import METHODS, find_method
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.tensor_file import Spec, StoredTensor, read_tensors, write_tensors
@@ -76,12 +75,6 @@ def check_fuses(*methods: str) -> None:
         raise InputError(f"a fusion is given, and method {methods[0]!r} does not fuse; expected {names}")
 
 
-def read_fusion(path: Path, methods: Sequence[str]) -> FusionParams:
-    """Return the tree of a file for a run of `methods`; InputError as `load_fusion`, or where no method fuses."""
-    check_fuses(*methods)
-    return load_fusion(path)
-
-
 def warn_if_fitted_otherwise(path: Path, model: Model, **settings: Any) -> None:
     """Log a warning for a model and for every setting (`align_scale`, `mask_pairs`) that differ from those of the fit.
 
@@ -127,7 +120,5 @@ def _named(params: FusionParams) -> dict[str, Any]:
 
 
 def _expected(gate: bool) -> dict[str, tuple[int, ...]]:
-    tree: dict[str, Any] = {name: jax.ShapeDtypeStruct(part.shape, np.float32) for name, part in PARTS.items()}
-    if gate:
-        tree["gate"] = jax.eval_shape(lambda: init_gate(jax.random.key(0), 4 + len(FEATURES), CHANNELS))
+    tree = jax.eval_shape(lambda: start(("gate",) if gate else ()))
     return {name: leaf.shape for name, leaf in _named(tree).items()}

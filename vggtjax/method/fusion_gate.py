@@ -15,12 +15,10 @@ CHANNELS = 16
 class Gate(nn.Module):
     """Two 3 x 3 convolutions and a last layer of zeros: an untrained gate changes nothing."""
 
-    channels: int = CHANNELS
-
     @nn.compact
     def __call__(self, x: Float[Array, "F H W C"]) -> Float[Array, "F H W 2"]:
         for i in range(2):
-            x = nn.gelu(nn.Dense(self.channels, name=f"conv{i}")(_neighbourhoods(x)))
+            x = nn.gelu(nn.Dense(CHANNELS, name=f"conv{i}")(_neighbourhoods(x)))
         return nn.Dense(2, kernel_init=nn.initializers.zeros, name="shift")(x)
 
 
@@ -31,13 +29,12 @@ def _neighbourhoods(x: Float[Array, "F H W C"]) -> Float[Array, "F H W 9C"]:
     return jnp.concatenate([x[:, i : i + H, j : j + W] for i in range(3) for j in range(3)], axis=-1)
 
 
-def init_gate(key: Array, inputs: int, channels: int = CHANNELS) -> dict[str, Any]:
+def init_gate(key: Array, inputs: int) -> dict[str, Any]:
     """Return the gate's parameters for `inputs` maps."""
-    return dict(Gate(channels).init(key, jnp.zeros((1, 3, 3, inputs)))["params"])
+    return dict(Gate().init(key, jnp.zeros((1, 3, 3, inputs)))["params"])
 
 
 def apply_gate(params: dict[str, Any], maps: Float[Array, "H W C"]) -> Float[Array, "H W 2"]:
     """Return the shifts of the log precision of each pass."""
-    channels = params["conv0"]["bias"].shape[0]
     with jax.default_matmul_precision("highest"):
-        return Gate(channels).apply({"params": params}, maps[None])[0]  # pyright: ignore[reportIndexIssue]
+        return Gate().apply({"params": params}, maps[None])[0]  # pyright: ignore[reportIndexIssue]

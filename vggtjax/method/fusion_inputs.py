@@ -101,22 +101,15 @@ def _squared_distance(mask: Bool[Array, "H W"]) -> Float[Array, "H W"]:
 def _margin(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"]) -> Float[Array, "S H W"]:
     """Return the saliency minus the threshold of the mask, clipped to the mask's side of 0.
 
-    Saliency and mask disagree where the mask was supplied by the user or smoothed. An empty mask has no edge.
-    """
-    margin = saliency - _threshold(saliency, dynamic)
-    margin = jnp.where(dynamic, jnp.maximum(margin, 0), jnp.minimum(margin, -_SMALLEST))
-    return jnp.where(dynamic.any(), margin, _STILL)
-
-
-def _threshold(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"]) -> Float[Array, ""]:
-    """Return the threshold of a clip's mask: midway between the largest static and the smallest dynamic saliency.
-
-    For an empty mask it is 1/2 above the largest saliency, for a full mask 1/2 below the smallest.
+    The threshold is midway between the largest static and the smallest dynamic saliency, for a full mask 1/2 below the
+    smallest. Saliency and mask disagree where the mask was supplied by the user or smoothed. An empty mask has no edge.
     """
     low = jnp.where(dynamic, -jnp.inf, saliency).max()
     high = jnp.where(dynamic, saliency, jnp.inf).min()
     low, high = jnp.where(jnp.isfinite(low), low, high - 1), jnp.where(jnp.isfinite(high), high, low + 1)
-    return (low + high) / 2
+    margin = saliency - (low + high) / 2
+    margin = jnp.where(dynamic, jnp.maximum(margin, 0), jnp.minimum(margin, -_SMALLEST))
+    return jnp.where(dynamic.any(), margin, _STILL)
 
 
 def _log_confidence(confidence: Float[Array, "*S"]) -> Float[Array, "*S"]:

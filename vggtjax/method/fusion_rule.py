@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vggtjax.errors import InputError
-from vggtjax.method.fusion_gate import CHANNELS, apply_gate, init_gate
+from vggtjax.method.fusion_gate import apply_gate, init_gate
 
 FusionParams = dict[str, Any]
 
@@ -117,35 +117,28 @@ def identity() -> FusionParams:
     return {name: jnp.full(part.shape, part.identity, float) for name, part in PARTS.items()}
 
 
-def start(family: tuple[str, ...], seed: int = 0, spread: float = 0.0) -> FusionParams:
+def start(family: tuple[str, ...], seed: int = 0) -> FusionParams:
     """Return the tree at the start of a fit: the paper's rule, except for free leaves whose gradient is 0 there.
 
-    Args:
-        family: the free parts.
-        seed: of the gate's weights, whose last layer is 0, and of the noise.
-        spread: standard deviation of noise on the free leaves.
+    `seed` is that of the gate's weights, whose last layer is 0.
     """
-    keys = jax.random.split(jax.random.key(seed), len(PARTS) + 1)
     tree = identity()
-    for key, (name, part) in zip(keys[1:], PARTS.items(), strict=True):
-        if name in family:
-            value = part.identity if part.start is None else part.start
-            tree[name] = jnp.full(part.shape, value, float) + spread * jax.random.normal(key, part.shape)
+    for name, part in PARTS.items():
+        if name in family and part.start is not None:
+            tree[name] = jnp.full(part.shape, part.start, float)
     if "gate" in family:
-        tree["gate"] = init_gate(keys[0], 4 + len(FEATURES), CHANNELS)
-    return projected(tree)
+        tree["gate"] = init_gate(jax.random.split(jax.random.key(seed), len(PARTS) + 1)[0], 4 + len(FEATURES))
+    return tree
 
 
 def projected(params: FusionParams, fitted: tuple[str, ...] = ()) -> FusionParams:
     """Return the tree with every leaf clipped to its range; for `fitted` parts, to the range during a fit."""
 
-    def low(name: str) -> float:
-        part = PARTS[name]
-        return part.least if name in fitted and part.least is not None else part.low
-
-    return {
-        name: leaf if name == "gate" else jnp.clip(leaf, low(name), PARTS[name].high) for name, leaf in params.items()
-    }
+    clipped = dict(params)
+    for name, part in PARTS.items():
+        low = part.least if name in fitted and part.least is not None else part.low
+        clipped[name] = jnp.clip(params[name], low, part.high)
+    return clipped
 
 
 def is_free(params: FusionParams, family: tuple[str, ...]) -> FusionParams:

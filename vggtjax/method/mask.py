@@ -94,20 +94,16 @@ def mine_mask(
 
 
 def smooth_by_clusters(
-    saliency: Float[Array, "B S h w"], patch_tokens: Float[Array, "B S P C"], clusters: int, *, seed: int = 0
+    saliency: Float[Array, "B S h w"], patch_tokens: Float[Array, "B S P C"], clusters: int
 ) -> Float[Array, "B S h w"]:
     """Give every token the mean saliency of its cluster, min-max normalised per frame again (VGGT4D).
 
-    Args:
-        saliency: of every patch, in [0, 1].
-        patch_tokens: the backbone's features; all frames of a clip are clustered together.
-        clusters: number of clusters.
-        seed: of k-means.
+    The backbone's features of all frames of a clip are clustered together.
     """
 
     def one_clip(clip: tuple[Array, Array]) -> Float[Array, "S h w"]:
         values, features = clip
-        labels = kmeans(jax.random.key(seed), features.reshape(-1, features.shape[-1]), clusters).labels
+        labels = kmeans(jax.random.key(0), features.reshape(-1, features.shape[-1]), clusters).labels
         return cluster_means(values, labels.reshape(values.shape), clusters)
 
     return jax.lax.map(one_clip, (saliency, patch_tokens.astype(jnp.float32)))

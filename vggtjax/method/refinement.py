@@ -118,15 +118,13 @@ def statistical_outliers(
     Invalid points and points that are not finite are outliers too, and not neighbours of other points.
     """
     flat = points.reshape(-1, 3)
-    outlier = np.logical_not(np.isfinite(flat).all(axis=1, keepdims=True))[:, 0]
+    outlier = ~np.isfinite(flat).all(axis=1)
     if valid is not None:
         outlier |= ~valid.ravel()
     known = flat[~outlier]
     if len(known):
-        neighbours = min(NEIGHBOURS, len(known))
-        distance = (
-            KDTree(known, leafsize=32).query(known, k=neighbours, workers=-1)[0].reshape(len(known), -1).mean(axis=1)
-        )
+        neighbours = range(1, min(NEIGHBOURS, len(known)) + 1)
+        distance = KDTree(known, leafsize=32).query(known, k=neighbours, workers=-1)[0].mean(axis=1)
         outlier[~outlier] = distance > distance.mean() + OUTLIER_SIGMA * distance.std()
     return outlier.reshape(points.shape[:2])
 
@@ -167,12 +165,8 @@ def cluster_losses(
     A projection is comparable on a static pixel inside the frame, in front of the camera, and not behind the pixel's
     depth. Depth is sampled at the nearest pixel, colour and mask bilinearly.
 
-    Args:
-        images, depth, dynamic_mask, camera_from_world, intrinsics: as for `refine_masks`.
-        index: pixels of the points, in row-major order.
-        weight: False for padding.
-        labels: cluster of each point.
-        clusters: number of clusters (static).
+    `index` holds the pixels of the points in row-major order, `labels` their clusters; `weight` is False for padding.
+    The number of `clusters` is static. Other arguments are as for `refine_masks`.
     """
     S, H, W = depth.shape
     N = index.shape[1]

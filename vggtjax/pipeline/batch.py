@@ -7,6 +7,7 @@ import json
 from collections import deque
 from collections.abc import Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Unpack
@@ -154,22 +155,16 @@ class _Run:
         return read_clip(open_source(source), self.sampling, self.fitter)
 
     def reconstruct(self, clip: Clip) -> Reconstruction:
+        size = self.fitter.size
         return reconstruct(
-            self.model,
-            clip,
-            options=self.options,
-            size=self.fitter.size,
-            fusion=self.fusion,
-            pad_frames=self.pad_frames,
+            self.model, clip, options=self.options, size=size, fusion=self.fusion, pad_frames=self.pad_frames
         )
 
     def write(self, name: str, clip: Clip, result: Reconstruction, folder: Path) -> ClipOutcome:
         pictures = clip.pictures() if self.saving.resolution == "original" else None
-        if folder.exists():
-            result.save(folder, saving=self.saving, pictures=pictures)
-        else:
-            with writing(folder) as temporary:  # the folder appears whole or not at all
-                result.save(temporary, saving=self.saving, pictures=pictures)
+        # A new folder appears whole or not at all.
+        with nullcontext(folder) if folder.exists() else writing(folder) as place:
+            result.save(place, saving=self.saving, pictures=pictures)
         return ClipOutcome(name, "done", frames=len(clip))
 
 

@@ -114,27 +114,27 @@ def reconstruct(
         raise InputError(f"smooth_frames is {options.smooth_frames}, but only mined masks are smoothed, not given ones")
     clip, tracks = _fitted(model, clip, size, tracks, on_stage)
     given = None if masks is None else masks_at_clip_pixels(masks, clip)
-    stages = _stages(model, options, clip.images.shape[:3])
-    padding = padded_frames(len(clip), model.config.motion.offsets) - len(clip) if pad_frames and tracks is None else 0
+    frames, height, width = clip.images.shape[:3]
+    stages = Stages(model.config, options, frames, (height, width))
+    padding = padded_frames(frames, model.config.motion.offsets) - frames if pad_frames and tracks is None else 0
 
-    def padded(frames: np.ndarray) -> Array:
-        frames = np.pad(frames, ((0, padding), *((0, 0),) * (frames.ndim - 1))) if padding else frames
-        return jax.device_put(frames[None])
+    def padded(x: np.ndarray) -> Array:
+        return jax.device_put(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None])
 
     inputs = ClipInputs(
         images=padded(clip.images),
-        frame_count=jax.device_put(np.array([len(clip)], np.int32)) if padding else None,
+        frame_count=jax.device_put(np.array([frames], np.int32)) if padding else None,
         dynamic_mask=None if given is None else padded(given),
         moves=given is None or bool(given.any()),
         query_points={} if tracks is None else _points_by_frame(tracks),
     )
     run = partial(run_stages, params=model.params, inputs=inputs, fusion=fusion, all_outputs=keep_passes)
-    with device_memory_errors(_LESS_MEMORY, *clip.images.shape[:3]):
+    with device_memory_errors(_LESS_MEMORY, frames, height, width):
         with on_stage("compile"):
             run(dataclasses.replace(stages, run=Compile()))
         passes, assembly, by_frame = run(dataclasses.replace(stages, run=Execute(on_stage)))
-    passes = jax.tree.map(lambda x: np.asarray(x)[:, : len(clip)], passes)
-    fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, len(clip)))
+    passes = jax.tree.map(lambda x: np.asarray(x)[:, :frames], passes)
+    fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, frames))
     result = Reconstruction(
         **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
         **fields,
@@ -187,7 +187,7 @@ def compile_ahead(
         frame_count=None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32),  # type: ignore[arg-type]
     )
     compiler = Compile()
-    stages = dataclasses.replace(_stages(model, options, (frames, height, width)), run=compiler)
+    stages = Stages(model.config, options, frames, (height, width), run=compiler)
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
         run_stages(stages, model.params, inputs, all_outputs=keep_passes)
     return compiler.memory
@@ -240,11 +240,6 @@ def _fitted(
             loaded, clip = clip, clip.refit(size, config.patch_size)
             tracks = None if tracks is None else tracks.moved(loaded, clip)
     return clip, tracks
-
-
-def _stages(model: Model, options: Options, shape: tuple[int, ...]) -> Stages:
-    frames, height, width = shape
-    return Stages(model.config, options, frames, (height, width))
 
 
 def _clip_fields(clip: Clip) -> dict[str, Any]:

@@ -39,28 +39,18 @@ def reconstruct_methods(
         methods: names of `METHODS`.
         options: settings of all methods; `options.method` is not read.
         fusion: the rule of fusion of the methods that fuse; at least one of them must.
-        model, clip, size, on_stage, changes: as for `reconstruct`.
+        model, clip, size, on_stage, changes: as for `reconstruct`, whose errors are raised.
 
     Returns:
         The results by method, in the order of `methods`.
-
-    Raises:
-        What `reconstruct` raises.
     """
     options = options.changed(**changes)
     if fusion is not None:
         check_fuses(*methods)
     results: dict[str, Reconstruction] = {}
     for group in groups_of_methods(methods, options):
-        shared = next((each for each in group if each.row.needs_second_pass), group[0])
-        result = reconstruct(
-            model,
-            clip,
-            options=shared.changed(refine_mask=False),
-            size=size,
-            keep_passes=True,
-            on_stage=on_stage,
-        )
+        shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(refine_mask=False)
+        result = reconstruct(model, clip, options=shared, size=size, keep_passes=True, on_stage=on_stage)
         for each in group:
             results[each.method] = _as_method(result, model, each, fusion, on_stage or (lambda name: nullcontext()))
     return {name: results[name] for name in methods}

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.cameras import Cameras
-from vggtjax.config import MotionConfig, VGGTConfig
+from vggtjax.config import VGGTConfig
 from vggtjax.method.fusion_inputs import apply_fusion
 from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.method.mask import mine_mask
@@ -75,7 +75,7 @@ def _assemble(
 
 
 _encode = Program(encode, static=("config", "compute_dtype"))
-_first_pass = Program(_first, static=("config", "gram", "motion", "outputs", "compute_dtype"))
+_first_pass = Program(_first, static=("config", "gram", "compute_dtype"))
 _mine_mask = Program(_mine, static=("frames", "size", "clusters", "threshold", "smooth_frames"))
 _second_pass = Program(_second, static=("config", "suppress", "outputs", "compute_dtype"))  # mask_pairs is traced
 _track_from = Program(_track, static=("config", "compute_dtype"))
@@ -143,13 +143,10 @@ class Stages:
         params: Params,
         clips: ClipBatch,
         query_points: Float[Array, "B Q 2"] | None = None,
-        *,
-        motion: MotionConfig | None = None,
     ) -> tuple[Predictions, Float[Array, "B F h w"]]:
         """Return what the plain pass predicts, and the motion saliency."""
-        options = self._network | {"gram": self.options.row.gram} | ({} if motion is None else {"motion": motion})
         points = () if query_points is None else (query_points,)
-        return self.run("first pass", _first_pass, params, clips, *points, **options)
+        return self.run("first pass", _first_pass, params, clips, *points, gram=self.options.row.gram, **self._network)
 
     def dynamic_mask(
         self, saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"]

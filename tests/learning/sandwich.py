@@ -8,11 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from vggtjax.errors import InputError
-from vggtjax.learning.fit import FitClips, Objective, clip_losses
+from vggtjax.learning.fit import FitClips, Objective, clip_loss
 from vggtjax.method.fusion_rule import PARTS, FusionParams
+
+
+def clip_losses(params: FusionParams, clips: FitClips, objective: Objective) -> Float[Array, " C"]:
+    """Return the objective of every clip."""
+    return jax.vmap(clip_loss, in_axes=(None, 0, None))(params, clips, objective)
 
 
 def standard_errors(
