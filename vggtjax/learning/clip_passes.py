@@ -223,7 +223,8 @@ def _result(
 ) -> Reconstruction:
     """Reconstruct pictures or their paths, and keep the passes."""
     clip = load_clip(frames, size=side, patch=model.config.patch_size)
-    return reconstruct(model, clip, method=METHOD, size=side, keep_passes=True, on_stage=on_stage, **(options or {}))
+    settings = dict(options or {})
+    return reconstruct(model, clip, method=METHOD, size=side, keep_passes=True, on_stage=on_stage, **settings)
 
 
 def observations(clip: ClipPasses, patch_size: int) -> Observations:

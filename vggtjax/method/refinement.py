@@ -118,13 +118,13 @@ def statistical_outliers(
     Invalid points and points that are not finite are outliers too, and not neighbours of other points.
     """
     flat = points.reshape(-1, 3)
-    outlier = ~np.isfinite(flat).all(axis=1)
+    outlier = np.logical_not(np.isfinite(flat).all(axis=1, keepdims=True))[:, 0]
     if valid is not None:
         outlier |= ~valid.ravel()
     known = flat[~outlier]
     if len(known):
-        neighbours = range(1, min(NEIGHBOURS, len(known)) + 1)
-        distance = KDTree(known, leafsize=32).query(known, k=neighbours, workers=-1)[0].mean(axis=1)
+        distances, _ = KDTree(known, leafsize=32).query(known, k=min(NEIGHBOURS, len(known)), workers=-1)
+        distance = distances.reshape(len(known), -1).mean(axis=1)
         outlier[~outlier] = distance > distance.mean() + OUTLIER_SIGMA * distance.std()
     return outlier.reshape(points.shape[:2])
 
