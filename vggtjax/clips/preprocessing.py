@@ -68,9 +68,8 @@ class Fitter:
 
         Raises ClipError for a picture so narrow or so long that a side becomes 0 or the resized picture huge.
         """
-        wide = self.mode == "crop" or width >= height
         # The order of these operations decides how halves round; it is that of VGGT.
-        if wide:
+        if self.mode == "crop" or width >= height:
             resized_width = self.size
             resized_height = round(height * (self.size / width) / self.patch) * self.patch
         else:

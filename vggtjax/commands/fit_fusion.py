@@ -187,11 +187,11 @@ def _say(report: Report, scores: list[RuleScore], chosen: str, out: Path) -> Non
     for rule, row in rows.items():
         cells = (f"{row[name][0]:7.4f} ±{row[name][1]:7.4f}" for name in names)
         report.line(f"{rule:{width}}  " + "  ".join(cells))
-    apart = gains(scores).get(CHOSEN, gains(scores).get(chosen))
+    name = CHOSEN if CHOSEN in rows else chosen
+    apart = gains(scores).get(name)
     if apart is not None:
         count = len({score.seed for score in scores})
-        text = (f"{METRICS[name]} {apart[name][0]:+.4f} (lower with {apart[name][2]} of {count})" for name in names[:2])
-        name = CHOSEN if CHOSEN in rows else chosen
+        text = (f"{METRICS[key]} {apart[key][0]:+.4f} (lower with {apart[key][2]} of {count})" for key in names[:2])
         report.line(f"{name} against {PAPER}, on clips that were not fitted to: {', '.join(text)}")
     report.line(f"For --fusion: {out / 'fusion.safetensors'} ({chosen}, the lowest NLL on the clips for stopping)")
     report.line(f"Look at {out / 'scores.png'}, {out / 'precision.png'}, {out / 'calibration.png'}")

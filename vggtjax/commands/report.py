@@ -76,9 +76,11 @@ class Report:
                 "look at": f"{out / 'preview' / 'sheet.png'}, {out / 'scene.glb'}",
             }
         )
-        if model is not None and model.note:
+        if model is None:
+            return
+        if model.note:
             self.line(f"The model {model.name} is a {model.note}.")
-        if model is not None and not model.trained:
+        if not model.trained:
             self.line(
                 "The weights of this model are untrained: this shows that everything runs, not what the scene is. "
                 "For a reconstruction, run: vggtjax reconstruct CLIP --out DIR --model WEIGHTS"

@@ -256,8 +256,7 @@ def fit_clips(
         frames: without `pixels`, number of consecutive frames to take of each clip: those of most true depth.
         seed: of the draw of pixels.
 
-    Raises:
-        InputError: no clips, or pixels are drawn from a clip without true depth.
+    Raises InputError without clips, or where pixels are drawn from a clip without true depth.
     """
     if not clips:
         raise InputError("there are no clips to fit to; expected at least one")

@@ -51,8 +51,7 @@ def negative_log_likelihood(
         square = jnp.exp(jnp.minimum(jnp.log(error * error + _TINY**2) + log_precision, _MOST))
         loss = (_LOG_2PI - log_precision + square) / 2
     else:
-        log_width = -(log_precision + _LOG_2) / 2  # of a Laplace distribution with that variance
-        loss = _LOG_2 + log_width + jnp.exp(jnp.minimum(jnp.log(jnp.abs(error) + _TINY) - log_width, _MOST))
+        loss = _laplace(error, -log_precision)
     return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1)
 
 
@@ -81,6 +80,12 @@ def joint_negative_log_likelihood(
     other = (_LOG_2PI - claims[1] + jnp.log(left) + residual * residual / left) / 2
     loss = alone + (1 - seen.dynamic) * other
     return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1)
+
+
+def _laplace(error: Float[Array, "*S"], log_variance: Float[Array, "*S"]) -> Float[Array, "*S"]:
+    """Return the negative log likelihood of errors by a Laplace distribution of a variance, in nats."""
+    log_width = (log_variance - _LOG_2) / 2
+    return _LOG_2 + log_width + jnp.exp(jnp.minimum(jnp.log(jnp.abs(error) + _TINY) - log_width, _MOST))
 
 
 def unit_factor(
@@ -134,9 +139,7 @@ def geometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
         weight = static * valid
         logs = [jnp.log(jnp.where(valid, value, 1)) for value in (z, sampled[..., 0])]
         log_variance = jnp.logaddexp(-depth[..., 1] - 2 * logs[0], -sampled[..., 1] - 2 * logs[1])
-        log_width = (log_variance - _LOG_2) / 2
-        size = jnp.log(jnp.abs(logs[0] - logs[1]) + _TINY)
-        loss = _LOG_2 + log_width + jnp.exp(jnp.minimum(size - log_width, _MOST))
+        loss = _laplace(logs[0] - logs[1], log_variance)
         return jnp.sum(jnp.where(valid, weight * loss, 0)), jnp.sum(weight)
 
     maps = jnp.stack([fused.depth, fused.log_precision], axis=-1)

@@ -38,8 +38,7 @@ def fuse_depth(
         dynamic_mask: True where the scene moves.
         eps: keeps the weight finite where both confidences are 0.
 
-    Returns:
-        Fused depth and confidence, of the inputs' shape.
+    Returns depth and confidence, of the inputs' shape.
     """
     c1, c2 = (jnp.asarray(confidence) for confidence in (confidence1, confidence2))
     c1, c2 = (jnp.minimum(c, jnp.finfo(c.dtype).max / 4) for c in (c1, c2))  # untrained weights can overflow

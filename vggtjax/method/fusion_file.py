@@ -39,11 +39,7 @@ def save_fusion(path: str | Path, params: FusionParams, about: Mapping[str, Any]
 
 
 def load_fusion(path: str | Path) -> FusionParams:
-    """Read a tree.
-
-    Raises:
-        InputError: the file cannot be read, is not a tree of this family, or has values out of range.
-    """
+    """Read a tree; InputError if the file cannot be read, is not a tree of this family, or has values out of range."""
     tensors, _ = _read(path)
     wanted = _expected(any(name.startswith("gate.") for name in tensors))
     shapes = {name: stored.shape for name, stored in tensors.items()}

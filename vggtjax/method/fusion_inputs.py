@@ -39,8 +39,7 @@ def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None
         patch_size: of the model, in pixels.
         scale: factor on the depth of the second pass, as from `scale_between`; 1 if None.
 
-    Raises:
-        InputError: a pass, or its depth, is missing.
+    Raises InputError where a pass, its depth or its confidence is missing.
     """
     first, second = passes.first, passes.second
     if second is None or first.depth is None or second.depth is None:

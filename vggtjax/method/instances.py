@@ -54,8 +54,7 @@ def find_instances(
     Returns:
         0 on static pixels and in small regions, else the id of the object: 1 fills most pixels of the clip, 255 fewest.
 
-    Raises:
-        InputError: a mask that is not bool [S, H, W], or a value out of range.
+    Raises InputError for a mask that is not bool [S, H, W], or a value out of range.
     """
     if dynamic_mask.ndim != 3 or dynamic_mask.dtype != bool:
         raise InputError(f"dynamic_mask is {dynamic_mask.dtype} {dynamic_mask.shape}; expected bool [S, H, W]")

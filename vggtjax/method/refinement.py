@@ -77,8 +77,7 @@ def refine_masks(
         seed: of k-means.
         progress: called with the frames searched for outliers and their number.
 
-    Raises:
-        InputError: inconsistent shapes, or wrong types.
+    Raises InputError for inconsistent shapes, or wrong types.
     """
     _check(images, depth, dynamic_mask, camera_from_world, intrinsics, valid)
     S = len(depth)

@@ -210,14 +210,9 @@ def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:
 
 def refined(result: Reconstruction, progress: Progress | None) -> Reconstruction:
     """Return the result without the mask's pixels that agree with other frames, by the result's depth and cameras."""
+    images, cameras = result.images / np.float32(255), (result.camera_from_world, result.intrinsics)
     mask = refine_masks(
-        result.images / np.float32(255),
-        result.depth,
-        result.dynamic_mask,
-        result.camera_from_world,
-        result.intrinsics,
-        valid=result.inside_pictures,
-        progress=progress,
+        images, result.depth, result.dynamic_mask, *cameras, valid=result.inside_pictures, progress=progress
     )
     return dataclasses.replace(result, dynamic_mask=mask)
 
