@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from benchmarks.blind import (
     best_angular_velocity,
@@ -19,8 +19,9 @@ from benchmarks.blind import (
     turning,
 )
 from vggtjax.clips.truth import Truth
+from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import LadderRow
-from vggtjax.evaluation.metrics.depth import depth_errors, mean_depth_map
+from vggtjax.evaluation.metrics.depth import depth_errors, measured
 from vggtjax.evaluation.metrics.trajectory import rotation_error
 from vggtjax.scenes import SceneConfig, generate, load_textures
 
@@ -95,6 +96,24 @@ def training_prior(config: SceneConfig, scenes: int, *, batch: int = 8, progress
         if progress is not None:
             progress(start + count, scenes)
     return Prior(total / scenes, np.mean(rates, axis=0))
+
+
+def mean_depth_map(clips: Float[np.ndarray, "N S H W"]) -> Float64[np.ndarray, "H W"]:
+    """Return the mean known depth of every pixel over the frames of all clips: a guess that sees no image.
+
+    Broadcast to a clip's frames, it is aligned like a prediction.
+
+    Raises:
+        InputError: another number of axes than 4, or a pixel without depth in every frame.
+    """
+    clips = np.asarray(clips)
+    if clips.ndim != 4:
+        raise InputError(f"depths have shape {clips.shape}; expected clips [N, S, H, W]")
+    known = measured(clips)
+    counts = known.sum(axis=(0, 1))
+    if not counts.all():
+        raise InputError(f"{int((counts == 0).sum())} pixels have no depth in any frame; expected at least one")
+    return np.where(known, clips, 0).sum(axis=(0, 1), dtype=np.float64) / counts
 
 
 def guesses(truth: Truth, prior: Prior) -> list[Guess]:

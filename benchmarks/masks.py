@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -15,7 +16,7 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.masks import jaccard, precision_recall
+from vggtjax.evaluation.metrics.masks import jaccard
 from vggtjax.method.refinement import refine_masks
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pretrained.load import load_model
@@ -67,6 +68,12 @@ def masks(
         for method, window in track(runs, description=name, console=console, transient=True):
             _add_rows(table, loaded, truth, method, window)
         console.print(table)
+
+
+def precision_recall(predicted: Bool[np.ndarray, "S H W"], truth: Bool[np.ndarray, "S H W"]) -> tuple[float, float]:
+    """Return the correct share of the predicted pixels and the predicted share of the true pixels; 1 without pixels."""
+    correct, positives, true_pixels = int((predicted & truth).sum()), int(predicted.sum()), int(truth.sum())
+    return correct / positives if positives else 1.0, correct / true_pixels if true_pixels else 1.0
 
 
 def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int) -> None:

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks import __main__ as benchmarks
 from benchmarks import speed
-from benchmarks.blind_guesses import Prior, compare, guesses, training_prior
+from benchmarks.blind_guesses import Prior, compare, guesses, mean_depth_map, training_prior
+from benchmarks.masks import precision_recall
 from benchmarks.real_clips import load_windows, takes, window_starts
 from benchmarks.summaries import comparison_table, ladder_table, saliency_auc, spread, summarise
 from tests.tiny import tiny_config
@@ -110,6 +111,24 @@ def test_the_prior_is_the_mean_of_training_scenes():
     assert np.linalg.norm(prior.angular_velocity) < 1
     again = training_prior(config, 3, batch=4)  # batches do not matter
     assert np.allclose(again.depth, prior.depth, rtol=1e-4)
+
+
+def test_the_mean_map_leaves_out_what_is_not_measured():
+    clips = np.array([[[[1.0, 0.0]], [[3.0, 4.0]]], [[[5.0, 8.0]], [[7.0, np.nan]]]])  # 2 clips, 2 frames, 1 x 2 pixels
+    assert mean_depth_map(clips).tolist() == [[4.0, 6.0]]
+    with pytest.raises(InputError, match="1 pixels have no depth"):
+        mean_depth_map(clips * [1, 0])
+    with pytest.raises(InputError, match=r"expected clips \[N, S, H, W\]"):
+        mean_depth_map(clips[0])
+
+
+def test_precision_and_recall_by_hand():
+    half = np.array([[[True, False], [True, False]]])
+    none, everything = half & False, half | True
+    assert precision_recall(everything, half) == (0.5, 1)
+    assert precision_recall(half, everything) == (1, 0.5)
+    assert precision_recall(none, half) == (1, 0)
+    assert precision_recall(half, none) == (0, 1)
 
 
 def test_guesses_and_comparisons_by_hand():

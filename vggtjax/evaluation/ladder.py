@@ -66,8 +66,8 @@ class _Scene(NamedTuple):
 class _Setting(NamedTuple):
     """The settings of a second pass."""
 
-    source: MaskSource | None = None
-    pairs: int | None = None
+    mask_source: MaskSource | None = None
+    mask_pairs: int | None = None
     suppress: Suppress | None = None
 
 
@@ -127,7 +127,7 @@ def ladder(
     options = Options(gram=gram, compute_dtype=compute_dtype)
     shared = Stages(model.config, options, frames, (size[0], size[1]))
     second_stages = [
-        replace(shared, options=options.changed(mask_pairs=setting.pairs, suppress=setting.suppress))
+        replace(shared, options=options.changed(mask_pairs=setting.mask_pairs, suppress=setting.suppress))
         for setting in settings
     ]
     batches = list(_batches(len(truth.images), batch_size))
@@ -146,7 +146,7 @@ def ladder(
         rows += _scored(Passes(first, None, saliency, mined), plain, scenes, _Setting())
         advance()
         for setting, stages in zip(settings, second_stages, strict=True) if masked else ():
-            mask = mined if setting.source == "mined" else jax.device_put(truth.dynamic_mask[padded])
+            mask = mined if setting.mask_source == "mined" else jax.device_put(truth.dynamic_mask[padded])
             second = stages.second_pass(model.params, batch, mask, first)
             rows += _scored(Passes(first, second, saliency, mask), masked, scenes, setting)
             advance()
@@ -192,15 +192,13 @@ def _row(
     return LadderRow(
         clip=int(scene.clip),
         method=method,
-        mask_source=setting.source,
-        mask_pairs=setting.pairs,
-        suppress=setting.suppress,
+        **setting._asdict(),
         **(attempt(_depth_scores, depth, truth) or dict.fromkeys(_DEPTH_SCORES)),
         rotation_error=attempt(rotation_error, camera_from_world, truth.camera_from_world),
         centre_error=centres,
         centre_error_ratio=None if centres is None or distance is None else centres / distance,
         saliency_auc=attempt(auc, scene.saliency, dynamic) if dynamic.any() and not dynamic.all() else None,
-        mask_jaccard=None if setting.source is None else jaccard(mask, dynamic),
+        mask_jaccard=None if setting.mask_source is None else jaccard(mask, dynamic),
         failure="; ".join(failures),
     )
 

@@ -99,20 +99,6 @@ def _page(
     warnings: Sequence[str],
 ) -> str:
     from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup, escape
-
-    def table(columns: Sequence[tables.Column], rows: Mapping[str, Mapping[str, float]]) -> Markup:
-        heads = "".join(f"<th>{escape(c.heading)} {tables.ARROWS[c.better]}</th>" for c in columns)
-        body = ""
-        for method, row in rows.items():
-            cells = (
-                f'<td class="best">{tables.cell(row, c)}</td>'
-                if method in tables.best(rows, c)
-                else f"<td>{tables.cell(row, c)}</td>"
-                for c in columns
-            )
-            body += f"<tr><td>{escape(method)}</td>{''.join(cells)}</tr>"
-        return Markup(f"<table><thead><tr><th>method</th>{heads}</tr></thead><tbody>{body}</tbody></table>")
 
     environment = Environment(autoescape=True, undefined=StrictUndefined)
     template = environment.from_string(files("vggtjax.evaluation").joinpath("page.html").read_text(encoding="utf-8"))
@@ -127,8 +113,7 @@ def _page(
         failed={method: tables.failed(row) for method, row in means.items() if row["failed"]},
         settings=settings,
         warnings=warnings,
-        table=table,
-        grouped=tables.grouped,
+        tables=tables,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +38,24 @@ def _figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), layout="constrained")
 
 
+def _add_legend(figure: Figure, columns: int) -> None:
+    handles = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=columns, frameon=False)
+
+
+def _show_pictures(figure: Any, rows: Mapping[str, Iterable[np.ndarray]], shown: np.ndarray) -> np.ndarray:
+    """Draw a row of pictures for each name, a column for each shown frame; return the axes."""
+    grid = figure.subplots(len(rows), len(shown), squeeze=False)
+    for axis, frame in zip(grid[0], shown, strict=True):
+        axis.set_title(f"frame {frame}", fontsize=9)
+    for axes, (name, pictures) in zip(grid, rows.items(), strict=True):
+        axes[0].set_ylabel(name, fontsize=9)
+        for axis, picture in zip(axes, pictures, strict=True):
+            axis.imshow(picture, vmin=0, vmax=_MOST_ERROR, cmap="magma")  # pictures with three channels ignore these
+            axis.set(xticks=[], yticks=[], facecolor=_UNKNOWN)
+    return grid
+
+
 def _paths(curves: Curves) -> Figure:
     """Draw the camera centres from above and from the side, in the plane of their greatest spread."""
     true = next(iter(curves.values()))["true_centres"]
@@ -55,7 +73,7 @@ def _paths(curves: Curves) -> Figure:
         axis.set_xlabel(f"{labels[0]} principal axis")
         axis.set_ylabel(labels[1])
         axis.grid(alpha=0.3)
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, frameon=False)
+    _add_legend(figure, 6)
     return figure
 
 
@@ -65,28 +83,13 @@ def _error_maps(curves: Curves) -> Figure:
     shown, true = first["shown"], first["true_depth"]
     known = true > 0
     inverse_range = inverse_depth_range(true, known)
-    rows: dict[str, Any] = {
-        "picture": list(first["images"]),
-        "true depth": [color_depth(d, k, inverse_range) for d, k in zip(true, known, strict=True)],
-    }
-    rows |= {method: list(own["error_maps"].astype(np.float32)) for method, own in curves.items()}
+    coloured = [color_depth(d, k, inverse_range) for d, k in zip(true, known, strict=True)]
+    rows = {"picture": first["images"], "true depth": coloured}
+    rows |= {method: own["error_maps"].astype(np.float32) for method, own in curves.items()}
     height, width = true.shape[1:]
     figure = _figure(2.6 * len(shown) + 1.2, 2.6 * height / width * len(rows) + 0.4)
-    grid = figure.subplots(len(rows), len(shown), squeeze=False)
-    image: Any = None
-    for row, (axes, (name, pictures)) in enumerate(zip(grid, rows.items(), strict=True)):
-        for axis, picture, frame in zip(axes, pictures, shown, strict=True):
-            drawn = axis.imshow(
-                picture, **({} if picture.ndim == 3 else {"vmin": 0, "vmax": _MOST_ERROR, "cmap": "magma"})
-            )
-            image = drawn if picture.ndim == 2 else image
-            axis.set_xticks([])
-            axis.set_yticks([])
-            axis.set_facecolor(_UNKNOWN)
-            if row == 0:
-                axis.set_title(f"frame {frame}", fontsize=9)
-        axes[0].set_ylabel(name, fontsize=9)
-    figure.colorbar(image, ax=grid[2:], label="relative error", shrink=0.8)
+    grid = _show_pictures(figure, rows, shown)
+    figure.colorbar(grid[-1, 0].images[0], ax=grid[2:], label="relative error", shrink=0.8)
     return figure
 
 
@@ -94,7 +97,8 @@ def _masks(curves: Curves) -> Figure:
     """Draw J of every frame, and below it true and predicted masks over some of the pictures."""
     first = next(iter(curves.values()))
     shown = first["shown"]
-    rows = {"truth": first["true_masks"]} | {method: own["masks"] for method, own in curves.items()}
+    masks = {"truth": first["true_masks"]} | {method: own["masks"] for method, own in curves.items()}
+    rows = {name: map(overlay, first["images"], own) for name, own in masks.items()}
     height, width = first["true_masks"].shape[1:]
     figure = _figure(2.6 * len(shown) + 0.8, 2.4 + 2.6 * height / width * len(rows))
     halves: Any = figure.subfigures(2, 1, height_ratios=[2.4, 2.6 * height / width * len(rows)])
@@ -105,15 +109,7 @@ def _masks(curves: Curves) -> Figure:
     axis.set(xlabel="frame", ylabel="J", ylim=(0, 1))
     axis.grid(alpha=0.3)
     axis.legend(fontsize=8, ncols=3, frameon=False)
-    grid = bottom.subplots(len(rows), len(shown), squeeze=False)
-    for row, (axes, (name, masks)) in enumerate(zip(grid, rows.items(), strict=True)):
-        for axis, image, mask, frame in zip(axes, first["images"], masks, shown, strict=True):
-            axis.imshow(overlay(image, mask))
-            axis.set_xticks([])
-            axis.set_yticks([])
-            if row == 0:
-                axis.set_title(f"frame {frame}", fontsize=9)
-        axes[0].set_ylabel(name, fontsize=9)
+    _show_pictures(bottom, rows, shown)
     return figure
 
 
@@ -128,7 +124,7 @@ def _distances(curves: Curves) -> Figure:
             axis.stairs(own[kind] / max(own[kind].sum(), 1), own["distance_bins"], label=method)
         axis.set(xscale="log", xlabel="distance", ylabel="share of points", title=title)
         axis.grid(alpha=0.3)
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    _add_legend(figure, 5)
     return figure
 
 
@@ -150,7 +146,7 @@ def _calibration(curves: Curves) -> Figure:
     right.set_title("reliability after one scale (dotted: before)", fontsize=10)
     for axis in (left, right):
         axis.grid(alpha=0.3)
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    _add_legend(figure, 5)
     return figure
 
 

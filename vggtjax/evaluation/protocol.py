@@ -95,11 +95,7 @@ def _trajectory(result: Result, truth: TruthAtPixels) -> _Outputs:
     poses = truth.poses
     errors = trajectory_errors(result.world_from_camera, poses)
     similarity = _alignment(result, poses, allow_line=True)
-    curves = {
-        "centres": similarity.apply(result.camera_centres),
-        "true_centres": poses[:, :3, 3],
-    }
-    return {"ate": errors.ate, "rte": errors.rte, "rre": errors.rre}, curves
+    return errors._asdict(), {"centres": similarity.apply(result.camera_centres), "true_centres": poses[:, :3, 3]}
 
 
 def _alignment(result: Result, poses: Float64[np.ndarray, "S 4 4"], *, allow_line: bool = False) -> Similarity:
@@ -179,9 +175,7 @@ def _depth_maps(result: Result, truth: TruthAtPixels, scale: float, shift: float
     }
 
 
-def depth_at_source(
-    result: Result,
-) -> tuple[Float32[np.ndarray, "S h w"], Bool[np.ndarray, "S h w"]]:
+def depth_at_source(result: Result) -> tuple[Float32[np.ndarray, "S h w"], Bool[np.ndarray, "S h w"]]:
     """Return the depth at the source's size, bilinear as in the protocols of video depth, and the pixels in the frame.
 
     Without a crop, that is a resize with half-pixel centres; a crop is undone first.
@@ -211,13 +205,10 @@ def _uncertainty(result: Result, truth: TruthAtPixels) -> _Outputs:
     if np.array_equal(predicted, true):
         raise AbsentError("all errors are 0; a confidence cannot be scored")
     scores = uncertainty_scores(predicted, true, precision)
-    removed, kept, oracle = sparsification_curve(np.abs(predicted - true), precision)
+    sparsification = sparsification_curve(np.abs(predicted - true), precision)
     levels, shares = reliability_curve(predicted - true, precision, 1.0)
     calibrated = reliability_curve(predicted - true, precision, scores.scale)[1]
-    curves = {
-        "sparsification": np.stack([removed, kept, oracle]),
-        "reliability": np.stack([levels, shares, calibrated]),
-    }
+    curves = {"sparsification": np.stack(sparsification), "reliability": np.stack([levels, shares, calibrated])}
     return {f"uncertainty_{key}" if key == "scale" else key: value for key, value in scores._asdict().items()}, curves
 
 

@@ -110,15 +110,9 @@ class ModelSource:
         if self._last is None or self._last[0] is not sequence:
             paths = [str(path) for path in sequence.pictures]
             self._last = sequence, read_clip(open_source(paths), Sampling(), self._fitter)
-        clip = self._last[1]
+        _, clip = self._last
         return reconstruct_methods(
-            self.model,
-            clip,
-            names,
-            options=self.options,
-            size=self._fitter.size,
-            fusion=self.fusion,
-            on_stage=on_stage,
+            self.model, clip, names, options=self.options, size=self._fitter.size, fusion=self.fusion, on_stage=on_stage
         )
 
 

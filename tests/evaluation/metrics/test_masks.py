@@ -15,7 +15,6 @@ from vggtjax.evaluation.metrics.masks import (
     jaccard,
     mask_scores,
     pooled_scores,
-    precision_recall,
 )
 
 NONE, SOME, MORE = (np.array(bits, bool).reshape(1, 2, 2) for bits in ([0, 0, 0, 0], [1, 0, 1, 0], [1, 1, 0, 0]))
@@ -59,24 +58,18 @@ def test_auc_of_bad_input_is_one_sentence(saliency, mask, sentence):
         auc(saliency, mask)
 
 
-def test_jaccard_precision_and_recall_by_hand():
+def test_jaccard_by_hand():
     assert jaccard(SOME, MORE) == pytest.approx(1 / 3)
     assert jaccard(SOME, SOME) == 1
     assert jaccard(NONE, SOME) == 0
     assert jaccard(NONE, NONE) == 1
-    everything = ~NONE
-    assert precision_recall(everything, SOME) == (0.5, 1)
-    assert precision_recall(SOME, everything) == (1, 0.5)
-    assert precision_recall(NONE, SOME) == (1, 0)
-    assert precision_recall(SOME, NONE) == (0, 1)
 
 
-@pytest.mark.parametrize("function", [jaccard, precision_recall])
-def test_masks_that_do_not_fit_are_one_sentence(function):
+def test_masks_that_do_not_fit_are_one_sentence():
     with pytest.raises(InputError, match=r"has shape \(2, 2\) and the true one \(1, 2, 2\)"):
-        function(SOME[0], SOME)
+        jaccard(SOME[0], SOME)
     with pytest.raises(InputError, match="expected bool"):
-        function(SOME.astype(np.uint8), SOME)
+        jaccard(SOME.astype(np.uint8), SOME)
 
 
 def rectangle(rows, columns, shape=(12, 16)) -> np.ndarray:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64
 
+from vggtjax.cameras import world_from_camera
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.trajectory import checked_poses
 
@@ -65,10 +66,4 @@ def world_from_camera_of(
     camera_from_world: Float[np.ndarray, "S 3 4"], source: Path | str
 ) -> Float64[np.ndarray, "S 4 4"]:
     """Return the inverse of poses; raises what `checked_world_from_camera` raises."""
-    poses = np.tile(np.eye(4), (len(camera_from_world), 1, 1))
-    poses[:, :3] = camera_from_world
-    checked_world_from_camera(poses, source)
-    rotation = poses[:, :3, :3].swapaxes(1, 2)
-    poses[:, :3, 3] = -np.einsum("sij,sj->si", rotation, poses[:, :3, 3])
-    poses[:, :3, :3] = rotation
-    return poses
+    return checked_world_from_camera(world_from_camera(np.asarray(camera_from_world, np.float64)), source)

@@ -8,6 +8,8 @@ pixel at (0, 0), as this library does.
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,22 +21,15 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.cameras import PIXEL_CENTRE, intrinsics_matrix
 from vggtjax.evaluation.datasets.folders import read_bytes
 
-
-class Model(NamedTuple):
-    """A camera model: its first parameters, and the number of its parameters."""
-
-    pinhole: str  # "f" for one focal length, "ff" for two; the principal point follows
-    parameters: int
-
-
-# By COLMAP's numbers, without fisheye models: K alone does not describe their cameras.
+# Camera models by COLMAP's numbers: numbers of focal lengths and of all parameters; the principal point follows the
+# focal lengths. Without fisheye models: K alone does not describe their cameras.
 _MODELS = {
-    0: Model("f", 3),  # SIMPLE_PINHOLE
-    1: Model("ff", 4),  # PINHOLE
-    2: Model("f", 4),  # SIMPLE_RADIAL
-    3: Model("f", 5),  # RADIAL
-    4: Model("ff", 8),  # OPENCV
-    6: Model("ff", 12),  # FULL_OPENCV
+    0: (1, 3),  # SIMPLE_PINHOLE
+    1: (2, 4),  # PINHOLE
+    2: (1, 4),  # SIMPLE_RADIAL
+    3: (1, 5),  # RADIAL
+    4: (2, 8),  # OPENCV
+    6: (2, 12),  # FULL_OPENCV
 }
 _POINT_BYTES = 24  # of an observation in images.bin: x, y, the point's number
 
@@ -46,12 +41,6 @@ class View(NamedTuple):
     size: tuple[int, int]  # width, height
     distorted: bool  # the lens has a distortion, which the intrinsics lack
     camera_from_world: Float64[np.ndarray, "3 4"]
-
-
-class _Camera(NamedTuple):
-    intrinsics: Float64[np.ndarray, "3 3"]
-    size: tuple[int, int]
-    distorted: bool
 
 
 def read_views(folder: Path) -> dict[str, View]:
@@ -72,25 +61,26 @@ def read_views(folder: Path) -> dict[str, View]:
         if not np.isfinite(pose).all() or abs(np.linalg.norm(quaternion) - 1) > 0.01:
             raise InputError(f"{reader.path} has an invalid pose of {name!r}; expected a quaternion of length 1")
         rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
-        views[name] = View(*cameras[camera], np.column_stack([rotation, translation]))
+        views[name] = cameras[camera](np.column_stack([rotation, translation]))
     return views
 
 
-def _read_cameras(path: Path) -> dict[int, _Camera]:
+def _read_cameras(path: Path) -> dict[int, Callable[[Float64[np.ndarray, "3 4"]], View]]:
+    """Return by number the cameras of a model as functions from a pose to a view."""
     reader = _Reader(path)
     cameras = {}
     for _ in range(reader.next("<Q")[0]):
         number, kind, width, height = reader.next("<iiQQ")
         if kind not in _MODELS:
             raise InputError(f"{path} has a camera of kind {kind}; expected one of {', '.join(map(str, _MODELS))}")
-        values = reader.next(f"<{_MODELS[kind].parameters}d")
-        focal = len(_MODELS[kind].pinhole)
+        focal, parameters = _MODELS[kind]
+        values = reader.next(f"<{parameters}d")
         fx, fy = values[0], values[focal - 1]
         cx, cy = values[focal : focal + 2]
         if not width or not height:
             raise InputError(f"{path} has a camera of {width} x {height} pixels; expected sizes above 0")
         intrinsics = intrinsics_matrix(fx, fy, cx, cy, first_pixel=PIXEL_CENTRE, source=path)
-        cameras[number] = _Camera(intrinsics, (width, height), any(values[focal + 2 :]))
+        cameras[number] = partial(View, intrinsics, (width, height), any(values[focal + 2 :]))
     return cameras
 
 

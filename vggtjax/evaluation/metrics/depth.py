@@ -19,22 +19,17 @@ class DepthErrors(NamedTuple):
     delta1: float
 
 
-def median_scale(
-    predicted: Float[np.ndarray, "*S H W"],
-    truth: Float[np.ndarray, "*S H W"],
-    valid: Bool[np.ndarray, "*S H W"] | None = None,
-) -> float:
+def median_scale(predicted: Float[np.ndarray, "*S H W"], truth: Float[np.ndarray, "*S H W"]) -> float:
     """Return the factor from a clip's predicted depth to the truth: the median of truth / predicted.
 
     Args:
         predicted: depth up to scale, above 0.
         truth: depth; values that are not finite and above 0 are unknown and do not count.
-        valid: pixels to use; all pixels with a known depth if None.
 
     Raises:
-        InputError: different shapes, no pixel to use, or a predicted depth there that is not finite and above 0.
+        InputError: different shapes, no known depth, or a predicted depth there that is not finite and above 0.
     """
-    predicted, truth = _used(predicted, truth, valid)
+    predicted, truth = _used(predicted, truth)
     return float(np.median(truth / predicted))
 
 
@@ -48,12 +43,13 @@ def depth_errors(
     """Return AbsRel and delta1 of a clip after one scale for all its frames.
 
     Args:
-        predicted, truth, valid: as for `median_scale`.
+        predicted, truth: as for `median_scale`.
+        valid: pixels to use; all pixels with a known depth if None.
         scale: factor of `predicted`; `median_scale` of the same pixels if None. The whole clip's scale shows how well a
             part of the clip is placed among the rest.
 
     Raises:
-        InputError: as `median_scale`.
+        InputError: as `median_scale`, and valid pixels that are not bool or none of which has a known depth.
     """
     predicted, truth = _used(predicted, truth, valid)
     scaled = predicted * (float(np.median(truth / predicted)) if scale is None else scale)
@@ -67,26 +63,7 @@ def measured(truth: Float[np.ndarray, "*S H W"]) -> Bool[np.ndarray, "*S H W"]:
     return np.isfinite(truth) & (truth > 0)
 
 
-def mean_depth_map(clips: Float[np.ndarray, "N S H W"]) -> Float64[np.ndarray, "H W"]:
-    """Return the mean known depth of every pixel over the frames of all clips: a guess that sees no image.
-
-    Broadcast to a clip's frames, it is aligned like a prediction.
-
-    Raises:
-        InputError: another number of axes than 4, or a pixel without depth in every frame.
-    """
-    clips = np.asarray(clips)
-    if clips.ndim != 4:
-        raise InputError(f"depths have shape {clips.shape}; expected clips [N, S, H, W]")
-    known = measured(clips)
-    counts = known.sum(axis=(0, 1))
-    if not counts.all():
-        raise InputError(f"{int((counts == 0).sum())} pixels have no depth in any frame; expected at least one")
-    return np.where(known, clips, 0).sum(axis=(0, 1), dtype=np.float64) / counts
-
-
-def _used(predicted, truth, valid) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
-    """Return predicted and true depths of the pixels to use."""
+def _used(predicted, truth, valid=None) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
     predicted, truth = np.asarray(predicted), np.asarray(truth)
     if predicted.shape != truth.shape:
         raise InputError(f"predicted depth has shape {predicted.shape} and the truth {truth.shape}; expected the same")

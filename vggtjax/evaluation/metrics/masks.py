@@ -20,13 +20,6 @@ _BINS = 4  # of a sequence, for the decay
 _BOUNDARY_WIDTH = 0.008  # largest distance of matched boundaries, in diagonals of the frame
 
 
-class PrecisionRecall(NamedTuple):
-    """Correct share of the predicted pixels, and predicted share of the true pixels."""
-
-    precision: float
-    recall: float
-
-
 class MaskScores(NamedTuple):
     """DAVIS' statistics of J (intersection over union) and F (boundaries) over frames.
 
@@ -75,14 +68,6 @@ def jaccard(predicted: Bool[np.ndarray, "*S H W"], truth: Bool[np.ndarray, "*S H
     predicted, truth = _masks(predicted, truth)
     union = int((predicted | truth).sum())
     return float((predicted & truth).sum() / union) if union else 1.0
-
-
-def precision_recall(predicted: Bool[np.ndarray, "*S H W"], truth: Bool[np.ndarray, "*S H W"]) -> PrecisionRecall:
-    """Return precision and recall; the precision of an empty prediction and the recall of an empty truth are 1."""
-    predicted, truth = _masks(predicted, truth)
-    correct = int((predicted & truth).sum())
-    positives, true_pixels = int(predicted.sum()), int(truth.sum())
-    return PrecisionRecall(correct / positives if positives else 1.0, correct / true_pixels if true_pixels else 1.0)
 
 
 def mask_scores(

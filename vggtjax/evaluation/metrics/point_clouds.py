@@ -40,13 +40,6 @@ class PointCloudErrors(NamedTuple):
     normal_consistency: float | None
 
 
-class _Direction(NamedTuple):
-    """The result of a search from one cloud in the other."""
-
-    distance: Statistics
-    normal_consistency: float | None
-
-
 def point_cloud_errors(
     predicted: Float[np.ndarray, "N 3"],
     truth: Float[np.ndarray, "M 3"],
@@ -71,28 +64,25 @@ def point_cloud_errors(
             or without a pair to compare.
     """
     predicted, truth = _cloud("predicted", predicted), _cloud("true", truth)
-    predicted_normals, true_normals = (None, None) if normals is None else normals
+    predicted_normals = true_normals = None
     if normals is not None:
         predicted_normals = _checked_normals("predicted", normals[0], predicted)
         true_normals = _checked_normals("true", normals[1], truth)
     total = len(predicted) + len(truth)
 
-    def look_up(source, target, source_normals, target_normals, before: int) -> _Direction:
+    def look_up(source, target, source_normals, target_normals, before: int):
         def advance(done: int) -> None:
             if progress is not None:
                 progress(before + done, total)
 
         distances, consistency = _nearest(source, target, source_normals, target_normals, advance)
-        return _Direction(statistics(distances), consistency)
+        return statistics(distances), consistency
 
-    accuracy = look_up(predicted, truth, predicted_normals, true_normals, 0)
-    completeness = look_up(truth, predicted, true_normals, predicted_normals, len(predicted))
-    both = zip(accuracy.distance, completeness.distance, strict=True)
-    consistency = None
-    if accuracy.normal_consistency is not None and completeness.normal_consistency is not None:
-        consistency = (accuracy.normal_consistency + completeness.normal_consistency) / 2
-    chamfer = Statistics(*((one + other) / 2 for one, other in both))
-    return PointCloudErrors(accuracy.distance, completeness.distance, chamfer, consistency)
+    accuracy, of_predicted = look_up(predicted, truth, predicted_normals, true_normals, 0)
+    completeness, of_true = look_up(truth, predicted, true_normals, predicted_normals, len(predicted))
+    chamfer = Statistics(*((one + other) / 2 for one, other in zip(accuracy, completeness, strict=True)))
+    consistency = None if of_predicted is None or of_true is None else (of_predicted + of_true) / 2
+    return PointCloudErrors(accuracy, completeness, chamfer, consistency)
 
 
 def paired_distance(predicted: Float[np.ndarray, "N 3"], truth: Float[np.ndarray, "N 3"]) -> Statistics:

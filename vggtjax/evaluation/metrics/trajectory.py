@@ -98,13 +98,9 @@ def centre_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray,
     Raises:
         InputError: fewer than 3 poses, or a trajectory that does not move.
     """
-    return point_error(*_pair_of_centres(predicted, truth))
-
-
-def point_error(predicted: Float[np.ndarray, "N 3"], truth: Float[np.ndarray, "N 3"]) -> float:
-    """Return the RMSE of points after Sim(3) alignment, in the truth's unit; raises as `umeyama_sim3` with lines."""
-    aligned = umeyama_sim3(predicted, truth, allow_line=True).apply(predicted)
-    return float(np.sqrt(((aligned - truth) ** 2).sum(axis=1).mean()))
+    source, target = _pair_of_centres(predicted, truth)
+    offsets = umeyama_sim3(source, target, allow_line=True).apply(source) - target
+    return float(np.sqrt((offsets**2).sum(axis=1).mean()))
 
 
 def rotation_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray, "S 3 4"]) -> float:

@@ -75,23 +75,15 @@ def video_depth_errors(
 
 
 def depth_alignment(
-    predicted: Float[np.ndarray, "*S"],
-    truth: Float[np.ndarray, "*S"],
-    align: Align = "scale",
-    *,
-    max_depth: float | None = None,
+    predicted: Float[np.ndarray, "*S"], truth: Float[np.ndarray, "*S"], align: Align = "scale"
 ) -> DepthLine:
     """Return the scale and the shift of `video_depth_errors`; arguments and errors are the same, for any shape."""
-    return _line(*_valid_pixels(predicted, truth, max_depth), align)
-
-
-def _median(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]) -> DepthLine:
-    return DepthLine(_ratio("median", float(np.median(predicted)), float(np.median(truth))))
+    return _line(*_valid_pixels(predicted, truth), align)
 
 
 def _scale(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]) -> DepthLine:
     """Return the scale of the least absolute error, by a fixed number of rounds of reweighted least squares."""
-    scale = _ratio("mean", float(predicted.mean()), float(truth.mean()))
+    scale = _ratio(np.mean, predicted, truth)
     for _ in range(_SCALE_ROUNDS):
         weighted = predicted / (np.abs(scale * predicted - truth) + _LEAST)
         scale = float(weighted @ truth / (weighted @ predicted))
@@ -131,7 +123,7 @@ def _least_absolute_line(predicted: Float64[np.ndarray, " N"], truth: Float64[np
 
 _ALIGNMENTS: dict[str, Callable[[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]], DepthLine]] = {
     "metric": lambda predicted, truth: DepthLine(1.0),
-    "median": _median,
+    "median": lambda predicted, truth: DepthLine(_ratio(np.median, predicted, truth)),
     "scale": _scale,
     "scale-shift": _least_absolute_line,
 }
@@ -143,13 +135,14 @@ def _line(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]
     return _ALIGNMENTS[align](predicted, truth)
 
 
-def _ratio(name: str, predicted: float, truth: float) -> float:
-    if predicted <= 0:
-        raise InputError(f"the {name} of the predicted depth is {predicted:.6g}; expected it above 0")
-    return truth / predicted
+def _ratio(average: Callable, predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]) -> float:
+    divisor = float(average(predicted))
+    if divisor <= 0:
+        raise InputError(f"the {average.__name__} of the predicted depth is {divisor:.6g}; expected it above 0")
+    return float(average(truth)) / divisor
 
 
-def _valid_pixels(predicted, truth, max_depth) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
+def _valid_pixels(predicted, truth, max_depth=None) -> tuple[Float64[np.ndarray, " N"], Float64[np.ndarray, " N"]]:
     predicted, truth = np.asarray(predicted), np.asarray(truth)
     if predicted.shape != truth.shape:
         raise InputError(
