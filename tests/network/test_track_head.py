@@ -117,7 +117,7 @@ def test_gradients_reach_parameters_and_taps(head, config):
         (("tracks",), None, "go together"),
         (("tracks",), np.zeros((3, 2)), "have shape"),
         (("tracks",), np.zeros((2, 3, 2)), "have shape"),
-        (("tracks",), np.zeros((1, 0, 2)), "are empty"),
+        (("tracks",), np.zeros((1, 0, 2)), "with at least one point"),
         (("tracks",), np.zeros((1, 3, 2)), "at least 32 pixels"),
     ],
 )

@@ -209,9 +209,9 @@ _DEPTH_SCORES = ("abs_rel", "abs_rel_static", "abs_rel_dynamic", "delta1")
 def _depth_scores(depth: Float[np.ndarray, "S H W"], truth: Truth) -> dict[str, float | None]:
     scale, known = median_scale(depth, truth.depth), measured(truth.depth)
     whole = depth_errors(depth, truth.depth, scale=scale)
-    regions = {"abs_rel_static": ~truth.dynamic_mask, "abs_rel_dynamic": truth.dynamic_mask}
-    within = {
-        name: depth_errors(depth, truth.depth, region, scale=scale).abs_rel if (region & known).any() else None
-        for name, region in regions.items()
-    }
-    return {"abs_rel": whole.abs_rel, "delta1": whole.delta1, **within}
+
+    def within(region: Bool[np.ndarray, "S H W"]) -> float | None:
+        return depth_errors(depth, truth.depth, region, scale=scale).abs_rel if (region & known).any() else None
+
+    values = (whole.abs_rel, within(~truth.dynamic_mask), within(truth.dynamic_mask), whole.delta1)
+    return dict(zip(_DEPTH_SCORES, values, strict=True))

@@ -70,8 +70,7 @@ def _paths(curves: Curves) -> Figure:
             style: dict[str, Any] = {"color": "black", "linewidth": 2.5} if method == "truth" else {"linewidth": 1.2}
             axis.plot(x, y, marker=".", label=method, **style)
         axis.set_aspect("equal", adjustable="datalim")
-        axis.set_xlabel(f"{labels[0]} principal axis")
-        axis.set_ylabel(labels[1])
+        axis.set(xlabel=f"{labels[0]} principal axis", ylabel=labels[1])
         axis.grid(alpha=0.3)
     _add_legend(figure, 6)
     return figure
@@ -101,8 +100,7 @@ def _masks(curves: Curves) -> Figure:
     rows = {name: map(overlay, first["images"], own) for name, own in masks.items()}
     height, width = first["true_masks"].shape[1:]
     figure = _figure(2.6 * len(shown) + 0.8, 2.4 + 2.6 * height / width * len(rows))
-    halves: Any = figure.subfigures(2, 1, height_ratios=[2.4, 2.6 * height / width * len(rows)])
-    top, bottom = halves
+    top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=[2.4, 2.6 * height / width * len(rows)]))
     axis = top.subplots()
     for method, own in curves.items():
         axis.plot(own["j"], marker=".", label=f"{method}")
@@ -116,10 +114,8 @@ def _masks(curves: Curves) -> Figure:
 def _distances(curves: Curves) -> Figure:
     """Draw the distances of points to the nearest points of the other cloud."""
     figure = _figure(9, 3.4)
-    for place, (kind, title) in enumerate(
-        (("accuracy", "accuracy: predicted to true"), ("completeness", "completeness: true to predicted"))
-    ):
-        axis = figure.add_subplot(1, 2, place + 1)
+    titles = {"accuracy": "accuracy: predicted to true", "completeness": "completeness: true to predicted"}
+    for axis, (kind, title) in zip(figure.subplots(1, 2), titles.items(), strict=True):
         for method, own in curves.items():
             axis.stairs(own[kind] / max(own[kind].sum(), 1), own["distance_bins"], label=method)
         axis.set(xscale="log", xlabel="distance", ylabel="share of points", title=title)

@@ -52,7 +52,7 @@ class GramCues:
         The patches are the last tokens of a frame; the tokens before them are excluded. Of clips with a `frame_count`
         only the real frames are sources, and each of them must have one at the offsets.
         """
-        B, S = q.shape[:2]
+        B, S, _, heads, _ = q.shape
         index, weights = sources(S, self.motion.offsets)
         weights = jnp.broadcast_to(weights, (B, *weights.shape))
         if frame_count is not None:
@@ -69,11 +69,13 @@ class GramCues:
             ) -> Float[Array, "S ..."]:
                 def mean_similarity(frame):
                     row, index, weights = frame
-                    return _mean_similarity(vectors(row), jnp.einsum("m,mnd->nd", weights, means[index]))
+                    source = jnp.einsum("m,mnd->nd", weights, means[index])
+                    return jnp.einsum("pnd,nd->p", vectors(row), source) / heads
 
                 def deviation(frame):
                     row, index, weights = frame
-                    gram = _similarities(vectors(row), jnp.einsum("m,mpnd->pnd", weights, vectors(columns[index])))
+                    source = jnp.einsum("m,mpnd->pnd", weights, vectors(columns[index]))
+                    gram = jnp.einsum("pnd,jnd->pj", vectors(row), source) / heads
                     return gram if self._keeps_gram(cue) else _sample_std(gram)
 
                 frames = (rows, index, weights)
@@ -145,14 +147,6 @@ def normalise(values: Float[Array, "B S P"]) -> Float[Array, "B S P"]:
     """Min-max normalise per frame: (m - min) / (max - min + 1e-6)."""
     low, high = values.min(axis=-1, keepdims=True), values.max(axis=-1, keepdims=True)
     return (values - low) / (high - low + _EPSILON)
-
-
-def _mean_similarity(rows: Float[Array, "P N D"], source_mean: Float[Array, "N D"]) -> Float[Array, " P"]:
-    return jnp.einsum("pnd,nd->p", rows, source_mean) / rows.shape[1]
-
-
-def _similarities(rows: Float[Array, "P N D"], columns: Float[Array, "J N D"]) -> Float[Array, "P J"]:
-    return jnp.einsum("pnd,jnd->pj", rows, columns) / rows.shape[1]
 
 
 def _unit(x: Float[Array, "... D"]) -> Float[Array, "... D"]:

@@ -91,11 +91,10 @@ class DPTFeatures(nn.Module):
         levels = [
             nn.Conv(self.features, (3, 3), use_bias=False, name=f"level{i}")(level) for i, level in enumerate(levels)
         ]
-        x, lateral = levels[3], None
+        x = levels[3]
         for i in (3, 2, 1, 0):
-            lateral = levels[i] if i < 3 else None
             size = levels[i - 1].shape[1:3] if i else (2 * x.shape[1], 2 * x.shape[2])
-            x = Fusion(name=f"fusion{i}")(x, lateral, size)
+            x = Fusion(name=f"fusion{i}")(x, levels[i] if i < 3 else None, size)
         return nn.Conv(self.out_features, (3, 3), name="output")(x)
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtjax.config import HEAD_NAMES, Suppress, VGGTConfig
+from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, aggregate, declare_aggregator
 from vggtjax.network.backbone import declare_backbone, encode, patch_grid
@@ -146,11 +146,7 @@ def predict(
     fields: dict[str, Any] = {"cue_sums": sums}
     if "camera" in outputs:
         fields["pose_encoding"] = predict_pose(
-            params,
-            camera_tokens,
-            config,
-            frame_count=clips.frame_count,
-            stop_gradient=compute.stop_camera_gradient,
+            params, camera_tokens, config, frame_count=clips.frame_count, stop_gradient=compute.stop_camera_gradient
         )
     regress = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4)) if compute.remat else predict_dense
     for name, field in (("depth", "depth"), ("points", "world_points")):
@@ -161,14 +157,12 @@ def predict(
     if query_points is not None:
         head = HEADS["tracks"]
         tracks = predict_tracks(params[head], [tap[head] for tap in taps], query_points, config, grid)
-        names = ("tracks", "track_visibility", "track_confidence")
-        fields |= dict(zip(names, tracks, strict=True))
+        fields |= zip(("tracks", "track_visibility", "track_confidence"), tracks, strict=True)
     return Predictions(**fields)
 
 
 def parameter_shapes(config: VGGTConfig) -> Params:
     """Return the parameter tree's shapes and dtypes (`jax.ShapeDtypeStruct` leaves) without allocating arrays."""
-
     declarations = {
         "camera": declare_camera_head,
         "depth": partial(declare_dense_head, kind="depth"),
@@ -226,8 +220,6 @@ def _check(grid: tuple[int, int], clips: ClipBatch, config: VGGTConfig, outputs:
         raise InputError(f"patch_tokens have shape {tuple(clips.patch_tokens.shape)}; expected {tokens_shape}")
     if clips.frame_count is not None and tuple(clips.frame_count.shape) != tokens_shape[:1]:
         raise InputError(f"frame_count has shape {tuple(clips.frame_count.shape)}; expected {tokens_shape[:1]}")
-    if unknown := [name for name in outputs if name not in HEAD_NAMES]:
-        raise InputError(f"outputs has {unknown}; expected some of {HEAD_NAMES}")
     if absent := [name for name in outputs if name not in config.heads]:
         raise InputError(f"outputs has {absent}; this model has only the heads {config.heads}")
 
@@ -240,10 +232,9 @@ def _check_queries(clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str],
         return
     if clips.frame_count is not None:
         raise InputError("frame_count and query_points are given; tracking requires clips whose frames are all real")
-    if len(query_points.shape) != 3 or query_points.shape[0] != B or query_points.shape[2] != 2:
-        raise InputError(f"query_points have shape {tuple(query_points.shape)}; expected {(B, 'Q', 2)}")
-    if query_points.shape[1] < 1:
-        raise InputError("query_points are empty; give at least one point")
+    shape = tuple(query_points.shape)
+    if len(shape) != 3 or shape != (B, max(shape[1], 1), 2):
+        raise InputError(f"query_points have shape {shape}; expected [{B}, Q, 2] with at least one point")
     if min(H, W) < smallest_side(config):
         raise InputError(
             f"tracks need frames of at least {smallest_side(config)} pixels a side; these have {H} x {W}: "

@@ -33,12 +33,7 @@ _PER_METRE = 5000.0
 _TOLERANCE = 0.02  # seconds between the timestamps of a picture and of its depth or pose
 _CAMERA = re.compile(r"(?:freiburg|(?<![a-z])fr)([123])(?!\d)")
 # fx fy cx cy of the colour cameras. The pictures of freiburg3 have no distortion.
-_FREIBURG = {
-    "1": (517.3, 516.5, 318.6, 255.3),
-    "2": (520.9, 521.0, 325.1, 249.7),
-    "3": (535.4, 539.2, 320.1, 247.6),
-}
-_DISTORTED = ("1", "2")
+_FREIBURG = {"1": (517.3, 516.5, 318.6, 255.3), "2": (520.9, 521.0, 325.1, 249.7), "3": (535.4, 539.2, 320.1, 247.6)}
 _BONN = (542.822841, 542.576870, 315.593520, 237.756098)
 # Bonn tracks markers on the camera. Its page takes a point of the camera to the world by ROS T ROS MARKERS, with T from
 # groundtruth.txt. The 3 x 3 part of MARKERS is a rotation times 1.059; the poses take the rotation alone.
@@ -174,12 +169,12 @@ def _listed(folder: Path, name: str) -> Files:
         if not words:
             continue
         try:
-            time, file = float(words[0]), words[1]
-        except (ValueError, IndexError):
-            raise InputError(f"{path} has {line[:80]!r} in line {number}; expected a timestamp and a path") from None
-        if not math.isfinite(time) or len(words) != 2:
+            time, valid = float(words[0]), len(words) == 2
+        except ValueError:
+            time, valid = 0.0, False
+        if not valid or not math.isfinite(time):
             raise InputError(f"{path} has {line[:80]!r} in line {number}; expected a timestamp and a path")
-        entries.append((time, inside(folder, file, path)))
+        entries.append((time, inside(folder, words[1], path)))
     if not entries:
         raise InputError(f"{path} names no files; expected lines of a timestamp and a path")
     entries.sort(key=lambda entry: (entry[0], natural_key(entry[1])))
@@ -206,6 +201,5 @@ def _tum_intrinsics(folder: Path) -> tuple[Float64[np.ndarray, "3 3"] | None, tu
         return intrinsics_matrix(fx, fy, cx, cy, first_pixel=0, source=path), ()
     if not (match := _CAMERA.search(folder.resolve().name.lower())):
         return None, ("its camera is unknown; name the folder after the camera, or put fx fy cx cy in calibration.txt",)
-    camera = match[1]
-    matrix = intrinsics_matrix(*_FREIBURG[camera], first_pixel=0, source=f"freiburg{camera}")
-    return matrix, (DISTORTED,) * (camera in _DISTORTED)
+    matrix = intrinsics_matrix(*_FREIBURG[match[1]], first_pixel=0, source=f"freiburg{match[1]}")
+    return matrix, () if match[1] == "3" else (DISTORTED,)

@@ -142,11 +142,7 @@ def nearest_distances(
 
 
 def statistics(distances: Float[np.ndarray, " N"]) -> Statistics:
-    """Return mean and median of distances.
-
-    Raises:
-        InputError: no distance.
-    """
+    """Return mean and median of distances. Raises InputError if there is no distance."""
     distances = np.asarray(distances, np.float64)
     if not distances.size:
         raise InputError("no distances; expected at least 1")

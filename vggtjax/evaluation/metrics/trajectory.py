@@ -95,8 +95,7 @@ def align(camera_from_world: Float[np.ndarray, "S 3 4"], similarity: Similarity)
 def centre_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray, "S 3 4"]) -> float:
     """Return the RMSE of the camera centres after Sim(3) alignment, in the truth's unit (ATE).
 
-    Raises:
-        InputError: fewer than 3 poses, or a trajectory that does not move.
+    Raises InputError for fewer than 3 poses, or a trajectory that does not move.
     """
     source, target = _pair_of_centres(predicted, truth)
     offsets = umeyama_sim3(source, target, allow_line=True).apply(source) - target
@@ -106,10 +105,7 @@ def centre_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray,
 def rotation_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray, "S 3 4"]) -> float:
     """Return the mean angle in degrees between rotations relative to frame 0, over frames 1 to S - 1.
 
-    Both trajectories are expressed relative to their own first frame; nothing is aligned.
-
-    Raises:
-        InputError: fewer than 2 poses, or different numbers of poses.
+    Nothing is aligned. Raises InputError for fewer than 2 poses, or different numbers of poses.
     """
     predicted, truth = _pair(predicted, truth, 2)
     return float(np.degrees((from_first(predicted) * from_first(truth).inv()).magnitude().mean()))

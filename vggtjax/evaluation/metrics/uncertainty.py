@@ -115,10 +115,8 @@ def ause(errors: Float[np.ndarray, "*S"], confidence: Float[np.ndarray, "*S"]) -
     """Return the area between the sparsification curve and the oracle's, divided by the mean |error|.
 
     Both curves have 20 steps; the area is the sum of trapezoids over the removed shares 0 to 0.95. 0 is the score of
-    the oracle's own order, and of errors that are all 0 (Ilg et al. 2018, with |error|).
-
-    Raises:
-        InputError: as `sparsification_curve`.
+    the oracle's own order, and of errors that are all 0 (Ilg et al. 2018, with |error|). Raises InputError as
+    `sparsification_curve`.
     """
     curve = sparsification_curve(errors, confidence)
     area = float(np.trapezoid(curve.remaining - curve.oracle, curve.fractions))
@@ -128,8 +126,7 @@ def ause(errors: Float[np.ndarray, "*S"], confidence: Float[np.ndarray, "*S"]) -
 def calibrated_scale(errors: Float[np.ndarray, "*S"], precision: Float[np.ndarray, "*S"]) -> float:
     """Return the c of maximum likelihood for errors with sigma^2 = c / precision: the mean of precision * error^2.
 
-    Raises:
-        InputError: different shapes, no pixel, values that are not finite, a precision that is not above 0.
+    Raises InputError for different shapes, no pixel, values that are not finite, a precision that is not above 0.
     """
     errors, precision = _claimed(errors, precision)
     return float((precision * errors**2).mean())
@@ -138,8 +135,7 @@ def calibrated_scale(errors: Float[np.ndarray, "*S"], precision: Float[np.ndarra
 def gaussian_nll(errors: Float[np.ndarray, "*S"], precision: Float[np.ndarray, "*S"], scale: float = 1.0) -> float:
     """Return the mean of log(2 pi sigma^2) / 2 + error^2 / (2 sigma^2), sigma^2 = scale / precision, in nats.
 
-    Raises:
-        InputError: as `calibrated_scale`.
+    Raises InputError as `calibrated_scale`.
     """
     errors, precision = _claimed(errors, precision)
     variance = scale / precision
