@@ -35,15 +35,8 @@ def save_calibration(
 ) -> Path:
     """Write the calibrated model, the numbers and the picture; return the model's path.
 
-    Args:
-        folder: made if missing; an earlier calibration in it is replaced.
-        model: the calibrated model.
-        sweep: result of `sweep`.
-        choice: result of `choose`.
-        source: JSON values that describe the clips, for calibration.json.
-
-    Raises:
-        OutputError: the folder cannot be written, or holds files with these names of another origin.
+    The folder is made if missing; an earlier calibration in it is replaced. `source` are JSON values about the clips.
+    Raises OutputError if the folder cannot be written, or holds files with these names of another origin.
     """
     folder = Path(folder)
     check_folder(folder)
@@ -88,13 +81,8 @@ def calibration_numbers(
         },
         "default_table": {"motion": dataclasses.asdict(sweep.table), "auc": _rating(choice.table)},
         "sweep": [
-            {
-                "gram": gram,
-                "rows": kind.rows,
-                "columns": kind.columns,
-                "statistic": kind.statistic,
-                "auc_of_layers": [round(float(value), 6) for value in auc[g, c]],  # on all clips
-            }
+            {"gram": gram, "rows": kind.rows, "columns": kind.columns, "statistic": kind.statistic}
+            | {"auc_of_layers": auc[g, c].round(6).tolist()}  # on all clips
             for g, gram in enumerate(GRAMS)
             for c, kind in enumerate(KINDS)
         ],

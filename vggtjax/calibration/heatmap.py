@@ -9,11 +9,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from vggtjax.calibration.choice import Choice
 from vggtjax.calibration.sweep import GRAMS, KINDS, kind_index
+from vggtjax.errors import one_line
 from vggtjax.results.previews import BACKGROUND, FAINT, TEXT
 
-_COLORS = (
-    (Colormap("colorbrewer:RdBu_r").lut(256)[:, :3] * 255).round().astype(np.uint8)
-)  # blue below one half, red above
+# Blue below one half, red above.
+_COLORS = (Colormap("colorbrewer:RdBu_r").lut(256)[:, :3] * 255).round().astype(np.uint8)
 _DARK, _OUTLINE = (20, 20, 24), (30, 200, 90)
 _CELL, _GAP, _MARGIN = (46, 30), 26, 24  # width and height; between the similarities; around everything
 _LABEL_WIDTH, _HEADER_HEIGHT, _LINE, _LEGEND = 150, 96, 22, (256, 12)
@@ -36,8 +36,7 @@ def draw_sweep(auc: Float64[np.ndarray, "G C L"], choice: Choice, *, title: str 
     sheet = Image.new("RGB", (width, bottom + (len(choice.steps) + 2) * _LINE + _MARGIN), BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     large, small, tiny = (ImageFont.load_default(size) for size in (22, 15, 12))
-    title = title if len(title) <= _MOST_LETTERS else f"{title[: _MOST_LETTERS - 1]}…"
-    draw.text((_MARGIN, _MARGIN), f"Motion cues of {title or 'the model'}", TEXT, large)
+    draw.text((_MARGIN, _MARGIN), f"Motion cues of {one_line(title, _MOST_LETTERS) or 'the model'}", TEXT, large)
     draw.text((_MARGIN, _MARGIN + 32), "area under the ROC curve of every pair's map for moving tokens", FAINT, small)
     _draw_legend(sheet, draw, small, reach, width)
 
@@ -63,15 +62,14 @@ def draw_sweep(auc: Float64[np.ndarray, "G C L"], choice: Choice, *, title: str 
         draw.rectangle((x - 2, y - 2, x + 10, y + 12), _OUTLINE)
         draw.text((x + 4, y + 5), str(number), _DARK, tiny, "mm")
     heading = f"Chosen for {choice.gram} similarity; AUC of the product of each cue and those above it"
-    rows = [(heading, ("calibration", "held-out half"), FAINT)]
-    rated = [
-        (f"{number}  {step.cue.name}{'  (1 - m)' if step.cue.inverted else ''}", step.rating, TEXT)
-        for number, step in enumerate(choice.steps, 1)
-    ]
-    for name, (calibration, held_out), ink in (*rated, ("default table", choice.table, FAINT)):
-        rows.append((name, (f"{calibration:.3f}", f"{held_out:.3f}"), ink))
-    for number, (name, values, ink) in enumerate(rows):
-        for text, x in zip((name, *values), _COLUMNS, strict=True):
+    rows: list[tuple[str, ...]] = [(heading, "calibration", "held-out half")]
+    for number, (cue, rating) in enumerate(choice.steps, 1):
+        name = f"{number}  {cue.name}{'  (1 - m)' if cue.inverted else ''}"
+        rows.append((name, *(f"{area:.3f}" for area in rating)))
+    rows.append(("default table", *(f"{area:.3f}" for area in choice.table)))
+    for number, row in enumerate(rows):
+        ink = TEXT if 0 < number < len(rows) - 1 else FAINT
+        for text, x in zip(row, _COLUMNS, strict=True):
             draw.text((x, bottom + number * _LINE), text, ink, small)
     return np.asarray(sheet)
 

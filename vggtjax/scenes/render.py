@@ -13,7 +13,7 @@ from vggtjax.network.precision import full_precision
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.sampling import sample_scene
 from vggtjax.scenes.scene import ROOM_FACES, Scene, camera_pose, compose, invert, part_poses
-from vggtjax.scenes.shapes import SHAPES
+from vggtjax.scenes.shapes import SHAPES, slabs
 from vggtjax.scenes.textures import Textures, sample
 
 _SELF = 1e-3  # share of the ray to the light in which a surface does not shade itself
@@ -60,9 +60,7 @@ def generate(key: Array, textures: Textures, config: SceneConfig) -> SyntheticCl
 def intrinsics_of(scene: Scene, config: SceneConfig) -> Float[Array, "3 3"]:
     """Return the camera's intrinsics in pixels: square pixels, principal point at the image centre."""
     focal = config.width / 2 / jnp.tan(scene.camera.half_angle)
-    zero, one = jnp.zeros(()), jnp.ones(())
-    row = [focal, zero, one * config.width / 2, zero, focal, one * config.height / 2, zero, zero, one]
-    return jnp.stack(row).reshape(3, 3)
+    return jnp.array([[focal, 0, config.width / 2], [0, focal, config.height / 2], [0, 0, 1]])
 
 
 @full_precision
@@ -78,8 +76,7 @@ def cast(
     poses = part_poses(scene, config, time)
     near, _ = _intervals(scene, config, poses, origin[:, None], direction)
     enter = jnp.where(near > 0, near, jnp.inf)  # parts around the camera are invisible
-    step = jnp.where(jnp.abs(direction) < 1e-9, 1e-9, direction)
-    walls = jnp.maximum((scene.room_low - origin)[:, None] / step, (scene.room_high - origin)[:, None] / step)
+    _, walls = slabs(origin[:, None], direction, scene.room_low[:, None], scene.room_high[:, None])
     depths = jnp.concatenate([walls.min(axis=0, keepdims=True), enter])  # [1 + K, P]
     part_ids = jnp.argmin(depths, axis=0)
     depth = depths.min(axis=0)
@@ -103,22 +100,21 @@ def _frame(scene: Scene, textures: Textures, config: SceneConfig, time: Array, s
     if config.samples > 1 or (config.exposures > 1 and config.shutter > 0):
         offsets = (np.stack(np.meshgrid(*2 * [np.arange(config.samples)]), -1).reshape(-1, 2) + 0.5) / config.samples
         opened = config.shutter * step * (np.arange(config.exposures) / config.exposures)
-        pairs = [(o, t) for o in offsets.astype(np.float32) for t in opened.astype(np.float32)]
 
-        def one(total, pair):
-            offset, delay = pair
+        def one(total, ray):
+            offset, delay = ray
             return total + cast(scene, textures, config, time + delay, jnp.asarray(corners) + offset[None]).colour, None
 
-        columns = tuple(jnp.asarray(np.stack(column)) for column in zip(*pairs, strict=True))
-        colour = jax.lax.scan(one, jnp.zeros_like(colour), columns)[0] / len(pairs)
+        rays = np.repeat(offsets, len(opened), axis=0), np.tile(opened, len(offsets))
+        rays = jax.tree.map(lambda values: jnp.asarray(values, jnp.float32), rays)
+        colour = jax.lax.scan(one, jnp.zeros_like(colour), rays)[0] / len(rays[0])
     colour = jnp.clip(colour * jnp.exp(scene.exposure.at(time))[:, None], 0, 1)
 
     objects = np.concatenate([[0], np.asarray(config.objects) + 1])
     moving = jnp.concatenate([jnp.zeros(1, bool), scene.moving])[objects]
     poses, later = (_poses_with_room(scene, config, t) for t in (time, time + step))
     motion = compose(later, invert(poses))  # [1 + K, 3, 4]
-    chosen = _one_hot(truth.part_ids, len(objects)).T @ motion.reshape(len(objects), 12)  # [P, 12]
-    chosen = chosen.reshape(-1, 3, 4)
+    chosen = (_one_hot(truth.part_ids, len(objects)).T @ motion.reshape(len(objects), 12)).reshape(-1, 3, 4)
     flow = jnp.einsum("pij,jp->pi", chosen[..., :3] - jnp.eye(3)[None], truth.point) + chosen[..., 3]
     rotation, centre = camera_pose(scene.camera, time)
     return SyntheticClip(

@@ -46,13 +46,7 @@ class _Draws:
 
 
 def sample_scene(key: Array, tiles: int, config: SceneConfig) -> Scene:
-    """Draw a scene. Pure; `config` is static.
-
-    Args:
-        key: a JAX random key.
-        tiles: number of texture tiles.
-        config: what the scene may contain.
-    """
+    """Draw a scene from a JAX random key and a number of texture tiles. Pure; `config` is static."""
     objects = np.asarray(config.objects)
     K, count = len(objects), max(config.objects) + 1
     draw = _Draws(key, 40 * K + 40 * count + 400)

@@ -9,12 +9,17 @@ Interval = tuple[Float[Array, "K P"], Float[Array, "K P"]]
 _TINY = 1e-9  # a ray parallel to a face is turned by this much
 
 
+def slabs(origin: Array, direction: Array, low: Array | float, high: Array | float) -> tuple[Array, Array]:
+    """Return where rays enter and leave slabs between two planes, for every coordinate by itself."""
+    step = jnp.where(jnp.abs(direction) < _TINY, _TINY, direction)
+    first, second = (low - origin) / step, (high - origin) / step
+    return jnp.minimum(first, second), jnp.maximum(first, second)
+
+
 def box(origin: Float[Array, "K 3 #P"], direction: Float[Array, "K 3 P"], size: Float[Array, "K 3"]) -> Interval:
     """Return where rays enter and leave boxes of half extents `size`; rays that miss leave before they enter."""
-    step = jnp.where(jnp.abs(direction) < _TINY, _TINY, direction)
-    low = (-size[..., None] - origin) / step
-    high = (size[..., None] - origin) / step
-    return jnp.minimum(low, high).max(axis=-2), jnp.maximum(low, high).min(axis=-2)
+    near, far = slabs(origin, direction, -size[..., None], size[..., None])
+    return near.max(axis=-2), far.min(axis=-2)
 
 
 def ellipsoid(origin: Float[Array, "K 3 #P"], direction: Float[Array, "K 3 P"], size: Float[Array, "K 3"]) -> Interval:
@@ -30,9 +35,8 @@ def cylinder(origin: Float[Array, "K 3 #P"], direction: Float[Array, "K 3 P"], s
     b = o[..., 0, :] * d[..., 0, :] + o[..., 2, :] * d[..., 2, :]
     c = o[..., 0, :] ** 2 + o[..., 2, :] ** 2 - 1
     side_in, side_out = _quadratic(jnp.maximum(a, _TINY), b, c)
-    step = jnp.where(jnp.abs(d[..., 1, :]) < _TINY, _TINY, d[..., 1, :])
-    low, high = (-1 - o[..., 1, :]) / step, (1 - o[..., 1, :]) / step
-    return jnp.maximum(side_in, jnp.minimum(low, high)), jnp.minimum(side_out, jnp.maximum(low, high))
+    caps_in, caps_out = slabs(o[..., 1, :], d[..., 1, :], -1, 1)
+    return jnp.maximum(side_in, caps_in), jnp.minimum(side_out, caps_out)
 
 
 def box_normal(point: Float[Array, "3 P"], size: Float[Array, "3 P"]) -> Float[Array, "3 P"]:

@@ -23,9 +23,7 @@ _UNMIXED = ("parts", "flow")  # mixed colours have no meaning
 def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
     """Draw up to eight scenes, evenly spread, a row each: three frames, then depth, mask, parts and flow of the middle.
 
-    Args:
-        scenes: folders that `write_scenes` wrote, of images of one size.
-        title: of the preview.
+    `scenes` are folders that `write_scenes` wrote, of images of one size.
     """
     chosen = [scenes[i] for i in np.linspace(0, len(scenes) - 1, min(len(scenes), _MOST_ROWS)).round().astype(int)]
     rows = [_row(scene) for scene in chosen]
@@ -34,22 +32,18 @@ def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
     size = max(1, round(width * scale)), max(1, round(height * scale))
     step_x, step_y = size[0] + _GAP, size[1] + _GAP
     left, top = _MARGIN + _LABEL, _MARGIN + _HEADER
-    sheet = Image.new(
-        "RGB",
-        (left + len(_COLUMNS) * step_x - _GAP + _MARGIN, top + len(rows) * step_y - _GAP + _MARGIN),
-        BACKGROUND,
-    )
+    right, bottom = left + len(_COLUMNS) * step_x - _GAP, top + len(rows) * step_y - _GAP
+    sheet = Image.new("RGB", (right + _MARGIN, bottom + _MARGIN), BACKGROUND)
     draw = ImageDraw.Draw(sheet)
     large, small = ImageFont.load_default(22), ImageFont.load_default(15)
     draw.text((_MARGIN, _MARGIN), title, TEXT, large)
-    for column, name in enumerate(_COLUMNS):
-        draw.text((left + column * step_x, top - 24), name, FAINT, small)
-    for row, (scene, pictures) in enumerate(zip(chosen, rows, strict=True)):
-        y = top + row * step_y
+    for x, name in zip(range(left, right, step_x), _COLUMNS, strict=True):
+        draw.text((x, top - 24), name, FAINT, small)
+    for y, scene, pictures in zip(range(top, bottom, step_y), chosen, rows, strict=True):
         draw.text((_MARGIN, y), scene.name, TEXT, small)
-        for column, picture in enumerate(pictures):
-            filtering = Image.Resampling.NEAREST if _COLUMNS[column] in _UNMIXED else Image.Resampling.LANCZOS
-            sheet.paste(Image.fromarray(picture).resize(size, filtering), (left + column * step_x, y))
+        for x, name, picture in zip(range(left, right, step_x), _COLUMNS, pictures, strict=True):
+            filtering = Image.Resampling.NEAREST if name in _UNMIXED else Image.Resampling.LANCZOS
+            sheet.paste(Image.fromarray(picture).resize(size, filtering), (x, y))
     return sheet
 
 

@@ -54,13 +54,10 @@ def load_textures(split: Split = "training") -> Textures:
 def sample(
     textures: Textures, tile: Int[Array, " P"], uv: Float[Array, "2 P"], footprint: Float[Array, " P"]
 ) -> Float[Array, "3 P"]:
-    """Return bilinear samples, RGB in [0, 1].
+    """Return bilinear samples, RGB in [0, 1], of every pixel's tile.
 
-    Args:
-        textures: the tiles.
-        tile: index of the tile of every pixel.
-        uv: position in units of a tile's side; outside [0, 1] the tile repeats, mirrored.
-        footprint: size of a pixel on the tile, in the same units; it decides the level of the pyramid.
+    The position `uv` is in units of a tile's side; outside [0, 1] the tile repeats, mirrored. The pixel's footprint on
+    the tile, in the same units, decides the level of the pyramid.
     """
     level = jnp.log2(jnp.maximum(footprint * SIDES[0], 1e-6))
     level = jnp.clip(jnp.round(level), 0, len(SIDES) - 1).astype(jnp.int32)

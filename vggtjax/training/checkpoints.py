@@ -40,14 +40,8 @@ def latest(folder: str | Path) -> int | None:
 def save(folder: str | Path, state: TrainingState, recipe: Recipe, notes: dict[str, Any] | None = None) -> None:
     """Write a checkpoint of a step, unless it exists, and remove all but the newest `KEPT`.
 
-    Args:
-        folder: of this run's checkpoints, made if missing.
-        state: of the run.
-        recipe: of the run, written as JSON.
-        notes: JSON values, written beside the state.
-
-    Raises:
-        OutputError: the folder cannot be written or the disk is full.
+    The folder is made if missing. Recipe and notes, which are JSON values, are written beside the state.
+    Raises OutputError if the folder cannot be written or the disk is full.
     """
     folder = Path(folder)
     step = int(state.step)
@@ -65,13 +59,9 @@ def save(folder: str | Path, state: TrainingState, recipe: Recipe, notes: dict[s
 def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe) -> Restored:
     """Read the newest checkpoint onto the default device.
 
-    Args:
-        folder: of a run's checkpoints.
-        shapes: the recipe's state as shapes and dtypes (`state_shapes`).
-        recipe: of the resumed run. Phases, learning rate and losses may differ from those of the checkpoint.
-
-    Raises:
-        CheckpointError: no checkpoint, an unreadable checkpoint, or a state of other parameters.
+    `recipe` is that of the resumed run: its phases, learning rate and losses may differ from those of the checkpoint.
+    `shapes` are those of its state (`state_shapes`).
+    Raises CheckpointError for a missing or unreadable checkpoint, and for a state of other parameters.
     """
     folder = Path(folder)
     if (step := latest(folder)) is None:
@@ -111,8 +101,7 @@ def _explaining(place: Path) -> Iterator[None]:
     except CheckpointError:
         raise
     except (OSError, ValueError, KeyError, TypeError) as error:
-        text = one_line(str(error))
-        raise CheckpointError(f"{place} cannot be read as a checkpoint of a training run: {text}") from error
+        raise CheckpointError(f"{place} cannot be read as a checkpoint of a run: {one_line(str(error))}") from error
 
 
 def _check_shapes(place: Path, metadata: Any, shapes: TrainingState) -> None:

@@ -15,13 +15,9 @@ IN_ORDER = 0.5  # share of clips with frames in order of time
 
 
 def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> SyntheticClip:
-    """Return `phase.batch` clips of `frames` frames: random order of frames, random colours. Pure.
+    """Return the batch of a JAX random key: `phase.batch` clips of `frames` frames, in random order and colours.
 
-    Args:
-        key: a JAX random key; the same key gives the same batch.
-        textures: the tiles of a split.
-        phase: size, motion and share of dynamic scenes (static).
-        frames: number of frames (static).
+    Pure; `phase` and `frames` are static.
     """
     config = phase.scenes(frames)
 

@@ -36,7 +36,6 @@ class MatchLoss:
 
     def zeros(self, B: int, S: int, P: int) -> MatchSums:
         """Return empty sums."""
-        del B, S, P
         return MatchSums(jnp.zeros(()), jnp.zeros(()))
 
     def add(
@@ -51,7 +50,6 @@ class MatchLoss:
 
         The patches are the last tokens of a frame. Padded frames have no visible matches.
         """
-        del frame_count
         P = self._matches.patch.shape[-1]
 
         @jax.checkpoint  # otherwise the scan stores the logits of every layer

@@ -119,7 +119,6 @@ def plot(table: str | Path, picture: str | Path) -> None:
 
     Raises InputError for an unreadable table, OutputError where the picture cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     rows = read_metrics(table)
@@ -128,7 +127,6 @@ def plot(table: str | Path, picture: str | Path) -> None:
     columns = min(3, max(len(panels), 1))
     height = -(-max(len(panels), 1) // columns)
     figure = Figure(figsize=(5 * columns, 3.4 * height), layout="constrained")
-    FigureCanvasAgg(figure)
     for index, (title, names) in enumerate(panels.items()):
         axes = figure.add_subplot(height, columns, index + 1)
         for name in names:

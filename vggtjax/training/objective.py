@@ -59,12 +59,9 @@ class LossWeights:
 
 def init_probes(seed: int, config: VGGTConfig) -> Params:
     """Return the parameters of the linear read-outs of the taps, all 0."""
-    del seed
     E, taps = config.tap_dim, len(config.taps)
-    return {
-        "patch": {"kernel": jnp.zeros((taps, E, PATCH_PROBE)), "bias": jnp.zeros((taps, PATCH_PROBE))},
-        "camera": {"kernel": jnp.zeros((taps, E, CAMERA_PROBE)), "bias": jnp.zeros((taps, CAMERA_PROBE))},
-    }
+    widths = {"patch": PATCH_PROBE, "camera": CAMERA_PROBE}
+    return {name: {"kernel": jnp.zeros((taps, E, F)), "bias": jnp.zeros((taps, F))} for name, F in widths.items()}
 
 
 @full_precision
@@ -79,13 +76,9 @@ def objective(
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """Return the loss of a batch of clips, and the metrics to log.
 
-    Args:
-        trained: {"model": the model's parameters, "probes": result of `init_probes`}.
-        batch: clips of equal size, with a batch axis.
-        config: the model's configuration.
-        weights: of the terms (static).
-        compute_dtype: of the blocks' matrix products.
-        remat: compute the activations of encoder, aggregator and dense heads again in the backward pass.
+    `trained` holds the model's parameters as "model" and those of `init_probes` as "probes"; `config` and `weights` are
+    static. `compute_dtype` is that of the blocks' matrix products; with `remat` the activations of encoder, aggregator
+    and dense heads are computed again in the backward pass.
     """
     model, probes = trained["model"], trained["probes"]
     images = batch.images
@@ -109,17 +102,12 @@ def objective(
 
         return captured
 
+    captures = [capture(slot) for slot in range(len(config.taps))]
+    compute = Compute(compute_dtype)
+
     def network(model: Params):
         tokens = encode(model, images, config, compute_dtype=compute_dtype)
-        return aggregate(
-            model,
-            tokens,
-            config,
-            grid,
-            captures=[capture(slot) for slot in range(len(config.taps))],
-            accumulator=matching,
-            compute=Compute(compute_dtype),
-        )
+        return aggregate(model, tokens, config, grid, captures=captures, accumulator=matching, compute=compute)
 
     camera_tokens, taps, sums = (jax.checkpoint(network) if remat else network)(model)
     pose = predict_pose(model, camera_tokens, config)
@@ -202,9 +190,8 @@ def _depth_error(depth: Float[Array, "B S H W"], truth: Float[Array, "B S H W"])
 
 def _probe(params: Params, slot: int, tokens: Float[Array, "... E"]) -> Float[Array, "... F"]:
     normed = apply(LayerNorm(use_bias=False, use_scale=False), {}, tokens)
-    return jnp.einsum("...e,ef->...f", normed, params["kernel"][slot]) + params["bias"][slot].reshape(
-        (1,) * (tokens.ndim - 1) + (-1,)
-    )
+    bias = params["bias"][slot].reshape((1,) * (tokens.ndim - 1) + (-1,))
+    return jnp.einsum("...e,ef->...f", normed, params["kernel"][slot]) + bias
 
 
 def _probe_terms(taps, truth: Targets, paired: Matches, patch_size: int) -> dict[str, Array]:

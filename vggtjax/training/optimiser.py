@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -69,14 +70,11 @@ def decays(path: tuple[Any, ...]) -> bool:
 
 
 def _decay_kernels(weight_decay: float) -> optax.GradientTransformation:
-    def update(updates: Any, state: Any, params: Any = None):
-        def decayed(path, update, param):
-            # The direction is exactly 0 without any gradient so far.
-            return update + weight_decay * jnp.where(update == 0, 0, param) if decays(path) else update
+    def decayed(path, update, param):
+        # The direction is exactly 0 without any gradient so far.
+        return update + weight_decay * jnp.where(update == 0, 0, param) if decays(path) else update
 
-        return jax.tree_util.tree_map_with_path(decayed, updates, params), state
-
-    return optax.GradientTransformation(optax.init_empty_state, update)
+    return optax.stateless(partial(jax.tree.map_with_path, decayed))
 
 
 def _muon() -> optax.GradientTransformation:
@@ -84,15 +82,12 @@ def _muon() -> optax.GradientTransformation:
         # All other axes (layers; q, k, v) are batch axes.
         return jax.tree.map(lambda leaf: MuonDimensionNumbers(_input_axis(leaf), leaf.ndim - 1), tree)
 
-    def sized(updates: Any, state: Any, params: Any = None):
-        def scaled(leaf):
-            largest = max(leaf.shape[_input_axis(leaf)], leaf.shape[-1])
-            return _ADAM_RMS * largest**0.5 * leaf  # an orthogonal matrix has a mean square of 1 / its larger side
+    def sized(update, _):
+        largest = max(update.shape[_input_axis(update)], update.shape[-1])
+        return _ADAM_RMS * largest**0.5 * update  # an orthogonal matrix has a mean square of 1 / its larger side
 
-        return jax.tree.map(scaled, updates), state
-
-    size = optax.GradientTransformation(optax.init_empty_state, sized)
-    return optax.chain(scale_by_muon(beta=_MUON_DECAY, weight_dimension_numbers=dimensions), size)
+    direction = scale_by_muon(beta=_MUON_DECAY, weight_dimension_numbers=dimensions)
+    return optax.chain(direction, optax.stateless_with_tree_map(sized))
 
 
 def _input_axis(kernel: jax.Array) -> int:

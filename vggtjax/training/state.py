@@ -37,15 +37,9 @@ class TrainingState(NamedTuple):
 
 
 def initial_state(recipe: Recipe, probes: Params, init: Params | None = None) -> TrainingState:
-    """Return the state before the first step, in float32.
+    """Return the state before the first step, in float32, from the objective's own parameters and the model's.
 
-    Args:
-        recipe: the run's recipe.
-        probes: parameters of the objective alone.
-        init: the model's parameters to start from; None for random ones.
-
-    Raises:
-        CheckpointError: `init` does not have the shapes of the recipe's model.
+    Without `init` the model's parameters are random. Raises CheckpointError if `init` does not fit the recipe's model.
     """
     if init is None:
         init = start_params(recipe)
@@ -65,13 +59,9 @@ def state_shapes(recipe: Recipe, probes: Params) -> TrainingState:
 
 
 def loss_and_gradient(trained: Params, batch: Any, recipe: Recipe, objective: Objective) -> tuple[Metrics, Params]:
-    """Return the objective's metrics with the loss, and its gradient by the optimised parameters.
+    """Return the objective's metrics with the loss, and its gradient by the optimised parameters of `trained`.
 
-    Args:
-        trained: {"model": ..., "probes": ...}.
-        batch: second argument of the objective: clips [B, S, ...].
-        recipe: the run's recipe (static under jit).
-        objective: (trained, batch, config, weights, *, compute_dtype, remat) -> loss, metrics (static under jit).
+    Recipe and objective are static under jit; `Task` describes the objective and its batch.
     """
     moving, frozen = split(trained, recipe)
 
@@ -92,15 +82,8 @@ def apply_gradient(
     unchanged. The decay of the average is min(ema_decay, (1 + t) / (10 + t)) after t updates, so that the start has
     little weight early.
 
-    Args:
-        state: result of the last step.
-        gradient: by the optimised parameters.
-        metrics: with the loss.
-        recipe: the run's recipe (static under jit).
-
-    Returns:
-        The next state; and the metrics, in float32, with grad_norm (before clipping), learning_rate and skipped (1 for
-        a skipped step, else 0).
+    `recipe` is static under jit. The returned metrics, in float32, have gained grad_norm (before clipping),
+    learning_rate and skipped (1 for a skipped step, else 0).
     """
     norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(metrics["loss"]) & jnp.isfinite(norm)
