@@ -2,8 +2,8 @@
 
 The new files are written in a hidden folder beside the old ones. Once they are whole, that folder is renamed to
 `.replacing`, with new/ and old/ in it. Then the old files move to old/, the archive first, and the new files into the
-folder, the archive last. A killed process leaves `.replacing` at one of these steps: the next save continues from this
-step, and until then the archive in new/ is read unless the folder has one.
+folder, the archive last. If the process is killed, `.replacing` stays, and the next save finishes the moves. Until then
+`find_archive` returns the archive in the folder or, if it is missing, the archive in new/.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def find_archive(folder: Path) -> Path:
 
 
 def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
-    """Make sure that a result with these `OPTIONAL_FILES` can be saved in `folder`, before hours are spent on one.
+    """Finish an interrupted replacement in `folder`, then check that a result with these `OPTIONAL_FILES` can be saved.
 
-    An interrupted replacement is finished first. Raises OutputError where the folder cannot be made or written, or
+    Raises OutputError where the folder cannot be made or written, or
     holds files of our names that are not part of an earlier result.
     """
     if os.path.lexists(folder / _REPLACING):
@@ -63,7 +63,7 @@ def _swap(folder: Path) -> None:
     """Do the remaining moves of a replacement; undo them if one fails."""
     new, old = folder / _REPLACING / "new", folder / _REPLACING / "old"
     moves = [(new / name, folder / name) for name in (*NAMES, *OPTIONAL_FILES, ARCHIVE_NAME)]
-    if os.path.lexists(new / NAMES[0]):  # it moves first: all files in the folder are old
+    if os.path.lexists(new / NAMES[0]):  # the first new file to move is still there: all files in the folder are old
         archive = next((path for path in (old / ARCHIVE_NAME, folder / ARCHIVE_NAME) if path.is_file()), None)
         earlier = () if archive is None else (ARCHIVE_NAME, *NAMES, *saved_files(archive))
         moves = [(folder / name, old / name) for name in earlier] + moves
@@ -75,13 +75,13 @@ def _swap(folder: Path) -> None:
         for source, target in reversed(moves):
             if os.path.lexists(target) and not os.path.lexists(source):
                 target.rename(source)
-        if os.path.lexists(new / NAMES[0]) and not any(old.iterdir()):  # as before the first move
+        if os.path.lexists(new / NAMES[0]) and not any(old.iterdir()):  # all moves are undone
             _remove(folder)
         raise
     _remove(folder)
 
 
 def _remove(folder: Path) -> None:
-    """Remove the folder of a replacement; it is renamed first, as a half removed one would look like a step."""
+    """Remove the folder of a replacement, renamed first: half of it would look like an interrupted replacement."""
     with staging(folder) as rubbish:
         (folder / _REPLACING).rename(rubbish / "replaced")

@@ -31,8 +31,8 @@ class Result:
     no point. Arrays of a wider type are cast to the type below, `dynamic_mask` is cleared in padding, and fields of
     view outside [0.01, 3.1] rad are clamped with a FieldOfViewWarning that names the frames.
 
-    Raises ResultError where the fields do not fit together, or where no depth or no confidence of a frame is finite:
-    the weights or the computation are broken then. The depth of a frame without any known depth is 0.
+    Raises ResultError if the fields do not fit together, or if all depths or all confidences of a frame are NaN or
+    infinite, which broken weights cause. A frame of unknown depth has depth 0.
     """
 
     depth: Float32[np.ndarray, "S H W"]  # z in the camera, up to scale
@@ -175,8 +175,8 @@ class Result:
     def world_points(self, *, pixel_offset: float = 0.5) -> Float32[np.ndarray, "S H W 3"]:
         """Lift every pixel to its point in the world, padding and unsure pixels too.
 
-        `pixel_offset` 0.5 sees each pixel at its centre, which fits principal points at (W/2, H/2) and the refinement
-        of masks; VGGT's own unprojection uses 0.0, so its points lie half a pixel up and left of these.
+        `pixel_offset` 0.5 takes pixel centres, as for a principal point at (W/2, H/2); the refinement of masks does the
+        same. VGGT's own unprojection uses 0.0: its points lie half a pixel up and left of these.
         """
         return unproject(self.depth, self.intrinsics, self.camera_from_world, pixel_offset=pixel_offset)
 

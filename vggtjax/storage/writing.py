@@ -69,7 +69,7 @@ def locked_folder(folder: str | Path, what: str) -> Iterator[None]:
 
 
 def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str) -> None:
-    """Check that files of these names can be written in `folder`, before hours of computation; it is not made.
+    """Check that files of these names can be written in `folder`, before hours of computation. A missing folder is made for the check and removed.
 
     `replaced` tells whether existing files belong to an earlier output of this kind (`what`), and may be replaced.
     Raises OutputError if the folder cannot be made or written, or holds files that may not be replaced.
@@ -108,15 +108,15 @@ def _explaining(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _staged(folder: Path) -> Iterator[Path]:
-    """Yield a new temporary folder whose lock file, beside it, tells other writers that this one is alive."""
+    """Yield a new temporary folder. Other writers see its lock file beside it, and do not remove the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(folder)
     lock, name = None, ""
-    for _ in range(_TRIES):  # another writer can take the lock file for a leftover before it is locked
+    for _ in range(_TRIES):  # another writer may remove our lock file, as a leftover, before we lock it: try again
         name = f".partial-{token_hex(4)}"
         try:
             lock = _acquire(folder / f"{name}.lock")
-        except OSError:  # a file system without locks: leftovers go by their age
+        except OSError:  # a file system without locks: leftovers are removed by their age
             break
         if lock is not None:
             break
@@ -153,6 +153,6 @@ def _acquire(path: Path) -> FileLock | None:
 
 
 def _release(lock: FileLock) -> None:
-    with suppress(OSError):  # Windows removes no open file
-        Path(lock.lock_file).unlink(missing_ok=True)  # while the lock is held: nobody else holds it then
+    with suppress(OSError):  # Windows cannot remove an open file
+        Path(lock.lock_file).unlink(missing_ok=True)  # before the release: afterwards another process may hold it
     lock.release()
