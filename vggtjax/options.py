@@ -10,6 +10,7 @@ import tyro
 
 from vggtjax.config import Gram, Suppress
 from vggtjax.errors import InputError
+from vggtjax.storage.json_values import Natural, check_fields
 
 Pass = Literal["first", "second"]
 Threshold = Literal["otsu", "multi-otsu"]
@@ -21,8 +22,8 @@ MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4
 class Method:
     """One row of the table of methods: where depth and cameras come from, and how the dynamic mask is mined.
 
-    `clusters` is the number of groups of patch features; the saliency is averaged within each group before the
-    `threshold` is applied; 0 for no groups. `refine`: refine the mask at the end by the method's depth and cameras.
+    `clusters` is the number of clusters of patch features: the saliency is averaged within each cluster before the
+    `threshold` is applied; 0 for no clusters. `refine` tells whether the method's depth and cameras refine the mask.
     """
 
     depth: Literal["first", "second", "replaced", "fused"]
@@ -39,7 +40,7 @@ class Method:
         return {self.depth, self.extrinsics, self.intrinsics} != {"first"}
 
     def second_outputs(self, align_scale: bool = False) -> tuple[str, ...]:
-        """Return the outputs needed of the second pass; aligning scales needs its depth."""
+        """Return the outputs of the second pass: the camera, and depth if the method or `align_scale` reads it."""
         return ("camera", "depth") if self.depth != "first" or align_scale else ("camera",)
 
 
@@ -98,7 +99,7 @@ class Options:
     """similarity of the motion cues; the method's own by default"""
     suppress: Suppress | None = None
     """how the keys of dynamic tokens are suppressed; the method's own by default"""
-    mask_pairs: int = 5
+    mask_pairs: Natural = 5
     """number of pairs of blocks in which the keys of dynamic tokens are suppressed (L_mask of the paper)"""
     align_scale: tyro.conf.FlagCreatePairsOff[bool] = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
@@ -111,15 +112,8 @@ class Options:
 
     def __post_init__(self) -> None:
         find_method(self.method)
-        for name, allowed in (("gram", Gram), ("suppress", Suppress), ("compute_dtype", ComputeDType)):
-            value, choices = getattr(self, name), get_args(allowed)
-            if value not in choices and not (value is None and name != "compute_dtype"):
-                raise InputError(f"{name} is {value!r}; expected {' or '.join(map(repr, choices))}")
-        check_mask_pairs(self.mask_pairs)
+        check_fields(self)
         check_smooth_frames(self.smooth_frames)
-        for name, kinds in (("align_scale", bool), ("refine_mask", bool | None)):
-            if not isinstance(getattr(self, name), kinds):
-                raise InputError(f"{name} is {getattr(self, name)!r}; expected True or False")
 
     @property
     def row(self) -> Method:
@@ -139,10 +133,10 @@ class Options:
 
     @property
     def passes_key(self) -> tuple[Any, ...]:
-        """What decides the two passes: methods with equal keys share one run of them, caches are valid for one key."""
-        row = self.row
-        mining = (row.gram, row.suppress, row.clusters, row.threshold)
-        return (*mining, self.mask_pairs, self.smooth_frames, self.compute_dtype)
+        """The options that the two passes depend on: methods with equal keys share one run of the passes."""
+        same = {"method": Options.method, "align_scale": False, "refine_mask": None}  # read after the passes
+        method = self.row
+        return (dataclasses.replace(self.resolved(), **same), method.clusters, method.threshold)
 
     def changed(self, **changes: Any) -> Options:
         """Return the options with other values. Raises TypeError for an unknown name."""
