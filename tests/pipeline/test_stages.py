@@ -119,7 +119,7 @@ def test_what_is_compiled_ahead_is_not_compiled_again(model):
     assert compilations(lambda: reconstruct(model, clip)) == 0
     with pytest.raises(InputError, match="multiples of the patch size 14"):
         compile_ahead(model, 2, 20, 70)
-    with pytest.raises(InputError, match="expected 'float32' or 'bfloat16'"):
+    with pytest.raises(InputError, match="compute_dtype is 'float16'; expected one of"):
         compile_ahead(model, 2, SIDE, SIDE, compute_dtype="float16")
 
 

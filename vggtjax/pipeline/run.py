@@ -22,13 +22,13 @@ from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError, device_memory_errors
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.fusion_rule import FusionParams
-from vggtjax.method.passes import Assembly, Passes, assemble, run_passes
+from vggtjax.method.passes import Assembly, Passes
 from vggtjax.method.refinement import refine_masks
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import OptionChanges, Options
-from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, padded_frames, run_stages
+from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, inline, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress
 from vggtjax.results.reconstruction import Reconstruction
 
@@ -57,16 +57,16 @@ def infer(
     Returns:
         The method's depth, confidence and cameras, and the passes they were made of.
     """
-    options = options.changed(**changes)
-    return _infer(params, images, config, options, motion)
+    config = config if motion is None else dataclasses.replace(config, motion=motion)
+    return _infer(params, images, config, options.changed(**changes))
 
 
-@partial(jax.jit, static_argnames=("config", "options", "motion"))
-def _infer(
-    params: Params, images: Array, config: VGGTConfig, options: Options, motion: MotionConfig | None
-) -> tuple[Assembly, Passes]:
-    passes = run_passes(params, images, config, options=options, motion=motion)
-    return assemble(passes, options.method, align_scale=options.align_scale), passes
+@partial(jax.jit, static_argnames=("config", "options"))
+def _infer(params: Params, images: Array, config: VGGTConfig, options: Options) -> tuple[Assembly, Passes]:
+    frames, height, width = images.shape[1:4]
+    stages = Stages(config, options, frames, (height, width), run=inline)
+    passes, assembly, _ = run_stages(stages, params, ClipInputs(images))
+    return assembly, passes
 
 
 def reconstruct(
@@ -87,8 +87,8 @@ def reconstruct(
 
     Args:
         model: what `load_model` returned.
-        clip: what `load_clip` returned, or a source that it loads, such as "clip.mp4". A clip of another size or patch
-            size than the model's is read from its source again.
+        clip: what `load_clip` returned, or a source that it loads, such as "clip.mp4". A clip of another size than
+            `size`, or of another patch size than the model's, is read from its source again.
         options: the method and its settings.
         size: side in pixels to run at, a multiple of the patch size; the model's own if None.
         masks: what moves, instead of the mined masks: boolean at the size of the clip's frames or of the source's
@@ -198,7 +198,7 @@ def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:
     depth, confidence, camera_from_world, intrinsics = (np.array(x)[0] for x in jax.tree.leaves(assembly))
     fields_of_view = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
     focal = intrinsics[:, [0, 1], [0, 1]]
-    # Beyond 2 pi the tangent repeats: such cameras get a negative focal length, which Reconstruction clamps.
+    # tan(fov / 2) has period 2 pi: a field of view above pi gets a negative focal length, which Reconstruction clamps.
     intrinsics[:, [0, 1], [0, 1]] = np.where(fields_of_view > np.pi, -np.abs(focal), focal)
     return {
         "depth": depth,
@@ -248,7 +248,7 @@ def _clip_fields(clip: Clip) -> dict[str, Any]:
 def _settings(
     model: Model, clip: Clip, options: Options, masks_given: bool, fusion: FusionParams | None
 ) -> dict[str, Any]:
-    """Return what decided a result beside the method, as JSON values."""
+    """Return the settings that a result depends on besides the method, as JSON values."""
     settings = {name: value for name, value in options.to_json().items() if name not in ("method", "refine_mask")}
     settings |= {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
     settings |= {"masks": "given" if masks_given else "mined", "refine_mask": options.refine_mask}

@@ -61,7 +61,7 @@ def _track(params, clips, query_points, frame, *, config, compute_dtype):
 def _mine(
     saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"], *, frames: int, **options
 ) -> Bool[Array, "B F H W"]:
-    """Mine the mask of the first `frames` frames; the mask of padded frames is False."""
+    """Mine the mask of the first `frames` frames; padded frames get an empty mask."""
     mask = mine_mask(saliency[:, :frames], patch_tokens[:, :frames], **options)
     return jnp.pad(mask, ((0, 0), (0, saliency.shape[1] - frames), (0, 0), (0, 0)))
 
@@ -103,6 +103,12 @@ class Execute:
             return jax.block_until_ready(program(*arguments, **options))
 
 
+def inline(stage: str, program: Program, *arguments: Any, **options: Any) -> Any:
+    """Compute the outputs of the program as a part of the caller's own program."""
+    del stage
+    return program.function(*arguments, **options)
+
+
 class Compile:
     """Compiles each program for the shapes of its arguments; later calls with such arguments find it compiled."""
 
@@ -120,16 +126,16 @@ class Compile:
 
 @dataclass(frozen=True)
 class Stages:
-    """The stages for clips of one shape; each reads of `options` what it needs, so that the others stay compiled.
+    """The stages for clips of one shape, which may be padded beyond `frames`.
 
-    The clips may be padded beyond `frames`; `frame_count` then says how many frames are real, and is None otherwise.
+    Each stage reads only the options that it needs: changing an option recompiles only the stages that read it.
     """
 
     config: VGGTConfig
     options: Options
     frames: int
     size: tuple[int, int]  # height and width in pixels
-    run: Callable[..., Any] = field(default_factory=Execute)  # Execute or Compile
+    run: Callable[..., Any] = field(default_factory=Execute)  # Execute, Compile or inline
 
     @property
     def _network(self) -> dict[str, Any]:
@@ -213,7 +219,7 @@ def run_stages(
     """Reconstruct clips: image features, first pass, dynamic mask, second pass, assembly, tracks.
 
     Args:
-        stages: the stages for these clips; `stages.run` decides whether they run or are compiled.
+        stages: the stages for these clips; `stages.run` decides whether they are run or compiled.
         params: the model's parameter tree.
         inputs: the clips, and optionally their masks and points to track.
         fusion: a fitted rule of fusion; the method's own rule if None.

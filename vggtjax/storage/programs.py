@@ -34,7 +34,7 @@ class Program:
 
     def __init__(self, function: Callable[..., Any], static: Sequence[str] = ()) -> None:
         self.__name__ = function.__name__
-        self._function, self._static = function, tuple(static)
+        self.function, self._static = function, tuple(static)
         self._jitted = jax.jit(function, static_argnames=self._static)
         self._ready: dict[Any, Callable[..., Any]] = {}
 
@@ -83,7 +83,7 @@ class Program:
         self, key: tuple, fixed: dict[str, Any], arguments: tuple, traced: dict[str, Any]
     ) -> Callable[..., Any]:
         """Return the program of a file, or trace the function and write the file; on failure, the jitted function."""
-        name = f"{self._function.__module__}.{self._function.__qualname__}"
+        name = f"{self.function.__module__}.{self.function.__qualname__}"
         precision = jax.config.values["jax_default_matmul_precision"]
         path = _kept_path("\n".join((source_digest(), name, *map(str, key), str(precision))), "bin")
         if (content := _read_kept(path)) is not None:
@@ -92,7 +92,7 @@ class Program:
             lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), (arguments, traced)
         )
         try:
-            exported = export.export(jax.jit(partial(self._function, **fixed)))(*shapes, **named)
+            exported = export.export(jax.jit(partial(self.function, **fixed)))(*shapes, **named)
             content = bytes(exported.serialize())
         except (ValueError, NotImplementedError):  # calls back to the host
             return self._jitted

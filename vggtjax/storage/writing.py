@@ -72,7 +72,8 @@ def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str)
     """Check that files of these names can be written in `folder`, before hours of computation.
 
     A missing folder is made for the check, and removed. `replaced` tells whether existing files belong to an earlier
-    output of this kind (`what`), and may be replaced. Raises OutputError if the folder cannot be made or written, or holds files that may not be replaced.
+    output of this kind (`what`), and may be replaced. Raises OutputError if the folder cannot be made or written, or
+    holds files that may not be replaced.
     """
     taken = [name for name in names if os.path.lexists(folder / name)]
     if taken and not replaced:
