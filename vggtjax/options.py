@@ -75,9 +75,10 @@ def check_mask_pairs(pairs: object) -> None:
         raise InputError(f"mask_pairs is {pairs}; expected a whole number of at least 0")
 
 
-def _refine_mask(
-    refine_mask: tyro.conf.FlagCreatePairsOff[bool] = False, no_refine_mask: tyro.conf.FlagCreatePairsOff[bool] = False
-) -> bool | None:
+_Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
+
+
+def _refine_mask(refine_mask: _Flag = False, no_refine_mask: _Flag = False) -> bool | None:
     """Whether the mask is refined; the method's own choice by default.
 
     Args:

@@ -96,7 +96,7 @@ def test_a_folder_without_images_says_what_it_holds(tmp_path):
 @pytest.mark.parametrize(
     ("source", "message"),
     [
-        ("missing/frames", "missing/frames does not exist"),
+        ("missing/frames", "'missing/frames' does not exist"),
         ("https://example.org/clip.mp4", "does not exist"),
         ("", "'' is not a path"),
         ("a\0b", "is not a path"),

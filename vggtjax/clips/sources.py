@@ -102,7 +102,7 @@ def _from_path(name: str) -> Source:
             return _images(matches, f"pattern {name} matches", "expected images")
     except OSError as error:
         raise ClipError(f"cannot look for frames in {name}: {error.strerror}; check the path") from error
-    raise ClipError(f"{path} does not exist; expected a folder, a pattern, or an image or video file")
+    raise ClipError(f"'{path}' does not exist; expected a folder, a pattern, or an image or video file")
 
 
 def _from_file(path: Path) -> Source:

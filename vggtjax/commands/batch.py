@@ -10,6 +10,7 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
+from vggtjax.commands.arguments import Frames, Method, ModelName, Output, Size, Sources
 from vggtjax.commands.models import load_with_fusion
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
@@ -19,17 +20,17 @@ from vggtjax.results.saving import Saving
 
 
 def batch(
-    sources: tyro.conf.Positional[tuple[str, ...]],
+    sources: Sources,
     /,
     out: Path,
     *,
-    model: str | None = None,
+    model: ModelName = None,
     fusion: Path | None = None,
     pad_frames: tyro.conf.FlagCreatePairsOff[bool] = False,
-    sampling: Sampling = Sampling(),
-    framing: Framing = Framing(),
-    options: Options = Options(),
-    saving: Saving = Saving(),
+    sampling: Frames = Sampling(),
+    framing: Size = Framing(),
+    options: Method = Options(),
+    saving: Output = Saving(),
 ) -> None:
     """Reconstruct many clips, each into a folder of its own; run the same command again to resume.
 
@@ -40,13 +41,13 @@ def batch(
         out: folder for the results, with one folder per clip, named after the clip.
         model: a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or "demo", the small
             demonstration model, which is not for real footage.
-        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default.
+        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; without it, the paper's rule.
         pad_frames: pad clips to one of a few lengths, so that clips of similar length share compiled programs: for many
             different lengths on a GPU, where compiling takes longer than running.
-        sampling: frames
-        framing: size
-        options: method
-        saving: output
+        sampling: which frames of the source
+        framing: how frames are fitted to the model
+        options: how the clip is reconstructed
+        saving: how the result is written
     """
     report = Report()
     with report.running():

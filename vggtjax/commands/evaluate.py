@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
+from vggtjax.commands.arguments import Frames, Size
 from vggtjax.commands.models import load_with_fusion
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
@@ -93,31 +94,31 @@ class Scores:
 
 
 def evaluate(
-    dataset: tyro.conf.Positional[str],
-    root: tyro.conf.Positional[Path],
+    dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")],
+    root: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ROOT")],
     /,
     out: Path,
     *,
-    candidates: Candidates = Candidates(),
-    folders: Folders = Folders(),
-    scores: Scores = Scores(),
-    sampling: Sampling = Sampling(),
-    framing: Framing = Framing(),
-    options: EvaluatedOptions = EvaluatedOptions(),
+    candidates: Annotated[Candidates, tyro.conf.arg(name="model")] = Candidates(),
+    folders: Annotated[Folders, tyro.conf.arg(name="folder")] = Folders(),
+    scores: Annotated[Scores, tyro.conf.arg(name="score")] = Scores(),
+    sampling: Frames = Sampling(),
+    framing: Size = Framing(),
+    options: Annotated[EvaluatedOptions, tyro.conf.arg(name="method")] = EvaluatedOptions(),
 ) -> None:
     """Score methods on a data set with ground truth: cameras, point clouds, masks, depth, uncertainty.
 
     Finished sequences are kept: run the same command again to resume.
 
     Args:
-        dataset: its name: composite, hololens, plain, tum, bonn, dycheck, sintel, kitti, davis, davis-2017 or 7scenes.
+        dataset: name of the data set, such as plain, sintel or davis; an unknown name lists all.
         root: folder of the data set, or of one sequence of it.
         out: folder for results.json, results.csv, table.md, table.tex and index.html.
-        candidates: model
+        candidates: the model and its methods
         folders: results of other programs
-        scores: scores
-        sampling: frames
-        framing: size
+        scores: what is scored, and how
+        sampling: which frames of a sequence
+        framing: how frames are fitted to the model
         options: settings of all methods
     """
     report = Report()

@@ -90,7 +90,7 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
             return tyro.extras.subcommand_cli_from_dict(  # type: ignore[return-value]
                 {name: later(command) for name, command in COMMANDS.items()},
                 prog="vggtjax",
-                description="4-D reconstruction of monocular video of a moving world, in JAX.",
+                description="4-D reconstruction of monocular video of a moving world. --version prints the version.",
                 args=arguments,
                 config=(tyro.conf.OmitArgPrefixes,),
             )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
+from vggtjax.commands.arguments import Frames, Method, ModelName, Output, Size, Sources
 from vggtjax.commands.models import load_with_fusion
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Known:
-    """What you know of the clip. Raises InputError for options that exclude each other."""
+    """Masks and points of the user. Raises InputError for options that exclude each other."""
 
     masks: Path | None = None
     """folder of pictures, bright where something moves, one per frame; mined from the clip by default"""
@@ -63,18 +64,18 @@ class Known:
 
 
 def reconstruct(
-    source: tyro.conf.Positional[tuple[str, ...]],
+    source: Sources,
     /,
     out: Path,
     *,
-    model: str | None = None,
+    model: ModelName = None,
     config: Path | None = None,
     fusion: Path | None = None,
-    sampling: Sampling = Sampling(),
-    framing: Framing = Framing(),
-    options: Options = Options(),
-    known: Known = Known(),
-    saving: Saving = Saving(),
+    sampling: Frames = Sampling(),
+    framing: Size = Framing(),
+    options: Method = Options(),
+    known: Annotated[Known, tyro.conf.arg(name="mask")] = Known(),
+    saving: Output = Saving(),
 ) -> None:
     """Cameras, depth, dynamic masks and a 4-D point cloud of a clip.
 
@@ -84,12 +85,12 @@ def reconstruct(
         model: a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or "demo", the small
             demonstration model, which is not for real footage.
         config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
-        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default.
-        sampling: frames
-        framing: size
-        options: method
-        known: masks, points
-        saving: output
+        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; without it, the paper's rule.
+        sampling: which frames of the source
+        framing: how frames are fitted to the model
+        options: how the clip is reconstructed
+        known: masks and points of your own
+        saving: how the result is written
     """
     if not source:
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
