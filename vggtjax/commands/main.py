@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
-    keep_compilations()  # after the line above: it handles some warnings itself
+    keep_compilations()  # after showwarning is set: keep_compilations replaces it for some warnings
     arguments = sys.argv[1:] if arguments is None else arguments
     if list(arguments) in (["--version"], ["-V"]):
         sys.stdout.write(f"vggtjax {__version__}\n")
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
     """Return the command with its arguments, ready to be called.
 
-    tyro turns the errors of the dataclasses of options into a box; they are raised here as they are instead.
+    tyro prints errors of the option dataclasses in a box. Find the error in the chain of exceptions and raise it.
     """
 
     def later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:

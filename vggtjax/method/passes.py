@@ -1,4 +1,4 @@
-"""The two passes and the methods assembled from them: the stages of 4DVGGT-D as pure functions (2605.12027)."""
+"""The two passes and the methods assembled from them: the stages of 4DVGGT-D as pure functions (arXiv 2605.12027)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def first_pass(
 ) -> tuple[Predictions, Float[Array, "B S h w"]]:
     """Run the plain pass and mine the motion saliency inside it; with `query_points`, track them too.
 
-    Of clips with a `frame_count` only the real frames are valid. `exponents` are those of the cues in their product.
+    Predictions of padded frames are meaningless. `exponents` has one power per cue, applied before their product.
     """
     if gram not in ("cosine", "dot"):
         raise InputError(f"gram is {gram!r}; expected 'cosine' or 'dot'")
@@ -99,9 +99,8 @@ def second_pass(
 ) -> Predictions:
     """Run the mask-aware pass: the keys of dynamic tokens are suppressed in the first pairs of blocks.
 
-    Without a dynamic pixel in the whole batch, it equals the plain pass: the predictions of `plain`, where given, are
-    returned without computation, unless `plain` lacks one of the outputs. Of clips with a `frame_count` only the real
-    frames are valid.
+    If the mask is boolean, no pixel of the batch is dynamic and `plain` has all outputs, the predictions of `plain` are
+    returned and nothing is computed. Predictions of padded frames are meaningless.
 
     Args:
         params: the model's parameter tree.
@@ -223,7 +222,7 @@ def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = Fa
     """Return a method's depth, confidence and cameras from two passes; the methods of `LADDER` share one run of them.
 
     Args:
-        passes: what `run_passes` returned for the method's own cues, suppression and mask; this is not checked.
+        passes: of `run_passes` with this method's options; passes of another method give a wrong result, not an error.
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
             pixels before it is used. Not in the paper.

@@ -47,12 +47,12 @@ class Accumulator(Protocol):
         frame_count: Int[Array, " B"] | None,
         /,
     ) -> Any:
-        """Return the sums with one pair added; of clips with a `frame_count` only the first frames count."""
+        """Return the sums with one pair of blocks added; padded frames, from `frame_count` on, are ignored."""
         ...
 
 
 def identity(tokens: Float[Array, "B S T E"]) -> Float[Array, "B S T E"]:
-    """Capture a tap whole: frame output next to global output, E = 2C."""
+    """Return a tap unchanged: outputs of the frame and the global block, concatenated to E = 2C channels."""
     return tokens
 
 
@@ -79,8 +79,7 @@ def aggregate(
         captures: one function per entry of `config.taps`, from tokens [B, S, T, 2C] to any tree of arrays. Only these
             trees are stored, and only of the tapped pairs.
         accumulator: what to sum over q and k of the global blocks, such as motion cues, or None.
-        frame_count: number of real frames of each clip, its first ones, at least one; the other frames do not influence
-            them.
+        frame_count: number of real frames of each clip, at least one; padded frames follow and do not change them.
         suppression: the keys to suppress, in both blocks of a pair.
         compute: type of the products; with `remat`, only the input of every pair is stored for the gradient.
     """
@@ -121,7 +120,7 @@ def aggregate(
         None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
     )
     sums = None if accumulator is None else accumulator.zeros(B, S, P)
-    if real is not None:  # NaN would count even with weight 0
+    if real is not None:  # 0 x NaN is NaN: padded frames are set to 0
         patch_tokens = jnp.where(real[:, :, None, None], patch_tokens, 0)
     tokens = _tokens(params, widened(patch_tokens))
     camera = jnp.zeros((B, S, 2 * C), tokens.dtype)

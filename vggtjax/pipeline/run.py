@@ -93,7 +93,7 @@ def reconstruct(
         size: side in pixels to run at, a multiple of the patch size; the model's own if None.
         masks: what moves, instead of the mined masks: boolean at the size of the clip's frames or of the source's
             pictures, or a folder of pictures. If no pixel moves, the second pass is not run.
-        tracks: points to follow, in pixels of the frames; each frame with points, except the first, costs a pass.
+        tracks: points to follow, in pixels of the frames; points of a later frame than the first cost one more pass.
         fusion: a fitted rule (`load_fusion`), whose confidence is the fused precision; None: the paper's rule.
         pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs; the
             result is the same to rounding. Not for clips with tracks.

@@ -33,10 +33,10 @@ _DIGITS = 4  # significant binary digits of padded lengths: no clip gets longer 
 
 
 def padded_frames(frames: int, offsets: tuple[int, ...]) -> int:
-    """Return the next length with four significant binary digits: 1 to 16, 18, 20, ... 32, 36, ...
+    """Return the length rounded up to four significant binary digits: 1 to 16, 18, 20, ... 32, 36, ...
 
-    Clips of similar length then share compiled programs. A clip keeps its length if one of its frames has no other
-    frame at any of the `offsets` of the motion cues.
+    Clips of similar length then share compiled programs. A clip is not padded if one of its frames has no other frame
+    at any of the `offsets` of the motion cues: padding would give that frame another one to be compared with.
     """
     if not all(any(0 <= frame + offset < frames for offset in offsets) for frame in range(frames)):
         return frames

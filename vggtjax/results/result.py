@@ -191,7 +191,7 @@ def _arrays() -> dict[str, tuple[np.dtype, tuple[str | int, ...]]]:
     }
 
 
-ARRAYS = _arrays()  # depth binds S, H, W, saliency h, w and track_frames Q; the others must agree
+ARRAYS = _arrays()  # S, H, W are those of depth, h, w of saliency, Q of track_frames; all others must match
 TRACKS = frozenset(name for name in ARRAYS if name.startswith("track_"))  # all are given, or none
 OPTIONAL = TRACKS | {"timestamps", "saliency"}
 STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": (), "model_name": (), "settings": ()}

@@ -1,0 +1,48 @@
+"""Options: checked values, the key of the passes, and the keywords of public functions."""
+
+import dataclasses
+
+import pytest
+
+from vggtjax.errors import InputError
+from vggtjax.options import METHODS, OptionChanges, Options
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"method": "best"}, "unknown method 'best'"),
+        ({"gram": "sine"}, "gram is 'sine'; expected one of"),
+        ({"mask_pairs": -1}, "mask_pairs is -1; expected a whole number of at least 0"),
+        ({"mask_pairs": 2.5}, "mask_pairs is 2.5"),
+        ({"smooth_frames": 2}, "smooth_frames is 2; expected an odd number"),
+        ({"compute_dtype": "float16"}, "compute_dtype is 'float16'"),
+        ({"align_scale": 1}, "align_scale is 1"),
+    ],
+)
+def test_invalid_values(changes, message):
+    with pytest.raises(InputError, match=message):
+        Options(**changes)
+
+
+def test_keywords_are_the_fields():
+    assert set(OptionChanges.__annotations__) == {field.name for field in dataclasses.fields(Options)}
+    with pytest.raises(TypeError, match="grams"):
+        Options().changed(grams="dot")
+
+
+def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
+    """A new option belongs to the key unless it is named there."""
+    other = {"gram": "dot", "suppress": "drop", "mask_pairs": 2, "smooth_frames": 3, "compute_dtype": "bfloat16"}
+    fields = {field.name for field in dataclasses.fields(Options)}
+    assert fields - set(other) == {"method", "align_scale", "refine_mask"}
+    key = Options().passes_key
+    assert all(Options(**{name: value}).passes_key != key for name, value in other.items())
+    assert Options(align_scale=True, refine_mask=True).passes_key == key
+    same = {name for name in METHODS if Options(name).passes_key == key}  # pyright: ignore[reportArgumentType]
+    assert same == set(METHODS) - {"vggt4d"}
+
+
+def test_the_method_fills_in_what_is_not_given():
+    assert Options("vggt4d").resolved() == Options("vggt4d", gram="dot", suppress="drop", refine_mask=True)
+    assert Options("vggt4d", gram="cosine", refine_mask=False).resolved().gram == "cosine"
