@@ -11,7 +11,7 @@ from benchmarks.suite.cases import Case, DType, Size, check_counts, frame_size, 
 from benchmarks.suite.measure import Measured, compiling_anew, measure_program, without_memory
 from benchmarks.suite.report import Sheet, console, describe, machine, number, write_json
 from vggtjax.learning.soft import reconstruct_softly, soft_masking
-from vggtjax.method.fusion_rule import identity
+from vggtjax.method.fusion_family import identity
 
 _FIRST = "both passes and fusion"
 

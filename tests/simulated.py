@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtjax.method.fusion_rule import FEATURES, FusionParams, Observations, log_precisions, projected
+from vggtjax.method.fusion_family import FEATURES, FusionParams, Observations, log_precisions, projected
 
 DEEPEST, NEAREST = 3.0, 1.0
 

@@ -13,8 +13,8 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.learning.ablation import CHOSEN, split_clips
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, kept_passes, observations, sequence_digest
+from vggtjax.method.fusion_family import identity
 from vggtjax.method.fusion_file import load_fusion, save_fusion
-from vggtjax.method.fusion_rule import identity
 from vggtjax.pretrained.embedded import MODEL, demo_clip
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.arrays import write_arrays

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from vggtjax.errors import InputError
 from vggtjax.learning.fit import FitClips, Objective, clip_loss
-from vggtjax.method.fusion_rule import PARTS, FusionParams
+from vggtjax.method.fusion_family import PARTS, FusionParams
 
 
 def clip_losses(params: FusionParams, clips: FitClips, objective: Objective) -> Float[Array, " C"]:

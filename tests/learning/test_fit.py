@@ -15,7 +15,7 @@ from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError
 from vggtjax.learning.fit import FitClips, FitConfig, fit_fusion
 from vggtjax.learning.objectives import View, joint_negative_log_likelihood
-from vggtjax.method.fusion_rule import PRESETS, Observations, fuse, identity, log_precisions, parse_family
+from vggtjax.method.fusion_family import PRESETS, Observations, fuse, identity, log_precisions, parse_family
 
 TRUE = identity() | {
     "scale": jnp.asarray([2.5, 1.5]),

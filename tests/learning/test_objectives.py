@@ -16,7 +16,7 @@ from vggtjax.cameras import Cameras
 from vggtjax.evaluation.metrics.trajectory import rotation_error
 from vggtjax.learning.distances import nearest_distance, point_cloud_distance, pose_error
 from vggtjax.learning.objectives import View, geometric_loss, negative_log_likelihood, photometric_loss, unit_factor
-from vggtjax.method.fusion_rule import Fused
+from vggtjax.method.fusion_family import Fused
 
 
 def fused_of(depth, log_precision) -> Fused:

@@ -14,7 +14,7 @@ from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
 from vggtjax.learning.distances import pose_error
 from vggtjax.learning.soft import SoftMasking, reconstruct_softly, soft_masking, soft_pixels
-from vggtjax.method.fusion_rule import identity
+from vggtjax.method.fusion_family import identity
 
 CONFIG = tiny_config(patch_size=8, image_size=32, taps=(0, 1, 2, 3))
 SHAPE = (1, 4, 16, 24, 3)

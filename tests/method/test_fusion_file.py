@@ -12,8 +12,8 @@ from tests.simulated import scattered
 from tests.tiny import tiny_config
 from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
+from vggtjax.method.fusion_family import parse_family, start
 from vggtjax.method.fusion_file import load_fusion, save_fusion, warn_if_fitted_otherwise
-from vggtjax.method.fusion_rule import parse_family, start
 from vggtjax.storage.tensor_file import read_tensors
 
 

@@ -133,7 +133,7 @@ def fit_fusion(
         from vggtjax.learning.ablation import ablate
         from vggtjax.learning.export import begin, check_folder, save_fits
         from vggtjax.learning.fit import FitConfig
-        from vggtjax.method.fusion_rule import parse_family
+        from vggtjax.method.fusion_family import parse_family
 
         check_extra("drawing a fit", "train", "matplotlib")
         check_folder(out)

@@ -12,7 +12,7 @@ from vggtjax.errors import InputError
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
     from vggtjax.commands.report import Report
-    from vggtjax.method.fusion_rule import FusionParams
+    from vggtjax.method.fusion_family import FusionParams
     from vggtjax.options import Options
 
 _MOST_CONFIG_BYTES = 1 << 20

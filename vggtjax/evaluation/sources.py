@@ -23,7 +23,7 @@ from vggtjax.storage.trajectories import Quaternion
 if TYPE_CHECKING:  # the folders of other programs are scored without jax
     from vggtjax.checkpoint import Model
     from vggtjax.clips.clip import Clip
-    from vggtjax.method.fusion_rule import FusionParams
+    from vggtjax.method.fusion_family import FusionParams
 
 _MOST_FILES = 100_000  # of a folder with one result
 _UNTRAINED = "The weights of this model are untrained: these numbers show that everything runs, and mean nothing else."

@@ -21,7 +21,7 @@ from vggtjax.evaluation.metrics.uncertainty import reliability_curve, uncertaint
 from vggtjax.evaluation.metrics.video_depth import depth_alignment
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, observations
 from vggtjax.learning.fit import NEEDS_FRAMES, FitConfig, FitOutcome, fit_fusion
-from vggtjax.method.fusion_rule import Fused, Observations, fuse, identity, parse_family
+from vggtjax.method.fusion_family import Fused, Observations, fuse, identity, parse_family
 from vggtjax.progress import Progress
 
 METRICS = {

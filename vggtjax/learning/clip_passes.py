@@ -23,8 +23,8 @@ from vggtjax.errors import InputError, OutputError, ResultError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.learning.fit import FitClips
 from vggtjax.learning.objectives import View
+from vggtjax.method.fusion_family import Observations
 from vggtjax.method.fusion_inputs import observe
-from vggtjax.method.fusion_rule import Observations
 from vggtjax.method.passes import Passes
 from vggtjax.network.model import Predictions
 from vggtjax.pipeline.run import reconstruct

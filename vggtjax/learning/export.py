@@ -26,8 +26,8 @@ from vggtjax.learning.ablation import PAPER, RuleScore, fit_split, gains, markdo
 from vggtjax.learning.clip_passes import ClipPasses, observations
 from vggtjax.learning.fit import FitConfig
 from vggtjax.learning.plots import draw_fits
+from vggtjax.method.fusion_family import identity, parse_family
 from vggtjax.method.fusion_file import save_fusion
-from vggtjax.method.fusion_rule import identity, parse_family
 from vggtjax.storage.writing import check_free, says_format, staging, writing
 
 FORMAT = "vggtjax fits"

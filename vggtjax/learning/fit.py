@@ -23,7 +23,7 @@ from vggtjax.learning.objectives import (
     negative_log_likelihood,
     photometric_loss,
 )
-from vggtjax.method.fusion_rule import PARTS, FusionParams, Observations, fuse, identity, is_free, projected, start
+from vggtjax.method.fusion_family import PARTS, FusionParams, Observations, fuse, identity, is_free, projected, start
 from vggtjax.progress import Progress
 from vggtjax.storage.arrays import read_arrays, write_arrays
 from vggtjax.storage.json_values import Count, check_fields

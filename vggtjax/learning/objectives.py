@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.cameras import Cameras, unproject
-from vggtjax.method.fusion_rule import Fused, FusionParams, Observations, fuse, log_precisions
+from vggtjax.method.fusion_family import Fused, FusionParams, Observations, fuse, log_precisions
 from vggtjax.network.precision import full_precision
 from vggtjax.network.sampling import bilinear
 

@@ -12,7 +12,7 @@ import numpy as np
 from vggtjax.evaluation.metrics.video_depth import depth_alignment
 from vggtjax.learning.ablation import PAPER, RuleScore
 from vggtjax.learning.clip_passes import ClipPasses, observations
-from vggtjax.method.fusion_rule import FusionParams, log_precisions
+from vggtjax.method.fusion_family import FusionParams, log_precisions
 from vggtjax.storage.writing import writing
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 
 from vggtjax.cameras import Cameras, unproject
 from vggtjax.config import Gram, MotionConfig, VGGTConfig
+from vggtjax.method.fusion_family import FusionParams, fuse, identity, soft_mask
 from vggtjax.method.fusion_inputs import observe
-from vggtjax.method.fusion_rule import FusionParams, fuse, identity, soft_mask
 from vggtjax.method.mask import CONSTANT, otsu_threshold, upsample
 from vggtjax.method.passes import Passes, first_pass, second_pass
 from vggtjax.network.backbone import encode

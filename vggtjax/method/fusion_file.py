@@ -15,7 +15,7 @@ import numpy as np
 
 from vggtjax.checkpoint import Model
 from vggtjax.errors import CheckpointError, InputError
-from vggtjax.method.fusion_rule import PARTS, FusionParams, projected, start
+from vggtjax.method.fusion_family import PARTS, FusionParams, projected, start
 from vggtjax.options import METHODS, find_method
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.tensor_file import Spec, StoredTensor, read_tensors, write_tensors

@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtjax.errors import InputError
 from vggtjax.method.fusion import scale_between
-from vggtjax.method.fusion_rule import FusionParams, Observations, fuse
+from vggtjax.method.fusion_family import FusionParams, Observations, fuse
 from vggtjax.method.mask import upsample
 from vggtjax.method.passes import Assembly, Passes
 

@@ -18,8 +18,8 @@ from vggtjax.clips.preprocessing import Fitter, Framing, FramingChanges
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, VggtjaxError
+from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
-from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.options import OptionChanges, Options
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.progress import Progress

@@ -20,8 +20,8 @@ from vggtjax.clips.queries import Queries
 from vggtjax.clips.sources import ClipSource
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError, device_memory_errors
+from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
-from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.method.passes import Assembly, Passes
 from vggtjax.method.refinement import refine_masks
 from vggtjax.network.layers import Params

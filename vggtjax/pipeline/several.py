@@ -10,8 +10,8 @@ from typing import Unpack
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
+from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
-from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.options import OptionChanges, Options
 from vggtjax.pipeline.run import assembled_fields, reconstruct, refined
 from vggtjax.pipeline.stages import Stages

@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.cameras import Cameras
 from vggtjax.config import VGGTConfig
+from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_inputs import apply_fusion
-from vggtjax.method.fusion_rule import FusionParams
 from vggtjax.method.mask import mine_mask
 from vggtjax.method.passes import Assembly, Passes, assemble, first_pass, second_pass, track_from
 from vggtjax.network.backbone import encode

@@ -13,8 +13,8 @@ from hypothesis.extra import numpy as hnp
 from tests.simulated import scattered
 from vggtjax import fuse_depth
 from vggtjax.errors import InputError
-from vggtjax.method import fusion_rule as family
-from vggtjax.method.fusion_rule import (
+from vggtjax.method import fusion_family as family
+from vggtjax.method.fusion_family import (
     FEATURES,
     PARTS,
     PRESETS,
