@@ -49,7 +49,8 @@ def save(folder, frames, optional):
 def frames_of(folder):
     """Return the frames of the result in a folder, of which every file must be."""
     result = Reconstruction.load(folder)
-    texts = {path.name: path.read_text() for path in folder.iterdir() if path.name != ARCHIVE_NAME}
+    others = {ARCHIVE_NAME, ".vggtjax.lock"}  # a killed process leaves the file of its lock, which is free
+    texts = {path.name: path.read_text() for path in folder.iterdir() if path.name not in others}
     assert set(texts) - set(saved_files(folder / ARCHIVE_NAME)) == set(NAMES)
     assert set(texts.values()) == {str(len(result.depth))}
     return len(result.depth)

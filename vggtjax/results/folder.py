@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from vggtjax.results.archive import ARCHIVE_NAME, OPTIONAL_FILES, is_result, saved_files
-from vggtjax.storage.writing import check_free, staging
+from vggtjax.storage.writing import check_free, locked_folder, staging
 
 NAMES = (
     "confidence", "depth", "mask", "instances", "preview", "frames",
@@ -36,8 +36,8 @@ def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
     holds files of our names that are not part of an earlier result.
     """
     if os.path.lexists(folder / _REPLACING):
-        with staging(folder):
-            _swap(folder)
+        with locked_folder(folder, "a result"):
+            _finish(folder)
     archive = folder / ARCHIVE_NAME
     check_free(folder, (ARCHIVE_NAME, *NAMES), replaced=is_result(archive), what="result")
     strange = [name for name in optional if name not in saved_files(archive)]
@@ -55,8 +55,17 @@ def replacing(folder: Path, optional: Sequence[str]) -> Iterator[Path]:
         for name in ("new", "old"):
             (staged / name).mkdir()
         yield staged / "new"
-        staged.rename(folder / _REPLACING)
-        _swap(folder)
+        with locked_folder(folder, "a result"):
+            _finish(folder)
+            staged.rename(folder / _REPLACING)
+            _swap(folder)
+
+
+def _finish(folder: Path) -> None:
+    """Do the remaining moves of an interrupted replacement, if there is one; the caller holds the folder's lock."""
+    if os.path.lexists(folder / _REPLACING):
+        with staging(folder):
+            _swap(folder)
 
 
 def _swap(folder: Path) -> None:
