@@ -90,6 +90,10 @@ def _refine_mask(refine_mask: _Flag = False, no_refine_mask: _Flag = False) -> b
     return True if refine_mask else False if no_refine_mask else None
 
 
+# Of that name, the two flags stand among those of the method.
+_RefineMask = Annotated[bool | None, tyro.conf.arg(constructor=_refine_mask, name="method", prefix_name=False)]
+
+
 @dataclass(frozen=True)
 class Options:
     """How a clip is reconstructed. Raises InputError for an invalid value."""
@@ -106,7 +110,7 @@ class Options:
     """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1
     """odd number of frames over which the saliency is averaged before thresholding (not in the papers)"""
-    refine_mask: Annotated[bool | None, tyro.conf.arg(constructor=_refine_mask)] = None
+    refine_mask: _RefineMask = None
     """remove pixels from the mask that agree with other frames; the method's own choice by default"""
     compute_dtype: Annotated[ComputeDType, tyro.conf.arg(name="dtype")] = "float32"
     """type of the blocks' matrix products"""

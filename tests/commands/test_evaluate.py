@@ -13,6 +13,7 @@ from vggtjax.commands import main as cli
 from vggtjax.pretrained.embedded import demo_clip
 
 FRAMES = 4
+MODEL = ("--model", "demo")
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def run(capsys, *arguments):
 @pytest.fixture(scope="module")
 def evaluated(dataset, tmp_path_factory):
     out = tmp_path_factory.mktemp("evaluated")
-    assert cli.main(["evaluate", "plain", str(dataset), "--out", str(out), "--methods", "vggt,4dvggt-d"]) == 0
+    assert cli.main(["evaluate", "plain", str(dataset), "--out", str(out), *MODEL, "--methods", "vggt,4dvggt-d"]) == 0
     return out
 
 
@@ -69,7 +70,7 @@ def test_all_of_it(dataset, evaluated, capsys):
 
     # Again, with one method more in mind: what is finished is not done again.
     before = (evaluated / "sequences/first/vggt.json").stat().st_mtime_ns
-    code, out, err = run(capsys, "evaluate", "plain", dataset, "--out", evaluated, "--methods", "vggt")
+    code, out, err = run(capsys, "evaluate", "plain", dataset, "--out", evaluated, *MODEL, "--methods", "vggt")
     assert code == 0, err
     assert "first pass" not in err
     assert "index.html" in out
@@ -123,8 +124,8 @@ def test_results_of_a_folder(dataset, tmp_path, capsys):
         (["plain", "{data}", "--sequences", "third"], "sequence 'third'"),
         (["plain", "{data}", "--gt", "lidar"], "gt is 'lidar'"),
         (["plain", "{data}", "--stride", "0"], "stride is 0"),
-        (["plain", "{data}", "--max-frames", "0"], "max_frames is 0"),
-        (["plain", "{data}", "--smooth-frames", "2"], "smooth_frames is 2"),
+        (["plain", "{data}", "--max-frames", "0"], "--max-frames is 0"),
+        (["plain", "{data}", "--smooth-frames", "2"], "--smooth-frames is 2"),
         (["plain", "{data}", "--format", "cut3r"], "give both or neither"),
         (["plain", "{data}", "--quaternion", "xyzw"], "give both or neither"),
         (["plain", "{data}", "--results", "{data}", "--methods", "vggt"], "exclude each other"),
@@ -132,9 +133,11 @@ def test_results_of_a_folder(dataset, tmp_path, capsys):
         (["plain", "{data}", "--results", "{data}", "--format", "da3", "--quaternion", "wxyz"], "none for others"),
         (["plain", "{data}", "--results", "{tmp}/none"], "names no folder"),
         (["plain", "{data}", "--results", "a={data}", "a={tmp}"], "two folders named a"),
-        (["plain", "{data}", "--size", "100"], "size is 100"),
-        (["plain", "{data}", "--mask-pairs", "-1"], "mask_pairs is -1"),
+        (["plain", "{data}", *MODEL, "--size", "100"], "--size is 100"),
+        (["plain", "{data}", "--mask-pairs", "-1"], "--mask-pairs is -1"),
         (["plain", "{data}", "--model", "{tmp}/none.safetensors"], "none.safetensors"),
+        (["plain", "{data}"], "no model is named"),
+        (["plain", "{data}", "--results", "{data}", "--config", "{tmp}/c.json"], "--config and --results exclude"),
     ],
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(dataset, tmp_path, capsys, arguments, sentence):

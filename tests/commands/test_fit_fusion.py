@@ -146,7 +146,7 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
         (["--seeds", "0"], "seeds is 0"),
         (["--steps", "0"], "steps is 0"),
         (["--pixels", "0"], "pixels is 0"),
-        (["--held-out", "1.5", "--data", "generated=3"], "held_out is 1.5"),
+        (["--held-out", "1.5", "--data", "generated=3"], "--held-out is 1.5"),
         (["--max-frames", "8", "--data", "generated=3"], "generated scenes have at least 12 frames"),
         (["--family", "soft", "--objective", "joint"], "does not see soft masks"),
     ],

@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from datetime import timedelta
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import Frames, Method, ModelName, Output, Size, Sources
-from vggtjax.commands.models import load_with_fusion
+from vggtjax.commands.arguments import Frames, Method, Output, Size, Sources
+from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.options import Options
@@ -24,9 +25,8 @@ def batch(
     /,
     out: Path,
     *,
-    model: ModelName = None,
-    fusion: Path | None = None,
     pad_frames: tyro.conf.FlagCreatePairsOff[bool] = False,
+    files: Annotated[ModelFiles, tyro.conf.arg(name="model")] = ModelFiles(),
     sampling: Frames = Sampling(),
     framing: Size = Framing(),
     options: Method = Options(),
@@ -39,11 +39,9 @@ def batch(
     Args:
         sources: folders of images, or videos; or one folder of such.
         out: folder for the results, with one folder per clip, named after the clip.
-        model: a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or "demo", the small
-            demonstration model, which is not for real footage.
-        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; without it, the paper's rule.
         pad_frames: pad clips to one of a few lengths, so that clips of similar length share compiled programs: for many
             different lengths on a GPU, where compiling takes longer than running.
+        files: the model
         sampling: which frames of the source
         framing: how frames are fitted to the model
         options: how the clip is reconstructed
@@ -54,7 +52,7 @@ def batch(
         from vggtjax.clips.sources import clips_by_name
 
         named = clips_by_name(sources)
-        network, fitted = load_with_fusion(report, model, fusion, options, [options.method])
+        network, fitted = files.load(report, options, [options.method])
         from vggtjax.pipeline.batch import reconstruct_many
 
         outcomes = []

@@ -11,8 +11,8 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import Frames, Size
-from vggtjax.commands.models import load_with_fusion
+from vggtjax.commands.arguments import Size
+from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS, MethodName, Options, find_method
@@ -30,22 +30,25 @@ class EvaluatedOptions(Options):
 
 
 @dataclass(frozen=True)
-class Candidates:
+class EvaluatedFrames(Sampling):
+    """Frames of a data set, which has pictures without presentation times."""
+
+    fps: tyro.conf.Suppress[float | None] = None
+
+
+@dataclass(frozen=True)
+class Candidates(ModelFiles):
     """A model and its methods."""
 
-    model: str | None = None
-    """"demo" (the default), a converted .safetensors, a PyTorch checkpoint, or a hub id"""
     methods: str | None = None
     """names of methods, with commas; all five by default; methods that mine alike share one run of the passes"""
-    fusion: Path | None = None
-    """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""
 
     def source(self, report: Report, options: Options, framing: Framing) -> ModelSource:
         """Return the results of the model, loaded as a stage of the report."""
         names = tuple(METHODS) if self.methods is None else _words(self.methods)
         for name in names:
             find_method(name)
-        network, fitted = load_with_fusion(report, self.model or "demo", self.fusion, options, names)
+        network, fitted = self.load(report, options, names)
         from vggtjax.evaluation.sources import ModelSource
 
         return ModelSource(network, names, options, framing, fitted)
@@ -80,7 +83,7 @@ class Folders:
 
 
 @dataclass(frozen=True)
-class Scores:
+class ScoreOptions:
     """What is scored, and how."""
 
     sequences: str | None = None
@@ -101,8 +104,8 @@ def evaluate(
     *,
     candidates: Annotated[Candidates, tyro.conf.arg(name="model")] = Candidates(),
     folders: Annotated[Folders, tyro.conf.arg(name="folder")] = Folders(),
-    scores: Annotated[Scores, tyro.conf.arg(name="score")] = Scores(),
-    sampling: Frames = Sampling(),
+    scores: Annotated[ScoreOptions, tyro.conf.arg(name="score")] = ScoreOptions(),
+    sampling: Annotated[EvaluatedFrames, tyro.conf.arg(name="frame")] = EvaluatedFrames(),
     framing: Size = Framing(),
     options: Annotated[EvaluatedOptions, tyro.conf.arg(name="method")] = EvaluatedOptions(),
 ) -> None:
@@ -114,7 +117,7 @@ def evaluate(
         dataset: name of the data set, such as plain, sintel or davis; an unknown name lists all.
         root: folder of the data set, or of one sequence of it.
         out: folder for results.json, results.csv, table.md, table.tex and index.html.
-        candidates: the model and its methods
+        candidates: the model, required unless --results is given, and its methods
         folders: results of other programs
         scores: what is scored, and how
         sampling: which frames of a sequence
@@ -136,8 +139,8 @@ def evaluate(
             chosen = None if scores.sequences is None else _words(scores.sequences)
             found = find_sequences(dataset, root, sequences=chosen, sampling=sampling, gt=scores.gt)
         if folders.results:
-            for name in ("model", "methods", "fusion"):
-                if getattr(candidates, name) is not None:
+            for name, value in vars(candidates).items():
+                if value is not None:
                     raise InputError(f"--{name} and --results exclude each other; give one of them")
             source = folders.source()
         else:

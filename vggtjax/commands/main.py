@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _parsed(arguments)()
         return 0
     except VggtjaxError as error:
-        message, code = str(error), 2
+        message, code = _with_flag(str(error), arguments), 2
     except MemoryError:  # of the host
         message, code = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size", 2
     except OSError as error:  # of a file that no other message covers
@@ -69,6 +69,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message, code = "interrupted", 130
     sys.stderr.write(f"vggtjax: {message}\n")
     return code
+
+
+def _with_flag(message: str, arguments: Sequence[str]) -> str:
+    """Return a message about a field ("mask_pairs is ...") with the flag that the user gave ("--mask-pairs is ...")."""
+    field, *rest = message.split(" ", 1)
+    flag = f"--{field.replace('_', '-')}"
+    return " ".join([flag, *rest]) if any(argument.split("=")[0] == flag for argument in arguments) else message
 
 
 def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
@@ -92,7 +99,7 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
                 prog="vggtjax",
                 description="4-D reconstruction of monocular video of a moving world. --version prints the version.",
                 args=arguments,
-                config=(tyro.conf.OmitArgPrefixes,),
+                config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )
     except SystemExit as stop:
         error: BaseException | None = stop

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vggtjax.commands.arguments import ModelName
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 
@@ -31,28 +33,33 @@ def load(report: Report, name: str | None, config: Path | None = None) -> Model:
         return load_model(name, config=read_config(config), progress=progress)
 
 
-def load_with_fusion(
-    report: Report,
-    name: str | None,
-    fusion: Path | None,
-    options: Options,
-    methods: Sequence[str],
-    config: Path | None = None,
-) -> tuple[Model, FusionParams | None]:
-    """Load a model, and a fitted rule of fusion from a file (None, the paper's rule, without a file).
+@dataclass(frozen=True)
+class ModelFiles:
+    """The files of a model and of a fitted rule of fusion."""
 
-    The file is read first: InputError where it is invalid or no method fuses. A warning is logged if the rule was
-    fitted to another model or with other settings.
-    """
-    if fusion is None:
-        return load(report, name, config), None
-    from vggtjax.method.fusion_file import check_fuses, load_fusion, warn_if_fitted_otherwise
+    model: ModelName = None
+    """a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or "demo", the small
+    demonstration model, which is not for real footage"""
+    config: Path | None = None
+    """JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B"""
+    fusion: Path | None = None
+    """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""
 
-    check_fuses(*methods)
-    params = load_fusion(fusion)
-    model = load(report, name, config)
-    warn_if_fitted_otherwise(fusion, model, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
-    return model, params
+    def load(self, report: Report, options: Options, methods: Sequence[str]) -> tuple[Model, FusionParams | None]:
+        """Load the model, and the fitted rule of fusion (None, the paper's rule, without a file).
+
+        The rule is read first: InputError where it is invalid or no method fuses. A warning is logged if the rule was
+        fitted to another model or with other settings.
+        """
+        if self.fusion is None:
+            return load(report, self.model, self.config), None
+        from vggtjax.method.fusion_file import check_fuses, load_fusion, warn_if_fitted_otherwise
+
+        check_fuses(*methods)
+        params = load_fusion(self.fusion)
+        model = load(report, self.model, self.config)
+        warn_if_fitted_otherwise(self.fusion, model, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
+        return model, params
 
 
 def read_config(path: Path | None) -> VGGTConfig | None:

@@ -10,8 +10,8 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import Frames, Method, ModelName, Output, Size, Sources
-from vggtjax.commands.models import load_with_fusion
+from vggtjax.commands.arguments import Frames, Method, Output, Size, Sources
+from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.options import Options
@@ -68,9 +68,7 @@ def reconstruct(
     /,
     out: Path,
     *,
-    model: ModelName = None,
-    config: Path | None = None,
-    fusion: Path | None = None,
+    files: Annotated[ModelFiles, tyro.conf.arg(name="model")] = ModelFiles(),
     sampling: Frames = Sampling(),
     framing: Size = Framing(),
     options: Method = Options(),
@@ -82,10 +80,7 @@ def reconstruct(
     Args:
         source: a folder of images, a pattern, images, or a video.
         out: folder for the results; an earlier result in it is replaced.
-        model: a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or "demo", the small
-            demonstration model, which is not for real footage.
-        config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
-        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; without it, the paper's rule.
+        files: the model
         sampling: which frames of the source
         framing: how frames are fitted to the model
         options: how the clip is reconstructed
@@ -104,7 +99,7 @@ def reconstruct(
         known.check(options)
         optional = {"tracks.npz": known.tracks is not None, "vggt4d": saving.format == "vggt4d"}
         check_folder(out, [name for name, is_written in optional.items() if is_written])
-        network, fitted = load_with_fusion(report, model, fusion, options, [options.method], config)
+        network, fitted = files.load(report, options, [options.method])
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import read_clip
             from vggtjax.clips.queries import parse_queries
