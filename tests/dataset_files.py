@@ -8,14 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from vggtjax.evaluation.datasets import open_dataset
+from vggtjax.clips.sampling import Sampling
+from vggtjax.evaluation.datasets import find_sequences
 
 SINTEL_TAG = struct.pack("<f", 202021.25)
 
 
-def opened(name: str, root: Path, **options: Any) -> Any:
-    """What `open_dataset` returns, of no type: a test knows which ground truth there is."""
-    return open_dataset(name, root, **options)
+def opened(name: str, root: Path, *, stride: int | None = None, max_frames: int | None = None, **options: Any) -> Any:
+    """Open all sequences, of no type: a test knows which ground truth there is."""
+    sampling = Sampling(stride=stride, max_frames=max_frames)
+    return [opener() for opener in find_sequences(name, root, sampling=sampling, **options).values()]
 
 
 def write(path: Path, content: bytes | str) -> Path:

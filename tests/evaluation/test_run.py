@@ -8,6 +8,7 @@ import pytest
 
 from tests.scored_room import SETTINGS, Perfect, run, stage
 from vggtjax.commands.report import Report
+from vggtjax.errors import InputError
 from vggtjax.evaluation import tables
 from vggtjax.evaluation.page import write_report
 from vggtjax.evaluation.records import Records
@@ -72,6 +73,16 @@ def test_a_sequence_that_raises_is_a_row(tmp_path, three):
     write_report(tmp_path / "out", records, store, SETTINGS | {"root": "caf\udce9"})
     assert "IndexError" in (tmp_path / "out/index.html").read_text()
     assert "IndexError" in (tmp_path / "out/results.csv").read_text()
+
+
+def test_the_log_has_the_traceback_of_errors_of_the_program_alone(tmp_path, three, caplog):
+    room, (sequence, *_) = three
+    openers = {name: (lambda name=name: dataclasses.replace(sequence, name=name)) for name in ("program", "library")}
+    source = Picky(room, {"program": IndexError("index 9"), "library": InputError("no such result")})
+    evaluate(openers, source, Records(tmp_path), SETTINGS, Scoring(), on_stage=stage)
+    assert "in results" in caplog.text
+    assert "IndexError: index 9" in caplog.text
+    assert "no such result" not in caplog.text
 
 
 def test_scores_that_raise_are_a_row(tmp_path, three):

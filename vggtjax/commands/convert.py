@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import tyro
 
@@ -44,7 +44,7 @@ def import_result(
     /,
     out: Path,
     *,
-    layout: Annotated[Literal["vggt4d", "monst3r", "cut3r", "da3"], tyro.conf.arg(name="format")],
+    format: Literal["vggt4d", "monst3r", "cut3r", "da3"],
     quaternion: Literal["xyzw", "wxyz"] | None = None,
     confidence_percentile: float = 20.0,
 ) -> None:
@@ -53,7 +53,7 @@ def import_result(
     Args:
         source: the folder.
         out: folder for our files; an earlier result in it is replaced.
-        layout: the project that wrote the folder.
+        format: the project that wrote the folder.
         quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw.
         confidence_percentile: percent of the pixels, the least confident, to leave out of the point clouds.
     """
@@ -65,7 +65,7 @@ def import_result(
 
         check_folder(out)
         with report.stage("read"):
-            result = Reconstruction.load(source, layout=layout, quaternion=quaternion)
+            result = Reconstruction.load(source, format=format, quaternion=quaternion)
         with report.stage("write") as progress:
             result.save(out, saving=saving, progress=progress)
     report.summary(result, out)

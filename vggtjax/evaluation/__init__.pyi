@@ -1,5 +1,5 @@
 from .datasets import DATASETS as DATASETS
-from .datasets import open_dataset as open_dataset
+from .datasets import find_sequences as find_sequences
 from .datasets.sequence import LabelledSequence as LabelledSequence
 from .datasets.sequence import Sequence as Sequence
 from .metrics.masks import frame_scores as frame_scores

@@ -63,17 +63,17 @@ def evaluate(
         A record for each sequence and name of a result, in this order. A sequence that cannot be opened or scored,
         whatever its opener or its result raises, has records with the status "failed" and a reason.
     """
-    run = _Run(source, records, settings, scoring)
+    evaluation = _Evaluation(source, records, settings, scoring)
     scored: list[Record] = []
     for number, (name, opener) in enumerate(sequences.items()):
         title = shown_name(name)
         with on_stage(f"{number + 1}/{len(sequences)} {title}") as progress:
-            scored += run.records_of(title, opener, progress)
+            scored += evaluation.records_of(title, opener, progress)
     return scored
 
 
 @dataclass(frozen=True)
-class _Run:
+class _Evaluation:
     source: ResultSource
     store: Records
     settings: Mapping[str, Any]
@@ -150,7 +150,7 @@ def _reason(error: Exception) -> str:
     """Return why a sequence failed, as one line."""
     if isinstance(error, VggtjaxError | MemoryError):
         return one_line(str(error) or "out of memory", _MOST_LETTERS)
-    logger.debug("a sequence failed", exc_info=error)
+    logger.error("a sequence failed by an error of the program; report it with these lines", exc_info=error)
     return one_line(f"{type(error).__name__}: {error}", _MOST_LETTERS)
 
 

@@ -93,7 +93,7 @@ def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict
         "timestamps": None,
         "method": format,
         "model_name": format,
-        "settings": {"layout": format, "quaternion": quaternion, "missing": missing},
+        "settings": {"format": format, "quaternion": quaternion, "missing": missing},
         "source_size": np.tile([H, W], (S, 1)),
         "source_scale": np.ones((S, 2)),
         "source_offset": np.zeros((S, 2)),

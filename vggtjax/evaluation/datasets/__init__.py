@@ -3,4 +3,3 @@
 from vggtjax.evaluation.datasets.table import DATASETS as DATASETS
 from vggtjax.evaluation.datasets.table import Dataset as Dataset
 from vggtjax.evaluation.datasets.table import find_sequences as find_sequences
-from vggtjax.evaluation.datasets.table import open_dataset as open_dataset

@@ -34,7 +34,7 @@ _MODELS = {
 _POINT_BYTES = 24  # of an observation in images.bin: x, y, the point's number
 
 
-class View(NamedTuple):
+class ColmapView(NamedTuple):
     """A registered image: its camera in pixels, the size of its picture, and its pose."""
 
     intrinsics: Float64[np.ndarray, "3 3"]
@@ -43,7 +43,7 @@ class View(NamedTuple):
     camera_from_world: Float64[np.ndarray, "3 4"]
 
 
-def read_views(folder: Path) -> dict[str, View]:
+def read_views(folder: Path) -> dict[str, ColmapView]:
     """Return the registered images of a model by name.
 
     Raises InputError for files that end early, other camera models, and invalid cameras.
@@ -65,7 +65,7 @@ def read_views(folder: Path) -> dict[str, View]:
     return views
 
 
-def _read_cameras(path: Path) -> dict[int, Callable[[Float64[np.ndarray, "3 4"]], View]]:
+def _read_cameras(path: Path) -> dict[int, Callable[[Float64[np.ndarray, "3 4"]], ColmapView]]:
     """Return by number the cameras of a model as functions from a pose to a view."""
     reader = _Reader(path)
     cameras = {}
@@ -80,7 +80,7 @@ def _read_cameras(path: Path) -> dict[int, Callable[[Float64[np.ndarray, "3 4"]]
         if not width or not height:
             raise InputError(f"{path} has a camera of {width} x {height} pixels; expected sizes above 0")
         intrinsics = intrinsics_matrix(fx, fy, cx, cy, first_pixel=PIXEL_CENTRE, source=path)
-        cameras[number] = partial(View, intrinsics, (width, height), any(values[focal + 2 :]))
+        cameras[number] = partial(ColmapView, intrinsics, (width, height), any(values[focal + 2 :]))
     return cameras
 
 

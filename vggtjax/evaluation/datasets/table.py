@@ -111,24 +111,6 @@ def find_sequences(
     return {sequence: partial(opened, sequence) for sequence in chosen}
 
 
-def open_dataset(
-    name: str,
-    root: str | Path,
-    *,
-    sequences: Iterable[str] | None = None,
-    stride: int | None = None,
-    max_frames: int | None = None,
-    gt: str | None = None,
-) -> list[LabelledSequence]:
-    """Open sequences of a data set. Cameras are read at once; pictures, depth and masks at their first use.
-
-    Arguments and errors are those of `find_sequences`; `stride` and `max_frames` are those of its `sampling`.
-    """
-    sampling = Sampling(stride=stride, max_frames=max_frames)
-    openers = find_sequences(name, root, sequences=sequences, sampling=sampling, gt=gt)
-    return [opener() for opener in openers.values()]
-
-
 def _chosen(
     name: str, root: Path, available: list[str], sequences: Iterable[str] | None
 ) -> tuple[list[str], tuple[str, ...]]:
