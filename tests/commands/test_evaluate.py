@@ -66,7 +66,7 @@ def test_all_of_it(dataset, evaluated, capsys):
     assert values["settings"]["model"]["name"] == "demo"
     for name in ("results.csv", "table.md", "table.tex", "index.html", "plots/first/paths.png"):
         assert (evaluated / name).stat().st_size > 100
-    assert not list(evaluated.rglob("*.partial*"))
+    assert not list(evaluated.rglob(".vggtjax-partial*"))
 
     # Again, with one method more in mind: what is finished is not done again.
     before = (evaluated / "sequences/first/vggt.json").stat().st_mtime_ns

@@ -138,9 +138,10 @@ def test_the_command_goes_on_after_it_was_killed(model, tmp_path):
 
 
 def test_what_a_killed_run_has_left_is_cleared_away(model, clips, tmp_path):
-    (tmp_path / ".clip0.partial/depth").mkdir(parents=True)
-    (tmp_path / ".clip0.partial/depth/old.npy").write_bytes(b"half")
-    os.utime(tmp_path / ".clip0.partial", (0, 0))
+    half_written = tmp_path / ".vggtjax-partial-0123456789abcdef"
+    (half_written / "clip0/depth").mkdir(parents=True)
+    (half_written / "clip0/depth/old.npy").write_bytes(b"half")
+    os.utime(half_written, (0, 0))
     sources = {"clip0": str(clips / "clip0")}
     assert [outcome.status for outcome in reconstruct_many(model, sources, tmp_path, options={"method": "vggt"})] == [
         "done"

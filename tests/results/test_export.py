@@ -371,3 +371,14 @@ def test_links_are_replaced_and_not_followed(tmp_path):
     make_room(2).save(tmp_path / "result")
     assert set(files(elsewhere)) == {"000000.ply"}
     assert set(files(tmp_path / "result")) == expected_files(2)
+
+
+@pytest.mark.parametrize("rows", [13, 27])
+def test_mostly_invalid_depth_is_warned_about(tmp_path, caplog, rows):
+    room = make_room(1)
+    depth = room.depth.copy()
+    depth[:, :rows] = np.nan
+    make_room(1, depth=depth).save(tmp_path)
+    said = f"{27 * 42} of {28 * 42} pixels (96.43%) have an invalid depth or confidence"
+    assert (said in caplog.text) == (rows == 27)
+    assert ("invalid" in caplog.text) == (rows == 27)

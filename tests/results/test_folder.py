@@ -2,6 +2,8 @@
 
 import errno
 import shutil
+import subprocess
+import sys
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,9 +12,11 @@ import pytest
 from tests.results.test_export import files
 from tests.room import make_room
 from vggtjax.errors import OutputError
+from vggtjax.results import folder as folders
 from vggtjax.results.archive import ARCHIVE_NAME, saved_files
 from vggtjax.results.folder import NAMES, check_folder, find_archive, replacing
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.storage.writing import _remove_leftovers
 
 
 class Killed(BaseException):
@@ -35,7 +39,10 @@ def killed_after(n):
     with pytest.MonkeyPatch.context() as patch:
         for owner, name in ((Path, "rename"), (Path, "replace"), (Path, "unlink"), (shutil, "rmtree")):
             patch.setattr(owner, name, dying(getattr(owner, name)))
-        yield
+        try:
+            yield
+        finally:
+            _remove_leftovers.cache_clear()  # as in the next process
 
 
 def save(folder, frames, optional):
@@ -104,3 +111,65 @@ def test_a_failed_replacement_is_undone(tmp_path, monkeypatch, failing):
     else:
         make_room(3).save(tmp_path)
         assert len(Reconstruction.load(tmp_path).depth) == 3
+
+
+SAVER = """
+import sys
+from pathlib import Path
+from tests.results.test_folder import save
+folder, frames, pausing = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
+print("ready", flush=True)
+sys.stdin.readline()
+if pausing:
+    rename = Path.rename
+    def pause(source, target):
+        if source.name == target.name == "depth":
+            Path.rename = rename
+            print("moving", flush=True)
+            sys.stdin.readline()
+        return rename(source, target)
+    Path.rename = pause
+for _ in range(1 if pausing else 12):
+    save(folder, frames, ("tracks.npz",) if frames == 2 else ())
+assert "jax" not in sys.modules
+"""
+
+
+def saver(*arguments):
+    """Start a process that saves results of this many frames into a folder once a line is written to it."""
+    command = [sys.executable, "-c", SAVER, *map(str, arguments)]
+    return subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]
+    )
+
+
+def start(process):
+    process.stdin.write("go\n")
+    process.stdin.flush()
+
+
+def heard(process):
+    return process.stdout.readline().strip()
+
+
+def test_two_processes_save_into_one_folder(tmp_path, monkeypatch):
+    folder = tmp_path / "result"
+    with saver(folder, 1) as one, saver(folder, 2) as other, saver(folder, 3, "pausing") as slow:
+        assert [heard(process) for process in (one, other, slow)] == ["ready"] * 3
+        start(one)
+        start(other)
+        assert [one.wait(60), other.wait(60)] == [0, 0]
+        assert frames_of(folder) in (1, 2)
+        assert not list(folder.glob(".*"))
+        start(slow)
+        assert heard(slow) == "moving"
+        before = sorted(folder.rglob("*"))
+        monkeypatch.setattr(folders, "_WAIT", 0.1)
+        for attempt in (lambda: check_folder(folder), lambda: save(folder, 4, ())):
+            with pytest.raises(OutputError, match="another run is writing a result"):
+                attempt()
+        assert sorted(folder.rglob("*")) == before
+        start(slow)
+        assert slow.wait(60) == 0
+    assert frames_of(folder) == 3
+    assert not list(folder.glob(".*"))

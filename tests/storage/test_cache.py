@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from vggtjax.storage.cache import cache_folder, keep_compilations
+from vggtjax.storage.cache import _show_warning, cache_folder, keep_compilations
 
 PROGRAM = """
 from vggtjax.storage.cache import keep_compilations
@@ -54,6 +54,21 @@ def test_damaged_entries_are_made_anew(tmp_path):
     compiled(own, tmp_path / "compiled")
     assert set((tmp_path / "compiled").glob("*-cache")) == {*contents, unused}
     assert len(damaged.read_bytes()) > 1000
+
+
+@pytest.mark.parametrize("kind", ["reading", "writing"])
+def test_a_cache_that_cannot_be_used_is_warned_about_once(tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    shown, said = set(), []
+    text = f"Error {kind} persistent compilation cache entry for 'jit_f': OSError: [Errno 28] No space left on device"
+    kept = tmp_path / "jit_g-0-cache", tmp_path / "jit_g-0-atime"
+    for path in kept:
+        path.touch()
+    for _ in range(3):
+        _show_warning(said.append, shown, text)
+    _show_warning(said.append, shown, "another warning")
+    assert said == [text, "another warning"]
+    assert all(path.exists() for path in kept)
 
 
 @pytest.mark.skipif("jax" not in sys.modules, reason="nothing here has imported jax")

@@ -118,7 +118,22 @@ def test_the_oldest_go_first(folder, monkeypatch):
     (program, *_), _ = counted()
     program(Pair(X), None, power=2)
     program(Pair(X), None, power=3)
-    assert len(list(folder.glob("*.bin"))) == 0
+    assert kept_text("name", lambda: "text") == "text"
+    assert not list(folder.iterdir())
+
+
+def test_a_gpu_keeps_text_but_not_programs(tmp_path, monkeypatch):
+    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    name, makes = "jax_compilation_cache_dir", []
+    earlier = jax.config.values[name]
+    jax.config.update(name, str(tmp_path / "compiled"))
+    try:
+        assert [kept_text("name", lambda: f"text {makes.append(1)}") for _ in range(2)] == ["text None"] * 2
+        assert counted()[0][0]._key((Pair(X), None), {"power": 2})[0] is None
+    finally:
+        jax.config.update(name, earlier)
+    assert len(makes) == 1
 
 
 def test_text_is_kept(folder):

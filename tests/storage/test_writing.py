@@ -1,10 +1,12 @@
 """Writers: whole files or none, no leftovers of killed writers, one writer for a locked folder."""
 
+import errno
 import os
 import signal
 import subprocess
 import sys
 import time
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from vggtjax.errors import OutputError
-from vggtjax.storage.writing import locked_folder, staging, writing
+from vggtjax.storage.writing import _remove_leftovers, check_free, locked_folder, staging, writing
 
 WRITER = """
 import sys, time
@@ -90,6 +92,7 @@ def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path, kind):
             temporary.write_text("whole")
         assert len(halves(tmp_path)) == 1  # its writer lives
     assert len(halves(tmp_path)) == 1
+    _remove_leftovers.cache_clear()  # as in the next process
     with writing(tmp_path / "b") as temporary:
         temporary.write_text("whole")
     assert [path.name for path in tmp_path.iterdir()] == ["b"]
@@ -109,19 +112,65 @@ def test_writers_of_one_process_keep_their_files(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["b"]
 
 
-def test_leftovers_without_a_lock_go_by_their_age(tmp_path):
-    leftovers = [tmp_path / ".partial-abcd1234", tmp_path / ".a.npz.x7_k2.partial.npz", tmp_path / ".clip.partial"]
-    others = [tmp_path / ".partially", tmp_path / "a.partial", tmp_path / ".partial-abcd1234" / "x"]
-    leftovers[0].mkdir()
-    for path in (*leftovers[1:], *others):
-        path.write_text("half")
-    with staging(tmp_path):
-        assert all(path.exists() for path in (*leftovers, *others))
-    for path in (*leftovers, *others):
-        os.utime(path, (time.time() - 2 * 24 * 3600, time.time() - 2 * 24 * 3600))
-    with staging(tmp_path):
-        pass
-    assert sorted(tmp_path.iterdir()) == sorted(others[:2])
+def test_only_our_old_leftovers_without_a_lock_are_removed(tmp_path):
+    ours = tmp_path / ".vggtjax-partial-0123456789abcdef"
+    names = (".partial-abcd1234", ".partial-notes", ".clip.partial", f"{ours.name}0", ".vggtjax-partial-notes")
+    for path in (ours, *(tmp_path / name for name in names)):
+        path.mkdir()
+        os.utime(path, (time.time() - 3600, time.time() - 3600))
+    for hours, left in ((1, {ours.name, *names}), (48, set(names))):
+        os.utime(ours, (time.time() - hours * 3600, time.time() - hours * 3600))
+        for name in names:
+            os.utime(tmp_path / name, (0, 0))
+        _remove_leftovers.cache_clear()
+        with staging(tmp_path):
+            pass
+        assert {path.name for path in tmp_path.iterdir()} == left
+
+
+def test_a_folder_is_scanned_once(tmp_path, monkeypatch):
+    scans, scandir = [], os.scandir
+
+    def counted(path):
+        scans.append(path)
+        return scandir(path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "scandir", counted)
+        for number in range(3):
+            with writing(tmp_path / str(number)) as temporary:
+                temporary.write_text("x")
+    assert scans.count(tmp_path) == 1
+
+
+@pytest.mark.skipif(os.name != "posix", reason="flock")
+@pytest.mark.parametrize("code", ["ENOLCK", "EOPNOTSUPP", "ENOSYS"])
+def test_a_file_system_without_locks_is_written_without_one(tmp_path, monkeypatch, code):
+    import fcntl
+
+    def flock(file, operation):
+        raise OSError(getattr(errno, code), os.strerror(getattr(errno, code)))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.resetwarnings()
+        for name in ("a", "b"):
+            with locked_folder(tmp_path, "a batch"), writing(tmp_path / name) as path:
+                path.write_text("whole")
+    assert [str(warning.message)[:28] for warning in warned] == ["the file system has no locks"]
+    assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
+
+
+def test_a_folder_that_another_run_fills_during_its_check_stays(tmp_path, monkeypatch):
+    rmdir = Path.rmdir
+
+    def late(path):
+        (tmp_path / "a/b/other").write_text("of another run")
+        rmdir(path)
+
+    monkeypatch.setattr(Path, "rmdir", late)
+    check_free(tmp_path / "a/b", ("x",), replaced=False, what="result")
+    assert (tmp_path / "a/b/other").exists()
 
 
 def test_a_locked_folder_has_one_writer(tmp_path):

@@ -30,12 +30,13 @@ and where points were tracked:
 
     tracks.npz              positions [S, Q, 2] in pixels of the source, visibility, confidence [S, Q], frames [Q]
     preview/tracks.png      the tracks over some of the frames
-    preview/tracks.mp4      the tracks over all frames, where PyAV is installed
+    preview/tracks.mp4      the tracks over all frames, where PyAV has an encoder
 """
 
 from __future__ import annotations
 
 import itertools
+import logging
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -64,6 +65,9 @@ from vggtjax.storage.trajectories import commented, write_trajectory
 
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
 _WORKERS = 8
+_MOST_INVALID = 0.5  # share of a clip's pixels; more are warned about
+
+logger = logging.getLogger(__name__)
 
 
 def optional_files(result: Result, saving: Saving) -> tuple[str, ...]:
@@ -161,7 +165,13 @@ def _write_frames(
     names = ("confidence", "depth", "mask", "instances", "preview/depth", "preview/overlay", "frames")
     for name in (*names, "vggt4d") if saving.format == "vggt4d" else names:
         (folder / name).mkdir(parents=True)
-    valid = result.valid_pixels
+    valid, pictured = result.valid_pixels, int(result.inside_pictures.sum())
+    invalid = pictured - int(valid.sum())
+    if invalid > _MOST_INVALID * pictured:
+        logger.warning(
+            "%d of %d pixels (%.2f%%) have an invalid depth or confidence and become no points; check the weights and "
+            "the inputs", invalid, pictured, 100 * invalid / pictured,
+        )  # fmt: skip
     scale = depth_scale(result.depth, valid)
     head = commented("depth = png / scale, one scale for the clip; 0 in the png: no depth", result.model_note)
     (folder / "depth/scale.txt").write_text(f"{head}\n{scale!r}\n", encoding="utf-8")

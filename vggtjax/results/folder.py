@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from vggtjax.results.archive import ARCHIVE_NAME, OPTIONAL_FILES, is_result, saved_files
@@ -21,6 +21,7 @@ NAMES = (
     "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb",
 )  # fmt: skip
 _REPLACING = ".replacing"
+_WAIT = 60  # seconds for the moves of another process
 
 
 def find_archive(folder: Path) -> Path:
@@ -32,16 +33,15 @@ def find_archive(folder: Path) -> Path:
 def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
     """Finish an interrupted replacement in `folder`, then check that a result with these `OPTIONAL_FILES` can be saved.
 
-    Raises OutputError where the folder cannot be made or written, or
-    holds files of our names that are not part of an earlier result.
+    Raises OutputError where the folder cannot be made or written, holds files of our names that are not part of an
+    earlier result, or is locked by another process for a minute.
     """
-    if os.path.lexists(folder / _REPLACING):
-        with locked_folder(folder, "a result"):
-            _finish(folder)
-    archive = folder / ARCHIVE_NAME
-    check_free(folder, (ARCHIVE_NAME, *NAMES), replaced=is_result(archive), what="result")
-    strange = [name for name in optional if name not in saved_files(archive)]
-    check_free(folder, strange, replaced=False, what="result")
+    with locked_folder(folder, "a result", _WAIT) if folder.is_dir() else nullcontext():
+        _finish(folder)
+        archive = folder / ARCHIVE_NAME
+        check_free(folder, (ARCHIVE_NAME, *NAMES), replaced=is_result(archive), what="result")
+        strange = [name for name in optional if name not in saved_files(archive)]
+        check_free(folder, strange, replaced=False, what="result")
 
 
 @contextmanager
@@ -55,7 +55,7 @@ def replacing(folder: Path, optional: Sequence[str]) -> Iterator[Path]:
         for name in ("new", "old"):
             (staged / name).mkdir()
         yield staged / "new"
-        with locked_folder(folder, "a result"):
+        with locked_folder(folder, "a result", _WAIT):
             _finish(folder)
             staged.rename(folder / _REPLACING)
             _swap(folder)

@@ -42,27 +42,23 @@ def track_strip(result: Result) -> UInt8[np.ndarray, "height width 3"]:
     return np.asarray(strip)
 
 
-def write_track_video(path: Path, result: Result) -> bool:
-    """Write the clip with its tracks as an mp4; return False and log a note without PyAV or an encoder."""
-    try:
-        import av
-    except ImportError:
-        logger.info("tracks are drawn as pictures only; for a video, install the extra: pip install 'vggtjax[video]'")
-        return False
+def write_track_video(path: Path, result: Result) -> None:
+    """Write the clip with its tracks as an mp4; log a note if PyAV has no encoder for it."""
+    import av
+
     _, H, W = result.depth.shape
     factor = max(1, -(-_VIDEO_SIDE // max(H, W)))
     size = (W * factor // 2 * 2, H * factor // 2 * 2)  # H.264 needs even sides
     codec = next((name for name in ("libx264", "mpeg4") if name in av.codecs_available), None)
     if codec is None:
         logger.info("tracks are drawn as pictures only; this PyAV has no encoder for an mp4")
-        return False
+        return
     with av.open(str(path), "w", format="mp4") as container:
         stream: Any = container.add_stream(codec, rate=_FRAMES_PER_SECOND)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
         for frame in range(len(result.depth)):
             container.mux(stream.encode(av.VideoFrame.from_image(_drawn(result, frame, size))))
         container.mux(stream.encode())
-    return True
 
 
 def _drawn(result: Result, frame: int, size: tuple[int, int]) -> Image.Image:

@@ -7,12 +7,13 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 COMPILED_BYTES = 2 * 2**30  # of kept compiled programs; the least recently used go first
-_DAMAGED = re.compile(r"Error (?:reading|writing) persistent compilation cache entry for '([^']+)'")
+_DAMAGED = re.compile(r"Error (reading|writing) persistent compilation cache entry for '([^']+)'")
 _SHORTEST = 0.05  # seconds; programs that compile faster are not kept
 
 
@@ -50,21 +51,30 @@ def keep_compilations() -> bool:
     }
     for name, value in settings.items():
         os.environ.setdefault(name, value)
-    warnings.showwarning = partial(_show_warning, warnings.showwarning)
+    warnings.showwarning = partial(_show_warning, warnings.showwarning, set())
     return True
 
 
-def _show_warning(show: Callable[..., object], message: Warning | str, *details: Any, **options: Any) -> None:
+def _show_warning(
+    show: Callable[..., object], shown: set[str], message: Warning | str, *details: Any, **options: Any
+) -> None:
     """Remove damaged entries of jax's cache instead of showing jax's warning: jax then compiles and keeps a new one.
 
-    jax itself would read the damaged entry again in every later process.
+    jax itself would read the damaged entry again in every later process. A cache that cannot be read or written for
+    other reasons is warned about once; `shown` remembers that.
     """
     if (match := _DAMAGED.match(str(message))) is None:
         show(message, *details, **options)
         return
-    folder = Path(os.environ["JAX_COMPILATION_CACHE_DIR"])
-    for entry in folder.glob("*-cache"):
-        used = entry.with_name(entry.name.removesuffix("cache") + "atime")  # a killed process has not written it
-        if entry.name.startswith(f"{match[1]}-") or not used.exists():
-            for path in (entry, used):
-                path.unlink(missing_ok=True)
+    kind, program = match.groups()
+    is_mended = kind == "writing" and "-atime" in str(message)  # a killed process has not written that file
+    for entry in Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).glob("*-cache"):
+        used = entry.with_name(entry.name.removesuffix("cache") + "atime")
+        if not used.exists() or (kind == "reading" and entry.name.startswith(f"{program}-")):
+            with suppress(OSError):
+                entry.unlink(missing_ok=True)
+                used.unlink(missing_ok=True)
+                is_mended |= kind == "reading"
+    if not is_mended and not shown:
+        shown.add(kind)
+        show(message, *details, **options)

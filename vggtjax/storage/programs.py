@@ -1,8 +1,8 @@
 """Jitted functions that the next process need not trace again.
 
 Tracing and lowering the network take as long as loading its compiled form. If compiled programs are kept in the user's
-cache (`cache.keep_compilations`), so are lowered programs (jax.export). Their key is the sources of this package, the
-versions of jax, the platform, the static options, and the shapes of the arguments.
+cache (`cache.keep_compilations`), so are, on a CPU, lowered programs (jax.export). Their key is the sources of this
+package, the versions of jax, the platform, the static options, and the shapes of the arguments.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vggtjax.errors import OutputError
 from vggtjax.storage.cache import compiled_folder, lowered_folder
 from vggtjax.storage.writing import writing
 
-KEPT_BYTES = 2**28  # of lowered programs; the oldest are removed first
+KEPT_BYTES = 2**28  # of lowered programs and texts; the oldest are removed first
 _DIGEST = 32  # bytes of the sha256 at the start of a kept file
 _PACKAGE = Path(__file__).parents[1]
 
@@ -60,7 +60,7 @@ class Program:
     def _key(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Return the key of a program on disk, None if it cannot be kept; and the traced options."""
         traced = {name: value for name, value in options.items() if name not in self._static}
-        if not _keeping():
+        if not _keeping() or jax.default_backend() != "cpu":
             return None, traced
         leaves, structure = jax.tree.flatten((arguments, traced))
         if any(isinstance(leaf, Tracer) for leaf in leaves):
@@ -85,7 +85,7 @@ class Program:
         """Return the program of a file, or trace the function and write the file; on failure, the jitted function."""
         name = f"{self.function.__module__}.{self.function.__qualname__}"
         precision = jax.config.values["jax_default_matmul_precision"]
-        path = _kept_path("\n".join((source_digest(), name, *map(str, key), str(precision))), "bin")
+        path = _kept_path("\n".join((source_digest(), name, *map(str, key), str(precision))))
         if (content := _read_kept(path)) is not None:
             return jax.jit(export.deserialize(bytearray(content)).call)
         shapes, named = jax.tree.map(
@@ -98,7 +98,6 @@ class Program:
             return self._jitted
         try:
             _keep(path, content)
-            _prune(path.parent)
         except OutputError:  # the cache cannot be written
             return self._jitted
         return jax.jit(exported.call)
@@ -111,10 +110,10 @@ def keep_type(kind: type) -> type:
 
 
 def kept_text(name: str, make: Callable[[], str]) -> str:
-    """Return text that depends on `name` and the sources of this package alone, made once where programs are kept."""
+    """Return text that depends on `name` and the sources of this package alone; keep it if compiled programs are."""
     if not _keeping():
         return make()
-    path = _kept_path(f"{source_digest()} {name}", "txt")
+    path = _kept_path(f"{source_digest()} {name}")
     if (content := _read_kept(path)) is not None:
         return content.decode()
     text = make()
@@ -123,8 +122,8 @@ def kept_text(name: str, make: Callable[[], str]) -> str:
     return text
 
 
-def _kept_path(text: str, suffix: str) -> Path:
-    return lowered_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.{suffix}"
+def _kept_path(text: str) -> Path:
+    return lowered_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.bin"
 
 
 def _read_kept(path: Path) -> bytes | None:
@@ -140,11 +139,18 @@ def _read_kept(path: Path) -> bytes | None:
 def _keep(path: Path, content: bytes) -> None:
     with writing(path) as temporary:
         temporary.write_bytes(hashlib.sha256(content).digest() + content)
+    total = 0
+    with suppress(FileNotFoundError):  # another process removes files, too
+        for old in sorted(path.parent.glob("*.bin"), key=lambda path: path.stat().st_mtime, reverse=True):
+            total += old.stat().st_size
+            if total > KEPT_BYTES:
+                old.unlink()
 
 
 def _keeping() -> bool:
+    """Return whether compiled programs are kept in the user's cache."""
     folder = jax.config.values["jax_compilation_cache_dir"]
-    return folder is not None and Path(folder) == compiled_folder() and jax.default_backend() == "cpu"
+    return folder is not None and Path(folder) == compiled_folder()
 
 
 @cache
@@ -155,11 +161,3 @@ def source_digest() -> str:
         digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
     versions = [version(name) for name in ("jax", "jaxlib", "flax")]
     return f"{' '.join(versions)} {jax.default_backend()} {digest.hexdigest()}"
-
-
-def _prune(folder: Path) -> None:
-    total = 0
-    for path in sorted(folder.glob("*.bin"), key=lambda path: path.stat().st_mtime, reverse=True):
-        total += path.stat().st_size
-        if total > KEPT_BYTES:
-            path.unlink(missing_ok=True)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
 import time
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
@@ -17,7 +20,9 @@ from filelock import FileLock, Timeout
 from vggtjax.errors import InputError, OutputError
 from vggtjax.storage.json_values import read_json
 
-_LEFTOVER = re.compile(r"\.partial-\w+(\.lock)?|\..+\.partial(\.\w+)?")  # temporary names, of earlier versions too
+_MARK = ".vggtjax-partial-"  # of temporary folders
+_LEFTOVER = re.compile(re.escape(_MARK) + r"[0-9a-f]{16}(\.lock)?")
+_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP}  # of file systems without locks
 _OLD = 24 * 3600  # seconds; no writer takes this long
 _TRIES = 8
 
@@ -50,18 +55,21 @@ def staging(folder: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def locked_folder(folder: str | Path, what: str) -> Iterator[None]:
+def locked_folder(folder: str | Path, what: str, wait: float = 0) -> Iterator[None]:
     """Keep other runs, which lock the same folder (made if missing), from writing `what` there at the same time.
 
-    The operating system releases the lock of a killed process. Raises OutputError where another run holds the lock, or
-    where the folder cannot be written.
+    The operating system releases the lock of a killed process. A file system without locks is written without a lock,
+    with a warning. Raises OutputError where another run holds the lock for `wait` seconds, or where the folder cannot
+    be written.
     """
     path = Path(folder) / ".vggtjax.lock"
     with _explaining(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock = _acquire(path)
-    if lock is None:
+        lock, is_free = _acquire(path, wait)
+    if not is_free:
         raise OutputError(f"another run is writing {what} into {folder}; wait for it or choose another folder")
+    if lock is None:
+        warnings.warn("the file system has no locks; start only one run for each output folder", stacklevel=1)  # once
     try:
         yield
     finally:
@@ -84,8 +92,9 @@ def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str)
     new = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
     with staging(folder):
         pass
-    for parent in new:
-        parent.rmdir()
+    with suppress(OSError):  # another run writes there by now
+        for parent in new:
+            parent.rmdir()
 
 
 def says_format(path: Path, name: str) -> bool:
@@ -112,48 +121,55 @@ def _staged(folder: Path) -> Iterator[Path]:
     """Yield a new temporary folder. Other writers see its lock file beside it, and do not remove the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(folder)
-    lock, name = None, ""
+    lock, is_free, staged = None, False, folder
     for _ in range(_TRIES):  # another writer may remove our lock file, as a leftover, before we lock it: try again
-        name = f".partial-{token_hex(4)}"
-        try:
-            lock = _acquire(folder / f"{name}.lock")
-        except OSError:  # a file system without locks: leftovers are removed by their age
+        staged = folder / f"{_MARK}{token_hex(8)}"
+        lock, is_free = _acquire(staged.with_suffix(".lock"))
+        if is_free:
             break
-        if lock is not None:
-            break
-    staged = folder / name
     try:
         staged.mkdir()
         yield staged
     finally:
         shutil.rmtree(staged, ignore_errors=True)
-        if lock is not None:
-            _release(lock)
+        _release(lock)
 
 
+@lru_cache(maxsize=256)  # once in a process: a scan of 20,000 files takes as long as writing 50
 def _remove_leftovers(folder: Path) -> None:
-    """Remove what killed writers left in a folder: their locks are free, or their files are old."""
+    """Remove what killed writers left in a folder: their locks are free, or they have no lock and are old."""
     for path in [Path(entry) for entry in os.scandir(folder) if _LEFTOVER.fullmatch(entry.name)]:
         with suppress(OSError):  # files of another user, or of a writer that ends now
             if path.suffix == ".lock":
-                if (lock := _acquire(path)) is not None:
+                lock, _ = _acquire(path)
+                if lock is not None:
                     shutil.rmtree(path.with_suffix(""), ignore_errors=True)
-                    _release(lock)
-            elif time.time() - path.lstat().st_mtime > _OLD and not path.with_name(f"{path.name}.lock").exists():
-                shutil.rmtree(path) if path.is_dir() else path.unlink()
+                _release(lock)
+            elif time.time() - path.lstat().st_mtime > _OLD and not path.with_suffix(".lock").exists():
+                shutil.rmtree(path)
 
 
-def _acquire(path: Path) -> FileLock | None:
-    """Return the lock of a file that is made if missing; None if another writer holds the lock."""
-    lock = FileLock(path, timeout=0, thread_local=False)
+def _acquire(path: Path, wait: float = 0) -> tuple[FileLock | None, bool]:
+    """Return the lock of a file, made if missing, and whether the file is free.
+
+    There is no lock if another writer holds it for `wait` seconds (not free), or if the file system has none (free).
+    """
+    lock = FileLock(path, timeout=wait, thread_local=False, fallback_to_soft=False)
     try:
         lock.acquire()
     except Timeout:
-        return None
-    return lock
+        return None, False
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        path.unlink(missing_ok=True)
+        return None, True
+    return lock, True
 
 
-def _release(lock: FileLock) -> None:
+def _release(lock: FileLock | None) -> None:
+    if lock is None:
+        return
     with suppress(OSError):  # Windows cannot remove an open file
         Path(lock.lock_file).unlink(missing_ok=True)  # before the release: afterwards another process may hold it
     lock.release()
