@@ -2,12 +2,15 @@
 
 import ast
 import re
+from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
+from importlib.util import resolve_name
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
+TOPS = ("vggtjax", "converters", "benchmarks")
 FACES = ("vggtjax", "vggtjax.__main__")  # the public names, and `python -m vggtjax`: above all layers
 Graph = dict[str, set[str]]
 
@@ -19,26 +22,35 @@ def layers(text: str) -> dict[str, int]:
 
 
 def imports(root: Path) -> Graph:
-    """Return module -> modules that it imports anywhere, inside functions too; modules of this repository alone."""
-    tops = ("vggtjax", "converters", "benchmarks")
-    paths = {
-        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
-        for top in tops
-        for path in (root / top).rglob("*.py")
-    }
-    graph: Graph = {}
-    for module, path in paths.items():
-        graph[module] = set()
+    """Return module -> modules that it imports anywhere: in functions, in stubs, relatively, or by a name in a string.
+
+    Only modules of this repository count.
+    """
+    files = [path for top in TOPS for path in sorted((root / top).rglob("*.py*")) if path.suffix in (".py", ".pyi")]
+    modules = {".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__") for path in files}
+    graph: Graph = {module: set() for module in modules}
+    for path in files:
+        package = ".".join(path.relative_to(root).parent.parts)
+        module = package if path.stem == "__init__" else f"{package}.{path.stem}"
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Import):
-                graph[module] |= {alias.name for alias in node.names if alias.name in paths}
-            elif isinstance(node, ast.ImportFrom) and str(node.module).split(".")[0] in tops:
-                for alias in node.names:
-                    name = f"{node.module}.{alias.name}"
-                    if alias.name != "__version__":
-                        graph[module].add(name if name in paths else str(node.module))
+            graph[module] |= set(imported(node, package, modules))
         graph[module].discard(module)
     return graph
+
+
+def imported(node: ast.AST, package: str, modules: set[str]) -> Iterator[str]:
+    """Yield the modules that a node of a file in `package` imports; a string that names a module counts."""
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names if alias.name in modules)
+    elif isinstance(node, ast.ImportFrom):
+        source = resolve_name("." * node.level + (node.module or ""), package)
+        if source.split(".")[0] in TOPS:
+            names = [alias.name for alias in node.names if alias.name != "__version__"]
+            yield from (f"{source}.{name}" if f"{source}.{name}" in modules else source for name in names)
+    elif isinstance(node, ast.Constant) and isinstance(node.value, str) and re.fullmatch(r"\.*\w+(\.\w+)+", node.value):
+        depth = len(node.value) - len(node.value.lstrip("."))
+        if depth <= package.count(".") + 1 and (name := resolve_name(node.value, package)) in modules:
+            yield name
 
 
 def room(module: str) -> str:
@@ -91,6 +103,26 @@ def test_an_upward_import_and_a_circle_are_found(graph, layer):
     worse = graph | {"vggtjax.network.rope": {"vggtjax.method.mask"}}
     assert upward(worse, layer) == ["vggtjax.network.rope -> vggtjax.method.mask"]
     assert "vggtjax.errors" in circle(graph | {"vggtjax.errors": {"vggtjax.cameras"}})
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("rope.py", "import vggtjax.method.mask"),
+        ("rope.py", "from vggtjax.method import mask"),
+        ("rope.py", "from ..method import mask"),
+        ("rope.py", "from ..method.mask import upsample"),
+        ("rope.py", 'def late():\n    return importlib.import_module("vggtjax.method.mask")'),
+        ("rope.py", 'importlib.import_module("..method.mask", __package__)'),
+        ("rope.pyi", "from vggtjax.method.mask import upsample as upsample"),
+        ("rope.pyi", "from ..method.mask import upsample as upsample"),
+    ],
+)
+def test_every_kind_of_import_is_found(tmp_path, layer, file, text):
+    for path, content in (("network/__init__.py", ""), (f"network/{file}", text), ("method/mask.py", "")):
+        (tmp_path / "vggtjax" / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "vggtjax" / path).write_text(content)
+    assert upward(imports(tmp_path), layer) == ["vggtjax.network.rope -> vggtjax.method.mask"]
 
 
 def test_the_root_is_small():
