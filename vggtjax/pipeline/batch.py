@@ -79,7 +79,7 @@ def reconstruct_many(
         InputError: names that are not plain file names, an invalid option, or a folder with results of other settings.
         OutputError: the folder cannot be written, or another run is writing it.
     """
-    run = _Run.of(model, options, framing, sampling, saving, fusion, pad_frames, changes)
+    run = _Batch.of(model, options, framing, sampling, saving, fusion, pad_frames, changes)
     out = Path(out)
     for name in sources:
         if name in ("", ".", "..") or Path(name).name != name or not name.isprintable():
@@ -94,7 +94,7 @@ def reconstruct_many(
 
 
 @dataclass(frozen=True)
-class _Run:
+class _Batch:
     """What all clips of a batch have in common."""
 
     model: Model
@@ -116,7 +116,7 @@ class _Run:
         fusion: Any,
         pad_frames: bool,
         changes: Mapping[str, Any],
-    ) -> _Run:
+    ) -> _Batch:
         """Return a run of the arguments of `reconstruct_many`; what is wrong for all clips is raised once, here."""
         words = dict(changes)
         if isinstance(options, Mapping):
@@ -168,7 +168,7 @@ class _Run:
         return ClipOutcome(name, "done", frames=len(clip))
 
 
-def _reconstruct_all(run: _Run, sources: Mapping[str, ClipSource], out: Path, work: _Work) -> Generator[ClipOutcome]:
+def _reconstruct_all(run: _Batch, sources: Mapping[str, ClipSource], out: Path, work: _Work) -> Generator[ClipOutcome]:
     """Yield the outcomes of clips: while one is computed, the next is loaded and the previous one written."""
     with ThreadPoolExecutor(1) as loader, ThreadPoolExecutor(1) as writer:
         loading: deque[tuple[str, Future[Clip]]] = deque()

@@ -55,7 +55,7 @@ from vggtjax.errors import InputError
 from vggtjax.progress import Progress
 from vggtjax.results import foreign, previews, tracks
 from vggtjax.results.archive import OPTIONAL_FILES
-from vggtjax.results.frame import Frame, LeastConfidence, frame_of
+from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
 from vggtjax.results.glb import build_scene
 from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, joined, least_confidence, write_ply
 from vggtjax.results.result import Result
@@ -121,7 +121,7 @@ def write_files(
 
 def _frames(
     result: Result, resolution: Resolution, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None
-) -> Iterator[Callable[[], Frame]]:
+) -> Iterator[Callable[[], ResultFrame]]:
     """Yield, for each frame, a function that makes it: pictures are read in order, frames are made in parallel."""
     count = len(result.depth)
     shown = iter(pictures) if pictures is not None else itertools.repeat(None, count)
@@ -155,7 +155,7 @@ class _Written(NamedTuple):
 
 def _write_frames(
     result: Result,
-    frames: Iterator[Callable[[], Frame]],
+    frames: Iterator[Callable[[], ResultFrame]],
     least: LeastConfidence,
     saving: Saving,
     folder: Path,
@@ -177,7 +177,7 @@ def _write_frames(
     (folder / "depth/scale.txt").write_text(f"{head}\n{scale!r}\n", encoding="utf-8")
     inverse_range = previews.inverse_depth_range(result.depth, valid)
 
-    def write_frame(number: int, make: Callable[[], Frame]) -> tuple[_Written, PointCloud]:
+    def write_frame(number: int, make: Callable[[], ResultFrame]) -> tuple[_Written, PointCloud]:
         name, frame = f"{number:06d}", make()
         valid, pixels = frame.valid, frame.surer_than(least)
         np.save(folder / f"confidence/{name}.npy", frame.confidence, allow_pickle=False)

@@ -30,7 +30,7 @@ from vggtjax.cameras import Cameras, world_from_camera
 from vggtjax.clips.images import read_image
 from vggtjax.clips.masks import read_mask
 from vggtjax.errors import InputError, ResultError
-from vggtjax.results.frame import Frame
+from vggtjax.results.frame import ResultFrame
 from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, read_headers
 from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory
 
@@ -39,7 +39,7 @@ _GREY = 128  # of pictures that a format does not keep
 logger = logging.getLogger(__name__)
 
 
-def write_frame(folder: Path, number: int, frame: Frame) -> None:
+def write_frame(folder: Path, number: int, frame: ResultFrame) -> None:
     """Write a frame as VGGT4D does."""
     Image.fromarray(frame.image).save(folder / f"frame_{number:04d}.png")
     np.save(folder / f"frame_{number:04d}.npy", frame.depth, allow_pickle=False)

@@ -23,7 +23,7 @@ class LeastConfidence(NamedTuple):
     dynamic: float
 
 
-class Frame(NamedTuple):
+class ResultFrame(NamedTuple):
     """A frame of h x w pixels."""
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -52,7 +52,7 @@ class Frame(NamedTuple):
 
 def frame_of(
     result: Result, frame: int, resolution: Resolution = "model", *, picture: UInt8[np.ndarray, "h w 3"] | None = None
-) -> Frame:
+) -> ResultFrame:
     """Return a frame at the model's size, or at its source's.
 
     At the source's size the centre of every pixel is mapped to the model's frame. Masks and confidence are those of the
@@ -73,7 +73,7 @@ def frame_of(
         raise InputError(f"resolution is {resolution!r}; expected 'model' or 'original'")
     if resolution == "original":
         return _source_frame(result, frame, picture)
-    return Frame(
+    return ResultFrame(
         image=result.images[frame],
         depth=result.depth[frame],
         confidence=result.depth_confidence[frame],
@@ -85,7 +85,7 @@ def frame_of(
     )
 
 
-def _source_frame(result: Result, frame: int, picture: UInt8[np.ndarray, "h w 3"] | None) -> Frame:
+def _source_frame(result: Result, frame: int, picture: UInt8[np.ndarray, "h w 3"] | None) -> ResultFrame:
     height, width = (int(side) for side in result.source_size[frame])
     scale, offset = result.source_scale[frame], result.source_offset[frame]
     if picture is None:
@@ -103,7 +103,7 @@ def _source_frame(result: Result, frame: int, picture: UInt8[np.ndarray, "h w 3"
     intrinsics = result.intrinsics[frame].astype(np.float64)
     intrinsics[:2] *= scale[:, None]
     intrinsics[:2, 2] += offset
-    return Frame(
+    return ResultFrame(
         image=picture,
         depth=np.where(seen, depth, 0).astype(np.float32),
         confidence=np.where(seen, result.depth_confidence[frame][nearest], 0).astype(np.float32),

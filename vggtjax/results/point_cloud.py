@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from vggtjax.results.frame import Frame, LeastConfidence
+from vggtjax.results.frame import LeastConfidence, ResultFrame
 from vggtjax.results.result import Result
 
 _VERTEX = np.dtype([("points", "<f4", 3), ("colors", "u1", 3), ("alpha", "u1")])
@@ -53,7 +53,7 @@ def least_confidence(result: Result, confidence_percentile: float) -> LeastConfi
     return LeastConfidence(percentile(valid & ~result.dynamic_mask), percentile(valid & result.dynamic_mask))
 
 
-def frame_cloud(frame: Frame, pixels: Bool[np.ndarray, "h w"]) -> PointCloud:
+def frame_cloud(frame: ResultFrame, pixels: Bool[np.ndarray, "h w"]) -> PointCloud:
     """Return the points of the chosen pixels of a frame, but for points too far away for float32."""
     points = frame.world_points()[pixels]
     finite = np.isfinite(points).all(axis=-1)
