@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from functools import partial
 
 import jax
 import numpy as np
@@ -251,10 +252,27 @@ def test_two_batches_on_one_folder(model, clips, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["", "..", "a/b", "a\n"])
-def test_names_that_are_no_folders(model, tmp_path, name):
-    with pytest.raises(InputError, match="a clip is named"):
-        next(reconstruct_many(model, {name: "x"}, tmp_path))
-    assert not any(tmp_path.iterdir())
+def test_a_name_that_is_no_folder_fails_alone(model, clips, tmp_path, name):
+    sources = {name: str(clips / "clip0"), "b": str(clips / "clip2")}  # clip2 is corrupt: it fails in its turn
+    odd, other = reconstruct_many(model, sources, tmp_path / "out", method="vggt")
+    assert (odd.name, odd.status) == (name, "failed")
+    assert "a clip is named" in odd.reason
+    assert "1.png" in other.reason
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [SETTINGS_NAME]
+
+
+def test_only_settings_that_change_results_are_compared_and_they_are_named(model, tmp_path):
+    run = partial(reconstruct_many, model, {}, tmp_path)
+    assert list(run()) == []
+    assert list(run(gram="cosine", suppress="zero", refine_mask=False, sampling={"stride": 1})) == []
+    with pytest.raises(InputError, match=r"\(gram 'cosine', now 'dot'; mask_pairs 5, now 3\)"):
+        list(run(gram="dot", mask_pairs=3))
+
+
+def test_unknown_options_are_named(model, tmp_path):
+    for name in ("keep_passes", "masks"):
+        with pytest.raises(TypeError, match=f"no options named {name}; expected some of method, gram, .*, mode, size"):
+            next(reconstruct_many(model, {}, tmp_path, options={name: True}))
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from vggtjax.progress import Progress
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
+from vggtjax.storage.json_values import read_json
 from vggtjax.storage.writing import locked_folder, writing
 
 SETTINGS_NAME = "batch.json"
@@ -61,14 +62,16 @@ def reconstruct_many(
 ) -> Generator[ClipOutcome]:
     """Reconstruct clips, each into a folder of its own, and yield the outcome of each as it is finished.
 
-    Clips of one shape share compiled programs. A clip that fails does not stop the others. A later run with the same
-    settings keeps finished clips, so an interrupted run resumes. A clip's folder appears whole or not at all.
+    Clips of one shape share compiled programs. A clip that fails, also for a name that is not a plain file name, does
+    not stop the others. A later run with the same settings keeps finished clips, so an interrupted run resumes. A
+    clip's folder appears whole or not at all.
 
     Args:
         model: what `load_model` returned.
         sources: clips by name, as for `load_clip`; the names become folders.
         out: the folder of these folders.
-        options, fusion, pad_frames: as for `reconstruct`; a mapping of its keywords serves as options, too.
+        options, fusion, pad_frames: as for `reconstruct`; a mapping of the names in `changes`, of fusion and of
+            pad_frames serves as options, too.
         framing, sampling: how frames are fitted and which are taken; the keywords of `load_clip` serve, too.
         saving: how results are written; the keywords of `Reconstruction.save` serve, too.
         progress: called before the first clip and after each computed clip, with the frames done and the frames of all
@@ -76,19 +79,20 @@ def reconstruct_many(
         changes: fields of `framing` and `options` by name, such as `mode="pad"`.
 
     Raises:
-        InputError: names that are not plain file names, an invalid option, or a folder with results of other settings.
+        InputError: an invalid option, or a folder with results of other settings.
         OutputError: the folder cannot be written, or another run is writing it.
+        TypeError: a name that is no option.
     """
     run = _Batch.of(model, options, framing, sampling, saving, fusion, pad_frames, changes)
     out = Path(out)
-    for name in sources:
-        if name in ("", ".", "..") or Path(name).name != name or not name.isprintable():
-            raise InputError(f"a clip is named {name!r}; expected a plain name, which becomes its folder")
     with locked_folder(out, "a batch"):
         _settle(out, run.settings)
-        kept = {name for name in sources if is_result(out / name / ARCHIVE_NAME)}
+        odd = {name for name in sources if name in ("", "..") or Path(name).name != name or not name.isprintable()}
+        reason = "a clip is named {!r}; expected a plain name, which becomes its folder"
+        yield from (ClipOutcome(name, "failed", reason.format(name)) for name in sources if name in odd)
+        kept = {name for name in sources if name not in odd and is_result(out / name / ARCHIVE_NAME)}
         yield from (ClipOutcome(name, "kept") for name in sources if name in kept)
-        names = [name for name in sources if name not in kept]
+        names = [name for name in sources if name not in odd and name not in kept]
         work = _Work({name: _length(sources[name], run.sampling) for name in names}, progress or (lambda *_: None))
         yield from _reconstruct_all(run, {name: sources[name] for name in names}, out, work)
 
@@ -124,6 +128,10 @@ class _Batch:
             fusion, pad_frames = words.pop("fusion", fusion), words.pop("pad_frames", pad_frames)
         of_framing = {name: words.pop(name) for name in FramingChanges.__annotations__ if name in words}
         framing = dataclasses.replace(framing or Framing(), **of_framing)
+        if unknown := words.keys() - OptionChanges.__annotations__.keys():
+            expected = ", ".join([*OptionChanges.__annotations__, *FramingChanges.__annotations__])
+            unknown = ", ".join(sorted(unknown))
+            raise TypeError(f"reconstruct_many() has no options named {unknown}; expected some of {expected}")
         options = (options or Options()).changed(**words)
         if fusion is not None:
             check_fuses(options.method)
@@ -145,7 +153,8 @@ class _Batch:
             "mode": self.fitter.mode,
             "size": self.fitter.size,
             **dataclasses.asdict(self.sampling),
-            **self.options.to_json(),
+            "stride": self.sampling.step,
+            **self.options.resolved().to_json(),
             **dataclasses.asdict(self.saving),
             "fusion": fusion_digest(self.fusion),
             "pad_frames": self.pad_frames,
@@ -246,13 +255,17 @@ def _written(name: str, write: Future[ClipOutcome]) -> ClipOutcome:
         return _failed(name, error)
 
 
-def _settle(out: Path, settings: Mapping[str, Any]) -> None:
+def _settle(out: Path, settings: dict[str, Any]) -> None:
     """Write the settings of a batch into its folder. Raises InputError if the folder has other settings."""
-    text = json.dumps(settings, indent=2, sort_keys=True, default=str) + "\n"
     path = out / SETTINGS_NAME
-    if path.is_file():
-        if path.read_text(encoding="utf-8") != text:
-            raise InputError(f"{path} has other settings than this run; choose another folder, or move the file away")
+    if not path.is_file():
+        with writing(path) as temporary:
+            temporary.write_text(json.dumps(settings, indent=2, sort_keys=True) + "\n", encoding="utf-8")
         return
-    with writing(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    earlier = read_json(path, dict[str, Any], "settings of a batch")
+    names = [name for name in settings | earlier if earlier.get(name) != settings.get(name)]
+    if names:
+        others = "; ".join(f"{name} {earlier.get(name)!r}, now {settings.get(name)!r}" for name in names)
+        raise InputError(
+            f"{path} has other settings than this run ({others}); choose another folder, or move the file away"
+        )
