@@ -13,7 +13,8 @@ from tests.tiny import tiny_config
 from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
 from vggtjax.method.fusion_family import parse_family, start
-from vggtjax.method.fusion_file import load_fusion, save_fusion, warn_if_fitted_otherwise
+from vggtjax.method.fusion_file import load_fusion, origin_of_fit, save_fusion, warn_if_fitted_otherwise
+from vggtjax.options import Options
 from vggtjax.storage.tensor_file import read_tensors
 
 
@@ -72,11 +73,11 @@ def test_a_malformed_origin_is_one_sentence(tmp_path, about, sentence):
     save_fusion(path, start(()))
     save_file(load_file(path), path, read_tensors(path).metadata | {"about": about})
     with pytest.raises(InputError, match=sentence):
-        warn_if_fitted_otherwise(path, Model(tiny_config(), {}, "mine"))
+        warn_if_fitted_otherwise(path, Model(tiny_config(), {}, "mine"), Options())
 
 
 def test_other_models_and_settings_are_warned_of(tmp_path, caplog):
-    """By digest; by the name of the model where an older file has no digest."""
+    """By digest; by the name of the model where an older file has no digest. And by every option of the passes."""
     path = tmp_path / "a.safetensors"
     model, other = (Model(tiny_config(), {"x": np.full(2, value)}, "mine") for value in (1.0, 2.0))
     renamed = dataclasses.replace(model, name="models/renamed.safetensors")
@@ -91,5 +92,21 @@ def test_other_models_and_settings_are_warned_of(tmp_path, caplog):
     ):
         caplog.clear()
         save_fusion(path, start(()), about)
-        warn_if_fitted_otherwise(path, user, mask_pairs=5, align_scale=True)
+        warn_if_fitted_otherwise(path, user, Options(align_scale=True))
         assert [f"{record.args[2]} {record.args[3]}" for record in caplog.records] == ([warning] if warning else [])
+
+
+def test_every_option_of_the_passes_is_compared_and_the_type_of_the_weights_is_not(tmp_path, caplog):
+    path = tmp_path / "a.safetensors"
+    model = Model(tiny_config(), {"x": np.full(2, 1.5, np.float32)}, "mine")
+    narrow = dataclasses.replace(model, params={"x": model.params["x"].astype(jax.numpy.bfloat16)})
+    for fitted, used in ((model, narrow), (narrow, model)):
+        save_fusion(path, start(()), origin_of_fit(fitted, Options()))
+        warn_if_fitted_otherwise(path, used, Options(gram="cosine", refine_mask=True))
+    assert not caplog.records
+    other = Options(
+        gram="dot", suppress="drop", mask_pairs=2, align_scale=True, smooth_frames=3, compute_dtype="float64"
+    )
+    warn_if_fitted_otherwise(path, model, other)
+    names = {"gram", "suppress", "mask_pairs", "align_scale", "smooth_frames", "compute_dtype"}
+    assert {record.args[1] for record in caplog.records} == names  # pyright: ignore

@@ -6,12 +6,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import tyro
 from msgspec import Meta
 
 from vggtjax.commands.models import load
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, check_extra
-from vggtjax.options import ComputeDType
+from vggtjax.options import MethodName, Options
 from vggtjax.storage.json_values import Count, check_fields
 
 if TYPE_CHECKING:
@@ -58,8 +59,8 @@ class Clips:
             elif not Path(place).is_dir():
                 raise InputError(f"--data has {text!r}, and {place} is not a folder")
 
-    def passes(self, report: Report, model: Model, options: dict[str, Any]) -> dict[str, ClipPasses]:
-        """Return the passes over all clips by name; every source is a stage of the report."""
+    def passes(self, report: Report, model: Model, options: Options) -> dict[str, ClipPasses]:
+        """Return the passes over all clips by name, in one scale if so asked; every source is a stage of the report."""
         from vggtjax.learning.clip_passes import dataset_passes, generated_passes
 
         clips: dict[str, ClipPasses] = {}
@@ -73,7 +74,15 @@ class Clips:
                 else:
                     named = dataset_passes(model, name, Path(place), max_frames=self.max_frames, **common)
                 clips |= {f"{text}, {clip}": passes for clip, passes in named}
-        return clips
+        return {name: aligned(clip) for name, clip in clips.items()} if options.align_scale else clips
+
+
+@dataclass(frozen=True)
+class PassOptions(Options):
+    """The options that passes and their fusion depend on."""
+
+    method: tyro.conf.Suppress[MethodName] = "4dvggt-d"
+    refine_mask: tyro.conf.Suppress[bool | None] = None
 
 
 @dataclass(frozen=True)
@@ -107,9 +116,7 @@ def fit_fusion(
     model: str = "demo",
     family: tuple[str, ...] = ("scale", "calibrated", "correlated", "features", "robust"),
     fits: Fits = Fits(),
-    mask_pairs: int = 5,
-    align_scale: bool = False,
-    dtype: ComputeDType = "float32",
+    options: Annotated[PassOptions, tyro.conf.arg(name="method")] = PassOptions(),
 ) -> None:
     """Fit rules that fuse the two passes, and compare them with the paper's rule on clips that were not fitted to.
 
@@ -124,9 +131,7 @@ def fit_fusion(
         family: free parts: scale, calibrated, correlated, features, robust, soft, full, gate, or parts such as
             scale+power+floor+correlation+inflation+distrust+saliency+depth+boundary+dynamic+offset+temperature+gate.
         fits: fits
-        mask_pairs: number of pairs in which the keys of dynamic tokens are suppressed.
-        align_scale: scale the second pass to the first pass before the fusion.
-        dtype: type of the blocks' matrix products.
+        options: how the passes run
     """
     report = Report()
     with report.running():
@@ -134,6 +139,7 @@ def fit_fusion(
         from vggtjax.learning.export import begin, check_folder, save_fits
         from vggtjax.learning.fit import FitConfig
         from vggtjax.method.fusion_family import parse_family
+        from vggtjax.method.fusion_file import origin_of_fit
 
         check_extra("drawing a fit", "train", "matplotlib")
         check_folder(out)
@@ -144,10 +150,7 @@ def fit_fusion(
             FitConfig(parse_family(name), **settings)
         config = FitConfig(**settings)
         network = load(report, model)
-        options = {"mask_pairs": mask_pairs, "compute_dtype": dtype}
         passes = clips.passes(report, network, options)
-        if align_scale:
-            passes = {name: aligned(clip) for name, clip in passes.items()}
         patch = network.config.patch_size
         sampling: dict[str, Any] = {"held_out": held_out, "pixels": pixels}
         with report.stage("fit") as progress:
@@ -156,9 +159,8 @@ def fit_fusion(
                 every, patch, family, config, seeds=range(seeds), folder=states, progress=progress, **sampling
             )
         with report.stage("write"):
-            about = {"model": network.name, "model_sha256": network.identity.sha256, "data": list(clips.data)}
-            about |= sampling | options | {"align_scale": align_scale}
-            about |= {"max_frames": clips.max_frames, "size": clips.size}
+            about = origin_of_fit(network, options) | sampling
+            about |= {"data": list(clips.data), "max_frames": clips.max_frames, "size": clips.size}
             chosen = save_fits(out, scores, passes, patch, config, about=about)
     _say(report, scores, chosen, out)
     if not network.trained:

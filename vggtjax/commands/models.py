@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 from vggtjax.commands.arguments import ModelName
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
+from vggtjax.options import METHODS, Options
 
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
     from vggtjax.commands.report import Report
     from vggtjax.method.fusion_family import FusionParams
-    from vggtjax.options import Options
 
 _MOST_CONFIG_BYTES = 1 << 20
 
@@ -48,8 +48,8 @@ class ModelFiles:
     def load(self, report: Report, options: Options, methods: Sequence[str]) -> tuple[Model, FusionParams | None]:
         """Load the model, and the fitted rule of fusion (None, the paper's rule, without a file).
 
-        The rule is read first: InputError where it is invalid or no method fuses. A warning is logged if the rule was
-        fitted to another model or with other settings.
+        The rule is read first: InputError where it is invalid or none of the `methods` (in place of `options.method`)
+        fuses. A warning is logged if the rule was fitted to another model or with other options.
         """
         if self.fusion is None:
             return load(report, self.model, self.config), None
@@ -58,7 +58,8 @@ class ModelFiles:
         check_fuses(*methods)
         params = load_fusion(self.fusion)
         model = load(report, self.model, self.config)
-        warn_if_fitted_otherwise(self.fusion, model, align_scale=options.align_scale, mask_pairs=options.mask_pairs)
+        fusing = next(name for name in methods if METHODS[name].depth == "fused")
+        warn_if_fitted_otherwise(self.fusion, model, options.changed(method=fusing))
         return model, params
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, TypedDict, Unpack, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from vggtjax.method.fusion_family import Observations
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.passes import Passes
 from vggtjax.network.model import Predictions
+from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.progress import OnStage, Progress
 from vggtjax.results.reconstruction import Reconstruction
@@ -112,17 +113,27 @@ def _read(path: Path) -> ClipPasses | None:
     return ClipPasses(**arrays) if whole else None
 
 
+class PassesSettings(TypedDict, total=False):
+    """Keywords of `generated_passes` and `dataset_passes`."""
+
+    size: int | None  # side in pixels; the model's own if None
+    options: Options | Mapping[str, Any] | None  # or fields of them; method, align_scale, refine_mask change no pass
+    folder: Path | None  # of kept passes; the user's cache if None
+    on_stage: OnStage | None  # as for `reconstruct`
+    progress: Progress | None  # called with the clips done and their number
+
+
+class _LabelledClip(NamedTuple):
+    """A clip with its truth, loaded only if its passes are not kept."""
+
+    name: str
+    key: Mapping[str, Any]
+    pictures: Callable[[], Any]
+    truth: Callable[[Reconstruction], tuple[Any, Any]]  # depth and dynamic pixels at the pixels of a result
+
+
 def generated_passes(
-    model: Model,
-    count: int,
-    *,
-    frames: int = 12,
-    size: int | None = None,
-    seed: int = 0,
-    options: Mapping[str, Any] | None = None,
-    folder: Path | None = None,
-    on_stage: OnStage | None = None,
-    progress: Progress | None = None,
+    model: Model, count: int, *, frames: int = 12, seed: int = 0, **settings: Unpack[PassesSettings]
 ) -> Iterator[tuple[str, ClipPasses]]:
     """Yield names and passes of generated test scenes with moving things and exact truth.
 
@@ -130,51 +141,36 @@ def generated_passes(
         model: from `load_model`.
         count: number of scenes.
         frames: of each scene, at least 12.
-        size: side in pixels; the model's own if None.
         seed: of the set of scenes; training draws no scene and no texture of it.
-        options: keywords of `reconstruct`.
-        folder: of kept passes; the user's cache if None.
-        on_stage: as for `reconstruct`.
-        progress: called with the scenes done and their number.
+        settings: see `PassesSettings`.
     """
     from vggtjax.scenes import SceneConfig, held_out_scenes
 
-    side = model.config.image_size if size is None else size
-    key = {"model": model.identity.sha256, "scenes": seed, "frames": frames, "size": side, "options": options}
+    side = model.config.image_size if (size := settings.get("size")) is None else size
 
     @cache  # all scenes are drawn at once, and only if passes are missing
     def scenes() -> Any:
         return held_out_scenes("dynamic", count, SceneConfig(side, side, frames), seed=seed)
 
-    def passes(number: int) -> ClipPasses:
-        scene = jax.tree.map(lambda x: x[number], scenes())
-        result = _result(model, scene.images, side, options, on_stage)
-        return passes_of(result, scene.depth, scene.dynamic_mask)
+    def labelled(number: int) -> _LabelledClip:
+        def truth(_: Reconstruction) -> tuple[Any, Any]:
+            return scenes().depth[number], scenes().dynamic_mask[number]
 
-    for scene in range(count):
-        yield f"scene {seed}-{scene}", kept_passes(key | {"scene": scene}, lambda scene=scene: passes(scene), folder)
-        if progress is not None:
-            progress(scene + 1, count)
+        key = {"scenes": seed, "frames": frames, "scene": number}
+        return _LabelledClip(f"scene {seed}-{number}", key, lambda: scenes().images[number], truth)
+
+    yield from _all_passes(model, map(labelled, range(count)), count, **settings)
 
 
 def dataset_passes(
-    model: Model,
-    dataset: str,
-    root: Path,
-    *,
-    max_frames: int | None = None,
-    size: int | None = None,
-    options: Mapping[str, Any] | None = None,
-    folder: Path | None = None,
-    on_stage: OnStage | None = None,
-    progress: Progress | None = None,
+    model: Model, dataset: str, root: Path, *, max_frames: int | None = None, **settings: Unpack[PassesSettings]
 ) -> Iterator[tuple[str, ClipPasses]]:
     """Yield names and passes of the sequences of a data set that have true depth; a warning names the others.
 
     Args:
-        model, size, options, folder, on_stage: as for `generated_passes`.
+        model: from `load_model`.
         dataset, root, max_frames: as for `find_sequences`.
-        progress: called with the sequences done and their number.
+        settings: see `PassesSettings`.
 
     Raises InputError where no sequence has true depth.
     """
@@ -182,28 +178,56 @@ def dataset_passes(
     from vggtjax.evaluation.datasets import DATASETS, find_sequences
     from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
 
-    side = model.config.image_size if size is None else size
-    openers, used = find_sequences(dataset, root, sampling=Sampling(max_frames=max_frames)), 0
+    openers = find_sequences(dataset, root, sampling=Sampling(max_frames=max_frames))
     max_depth = DATASETS[dataset].max_depth
-    key = {"model": model.identity.sha256, "dataset": [dataset, max_depth], "size": side, "options": options}
 
-    def passes(sequence: LabelledSequence) -> ClipPasses:
-        result = _result(model, [str(path) for path in sequence.pictures], side, options, on_stage)
-        truth = TruthAtPixels(sequence, result, max_depth=max_depth)
-        return passes_of(result, truth.depth, None if sequence.mask is None else truth.mask)
-
-    for number, (name, opener) in enumerate(openers.items()):
-        sequence = opener()
-        if sequence.depth is not None and any((sequence.depth(i) > 0).any() for i in range(len(sequence))):
-            used += 1
-            data = {"data": sequence_digest(sequence)}
-            yield name, kept_passes(key | data, lambda sequence=sequence: passes(sequence), folder)
-        else:
+    def labelled(name: str, sequence: LabelledSequence) -> _LabelledClip | None:
+        if sequence.depth is None or not any((sequence.depth(i) > 0).any() for i in range(len(sequence))):
             logger.warning("%s has no true depth and is left out", name)
-        if progress is not None:
-            progress(number + 1, len(openers))
-    if not used:
+            return None
+
+        def truth(result: Reconstruction) -> tuple[Any, Any]:
+            at_pixels = TruthAtPixels(sequence, result, max_depth=max_depth)
+            return at_pixels.depth, None if sequence.mask is None else at_pixels.mask
+
+        key = {"dataset": [dataset, max_depth], "data": sequence_digest(sequence)}
+        return _LabelledClip(name, key, lambda: [str(path) for path in sequence.pictures], truth)
+
+    clips = (labelled(name, opener()) for name, opener in openers.items())
+    named = None
+    for named in _all_passes(model, clips, len(openers), **settings):
+        yield named
+    if named is None:
         raise InputError(f"no sequence of {root} has true depth; a fusion cannot be fitted to it")
+
+
+def _all_passes(
+    model: Model,
+    clips: Iterable[_LabelledClip | None],
+    count: int,
+    *,
+    size: int | None = None,
+    options: Options | Mapping[str, Any] | None = None,
+    folder: Path | None = None,
+    on_stage: OnStage | None = None,
+    progress: Progress | None = None,
+) -> Iterator[tuple[str, ClipPasses]]:
+    """Yield names and passes of `count` clips; None stands for a clip that is left out."""
+    size = model.config.image_size if size is None else size
+    options = options if isinstance(options, Options) else Options(**(options or {}))
+    options = options.changed(method=METHOD, align_scale=False, refine_mask=False)
+    common = {"model": model.identity.sha256, "size": size, "options": options.passes_settings}
+
+    def passes(clip: _LabelledClip) -> ClipPasses:
+        frames = load_clip(clip.pictures(), size=size, patch=model.config.patch_size)
+        result = reconstruct(model, frames, options=options, size=size, keep_passes=True, on_stage=on_stage)
+        return passes_of(result, *clip.truth(result))
+
+    for done, clip in enumerate(clips, 1):
+        if clip is not None:
+            yield clip.name, kept_passes(common | dict(clip.key), partial(passes, clip), folder)
+        if progress is not None:
+            progress(done, count)
 
 
 def sequence_digest(sequence: LabelledSequence) -> str:
@@ -216,15 +240,6 @@ def sequence_digest(sequence: LabelledSequence) -> str:
         for array in () if read is None else map(read, range(len(sequence))):
             digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _result(
-    model: Model, frames: Any, side: int, options: Mapping[str, Any] | None, on_stage: OnStage | None
-) -> Reconstruction:
-    """Reconstruct pictures or their paths, and keep the passes."""
-    clip = load_clip(frames, size=side, patch=model.config.patch_size)
-    settings = dict(options or {})
-    return reconstruct(model, clip, method=METHOD, size=side, keep_passes=True, on_stage=on_stage, **settings)
 
 
 def observations(clip: ClipPasses, patch_size: int) -> Observations:

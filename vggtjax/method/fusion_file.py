@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import logging
@@ -16,7 +17,7 @@ import numpy as np
 from vggtjax.checkpoint import Model
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.fusion_family import PARTS, FusionParams, projected, start
-from vggtjax.options import METHODS, find_method
+from vggtjax.options import METHODS, Options, find_method
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.tensor_file import Spec, StoredTensor, read_tensors, write_tensors
 
@@ -71,15 +72,24 @@ def check_fuses(*methods: str) -> None:
         raise InputError(f"a fusion is given, and method {methods[0]!r} does not fuse; expected {names}")
 
 
-def warn_if_fitted_otherwise(path: Path, model: Model, **settings: Any) -> None:
-    """Log a warning for a model and for every setting (`align_scale`, `mask_pairs`) that differ from those of the fit.
+def origin_of_fit(model: Model, options: Options) -> dict[str, Any]:
+    """Return what a fit depends on that `warn_if_fitted_otherwise` compares, as JSON values."""
+    digests = {"model_sha256": model.identity.sha256, "weights_sha256": _weights_digest(model)}
+    return {"model": model.name, **digests, **options.passes_settings, "align_scale": options.align_scale}
 
-    Models are compared by their sha256; where a file has none, by their names, unless it has a path for the name.
+
+def warn_if_fitted_otherwise(path: Path, model: Model, options: Options) -> None:
+    """Log a warning for a model, and for every option of the passes or scale, that differ from those of the fit.
+
+    Models are compared by their sha256 or by that of their weights, whose type in memory does not count; where a file
+    has neither, by their names, unless it has a path for the name.
     """
     _, about = _read(path)
+    settings: dict[str, Any] = options.passes_settings | {"align_scale": options.align_scale}
     digest, fitted = about.get("model_sha256"), str(about.get("model"))
     if isinstance(digest, str):
-        if digest != model.identity.sha256:
+        digests = (digest, about.get("weights_sha256"))
+        if model.identity.sha256 not in digests and _weights_digest(model) not in digests:
             about["model"] = f"{fitted} (sha256 {digest[:8]})"
             settings["model"] = f"{model.name} (sha256 {model.identity.sha256[:8]})"
     elif not Path(fitted).is_absolute() and Path(fitted).suffix not in _MODEL_FILES:
@@ -108,6 +118,12 @@ def _read(path: str | Path) -> tuple[Mapping[str, StoredTensor], dict[str, Any]]
     if file.metadata.get("format") != FORMAT or file.metadata.get("version") != str(VERSION):
         raise InputError(f"{path} is not a fitted fusion of version {VERSION}; expected what vggtjax fit-fusion wrote")
     return file.tensors, parse_json(file.metadata.get("about", "{}"), dict[str, Any], f"origin of the fusion {path}")
+
+
+def _weights_digest(model: Model) -> str:
+    """Return a digest of configuration and parameters in float32: equal for a model in two types of equal values."""
+    params = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model.params)
+    return dataclasses.replace(model, params=params).identity.sha256
 
 
 def _named(params: FusionParams) -> dict[str, Any]:
