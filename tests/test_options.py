@@ -1,8 +1,11 @@
 """Options: checked values, the key of the passes, and the keywords of public functions."""
 
 import dataclasses
+import json
 
+import numpy as np
 import pytest
+import tyro
 
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS, OptionChanges, Options
@@ -23,6 +26,19 @@ from vggtjax.options import METHODS, OptionChanges, Options
 def test_invalid_values(changes, message):
     with pytest.raises(InputError, match=message):
         Options(**changes)
+
+
+def test_numbers_of_numpy_become_plain_numbers():
+    options = Options(mask_pairs=np.int64(3), smooth_frames=np.int64(3))  # pyright: ignore[reportArgumentType]
+    assert options == Options(mask_pairs=3, smooth_frames=3)
+    assert json.loads(json.dumps(options.to_json())) == options.to_json()
+
+
+def test_float64_is_for_python_alone(capsys):
+    assert Options(compute_dtype="float64").compute_dtype == "float64"
+    with pytest.raises(SystemExit):
+        tyro.cli(Options, args=["--dtype", "float64"])
+    assert "bfloat16" in capsys.readouterr().err
 
 
 def test_keywords_are_the_fields():

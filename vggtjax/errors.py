@@ -1,5 +1,6 @@
 """Exceptions of the public boundary: one clear sentence each; the command line turns them into exit code 2."""
 
+import operator
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -46,6 +47,23 @@ def check_extra(purpose: str, extra: str, *modules: str) -> None:
     """Raise MissingExtraError unless all modules of an extra are installed: before hours are spent."""
     if not all(find_spec(module) for module in modules):
         raise MissingExtraError(purpose, extra)
+
+
+def whole_number(name: str, value: object, lowest: int) -> int:
+    """Return `value` as an int of at least `lowest`, else raise InputError naming the argument."""
+    try:
+        number = operator.index(value)  # type: ignore[arg-type]
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool) or number < lowest:
+        raise InputError(f"{name} is {value!r}; expected a whole number of at least {lowest}")
+    return number
+
+
+def check_choice(name: str, value: object, choices: Sequence[object]) -> None:
+    """Raise InputError, naming the argument, for a value that is not one of the choices."""
+    if value not in choices:
+        raise InputError(f"{name} is {value!r}; expected {' or '.join(map(repr, choices))}")
 
 
 @contextmanager

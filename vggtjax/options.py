@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypedDict
+from typing import Annotated, Any, Literal, SupportsIndex, TypedDict
 
 import tyro
 
 from vggtjax.config import Gram, Suppress
-from vggtjax.errors import InputError
-from vggtjax.storage.json_values import Natural, check_fields
+from vggtjax.errors import InputError, whole_number
+from vggtjax.storage.json_values import check_fields
 
 Pass = Literal["first", "second"]
 Threshold = Literal["otsu", "multi-otsu"]
-ComputeDType = Literal["float32", "bfloat16"]
+_ShownDType = Literal["float32", "bfloat16"]  # on the command line
+ComputeDType = Literal["float32", "bfloat16", "float64"]
 MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d"]
 
 
@@ -63,17 +66,16 @@ def find_method(name: str) -> Method:
     return METHODS[name]
 
 
-def check_smooth_frames(frames: object) -> None:
-    """Raise InputError for an invalid number of frames to average over."""
-    if type(frames) is not int or frames < 1 or frames % 2 == 0:
-        raise InputError(f"smooth_frames is {frames!r}; expected an odd number of frames, such as 3")
+def odd_frames(frames: Any) -> int:
+    """Return a number of frames to average over as an int. Raises InputError for an invalid number."""
+    with suppress(TypeError):
+        number = operator.index(frames)
+        if number > 0 and number % 2 and not isinstance(frames, bool):
+            return number
+    raise InputError(f"smooth_frames is {frames!r}; expected an odd number of frames, such as 3")
 
 
-def check_mask_pairs(pairs: object) -> None:
-    """Raise InputError for an invalid number of pairs; traced values are not checked."""
-    if isinstance(pairs, int | float) and (pairs != int(pairs) or pairs < 0):
-        raise InputError(f"mask_pairs is {pairs}; expected a whole number of at least 0")
-
+_READ_AFTER_THE_PASSES = ("method", "align_scale", "refine_mask")
 
 _Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
 
@@ -104,7 +106,7 @@ class Options:
     """similarity of the motion cues; the method's own by default"""
     suppress: Suppress | None = None
     """how the keys of dynamic tokens are suppressed; the method's own by default"""
-    mask_pairs: Natural = 5
+    mask_pairs: int = 5
     """number of pairs of blocks in which the keys of dynamic tokens are suppressed (L_mask of the paper)"""
     align_scale: tyro.conf.FlagCreatePairsOff[bool] = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
@@ -112,13 +114,22 @@ class Options:
     """odd number of frames over which the saliency is averaged before thresholding (not in the papers)"""
     refine_mask: _RefineMask = None
     """remove pixels from the mask that agree with other frames; the method's own choice by default"""
-    compute_dtype: Annotated[ComputeDType, tyro.conf.arg(name="dtype")] = "float32"
+    compute_dtype: Annotated[
+        ComputeDType,
+        tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint="(default: float32)"),  # pyright: ignore
+    ] = "float32"
     """type of the blocks' matrix products"""
 
     def __post_init__(self) -> None:
         find_method(self.method)
+        object.__setattr__(self, "mask_pairs", whole_number("mask_pairs", self.mask_pairs, 0))
+        object.__setattr__(self, "smooth_frames", odd_frames(self.smooth_frames))
         check_fields(self)
-        check_smooth_frames(self.smooth_frames)
+
+    def check_given_masks(self) -> None:
+        """Raise InputError for options that only mined masks obey: called where the user gives masks."""
+        if self.smooth_frames != 1:
+            raise InputError(f"smooth_frames is {self.smooth_frames}; leave it out, as given masks are not smoothed")
 
     @property
     def row(self) -> Method:
@@ -137,11 +148,15 @@ class Options:
         return dataclasses.replace(self, gram=row.gram, suppress=row.suppress, refine_mask=row.refine)
 
     @property
+    def passes_settings(self) -> dict[str, Any]:
+        """What the two passes depend on, as JSON values: the options that are read before they end, and the mining."""
+        settings = self.resolved().to_json() | {"clusters": self.row.clusters, "threshold": self.row.threshold}
+        return {name: value for name, value in settings.items() if name not in _READ_AFTER_THE_PASSES}
+
+    @property
     def passes_key(self) -> tuple[Any, ...]:
-        """The options that the two passes depend on: methods with equal keys share one run of the passes."""
-        same = {"method": Options.method, "align_scale": False, "refine_mask": None}  # read after the passes
-        method = self.row
-        return (dataclasses.replace(self.resolved(), **same), method.clusters, method.threshold)
+        """The settings of the passes, hashable: methods with equal keys share one run of the passes."""
+        return tuple(self.passes_settings.items())
 
     def changed(self, **changes: Any) -> Options:
         """Return the options with other values. Raises TypeError for an unknown name."""
@@ -158,8 +173,8 @@ class OptionChanges(TypedDict, total=False):
     method: str
     gram: Gram | None
     suppress: Suppress | None
-    mask_pairs: int
+    mask_pairs: SupportsIndex
     align_scale: bool
-    smooth_frames: int
+    smooth_frames: SupportsIndex
     refine_mask: bool | None
     compute_dtype: str

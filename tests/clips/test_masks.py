@@ -7,7 +7,7 @@ from PIL import Image
 from benchmarks.seeded import seeded_images
 from tests.tiny import tiny_config
 from vggtjax import Model, init_params, load_clip, reconstruct
-from vggtjax.clips.masks import load_masks
+from vggtjax.clips.masks import load_masks, masks_at_clip_pixels
 from vggtjax.errors import ClipError, InputError
 
 WIDE, TALL = (90, 160), (160, 90)  # height, width
@@ -62,6 +62,20 @@ def test_masks_of_half_the_size_in_the_same_order(tmp_path):
     halves = [frame[::2, ::2, 0] for frame in frames]
     masks = load_masks(written(tmp_path / "masks", halves, ["0.png", "1.png"]), clip)
     assert (masks == (clip.images.mean(axis=-1) > 0.5)).mean() > 0.95
+
+
+@pytest.mark.parametrize("mode", ["crop", "pad"])
+def test_masks_at_the_size_of_the_loaded_clip_are_refitted(mode):
+    frames = np.stack(pictures(2, TALL, np.random.default_rng(1)))
+    loaded = load_clip(frames, size=140, mode=mode)
+    clip = loaded.refit(70, 14)
+    masks = masks_at_clip_pixels(loaded.images.mean(axis=-1) > 0.5, clip, loaded)
+    left, top, right, bottom = clip.valid_box[0]
+    bright = np.zeros(clip.images.shape[:3], bool)
+    bright[:, top:bottom, left:right] = clip.images[:, top:bottom, left:right].mean(axis=-1) > 0.5
+    assert (masks == bright).mean() > 0.97
+    with pytest.raises(InputError, match="expected bool"):
+        masks_at_clip_pixels(masks[:, 1:], clip, loaded)
 
 
 def test_masks_that_fit_no_frames(tmp_path):

@@ -180,6 +180,15 @@ def test_passes_take_options_or_their_fields(params, config, images):
         shapes(grams="dot")
     with pytest.raises(InputError, match="mask_pairs is -1"):
         shapes(mask_pairs=-1)
+    traced = jax.jit(lambda images, pairs: run_passes(params, images, config, mask_pairs=pairs))
+    assert jax.eval_shape(traced, images, np.int32(3)) == shapes()
+
+
+def test_equal_programs_are_compiled_once(params, config, images, monkeypatch):
+    monkeypatch.setattr(run, "_infer", lambda *arguments: arguments[3])  # its options are static under jit
+    options = infer(params, images, config, method="vggt4d")
+    assert infer(params, images, config, method="vggt4d", gram="dot", refine_mask=True) == options
+    assert infer(params, images, config, method="vggt4d", align_scale=True) != options
 
 
 def test_running_out_of_memory_is_one_sentence(params, config, images, monkeypatch):

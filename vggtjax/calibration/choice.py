@@ -14,7 +14,7 @@ from jaxtyping import Float32, Int8
 
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Sweep, token_auc
 from vggtjax.config import Cue, Gram, MotionConfig
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_choice
 from vggtjax.method.cues import normalise
 from vggtjax.progress import Progress
 
@@ -73,8 +73,7 @@ def choose(
     Raises:
         InputError: a half without moving or without static tokens, or an argument out of range.
     """
-    if gram not in GRAMS:
-        raise InputError(f"gram is {gram!r}; expected one of {GRAMS}")
+    check_choice("gram", gram, GRAMS)
     if type(max_terms) is not int or max_terms < 1:
         raise InputError(f"max_terms is {max_terms!r}; expected a whole number of at least 1")
     if not 0 <= min_gain <= 1:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -55,11 +57,14 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
     return np.stack([_mask(path, clip, frame) for frame, path in enumerate(paths)])
 
 
-def masks_at_clip_pixels(masks: Bool[np.ndarray, "S h w"] | str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
+def masks_at_clip_pixels(
+    masks: Bool[np.ndarray, "S h w"] | str | Path, clip: Clip, loaded: Clip
+) -> Bool[np.ndarray, "S H W"]:
     """Return masks at the pixels of the clip's frames.
 
-    The masks are boolean, of the size of the clip's frames or of the source's pictures, or a folder for `load_masks`.
-    Raises InputError for masks of another type or size, and what `load_masks` raises.
+    The masks are boolean, of the size of the clip's frames, of those of the clip that was `loaded` and refitted, or of
+    the source's pictures, or a folder for `load_masks`. Raises InputError for masks of another type or size, and what
+    `load_masks` raises.
     """
     if isinstance(masks, str | Path):
         return load_masks(masks, clip)
@@ -68,6 +73,8 @@ def masks_at_clip_pixels(masks: Bool[np.ndarray, "S h w"] | str | Path, clip: Cl
     sizes = {(int(height), int(width)) for height, width in clip.source_size}
     if masks.dtype == bool and masks.shape == expected:
         return masks
+    if masks.dtype == bool and masks.shape == loaded.images.shape[:3]:
+        return np.stack([_resampled(mask, clip, i, partial(loaded.from_source, i)) for i, mask in enumerate(masks)])
     if masks.dtype == bool and masks.ndim == 3 and len(masks) == len(clip) and {masks.shape[1:]} == sizes:
         return at_clip_pixels(clip, masks)
     source = f" or {(len(clip), *sizes.pop())}, as the source's pictures" if len(sizes) == 1 else ""
@@ -82,13 +89,20 @@ def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:
             f"mask {path.name} is {picture.shape[1]} x {picture.shape[0]} and its frame {width} x {height}; "
             "expected the same shape"
         )
+    return _resampled(picture, clip, frame, lambda places: places / [width, height] * picture.shape[::-1])
+
+
+def _resampled(
+    mask: Bool[np.ndarray, "h w"], clip: Clip, frame: int, from_source: Callable[[np.ndarray], np.ndarray]
+) -> Bool[np.ndarray, "H W"]:
+    """Return a mask at the pixels of a frame; `from_source` gives the mask's coordinates of places in the source."""
     H, W = clip.images.shape[1:3]
     columns, rows = np.meshgrid(np.arange(W) + 0.5, np.arange(H) + 0.5)
     left, top, right, bottom = clip.valid_box[frame]
     inside = (columns > left) & (columns < right) & (rows > top) & (rows < bottom)
-    places = clip.to_source(frame, np.stack([columns, rows], axis=-1)) / [width, height]  # in [0, 1]
-    x, y = (np.clip(places[..., i] * picture.shape[1 - i], 0, picture.shape[1 - i] - 1).astype(int) for i in (0, 1))
-    return picture[y, x] & inside
+    places = from_source(clip.to_source(frame, np.stack([columns, rows], axis=-1)))
+    x, y = (np.clip(places[..., i], 0, mask.shape[1 - i] - 1).astype(int) for i in (0, 1))
+    return mask[y, x] & inside
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from vggtjax.clips.sampling import whole_number
-from vggtjax.errors import ClipError, InputError
+from vggtjax.errors import ClipError, InputError, check_choice, whole_number
 
 Mode = Literal["crop", "pad"]
 
@@ -28,8 +27,7 @@ class Framing:
     """side in pixels to run at, a multiple of the patch size; the model's own by default"""
 
     def __post_init__(self) -> None:
-        if self.mode not in get_args(Mode):
-            raise InputError(f"mode is {self.mode!r}; expected 'crop' or 'pad'")
+        check_choice("mode", self.mode, get_args(Mode))
         if self.size is not None:
             object.__setattr__(self, "size", whole_number("size", self.size, 1))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from numbers import Real
@@ -11,7 +10,7 @@ from typing import Protocol, TypeVar
 
 from PIL import Image
 
-from vggtjax.errors import ClipError, InputError
+from vggtjax.errors import ClipError, InputError, whole_number
 
 Item = TypeVar("Item")
 
@@ -106,14 +105,3 @@ class Source(Protocol):
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes, one in memory at a time."""
         ...
-
-
-def whole_number(name: str, value: object, lowest: int) -> int:
-    """Return `value` as an int of at least `lowest`, else raise InputError naming the argument."""
-    try:
-        number = operator.index(value)  # type: ignore[arg-type]
-    except TypeError:
-        number = None
-    if number is None or isinstance(value, bool) or number < lowest:
-        raise InputError(f"{name} is {value!r}; expected a whole number of at least {lowest}")
-    return number

@@ -41,8 +41,8 @@ class Known:
 
     def check(self, options: Options) -> None:
         """Raise InputError for missing files, or for options that need mined masks."""
-        if options.smooth_frames != 1 and (self.masks is not None or self.no_masks):
-            raise InputError("--smooth-frames is for mined masks; leave it out with --masks and --no-masks")
+        if self.masks is not None or self.no_masks:
+            options.check_given_masks()
         if self.masks is not None:
             from vggtjax.clips.sources import open_source
 

@@ -8,6 +8,7 @@ scan, so that q and k of no layer are stored.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtjax.config import Cue, Gram, MotionConfig
+from vggtjax.errors import check_choice
 from vggtjax.network.precision import widened
 
 FRAMES_AT_ONCE = 4
@@ -25,11 +27,17 @@ Sums = tuple[Array, ...]
 
 @dataclass(frozen=True)
 class GramCues:
-    """An `Accumulator` of a table of cues, for a model with `depth` pairs and one similarity; one sum per cue."""
+    """An `Accumulator` of a table of cues, for a model with `depth` pairs and one similarity; one sum per cue.
+
+    Raises InputError for an unknown similarity.
+    """
 
     motion: MotionConfig
     depth: int
     gram: Gram = "cosine"
+
+    def __post_init__(self) -> None:
+        check_choice("gram", self.gram, get_args(Gram))
 
     def layer_counts(self) -> np.ndarray:
         """Return int [depth, cues]: how often a cue reads a pair; more than once only in models with fewer layers."""

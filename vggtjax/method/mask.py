@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.method.clustering import kmeans
 from vggtjax.method.cues import normalise
-from vggtjax.options import Threshold, check_smooth_frames
+from vggtjax.options import Threshold, odd_frames
 
 BINS = 256
 MOST_CLASSES = 4  # of multi-Otsu
@@ -116,7 +116,7 @@ def smooth_over_time(saliency: Float[Array, "B S h w"], frames: int) -> Float[Ar
 
     Raises InputError for an even number.
     """
-    check_smooth_frames(frames)
+    frames = odd_frames(frames)
     if frames == 1:
         return saliency
     S, reach = saliency.shape[1], frames // 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple, TypeVar, Unpack
+from typing import Any, NamedTuple, TypeVar, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -69,8 +69,6 @@ def first_pass(
 
     Predictions of padded frames are meaningless. `exponents` has one power per cue, applied before their product.
     """
-    if gram not in ("cosine", "dot"):
-        raise InputError(f"gram is {gram!r}; expected 'cosine' or 'dot'")
     cues = GramCues(motion or config.motion, config.depth, gram)
     predictions = predict(
         params,
@@ -194,8 +192,9 @@ def run_passes(
         motion: the table of cues; the configuration's own if None.
         clusters, threshold: how the mask is mined from the saliency, as for `mine_mask`; the method's own if None.
         second: outputs of the second pass, () for no second pass; the outputs that the method needs if None.
-        changes: fields of `options` by name, such as `gram="dot"`.
+        changes: fields of `options` by name, such as `gram="dot"`; `mask_pairs` can be traced.
     """
+    mask_pairs: Any = changes.pop("mask_pairs", options.mask_pairs)  # not in the options: the number can be traced
     options = options.changed(**changes)
     method, compute = options.row, Compute(options.compute_dtype)
     if second is None:
@@ -213,7 +212,7 @@ def run_passes(
     )
     if not second:
         return Passes(first, None, saliency, mask)
-    suppression = Suppression(suppress=method.suppress, mask_pairs=options.mask_pairs)
+    suppression = Suppression(suppress=method.suppress, mask_pairs=mask_pairs)
     masking = {"plain": first, "suppression": suppression, "outputs": second, "compute": compute}
     return Passes(first, second_pass(params, clips, mask, config, **masking), saliency, mask)
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_choice
+from vggtjax.options import ComputeDType
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -39,8 +40,7 @@ class Compute:
 
 def check_compute_dtype(name: str) -> None:
     """Raise InputError for a type in which the blocks cannot be computed."""
-    if name not in ("float32", "bfloat16", "float64"):
-        raise InputError(f"compute_dtype is {name!r}; expected 'float32' or 'bfloat16'")
+    check_choice("compute_dtype", name, get_args(ComputeDType))
     if name == "float64" and not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
         raise InputError("compute_dtype is 'float64', which requires jax.enable_x64(True)")
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.network.attention import attention
-from vggtjax.options import check_mask_pairs
 
 
 @partial(
@@ -48,9 +49,9 @@ class Suppression:
         shares = tokens is not None and jnp.issubdtype(tokens.dtype, jnp.floating)
         if tokens is not None and tokens.dtype != bool and not shares:
             raise InputError(f"dynamic_tokens have type {tokens.dtype}; expected bool, or shares as floats")
-        check_mask_pairs(self.mask_pairs)
-        if self.suppress not in ("zero", "drop"):
-            raise InputError(f"suppress is {self.suppress!r}; expected 'zero' or 'drop'")
+        if not isinstance(self.mask_pairs, Tracer):
+            whole_number("mask_pairs", self.mask_pairs, 0)
+        check_choice("suppress", self.suppress, get_args(Suppress))
         if self.suppress != "zero" and (shares or strength is not None):
             raise InputError(
                 f"suppress is {self.suppress!r} with shares of tokens or a strength; expected 'zero': a dropped key is "

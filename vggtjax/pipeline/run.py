@@ -58,7 +58,9 @@ def infer(
         The method's depth, confidence and cameras, and the passes they were made of.
     """
     config = config if motion is None else dataclasses.replace(config, motion=motion)
-    return _infer(params, images, config, options.changed(**changes))
+    # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.
+    options = dataclasses.replace(options.changed(**changes).resolved(), refine_mask=False)
+    return _infer(params, images, config, options)
 
 
 @partial(jax.jit, static_argnames=("config", "options"))
@@ -91,8 +93,8 @@ def reconstruct(
             `size`, or of another patch size than the model's, is read from its source again.
         options: the method and its settings.
         size: side in pixels to run at, a multiple of the patch size; the model's own if None.
-        masks: what moves, instead of the mined masks: boolean at the size of the clip's frames or of the source's
-            pictures, or a folder of pictures. If no pixel moves, the second pass is not run.
+        masks: what moves, instead of the mined masks: boolean at the size of the clip's frames, as given or as
+            fitted, or of the source's pictures, or a folder of pictures. If no pixel moves, the second pass is not run.
         tracks: points to follow, in pixels of the frames; points of a later frame than the first cost one more pass.
         fusion: a fitted rule (`load_fusion`), whose confidence is the fused precision; None: the paper's rule.
         pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs; the
@@ -110,10 +112,10 @@ def reconstruct(
     on_stage = on_stage or (lambda name: nullcontext())
     if fusion is not None:
         check_fuses(options.method)
-    if masks is not None and options.smooth_frames != 1:
-        raise InputError(f"smooth_frames is {options.smooth_frames}, but only mined masks are smoothed, not given ones")
-    clip, tracks = _fitted(model, clip, size, tracks, on_stage)
-    given = None if masks is None else masks_at_clip_pixels(masks, clip)
+    if masks is not None:
+        options.check_given_masks()
+    source, (clip, tracks) = clip, _fitted(model, clip, size, tracks, on_stage)
+    given = None if masks is None else masks_at_clip_pixels(masks, clip, source if isinstance(source, Clip) else clip)
     frames, height, width = clip.images.shape[:3]
     stages = Stages(model.config, options, frames, (height, width))
     padding = padded_frames(frames, model.config.motion.offsets) - frames if pad_frames and tracks is None else 0
@@ -249,9 +251,9 @@ def _settings(
     model: Model, clip: Clip, options: Options, masks_given: bool, fusion: FusionParams | None
 ) -> dict[str, Any]:
     """Return the settings that a result depends on besides the method, as JSON values."""
-    settings = {name: value for name, value in options.to_json().items() if name not in ("method", "refine_mask")}
+    settings = {name: value for name, value in options.to_json().items() if name != "method"}
     settings |= {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
-    settings |= {"masks": "given" if masks_given else "mined", "refine_mask": options.refine_mask}
+    settings |= {"masks": "given" if masks_given else "mined"}
     settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
     return settings | ({"model_note": model.note} if model.note else {})
 

@@ -194,9 +194,7 @@ def _read_map(path: Path) -> Float32[np.ndarray, "H W"]:
 
 
 def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
-    if quaternion is None:
-        raise InputError("quaternion is None; expected 'xyzw' or 'wxyz'")
-    poses = read_trajectory(folder / "pred_traj.txt", quaternion)[1]
+    poses = read_trajectory(folder / "pred_traj.txt", quaternion)[1]  # pyright: ignore[reportArgumentType] - checked
     intrinsics = read_numbers(folder / "pred_intrinsics.txt", 9).reshape(-1, 3, 3)
     for name, array in (("pred_traj.txt", poses), ("pred_intrinsics.txt", intrinsics)):
         if len(array) != len(numbers):

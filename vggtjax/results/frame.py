@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from PIL import Image
 
 from vggtjax.cameras import unproject
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_choice
 from vggtjax.results.result import Result, inside_box, show_points
 from vggtjax.results.saving import Resolution
 
@@ -69,8 +69,7 @@ def frame_of(
     """
     if not 0 <= frame < len(result.depth):
         raise InputError(f"frame is {frame}; expected 0 to {len(result.depth) - 1}")
-    if resolution not in ("model", "original"):
-        raise InputError(f"resolution is {resolution!r}; expected 'model' or 'original'")
+    check_choice("resolution", resolution, get_args(Resolution))
     if resolution == "original":
         return _source_frame(result, frame, picture)
     return ResultFrame(

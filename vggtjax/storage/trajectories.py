@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import warnings
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from vggtjax.errors import InputError, ResultError, reading
+from vggtjax.errors import ResultError, check_choice, reading
 
 Quaternion = Literal["xyzw", "wxyz"]
 
@@ -55,8 +55,7 @@ def read_trajectory(
     unreadable file, a first line that names the other order, lines without eight finite numbers, or quaternions not of
     length 1.
     """
-    if quaternion not in ("xyzw", "wxyz"):
-        raise InputError(f"quaternion is {quaternion!r}; expected 'xyzw' or 'wxyz'")
+    check_choice("quaternion", quaternion, get_args(Quaternion))
     rows = read_numbers(path, 8)
     other: Quaternion = "wxyz" if quaternion == "xyzw" else "xyzw"
     with Path(path).open(encoding="utf-8") as file:
