@@ -1,4 +1,4 @@
-"""Foreign checkpoints -> parameter trees of vggtjax."""
+"""PyTorch checkpoints of VGGT -> checkpoints of vggtjax."""
 
 from converters.torch_to_flax import Conversion, convert, convert_state_dict
 

@@ -44,7 +44,7 @@ class MissingExtraError(VggtjaxError, ImportError):
 
 
 def check_extra(purpose: str, extra: str, *modules: str) -> None:
-    """Raise MissingExtraError unless all modules of an extra are installed: before hours are spent."""
+    """Raise MissingExtraError unless all modules of an extra are installed; call it before long work."""
     if not all(find_spec(module) for module in modules):
         raise MissingExtraError(purpose, extra)
 

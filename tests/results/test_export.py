@@ -124,7 +124,7 @@ def test_intrinsics_by_hand(saved):
 def test_clouds(saved):
     room = make_room()
     least = least_confidence(room, 20)
-    pixels = np.stack([frame_of(room, frame).surer_than(least) for frame in range(3)])
+    pixels = np.stack([frame_of(room, frame).confident(least) for frame in range(3)])
     static = read_ply(saved / "static.ply")
     assert len(static.vertices) == (pixels & ~room.dynamic_mask).sum()
     for frame in range(3):

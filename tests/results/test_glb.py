@@ -15,7 +15,7 @@ def load_scene(room, percentile=0.0, **options):
     least = point_cloud.least_confidence(room, percentile)
     frames = [frame_of(room, number) for number in range(len(room.depth))]
     static, dynamic = (
-        [point_cloud.frame_cloud(f, f.surer_than(least) & (f.dynamic_mask == own)) for f in frames]
+        [point_cloud.frame_cloud(f, f.confident(least) & (f.dynamic_mask == own)) for f in frames]
         for own in (False, True)
     )
     glb = build_scene(room, point_cloud.joined(static), dynamic, **options).export(file_type="glb")

@@ -8,7 +8,7 @@ from vggtjax.results.frame import LeastConfidence, frame_of
 
 def confident(room, percentile):
     least = point_cloud.least_confidence(room, percentile)
-    return np.stack([frame_of(room, number).surer_than(least) for number in range(len(room.depth))])
+    return np.stack([frame_of(room, number).confident(least) for number in range(len(room.depth))])
 
 
 def test_percentile_is_taken_over_the_clip_and_ties_stay():
@@ -29,7 +29,7 @@ def test_what_moves_stays_in_the_same_share(resolution):
     least = point_cloud.least_confidence(room, 20)
     frames = [frame_of(room, number, resolution) for number in range(4)]
     for region in (False, True):
-        chosen = np.concatenate([f.surer_than(least)[f.valid & (f.dynamic_mask == region)] for f in frames])
+        chosen = np.concatenate([f.confident(least)[f.valid & (f.dynamic_mask == region)] for f in frames])
         assert chosen.mean() == pytest.approx(0.8, abs=2e-3)
 
 

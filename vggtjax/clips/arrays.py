@@ -12,7 +12,7 @@ from PIL import Image
 from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.errors import ClipError
 
-_SLACK = 1e-3  # what rounding may leave of floating-point values beyond 0 and 1
+_SLACK = 1e-3  # largest distance of a floating-point value from [0, 1] that counts as rounding
 
 
 @dataclass(frozen=True, eq=False)

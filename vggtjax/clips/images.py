@@ -86,7 +86,7 @@ def to_rgb(image: Image.Image, name: str) -> Image.Image:
 
 @functools.cache
 def known_formats() -> tuple[str, ...]:
-    """Return the FORMATS that this Pillow can read; files of strangers are opened as no other format."""
+    """Return the FORMATS that this Pillow can read; files in other formats are refused."""
     Image.init()
     return tuple(name for name in FORMATS if name in Image.OPEN)
 

@@ -84,7 +84,7 @@ def masks_at_clip_pixels(
 def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:
     picture = read_mask(path)
     height, width = clip.source_size[frame]
-    if abs(picture.shape[0] * width - picture.shape[1] * height) > max(picture.shape):  # half a pixel is no other shape
+    if abs(picture.shape[0] * width - picture.shape[1] * height) > max(picture.shape):  # more than rounding
         raise ClipError(
             f"mask {path.name} is {picture.shape[1]} x {picture.shape[0]} and its frame {width} x {height}; "
             "expected the same shape"

@@ -32,8 +32,8 @@ _SUFFIXES = (
 # Containers that hold their own video. FFmpeg also reads playlists and text, which can name other files.
 _CONTAINERS = "mov,matroska,avi,mpeg,mpegts,asf,flv,ogg,mxf,gif"
 _MOST_PIXELS = 2**27  # of one frame; 15360 x 8640 is below it
-_EXACT_CONTAINERS = frozenset(("mov", "matroska", "avi"))  # those whose stated length can be relied upon ...
-_MISSING_END = 0.5  # ... up to so many seconds
+_EXACT_CONTAINERS = frozenset(("mov", "matroska", "avi"))  # their stated length is reliable
+_MISSING_END = 0.5  # seconds by which a whole file may end before its stated length
 
 
 @dataclass(frozen=True)

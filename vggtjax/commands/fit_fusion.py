@@ -30,7 +30,7 @@ class Clips:
     data: tuple[str, ...] = ("generated=16",)
     """clips with true depth: "generated=N" for N generated scenes, or DATASET=FOLDER as for evaluate"""
     max_frames: Count | None = None
-    """largest number of frames to take of each clip (a generated one has 12 by default, and at least)"""
+    """largest number of frames to take of each clip; generated clips have 12 by default, and no fewer"""
     size: int | None = None
     """side in pixels to run at; the model's own by default"""
 
@@ -91,7 +91,7 @@ class Fits:
 
     objective: Literal["gaussian", "laplace", "joint", "photometric", "geometric"] = "gaussian"
     """likelihood of the true depth (joint: of both passes' errors, which measures their correlation), or agreement of
-    frames, which needs no truth to fit (but to score)"""
+    frames, whose fit needs no truth (only the scores do)"""
     seeds: Count = 5
     """number of fits of every family; each seed splits the clips and draws pixels anew"""
     steps: Count = 300

@@ -1,4 +1,4 @@
-"""The command line: a table of commands, and what becomes of their errors. Does not import jax."""
+"""The command line: a table of commands; an error becomes one sentence and an exit code. Does not import jax."""
 
 from __future__ import annotations
 

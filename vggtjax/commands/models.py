@@ -1,4 +1,4 @@
-"""What commands share to load a model and a fitted rule of fusion. Does not import jax before it is needed."""
+"""Loading a model and a fitted rule of fusion, for several commands. Does not import jax before it is needed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the command line shows: live progress of every stage, and a summary at the end."""
+"""The output of the command line: live progress of every stage, and a summary at the end."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
     from vggtjax.evaluation.ladder import LadderRow
     from vggtjax.results.reconstruction import Reconstruction
+
+_LABELS = {"compile": "compile (once for clips of this shape)"}  # stage -> its line, where that says more
 
 
 class Report:
@@ -52,7 +54,8 @@ class Report:
     @contextmanager
     def stage(self, name: str) -> Iterator[Progress]:
         """Time a stage and show it; yields the callable that shows its progress."""
-        task = self._progress.add_task(name, total=None)
+        label = _LABELS.get(name, name)
+        task = self._progress.add_task(label, total=None)
         started = time.perf_counter()
         yield lambda done, total: self._progress.update(task, completed=done, total=total)
         seconds = time.perf_counter() - started
@@ -60,7 +63,7 @@ class Report:
         total = next(t.total for t in self._progress.tasks if t.id == task) or 1
         self._progress.update(task, total=total, completed=total)
         if not self._console.is_terminal:
-            self.note(f"{name:<18} {seconds:8.2f} s")
+            self.note(f"{label:<18} {seconds:8.2f} s")
 
     def summary(self, result: Reconstruction, out: Path, model: Model | None = None) -> None:
         """Print what was reconstructed, by which model, the total time, and where the files are."""

@@ -33,7 +33,7 @@ def check_report(out: Path, store: Records) -> None:
     """Make sure that `write_report` can write into `out`, before hours are spent.
 
     Raises:
-        MissingExtraError: what draws the page is not installed.
+        MissingExtraError: matplotlib or jinja2 is not installed.
         OutputError: the folder cannot be written, or holds files that are not of an evaluation.
     """
     check_extra("drawing an evaluation", "evaluate", "matplotlib", "jinja2")

@@ -20,7 +20,7 @@ from vggtjax.storage.writing import writing
 
 FOLDER = "sequences"
 BOTH_OVER_ONE = "both passes over one"
-_MARK = "evaluation.json"  # in that folder: it holds records
+_MARK = "evaluation.json"  # marks a folder of records
 _MOST_LETTERS = 80  # of a name
 
 
@@ -65,7 +65,7 @@ class Records:
         return record if good and record.settings == json.loads(json.dumps(settings)) else None
 
     def keep(self, record: Record, curves: Mapping[str, np.ndarray]) -> None:
-        """Write a record. Its JSON goes first and comes last: where a JSON file is, the record is whole."""
+        """Write a record; its JSON file is removed first and written last, so a JSON file means a whole record."""
         path = self._path(record.name, record.method, "json")
         path.unlink(missing_ok=True)
         with writing(path.with_suffix(".npz")) as temporary:

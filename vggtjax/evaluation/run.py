@@ -60,8 +60,8 @@ def evaluate(
         on_stage: called with the number and name of each sequence.
 
     Returns:
-        A record for each sequence and name of a result, in this order. A sequence that cannot be opened or scored,
-        whatever its opener or its result raises, has records with the status "failed" and a reason.
+        A record for each sequence and name of a result, in this order. Where opening, computing or
+        scoring raises any exception, the records have the status "failed" and a reason.
     """
     evaluation = _Evaluation(source, records, settings, scoring)
     scored: list[Record] = []

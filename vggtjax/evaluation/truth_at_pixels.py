@@ -17,7 +17,7 @@ PIXEL_OFFSET = 0.0  # of points: the protocol lifts whole pixel numbers, predict
 
 
 class AbsentError(InputError):
-    """A protocol compares what the sequence or the result lacks: neither a failure nor a number."""
+    """The sequence or the result lacks an input of a protocol: its metrics are left out, and nothing has failed."""
 
 
 class TruthAtPixels:

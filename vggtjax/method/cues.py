@@ -2,7 +2,7 @@
 
 A mean map needs no Gram matrix: mean_{s,j} q_i . q_sj = q_i . mean_{s,j} q_sj. A std map needs one P x P product
 per frame, of its rows with keys averaged over the source frames. Both are exact. Both are accumulated inside the layer
-scan, so that q and k of no layer are stored.
+scan, so no layer's q and k are stored.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class GramCues:
         """Return the sums after adding one pair's q and k (after norm and rotation) to the cues that read this pair.
 
         The patches are the last tokens of a frame; the tokens before them are excluded. Of clips with a `frame_count`
-        only the real frames are sources, and each of them must have one at the offsets.
+        only the real frames are sources, and each real frame needs a source at one of the offsets.
         """
         B, S, _, heads, _ = q.shape
         index, weights = sources(S, self.motion.offsets)

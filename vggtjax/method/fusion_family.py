@@ -176,7 +176,7 @@ def _claims(params: FusionParams, seen: Observations) -> tuple[Float[Array, "H W
 
 
 def _above(log_precision: Float[Array, "H W"], floor: Float[Array, ""]) -> Float[Array, "H W"]:
-    """Return log(exp(log_precision) + floor), with a gradient by a floor of 0 unless the precision is nearly 0."""
+    """Return log(exp(log_precision) + floor); its gradient by a floor of 0 is exact unless precision is near 0."""
     near = log_precision > -_MOST
     usual = log_precision + jnp.log1p(floor * jnp.exp(-jnp.where(near, log_precision, 0)))
     low = jnp.where(floor > 0, jnp.logaddexp(log_precision, jnp.log(jnp.where(floor > 0, floor, 1))), log_precision)

@@ -79,10 +79,10 @@ def origin_of_fit(model: Model, options: Options) -> dict[str, Any]:
 
 
 def warn_if_fitted_otherwise(path: Path, model: Model, options: Options) -> None:
-    """Log a warning for a model, and for every option of the passes or scale, that differ from those of the fit.
+    """Log a warning for each of the model, the options of the passes and `align_scale` that differs from the fit's.
 
-    Models are compared by their sha256 or by that of their weights, whose type in memory does not count; where a file
-    has neither, by their names, unless it has a path for the name.
+    Models are compared by the sha256 of the model or of its weights, whose type in memory does not count. If the file
+    has neither, models are compared by name; a path is not compared.
     """
     _, about = _read(path)
     settings: dict[str, Any] = options.passes_settings | {"align_scale": options.align_scale}

@@ -27,7 +27,7 @@ Capture = Callable[[Float[Array, "B S T E"]], Any]
 class Accumulator(Protocol):
     """Sums over q and k (after norm and rotation) of the global blocks: motion cues, or a loss of the attention.
 
-    The sums are any tree of arrays; they are carried through the scan, so that q and k of no pair are stored.
+    The sums are any tree of arrays; they are carried through the scan, so no pair's q and k are stored.
     """
 
     def layer_counts(self) -> Int[np.ndarray, "depth ..."]:

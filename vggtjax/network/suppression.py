@@ -54,8 +54,8 @@ class Suppression:
         check_choice("suppress", self.suppress, get_args(Suppress))
         if self.suppress != "zero" and (shares or strength is not None):
             raise InputError(
-                f"suppress is {self.suppress!r} with shares of tokens or a strength; expected 'zero': a dropped key is "
-                "dropped whole"
+                f"suppress is {self.suppress!r} with shares of tokens or a strength; expected 'zero': a key cannot "
+                "be dropped in part"
             )
         if strength is not None and tuple(strength.shape) != (depth,):
             raise InputError(f"strength has shape {tuple(strength.shape)}; expected {(depth,)}, one for each pair")

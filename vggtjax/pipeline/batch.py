@@ -121,7 +121,7 @@ class _Batch:
         pad_frames: bool,
         changes: Mapping[str, Any],
     ) -> _Batch:
-        """Return a run of the arguments of `reconstruct_many`; what is wrong for all clips is raised once, here."""
+        """Return a run of the arguments of `reconstruct_many`; errors that concern all clips are raised here."""
         words = dict(changes)
         if isinstance(options, Mapping):
             words, options = words | dict(options), None

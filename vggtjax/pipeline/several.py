@@ -75,7 +75,7 @@ def _as_method(
     assembly = Stages(model.config, options, frames, (height, width)).assemble(passes, fusion)
     settings = result.settings | {"refine_mask": method.refine}
     with warnings.catch_warnings():
-        if result.method == options.method:  # its clamped cameras have been named already
+        if result.method == options.method:  # the warning about clamped cameras has been given already
             warnings.simplefilter("ignore", FieldOfViewWarning)
         result = dataclasses.replace(
             result,

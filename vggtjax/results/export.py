@@ -140,9 +140,9 @@ def _build_scene(result: Result, least: LeastConfidence) -> trimesh.Scene:
     static, dynamic = [], []
     for number in range(len(result.depth)):
         frame = frame_of(result, number)
-        sure = frame.surer_than(least)
-        static.append(frame_cloud(frame, sure & ~frame.dynamic_mask))
-        dynamic.append(frame_cloud(frame, sure & frame.dynamic_mask))
+        confident = frame.confident(least)
+        static.append(frame_cloud(frame, confident & ~frame.dynamic_mask))
+        dynamic.append(frame_cloud(frame, confident & frame.dynamic_mask))
     return build_scene(result, joined(static), dynamic)
 
 
@@ -179,7 +179,7 @@ def _write_frames(
 
     def write_frame(number: int, make: Callable[[], ResultFrame]) -> tuple[_Written, PointCloud]:
         name, frame = f"{number:06d}", make()
-        valid, pixels = frame.valid, frame.surer_than(least)
+        valid, pixels = frame.valid, frame.confident(least)
         np.save(folder / f"confidence/{name}.npy", frame.confidence, allow_pickle=False)
         np.save(folder / f"depth/{name}.npy", frame.depth, allow_pickle=False)
         _write_png(folder / f"depth/{name}.png", encode_depth(frame.depth, valid, scale), depth_scale=repr(scale))

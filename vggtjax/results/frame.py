@@ -40,8 +40,8 @@ class ResultFrame(NamedTuple):
         """Pixels that show a point: seen, with a finite depth above 0 and a finite confidence."""
         return show_points(self.depth, self.confidence, self.seen)
 
-    def surer_than(self, least: LeastConfidence) -> Bool[np.ndarray, "h w"]:
-        """Valid pixels of at least this confidence."""
+    def confident(self, least: LeastConfidence) -> Bool[np.ndarray, "h w"]:
+        """Return the valid pixels of at least this confidence."""
         return self.valid & (self.confidence >= np.where(self.dynamic_mask, least.dynamic, least.static))
 
     def world_points(self, *, pixel_offset: float = 0.5) -> Float32[np.ndarray, "h w 3"]:

@@ -84,7 +84,7 @@ class Reconstruction(Result):
                 folder lacks get plain values (confidence 1, nothing moves, grey pictures), with a warning logged, and
                 are named in `settings["missing"]`; the saliency is None.
             quaternion: for "vggt4d" and "monst3r", the order of the quaternions in pred_traj.txt: "wxyz" as these
-                programs and this library write it, "xyzw" as TUM and this library up to version 0.2 do.
+                programs and this library write it, "xyzw" as earlier versions of this library did.
             layout: the old name of `format`.
 
         Raises:

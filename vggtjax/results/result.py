@@ -36,7 +36,7 @@ class Result:
     """
 
     depth: Float32[np.ndarray, "S H W"]  # z in the camera, up to scale
-    depth_confidence: Float32[np.ndarray, "S H W"]  # above 0; higher is surer; compare by rank, not by value
+    depth_confidence: Float32[np.ndarray, "S H W"]  # above 0; higher is more certain; compare by rank, not by value
     saliency: Float32[np.ndarray, "S h w"] | None  # motion of each patch, in [0, 1], where known
     dynamic_mask: Bool[np.ndarray, "S H W"]
     camera_from_world: Float32[np.ndarray, "S 3 4"]  # OpenCV axes: x right, y down, z forward

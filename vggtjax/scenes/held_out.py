@@ -26,7 +26,7 @@ MIN_SPREAD = 2.0  # 90th to 10th percentile of depth
 MIN_LAYERS = 3  # depths at which parts or the room cover at least LAYER_SHARE of the pixels
 LAYER_SHARE = 0.03
 MOVERS = (0.03, 0.30)  # range of the share of moving pixels, averaged over the frames
-SIZE = 48  # pixels of the images that decide, so that every image size has the same scenes
+SIZE = 48  # pixels of the images that scenes are selected by, whatever the size of the images returned
 _AT_ONCE = 16
 
 

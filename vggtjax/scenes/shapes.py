@@ -1,4 +1,4 @@
-"""Intervals of rays inside convex shapes. Components come first, so that pixels are long vectors."""
+"""Intervals of rays inside convex shapes. Arrays are [components, pixels], which vectorises over pixels."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ def read_array(path: Path) -> np.ndarray:
 def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """Return all arrays of an .npz file, or those with these names; raises ResultError as `read_headers` does.
 
-    Check the headers of a stranger's file first: compressed, a small file can hold large arrays.
+    Check the headers of an untrusted file first: a small compressed file can hold large arrays.
     """
     arrays = {}
     with _explaining("it", ".npz"), zipfile.ZipFile(path) as archive:

@@ -1,4 +1,4 @@
-"""JSON of strangers -> checked dataclasses, and the same checks for dataclasses built in Python.
+"""Untrusted JSON -> checked dataclasses, and the same checks for dataclasses built in Python.
 
 The annotation of a field spells its constraint once, such as `Annotated[int, Meta(ge=1)]` or a name below. Every
 problem is one sentence with the place in the document, the value, and the expected values. Does not import jax.

@@ -56,7 +56,7 @@ def staging(folder: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def locked_folder(folder: str | Path, what: str, wait: float = 0) -> Iterator[None]:
-    """Keep other runs, which lock the same folder (made if missing), from writing `what` there at the same time.
+    """Hold the lock of a folder (made if missing), so that only one run at a time writes `what` into the folder.
 
     The operating system releases the lock of a killed process. A file system without locks is written without a lock,
     with a warning. Raises OutputError where another run holds the lock for `wait` seconds, or where the folder cannot

@@ -33,7 +33,7 @@ from vggtjax.training.state import Metrics, Objective, TrainingState, apply_grad
 _AHEAD = 2  # steps that the host may prepare while the device computes
 _TIMED = 2  # steps of each interval in which rendering is timed separately
 
-# Apart, so that the optimiser, whose shapes are always the same, is compiled once and not for every size of batch.
+# Two programs: the optimiser, whose shapes never change, is compiled once, not for every size of batch.
 _loss_and_gradient = jax.jit(loss_and_gradient, static_argnums=(2, 3))
 _apply_gradient = jax.jit(apply_gradient, static_argnums=3, donate_argnums=0)
 

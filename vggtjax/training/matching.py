@@ -20,11 +20,10 @@ class MatchSums(NamedTuple):
 
 
 class MatchLoss:
-    """Accumulates, inside the scan over pairs of blocks, the loss of q and k of the global blocks on true matches.
+    """An `Accumulator` of the loss of attention against true matches, in place of motion cues.
 
-    Has the methods of motion cues and takes their place. The first half of the heads learns to attend from every patch
-    to its match in the first frame, among the patches of all frames; the second half to its match in each other frame,
-    among that frame's patches.
+    The first half of the heads learns to attend from every patch to its match in the first frame, among the patches of
+    all frames; the second half to its match in each other frame, among that frame's patches.
     """
 
     def __init__(self, matches: Matches, layers: tuple[int, ...], depth: int) -> None:

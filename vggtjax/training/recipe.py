@@ -53,7 +53,7 @@ class Phase:
             self.scenes(frames)
 
     def scenes(self, frames: int) -> SceneConfig:
-        """Return the configuration of scenes of `frames` frames. Raises InputError for values that no scene has."""
+        """Return the configuration of scenes of `frames` frames. Raises InputError for invalid values."""
         return SceneConfig(self.height, self.width, frames, self.dynamic, motion=self.motion)
 
 
@@ -108,7 +108,7 @@ class Recipe:
     model: VGGTConfig = field(default_factory=VGGTConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     losses: LossWeights = field(default_factory=LossWeights)
-    start: Start = field(default_factory=Start)  # not read with parameters to start from
+    start: Start = field(default_factory=Start)  # not read if initial parameters are given
     trainable: Literal["all", "heads"] = "all"  # "heads": backbone and aggregator stay unchanged
     untrained: tuple[str, ...] = ("track_head",)  # modules of the model that stay unchanged: those without a loss
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"  # bfloat16 on a GPU, else float32

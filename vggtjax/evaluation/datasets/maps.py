@@ -41,7 +41,7 @@ def depth_reader(
 def mask_reader(
     pictures: Sequence[Path], paths: Sequence[Path | None], read: Callable[[Path], Bool[np.ndarray, "h w"]]
 ) -> tuple[MaskReader | None, tuple[str, ...]]:
-    """Return a reader of the frames' masks, or None and a note unless every frame has a mask: masks have no unknown."""
+    """Return a reader of the frames' masks, or None and a note unless every frame has a mask."""
     masks = [path for path in paths if path is not None]
     if len(masks) < len(pictures):
         return None, (f"{len(masks) or 'none'} of {len(pictures)} frames have a mask, so it has no masks",)

@@ -45,8 +45,8 @@ def depth_errors(
     Args:
         predicted, truth: as for `median_scale`.
         valid: pixels to use; all pixels with a known depth if None.
-        scale: factor of `predicted`; `median_scale` of the same pixels if None. The whole clip's scale shows how well a
-            part of the clip is placed among the rest.
+        scale: factor of `predicted`; `median_scale` of the same pixels if None. With the whole
+            clip's scale, the error of a part includes its misplacement relative to the rest.
 
     Raises:
         InputError: as `median_scale`, and valid pixels that are not bool or none of which has a known depth.

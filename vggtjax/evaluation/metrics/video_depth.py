@@ -15,8 +15,8 @@ Align = Literal["metric", "median", "scale", "scale-shift"]
 
 _SCALE_ROUNDS = 10
 _SHIFT_ROUNDS = 40
-_SHRINK = 0.6  # of the smallest residual of a weight, from round to round
-_LEAST = 1e-8  # residual of the largest weight, in the truth's unit
+_SHRINK = 0.6  # factor of the floor of the residuals, from round to round
+_LEAST = 1e-8  # smallest floor, in the truth's unit
 
 
 class VideoDepthErrors(NamedTuple):
@@ -95,8 +95,8 @@ def _least_absolute_line(predicted: Float64[np.ndarray, " N"], truth: Float64[np
 
     The start is the least squares line. Forty rounds follow, each the least squares line with weights
     1 / max(|r|, floor) of the residuals r of the round before; the floor starts at their mean and shrinks by 0.6 from
-    round to round, down to 1e-8, so that a pixel on an early line does not hold the line. The line with the least sum
-    is returned.
+    round to round, down to 1e-8, so that a pixel on an early line does not fix all later lines. The line with the
+    least sum is returned.
     """
     middle = float(predicted.mean())
     centred = predicted - middle  # the normal equations stay well conditioned
