@@ -149,17 +149,14 @@ class Options:
 
     @property
     def passes_settings(self) -> dict[str, Any]:
-        """What the two passes depend on, as JSON values: the options that are read before they end, and the mining."""
+        """What the two passes depend on, as JSON values: methods with equal values share one run of the passes."""
         settings = self.resolved().to_json() | {"clusters": self.row.clusters, "threshold": self.row.threshold}
         return {name: value for name, value in settings.items() if name not in _READ_AFTER_THE_PASSES}
 
-    @property
-    def passes_key(self) -> tuple[Any, ...]:
-        """The settings of the passes, hashable: methods with equal keys share one run of the passes."""
-        return tuple(self.passes_settings.items())
-
     def changed(self, **changes: Any) -> Options:
         """Return the options with other values. Raises TypeError for an unknown name."""
+        if unknown := sorted(changes.keys() - OptionChanges.__annotations__.keys()):
+            raise TypeError(f"no option is named {' or '.join(unknown)}; expected {[*OptionChanges.__annotations__]}")
         return dataclasses.replace(self, **changes) if changes else self
 
     def to_json(self) -> dict[str, Any]:

@@ -271,7 +271,7 @@ def test_only_settings_that_change_results_are_compared_and_they_are_named(model
 
 def test_unknown_options_are_named(model, tmp_path):
     for name in ("keep_passes", "masks"):
-        with pytest.raises(TypeError, match=f"no options named {name}; expected some of method, gram, .*, mode, size"):
+        with pytest.raises(TypeError, match=f"no option is named {name}; expected .*mask_pairs"):
             next(reconstruct_many(model, {}, tmp_path, options={name: True}))
 
 

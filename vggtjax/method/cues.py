@@ -27,10 +27,7 @@ Sums = tuple[Array, ...]
 
 @dataclass(frozen=True)
 class GramCues:
-    """An `Accumulator` of a table of cues, for a model with `depth` pairs and one similarity; one sum per cue.
-
-    Raises InputError for an unknown similarity.
-    """
+    """An `Accumulator` of a table of cues, for a model with `depth` pairs and one similarity; one sum per cue."""
 
     motion: MotionConfig
     depth: int

@@ -128,10 +128,6 @@ class _Batch:
             fusion, pad_frames = words.pop("fusion", fusion), words.pop("pad_frames", pad_frames)
         of_framing = {name: words.pop(name) for name in FramingChanges.__annotations__ if name in words}
         framing = dataclasses.replace(framing or Framing(), **of_framing)
-        if unknown := words.keys() - OptionChanges.__annotations__.keys():
-            expected = ", ".join([*OptionChanges.__annotations__, *FramingChanges.__annotations__])
-            unknown = ", ".join(sorted(unknown))
-            raise TypeError(f"reconstruct_many() has no options named {unknown}; expected some of {expected}")
         options = (options or Options()).changed(**words)
         if fusion is not None:
             check_fuses(options.method)

@@ -61,7 +61,7 @@ def groups_of_methods(methods: Sequence[str], options: Options) -> list[list[Opt
     groups: dict[tuple, list[Options]] = {}
     for name in methods:
         each = options.changed(method=name)
-        groups.setdefault(each.passes_key, []).append(each)
+        groups.setdefault(tuple(each.passes_settings.items()), []).append(each)
     return list(groups.values())
 
 
