@@ -142,4 +142,5 @@ def test_lists_in_python_become_tuples():
 def test_recipes_of_the_embedded_model_load(path):
     recipe = read_recipe(path)
     assert Recipe.from_json(recipe.to_json()) == recipe
-    assert json.loads(recipe.to_json())["stages"] == json.loads(path.read_text())["stages"]
+    for phase, read in zip(json.loads(path.read_text())["stages"], json.loads(recipe.to_json())["stages"], strict=True):
+        assert read == read | phase  # later fields have their defaults

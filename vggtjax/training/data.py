@@ -1,4 +1,4 @@
-"""Batches of generated clips, drawn on the device from one key for each step."""
+"""Batches of generated clips, and the keys to suppress, drawn on the device from one key for each step."""
 
 from __future__ import annotations
 
@@ -8,29 +8,41 @@ from jaxtyping import Array
 
 from vggtjax.scenes.render import SyntheticClip, generate
 from vggtjax.scenes.textures import Textures
+from vggtjax.training.batch import Batch
 from vggtjax.training.recipe import Phase
+from vggtjax.training.regions import random_regions
 
 GREY = 0.1  # share of clips without colour
 IN_ORDER = 0.5  # share of clips with frames in order of time
+_SUPPRESSION = 1 << 20  # folded into keys: an index beyond those of `split`, so that the clips stay the same
 
 
-def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> SyntheticClip:
+def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> Batch:
     """Return the batch of a JAX random key: `phase.batch` clips of `frames` frames, in random order and colours.
 
-    Pure; `phase` and `frames` are static.
+    In a share `phase.suppressed` of the clips, random regions are suppressed. Pure; `phase` and `frames` are static.
     """
     config = phase.scenes(frames)
 
-    def one(key: Array) -> SyntheticClip:
+    def one(key: Array) -> tuple[SyntheticClip, Array | None]:
         scene_key, order_key, colour_key = jax.random.split(key, 3)
         clip = generate(scene_key, textures, config)
         shuffle_key, coin_key = jax.random.split(order_key)
         order = jax.random.permutation(shuffle_key, frames)
         order = jnp.where(jax.random.uniform(coin_key) < IN_ORDER, jnp.arange(frames), order)
         clip = jax.tree.map(lambda leaf: leaf[order], clip)
-        return clip._replace(images=_recolour(colour_key, clip.images))
+        clip = clip._replace(images=_recolour(colour_key, clip.images))
+        if not phase.suppressed:
+            return clip, None
+        region_key, coin_key = jax.random.split(jax.random.fold_in(key, _SUPPRESSION))
+        regions = random_regions(region_key, frames, phase.height, phase.width)[order]
+        return clip, regions & (jax.random.uniform(coin_key) < phase.suppressed)
 
-    return jax.vmap(one)(jax.random.split(key, phase.batch))
+    clips, regions = jax.vmap(one)(jax.random.split(key, phase.batch))
+    if regions is None:
+        return Batch(clips)
+    pairs = 1 - jax.random.uniform(jax.random.fold_in(key, _SUPPRESSION))
+    return Batch(clips, regions, jnp.broadcast_to(pairs, (phase.batch,)), phase.suppress)
 
 
 def _recolour(key: Array, images: Array) -> Array:

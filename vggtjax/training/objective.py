@@ -18,8 +18,8 @@ from vggtjax.network.layers import LayerNorm, Params, apply
 from vggtjax.network.model import DENSE_HEADS
 from vggtjax.network.pose import quaternion_to_matrix
 from vggtjax.network.precision import Compute, full_precision
-from vggtjax.scenes.render import SyntheticClip
 from vggtjax.storage.json_values import Natural, NotNegative, check_fields
+from vggtjax.training.batch import Batch
 from vggtjax.training.matching import MatchLoss
 from vggtjax.training.truth import Matches, Targets, matches, targets
 
@@ -67,7 +67,7 @@ def init_probes(seed: int, config: VGGTConfig) -> Params:
 @full_precision
 def objective(
     trained: Params,
-    batch: SyntheticClip,
+    batch: Batch,
     config: VGGTConfig,
     weights: LossWeights,
     *,
@@ -81,10 +81,11 @@ def objective(
     and dense heads are computed again in the backward pass.
     """
     model, probes = trained["model"], trained["probes"]
-    images = batch.images
+    clips = batch.clips
+    images = clips.images
     grid = patch_grid(images, config)
-    truth = targets(batch)
-    paired = matches(batch, config.patch_size)
+    truth = targets(clips)
+    paired = matches(clips, config.patch_size)
     dense = [name for name, weight in (("depth", weights.depth), ("points", weights.points)) if weight]
     matching = MatchLoss(paired, weights.match_layers, config.depth) if weights.match else None
 
@@ -107,7 +108,8 @@ def objective(
 
     def network(model: Params):
         tokens = encode(model, images, config, compute_dtype=compute_dtype)
-        return aggregate(model, tokens, config, grid, captures=captures, accumulator=matching, compute=compute)
+        settings = {"accumulator": matching, "suppression": batch.suppression(config), "compute": compute}
+        return aggregate(model, tokens, config, grid, captures=captures, **settings)
 
     camera_tokens, taps, sums = (jax.checkpoint(network) if remat else network)(model)
     pose = predict_pose(model, camera_tokens, config)

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from vggtjax.config import VGGTConfig
+from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.model import DENSE_HEADS, HEADS
 from vggtjax.scenes.config import SceneConfig
@@ -46,6 +46,8 @@ class Phase:
     width: int
     dynamic: float = 0.0  # share of scenes in which objects move
     motion: tuple[float, float] = (0.1, 1.0)  # range of the camera's share of its largest path
+    suppressed: Share = 0.0  # share of clips in which the keys of random regions are suppressed, whatever moves
+    suppress: Suppress = "zero"  # how; in the first pairs of blocks, their number drawn for each step
 
     def __post_init__(self) -> None:
         check_fields(self, "phase")

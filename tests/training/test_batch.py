@@ -1,0 +1,95 @@
+"""Random regions of suppressed keys: their shape, their share of the clips, and their effect on the network."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import ndimage
+from skimage.measure import label
+
+from tests.generated import QUICK
+from tests.training_runs import CONFIG
+from vggtjax.network.aggregator import aggregate, identity
+from vggtjax.network.backbone import encode, patch_grid
+from vggtjax.network.camera_head import predict_pose
+from vggtjax.network.model import init_params
+from vggtjax.network.suppression import Suppression
+from vggtjax.scenes import load_textures
+from vggtjax.training.data import make_batch
+from vggtjax.training.objective import LossWeights, init_probes, objective
+from vggtjax.training.recipe import Phase
+from vggtjax.training.regions import random_regions
+from vggtjax.training.truth import targets
+
+PHASE = Phase(1, 8, (3,), 28, 28)
+CAMERA = LossWeights(depth=0, points=0)
+
+
+def drawn(phase, key=0):
+    render = jax.jit(make_batch, static_argnums=(2, 3), compiler_options=QUICK)
+    return render(jax.random.key(key), load_textures("training"), phase, 3)
+
+
+@pytest.fixture(scope="module")
+def batch():
+    return drawn(dataclasses.replace(PHASE, suppressed=0.5))
+
+
+def test_regions_are_compact_and_move():
+    """At most two pieces, up to the area of two ellipses of the largest axes; the centres move at constant speed."""
+    draw = jax.jit(jax.vmap(lambda key: random_regions(key, 5, 48, 64)))
+    regions = np.asarray(draw(jax.random.split(jax.random.key(0), 64)))
+    assert regions.shape == (64, 5, 48, 64)
+    assert max(np.max(label(frame)) for clip in regions for frame in clip) == 2
+    shares = regions.mean(axis=(2, 3))
+    assert 0.05 < shares.mean() < 0.35
+    assert shares.max() < 2 * 0.7**2
+    assert np.mean(np.any(regions[:, 0] != regions[:, -1], axis=(1, 2))) > 0.95
+    alone = [
+        clip for clip in regions if clip.any((1, 2)).all() and not (clip[:, [0, -1]].any() | clip[..., [0, -1]].any())
+    ]
+    centres = np.array([[ndimage.center_of_mass(frame) for frame in clip] for clip in alone])
+    assert len(alone) > 2
+    assert np.abs(np.diff(centres, 2, axis=1)).max() < 1.5
+
+
+def test_a_share_of_clips_has_regions_and_the_clips_stay_the_same(batch):
+    plain = drawn(PHASE)
+    assert plain.regions is None
+    for one, other in zip(plain.clips, batch.clips, strict=True):  # two programs: a ray may pass an edge
+        assert np.mean(np.isclose(one, other, atol=1e-4)) > 0.99
+    counts = [int(drawn(dataclasses.replace(PHASE, suppressed=s)).regions.any((1, 2, 3)).sum()) for s in (0.5, 1.0)]
+    assert counts[1] >= 7  # a region can lie outside the frames of a short clip
+    assert 1 <= counts[0] <= 7
+    assert float(batch.pairs.min()) == float(batch.pairs.max())
+
+
+@pytest.mark.parametrize("suppress", ["zero", "drop"])
+def test_the_objective_suppresses_keys_as_a_second_pass_does(batch, suppress):
+    """The camera loss is that of the network's own suppressed pass; without regions it is the plain pass's."""
+    batch = dataclasses.replace(batch, suppress=suppress)
+    model = init_params(0, CONFIG)
+    trained = {"model": model, "probes": init_probes(0, CONFIG)}
+    losses = jax.jit(lambda batch: objective(trained, batch, CONFIG, CAMERA)[1], compiler_options=QUICK)
+    clips = batch.clips
+    pairs = int(np.ceil(float(batch.pairs[0]) * CONFIG.depth))
+    middle = slice(CONFIG.patch_size // 2, None, CONFIG.patch_size)
+    tokens = jnp.asarray(np.asarray(batch.regions)[:, :, middle, middle])
+    assert tokens.any()
+
+    def translation_loss(suppression):
+        patches = encode(model, clips.images, CONFIG)
+        grid = patch_grid(clips.images, CONFIG)
+        camera, _, _ = aggregate(
+            model, patches, CONFIG, grid, captures=[identity] * len(CONFIG.taps), suppression=suppression
+        )
+        error = jnp.abs(predict_pose(model, camera, CONFIG) - targets(clips).pose_encoding)
+        return float(error[..., :3].sum(axis=-1).mean())
+
+    found = float(losses(batch)["loss_translation"])
+    assert found == pytest.approx(translation_loss(Suppression(tokens, suppress, pairs)), rel=1e-5)
+    plain = float(losses(dataclasses.replace(batch, regions=None, pairs=None))["loss_translation"])
+    assert plain == pytest.approx(translation_loss(Suppression()), rel=1e-5)
+    assert abs(plain - found) > 1e-5
