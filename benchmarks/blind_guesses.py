@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,9 +23,8 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import LadderRow
 from vggtjax.evaluation.metrics.depth import depth_errors, measured
 from vggtjax.evaluation.metrics.trajectory import rotation_error
+from vggtjax.progress import Progress
 from vggtjax.scenes import SceneConfig, generate, load_textures
-
-Progress = Callable[[int, int], object]
 
 
 class Prior(NamedTuple):

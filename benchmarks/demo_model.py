@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bars
 
 from benchmarks.blind_guesses import Comparison, Guess, Prior, compare, guesses, training_prior
 from benchmarks.plots import plot_ladder, plot_rotations, plot_sweep
@@ -21,14 +22,13 @@ from vggtjax.clips.truth import Truth, batched_truth
 from vggtjax.errors import InputError, check_extra
 from vggtjax.evaluation.ladder import LadderRow, ladder
 from vggtjax.pretrained.load import load_model
+from vggtjax.progress import Progress
 from vggtjax.scenes import SceneConfig, held_out_scenes
 from vggtjax.storage.writing import staging, writing
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 SUPPRESS = ("zero", "drop")
 SWEPT = ("pose-decoupling", "4dvggt-d")  # methods whose sweep is shown; report.json has all
-
-Advance = Callable[[int, int], object]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +139,7 @@ class _Bench:
         self.model, self.settings = model, settings
         columns = (TextColumn("{task.description:<28}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         self.console = Console(stderr=True)
-        self.progress = Progress(*columns, console=self.console, disable=not self.console.is_terminal)
+        self.progress = Bars(*columns, console=self.console, disable=not self.console.is_terminal)
         self.priors: dict[tuple[int, int], Prior] = {}
 
     @contextmanager
@@ -147,10 +147,10 @@ class _Bench:
         with self.progress:
             yield
 
-    def stage(self, name: str) -> Advance:
+    def stage(self, name: str) -> Progress:
         task = self.progress.add_task(name, total=None)
 
-        def advance(done: int, total: int) -> None:
+        def advance(done: int, total: int | None) -> None:
             self.progress.update(task, completed=done, total=total)
             if done == total and not self.console.is_terminal:  # a log gets a line for each stretch
                 self.console.print(f"{name}: done", highlight=False)

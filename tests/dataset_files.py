@@ -13,6 +13,8 @@ from vggtjax.evaluation.datasets import find_sequences
 
 SINTEL_TAG = struct.pack("<f", 202021.25)
 
+QUARTER_ABOUT_Y = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # a turn by 90 degrees
+
 
 def opened(name: str, root: Path, *, stride: int | None = None, max_frames: int | None = None, **options: Any) -> Any:
     """Open all sequences, of no type: a test knows which ground truth there is."""

@@ -105,12 +105,30 @@ def test_a_record_leaves_before_its_curves_change(tmp_path, three, monkeypatch):
     assert again.calls
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"name": 1}', '{"name": "a", "method": "vggt", "status": "ok"}'])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{",
+        "[]",
+        '{"name": 1}',
+        '{"name": "a", "method": "vggt", "status": "ok"}',
+        {"metrics": {"ate": 10**400}},
+        {"metrics": {"ate": "1"}},
+        {"settings": json.loads("[" * 500 + "]" * 500)},
+        {"frames": -1},
+        {"status": "fine"},
+        {"unknown": 1},
+    ],
+)
 def test_a_broken_record_is_made_again(tmp_path, three, content):
     room, sequences = three
     store = Records(tmp_path / "out")
     run(sequences[:1], Perfect(room, ["vggt"]), store)
-    (tmp_path / "out/sequences/a/vggt.json").write_text(content)
+    path = tmp_path / "out/sequences/a/vggt.json"
+    if isinstance(content, dict):  # changed values of a whole record
+        content = json.dumps(json.loads(path.read_text()) | content)
+    path.write_text(content)
     again = Perfect(room, ["vggt"])
     assert run(sequences[:1], again, store)[0].status == "ok"
     assert again.calls

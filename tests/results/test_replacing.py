@@ -1,0 +1,116 @@
+"""Results saved over earlier files: replaced as a whole, or left untouched."""
+
+import errno
+
+import numpy as np
+import pytest
+
+from tests.results.test_export import expected_files, files
+from tests.room import make_room
+from vggtjax.errors import InputError, OutputError
+from vggtjax.results import export
+from vggtjax.results.reconstruction import Reconstruction
+
+
+def test_earlier_result_is_replaced_as_a_whole(tmp_path):
+    make_room(frames=4).save(tmp_path)
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "input").mkdir()
+    (tmp_path / "input" / "000000.png").write_text("mine too")
+    make_room(frames=2).save(tmp_path)
+    kept = {"notes.txt", "input/000000.png"}
+    assert set(files(tmp_path)) == expected_files(2) | kept
+    assert len(Reconstruction.load(tmp_path).depth) == 2
+
+
+@pytest.mark.parametrize("name", ["frames", "depth", "preview", "static.ply", "trajectory.txt"])
+def test_files_of_others_are_never_replaced(tmp_path, name):
+    path = tmp_path / name
+    if path.suffix:
+        path.write_text("mine")
+    else:
+        path.mkdir()
+        (path / "000000.png").write_text("mine")
+    before = files(tmp_path)
+    with pytest.raises(
+        OutputError, match=rf"{name} exists and is not part of an earlier result.*choose another folder"
+    ):
+        make_room(1).save(tmp_path)
+    assert files(tmp_path) == before
+
+
+def test_archives_of_others_are_never_replaced(tmp_path):
+    np.savez(tmp_path / "reconstruction.npz", points=np.zeros(3))
+    with pytest.raises(OutputError, match=r"reconstruction\.npz exists and is not part"):
+        make_room(1).save(tmp_path)
+    assert set(files(tmp_path)) == {"reconstruction.npz"}
+
+
+@pytest.mark.parametrize(
+    "writer", ["write_ply", "PlyWriter", "encode_depth", "write_trajectory", "build_scene", "_write_png"]
+)
+@pytest.mark.parametrize("earlier", [False, True])
+def test_full_disk_leaves_the_earlier_result_untouched(tmp_path, monkeypatch, writer, earlier):
+    folder = tmp_path / "result"
+    if earlier:
+        make_room(2).save(folder)
+    before = files(tmp_path)
+
+    def fail(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(export, writer, fail)
+    with pytest.raises(OutputError, match="No space left on device; choose a folder"):
+        make_room(3).save(folder)
+    assert files(tmp_path) == before
+    assert {path.name for path in folder.iterdir()} == {name.split("/")[0] for name in files(folder)}
+
+
+def test_the_archive_leaves_first_and_arrives_last(tmp_path, monkeypatch):
+    make_room(1).save(tmp_path)
+    rename, seen = type(tmp_path).rename, []
+
+    def watch(source, target):
+        result = rename(source, target)
+        seen.append((tmp_path / "reconstruction.npz").exists())
+        return result
+
+    monkeypatch.setattr(type(tmp_path), "rename", watch)
+    make_room(1).save(tmp_path)
+    assert seen == [True] + [False] * 21 + [True, True]  # first and last the hidden folder moves
+
+
+def test_error_of_the_callback_leaves_nothing_behind(tmp_path):
+    def stop(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        make_room(5).save(tmp_path, progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_folder_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match=r"cannot write .*file"):
+        make_room(1).save(tmp_path / "file")
+    with pytest.raises(OutputError, match="cannot write"):
+        make_room(1).save(tmp_path / "file" / "below")
+
+
+def test_percentile_out_of_range_writes_nothing(tmp_path):
+    with pytest.raises(InputError, match="confidence_percentile is 100"):
+        make_room(1).save(tmp_path / "result", confidence_percentile=100)
+    assert not (tmp_path / "result").exists()
+
+
+def test_links_are_replaced_and_not_followed(tmp_path):
+    make_room(1).save(tmp_path / "result")
+    elsewhere = tmp_path / "elsewhere"
+    (tmp_path / "result" / "frames").rename(elsewhere)
+    try:
+        (tmp_path / "result" / "frames").symlink_to(elsewhere, target_is_directory=True)
+    except OSError:
+        pytest.skip("this system does not let us make links")
+    make_room(2).save(tmp_path / "result")
+    assert set(files(elsewhere)) == {"000000.ply"}
+    assert set(files(tmp_path / "result")) == expected_files(2)
