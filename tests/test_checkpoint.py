@@ -68,7 +68,7 @@ def refusal(path, **options) -> str:
 def test_round_trip(saved_once, tree, config):
     model = load_model(saved_once)
     assert model.config == config
-    assert (model.name, model.path, model.trained, model.dtype) == ("tiny model", saved_once, True, "float32")
+    assert (model.name, model.path, model.note, model.dtype) == ("tiny model", saved_once, "", "float32")
     assert jax.tree.all(jax.tree.map(np.array_equal, model.params, tree))
     assert is_checkpoint(saved_once)
 
@@ -86,6 +86,18 @@ def test_saving_what_was_loaded_writes_the_same_bytes(saved_once, tmp_path):
     model = load_model(saved_once)
     copy = save_model(tmp_path / "copy.safetensors", model.params, model.config, name=model.name)
     assert copy.read_bytes() == saved_once.read_bytes()
+
+
+def test_note_and_untrained_heads_are_in_the_file(tree, config, tmp_path):
+    path = save_model(tmp_path / "a.safetensors", tree, config, note="first attempt", untrained_heads=("tracks",))
+    path = path.rename(tmp_path / "b.safetensors")
+    model = load_model(path)
+    assert model.warning == "The model a is a first attempt."
+    assert model.untrained_heads == ("tracks",)
+    assert model.summary()["heads"][-1] == "tracks (untrained)"
+    for labels in ({"note": "two\nlines"}, {"untrained_heads": ("nose",)}):
+        with pytest.raises(CheckpointError, match=r"'two\\nlines'|'nose'"):
+            save_model(path, tree, config, **labels)
 
 
 def test_type_on_loading(saved_once, tree):
@@ -212,6 +224,9 @@ def test_file_is_checked_against_its_configuration(saved_once, tmp_path):
         ({"config": '{"embed_dim": 1000000, "num_heads": 10, "dino_num_heads": 10}'}, "mis-shaped parameter"),
         ({"config": '{"motion": {"cues": [5]}}'}, "motion.cues[0] is 5"),
         ({"config": " " * 70_000}, "more than 65536 bytes"),
+        ({"note": "\u001b"}, "expected up to 200 printable letters"),
+        ({"untrained": '["nose"]'}, "names the untrained heads ['nose']"),
+        ({"untrained": "3"}, "the list of untrained heads of"),
         ({"origin": "[" * 60_000}, "x.safetensors is not JSON"),
         ({"origin": '{"a": ' + "9" * 400 + "}"}, "a is a number of more than 64 bits"),
         ({"origin": '{"a": "b"}'}, "Expected `str` matching regex"),
@@ -245,7 +260,7 @@ def test_reading_torch_layout_as_own_is_refused(shapes, tmp_path):
 def test_demo_model(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     model = load_model("demo")
-    assert (model.name, model.trained, model.dtype, model.origin) == ("demo", True, "float32", {})
+    assert (model.name, model.dtype, model.origin) == ("demo", "float32", {})
     again = load_model("demo")
     assert jax.tree.all(jax.tree.map(np.array_equal, model.params, again.params))
     assert load_model("demo", dtype="bfloat16").dtype == "bfloat16"

@@ -1,4 +1,4 @@
-"""Models on disk: one safetensors file with flat Flax names, the configuration and the name in its metadata."""
+"""Models on disk: one safetensors file with flat Flax names; configuration, name and note are in its metadata."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -58,9 +58,8 @@ class Model:
     params: Params = field(repr=False)  # nested dicts of arrays with Flax names, layers stacked on axis 0
     name: str = ""
     path: Path | None = None  # file of the parameters
-    trained: bool = True  # False: random parameters, meaningless results
     origin: Mapping[str, str] = field(default_factory=dict)  # names of the source files of a conversion -> sha256
-    untrained_heads: tuple[str, ...] = ()  # heads with random parameters in a trained model
+    untrained_heads: tuple[str, ...] = ()  # heads with random parameters
     note: str = ""  # for users of the model; part of the settings of its results
     _file: _FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets it
 
@@ -89,6 +88,11 @@ class Model:
         return sizes.most_common(1)[0][0]
 
     @property
+    def warning(self) -> str:
+        """The note as a sentence; empty without a note."""
+        return f"The model {self.name} is a {self.note}." if self.note else ""
+
+    @property
     def heads(self) -> tuple[str, ...]:
         """Names of the model's heads."""
         return self.config.heads
@@ -98,7 +102,7 @@ class Model:
         return {
             "name": self.name,
             "path": None if self.path is None else str(self.path),
-            "trained": self.trained,
+            **({"note": self.note} if self.note else {}),
             "parameters": self.parameter_count,
             "bytes": self.parameter_bytes,
             "dtype": self.dtype,
@@ -120,7 +124,7 @@ def read_model(path: str | Path, *, dtype: DType | None = None, **fields: Any) -
     Args:
         path: the file.
         dtype: of the parameters; None for the types in the file.
-        fields: fields of `Model` that the file does not know: name, note, untrained_heads.
+        fields: fields of `Model` in place of those in the file: name, note, untrained_heads.
 
     Raises CheckpointError, which lists all problems, unless the file is a whole checkpoint of this library that fits
     its own configuration.
@@ -143,16 +147,17 @@ def read_model(path: str | Path, *, dtype: DType | None = None, **fields: Any) -
     return model
 
 
-def save_model(path: str | Path, params: Params, config: VGGTConfig, *, name: str | None = None) -> Path:
+def save_model(path: str | Path, params: Params, config: VGGTConfig, **labels: Any) -> Path:
     """Write parameters, nested dicts of float32 or bfloat16 arrays, as a checkpoint of this library; return its path.
 
-    An existing file is replaced; without `name` the model is named after the file. Raises CheckpointError, which lists
-    all problems, if the parameters do not fit the configuration, and OutputError if the file cannot be written.
+    An existing file is replaced. `labels` are `name`, `note` and `untrained_heads` of `write_checkpoint`. Raises
+    CheckpointError, which lists all problems, if the parameters do not fit the configuration, and OutputError if the
+    file cannot be written.
     """
     flat: dict[str, Any] = flatten_dict(params, sep=".")
     check_parameters("the parameters do not fit the configuration", flat, config)
     specs = {key: Spec(leaf.shape, leaf.dtype) for key, leaf in flat.items()}
-    return write_checkpoint(path, specs, lambda key: [np.asarray(flat[key])], config, name=name)
+    return write_checkpoint(path, specs, lambda key: [np.asarray(flat[key])], config, **labels)
 
 
 def write_checkpoint(
@@ -162,16 +167,21 @@ def write_checkpoint(
     config: VGGTConfig,
     *,
     name: str | None = None,
+    note: str = "",
+    untrained_heads: Sequence[str] = (),
     origin: Mapping[str, str] | None = None,
 ) -> Path:
     """Write a checkpoint of this library piece by piece, as `write_tensors` does; return its path.
 
-    `origin` gives the names and sha256 of the source files of a conversion.
+    Without `name` the model is named after the file. `note` and `untrained_heads` are those of `Model`; `origin` gives
+    the names and sha256 of the source files of a conversion.
     """
     path = Path(path)
+    _check_labels(path, note, untrained_heads, config)
     metadata = {"format": FORMAT, "version": VERSION, "config": config.to_json(), "name": name or path.stem}
-    if origin:
-        metadata["origin"] = json.dumps(origin)
+    metadata |= {"note": note} if note else {}
+    metadata |= {"untrained": json.dumps(list(untrained_heads))} if untrained_heads else {}
+    metadata |= {"origin": json.dumps(origin)} if origin else {}
     write_tensors(path, specs, pieces, metadata)
     return path
 
@@ -211,7 +221,7 @@ def check_parameters(subject: str, tensors: Mapping[str, Any], config: VGGTConfi
 
 
 def _read_metadata(path: Path, metadata: Mapping[str, str]) -> tuple[VGGTConfig, dict[str, Any]]:
-    """Return the configuration, and the fields of the model: its name, or the file's stem if invalid, and origin."""
+    """Return the configuration, and the other fields of the model; its name is the file's stem if invalid."""
     if metadata.get("format") != FORMAT:
         raise CheckpointError(f"{path} is not a checkpoint of this library; load_model converts PyTorch weights")
     if metadata.get("version") != VERSION:
@@ -225,7 +235,18 @@ def _read_metadata(path: Path, metadata: Mapping[str, str]) -> tuple[VGGTConfig,
         raise CheckpointError(f"the origin of {path} names files with unprintable letters; expected names and sha256")
     name = metadata.get("name", "")
     is_valid = name.isprintable() and 0 < len(name) <= _MOST_NAME_LETTERS
-    return config, {"name": name if is_valid else path.stem, "origin": origin}
+    note = metadata.get("note", "")
+    untrained = parse(metadata.get("untrained", "[]"), tuple[str, ...], f"the list of untrained heads of {path}")
+    _check_labels(path, note, untrained, config)
+    name = name if is_valid else path.stem
+    return config, {"name": name, "origin": origin, "note": note, "untrained_heads": untrained}
+
+
+def _check_labels(path: Path, note: str, untrained_heads: Sequence[str], config: VGGTConfig) -> None:
+    if not note.isprintable() or len(note) > _MOST_NAME_LETTERS:
+        raise CheckpointError(f"the note of {path} is {note[:50]!r}; expected up to 200 printable letters")
+    if unknown := [head for head in untrained_heads if head not in config.heads]:
+        raise CheckpointError(f"{path} names the untrained heads {unknown}; expected some of {config.heads}")
 
 
 class _FileFacts(NamedTuple):

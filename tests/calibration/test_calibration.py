@@ -48,7 +48,7 @@ def model():
         track_hidden=48,
         motion=MotionConfig(offsets=(-2, -1, 1, 2)),
     )
-    return Model(config, init_params(0, config), "tiny")
+    return Model(config, init_params(0, config), "tiny", note="first attempt", untrained_heads=("tracks",))
 
 
 @pytest.fixture(scope="module")
@@ -227,7 +227,7 @@ def test_a_calibrated_model_knows_its_table(tmp_path, model, swept, choice):
     path = save_calibration(tmp_path / "out", model, swept, choice, source={"scenes": CLIPS})
     loaded = load_model(path)
     assert loaded.config == dataclasses.replace(model.config, motion=choice.motion)
-    assert loaded.name == "tiny"
+    assert (loaded.name, loaded.note, loaded.untrained_heads) == ("tiny", model.note, model.untrained_heads)
     assert (loaded.params["aggregator"]["camera_token"] == model.params["aggregator"]["camera_token"]).all()
     numbers = json.loads((tmp_path / "out" / NUMBERS).read_text())
     assert numbers["source"] == {"scenes": CLIPS}

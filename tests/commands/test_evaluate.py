@@ -64,6 +64,7 @@ def test_all_of_it(dataset, evaluated, capsys):
             assert values["mean"]["vggt"][metric] == pytest.approx(np.mean(each))
     assert values["settings"]["dataset"] == "plain"
     assert values["settings"]["model"]["name"] == "demo"
+    assert "The model demo is a small demonstration model" in (evaluated / "index.html").read_text()
     for name in ("results.csv", "table.md", "table.tex", "index.html", "plots/first/paths.png"):
         assert (evaluated / name).stat().st_size > 100
     assert not list(evaluated.rglob(".vggtjax-partial*"))

@@ -36,16 +36,20 @@ def test_train(recipe, tmp_path, capsys, monkeypatch):
 
 def test_fewer_steps_from_a_model(recipe, tmp_path, capsys):
     params = init_params(4, PROBES.model)
-    start = save_model(tmp_path / "start.safetensors", params, PROBES.model)
+    labels = {"note": "first attempt", "untrained_heads": ["camera", "points"]}
+    start = save_model(tmp_path / "start.safetensors", params, PROBES.model, **labels)
     out = tmp_path / "out"
     command.train(recipe, out, init=str(start), steps=3, options=RunOptions(seconds=1e-9, dtype="bfloat16"))
     assert "1 of 3; the same command resumes the run" in capsys.readouterr().out
     model = read_model(out / "model.safetensors")
     assert model.dtype == "bfloat16"
+    assert (model.note, model.untrained_heads) == ("first attempt", ("camera", "points"))
     np.testing.assert_allclose(
         np.asarray(model.params["backbone"]["class_token"], np.float32), params["backbone"]["class_token"], rtol=0.01
     )
     assert json.loads((out / "recipe.json").read_text())["stages"][0]["steps"] == 2
+    command.train(recipe, out, steps=3, options=RunOptions(dtype="bfloat16"))  # without --init: resumed
+    assert read_model(out / "model.safetensors").note == "first attempt"
 
 
 def test_bad_input(recipe, tmp_path, monkeypatch):

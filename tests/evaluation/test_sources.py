@@ -29,6 +29,13 @@ def test_retrained_weights_are_another_model(tmp_path, stored):
     assert after == before
 
 
+def test_the_note_of_a_model_is_a_warning_and_a_setting():
+    config = tiny_config()
+    source = ModelSource(Model(config, init_params(0, config), "m", note="first attempt"), ["vggt"])
+    assert source.warnings == ("The model m is a first attempt.",)
+    assert source.settings["model_note"] == "first attempt"
+
+
 def test_changed_weights_of_a_file_are_another_model(tmp_path):
     config = tiny_config()
     model = read_model(save_model(tmp_path / "m.safetensors", init_params(0, config), config))

@@ -53,7 +53,7 @@ def test_what_a_run_leaves(straight):
     assert latest(out / "checkpoints") == 6
     model = read_model(outcome.model)
     assert model.config == SHORT.model
-    assert model.name == "tiny"
+    assert (model.name, model.note, model.untrained_heads) == ("tiny", "", ("depth", "points", "tracks"))
     assert same(model.params, exported(outcome.state, SHORT))
     assert [status.step for status in seen] == [0, 2, 4, 6, 6]
     assert seen[0].seconds_left is None

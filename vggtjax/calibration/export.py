@@ -44,7 +44,8 @@ def save_calibration(
     config = dataclasses.replace(model.config, motion=choice.motion)
     numbers = calibration_numbers(model, sweep, choice, auc) | {"source": dict(source or {})}
     with staging(folder) as staged:
-        save_model(staged / MODEL, model.params, config, name=model.name or None)
+        names = {"name": model.name or None, "note": model.note}
+        save_model(staged / MODEL, model.params, config, **names, untrained_heads=model.untrained_heads)
         Image.fromarray(draw_sweep(auc, choice, title=model.name)).save(staged / PICTURE)
         (staged / NUMBERS).write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         (folder / NUMBERS).unlink(missing_ok=True)

@@ -79,7 +79,7 @@ def batch(
         if outcome.status == "failed":
             report.line(f"{outcome.name} failed: {outcome.reason}")
     if network.note:
-        report.line(f"The model {network.name} is a {network.note}.")
+        report.line(network.warning)
     if counts["failed"] == len(outcomes):
         raise InputError("none of the clips could be reconstructed; the reasons are above")
 

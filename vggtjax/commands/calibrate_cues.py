@@ -77,8 +77,8 @@ def calibrate_cues(
     report.table(rows | {"default table": "{:.3f}   {:.3f}".format(*choice.table), "model": path})
     if choice.steps[-1].rating.held_out < choice.table.held_out:
         report.line("On the held-out half the default table is better than the chosen table; try more scenes.")
-    if not loaded.trained:
-        report.line("The weights of this model are untrained, so its cues have no meaning.")
+    if loaded.note:
+        report.line(loaded.warning)
 
 
 def generated_clips(

@@ -163,8 +163,8 @@ def fit_fusion(
             about |= {"data": list(clips.data), "max_frames": clips.max_frames, "size": clips.size}
             chosen = save_fits(out, scores, passes, patch, config, about=about)
     _say(report, scores, chosen, out)
-    if not network.trained:
-        report.line("The weights of this model are untrained: these numbers show that everything runs, no more.")
+    if network.note:
+        report.line(network.warning)
 
 
 def aligned(clip: ClipPasses) -> ClipPasses:

@@ -79,15 +79,8 @@ class Report:
                 "look at": f"{out / 'preview' / 'sheet.png'}, {out / 'scene.glb'}",
             }
         )
-        if model is None:
-            return
-        if model.note:
-            self.line(f"The model {model.name} is a {model.note}.")
-        if not model.trained:
-            self.line(
-                "The weights of this model are untrained: this shows that everything runs, not what the scene is. "
-                "For a reconstruction, run: vggtjax reconstruct CLIP --out DIR --model WEIGHTS"
-            )
+        if model is not None and model.note:
+            self.line(model.warning)
 
     def table(self, rows: Mapping[str, object]) -> None:
         """Print names and values as a table."""

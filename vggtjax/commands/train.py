@@ -46,13 +46,12 @@ def train(
             chosen = read_recipe(recipe)
             if steps is not None:
                 chosen = chosen.with_steps(steps)
-        params = None
+        model = None
         if init is not None:
             with report.stage("load model") as progress:
                 from vggtjax.pretrained.load import load_weights
-                from vggtjax.training.state import adapted
 
-                params = adapted(load_weights(init, config=chosen.model, progress=progress), chosen.model)
+                model = load_weights(init, config=chosen.model, progress=progress)
         with report.stage("train") as advance:
             shown = time.perf_counter()
 
@@ -63,7 +62,7 @@ def train(
                     report.line(_line(status))
                     shown = time.perf_counter()
 
-            outcome = run(chosen, out, init=params, options=options, progress=show)
+            outcome = run(chosen, out, init=model, options=options, progress=show)
     done, total = int(outcome.state.step), chosen.total_steps
     report.table(
         {

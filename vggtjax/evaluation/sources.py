@@ -26,7 +26,6 @@ if TYPE_CHECKING:  # the folders of other programs are scored without jax
     from vggtjax.method.fusion_family import FusionParams
 
 _MOST_FILES = 100_000  # of a folder with one result
-_UNTRAINED = "The weights of this model are untrained: these numbers show that everything runs, and mean nothing else."
 
 
 class ResultSource(Protocol):
@@ -79,8 +78,8 @@ class ModelSource:
     @property
     def settings(self) -> dict[str, Any]:
         """What the results depend on besides the sequence, as JSON values."""
-        model = self.model.identity.to_json() | {"trained": self.model.trained}
-        settings = {"model": model, "mode": self._fitter.mode, "size": self._fitter.size}
+        settings = {"model": self.model.identity.to_json(), "mode": self._fitter.mode, "size": self._fitter.size}
+        settings |= {"model_note": self.model.note} if self.model.note else {}
         settings |= {name: value for name, value in self.options.to_json().items() if name != "method"}
         if self.fusion is not None:
             from vggtjax.method.fusion_file import fusion_digest
@@ -91,7 +90,7 @@ class ModelSource:
     @property
     def warnings(self) -> tuple[str, ...]:
         """Sentences that a reader of the numbers must know."""
-        return () if self.model.trained else (_UNTRAINED,)
+        return (self.model.warning,) if self.model.note else ()
 
     def fingerprint(self, name: str, sequence: LabelledSequence) -> str:
         """Return "": a model's results depend on the settings and the sequence alone."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import filecmp
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from vggtjax.storage.writing import writing
 MODEL = Path(__file__).with_name("model.safetensors")
 CLIP = MODEL.with_name("clip.npz")
 NOTE = "small demonstration model, trained on generated scenes; not for real footage"
+UNTRAINED_HEADS = ("points", "tracks")
 SCENE_SEED = 100  # of held-out dynamic scenes; the clip is the first of them; no evaluation uses this seed
 _NEAREST = np.float32(1e-3)  # metres
 _STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
@@ -27,7 +30,16 @@ def demo_model(dtype: DType = "float32") -> Model:
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
-    return read_model(MODEL, dtype=dtype, name="demo", note=NOTE, untrained_heads=("points", "tracks"))
+    return read_model(MODEL, dtype=dtype, **embedded_labels(MODEL))
+
+
+def embedded_labels(path: Path) -> dict[str, Any]:
+    """Return note and untrained heads for the embedded model's file or a copy of it; nothing for other files.
+
+    The metadata of this file lacks both: the file is older than these fields of a checkpoint.
+    """
+    is_embedded = MODEL.is_file() and filecmp.cmp(path, MODEL)
+    return {"note": NOTE, "untrained_heads": UNTRAINED_HEADS} if is_embedded else {}
 
 
 def demo_clip(path: Path = CLIP) -> Truth:

@@ -14,7 +14,7 @@ from converters.torch_to_flax import convert_weights
 from vggtjax.checkpoint import VERSION, DType, Model, is_checkpoint, numpy_dtype, read_model
 from vggtjax.config import VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError
-from vggtjax.pretrained.embedded import demo_model
+from vggtjax.pretrained.embedded import demo_model, embedded_labels
 from vggtjax.progress import Progress
 from vggtjax.storage.cache import cache_folder
 
@@ -67,7 +67,7 @@ def load_weights(
     path = weights.path
     if not is_checkpoint(path):
         path = _converted(path, weights.name, config or vggt_1b(), dtype or "float32", progress)
-    return read_model(path, dtype=dtype)
+    return read_model(path, dtype=dtype, **embedded_labels(path))
 
 
 def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from vggtjax.checkpoint import Model
 from vggtjax.network.layers import Params
 from vggtjax.scenes.textures import load_textures
 from vggtjax.storage.writing import locked_folder
@@ -27,9 +28,10 @@ from vggtjax.training.objective import init_probes as init_scene_probes
 from vggtjax.training.objective import objective as scene_objective
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, Recipe
-from vggtjax.training.run import Run
-from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient
+from vggtjax.training.run import Run, labels_of
+from vggtjax.training.state import Metrics, Objective, TrainingState, adapted, apply_gradient, loss_and_gradient
 
+GENERATED_NOTE = "model trained on generated scenes alone"
 _AHEAD = 2  # steps that the host may prepare while the device computes
 _TIMED = 2  # steps of each interval in which rendering is timed separately
 
@@ -80,7 +82,7 @@ def train(
     recipe: Recipe,
     out: str | Path,
     *,
-    init: Params | None = None,
+    init: Model | Params | None = None,
     options: RunOptions | None = None,
     progress: Callable[[Status], object] | None = None,
     task: Task | None = None,
@@ -95,7 +97,8 @@ def train(
         recipe: the model, the data, the losses and the optimiser.
         out: folder for recipe.json, metrics.csv, metrics.png, checkpoints/ and model.safetensors with the averaged
             parameters.
-        init: the model's parameters to start from; None for random ones. Not read when there is a checkpoint.
+        init: a model to start from, or its parameters; None for random ones. Image size and cues of the recipe replace
+            those of a model. Without effect when there is a checkpoint.
         options: intervals of metrics and checkpoints, time limit, type of the exported weights.
         progress: called with a Status.
         task: the data and the loss.
@@ -105,9 +108,11 @@ def train(
         OutputError: `out` cannot be written, or another run is writing into it.
         VggtjaxError: 50 steps in a row had a loss or gradient that is not finite.
     """
+    labels = labels_of(recipe, init, GENERATED_NOTE if task is None else "")
+    params = adapted(init, recipe.model) if isinstance(init, Model) else init
     options, task = options or RunOptions(), task or Task()
     with locked_folder(out, "checkpoints and a model"):
-        run = Run(recipe, Path(out), task.init_probes(recipe.seed, recipe.model), init, options)
+        run = Run(recipe, Path(out), task.init_probes(recipe.seed, recipe.model), params, labels, options)
         trainer = _Trainer(run, task)
         pace = _Pace(run, progress)
         pace.report()

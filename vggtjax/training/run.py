@@ -6,13 +6,15 @@ import logging
 import time
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
 
-from vggtjax.checkpoint import numpy_dtype, read_model, save_model
+from vggtjax.checkpoint import Model, numpy_dtype, read_model, save_model
 from vggtjax.errors import CheckpointError, VggtjaxError
 from vggtjax.network.layers import Params
+from vggtjax.network.model import HEADS
 from vggtjax.storage.writing import writing
 from vggtjax.training import checkpoints
 from vggtjax.training.devices import placement
@@ -27,12 +29,31 @@ _PLOT_SECONDS = 180.0
 logger = logging.getLogger(__name__)
 
 
+def labels_of(recipe: Recipe, init: Model | Params | None, note: str) -> dict[str, Any]:
+    """Return note (`note` for random parameters, else that of `init`) and untrained heads of the model of a run.
+
+    Untrained heads were untrained at the start, and the run leaves them unchanged. Parameters alone have no labels.
+    """
+    if init is not None and not isinstance(init, Model):
+        return {"note": "", "untrained_heads": []}
+    note, untrained = (note, recipe.model.heads) if init is None else (init.note, init.untrained_heads)
+    return {"note": note, "untrained_heads": [head for head in untrained if HEADS[head] in recipe.frozen]}
+
+
 class Run:
     """The state and the counts of a run, and the files in its folder."""
 
-    def __init__(self, recipe: Recipe, out: Path, probes: Params, init: Params | None, options: RunOptions) -> None:
+    def __init__(
+        self,
+        recipe: Recipe,
+        out: Path,
+        probes: Params,
+        init: Params | None,
+        labels: dict[str, Any],
+        options: RunOptions,
+    ) -> None:
         """Resume from the newest checkpoint in `out`, or start with `probes` and `init` (None: random parameters)."""
-        self.recipe, self.out, self.options = recipe, out, options
+        self.recipe, self.out, self.options, self.labels = recipe, out, options, labels
         self.checkpoints, self.model_path = out / "checkpoints", out / "model.safetensors"
         self.step, self.phase, self.samples, self.skipped_in_a_row = 0, 0, 0, 0
         self.averages = Averages()
@@ -103,12 +124,13 @@ class Run:
             "samples": self.samples,
             "skipped_in_a_row": self.skipped_in_a_row,
             "seconds": self.seconds,
+            "labels": self.labels,
         }
         checkpoints.save(self.checkpoints, self.state, self.recipe, notes)
         averaged, dtype = exported(self.state, self.recipe), numpy_dtype(self.options.dtype)
         params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(dtype, copy=False), averaged)
         if not self._has_exported(params):
-            save_model(self.model_path, params, self.recipe.model, name=self.recipe.name)
+            save_model(self.model_path, params, self.recipe.model, name=self.recipe.name, **self.labels)
         self.exported, self._saved_at = self.step, time.perf_counter()
         logger.info("step %d of %d saved in %s", self.step, self.recipe.total_steps, self.out)
 
@@ -118,14 +140,15 @@ class Run:
         self._plotted_at = time.perf_counter()
 
     def _has_exported(self, params: Params) -> bool:
-        """Return whether the file of the model holds these parameters, and the recipe's name and configuration."""
+        """Return whether the file of the model holds these parameters, the labels, and the recipe's name and model."""
         if self.exported is not None or not self.model_path.exists():
             return False
         try:
             model = read_model(self.model_path)
         except CheckpointError:
             return False
-        if (model.config, model.name) != (self.recipe.model, self.recipe.name):
+        labels = {"note": model.note, "untrained_heads": list(model.untrained_heads)}
+        if (model.config, model.name, labels) != (self.recipe.model, self.recipe.name, self.labels):
             return False
         return jax.tree.all(
             jax.tree.map(lambda a, b: a.dtype == b.dtype and np.array_equal(a, b), model.params, params)
@@ -142,6 +165,7 @@ class Run:
             self.averages = Averages(**notes["averages"])
             self.samples, self.skipped_in_a_row = int(notes["samples"]), int(notes["skipped_in_a_row"])
             self.earlier = float(notes["seconds"])
+            self.labels = dict(notes.get("labels", self.labels))  # an old checkpoint has none
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(
                 f"the checkpoint of step {self.step} in {self.checkpoints} lacks the counts of a training run ({error})"
