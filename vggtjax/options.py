@@ -92,7 +92,7 @@ def _refine_mask(refine_mask: _Flag = False, no_refine_mask: _Flag = False) -> b
     return True if refine_mask else False if no_refine_mask else None
 
 
-# Of that name, the two flags stand among those of the method.
+# The name puts both flags into the group of the method in the help.
 _RefineMask = Annotated[bool | None, tyro.conf.arg(constructor=_refine_mask, name="method", prefix_name=False)]
 
 
@@ -127,7 +127,7 @@ class Options:
         check_fields(self)
 
     def check_given_masks(self) -> None:
-        """Raise InputError for options that only mined masks obey: called where the user gives masks."""
+        """Raise InputError for options of mined masks; call it where the user gives masks."""
         if self.smooth_frames != 1:
             raise InputError(f"smooth_frames is {self.smooth_frames}; leave it out, as given masks are not smoothed")
 

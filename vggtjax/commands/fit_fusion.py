@@ -60,7 +60,7 @@ class Clips:
                 raise InputError(f"--data has {text!r}, and {place} is not a folder")
 
     def passes(self, report: Report, model: Model, options: Options) -> dict[str, ClipPasses]:
-        """Return the passes over all clips by name, in one scale if so asked; every source is a stage of the report."""
+        """Return the passes over clips by name, aligned with `align_scale`; each source is a stage of the report."""
         from vggtjax.learning.clip_passes import dataset_passes, generated_passes
 
         clips: dict[str, ClipPasses] = {}
