@@ -11,6 +11,7 @@ from vggtjax.commands.arguments import ModelName
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS, Options
+from vggtjax.storage.json_values import read_json
 
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
@@ -64,13 +65,4 @@ class ModelFiles:
 
 
 def read_config(path: Path | None) -> VGGTConfig | None:
-    if path is None:
-        return None
-    try:
-        if path.stat().st_size > _MOST_CONFIG_BYTES:
-            raise InputError(f"{path} is {path.stat().st_size} bytes; expected a small JSON file with a configuration")
-        return VGGTConfig.from_json(path.read_text())
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not text; expected a JSON file with a configuration") from None
+    return None if path is None else read_json(path, VGGTConfig, "configuration", most_bytes=_MOST_CONFIG_BYTES)

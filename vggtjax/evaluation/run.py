@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtjax.errors import InputError, VggtjaxError, one_line
+from vggtjax.errors import VggtjaxError, one_line, reading
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.metrics.masks import Empty
 from vggtjax.evaluation.metrics.video_depth import Align
@@ -165,10 +165,8 @@ def fingerprint(sequence: LabelledSequence) -> str:
     """
     digest = hashlib.sha256()
     for path in sequence.pictures:
-        try:
+        with reading(path):
             stat = path.stat()
-        except OSError as error:
-            raise InputError(f"cannot read {path}: {error.strerror or error}") from error
         digest.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode("utf-8", "surrogateescape"))
     for array in (sequence.world_from_camera, sequence.intrinsics, sequence.timestamps):
         digest.update(b"-" if array is None else np.ascontiguousarray(array, np.float64).tobytes())

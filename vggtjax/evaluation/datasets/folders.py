@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path, PureWindowsPath
 
 from vggtjax.clips.sources import natural_key
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, reading
 
 _MOST_BYTES = 2**28  # of a file
 _MOST_NAMES = 8  # of a message
@@ -62,12 +62,10 @@ def inside(folder: Path, name: str, source: Path) -> Path:
 
 def read_bytes(path: Path) -> bytes:
     """Return the content of a file; raises InputError for an unreadable or very large file."""
-    try:
+    with reading(path):
         if (size := path.stat().st_size) > _MOST_BYTES:
             raise InputError(f"{path} has {size} bytes; expected at most {_MOST_BYTES}")
         return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
 
 def read_text(path: Path) -> str:

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from vggtjax.clips.sampling import Sampling
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, reading
 from vggtjax.evaluation.datasets import published
 from vggtjax.evaluation.datasets.davis import davis
 from vggtjax.evaluation.datasets.dycheck import TRUTHS, dycheck
@@ -102,10 +102,8 @@ def find_sequences(
     frames = dataset.frames.sampled(sampling)
 
     def opened(name: str) -> LabelledSequence:
-        try:
+        with reading(f"sequence {name}"):
             sequence = openers[name](frames)
-        except OSError as error:
-            raise InputError(f"cannot read sequence {name}: {error.strerror or error}") from error
         return dataclasses.replace(sequence, notes=(*notices, *(f"{sequence.name}: {note}" for note in sequence.notes)))
 
     return {sequence: partial(opened, sequence) for sequence in chosen}
