@@ -23,7 +23,7 @@ from converters.strangers import refuse_strangers
 from vggtjax.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
 from vggtjax.config import HEAD_NAMES, VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.tensor_file import Spec
 
 _RULES = {path: list(rules) for path, rules in groupby(sorted(RULES, key=attrgetter("path")), attrgetter("path"))}
@@ -138,8 +138,7 @@ def convert_weights(
     done = count(1)
 
     def advance() -> None:
-        if progress is not None:
-            progress(next(done), total)
+        (progress or no_progress)(next(done), total)
 
     def parts(path: str) -> Iterator[np.ndarray]:
         for part in targets[path].parts(tensors):

@@ -14,7 +14,7 @@ from vggtjax.options import METHODS, OptionChanges, Options
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"method": "best"}, "unknown method 'best'"),
+        ({"method": "best"}, "method is 'best'; expected one of vggt, vggt4d"),
         ({"gram": "sine"}, "gram is 'sine'; expected one of"),
         ({"mask_pairs": -1}, "mask_pairs is -1; expected a whole number of at least 0"),
         ({"mask_pairs": 2.5}, "mask_pairs is 2.5"),

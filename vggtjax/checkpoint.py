@@ -19,7 +19,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from msgspec import Meta
 
 from vggtjax.config import VGGTConfig
-from vggtjax.errors import CheckpointError, InputError, problems_sentence
+from vggtjax.errors import CheckpointError, check_choice, problems_sentence
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
 from vggtjax.storage.json_values import parse_json
@@ -200,8 +200,7 @@ def flat_shapes(config: VGGTConfig) -> Mapping[str, tuple[int, ...]]:
 
 def numpy_dtype(dtype: DType) -> np.dtype:
     """Return the numpy type of a parameter type's name; raise InputError for other names."""
-    if dtype not in _DTYPES:
-        raise InputError(f"dtype is {dtype!r}; expected one of {tuple(_DTYPES)}")
+    check_choice("dtype", dtype, tuple(_DTYPES))
     return _DTYPES[dtype]
 
 

@@ -63,7 +63,7 @@ def whole_number(name: str, value: object, lowest: int) -> int:
 def check_choice(name: str, value: object, choices: Sequence[object]) -> None:
     """Raise InputError, naming the argument, for a value that is not one of the choices."""
     if value not in choices:
-        raise InputError(f"{name} is {value!r}; expected {' or '.join(map(repr, choices))}")
+        raise InputError(f"{name} is {value!r}; expected one of {', '.join(map(str, choices))}")
 
 
 @contextmanager

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import operator
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, SupportsIndex, TypedDict
 
 import tyro
 
 from vggtjax.config import Gram, Suppress
-from vggtjax.errors import InputError, whole_number
+from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.storage.json_values import check_fields
 
 Pass = Literal["first", "second"]
@@ -61,18 +59,16 @@ LADDER = ("vggt", "pose-decoupling", "hard-replacement", "4dvggt-d")  # one run 
 
 def find_method(name: str) -> Method:
     """Return the method of that name. Raises InputError for an unknown name."""
-    if name not in METHODS:
-        raise InputError(f"unknown method {name!r}; expected one of {', '.join(METHODS)}")
+    check_choice("method", name, tuple(METHODS))
     return METHODS[name]
 
 
-def odd_frames(frames: Any) -> int:
+def odd_frames(frames: object) -> int:
     """Return a number of frames to average over as an int. Raises InputError for an invalid number."""
-    with suppress(TypeError):
-        number = operator.index(frames)
-        if number > 0 and number % 2 and not isinstance(frames, bool):
-            return number
-    raise InputError(f"smooth_frames is {frames!r}; expected an odd number of frames, such as 3")
+    number = whole_number("smooth_frames", frames, 1)
+    if number % 2 == 0:
+        raise InputError(f"smooth_frames is {number}; expected an odd number of frames, such as 3")
+    return number
 
 
 _READ_AFTER_THE_PASSES = ("method", "align_scale", "refine_mask")

@@ -152,7 +152,7 @@ def test_refit_of_arrays():
 @pytest.mark.parametrize(
     ("values", "error", "message"),
     [
-        ({"mode": "squash"}, InputError, "mode is 'squash'; expected 'crop' or 'pad'"),
+        ({"mode": "squash"}, InputError, "mode is 'squash'; expected one of crop, pad"),
         ({"size": 30}, InputError, "size is 30; expected a multiple of patch 14"),
         ({"size": 7, "patch": 14}, InputError, "size is 7"),
         ({"start": 2}, ClipError, "start is 2, but the source has only 2 frames"),

@@ -100,7 +100,7 @@ def test_a_folder_without_images_says_what_it_holds(tmp_path):
         ("https://example.org/clip.mp4", "does not exist"),
         ("", "'' is not a path"),
         ("a\0b", "is not a path"),
-        ("x" * 5000, "cannot look for frames in x+: File name too long"),
+        ("x" * 5000, "cannot read x+: File name too long"),
         ([], "the list of frames is empty"),
         (["missing.png"], "image missing.png does not exist"),
         (["a.png", np.zeros((1, 1, 3))], "holds ndarray, str; expected image paths only, or arrays only"),
@@ -126,7 +126,7 @@ def test_an_unreadable_folder(tmp_path, monkeypatch):
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(Path, "iterdir", refuse)
-    with pytest.raises(ClipError, match=r"cannot look for frames in .*: Permission denied"):
+    with pytest.raises(ClipError, match=r"cannot read .*: Permission denied"):
         open_source(tmp_path)
 
 

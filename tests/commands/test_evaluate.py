@@ -121,7 +121,7 @@ def test_results_of_a_folder(dataset, tmp_path, capsys):
     [
         (["nothing", "{data}"], "data set 'nothing' is not known"),
         (["plain", "{tmp}/none"], "none"),
-        (["plain", "{data}", "--methods", "vggt,best"], "unknown method 'best'"),
+        (["plain", "{data}", "--methods", "vggt,best"], "method is 'best'; expected one of vggt, vggt4d"),
         (["plain", "{data}", "--sequences", "third"], "sequence 'third'"),
         (["plain", "{data}", "--gt", "lidar"], "gt is 'lidar'"),
         (["plain", "{data}", "--stride", "0"], "stride is 0"),

@@ -142,6 +142,7 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
         (["--data", "generated=many"], "expected a number of scenes"),
         (["--data", "nothing=."], "expected generated=N, or one of"),
         (["--data", "plain=/nowhere"], "/nowhere is not a folder"),
+        (["--data", "generated=3", "plain=."], "no model is named; give --model"),
         (["--family", "best"], "there is no 'best'"),
         (["--seeds", "0"], "seeds is 0"),
         (["--steps", "0"], "steps is 0"),

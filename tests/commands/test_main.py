@@ -5,6 +5,7 @@ import functools
 import json
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -175,6 +176,25 @@ def test_an_unknown_option_is_exit_code_2():
     )
     assert made.returncode == 2
     assert "Traceback" not in made.stderr
+
+
+@pytest.mark.parametrize("arguments", [["reconstruct", "--help"], ["--version"]])
+def test_a_reader_that_ends_early_is_no_error(arguments):
+    with subprocess.Popen(
+        [sys.executable, "-m", "vggtjax", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        process.stdout.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 1
+
+
+def test_an_odd_name_of_a_clip_is_printed_on_one_line(capsys, tmp_path, frames):
+    (tmp_path / "c\nd").mkdir()
+    shutil.copy(frames / "frame_0.png", tmp_path / "c\nd")
+    code, out, err = run(capsys, "batch", tmp_path / "c\nd", "--out", tmp_path / "out", "--model", "demo")
+    assert code == 2
+    assert "c d failed: a clip is named 'c\\nd'" in out
+    assert "1/1 c d: failed" in err
 
 
 def _shell_lines():

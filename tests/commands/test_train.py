@@ -10,6 +10,7 @@ from vggtjax.commands import train as command
 from vggtjax.errors import CheckpointError, InputError, MissingExtraError
 from vggtjax.network.model import init_params
 from vggtjax.training import loop
+from vggtjax.training.loop import Status
 from vggtjax.training.metrics import read_metrics
 from vggtjax.training.options import RunOptions
 
@@ -73,5 +74,6 @@ def test_bad_input(recipe, tmp_path, monkeypatch):
         command.train(recipe, tmp_path / "out")
 
 
-def test_durations():
-    assert [command._duration(s) for s in (4.4, 75, 3600, 7290)] == ["4 s", "1 min", "1 h 0 min", "2 h 1 min"]
+def test_the_line_of_a_status():
+    status = Status(3, 10, 0, 1.0, 7290.4, {"loss": 0.5})
+    assert command._line(status) == "step 3 of 10, phase 1, loss 0.5, 2:01:30 left"

@@ -184,7 +184,7 @@ def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"methods": ["vgtt"]}, "unknown method 'vgtt'"),
+        ({"methods": ["vgtt"]}, "method is 'vgtt'; expected one of vggt, vggt4d"),
         ({"masks": ["guessed"]}, "guessed.*expected 'mined' or 'true'"),
         ({"mask_pairs": [-1]}, "mask_pairs is -1"),
         ({"suppress": ["hide"]}, "suppress is 'hide'"),

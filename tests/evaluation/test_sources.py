@@ -9,7 +9,11 @@ from tests.tiny import tiny_config
 from vggtjax import Model, init_params
 from vggtjax.checkpoint import read_model, save_model
 from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.sources import FolderSource, ModelSource
+from vggtjax.method.fusion_family import identity
+from vggtjax.method.fusion_file import check_fuses
+from vggtjax.progress import no_stage
 
 
 @pytest.mark.parametrize("stored", [False, True])
@@ -41,6 +45,26 @@ def test_changed_weights_of_a_file_are_another_model(tmp_path):
     model = read_model(save_model(tmp_path / "m.safetensors", init_params(0, config), config))
     tuned = dataclasses.replace(model, params=jax.tree.map(lambda leaf: leaf * 1.001, model.params))
     assert ModelSource(tuned, ["vggt"]).settings != ModelSource(model, ["vggt"]).settings
+
+
+def test_methods_that_do_not_fuse_run_beside_those_that_do(monkeypatch):
+    config = tiny_config()
+    model, fusion, calls = Model(config, init_params(0, config), "m"), identity(), []
+
+    def methods(model, clip, names, *, fusion, **_):
+        check_fuses(fusion, *names)  # as reconstruct_methods does
+        calls.append((names, fusion))
+
+    monkeypatch.setattr("vggtjax.pipeline.several.reconstruct_methods", methods)
+    monkeypatch.setattr("vggtjax.clips.clip.read_clip", lambda *_: None)
+    monkeypatch.setattr("vggtjax.clips.sources.open_source", lambda *_: None)
+    source = ModelSource(model, ["vggt4d", "4dvggt-d"], fusion=fusion)
+    sequence = LabelledSequence("s", ())
+    for group in source.groups:
+        source.results(group, sequence, no_stage)
+    assert calls == [(["vggt4d"], None), (["4dvggt-d"], fusion)]
+    with pytest.raises(InputError, match="'vggt4d' does not fuse"):
+        ModelSource(model, ["vggt4d"], fusion=fusion)
 
 
 @pytest.mark.parametrize("name", ["caf\udce9", "two\nlines", "n" * 300, ""])

@@ -160,11 +160,11 @@ def test_a_clip_of_another_size_is_refitted(params, config, images):
 
 
 def test_unknown_names(params, config, images, inferred):
-    with pytest.raises(InputError, match="unknown method 'vgtt'"):
+    with pytest.raises(InputError, match="method is 'vgtt'; expected one of vggt, vggt4d"):
         assemble(inferred[1], "vgtt")
     with pytest.raises(InputError, match="needs the second pass"):
         assemble(inferred[1]._replace(second=None), "4dvggt-d")
-    with pytest.raises(InputError, match="'cosine' or 'dot'"):
+    with pytest.raises(InputError, match="expected one of cosine, dot"):
         motion_saliency(params, images, config, gram="sine")  # pyright: ignore[reportArgumentType]
 
 

@@ -142,7 +142,7 @@ def test_bfloat16_is_near_float32(params, config, images):
         ({"images": np.zeros((1, 0, 28, 42, 3))}, "at least one frame"),
         ({"dynamic_tokens": np.zeros((1, 2, 3, 2), bool)}, r"expected \(1, 2, 2, 3\)"),
         ({"outputs": ("camera", "tracks")}, "tracks"),
-        ({"suppress": "forget"}, "'zero' or 'drop'"),
+        ({"suppress": "forget"}, "expected one of zero, drop"),
         ({"suppression": Suppression(mask_pairs=-1)}, "at least 0"),
         ({"frame_count": np.array([2, 2])}, r"frame_count has shape \(2,\); expected \(1,\)"),
         ({"compute_dtype": "float16"}, "bfloat16"),

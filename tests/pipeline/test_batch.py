@@ -280,7 +280,7 @@ def test_unknown_options_are_named(model, tmp_path):
     [
         ({"size": 50}, "size is 50"),
         ({"sampling": {"stride": 0}}, "stride is 0"),
-        ({"options": {"method": "best"}}, "unknown method 'best'"),
+        ({"options": {"method": "best"}}, "method is 'best'; expected one of vggt, vggt4d"),
     ],
 )
 def test_what_is_wrong_for_all_clips_is_said_once(model, clips, tmp_path, wrong, message):

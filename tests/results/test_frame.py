@@ -143,5 +143,5 @@ def test_a_frame_that_is_not_there():
     for resolution in ("model", "original"):
         with pytest.raises(InputError, match="frame is 2; expected 0 to 1"):
             frame_of(result_of(clip), 2, resolution)
-    with pytest.raises(InputError, match="resolution is 'full'; expected 'model' or 'original'"):
+    with pytest.raises(InputError, match="resolution is 'full'; expected one of model, original"):
         frame_of(result_of(clip), 0, "full")  # pyright: ignore[reportArgumentType]

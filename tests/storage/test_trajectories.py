@@ -75,7 +75,7 @@ def test_what_is_no_trajectory(tmp_path, content, message):
 
 
 def test_wrong_arguments(tmp_path):
-    with pytest.raises(InputError, match="quaternion is 'wzyx'; expected 'xyzw' or 'wxyz'"):
+    with pytest.raises(InputError, match="quaternion is 'wzyx'; expected one of xyzw, wxyz"):
         read_trajectory(tmp_path / "t", "wzyx")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ResultError, match=r"cannot read .*: No such file"):
         read_numbers(tmp_path / "t", 3)

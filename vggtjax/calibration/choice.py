@@ -14,9 +14,9 @@ from jaxtyping import Float32, Int8
 
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Sweep, token_auc
 from vggtjax.config import Cue, Gram, MotionConfig
-from vggtjax.errors import InputError, check_choice
+from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.method.cues import normalise
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 
 MAX_TERMS = 5  # as many as VGGT4D's table has
 MIN_GAIN = 0.001
@@ -74,8 +74,7 @@ def choose(
         InputError: a half without moving or without static tokens, or an argument out of range.
     """
     check_choice("gram", gram, GRAMS)
-    if type(max_terms) is not int or max_terms < 1:
-        raise InputError(f"max_terms is {max_terms!r}; expected a whole number of at least 1")
+    max_terms = whole_number("max_terms", max_terms, 1)
     if not 0 <= min_gain <= 1:
         raise InputError(f"min_gain is {min_gain}; expected a number in [0, 1]")
     calibration, held_out = halves(sweep)
@@ -94,8 +93,7 @@ def choose(
                 value = _product_auc(saliency * _term(calibration, gram, candidate), calibration.truth)
                 if value > best and cue.name not in [other.name for other in chosen]:
                     best_cue, best = candidate, value
-            if progress is not None:
-                progress(len(steps) * len(pool) + tried, max_terms * len(pool))
+            (progress or no_progress)(len(steps) * len(pool) + tried, max_terms * len(pool))
         if best_cue is None:
             break
         rating = Rating(best, _product_auc(_product(held_out, gram, [*chosen, best_cue]), held_out.truth))

@@ -19,7 +19,7 @@ from vggtjax.evaluation.metrics.masks import auc
 from vggtjax.method.cues import GramCues, Sums, normalise
 from vggtjax.network.layers import Params
 from vggtjax.network.model import forward
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 
 GRAMS: tuple[Gram, ...] = ("cosine", "dot")
 KINDS = (
@@ -155,8 +155,7 @@ def sweep(
             raise InputError("the model's motion maps are not finite; its weights cannot be calibrated")
         maps.append(clip_maps[..., 0, :, :])
         saliencies.append(saliency[:, 0])
-        if progress is not None:
-            progress(done, total)
+        (progress or no_progress)(done, total)
     if len(maps) < 2:
         raise InputError(f"{len(maps)} clips; expected at least two, one to choose cues and one to confirm them")
     return Sweep(np.stack(maps, axis=3), np.stack(truths), table, np.stack(saliencies, axis=1))

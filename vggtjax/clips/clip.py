@@ -16,7 +16,7 @@ from vggtjax.clips.preprocessing import Fit, Fitter, Mode
 from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import ClipError, InputError
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 
 logger = logging.getLogger(__name__)
 
@@ -143,8 +143,7 @@ def read_clip(source: Source, sampling: Sampling, fitter: Fitter, progress: Prog
             rendering.append(pool.submit(fit.render, frame.image))
             if len(rendering) > workers:  # bounds the frames of the source's size in memory
                 pixels.append(rendering.popleft().result())
-            if progress is not None:
-                progress(len(fits), total)
+            (progress or no_progress)(len(fits), total)
         pixels.extend(render.result() for render in rendering)
     images, fits = _joined(pixels, fits)
     return Clip(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, reading
 
 if TYPE_CHECKING:
     from vggtjax.clips.clip import Clip
@@ -77,6 +77,7 @@ def parse_queries(text: str, clip: Clip) -> Queries:
 
     Raises InputError for other words, or points outside the frames.
     """
+    check_words(text)
     return _grid(text, clip) if text.startswith("grid:") else _read(Path(text), clip)
 
 
@@ -98,14 +99,10 @@ def _grid_side(text: str) -> int:
 
 def _read(path: Path, clip: Clip) -> Queries:
     try:
-        if path.stat().st_size > _MOST_FILE_BYTES:
-            raise InputError(f"{path} is {path.stat().st_size} bytes; expected a CSV file with x, y and frame")
-        with path.open(encoding="utf-8-sig", newline="") as file:
+        with reading(path), path.open(encoding="utf-8-sig", newline="") as file:
+            if path.stat().st_size > _MOST_FILE_BYTES:
+                raise InputError(f"{path} is {path.stat().st_size} bytes; expected a CSV file with x, y and frame")
             rows = list(csv.DictReader(file))
-    except OSError as error:
-        raise InputError(
-            f"tracks is {str(path)!r}, which cannot be read ({error.strerror}); expected grid:N or a CSV file"
-        ) from None
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path} is no CSV file: {error}") from None
     points, frames = [], []

@@ -17,7 +17,7 @@ from vggtjax.clips.arrays import ArrayFrames
 from vggtjax.clips.images import ImageFiles, is_image_name, to_rgb
 from vggtjax.clips.sampling import Source
 from vggtjax.clips.video import VideoFile, is_video_name
-from vggtjax.errors import ClipError
+from vggtjax.errors import ClipError, reading
 
 Name: TypeAlias = str | os.PathLike[str]
 ClipSource: TypeAlias = Name | Sequence[Name] | Sequence[Image.Image] | Sequence[np.ndarray] | np.ndarray
@@ -58,11 +58,9 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
     """
     found: dict[str, str] = {}
     for path in map(Path, paths):
-        try:
+        with reading(path, ClipError):
             entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
             whole = not path.is_dir() or any(is_image_name(entry) for entry in entries)
-        except OSError as error:
-            raise ClipError(f"cannot look for clips in {path}: {error.strerror}; check the path") from error
         visible = [entry for entry in entries if not entry.name.startswith(".")]
         clips = [path] if whole else [entry for entry in visible if entry.is_dir() or is_video_name(entry)]
         if not clips or not path.exists():
@@ -87,7 +85,7 @@ def natural_key(path: Path) -> list[list[str | int]]:
 
 def _from_path(name: str) -> Source:
     path = Path(name)
-    try:
+    with reading(name, ClipError):
         if not name or "\0" in name:
             raise ClipError(f"{name!r} is not a path; expected a folder, a pattern, or an image or video file")
         if path.is_dir():
@@ -100,8 +98,6 @@ def _from_path(name: str) -> Source:
         if glob.has_magic(name):
             matches = [Path(match) for match in glob.glob(name, recursive=True)]  # noqa: PTH207 - absolute patterns too
             return _images(matches, f"pattern {name} matches", "expected images")
-    except OSError as error:
-        raise ClipError(f"cannot look for frames in {name}: {error.strerror}; check the path") from error
     raise ClipError(f"'{path}' does not exist; expected a folder, a pattern, or an image or video file")
 
 

@@ -14,7 +14,7 @@ from vggtjax.clips.sampling import Sampling
 from vggtjax.commands.arguments import Frames, Method, Output, Size, Sources
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, one_line
 from vggtjax.options import Options
 from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving
@@ -72,12 +72,13 @@ def batch(
             ):
                 outcomes.append(outcome)
                 reason = f" ({outcome.reason})" if outcome.reason else ""
-                report.note(f"{len(outcomes)}/{len(named)} {outcome.name}: {outcome.status}{reason}{clock.left()}")
+                name = one_line(outcome.name)
+                report.note(f"{len(outcomes)}/{len(named)} {name}: {outcome.status}{reason}{clock.left()}")
     counts = {status: sum(outcome.status == status for outcome in outcomes) for status in ("done", "kept", "failed")}
     report.table({"clips": len(outcomes), **counts, "results": f"{out}/"})
     for outcome in outcomes:
         if outcome.status == "failed":
-            report.line(f"{outcome.name} failed: {outcome.reason}")
+            report.line(f"{one_line(outcome.name)} failed: {outcome.reason}")
     if network.note:
         report.line(network.warning)
     if counts["failed"] == len(outcomes):

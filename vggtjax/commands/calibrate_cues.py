@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from vggtjax.commands.report import Report
 from vggtjax.config import Gram
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, whole_number
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,8 +42,7 @@ def calibrate_cues(
     """
     if scenes < 2:
         raise InputError(f"scenes is {scenes}; expected at least 2, one to choose the cues and one to confirm them")
-    if max_terms < 1:
-        raise InputError(f"max_terms is {max_terms}; expected at least 1")
+    whole_number("max_terms", max_terms, 1)
     if not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed}; expected a number in [0, 2**31)")
     report = Report()

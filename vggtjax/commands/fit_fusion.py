@@ -113,7 +113,7 @@ def fit_fusion(
     out: Path,
     *,
     clips: Clips = Clips(),
-    model: str = "demo",
+    model: str | None = None,
     family: tuple[str, ...] = ("scale", "calibrated", "correlated", "features", "robust"),
     fits: Fits = Fits(),
     options: Annotated[PassOptions, tyro.conf.arg(name="method")] = PassOptions(),
@@ -127,7 +127,8 @@ def fit_fusion(
         out: folder for fusion.safetensors (give it to --fusion), one such file for every family, fit.json, table.md and
             pictures.
         clips: clips
-        model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id.
+        model: a converted .safetensors, a PyTorch checkpoint, a hub id, or "demo"; required with DATASET=FOLDER, else
+            "demo" by default.
         family: free parts: scale, calibrated, correlated, features, robust, soft, full, gate, or parts such as
             scale+power+floor+correlation+inflation+distrust+saliency+depth+boundary+dynamic+offset+temperature+gate.
         fits: fits
@@ -149,7 +150,8 @@ def fit_fusion(
         for name in family:
             FitConfig(parse_family(name), **settings)
         config = FitConfig(**settings)
-        network = load(report, model)
+        is_generated = all(text.startswith(f"{GENERATED}=") for text in clips.data)
+        network = load(report, "demo" if model is None and is_generated else model)
         passes = clips.passes(report, network, options)
         patch = network.config.patch_size
         sampling: dict[str, Any] = {"held_out": held_out, "pixels": pixels}

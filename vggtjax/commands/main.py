@@ -8,6 +8,7 @@ import functools
 import gc
 import io
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -44,7 +45,7 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code: 0, 2 for bad input or output, 130 when interrupted."""
+    """Run the command line; return the exit code: 0, 1 if nobody reads the output, 2 for errors, 130 if interrupted."""
     keep_freed_memory()
     atexit.register(gc.freeze)  # at the end there is nothing to collect, and a last collection takes half a second
     logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
@@ -53,16 +54,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
     keep_compilations()  # after showwarning is set: keep_compilations replaces it for some warnings
     arguments = sys.argv[1:] if arguments is None else arguments
-    if list(arguments) in (["--version"], ["-V"]):
-        sys.stdout.write(f"vggtjax {__version__}\n")
-        return 0
     try:
-        _parsed(arguments)()
+        if list(arguments) in (["--version"], ["-V"]):
+            sys.stdout.write(f"vggtjax {__version__}\n")
+        else:
+            _parsed(arguments)()
+        sys.stdout.flush()  # a broken pipe is noticed here
         return 0
     except VggtjaxError as error:
         message, code = _with_flag(str(error), arguments), 2
     except MemoryError:  # of the host
         message, code = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size", 2
+    except BrokenPipeError:  # the reader of our output, such as head, has ended
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the last flush of the interpreter
+        return 1
     except OSError as error:  # of a file that no other message covers
         message, code = f"{error.filename or 'a file'}: {error.strerror or error}", 2
     except KeyboardInterrupt:
@@ -108,4 +113,5 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
                 raise error from None
             error = error.__context__
         sys.stderr.write(complaint.getvalue())
+        sys.stdout.flush()  # of a help page
         raise

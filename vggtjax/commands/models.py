@@ -56,8 +56,8 @@ class ModelFiles:
             return load(report, self.model, self.config), None
         from vggtjax.method.fusion_file import check_fuses, load_fusion, warn_if_fitted_otherwise
 
-        check_fuses(*methods)
         params = load_fusion(self.fusion)
+        check_fuses(params, *methods)
         model = load(report, self.model, self.config)
         fusing = next(name for name in methods if METHODS[name].depth == "fused")
         warn_if_fitted_otherwise(self.fusion, model, options.changed(method=fusing))

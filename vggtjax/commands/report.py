@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from vggtjax.evaluation.ladder import LadderRow
     from vggtjax.results.reconstruction import Reconstruction
 
-_LABELS = {"compile": "compile (once for clips of this shape)"}  # stage -> its line, where that says more
-
 
 class Report:
     """Stages with a clock each, on standard error; tables on standard output.
@@ -54,7 +52,7 @@ class Report:
     @contextmanager
     def stage(self, name: str) -> Iterator[Progress]:
         """Time a stage and show it; yields the callable that shows its progress."""
-        label = _LABELS.get(name, name)
+        label = "compile (once for clips of this shape)" if name == "compile" else name
         task = self._progress.add_task(label, total=None)
         started = time.perf_counter()
         yield lambda done, total: self._progress.update(task, completed=done, total=total)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -79,13 +80,5 @@ def _line(status: Status) -> str:
     if "loss" in status.metrics:
         text += f", loss {status.metrics['loss']:.4g}"
     if status.seconds_left is not None:
-        text += f", {_duration(status.seconds_left)} left"
+        text += f", {timedelta(seconds=round(status.seconds_left))} left"
     return text
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min" if minutes else f"{rest} s"

@@ -20,7 +20,7 @@ from vggtjax.evaluation.protocol import score
 from vggtjax.evaluation.records import Record, Records, shown_name
 from vggtjax.evaluation.sources import ResultSource
 from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
-from vggtjax.progress import OnStage, Progress
+from vggtjax.progress import OnStage, Progress, no_progress
 from vggtjax.results.reconstruction import Reconstruction
 
 _SAMPLES = 3  # frames whose depth and mask are in the fingerprint of a sequence
@@ -198,8 +198,7 @@ class _Steps:
         self._progress, self._total, self._done = progress, _STEPS * names, 0
 
     def within(self, done: int, total: int | None) -> None:
-        if self._progress is not None:
-            self._progress(self._done + _STEPS * done // (total or 1), self._total)
+        (self._progress or no_progress)(self._done + _STEPS * done // (total or 1), self._total)
 
     def next(self) -> None:
         self.within(1, 1)

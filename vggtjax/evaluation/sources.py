@@ -14,7 +14,7 @@ from vggtjax.evaluation.datasets.pictures import picture_size
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.foreign_frames import placed
 from vggtjax.evaluation.records import shown_name
-from vggtjax.options import Options
+from vggtjax.options import METHODS, Options
 from vggtjax.progress import OnStage
 from vggtjax.results.foreign import check_format
 from vggtjax.results.reconstruction import Reconstruction
@@ -57,7 +57,7 @@ class ModelSource:
     """Results of a model by several methods; methods with the same masks share one run of the passes.
 
     Raises:
-        InputError: an unknown method, or a size that is not a multiple of the patch size.
+        InputError: an unknown method, a fusion though no method fuses, or a size that is no multiple of the patch size.
     """
 
     model: Model
@@ -69,8 +69,10 @@ class ModelSource:
     _last: tuple[LabelledSequence, Clip] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        from vggtjax.method.fusion_file import check_fuses
         from vggtjax.pipeline.several import groups_of_methods
 
+        check_fuses(self.fusion, *self.names)
         config = self.model.config
         self._fitter = self.framing.fitter(size=config.image_size, patch=config.patch_size)
         self.groups = [[each.method for each in group] for group in groups_of_methods(self.names, self.options)]
@@ -110,8 +112,9 @@ class ModelSource:
             paths = [str(path) for path in sequence.pictures]
             self._last = sequence, read_clip(open_source(paths), Sampling(), self._fitter)
         _, clip = self._last
+        fusion = self.fusion if any(METHODS[name].depth == "fused" for name in names) else None
         return reconstruct_methods(
-            self.model, clip, names, options=self.options, size=self._fitter.size, fusion=self.fusion, on_stage=on_stage
+            self.model, clip, names, options=self.options, size=self._fitter.size, fusion=fusion, on_stage=on_stage
         )
 
 

@@ -22,7 +22,7 @@ from vggtjax.evaluation.metrics.video_depth import depth_alignment
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, observations
 from vggtjax.learning.fit import NEEDS_FRAMES, FitConfig, FitOutcome, fit_fusion
 from vggtjax.method.fusion_family import Fused, Observations, fuse, identity, parse_family
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 
 METRICS = {
     "abs_rel": "AbsRel",
@@ -141,8 +141,7 @@ def ablate(
             fit = fit_split(clips, seen, split, settings, pixels=pixels, folder=folder)
             fitted.append(score(name, partial(_fused, fit.params), fit))
             done += 1
-            if progress is not None:
-                progress(done, total)
+            (progress or no_progress)(done, total)
         scores += fitted
         if len(fitted) > 1:
             best = min(fitted, key=lambda one: one.stopping["nll"])

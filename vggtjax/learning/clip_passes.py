@@ -29,7 +29,7 @@ from vggtjax.method.passes import Passes
 from vggtjax.network.model import Predictions
 from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct
-from vggtjax.progress import OnStage, Progress
+from vggtjax.progress import OnStage, Progress, no_progress
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.arrays import read_arrays, write_arrays
 from vggtjax.storage.cache import cache_folder
@@ -226,8 +226,7 @@ def _all_passes(
     for done, clip in enumerate(clips, 1):
         if clip is not None:
             yield clip.name, kept_passes(common | dict(clip.key), partial(passes, clip), folder)
-        if progress is not None:
-            progress(done, count)
+        (progress or no_progress)(done, count)
 
 
 def sequence_digest(sequence: LabelledSequence) -> str:

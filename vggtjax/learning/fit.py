@@ -24,7 +24,7 @@ from vggtjax.learning.objectives import (
     photometric_loss,
 )
 from vggtjax.method.fusion_family import PARTS, FusionParams, Observations, fuse, identity, is_free, projected, start
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.arrays import read_arrays, write_arrays
 from vggtjax.storage.json_values import Count, check_fields
 from vggtjax.storage.programs import source_digest
@@ -153,8 +153,7 @@ def fit_fusion(
         _check_finite(state, int(state.step) // _CHUNK)
         if checkpoint is not None:
             _keep(checkpoint, state, digest)
-        if progress is not None:
-            progress(min(int(state.step), config.steps), config.steps)
+        (progress or no_progress)(min(int(state.step), config.steps), config.steps)
     count = int(state.step) // _CHUNK + 1
     losses = np.column_stack([np.arange(count) * _CHUNK, np.asarray(state.losses)[:count]])
     best = jax.tree.map(np.asarray, state.best)

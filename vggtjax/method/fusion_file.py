@@ -65,9 +65,9 @@ def load_fusion(path: str | Path) -> FusionParams:
     return params
 
 
-def check_fuses(*methods: str) -> None:
-    """Raise InputError unless at least one of the methods fuses both passes."""
-    if all(find_method(method).depth != "fused" for method in methods):
+def check_fuses(fusion: FusionParams | None, *methods: str) -> None:
+    """Raise InputError if a fusion is given and none of the methods fuses both passes."""
+    if fusion is not None and all(find_method(method).depth != "fused" for method in methods):
         names = ", ".join(name for name, row in METHODS.items() if row.depth == "fused")
         raise InputError(f"a fusion is given, and method {methods[0]!r} does not fuse; expected {names}")
 

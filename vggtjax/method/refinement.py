@@ -21,7 +21,7 @@ from vggtjax.errors import InputError
 from vggtjax.method.clustering import kmeans, nearest_centre
 from vggtjax.network.precision import full_precision
 from vggtjax.network.sampling import bilinear
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 
 CLUSTERS = 30
 RESTARTS = 4  # of k-means
@@ -90,8 +90,7 @@ def refine_masks(
     for frame in range(S):
         if dynamic_mask[frame].any():
             inside[frame] = dynamic_mask[frame] & ~statistical_outliers(points[frame], valid[frame])
-        if progress is not None:
-            progress(frame + 1, S)
+        (progress or no_progress)(frame + 1, S)
     if not inside.any():
         return inside
     most = int(inside.sum(axis=(1, 2)).max())

@@ -22,7 +22,7 @@ from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.options import OptionChanges, Options
 from vggtjax.pipeline.run import reconstruct
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
@@ -83,7 +83,23 @@ def reconstruct_many(
         OutputError: the folder cannot be written, or another run is writing it.
         TypeError: a name that is no option.
     """
-    run = _Batch.of(model, options, framing, sampling, saving, fusion, pad_frames, changes)
+    words: dict[str, Any] = dict(changes)
+    if isinstance(options, Mapping):
+        words, options = words | dict(options), None
+        fusion, pad_frames = words.pop("fusion", fusion), words.pop("pad_frames", pad_frames)
+    of_framing = {name: words.pop(name) for name in FramingChanges.__annotations__ if name in words}
+    framing = dataclasses.replace(framing or Framing(), **of_framing)
+    options = (options or Options()).changed(**words)
+    check_fuses(fusion, options.method)
+    run = _Batch(
+        model=model,
+        options=options,
+        fitter=framing.fitter(size=model.config.image_size, patch=model.config.patch_size),
+        sampling=Sampling(**sampling) if isinstance(sampling, Mapping) else sampling or Sampling(),
+        saving=Saving().changed(**saving) if isinstance(saving, Mapping) else saving or Saving(),
+        fusion=fusion,
+        pad_frames=pad_frames,
+    )
     out = Path(out)
     with locked_folder(out, "a batch"):
         _settle(out, run.settings)
@@ -93,7 +109,7 @@ def reconstruct_many(
         kept = {name for name in sources if name not in odd and is_result(out / name / ARCHIVE_NAME)}
         yield from (ClipOutcome(name, "kept") for name in sources if name in kept)
         names = [name for name in sources if name not in odd and name not in kept]
-        work = _Work({name: _length(sources[name], run.sampling) for name in names}, progress or (lambda *_: None))
+        work = _Work({name: _length(sources[name], run.sampling) for name in names}, progress or no_progress)
         yield from _reconstruct_all(run, {name: sources[name] for name in names}, out, work)
 
 
@@ -108,38 +124,6 @@ class _Batch:
     saving: Saving
     fusion: FusionParams | None
     pad_frames: bool
-
-    @classmethod
-    def of(
-        cls,
-        model: Model,
-        options: Any,
-        framing: Any,
-        sampling: Any,
-        saving: Any,
-        fusion: Any,
-        pad_frames: bool,
-        changes: Mapping[str, Any],
-    ) -> _Batch:
-        """Return a run of the arguments of `reconstruct_many`; errors that concern all clips are raised here."""
-        words = dict(changes)
-        if isinstance(options, Mapping):
-            words, options = words | dict(options), None
-            fusion, pad_frames = words.pop("fusion", fusion), words.pop("pad_frames", pad_frames)
-        of_framing = {name: words.pop(name) for name in FramingChanges.__annotations__ if name in words}
-        framing = dataclasses.replace(framing or Framing(), **of_framing)
-        options = (options or Options()).changed(**words)
-        if fusion is not None:
-            check_fuses(options.method)
-        return cls(
-            model=model,
-            options=options,
-            fitter=framing.fitter(size=model.config.image_size, patch=model.config.patch_size),
-            sampling=Sampling(**sampling) if isinstance(sampling, Mapping) else sampling or Sampling(),
-            saving=Saving().changed(**saving) if isinstance(saving, Mapping) else saving or Saving(),
-            fusion=fusion,
-            pad_frames=pad_frames,
-        )
 
     @property
     def settings(self) -> dict[str, Any]:

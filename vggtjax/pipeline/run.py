@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Unpack
@@ -29,7 +28,7 @@ from vggtjax.network.model import Predictions
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import OptionChanges, Options
 from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, inline, padded_frames, run_stages
-from vggtjax.progress import OnStage, Progress
+from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.results.reconstruction import Reconstruction
 
 _LESS_MEMORY = "fewer frames (max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
@@ -109,9 +108,8 @@ def reconstruct(
         DeviceMemoryError: the clip does not fit in the memory of the device.
     """
     options = options.changed(**changes).resolved()
-    on_stage = on_stage or (lambda name: nullcontext())
-    if fusion is not None:
-        check_fuses(options.method)
+    on_stage = on_stage or no_stage
+    check_fuses(fusion, options.method)
     if masks is not None:
         options.check_given_masks()
     source, (clip, tracks) = clip, _fitted(model, clip, size, tracks, on_stage)

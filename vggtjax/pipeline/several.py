@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from contextlib import nullcontext
 from typing import Unpack
 
 from vggtjax.checkpoint import Model
@@ -15,7 +14,7 @@ from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.options import OptionChanges, Options
 from vggtjax.pipeline.run import assembled_fields, reconstruct, refined
 from vggtjax.pipeline.stages import Stages
-from vggtjax.progress import OnStage
+from vggtjax.progress import OnStage, no_stage
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
 
@@ -45,14 +44,13 @@ def reconstruct_methods(
         The results by method, in the order of `methods`.
     """
     options = options.changed(**changes)
-    if fusion is not None:
-        check_fuses(*methods)
+    check_fuses(fusion, *methods)
     results: dict[str, Reconstruction] = {}
     for group in groups_of_methods(methods, options):
         shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(refine_mask=False)
         result = reconstruct(model, clip, options=shared, size=size, keep_passes=True, on_stage=on_stage)
         for each in group:
-            results[each.method] = _as_method(result, model, each, fusion, on_stage or (lambda name: nullcontext()))
+            results[each.method] = _as_method(result, model, each, fusion, on_stage or no_stage)
     return {name: results[name] for name in methods}
 
 

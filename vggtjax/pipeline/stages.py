@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import nullcontext
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -26,7 +25,7 @@ from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
-from vggtjax.progress import OnStage
+from vggtjax.progress import OnStage, no_stage
 from vggtjax.storage.programs import Program, keep_type
 
 _DIGITS = 4  # significant binary digits of padded lengths: no clip gets longer by more than an eighth
@@ -95,7 +94,7 @@ class Execute:
     """Runs each program as a stage of its own."""
 
     def __init__(self, on_stage: OnStage | None = None) -> None:
-        self._on_stage = on_stage or (lambda name: nullcontext())
+        self._on_stage = on_stage or no_stage
 
     def __call__(self, stage: str, program: Program, *arguments: Any, **options: Any) -> Any:
         """Return the outputs of the program, when they are computed."""

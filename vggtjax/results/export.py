@@ -52,7 +52,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from vggtjax.errors import InputError
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 from vggtjax.results import foreign, previews, tracks
 from vggtjax.results.archive import OPTIONAL_FILES
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
@@ -96,8 +96,7 @@ def write_files(
     done, total = itertools.count(1), len(result.depth) + 4
 
     def advance() -> None:
-        if progress is not None:
-            progress(next(done), total)
+        (progress or no_progress)(next(done), total)
 
     times, poses = result.timestamps, result.world_from_camera
     times = np.arange(len(poses), dtype=np.float64) if times is None else times  # by default the frames' numbers

@@ -39,9 +39,9 @@ def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
     with locked_folder(folder, "a result", _WAIT) if folder.is_dir() else nullcontext():
         _finish(folder)
         archive = folder / ARCHIVE_NAME
-        check_free(folder, (ARCHIVE_NAME, *NAMES), replaced=is_result(archive), what="result")
-        strange = [name for name in optional if name not in saved_files(archive)]
-        check_free(folder, strange, replaced=False, what="result")
+        ours = (ARCHIVE_NAME, *NAMES, *saved_files(archive)) if is_result(archive) else ()
+        names = [name for name in (ARCHIVE_NAME, *NAMES, *optional) if name not in ours]
+        check_free(folder, names, replaced=False, what="result")
 
 
 @contextmanager

@@ -29,7 +29,7 @@ from PIL import Image
 from vggtjax.cameras import Cameras, world_from_camera
 from vggtjax.clips.images import read_image
 from vggtjax.clips.masks import read_mask
-from vggtjax.errors import InputError, ResultError
+from vggtjax.errors import InputError, ResultError, check_choice, reading
 from vggtjax.results.frame import ResultFrame
 from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, read_headers
 from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory
@@ -103,8 +103,7 @@ def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict
 
 def check_format(format: str, quaternion: str | None) -> None:
     """Raise InputError for an unknown format, or an order of quaternions that is missing, unknown or not wanted."""
-    if format not in ("vggtjax", *FORMATS):
-        raise InputError(f"format is {format!r}; expected one of vggtjax, {', '.join(FORMATS)}")
+    check_choice("format", format, ("vggtjax", *FORMATS))
     if quaternion is None and format in _WITH_TRAJECTORY:
         raise InputError(
             f"pred_traj.txt of {format} does not say the order of its quaternions; give quaternion='wxyz' (as VGGT4D, "
@@ -149,10 +148,8 @@ def _numbered(folder: Path, example: str) -> dict[int, Path]:
     """Return the files of all frames by number, with names like the `example` of frame 0."""
     folder = (folder / example).parent
     pattern = re.sub("0+", r"(\\d{1,9})", re.escape(Path(example).name))
-    try:
+    with reading(folder, ResultError):
         entries = list(folder.iterdir()) if folder.is_dir() else []
-    except OSError as error:
-        raise ResultError(f"it cannot be read ({error.strerror or error})") from error
     files: dict[int, Path] = {}
     for entry in entries:
         if match := re.fullmatch(pattern, entry.name, re.ASCII):

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vggtjax.errors import ClipError, ResultError
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 from vggtjax.results.archive import ARCHIVE_NAME, read_archive, write_archive
 from vggtjax.results.folder import find_archive, replacing
 from vggtjax.results.result import Result
@@ -60,8 +60,7 @@ class Reconstruction(Result):
             total = write_files(self, staged, saving, pictures, progress)
             with writing(staged / ARCHIVE_NAME) as path:
                 self.save_archive(path, files=optional)
-            if progress is not None:
-                progress(total, total)
+            (progress or no_progress)(total, total)
 
     def save_archive(self, path: Path, *, files: Sequence[str] = ()) -> None:
         """Write all fields but `passes` to one compressed .npz file; `files` are the optional files beside it."""

@@ -22,8 +22,8 @@ import numpy as np
 from PIL import Image
 
 from vggtjax.cameras import world_from_camera
-from vggtjax.errors import InputError, OutputError
-from vggtjax.progress import Progress
+from vggtjax.errors import InputError, OutputError, check_choice
+from vggtjax.progress import Progress, no_progress
 from vggtjax.results.export import encode_depth, write_intrinsics
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.held_out import Kind
@@ -107,8 +107,7 @@ def write_scenes(
     _write_index(out, index)  # first, so that no scene is ever without an index
     missing = [number for number in range(count) if not folders[number].is_dir()]
     for done, number in enumerate(missing, start=count - len(missing)):
-        if progress is not None:
-            progress(done, count)
+        (progress or no_progress)(done, count)
         clip = jax.device_get(_draw(jax.random.fold_in(stream, number), textures, config))
         with staging(out) as staged:
             scene = staged / "scene"
@@ -118,8 +117,7 @@ def write_scenes(
         _write_index(out, index)
     with writing(out / PREVIEW) as path:
         draw_sheet(folders, f"{kind} scenes, seed {seed}, {split} textures").save(path)
-    if progress is not None:
-        progress(count, count)
+    (progress or no_progress)(count, count)
     return folders
 
 
@@ -135,8 +133,7 @@ def read_index(out: str | Path) -> dict[str, Any]:
 
 
 def _check(config: SceneConfig, count: int, kind: str, seed: int) -> None:
-    if kind not in get_args(Kind):
-        raise InputError(f"kind is {kind!r}; expected one of {get_args(Kind)}")
+    check_choice("kind", kind, get_args(Kind))
     if type(count) is not int or not 1 <= count <= _MOST_SCENES:
         raise InputError(f"count is {count!r}; expected a whole number from 1 to {_MOST_SCENES}")
     if type(seed) is not int or not 0 <= seed < 2**31:

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vggtjax.errors import InputError
-from vggtjax.progress import Progress
+from vggtjax.errors import InputError, check_choice, whole_number
+from vggtjax.progress import Progress, no_progress
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.render import SyntheticClip, generate
 from vggtjax.scenes.textures import Textures, load_textures
@@ -68,10 +68,8 @@ def held_out_scenes(
     Raises:
         InputError: an unknown kind, a count below 1, or fewer than 12 frames.
     """
-    if kind not in get_args(Kind):
-        raise InputError(f"kind of scenes is {kind!r}; expected one of {get_args(Kind)}")
-    if type(count) is not int or count < 1:
-        raise InputError(f"count of scenes is {count!r}; expected a whole number of at least 1")
+    check_choice("kind of scenes", kind, get_args(Kind))
+    count = whole_number("count of scenes", count, 1)
     config = config or SceneConfig(height=112, width=112, frames=MIN_FRAMES)
     if config.frames < MIN_FRAMES:
         raise InputError(f"test scenes have {config.frames} frames; expected at least {MIN_FRAMES}")
@@ -129,8 +127,7 @@ def _hard_keys(kind: Kind, count: int, config: SceneConfig, seed: int, textures:
         hard = hardness(jax.device_get(_generate(keys, textures, small))).kept(kind)
         selected += [keys[i] for i in np.flatnonzero(hard)]
         candidate += _AT_ONCE
-        if progress is not None:
-            progress(min(len(selected), count), count)
+        (progress or no_progress)(min(len(selected), count), count)
     return jax.numpy.stack(selected[:count])
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 from PIL import Image
 
-from vggtjax.errors import InputError
+from vggtjax.errors import check_choice
 
 Split = Literal["training", "test"]
 SIDES = (256, 128, 64, 32, 16)  # pyramid of a tile, finest first
@@ -38,8 +38,7 @@ class Textures(NamedTuple):
 
 def load_textures(split: Split = "training") -> Textures:
     """Return the tiles of a split. Crops of photographs and seeds of procedural tiles are disjoint between splits."""
-    if split not in get_args(Split):
-        raise InputError(f"texture split is {split!r}; expected one of {get_args(Split)}")
+    check_choice("texture split", split, get_args(Split))
     generator = np.random.default_rng(SEEDS[split])
     tiles = [tile for name in PHOTOGRAPHS for tile in _crops(name, split, generator)]
     tiles += [_procedural(generator, kind) for kind in range(PROCEDURAL)]

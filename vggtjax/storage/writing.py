@@ -34,7 +34,7 @@ def writing(path: str | Path) -> Iterator[Path]:
     Raises OutputError if the folder cannot be written or the disk is full.
     """
     path = Path(path)
-    with _explaining(path), _staged(path.parent) as staged:
+    with write_errors(path), _staged(path.parent) as staged:
         temporary = staged / path.name
         yield temporary
         if not temporary.is_dir():
@@ -50,7 +50,7 @@ def staging(folder: str | Path) -> Iterator[Path]:
     Write all files there, then rename them into place: a rename within one folder needs no space.
     Raises OutputError if the folder cannot be written or the disk is full.
     """
-    with _explaining(Path(folder)), _staged(Path(folder)) as staged:
+    with write_errors(Path(folder)), _staged(Path(folder)) as staged:
         yield staged
 
 
@@ -63,11 +63,13 @@ def locked_folder(folder: str | Path, what: str, wait: float = 0) -> Iterator[No
     be written.
     """
     path = Path(folder) / ".vggtjax.lock"
-    with _explaining(path.parent):
+    with write_errors(path.parent):
         path.parent.mkdir(parents=True, exist_ok=True)
-        lock, is_free = _acquire(path, wait)
-    if not is_free:
-        raise OutputError(f"another run is writing {what} into {folder}; wait for it or choose another folder")
+        try:
+            lock = _acquire(path, wait)
+        except Timeout:
+            message = f"another run is writing {what} into {folder}; wait for it or choose another folder"
+            raise OutputError(message) from None
     if lock is None:
         warnings.warn("the file system has no locks; start only one run for each output folder", stacklevel=1)  # once
     try:
@@ -106,7 +108,8 @@ def says_format(path: Path, name: str) -> bool:
 
 
 @contextmanager
-def _explaining(path: Path) -> Iterator[None]:
+def write_errors(path: Path) -> Iterator[None]:
+    """Turn an OSError of the body into an OutputError, which names `path` and the reason."""
     try:
         yield
     except OutputError:
@@ -121,11 +124,11 @@ def _staged(folder: Path) -> Iterator[Path]:
     """Yield a new temporary folder. Other writers see its lock file beside it, and do not remove the folder."""
     folder.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(folder)
-    lock, is_free, staged = None, False, folder
+    lock, staged = None, folder
     for _ in range(_TRIES):  # another writer may remove our lock file, as a leftover, before we lock it: try again
         staged = folder / f"{_MARK}{token_hex(8)}"
-        lock, is_free = _acquire(staged.with_suffix(".lock"))
-        if is_free:
+        with suppress(Timeout):
+            lock = _acquire(staged.with_suffix(".lock"))
             break
     try:
         staged.mkdir()
@@ -141,30 +144,27 @@ def _remove_leftovers(folder: Path) -> None:
     for path in [Path(entry) for entry in os.scandir(folder) if _LEFTOVER.fullmatch(entry.name)]:
         with suppress(OSError):  # files of another user, or of a writer that ends now
             if path.suffix == ".lock":
-                lock, _ = _acquire(path)
-                if lock is not None:
+                if (lock := _acquire(path)) is not None:
                     shutil.rmtree(path.with_suffix(""), ignore_errors=True)
-                _release(lock)
+                    _release(lock)
             elif time.time() - path.lstat().st_mtime > _OLD and not path.with_suffix(".lock").exists():
                 shutil.rmtree(path)
 
 
-def _acquire(path: Path, wait: float = 0) -> tuple[FileLock | None, bool]:
-    """Return the lock of a file, made if missing, and whether the file is free.
+def _acquire(path: Path, wait: float = 0) -> FileLock | None:
+    """Return the lock of a file, made if missing; None if the file system has no locks.
 
-    There is no lock if another writer holds it for `wait` seconds (not free), or if the file system has none (free).
+    Raises Timeout, an OSError, if another writer holds the lock for `wait` seconds.
     """
     lock = FileLock(path, timeout=wait, thread_local=False, fallback_to_soft=False)
     try:
         lock.acquire()
-    except Timeout:
-        return None, False
     except OSError as error:
         if error.errno not in _NO_LOCKS:
             raise
         path.unlink(missing_ok=True)
-        return None, True
-    return lock, True
+        return None
+    return lock
 
 
 def _release(lock: FileLock | None) -> None:

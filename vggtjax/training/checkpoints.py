@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import jax
 import orbax.checkpoint as orbax
 
-from vggtjax.errors import CheckpointError, OutputError, one_line
+from vggtjax.errors import CheckpointError, one_line
+from vggtjax.storage.writing import write_errors
 from vggtjax.training.recipe import Recipe
 from vggtjax.training.state import TrainingState
 
@@ -45,15 +46,12 @@ def save(folder: str | Path, state: TrainingState, recipe: Recipe, notes: dict[s
     """
     folder = Path(folder)
     step = int(state.step)
-    try:
-        with _opened(folder, create=True) as manager:
-            if step in manager.all_steps():
-                return
-            run = {"recipe": json.loads(recipe.to_json()), "notes": notes or {}}
-            items = {_STATE: orbax.args.StandardSave(state), _RUN: orbax.args.JsonSave(run)}
-            manager.save(step, args=orbax.args.Composite(**items), force=True)
-    except OSError as error:
-        raise OutputError(f"cannot write the checkpoint {folder / str(step)}: {error.strerror or error}") from error
+    with write_errors(folder / str(step)), _opened(folder, create=True) as manager:
+        if step in manager.all_steps():
+            return
+        run = {"recipe": json.loads(recipe.to_json()), "notes": notes or {}}
+        items = {_STATE: orbax.args.StandardSave(state), _RUN: orbax.args.JsonSave(run)}
+        manager.save(step, args=orbax.args.Composite(**items), force=True)
 
 
 def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe) -> Restored:

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtjax.errors import InputError, OutputError
-from vggtjax.storage.writing import writing
+from vggtjax.errors import InputError, reading
+from vggtjax.storage.writing import write_errors, writing
 
 Row = dict[str, float]
 
@@ -70,11 +70,8 @@ class MetricsFile:
         if not row.keys() <= set(self.names):
             self._write_all()
             return
-        try:
-            with self.path.open("a", newline="", encoding="utf-8") as file:
-                csv.DictWriter(file, self.names).writerow(row)
-        except OSError as error:
-            raise OutputError(f"cannot write {self.path}: {error.strerror or error}") from error
+        with write_errors(self.path), self.path.open("a", newline="", encoding="utf-8") as file:
+            csv.DictWriter(file, self.names).writerow(row)
 
     def _write_all(self) -> None:
         self.names = _header(self.rows)
@@ -91,12 +88,10 @@ def read_metrics(path: str | Path) -> list[Row]:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{path} is {path.stat().st_size} bytes; expected the metrics of a training run")
-        with path.open(newline="", encoding="utf-8") as file:
+        with reading(path), path.open(newline="", encoding="utf-8") as file:
+            if path.stat().st_size > _MOST_BYTES:
+                raise InputError(f"{path} is {path.stat().st_size} bytes; expected the metrics of a training run")
             lines = list(csv.reader(file))
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror}") from None
     except (UnicodeDecodeError, csv.Error):
         raise InputError(f"{path} is not a table of text; expected the metrics of a training run") from None
     if not lines or tuple(lines[0][: len(COLUMNS)]) != COLUMNS:

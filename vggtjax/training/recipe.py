@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from vggtjax.config import Suppress, VGGTConfig
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, whole_number
 from vggtjax.network.model import DENSE_HEADS, HEADS
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.storage.json_values import (
@@ -174,8 +174,7 @@ class Recipe:
 
     def with_steps(self, steps: int) -> Recipe:
         """Return the recipe with `steps` steps in total: phases, warm-up and decay keep their shares."""
-        if type(steps) is not int or steps < 1:
-            raise InputError(f"steps is {steps!r}; expected a whole number above 0")
+        steps = whole_number("steps", steps, 1)
         total = self.total_steps
         ends = list(itertools.accumulate((phase.steps for phase in self.stages), initial=0))
         lengths = [end * steps // total - start * steps // total for start, end in itertools.pairwise(ends)]

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Float64
 from scipy.ndimage import distance_transform_edt
 from scipy.stats import rankdata
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_choice
 
 Empty = Literal["davis", "vggt4d"]
 
@@ -110,8 +110,7 @@ def frame_scores(
     predicted: Bool[np.ndarray, "S H W"], truth: Bool[np.ndarray, "S H W"], *, empty: Empty = "davis"
 ) -> FrameScores:
     """Return J and F of every frame; arguments and errors as for `mask_scores`."""
-    if empty not in _EMPTY_J:
-        raise InputError(f"empty is {empty!r}; expected one of {', '.join(_EMPTY_J)}")
+    check_choice("empty", empty, tuple(_EMPTY_J))
     predicted, truth = _masks(predicted, truth)
     if truth.ndim != 3 or not truth.size:
         raise InputError(f"the masks have shape {truth.shape}; expected [S, H, W] with at least one frame and pixel")

@@ -10,7 +10,7 @@ from jaxtyping import Float, Float64, Int
 from scipy.spatial import KDTree
 
 from vggtjax.errors import InputError
-from vggtjax.progress import Progress
+from vggtjax.progress import Progress, no_progress
 
 _CHUNK = 2**20  # points of one look-up
 _LEAF = 20  # points in a leaf of the tree: the fastest of 10, 20 and 40
@@ -68,14 +68,12 @@ def point_cloud_errors(
     if normals is not None:
         predicted_normals = _checked_normals("predicted", normals[0], predicted)
         true_normals = _checked_normals("true", normals[1], truth)
-    total = len(predicted) + len(truth)
+    tell, total = progress or no_progress, len(predicted) + len(truth)
 
     def look_up(source, target, source_normals, target_normals, before: int):
-        def advance(done: int) -> None:
-            if progress is not None:
-                progress(before + done, total)
-
-        distances, consistency = _nearest(source, target, source_normals, target_normals, advance)
+        distances, consistency = _nearest(
+            source, target, source_normals, target_normals, lambda done: tell(before + done, total)
+        )
         return statistics(distances), consistency
 
     accuracy, of_predicted = look_up(predicted, truth, predicted_normals, true_normals, 0)
@@ -133,12 +131,8 @@ def nearest_distances(
     Accuracy is the `statistics` of the distances from prediction to truth.
     """
     points, others = _cloud("first", points), _cloud("second", others)
-
-    def advance(done: int) -> None:
-        if progress is not None:
-            progress(done, len(points))
-
-    return _nearest(points, others, None, None, advance)[0]
+    tell = progress or no_progress
+    return _nearest(points, others, None, None, lambda done: tell(done, len(points)))[0]
 
 
 def statistics(distances: Float[np.ndarray, " N"]) -> Statistics:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 from scipy.spatial.transform import Rotation
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_choice
 
 Alignment = Literal["sim3", "se3", "first"]
 
@@ -134,8 +134,7 @@ def trajectory_errors(
         InputError: poses that are not rigid [S, 4, 4], different numbers of poses, an unknown alignment. With "sim3"
             and "se3" also fewer than 3 poses or cameras that do not move, with "first" fewer than 2 poses.
     """
-    if align not in get_args(Alignment):
-        raise InputError(f"align is {align!r}; expected one of {', '.join(get_args(Alignment))}")
+    check_choice("align", align, get_args(Alignment))
     fewest = 2 if align == "first" else FEWEST_POSES
     source, target = _pair(_camera_from_world("predicted", predicted), _camera_from_world("true", truth), fewest)
     aligned = _onto(source, target, align)

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Float64
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, check_choice
 from vggtjax.evaluation.metrics.depth import DELTA, measured
 
 Align = Literal["metric", "median", "scale", "scale-shift"]
@@ -130,8 +130,7 @@ _ALIGNMENTS: dict[str, Callable[[Float64[np.ndarray, " N"], Float64[np.ndarray, 
 
 
 def _line(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"], align: Align) -> DepthLine:
-    if align not in _ALIGNMENTS:
-        raise InputError(f"align is {align!r}; expected one of {', '.join(_ALIGNMENTS)}")
+    check_choice("align", align, tuple(_ALIGNMENTS))
     return _ALIGNMENTS[align](predicted, truth)
 
 
