@@ -1,6 +1,7 @@
 """Sources of results: what they depend on, and what they refuse."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import pytest
@@ -59,7 +60,7 @@ def test_methods_that_do_not_fuse_run_beside_those_that_do(monkeypatch):
     monkeypatch.setattr("vggtjax.clips.clip.read_clip", lambda *_: None)
     monkeypatch.setattr("vggtjax.clips.sources.open_source", lambda *_: None)
     source = ModelSource(model, ["vggt4d", "4dvggt-d"], fusion=fusion)
-    sequence = LabelledSequence("s", ())
+    sequence = LabelledSequence("s", (Path("0.png"),))
     for group in source.groups:
         source.results(group, sequence, no_stage)
     assert calls == [(["vggt4d"], None), (["4dvggt-d"], fusion)]

@@ -32,13 +32,15 @@ def draw_sequence(folder: Path, curves: Curves) -> list[tuple[str, str]]:
     return drawn
 
 
-def _figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float) -> Figure:
+    """Return an empty figure of a width and height in inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _add_legend(figure: Figure, columns: int) -> None:
+def add_legend(figure: Figure, columns: int) -> None:
+    """Add the legend of the first axes below the figure."""
     handles = figure.axes[0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=columns, frameon=False)
 
@@ -61,7 +63,7 @@ def _paths(curves: Curves) -> Figure:
     true = next(iter(curves.values()))["true_centres"]
     middle = true.mean(axis=0)
     axes = np.linalg.svd(true - middle)[2]  # first along the path, last across it
-    figure = _figure(9, 4)
+    figure = new_figure(9, 4)
     for column, (across, labels) in enumerate(((1, ("first", "second")), (2, ("first", "third")))):
         axis = figure.add_subplot(1, 2, column + 1)
         ways = {"truth": true} | {method: own["centres"] for method, own in curves.items()}
@@ -72,7 +74,7 @@ def _paths(curves: Curves) -> Figure:
         axis.set_aspect("equal", adjustable="datalim")
         axis.set(xlabel=f"{labels[0]} principal axis", ylabel=labels[1])
         axis.grid(alpha=0.3)
-    _add_legend(figure, 6)
+    add_legend(figure, 6)
     return figure
 
 
@@ -86,7 +88,7 @@ def _error_maps(curves: Curves) -> Figure:
     rows = {"picture": first["images"], "true depth": coloured}
     rows |= {method: own["error_maps"].astype(np.float32) for method, own in curves.items()}
     height, width = true.shape[1:]
-    figure = _figure(2.6 * len(shown) + 1.2, 2.6 * height / width * len(rows) + 0.4)
+    figure = new_figure(2.6 * len(shown) + 1.2, 2.6 * height / width * len(rows) + 0.4)
     grid = _show_pictures(figure, rows, shown)
     figure.colorbar(grid[-1, 0].images[0], ax=grid[2:], label="relative error", shrink=0.8)
     return figure
@@ -99,7 +101,7 @@ def _masks(curves: Curves) -> Figure:
     masks = {"truth": first["true_masks"]} | {method: own["masks"] for method, own in curves.items()}
     rows = {name: map(overlay, first["images"], own) for name, own in masks.items()}
     height, width = first["true_masks"].shape[1:]
-    figure = _figure(2.6 * len(shown) + 0.8, 2.4 + 2.6 * height / width * len(rows))
+    figure = new_figure(2.6 * len(shown) + 0.8, 2.4 + 2.6 * height / width * len(rows))
     top, bottom = np.asarray(figure.subfigures(2, 1, height_ratios=[2.4, 2.6 * height / width * len(rows)]))
     axis = top.subplots()
     for method, own in curves.items():
@@ -113,20 +115,20 @@ def _masks(curves: Curves) -> Figure:
 
 def _distances(curves: Curves) -> Figure:
     """Draw the distances of points to the nearest points of the other cloud."""
-    figure = _figure(9, 3.4)
+    figure = new_figure(9, 3.4)
     titles = {"accuracy": "accuracy: predicted to true", "completeness": "completeness: true to predicted"}
     for axis, (kind, title) in zip(figure.subplots(1, 2), titles.items(), strict=True):
         for method, own in curves.items():
             axis.stairs(own[kind] / max(own[kind].sum(), 1), own["distance_bins"], label=method)
         axis.set(xscale="log", xlabel="distance", ylabel="share of points", title=title)
         axis.grid(alpha=0.3)
-    _add_legend(figure, 5)
+    add_legend(figure, 5)
     return figure
 
 
 def _calibration(curves: Curves) -> Figure:
     """Draw how well confidence orders errors (sparsification) and states their size (reliability)."""
-    figure = _figure(9, 3.8)
+    figure = new_figure(9, 3.8)
     left, right = figure.subplots(1, 2)
     for number, (method, own) in enumerate(curves.items()):
         removed, kept, oracle = own["sparsification"]
@@ -142,7 +144,7 @@ def _calibration(curves: Curves) -> Figure:
     right.set_title("reliability after one scale (dotted: before)", fontsize=10)
     for axis in (left, right):
         axis.grid(alpha=0.3)
-    _add_legend(figure, 5)
+    add_legend(figure, 5)
     return figure
 
 

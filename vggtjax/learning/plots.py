@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from vggtjax.evaluation.metrics.video_depth import depth_alignment
+from vggtjax.evaluation.plots import add_legend, new_figure
 from vggtjax.learning.ablation import PAPER, RuleScore
 from vggtjax.learning.clip_passes import ClipPasses, observations
 from vggtjax.method.fusion_family import FusionParams, log_precisions
@@ -65,14 +66,8 @@ def precision_by_confidence(
     return middles, observed, np.stack([1 / variance[:, part].mean(axis=1) for part in parts], axis=1)
 
 
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.figure import Figure
-
-    return Figure(figsize=(width, height), layout="constrained")
-
-
 def _precision(scores: Sequence[RuleScore], clips: Sequence[ClipPasses], patch_size: int, shown: str) -> Figure:
-    figure = _figure(9, 4)
+    figure = new_figure(9, 4)
     fits = [score.fit for score in scores if score.rule == shown and score.fit is not None]
     for which in (0, 1):
         axis = figure.add_subplot(1, 2, which + 1)
@@ -84,12 +79,12 @@ def _precision(scores: Sequence[RuleScore], clips: Sequence[ClipPasses], patch_s
         axis.loglog()
         axis.set(xlabel="confidence", ylabel="precision of depth", title=f"pass {which + 1}")
         axis.grid(alpha=0.3, which="both")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    add_legend(figure, 3)
     return figure
 
 
 def _calibration(scores: Sequence[RuleScore], shown: str) -> Figure:
-    figure = _figure(4.8, 4.6)
+    figure = new_figure(4.8, 4.6)
     axis = figure.add_subplot()
     axis.plot([0, 1], [0, 1], color="black", linewidth=1, label="calibrated")
     for rule, color in ((PAPER, "tab:orange"), (shown, "tab:blue")):
@@ -107,7 +102,7 @@ def _scores(scores: Sequence[RuleScore]) -> Figure:
     rules = list(dict.fromkeys(score.rule for score in scores))
     colors = {score.rule: "tab:blue" if score.fit is not None else "tab:gray" for score in scores}
     colors[PAPER] = "tab:orange"
-    figure = _figure(11, 0.8 + 0.34 * len(rules))
+    figure = new_figure(11, 0.8 + 0.34 * len(rules))
     for place, (name, title) in enumerate(names.items()):
         axis = figure.add_subplot(1, len(names), place + 1)
         for row, rule in enumerate(rules):
@@ -128,7 +123,7 @@ def _losses(scores: Sequence[RuleScore]) -> Figure:
             fitted.setdefault(score.rule, []).append(score.fit)
     columns = min(max(len(fitted), 1), _COLUMNS)
     rows = -(-max(len(fitted), 1) // columns)
-    figure = _figure(3 * columns + 1, 2.4 * rows + 0.5)
+    figure = new_figure(3 * columns + 1, 2.4 * rows + 0.5)
     for place, (rule, fits) in enumerate(fitted.items()):
         axis = figure.add_subplot(rows, columns, place + 1)
         for i, fit in enumerate(fits):
@@ -138,5 +133,5 @@ def _losses(scores: Sequence[RuleScore]) -> Figure:
         axis.set(title=rule, xlabel="step", ylabel="" if place % columns else "objective")
         axis.grid(alpha=0.3)
     if fitted:
-        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
+        add_legend(figure, 2)
     return figure

@@ -144,7 +144,7 @@ def statistics(distances: Float[np.ndarray, " N"]) -> Statistics:
 
 
 def _nearest(
-    source, target, source_normals, target_normals, advance: Callable[[int], None]
+    source, target, source_normals, target_normals, advance: Callable[[int], object]
 ) -> tuple[Float64[np.ndarray, " N"], float | None]:
     """Look up every point of `source` in a tree of `target`; return distances and the consistency of normals."""
     tree = KDTree(target, leafsize=_LEAF, balanced_tree=False)  # cells cut in the middle: twice as fast to build
