@@ -81,7 +81,7 @@ def test_shares_of_0_and_1_are_the_boolean_mask():
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"suppress": "drop"}, "dropped whole"),
+        ({"suppress": "drop"}, "dropped in part"),
         ({"strength": jnp.ones(3)}, r"strength has shape \(3,\); expected \(4,\)"),
         ({"dynamic_tokens": jnp.ones((1, 4, 2, 3), int)}, "expected bool, or shares"),
         ({"compute_dtype": "float64"}, "enable_x64"),
