@@ -22,6 +22,7 @@ from benchmarks.speed import speed
 from benchmarks.suite.command import suite
 from benchmarks.suite.gpu_targets import gpu_targets
 from benchmarks.suite.memory import memory
+from benchmarks.training_step import training_step
 from vggtjax.errors import VggtjaxError
 
 COMMANDS = {
@@ -40,6 +41,7 @@ COMMANDS = {
     "second-pass": second_pass,
     "speed": speed,
     "suite": suite,
+    "training-step": training_step,
 }
 
 

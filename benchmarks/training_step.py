@@ -1,0 +1,153 @@
+"""Time of a training step, beside an earlier checkout of the package: python -m benchmarks training-step."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.suite.ceilings import Rounds
+from benchmarks.suite.report import Sheet, console, describe, machine, number, write_json
+from vggtjax.errors import InputError
+
+_ROOT = Path(__file__).resolve().parents[1]
+_WORKER = Path(__file__).with_name("training_step_worker.py")
+_PARTS = ("render", "gradient", "update")
+
+Answer = dict[str, Any]
+
+
+def training_step(
+    *,
+    recipe: Path = _ROOT / "docs" / "embedded" / "5-four-frames.json",
+    before: Path | None = None,
+    devices: int = 2,
+    steps: int = 2,
+    rounds: int = 5,
+    out: Path | None = None,
+) -> None:
+    """Time the parts of a training step, against the ceilings of the machine measured around every round.
+
+    The first phase of the recipe counts. The products of forward and backward pass are counted from the shapes: three
+    times those of the forward pass. With `before`, both checkouts take turns, and their losses on the same clips are
+    compared first.
+
+    Args:
+        recipe: JSON file with the recipe.
+        before: folder of another checkout, whose package `vggtjax` is measured too.
+        devices: XLA devices that a CPU is divided into; the clips are spread over them.
+        steps: steps of a round.
+        rounds: timed rounds, after a warm-up.
+        out: JSON file for the figures of every round.
+    """
+    if min(devices, steps, rounds) < 1:
+        raise InputError(f"devices, steps and rounds are {devices}, {steps} and {rounds}; expected at least 1")
+    if before is not None and not (before / "vggtjax" / "training").is_dir():
+        raise InputError(f"{before} has no vggtjax/training; expected a checkout of this package")
+    from vggtjax.training.recipe import read_recipe
+
+    chosen = read_recipe(recipe)
+    phase = chosen.stages[0]
+    grid = phase.height // chosen.model.patch_size, phase.width // chosen.model.patch_size
+    frames = phase.frames[0]
+    flop = 3 * phase.batch * _forward_flop(chosen, frames, grid)
+    sides = {"now": _ROOT} | ({} if before is None else {"before": before.resolve()})
+    screen, ceiling = console(), Rounds(rounds, _ceilings(chosen, grid))
+    with screen.status("compile"):
+        workers = {name: _Worker(folder, recipe.resolve(), devices) for name, folder in sides.items()}
+    try:
+        losses = {name: worker.ask(losses=True)["losses"] for name, worker in workers.items()}
+        runs: dict[str, list[Answer]] = {name: [] for name in sides}
+        with screen.status("measure"):
+            for number_ in ceiling:
+                for name in sides if number_ % 2 else reversed(sides):
+                    runs[name].append(workers[name].ask(steps=steps))
+    finally:
+        for worker in workers.values():
+            worker.close()
+    rates = [rate["linear"] for rate in ceiling.rates]
+    rows = [_row(name, runs[name], phase.batch * frames, flop, rates) for name in sides]
+    headings = ("package", *_PARTS, "step (s)", "frames/s", "GFLOP/s", "of the ceiling", "render share")
+    title = f"{phase.batch} clips of {frames} frames, {phase.width} x {phase.height}, {flop / 1e9:.0f} GFLOP a step"
+    Sheet(title, headings, rows).show(screen)
+    report = {"recipe": chosen.name, "flop": flop, "ceilings": rates, "runs": runs, "losses": losses}
+    if before is not None:
+        ratios = [_seconds(old) / _seconds(new) for old, new in zip(runs["before"], runs["now"], strict=True)]
+        apart = max(abs(losses["now"][key] - losses["before"][key]) / abs(losses["before"][key]) for key in losses["now"])
+        screen.print(f"{np.median(ratios):.2f} times the frames a second; losses differ by at most {apart:.1e}")
+        report |= {"ratios": ratios, "losses_apart": apart}
+    here = machine()
+    screen.print(describe(here), highlight=False)
+    if out is not None:
+        write_json(out, {"machine": here, **report})
+
+
+class _Worker:
+    """A process that takes training steps with the package of one checkout."""
+
+    def __init__(self, folder: Path, recipe: Path, devices: int) -> None:
+        flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
+        self._process: Any = subprocess.Popen(
+            [sys.executable, str(_WORKER), str(recipe)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": str(folder), "XLA_FLAGS": flags},
+        )
+        self.ask(steps=1)
+
+    def ask(self, **task: Any) -> Answer:
+        self._process.stdin.write(json.dumps(task) + "\n")
+        self._process.stdin.flush()
+        line = self._process.stdout.readline()
+        if not line:
+            raise InputError(f"the process with the package in {self._process.args[1]} ended; its output is above")
+        return json.loads(line)
+
+    def close(self) -> None:
+        self._process.stdin.close()
+        self._process.wait()
+
+
+def _forward_flop(recipe, frames: int, grid: tuple[int, int]) -> float:
+    from benchmarks.suite import work
+
+    config, losses = recipe.model, recipe.losses
+    parts = [*work.backbone(config, frames, grid), *work.alternating(config, frames, grid)]
+    parts += work.camera_head(config, frames)
+    for weight in (losses.depth, losses.points):
+        parts += work.depth_head(config, frames, grid) if weight else []
+    return work.flop(parts)
+
+
+def _ceilings(recipe, grid: tuple[int, int]):
+    from benchmarks.suite.ceilings import Ceilings
+
+    return Ceilings(recipe.model, grid, "float32")
+
+
+def _seconds(run: Answer) -> float:
+    return sum(run[part] for part in _PARTS)
+
+
+def _row(name: str, runs: list[Answer], frames: int, flop: float, ceilings: list[float]) -> tuple[str, ...]:
+    parts = [float(np.median([run[part] for run in runs])) for part in _PARTS]
+    seconds = [_seconds(run) for run in runs]
+    rate = flop / float(np.median([run["gradient"] for run in runs]))
+    share = float(np.median([flop / run["gradient"] / ceiling for run, ceiling in zip(runs, ceilings, strict=True)]))
+    median = float(np.median(seconds))
+    return (
+        name,
+        *map(number, parts),
+        number(median),
+        number(frames / median),
+        number(rate / 1e9),
+        f"{100 * share:.0f} %",
+        f"{100 * parts[0] / median:.0f} %",
+    )

@@ -1,0 +1,67 @@
+"""One side of the comparison of training steps: a process with the package of one checkout.
+
+Run as a script with the checkout on PYTHONPATH and the recipe's path as argument; then a line of JSON on standard input
+for every answer: {"steps": N} for the mean seconds of render, gradient and update; {"losses": true} for the losses of
+the first clips.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import jax
+
+from vggtjax.commands.process import keep_freed_memory
+from vggtjax.scenes.textures import load_textures
+from vggtjax.training.data import make_batch
+from vggtjax.training.devices import placement
+from vggtjax.training.objective import init_probes, objective
+from vggtjax.training.recipe import read_recipe
+from vggtjax.training.state import apply_gradient, initial_state, loss_and_gradient
+
+
+def main() -> None:
+    """Answer every line of standard input."""
+    keep_freed_memory()
+    recipe = read_recipe(Path(sys.argv[1]))
+    phase = recipe.stages[0]
+    where = placement(recipe)
+
+    def start():
+        return jax.device_put(initial_state(recipe, init_probes(recipe.seed, recipe.model)), where.whole)
+
+    state = start()
+    textures = jax.device_put(load_textures("training"), where.whole)
+    render = jax.jit(make_batch, static_argnums=(2, 3), out_shardings=where.by_clip)
+    gradient_of = jax.jit(loss_and_gradient, static_argnums=(2, 3))
+    update = jax.jit(apply_gradient, static_argnums=3, donate_argnums=0)
+
+    def draw(number: int):
+        return render(jax.random.key(number), textures, phase, phase.frames[0])
+
+    for line in sys.stdin:
+        task = json.loads(line)
+        if task.get("losses"):
+            metrics, _ = gradient_of(start().trained, draw(0), recipe, objective)
+            found = {name: float(value) for name, value in metrics.items() if name.startswith("loss")}
+            print(json.dumps({"losses": found}), flush=True)
+            continue
+        times = dict.fromkeys(("render", "gradient", "update"), 0.0)
+        for number in range(task["steps"]):
+            began = time.perf_counter()
+            batch = jax.block_until_ready(draw(number))
+            drawn = time.perf_counter()
+            metrics, gradient = jax.block_until_ready(gradient_of(state.trained, batch, recipe, objective))
+            done = time.perf_counter()
+            state, metrics = jax.block_until_ready(update(state, gradient, metrics, recipe))
+            times["render"] += drawn - began
+            times["gradient"] += done - drawn
+            times["update"] += time.perf_counter() - done
+        print(json.dumps({name: value / task["steps"] for name, value in times.items()}), flush=True)
+
+
+if __name__ == "__main__":
+    main()
