@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.suite.ceilings import Rounds
+from benchmarks.suite import work
+from benchmarks.suite.ceilings import Ceilings, Rounds
 from benchmarks.suite.report import Sheet, console, describe, machine, number, write_json
 from vggtjax.errors import InputError
+from vggtjax.training.recipe import Recipe, read_recipe
 
 _ROOT = Path(__file__).resolve().parents[1]
 _WORKER = Path(__file__).with_name("training_step_worker.py")
@@ -49,23 +51,21 @@ def training_step(
         raise InputError(f"devices, steps and rounds are {devices}, {steps} and {rounds}; expected at least 1")
     if before is not None and not (before / "vggtjax" / "training").is_dir():
         raise InputError(f"{before} has no vggtjax/training; expected a checkout of this package")
-    from vggtjax.training.recipe import read_recipe
-
     chosen = read_recipe(recipe)
     phase = chosen.stages[0]
     grid = phase.height // chosen.model.patch_size, phase.width // chosen.model.patch_size
     frames = phase.frames[0]
     flop = 3 * phase.batch * _forward_flop(chosen, frames, grid)
     sides = {"now": _ROOT} | ({} if before is None else {"before": before.resolve()})
-    screen, ceiling = console(), Rounds(rounds, _ceilings(chosen, grid))
+    screen, ceiling = console(), Rounds(rounds, Ceilings(chosen.model, grid, "float32"))
     with screen.status("compile"):
         workers = {name: _Worker(folder, recipe.resolve(), devices) for name, folder in sides.items()}
     try:
         losses = {name: worker.ask(losses=True)["losses"] for name, worker in workers.items()}
         runs: dict[str, list[Answer]] = {name: [] for name in sides}
         with screen.status("measure"):
-            for number_ in ceiling:
-                for name in sides if number_ % 2 else reversed(sides):
+            for turn in ceiling:
+                for name in sides if turn % 2 else reversed(sides):
                     runs[name].append(workers[name].ask(steps=steps))
     finally:
         for worker in workers.values():
@@ -78,7 +78,9 @@ def training_step(
     report = {"recipe": chosen.name, "flop": flop, "ceilings": rates, "runs": runs, "losses": losses}
     if before is not None:
         ratios = [_seconds(old) / _seconds(new) for old, new in zip(runs["before"], runs["now"], strict=True)]
-        apart = max(abs(losses["now"][key] - losses["before"][key]) / abs(losses["before"][key]) for key in losses["now"])
+        apart = max(
+            abs(losses["now"][key] - losses["before"][key]) / abs(losses["before"][key]) for key in losses["now"]
+        )
         screen.print(f"{np.median(ratios):.2f} times the frames a second; losses differ by at most {apart:.1e}")
         report |= {"ratios": ratios, "losses_apart": apart}
     here = machine()
@@ -113,23 +115,16 @@ class _Worker:
     def close(self) -> None:
         self._process.stdin.close()
         self._process.wait()
+        self._process.stdout.close()
 
 
-def _forward_flop(recipe, frames: int, grid: tuple[int, int]) -> float:
-    from benchmarks.suite import work
-
+def _forward_flop(recipe: Recipe, frames: int, grid: tuple[int, int]) -> float:
     config, losses = recipe.model, recipe.losses
     parts = [*work.backbone(config, frames, grid), *work.alternating(config, frames, grid)]
     parts += work.camera_head(config, frames)
     for weight in (losses.depth, losses.points):
         parts += work.depth_head(config, frames, grid) if weight else []
     return work.flop(parts)
-
-
-def _ceilings(recipe, grid: tuple[int, int]):
-    from benchmarks.suite.ceilings import Ceilings
-
-    return Ceilings(recipe.model, grid, "float32")
 
 
 def _seconds(run: Answer) -> float:

@@ -11,6 +11,7 @@ import json
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -47,7 +48,7 @@ def main() -> None:
         if task.get("losses"):
             metrics, _ = gradient_of(start().trained, draw(0), recipe, objective)
             found = {name: float(value) for name, value in metrics.items() if name.startswith("loss")}
-            print(json.dumps({"losses": found}), flush=True)
+            answer({"losses": found})
             continue
         times = dict.fromkeys(("render", "gradient", "update"), 0.0)
         for number in range(task["steps"]):
@@ -60,7 +61,13 @@ def main() -> None:
             times["render"] += drawn - began
             times["gradient"] += done - drawn
             times["update"] += time.perf_counter() - done
-        print(json.dumps({name: value / task["steps"] for name, value in times.items()}), flush=True)
+        answer({name: value / task["steps"] for name, value in times.items()})
+
+
+def answer(values: dict[str, Any]) -> None:
+    """Write a line of JSON."""
+    sys.stdout.write(json.dumps(values) + "\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def test_attention_of_each_platform(case, implementation):
 
 
 def test_pieces(case, monkeypatch):
-    monkeypatch.setattr(pieces, "ROWS_ON_CPU", 64)
+    monkeypatch.setattr(pieces, "NUMBERS_ON_CPU", 64 * case.config.embed_dim)
     for name, made in passes(case):
         assert_golden(case, name, made)
 

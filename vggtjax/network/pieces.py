@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-ROWS_ON_CPU = 1600  # the hidden rows of an MLP (26 MB for VGGT) stay in the cache, where products are fastest
+NUMBERS_ON_CPU = 1600 * 1024  # of a piece: an MLP's hidden rows (26 MB) stay in the cache, where products are fastest
 ROWS_ELSEWHERE = 2**15
 
 _Rows = TypeVar("_Rows")
@@ -17,12 +17,11 @@ _Outputs = TypeVar("_Outputs")
 
 
 def in_pieces(function: Callable[[_Rows], _Outputs], rows: _Rows) -> _Outputs:
-    """Return `function(rows)` for a tree of arrays [R, ...], with the intermediate values of one piece at a time.
+    """Return `function(rows)` for a tree of arrays [R, C], ..., with the intermediate values of one piece at a time.
 
     The function must treat every row independently. Few rows take a single call, without a loop.
     """
-
-    if _count(rows) <= ROWS_ON_CPU:  # the code below is traced for every platform
+    if _count(rows) <= _rows_on_cpu(rows):  # the code below is traced for every platform
         return function(rows)
 
     def at_most(most: int) -> Callable[[_Rows], _Outputs]:
@@ -41,8 +40,7 @@ def replaced_in_pieces(
     function: Callable[[Float[Array, "r C"], _Rows], Float[Array, "r C"]], x: Float[Array, "R C"], others: _Rows
 ) -> Float[Array, "R C"]:
     """Return `function(x, others)` as `in_pieces` does; each piece overwrites its own input."""
-
-    if len(x) <= ROWS_ON_CPU:
+    if len(x) <= _rows_on_cpu(x):
         return function(x, others)
 
     def at_most(most: int):
@@ -81,7 +79,11 @@ def piece_size(count: int, most: int) -> int | None:
 
 
 def _by_platform(at_most, rows):
-    return jax.lax.platform_dependent(rows, cpu=at_most(ROWS_ON_CPU), default=at_most(ROWS_ELSEWHERE))
+    return jax.lax.platform_dependent(rows, cpu=at_most(_rows_on_cpu(rows)), default=at_most(ROWS_ELSEWHERE))
+
+
+def _rows_on_cpu(rows) -> int:
+    return max(NUMBERS_ON_CPU // jax.tree.leaves(rows)[0].shape[1], 1)
 
 
 def _count(rows) -> int:

@@ -1,0 +1,42 @@
+"""The benchmark of the training step: two checkouts of the same package, and bad input."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks import __main__ as benchmarks
+from benchmarks.training_step import training_step
+from tests.training_runs import RECIPE
+from vggtjax.errors import InputError
+from vggtjax.training.objective import LossWeights
+from vggtjax.training.recipe import Phase
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_two_checkouts_take_turns(tmp_path):
+    """The same package twice: the losses on the same clips are equal, every part took time, the counts are right."""
+    recipe = dataclasses.replace(RECIPE, stages=(Phase(9, 2, (2,), 28, 28),), losses=LossWeights(depth=0, points=0))
+    (tmp_path / "recipe.json").write_text(recipe.to_json())
+    out = tmp_path / "report.json"
+    arguments = ("--recipe", tmp_path / "recipe.json", "--before", ROOT, "--out", out)
+    counts = ("--devices", 1, "--steps", 1, "--rounds", 1)
+    assert benchmarks.main(["training-step", *map(str, (*arguments, *counts))]) == 0
+    report = json.loads(out.read_text())
+    assert report["losses_apart"] == 0
+    assert len(report["ratios"]) == 1
+    for runs in report["runs"].values():
+        assert all(seconds > 0 for run in runs for seconds in run.values())
+    C, depth = recipe.model.embed_dim, recipe.model.depth + recipe.model.dino_depth / 2
+    least = 3 * 2 * 2 * depth * 2 * 24 * C**2 * (28 // recipe.model.patch_size) ** 2  # the blocks' linear layers alone
+    assert least < report["flop"] < 100 * least
+
+
+@pytest.mark.parametrize(
+    ("option", "message"), [({"rounds": 0}, "rounds are 2, 2 and 0"), ({"before": Path("/")}, "no vggtjax")]
+)
+def test_bad_input(option, message):
+    with pytest.raises(InputError, match=message):
+        training_step(**option)
