@@ -17,7 +17,7 @@ from vggtjax.clips.clip import load_clip
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.masks import jaccard
-from vggtjax.method.refinement import refine_masks
+from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes

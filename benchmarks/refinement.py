@@ -11,7 +11,7 @@ from rich.table import Table
 
 from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
-from vggtjax.method.refinement import refine_masks, statistical_outliers
+from vggtjax.method.mask_refinement import refine_masks, statistical_outliers
 from vggtjax.scenes import load_textures
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.render import generate

@@ -9,12 +9,12 @@ from .config import vggt_1b as vggt_1b
 from .errors import VggtjaxError as VggtjaxError
 from .method.fusion import fuse_depth as fuse_depth
 from .method.instances import find_instances as find_instances
+from .method.mask_refinement import refine_masks as refine_masks
 from .method.passes import Assembly as Assembly
 from .method.passes import Passes as Passes
 from .method.passes import assemble as assemble
 from .method.passes import motion_saliency as motion_saliency
 from .method.passes import run_passes as run_passes
-from .method.refinement import refine_masks as refine_masks
 from .network.backbone import encode as encode
 from .network.model import Predictions as Predictions
 from .network.model import forward as forward

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, SupportsIndex, TypedDict
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -151,23 +151,11 @@ class Options:
 
     def changed(self, **changes: Any) -> Options:
         """Return the options with other values. Raises TypeError for an unknown name."""
-        if unknown := sorted(changes.keys() - OptionChanges.__annotations__.keys()):
-            raise TypeError(f"no option is named {' or '.join(unknown)}; expected {[*OptionChanges.__annotations__]}")
+        names = [field.name for field in dataclasses.fields(self)]
+        if unknown := sorted(changes.keys() - set(names)):
+            raise TypeError(f"no option is named {' or '.join(unknown)}; expected {names}")
         return dataclasses.replace(self, **changes) if changes else self
 
     def to_json(self) -> dict[str, Any]:
         """Return the options as JSON values."""
         return dataclasses.asdict(self)
-
-
-class OptionChanges(TypedDict, total=False):
-    """Keywords of functions with `options`: each changes one field of the options."""
-
-    method: str
-    gram: Gram | None
-    suppress: Suppress | None
-    mask_pairs: SupportsIndex
-    align_scale: bool
-    smooth_frames: SupportsIndex
-    refine_mask: bool | None
-    compute_dtype: str

@@ -21,7 +21,7 @@ from benchmarks.suite.measure import Measured, measure_calls, measure_program, t
 from converters.torch_to_flax import convert, source_shapes
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
-from vggtjax.method.refinement import refine_masks
+from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.network.aggregator import aggregate
 from vggtjax.network.backbone import encode
 from vggtjax.network.dpt_head import predict_dense, project_tap

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from vggtjax.cameras import unproject
-from vggtjax.method import refinement
-from vggtjax.method.refinement import cluster_losses, refine_masks, statistical_outliers
+from vggtjax.method import mask_refinement
+from vggtjax.method.mask_refinement import cluster_losses, refine_masks, statistical_outliers
 
 
 @pytest.fixture(scope="module")
@@ -31,23 +31,23 @@ def test_outliers(arrays):
 
 def test_losses_of_given_clusters(arrays):
     inside = arrays["labels"] >= 0
-    index, weight = refinement._packed(inside, int(inside.sum(axis=(1, 2)).max()) + 5)
+    index, weight = mask_refinement._packed(inside, int(inside.sum(axis=(1, 2)).max()) + 5)
     labels = np.take_along_axis(arrays["labels"].reshape(len(inside), -1), index, axis=1)
     made = cluster_losses(*scene(arrays), index, weight, np.where(weight, labels, 0), 30)
     golden = arrays["cluster_losses"]
-    few = golden[..., 1] == refinement.TOO_FEW
-    assert np.array_equal(np.asarray(made.total) == refinement.TOO_FEW, few)
+    few = golden[..., 1] == mask_refinement.TOO_FEW
+    assert np.array_equal(np.asarray(made.total) == mask_refinement.TOO_FEW, few)
     for column, value in ((1, made.depth), (2, made.rgb), (3, made.total)):
         assert np.abs(np.asarray(value) - golden[..., column])[~few].max() <= 1e-4
 
 
 def test_masks_of_given_clusters(arrays, monkeypatch):
     def given(key, points, weight, clusters):
-        index, _ = refinement._packed(arrays["labels"] >= 0, points.shape[1])
+        index, _ = mask_refinement._packed(arrays["labels"] >= 0, points.shape[1])
         labels = np.take_along_axis(arrays["labels"].reshape(len(index), -1), index, axis=1)
         return jax.numpy.asarray(np.where(weight, labels, 0))
 
-    monkeypatch.setattr(refinement, "cluster_points", given)
+    monkeypatch.setattr(mask_refinement, "cluster_points", given)
     assert (refine_masks(*scene(arrays)) != arrays["refined_masks"]).mean() <= 1e-3
 
 

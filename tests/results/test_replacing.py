@@ -9,6 +9,7 @@ from tests.results.test_export import expected_files, files
 from tests.room import make_room
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results import export
+from vggtjax.results.folder import replacing
 from vggtjax.results.reconstruction import Reconstruction
 
 
@@ -101,6 +102,12 @@ def test_percentile_out_of_range_writes_nothing(tmp_path):
     with pytest.raises(InputError, match="confidence_percentile is 100"):
         make_room(1).save(tmp_path / "result", confidence_percentile=100)
     assert not (tmp_path / "result").exists()
+
+
+def test_a_new_kind_of_file_is_not_lost(tmp_path):
+    with pytest.raises(ValueError, match=r"\['notes.txt'\] would not be moved"), replacing(tmp_path, ()) as new:
+        (new / "notes.txt").write_text("written by a new exporter")
+    assert not files(tmp_path)
 
 
 def test_links_are_replaced_and_not_followed(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple, TypeVar, Unpack
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
-from vggtjax.options import OptionChanges, Options, Threshold, find_method
+from vggtjax.options import Options, Threshold, find_method
 
 _Value = TypeVar("_Value")
 
@@ -178,7 +178,7 @@ def run_passes(
     clusters: int | None = None,
     threshold: Threshold | None = None,
     second: tuple[str, ...] | None = None,
-    **changes: Unpack[OptionChanges],
+    **changes: Any,
 ) -> Passes:
     """Run both passes once with shared backbone features, for `assemble`.
 

@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Unpack
+from typing import Any, Literal, NamedTuple
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, read_clip
@@ -20,7 +20,7 @@ from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
-from vggtjax.options import OptionChanges, Options
+from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
@@ -42,10 +42,6 @@ class ClipOutcome(NamedTuple):
     frames: int = 0
 
 
-class ManyChanges(FramingChanges, OptionChanges, total=False):
-    """Keywords of `reconstruct_many` that change fields of its `framing` and `options`."""
-
-
 def reconstruct_many(
     model: Model,
     sources: Mapping[str, ClipSource],
@@ -58,7 +54,7 @@ def reconstruct_many(
     fusion: FusionParams | None = None,
     pad_frames: bool = False,
     progress: Progress | None = None,
-    **changes: Unpack[ManyChanges],
+    **changes: Any,
 ) -> Generator[ClipOutcome]:
     """Reconstruct clips, each into a folder of its own, and yield the outcome of each as it is finished.
 

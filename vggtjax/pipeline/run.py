@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from functools import partial
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,12 +21,12 @@ from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError, device_memory_errors
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
+from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.passes import Assembly, Passes
-from vggtjax.method.refinement import refine_masks
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
 from vggtjax.network.track_head import Tracks
-from vggtjax.options import OptionChanges, Options
+from vggtjax.options import Options
 from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, inline, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.results.reconstruction import Reconstruction
@@ -41,7 +41,7 @@ def infer(
     *,
     options: Options = Options(),
     motion: MotionConfig | None = None,
-    **changes: Unpack[OptionChanges],
+    **changes: Any,
 ) -> tuple[Assembly, Passes]:
     """Run a method on a batch of clips as one compiled function.
 
@@ -82,7 +82,7 @@ def reconstruct(
     pad_frames: bool = False,
     keep_passes: bool = False,
     on_stage: OnStage | None = None,
-    **changes: Unpack[OptionChanges],
+    **changes: Any,
 ) -> Reconstruction:
     """Reconstruct a clip: cameras, depth, its confidence, and what moves.
 
@@ -160,7 +160,7 @@ def compile_ahead(
     options: Options = Options(),
     pad_frames: bool = False,
     keep_passes: bool = False,
-    **changes: Unpack[OptionChanges],
+    **changes: Any,
 ) -> dict[str, StageMemory]:
     """Compile ahead of time what `reconstruct` runs with these options for a clip of this shape.
 

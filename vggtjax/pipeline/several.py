@@ -5,13 +5,13 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections.abc import Sequence
-from typing import Unpack
+from typing import Any
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
-from vggtjax.options import OptionChanges, Options
+from vggtjax.options import Options
 from vggtjax.pipeline.run import assembled_fields, reconstruct, refined
 from vggtjax.pipeline.stages import Stages
 from vggtjax.progress import OnStage, no_stage
@@ -28,7 +28,7 @@ def reconstruct_methods(
     size: int | None = None,
     fusion: FusionParams | None = None,
     on_stage: OnStage | None = None,
-    **changes: Unpack[OptionChanges],
+    **changes: Any,
 ) -> dict[str, Reconstruction]:
     """Reconstruct a clip by several methods, each as `reconstruct` does.
 

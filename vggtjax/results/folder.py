@@ -20,6 +20,7 @@ NAMES = (
     "confidence", "depth", "mask", "instances", "preview", "frames",
     "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb",
 )  # fmt: skip
+_ALL = {ARCHIVE_NAME, *NAMES, *OPTIONAL_FILES}
 _REPLACING = ".replacing"
 _WAIT = 60  # seconds for the moves of another process
 
@@ -46,15 +47,18 @@ def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
 
 @contextmanager
 def replacing(folder: Path, optional: Sequence[str]) -> Iterator[Path]:
-    """Yield an empty folder; at the end its files, the archive and all `NAMES` among them, replace those of `folder`.
+    """Yield an empty folder; at the end its files, the archive and all `NAMES` among them, replace those in it.
 
-    If anything fails, the earlier result is left untouched. Raises what `check_folder` raises.
+    If anything fails, the earlier result is left untouched. Raises what `check_folder` raises, and ValueError for a new
+    file of another name.
     """
     check_folder(folder, optional)
     with staging(folder) as staged:
         for name in ("new", "old"):
             (staged / name).mkdir()
         yield staged / "new"
+        if unknown := {path.name for path in (staged / "new").iterdir()} - _ALL:
+            raise ValueError(f"{sorted(unknown)} would not be moved; add the name to NAMES or OPTIONAL_FILES")
         with locked_folder(folder, "a result", _WAIT):
             _finish(folder)
             staged.rename(folder / _REPLACING)

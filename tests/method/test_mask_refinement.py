@@ -8,8 +8,8 @@ import pytest
 from scipy import ndimage
 
 from vggtjax.errors import InputError
-from vggtjax.method import refinement
-from vggtjax.method.refinement import refine_masks, statistical_outliers
+from vggtjax.method import mask_refinement
+from vggtjax.method.mask_refinement import refine_masks, statistical_outliers
 from vggtjax.scenes import load_textures
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.render import generate
@@ -95,8 +95,8 @@ def test_large_masks_are_grouped_by_a_part_of_their_points(clip, monkeypatch):
     coarse = clip.dynamic_mask.copy()
     coarse[:, 8:60, 8:60] = True
     whole = refined(clip, coarse)
-    jitted: Any = refinement.cluster_points
-    monkeypatch.setattr(refinement, "FITTED", 500)
+    jitted: Any = mask_refinement.cluster_points
+    monkeypatch.setattr(mask_refinement, "FITTED", 500)
     jitted.clear_cache()
     part = refined(clip, coarse)
     jitted.clear_cache()
