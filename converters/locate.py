@@ -40,8 +40,9 @@ def locate(source: str | Path) -> Weights:
         if (not hub_id.endswith(SUFFIXES)) if file is None else file.endswith(SUFFIXES):
             refuse_strangers(source)
             return Weights(download(hub_id, file), source)
+    if source == "demo":
+        raise CheckpointError("demo is the embedded model, which needs no conversion; give it to --model as it is")
     raise CheckpointError(
         f"there are no weights at {source}; expected a file (.safetensors, .pt, .pth), the index or folder of sharded "
-        ".safetensors, a hub id such as 'facebook/VGGT-1B' ('/FILE' appended if the repository holds several), or "
-        "'demo', which can be loaded but not converted"
+        ".safetensors, 'demo', or a hub id such as 'facebook/VGGT-1B' ('/FILE' appended if it holds several)"
     )

@@ -279,7 +279,7 @@ def test_torch_weights_are_converted_once(shapes, tree, config, tmp_path, cache,
     assert jax.tree.all(jax.tree.map(np.array_equal, model.params, tree))
     assert model.name == "weights"
     assert [model.path] == list(cache.iterdir())
-    assert f"converting {source} to {model.path}" in caplog.text
+    assert f"converted {source} to {model.path}" in caplog.text
     assert calls[-1] == (1502 + 8, 1502 + 8)  # tensors, and blocks of the source
 
     with monkeypatch.context() as patch:

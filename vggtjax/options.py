@@ -103,7 +103,8 @@ class Options:
     suppress: Suppress | None = None
     """how the keys of dynamic tokens are suppressed; the method's own by default"""
     mask_pairs: int = 5
-    """number of pairs of blocks in which the keys of dynamic tokens are suppressed (L_mask of the paper)"""
+    """number of pairs of blocks in which the keys of dynamic tokens are suppressed (L_mask of the paper); a number
+    above the model's means all"""
     align_scale: tyro.conf.FlagCreatePairsOff[bool] = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1

@@ -73,6 +73,15 @@ def test_frames_of_different_sizes_are_padded_with_white(caplog):
     assert "different sizes (28 x 14, 28 x 28); they are padded with white to 28 x 28" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "mode", "lines"), [(9, 16, "crop", 1), (9, 16, "pad", 0), (28, 30, "crop", 0)]
+)
+def test_a_large_cut_is_said_once(width, height, mode, lines, caplog):
+    load_clip(frames((width, height), (width, height)), size=28, patch=7, mode=mode)
+    assert caplog.text.count("frames of 9 x 16 pixels lose 43 % of their pixels above and below; --mode pad") == lines
+    assert len(caplog.records) == lines
+
+
 @pytest.mark.parametrize("mode", ["crop", "pad"])
 @pytest.mark.parametrize("size", [(200, 120), (120, 200), (150, 150)])
 def test_a_drawn_spot_lands_where_the_mapping_says(mode, size):

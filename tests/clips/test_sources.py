@@ -78,18 +78,18 @@ def test_arrays():
 
 
 def test_a_folder_without_images_says_what_it_holds(tmp_path):
-    with pytest.raises(ClipError, match="holds no images but nothing at all"):
+    with pytest.raises(ClipError, match="holds no images; name the folder"):
         open_source(tmp_path)
     for name in ("b10", "b9"):
         (tmp_path / name).mkdir()
     for name in ("a.mp4", "x.txt", "y.txt"):
         (tmp_path / name).touch()
-    message = r"no images but 2 folders \(b9, b10\) and 1 videos \(a.mp4\) and 2 other files \(.txt\)"
+    message = r"no images, but 2 folders \(b9, b10\) and 1 video \(a.mp4\) and 2 other files \(x.txt, y.txt\)"
     with pytest.raises(ClipError, match=message):
         open_source(tmp_path)
-    with pytest.raises(ClipError, match=r"matches no images but 1 videos \(a.mp4\)"):
+    with pytest.raises(ClipError, match=r"matches no images, but 1 video \(a.mp4\)"):
         open_source(f"{tmp_path}/*.mp4")
-    with pytest.raises(ClipError, match="matches no images but nothing at all"):
+    with pytest.raises(ClipError, match="matches no images; expected"):
         open_source(f"{tmp_path}/*.png")
 
 
@@ -97,7 +97,7 @@ def test_a_folder_without_images_says_what_it_holds(tmp_path):
     ("source", "message"),
     [
         ("missing/frames", "'missing/frames' does not exist"),
-        ("https://example.org/clip.mp4", "does not exist"),
+        ("https://example.org/clip.mp4?x=1", r"https://example.org/clip.mp4\?x=1 is a URL; download the file first"),
         ("", "'' is not a path"),
         ("a\0b", "is not a path"),
         ("x" * 5000, "cannot read x+: File name too long"),

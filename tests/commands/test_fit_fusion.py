@@ -139,6 +139,7 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
     ("arguments", "sentence"),
     [
         (["--data", "scenes"], "expected generated=N or DATASET=FOLDER"),
+        (["--data", "generated=2"], "2 clips with a true depth; expected at least three"),
         (["--data", "generated=many"], "expected a number of scenes"),
         (["--data", "nothing=."], "expected generated=N, or one of"),
         (["--data", "plain=/nowhere"], "/nowhere is not a folder"),

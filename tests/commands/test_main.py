@@ -133,6 +133,15 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
         (["batch", "{frames}", "--out", "{tmp}/out"], "no model is named"),
         (["batch", "{frames}", "--model", "demo", "--out", "{tmp}/out", "--smooth-frames", "2"], "an odd number"),
         (["reconstruct", "{tmp}", "--out", "{tmp}/out"], "no images"),
+        (["reconstruct", "{tmp}/a.mp4", "{tmp}/a.mp4", "--out", "{tmp}/out"], "a.mp4 is a video; give one"),
+        (["reconstruct", "{tmp}/a.mp4", "--out", "{tmp}/out"], "cannot read video"),
+        (
+            ["reconstruct", "{frames}", "--out", "{tmp}/out", "--fps", "2", "--stride", "2"],
+            "--fps is 2.0 and --stride is",
+        ),
+        (["train", "--recipe", "{tmp}/a.mp4", "--out", "{tmp}/out"], "vggtjax: recipe "),
+        (["import", "{tmp}/none", "--format", "monst3r", "--out", "{tmp}/out"], "there is no such folder"),
+        (["convert", "demo", "{tmp}/out.safetensors"], "demo is the embedded model, which needs no conversion"),
         (["reconstruct", "{frames}", "--model", "demo", "--out", "{tmp}/out", "--size", "100"], "100"),
         (["reconstruct", "{frames}", "--out", "{tmp}/out", "--stride", "0"], "stride"),
         (["reconstruct", "{frames}", "--model", "demo", "--out", "{tmp}/out", "--start", "7"], "start is 7"),
@@ -150,6 +159,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, frames, arguments, sentence):
     places = {"tmp": tmp_path, "frames": frames}
+    (tmp_path / "a.mp4").write_text("no video")
     code, _, err = run(capsys, *(a.format(**places) for a in arguments))
     assert code == 2
     last = err.strip().splitlines()[-1]

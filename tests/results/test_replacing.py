@@ -92,9 +92,9 @@ def test_error_of_the_callback_leaves_nothing_behind(tmp_path):
 
 def test_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"cannot write .*file"):
+    with pytest.raises(OutputError, match=r"cannot write .*file: .*file is a file; choose"):
         make_room(1).save(tmp_path / "file")
-    with pytest.raises(OutputError, match="cannot write"):
+    with pytest.raises(OutputError, match=r"below: .*file is a file"):
         make_room(1).save(tmp_path / "file" / "below")
 
 

@@ -14,6 +14,7 @@ from tests.generated import QUICK, textures
 from vggtjax.clips.clip import load_clip
 from vggtjax.commands.scenes import Images, scenes
 from vggtjax.errors import InputError, OutputError
+from vggtjax.evaluation.datasets import find_sequences
 from vggtjax.scenes import SceneConfig, dataset, generate
 from vggtjax.scenes.dataset import read_index, write_scenes
 from vggtjax.scenes.sheet import color_flow, color_parts, draw_sheet
@@ -54,6 +55,17 @@ def written(tmp_path_factory):
         patch.setattr(dataset, "_draw", quick)
         scenes(out, count=2, images=Images(frames=S, height=H, width=W), seed=3)
     return out
+
+
+def test_an_evaluation_reads_the_set(written):
+    (first, _) = find_sequences("plain", written).values()
+    sequence = first()
+    depth = np.load(written / "scene_0000/depth/00001.npy")
+    assert (len(sequence), sequence.notes) == (S, ())
+    assert np.allclose(sequence.depth(1), depth, atol=1e-3)
+    assert sequence.mask(1).shape == (H, W)
+    assert np.allclose(sequence.intrinsics[:, [0, 1], 2], [W / 2, H / 2])
+    assert np.abs(np.diff(sequence.world_from_camera[:, :3, 3], axis=0)).max() > 0
 
 
 def files(folder):

@@ -21,6 +21,7 @@ from vggtjax.progress import Progress, no_progress
 logger = logging.getLogger(__name__)
 
 _MOST_WORKERS = 4
+_LARGE_CUT = 0.1  # share of a frame's pixels
 _MOST_BYTES = 2**34  # of the images of one clip; over 5000 frames of 518 x 518
 
 
@@ -145,6 +146,10 @@ def read_clip(source: Source, sampling: Sampling, fitter: Fitter, progress: Prog
                 pixels.append(rendering.popleft().result())
             (progress or no_progress)(len(fits), total)
         pixels.extend(render.result() for render in rendering)
+    most = max(fits, key=lambda fit: fit.cut_share)
+    if most.cut_share > _LARGE_CUT:
+        size = "frames of {} x {} pixels lose".format(*most.source_size)
+        logger.warning("%s %.0f %% of their pixels above and below; --mode pad keeps all", size, 100 * most.cut_share)
     images, fits = _joined(pixels, fits)
     return Clip(
         images=images,

@@ -105,6 +105,11 @@ class Fit:
     box: tuple[int, int, int, int]
 
     @property
+    def cut_share(self) -> float:
+        """Share of the source's pixels above and below the frame."""
+        return 1 - (self.box[3] - self.box[1]) / self.resized_size[1]
+
+    @property
     def scale(self) -> tuple[float, float]:
         """Source pixels per frame pixel."""
         return self.source_size[0] / self.resized_size[0], self.source_size[1] / self.resized_size[1]

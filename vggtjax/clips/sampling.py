@@ -48,7 +48,7 @@ class Sampling:
         if isinstance(self.fps, bool) or not isinstance(self.fps, Real) or not 0 < self.fps < math.inf:
             raise InputError(f"fps is {self.fps!r}; expected a number of frames per second above 0")
         if self.step != 1:
-            raise InputError(f"fps={self.fps} and stride={self.stride} exclude each other; give one of them")
+            raise InputError(f"fps is {self.fps} and stride is {self.stride}, but they exclude each other; give one")
         object.__setattr__(self, "fps", float(self.fps))
 
     @property

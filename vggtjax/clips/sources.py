@@ -5,7 +5,6 @@ from __future__ import annotations
 import glob
 import os
 import re
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -57,13 +56,16 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
     two clips of one name.
     """
     found: dict[str, str] = {}
-    for path in map(Path, paths):
+    for text in paths:
+        path = Path(text)
         with reading(path, ClipError):
+            if not path.exists():
+                raise _missing(text)
             entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
             whole = not path.is_dir() or any(is_image_name(entry) for entry in entries)
         visible = [entry for entry in entries if not entry.name.startswith(".")]
         clips = [path] if whole else [entry for entry in visible if entry.is_dir() or is_video_name(entry)]
-        if not clips or not path.exists():
+        if not clips:
             raise ClipError(f"{path} is not a clip and holds no clips; expected folders of images, or videos")
         for clip in clips:
             name = clip.resolve().name if clip.is_dir() else clip.stem
@@ -95,10 +97,16 @@ def _from_path(name: str) -> Source:
             return _from_file(path)
         if path.exists():
             raise ClipError(f"{path} is neither a file nor a folder; expected images or a video")
-        if glob.has_magic(name):
+        if glob.has_magic(name) and "://" not in name:
             matches = [Path(match) for match in glob.glob(name, recursive=True)]  # noqa: PTH207 - absolute patterns too
             return _images(matches, f"pattern {name} matches", "expected images")
-    raise ClipError(f"'{path}' does not exist; expected a folder, a pattern, or an image or video file")
+    raise _missing(name)
+
+
+def _missing(name: str) -> ClipError:
+    if "://" in name:
+        return ClipError(f"{name} is a URL; download the file first, and give its path")
+    return ClipError(f"'{name}' does not exist; expected a folder, a pattern, or an image or video file")
 
 
 def _from_file(path: Path) -> Source:
@@ -113,6 +121,8 @@ def _from_list(paths: list[Path]) -> Source:
     for path in paths:
         if not os.path.isfile(path):  # noqa: PTH113 - False, not an error, for an over-long or forbidden path
             raise ClipError(f"image {path} does not exist or is not a file; check the list of frames")
+        if is_video_name(path):
+            raise ClipError(f"{path} is a video; give one video at a time, or several to vggtjax batch")
     return ImageFiles(tuple(path.absolute() for path in paths))
 
 
@@ -120,20 +130,18 @@ def _images(paths: list[Path], place: str, advice: str) -> Source:
     """Return the image files among `paths` in natural order, absolute; names that tie keep a fixed order."""
     images = [path.absolute() for path in paths if is_image_name(path) and path.is_file()]
     if not images:
-        raise ClipError(f"{place} no images but {_inventory(paths)}; {advice}")
+        raise ClipError(f"{place} no images{_inventory(paths)}; {advice}")
     return ImageFiles(tuple(sorted(images, key=lambda path: (natural_key(path), str(path)))))
 
 
 def _inventory(entries: list[Path]) -> str:
-    """Return in words the folders and videos by name, and other files by suffix."""
-    folders = sorted((entry for entry in entries if entry.is_dir()), key=natural_key)
-    videos = sorted((entry for entry in entries if entry.is_file() and is_video_name(entry)), key=natural_key)
-    endings = Counter(entry.suffix or "no ending" for entry in entries if entry.is_file() and not is_video_name(entry))
-    found = []
-    for kind, paths in (("folders", folders), ("videos", videos)):
-        if paths:
-            names = ", ".join(path.name for path in paths[:3]) + (", ..." if len(paths) > 3 else "")
-            found.append(f"{len(paths)} {kind} ({names})")
-    if endings:
-        found.append(f"{endings.total()} other files ({', '.join(ending for ending, _ in endings.most_common(3))})")
-    return " and ".join(found) or "nothing at all"
+    """Return in words, after a comma, the number of folders, videos and other files, and up to three names of each."""
+    names: dict[str, list[str]] = {"folder": [], "video": [], "other file": []}
+    for entry in sorted(entries, key=natural_key):
+        names["folder" if entry.is_dir() else "video" if is_video_name(entry) else "other file"].append(entry.name)
+    found = [
+        f"{len(some)} {kind}{'s' if len(some) > 1 else ''} ({', '.join(some[:3])}{', ...' if len(some) > 3 else ''})"
+        for kind, some in names.items()
+        if some
+    ]
+    return f", but {' and '.join(found)}" if found else ""

@@ -98,5 +98,6 @@ class _Clock:
         self._seconds = (time.perf_counter() - self._started) * (total / done - 1) if done and total else None
 
     def left(self) -> str:
-        """Return words for the remaining time; none before the first frame is done."""
-        return "" if self._seconds is None else f", {timedelta(seconds=round(self._seconds))} left"
+        """Return words for the remaining time; none before the first frame is done, or below half a second."""
+        left = timedelta(seconds=round(self._seconds or 0))
+        return f", {left} left" if left else ""

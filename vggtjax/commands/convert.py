@@ -81,4 +81,7 @@ def info(model: tyro.conf.Positional[str] = "demo", /, *, config: Path | None = 
     report = Report()
     with report.running():
         network = load(report, model, config)
-    report.table(network.summary())
+    summary = network.summary()
+    if network.path is not None:
+        summary["bytes"] = f"{summary['bytes']} in memory, {network.path.stat().st_size} in the file"
+    report.table(summary | {"dtype": f"{summary['dtype']} in memory"})

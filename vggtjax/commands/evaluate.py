@@ -40,6 +40,9 @@ class EvaluatedFrames(Sampling):
 class Candidates(ModelFiles):
     """A model and its methods."""
 
+    model: Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="(required without --results)")] = (
+        None
+    )
     methods: str | None = None
     """names of methods, with commas; all five by default; methods that mine alike share one run of the passes"""
 
@@ -117,7 +120,7 @@ def evaluate(
         dataset: name of the data set, such as plain, sintel or davis; an unknown name lists all.
         root: folder of the data set, or of one sequence of it.
         out: folder for results.json, results.csv, table.md, table.tex and index.html.
-        candidates: the model, required unless --results is given, and its methods
+        candidates: the model and its methods
         folders: results of other programs
         scores: what is scored, and how
         sampling: which frames of a sequence

@@ -38,10 +38,12 @@ class Clips:
         check_fields(self)
 
     def check(self) -> None:
-        """Raise InputError for an unknown data set, an invalid number of scenes or frames, or a missing folder."""
-        from vggtjax.evaluation.datasets import DATASETS
+        """Raise InputError for an unknown data set, invalid numbers of clips or frames, or a missing folder."""
+        from vggtjax.evaluation.datasets import DATASETS, find_sequences
+        from vggtjax.learning.ablation import split_clips
         from vggtjax.scenes.held_out import MIN_FRAMES
 
+        count = 0
         for text in self.data:
             name, _, place = text.partition("=")
             if not place:
@@ -53,11 +55,15 @@ class Clips:
                     raise InputError(
                         f"max_frames is {self.max_frames}; generated scenes have at least {MIN_FRAMES} frames"
                     )
+                count += int(place)
             elif name not in DATASETS:
                 names = ", ".join(DATASETS)
                 raise InputError(f"--data has {text!r}; expected generated=N, or one of {names} and a folder")
             elif not Path(place).is_dir():
                 raise InputError(f"--data has {text!r}, and {place} is not a folder")
+            else:
+                count += len(find_sequences(name, place))
+        split_clips(count, 0)
 
     def passes(self, report: Report, model: Model, options: Options) -> dict[str, ClipPasses]:
         """Return the passes over clips by name, aligned with `align_scale`; each source is a stage of the report."""

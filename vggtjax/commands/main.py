@@ -9,6 +9,7 @@ import gc
 import io
 import logging
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -77,10 +78,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _with_flag(message: str, arguments: Sequence[str]) -> str:
-    """Return a message about a field ("mask_pairs is ...") with the flag that the user gave ("--mask-pairs is ...")."""
-    field, *rest = message.split(" ", 1)
-    flag = f"--{field.replace('_', '-')}"
-    return " ".join([flag, *rest]) if any(argument.split("=")[0] == flag for argument in arguments) else message
+    """Return a message about fields ("mask_pairs is ...") with the flags that the user gave ("--mask-pairs is ...")."""
+    flags = {argument.split("=")[0] for argument in arguments}
+
+    def named(field: re.Match[str]) -> str:
+        flag = f"--{field[0].replace('_', '-')}"
+        return flag if flag in flags else field[0]
+
+    return re.sub(r"(?:^|(?<= and ))\w+(?= is )", named, message)
 
 
 def _parsed(arguments: Sequence[str]) -> Callable[[], None]:

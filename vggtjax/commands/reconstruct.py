@@ -95,7 +95,9 @@ def reconstruct(
         from vggtjax.clips.sources import open_source
         from vggtjax.results.folder import check_folder
 
-        opened = open_source(frames)  # before the model is loaded, which takes longer
+        opened = open_source(frames)
+        opened.total(sampling)
+        next(opened.frames(Sampling()))  # finds a broken source before the model is loaded, which takes longer
         known.check(options)
         optional = {"tracks.npz": known.tracks is not None, "vggt4d": saving.format == "vggt4d"}
         check_folder(out, [name for name, is_written in optional.items() if is_written])

@@ -41,7 +41,7 @@ def scenes(
     split: Literal["training", "test"] = "training",
     seed: int = 0,
 ) -> None:
-    """Generate clips of rooms with exact depth, masks, parts, flow and cameras, as a data set.
+    """Generate clips of rooms with exact depth, masks, parts, flow and cameras; `vggtjax evaluate plain` reads them.
 
     Args:
         out: folder of the set; existing scenes are kept, so the same command resumes an interrupted set.

@@ -81,8 +81,8 @@ def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress
     key = hashlib.sha256("\n".join(facts).encode("utf-8", "surrogateescape")).hexdigest()[:16]
     destination = cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', name)[:80]}-{key}.safetensors"
     if not _is_whole(destination):
-        logger.info("converting %s to %s, once", path, destination)
         convert_weights(Weights(path, name), destination, dtype=dtype, config=config, progress=progress)
+        logger.info("converted %s to %s, once", path, destination)
     logger.info("loading %s", destination)
     return destination
 

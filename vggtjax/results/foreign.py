@@ -71,10 +71,11 @@ class _Folder(NamedTuple):
 def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict[str, Any]:
     """Read the result folder of another program as fields of a `Result`; see `Reconstruction.load`.
 
-    Raises ClipError or ResultError, without the path, for anything but a whole folder.
+    Raises ClipError or ResultError, without the path, for anything but a whole folder; else what `check_format` raises.
     """
     if not path.exists() or (format != "da3" and not path.is_dir()):
         raise ResultError("there is no such folder")
+    check_format(format, quaternion)
     fields = _read_da3(path) if format == "da3" else _read_folder(path, _FOLDERS[format], quaternion)
     S, H, W = fields["depth"].shape
     plain = {
@@ -106,8 +107,8 @@ def check_format(format: str, quaternion: str | None) -> None:
     check_choice("format", format, ("vggtjax", *FORMATS))
     if quaternion is None and format in _WITH_TRAJECTORY:
         raise InputError(
-            f"pred_traj.txt of {format} does not say the order of its quaternions; give quaternion='wxyz' (as VGGT4D, "
-            "MonST3R, CUT3R, Easi3R and vggtjax write them) or 'xyzw' (TUM's order, and that of earlier vggtjax)"
+            f"pred_traj.txt of {format} does not say the order of its quaternions; give --quaternion wxyz (as VGGT4D, "
+            "MonST3R, CUT3R, Easi3R and vggtjax write them) or xyzw (TUM's order, and that of earlier vggtjax)"
         )
     if quaternion is not None and (quaternion not in get_args(Quaternion) or format not in _WITH_TRAJECTORY):
         raise InputError(

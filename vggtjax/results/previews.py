@@ -27,7 +27,7 @@ _SHEET_FRAMES = 8
 _SHEET_WIDTH = 1800  # pixels of all columns
 _TITLE_WIDTH = 700  # least pixels of the title
 _THUMBNAIL = (480, 300)  # widest and highest
-_MARGIN, _GAP, _LABEL_WIDTH, _LEGEND_WIDTH, _HEADER_HEIGHT = 24, 6, 150, 120, 88
+_MARGIN, _GAP, _LABEL_WIDTH, _LEGEND_WIDTH, _HEADER_HEIGHT = 24, 6, 150, 120, 104
 BACKGROUND, TEXT, FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)  # of every sheet
 
 

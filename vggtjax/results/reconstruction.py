@@ -92,9 +92,8 @@ class Reconstruction(Result):
         """
         path, format = Path(path), layout or format
         if format != "vggtjax":
-            from vggtjax.results.foreign import check_format, read_foreign
+            from vggtjax.results.foreign import read_foreign
 
-            check_format(format, quaternion)
             try:
                 return cls(**read_foreign(path, format, quaternion))
             except (ClipError, ResultError) as error:

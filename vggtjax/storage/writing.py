@@ -115,7 +115,9 @@ def write_errors(path: Path) -> Iterator[None]:
     except OutputError:
         raise
     except OSError as error:
-        reason = error.strerror or str(error)
+        is_blocked = isinstance(error, FileExistsError | NotADirectoryError)
+        file = next((part for part in (path, *path.parents) if part.is_file()), None) if is_blocked else None
+        reason = f"{file} is a file" if file else error.strerror or error
         raise OutputError(f"cannot write {path}: {reason}; choose a folder that is writable and has space") from error
 
 

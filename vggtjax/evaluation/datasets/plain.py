@@ -1,5 +1,7 @@
 """Plain folders: rgb/, and optionally depth/, mask/, K.txt and world_from_camera.txt. Does not import jax.
 
+Clips of `vggtjax scenes` are read too: images/, intrinsics.txt and trajectory.txt stand for the first and the last two.
+
 Depth is PNG of 16 bits in millimetres, 0 where it is unknown; masks are pictures, bright where the world moves. K.txt
 has three rows of three numbers for all frames, or three rows for each; world_from_camera.txt a row of 16 numbers for
 each frame, in metres. Intrinsics are not shifted by half a pixel: the pixel origin of the HoloLens is unknown, and half
@@ -25,7 +27,7 @@ from vggtjax.evaluation.datasets.folders import files, sequence_folders
 from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader, mask_reader
 from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
-from vggtjax.storage.trajectories import read_numbers
+from vggtjax.storage.trajectories import read_numbers, read_trajectory
 
 _NEW_TAKE = 10.0  # times the median step of the camera: a jump between two takes
 _PER_METRE = 1000.0
@@ -34,7 +36,7 @@ _PER_METRE = 1000.0
 def plain(root: Path) -> dict[str, Opener]:
     """Find plain folders; a folder with several takes, between which the camera jumps, has a sequence for each take."""
     openers: dict[str, Opener] = {}
-    for name, folder in sequence_folders(root, lambda folder: (folder / "rgb").is_dir(), "a folder rgb").items():
+    for name, folder in sequence_folders(root, _holds_pictures, "a folder rgb").items():
         try:
             poses = _poses(folder)
         except InputError:  # the opener raises it
@@ -86,27 +88,36 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
     )
 
 
+def _holds_pictures(folder: Path) -> bool:
+    return (folder / "rgb").is_dir() or all((folder / name).exists() for name in ("images", "trajectory.txt"))
+
+
 def _pictures(folder: Path) -> list[Path]:
-    pictures = [path for path in (folder / "rgb").iterdir() if is_image_name(path) and not path.name.startswith(".")]
+    place = folder / ("rgb" if (folder / "rgb").is_dir() else "images")
+    pictures = [path for path in place.iterdir() if is_image_name(path) and not path.name.startswith(".")]
     if not pictures:
-        raise InputError(f"{folder / 'rgb'} holds no pictures; expected one for each frame")
+        raise InputError(f"{place} holds no pictures; expected one for each frame")
     if len({path.stem for path in pictures}) < len(pictures):
-        raise InputError(f"{folder / 'rgb'} holds two pictures of one name; expected one for each frame")
+        raise InputError(f"{place} holds two pictures of one name; expected one for each frame")
     return sorted(pictures, key=natural_key)
 
 
 def _poses(folder: Path) -> Float64[np.ndarray, "S 4 4"] | None:
-    path = folder / "world_from_camera.txt"
+    path, trajectory = folder / "world_from_camera.txt", folder / "trajectory.txt"
     if not path.is_file():
-        return None
+        return read_trajectory(trajectory)[1] if trajectory.is_file() else None
     return checked_world_from_camera(read_numbers(path, 16).reshape(-1, 4, 4), path)
 
 
 def _intrinsics(folder: Path, count: int) -> Float64[np.ndarray, "S 3 3"] | None:
-    path = folder / "K.txt"
-    if not path.is_file():
+    path, focals = folder / "K.txt", folder / "intrinsics.txt"
+    if path.is_file():
+        rows = read_numbers(path, 3)
+    elif focals.is_file():
+        rows = np.array([[(fx, 0, cx), (0, fy, cy), (0, 0, 1)] for fx, fy, cx, cy in read_numbers(focals, 4)])
+        rows, path = rows.reshape(-1, 3), focals
+    else:
         return None
-    rows = read_numbers(path, 3)
     if len(rows) not in (3, 3 * count):
         raise InputError(f"{path} has {len(rows)} rows; expected 3, or 3 for each of {count} pictures")
     return np.broadcast_to(checked_intrinsics(rows.reshape(-1, 3, 3), path), (count, 3, 3))

@@ -47,7 +47,7 @@ class Dataset:
 _ROOM = ("depth", "poses", "intrinsics")
 
 DATASETS: Mapping[str, Dataset] = {
-    "plain": Dataset(plain, "folders of rgb/, depth/, mask/, cameras", (*_ROOM, "masks")),
+    "plain": Dataset(plain, "folders of rgb/, depth/, mask/, cameras; clips of vggtjax scenes", (*_ROOM, "masks")),
     "composite": Dataset(plain, "filmed objects pasted into a filmed room", (*_ROOM, "masks")),
     "hololens": Dataset(plain, "a static room, filmed in two takes", _ROOM),
     "tum": Dataset(tum, "TUM RGB-D, moving people", _ROOM, FrameChoice(stride=3, most=90), published.TUM),
