@@ -143,7 +143,7 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
         (["--data", "generated=many"], "expected a number of scenes"),
         (["--data", "nothing=."], "expected generated=N, or one of"),
         (["--data", "plain=/nowhere"], "/nowhere is not a folder"),
-        (["--data", "generated=3", "plain=."], "no model is named; give --model"),
+        (["--data", "generated=3", "plain={tmp}"], "no model is named; give --model"),
         (["--family", "best"], "there is no 'best'"),
         (["--seeds", "0"], "seeds is 0"),
         (["--steps", "0"], "steps is 0"),
@@ -154,7 +154,8 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset
     ],
 )
 def test_bad_input_is_one_sentence(arguments, sentence, tmp_path, capsys):
-    assert run("fit-fusion", "--out", tmp_path / "out", *arguments) == 2
+    (tmp_path / "clip" / "rgb").mkdir(parents=True)
+    assert run("fit-fusion", "--out", tmp_path / "out", *(text.format(tmp=tmp_path) for text in arguments)) == 2
     assert sentence in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
