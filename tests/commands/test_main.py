@@ -193,6 +193,8 @@ def test_a_reader_that_ends_early_is_no_error(arguments):
     with subprocess.Popen(
         [sys.executable, "-m", "vggtjax", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
         process.stdout.close()
         assert process.stderr.read() == b""
     assert process.returncode == 1

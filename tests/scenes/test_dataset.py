@@ -3,6 +3,7 @@ import json
 import re
 import subprocess
 import sys
+from typing import Any
 
 import jax
 import numpy as np
@@ -59,7 +60,7 @@ def written(tmp_path_factory):
 
 def test_an_evaluation_reads_the_set(written):
     (first, _) = find_sequences("plain", written).values()
-    sequence = first()
+    sequence: Any = first()  # with depth, masks and cameras
     depth = np.load(written / "scene_0000/depth/00001.npy")
     assert (len(sequence), sequence.notes) == (S, ())
     assert np.allclose(sequence.depth(1), depth, atol=1e-3)
