@@ -35,6 +35,7 @@ def second_pass(
     scenes: int = 64,
     frames: int = 12,
     seed: int = 0,
+    size: int | None = None,
     pairs: tuple[int, ...] = (1, 2, 3, 5),
     suppress: Literal["zero", "drop"] = "zero",
 ) -> None:
@@ -45,6 +46,7 @@ def second_pass(
         scenes: number of held-out dynamic scenes, at least two.
         frames: frames of a scene.
         seed: another seed draws other scenes.
+        size: side of the frames in pixels; the model's own by default.
         pairs: numbers of pairs in which keys are suppressed.
         suppress: how keys are suppressed.
     """
@@ -52,7 +54,7 @@ def second_pass(
         raise InputError(f"scenes is {scenes}; expected at least 2: each scene uses the mask of another")
     loaded = load_model(model)
     config = loaded.config
-    side = config.image_size
+    side = size or config.image_size
     wanted = SceneConfig(height=side, width=side, frames=frames)
     console = Console()
     with console.status("scenes"):
