@@ -1,7 +1,9 @@
 import dataclasses
 import json
+from functools import partial
 from pathlib import Path
 
+import jax
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,8 +11,11 @@ from hypothesis import strategies as st
 from tests.training_runs import RECIPE
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.training.objective import LossWeights
+from vggtjax.scenes import load_textures
+from vggtjax.training.data import make_batch
+from vggtjax.training.objective import LossWeights, init_probes, objective
 from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe, read_recipe
+from vggtjax.training.state import loss_and_gradient, state_shapes
 
 PHASE = {"steps": 5, "batch": 2, "frames": [2, 4], "height": 28, "width": 42}
 
@@ -138,9 +143,26 @@ def test_lists_in_python_become_tuples():
     assert LossWeights(match_layers=[0, 1]).match_layers == (0, 1)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "docs" / "embedded").glob("*.json")), ids=str)
-def test_recipes_of_the_embedded_model_load(path):
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+@pytest.mark.parametrize("path", sorted(DOCS.glob("*/*.json")), ids=lambda path: path.stem)
+def test_recipes_of_the_docs_load(path):
     recipe = read_recipe(path)
     assert Recipe.from_json(recipe.to_json()) == recipe
     for phase, read in zip(json.loads(path.read_text())["stages"], json.loads(recipe.to_json())["stages"], strict=True):
         assert read == read | phase  # later fields have their defaults
+
+
+def test_the_recipe_for_a_gpu_fits_the_wheel_and_takes_a_step():
+    """The model takes at most 24 MB in bfloat16; shapes of a step of the last phase, at its most frames."""
+    recipe = read_recipe(DOCS / "recipes" / "gpu.json")
+    state = state_shapes(recipe, init_probes(0, recipe.model))
+    assert 2 * sum(leaf.size for leaf in jax.tree.leaves(state.trained["model"])) < 24e6
+    phase = recipe.stages[-1]
+    draw = partial(make_batch, textures=load_textures("training"), phase=phase, frames=max(phase.frames))
+    batch = jax.eval_shape(draw, jax.random.key(0))
+    step = partial(loss_and_gradient, recipe=recipe, objective=objective)
+    metrics, gradient = jax.eval_shape(step, state.trained, batch)
+    assert metrics["loss"].shape == ()
+    assert jax.tree.structure(gradient) == jax.tree.structure(state.ema)
