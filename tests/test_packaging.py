@@ -28,6 +28,10 @@ def test_the_wheel_works_outside_the_repository(tmp_path):
     assert {"vggtjax/__init__.pyi", "vggtjax/py.typed"} <= set(names)
     (entry_points,) = (tmp_path / "installed").glob("*.dist-info/entry_points.txt")
     assert "vggtjax = vggtjax.__main__:run" in entry_points.read_text()
+    (metadata,) = (tmp_path / "installed").glob("*.dist-info/METADATA")
+    needed = [line for line in metadata.read_text().splitlines() if line.startswith("Requires-Dist: av")]
+    assert needed  # videos are read without an extra
+    assert not any("extra" in line for line in needed)
     code = "import vggtjax, converters; print(vggtjax.__file__); vggtjax.forward; converters.convert; vggtjax.METHODS"
     made = subprocess.run(
         [sys.executable, "-P", "-c", code],

@@ -119,7 +119,7 @@ def test_masks_that_cannot_be_told_apart(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore:the field of view")  # seeded weights give odd cameras
-def test_given_masks_replace_the_mined_ones(params, config):
+def test_given_masks_replace_the_mined_ones(params, config, tmp_path):
     images = seeded_images(3, 56, 56, seed=4).transpose(0, 2, 3, 1)
     clip, model = load_clip(images, size=56), Model(config, params, "tiny")
     masks = np.zeros(clip.images.shape[:3], bool)
@@ -136,7 +136,9 @@ def test_given_masks_replace_the_mined_ones(params, config):
         reconstruct(model, clip, size=56, masks=masks[:2])
     of_source = masks.repeat(2, axis=1).repeat(2, axis=2)  # at the size of the source's pictures
     large = images.repeat(2, axis=1).repeat(2, axis=2)
-    loaded = reconstruct(model, large, size=56, masks=of_source, method="vggt")  # a source instead of a clip
+    for index, picture in enumerate(large):
+        Image.fromarray(np.uint8(255 * picture)).save(tmp_path / f"{index}.png")
+    loaded = reconstruct(model, str(tmp_path), size=56, masks=of_source, method="vggt")  # a path instead of a clip
     assert np.array_equal(loaded.dynamic_mask, masks)
 
 

@@ -1,5 +1,8 @@
+from typing import Any
+
 import numpy as np
 import pytest
+import trimesh
 
 from tests.room import make_room
 from vggtjax.results import point_cloud
@@ -31,6 +34,27 @@ def test_what_moves_stays_in_the_same_share(resolution):
     for region in (False, True):
         chosen = np.concatenate([f.confident(least)[f.valid & (f.dynamic_mask == region)] for f in frames])
         assert chosen.mean() == pytest.approx(0.8, abs=2e-3)
+
+
+def load_cloud(path) -> Any:
+    return trimesh.load(path)
+
+
+def test_files_keep_what_moves_in_the_same_share(tmp_path):
+    room = make_room(frames=4)
+    confidence = (room.depth_confidence + ~room.dynamic_mask).astype(np.float32)
+    make_room(frames=4, depth_confidence=confidence).save(tmp_path)
+    count = {path: len(load_cloud(path).vertices) for path in tmp_path.rglob("*.ply")}
+    static = count.pop(tmp_path / "static.ply")
+    scene = trimesh.load_scene(tmp_path / "scene.glb").geometry
+    moving = sum(len(part.vertices) for name, part in scene.items() if name.startswith("dynamic"))
+    shares = {
+        "static.ply": static / (~room.dynamic_mask).sum(),
+        "frames/": (sum(count.values()) - static) / room.dynamic_mask.sum(),
+        "static in scene.glb": len(scene["static"].vertices) / (~room.dynamic_mask).sum(),
+        "dynamic in scene.glb": moving / room.dynamic_mask.sum(),
+    }
+    assert shares == pytest.approx(dict.fromkeys(shares, 0.8), abs=2e-3)
 
 
 def test_clouds_are_the_chosen_points():
