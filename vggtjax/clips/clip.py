@@ -21,7 +21,7 @@ from vggtjax.progress import Progress, no_progress
 logger = logging.getLogger(__name__)
 
 _MOST_WORKERS = 4
-_LARGE_CUT = 0.1  # share of a frame's pixels
+_LARGE_CUT = 0.1  # share of a picture's pixels; larger cuts are warned about
 _MOST_BYTES = 2**34  # of the images of one clip; over 5000 frames of 518 x 518
 
 

@@ -18,6 +18,7 @@ MODEL = Path(__file__).with_name("model.safetensors")
 CLIP = MODEL.with_name("clip.npz")
 NOTE = "small demonstration model, trained on generated scenes; not for real footage"
 UNTRAINED_HEADS = ("points", "tracks")
+_LABELS: dict[str, Any] = {"note": NOTE, "untrained_heads": UNTRAINED_HEADS}  # this file's metadata lacks them
 SCENE_SEED = 100  # of held-out dynamic scenes; the clip is the first of them; no evaluation uses this seed
 _NEAREST = np.float32(1e-3)  # metres
 _STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
@@ -30,16 +31,12 @@ def demo_model(dtype: DType = "float32") -> Model:
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
-    return read_model(MODEL, dtype=dtype, **embedded_labels(MODEL))
+    return read_model(MODEL, dtype=dtype, **_LABELS)
 
 
 def embedded_labels(path: Path) -> dict[str, Any]:
-    """Return note and untrained heads for the embedded model's file or a copy of it; nothing for other files.
-
-    The metadata of this file lacks both: the file is older than these fields of a checkpoint.
-    """
-    is_embedded = MODEL.is_file() and filecmp.cmp(path, MODEL)
-    return {"note": NOTE, "untrained_heads": UNTRAINED_HEADS} if is_embedded else {}
+    """Return note and untrained heads for the embedded model's file or a copy of it; nothing for other files."""
+    return _LABELS if MODEL.is_file() and filecmp.cmp(path, MODEL, shallow=False) else {}
 
 
 def demo_clip(path: Path = CLIP) -> Truth:

@@ -47,7 +47,7 @@ def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
 
 @contextmanager
 def replacing(folder: Path, optional: Sequence[str]) -> Iterator[Path]:
-    """Yield an empty folder; at the end its files, the archive and all `NAMES` among them, replace those in it.
+    """Yield an empty folder, whose files (the archive and all `NAMES` among them) replace those of `folder` at the end.
 
     If anything fails, the earlier result is left untouched. Raises what `check_folder` raises, and ValueError for a new
     file of another name.
