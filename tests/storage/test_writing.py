@@ -173,6 +173,28 @@ def test_a_folder_that_another_run_fills_during_its_check_stays(tmp_path, monkey
     assert (tmp_path / "a/b/other").exists()
 
 
+@pytest.mark.parametrize("context", [staging, lambda folder: locked_folder(folder, "a result")])
+def test_a_folder_that_another_check_removes_is_made_again(tmp_path, monkeypatch, context):
+    folder, open_file, removed = tmp_path / "out", os.open, []
+
+    def late(path, *arguments, **options):
+        if str(path).endswith(".lock") and len(removed) < often:
+            removed.append(path)
+            folder.rmdir()
+        return open_file(path, *arguments, **options)
+
+    monkeypatch.setattr(os, "open", late)
+    often = 2
+    with context(folder):
+        assert len(removed) == 2
+        (folder / "file").touch()
+    assert [path.name for path in folder.iterdir()] == ["file"]
+    (folder / "file").unlink()
+    often = 1000
+    with pytest.raises(OutputError, match="another program removes it again and again"), context(folder):
+        pass
+
+
 def test_a_locked_folder_has_one_writer(tmp_path):
     folder = tmp_path / "out"
     sentence = f"another run is writing the batch into {folder}; wait for it or choose another folder"

@@ -64,9 +64,8 @@ def locked_folder(folder: str | Path, what: str, wait: float = 0) -> Iterator[No
     """
     path = Path(folder) / ".vggtjax.lock"
     with write_errors(path.parent):
-        path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            lock = _acquire(path, wait)
+            lock = _acquire_in(path.parent, path.name, wait)
         except Timeout:
             message = f"another run is writing {what} into {folder}; wait for it or choose another folder"
             raise OutputError(message) from None
@@ -124,15 +123,14 @@ def write_errors(path: Path) -> Iterator[None]:
 @contextmanager
 def _staged(folder: Path) -> Iterator[Path]:
     """Yield a new temporary folder. Other writers see its lock file beside it, and do not remove the folder."""
-    folder.mkdir(parents=True, exist_ok=True)
-    _remove_leftovers(folder)
     lock, staged = None, folder
     for _ in range(_TRIES):  # another writer may remove our lock file, as a leftover, before we lock it: try again
         staged = folder / f"{_MARK}{token_hex(8)}"
         with suppress(Timeout):
-            lock = _acquire(staged.with_suffix(".lock"))
+            lock = _acquire_in(folder, f"{staged.name}.lock")
             break
     try:
+        _remove_leftovers(folder)
         staged.mkdir()
         yield staged
     finally:
@@ -151,6 +149,18 @@ def _remove_leftovers(folder: Path) -> None:
                     _release(lock)
             elif time.time() - path.lstat().st_mtime > _OLD and not path.with_suffix(".lock").exists():
                 shutil.rmtree(path)
+
+
+def _acquire_in(folder: Path, name: str, wait: float = 0) -> FileLock | None:
+    """Make `folder` if it is missing, and return what `_acquire` returns for a file in it.
+
+    Another process may make the same folder for a check, and remove it before our file is there: then try again.
+    """
+    for _ in range(_TRIES):
+        folder.mkdir(parents=True, exist_ok=True)
+        with suppress(FileNotFoundError):
+            return _acquire(folder / name, wait)
+    raise OutputError(f"cannot write {folder}: another program removes it again and again; choose another folder")
 
 
 def _acquire(path: Path, wait: float = 0) -> FileLock | None:
