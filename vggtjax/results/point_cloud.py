@@ -39,18 +39,22 @@ class PointCloud:
         return len(self.points)
 
 
-def least_confidence(result: Result, confidence_percentile: float) -> LeastConfidence:
+def least_confidence(
+    result: Result, confidence_percentile: float, dynamic_percentile: float | None = None
+) -> LeastConfidence:
     """Return the confidence that `confidence_percentile` percent of the clip's valid pixels do not reach.
 
     Static and dynamic pixels have a percentile each, over all frames at the model's size: fused confidence is the sum
     of two passes in static pixels and of one in dynamic pixels, so a common percentile would remove moving points.
+    `dynamic_percentile` is another share for the dynamic ones.
     """
 
-    def percentile(pixels: Bool[np.ndarray, "S H W"]) -> float:
-        return float(np.percentile(result.depth_confidence[pixels], confidence_percentile)) if pixels.any() else 0.0
+    def percentile(pixels: Bool[np.ndarray, "S H W"], share: float) -> float:
+        return float(np.percentile(result.depth_confidence[pixels], share)) if pixels.any() else 0.0
 
-    valid = result.valid_pixels
-    return LeastConfidence(percentile(valid & ~result.dynamic_mask), percentile(valid & result.dynamic_mask))
+    valid, moving = result.valid_pixels, result.dynamic_mask
+    share = confidence_percentile if dynamic_percentile is None else dynamic_percentile
+    return LeastConfidence(percentile(valid & ~moving, confidence_percentile), percentile(valid & moving, share))
 
 
 def frame_cloud(frame: ResultFrame, pixels: Bool[np.ndarray, "h w"]) -> PointCloud:
