@@ -5,8 +5,8 @@ those that are fitted to, those that tell when to stop, and those that the score
 
     python examples/learned_fusion.py --out learned-fusion
 
-and look at table.md and the pictures; docs/fusion.md says what came out here. The passes over the scenes are kept: a
-second run has only the fits to do.
+and look at table.md and the pictures; docs/research-notes/learned-fusion.md says what came out here. The passes over
+the scenes are kept: a second run has only the fits to do.
 """
 
 from __future__ import annotations

@@ -32,15 +32,15 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
 
 def test_the_python_of_the_docs_runs():
     """Pages that show Python; gradients through the embedded model are part of it."""
-    page = (README.parent / "docs" / "fusion.md").read_text(encoding="utf-8")
+    page = (README.parent / "docs" / "research-notes" / "learned-fusion.md").read_text(encoding="utf-8")
     (block,) = (part.split("```")[0] for part in page.split("```python\n")[1:])
     names: dict = {}
-    exec(compile(block, "docs/fusion.md", "exec"), names)
+    exec(compile(block, "docs/research-notes/learned-fusion.md", "exec"), names)
     assert names["by_masking"].temperature != 0
     assert all(np.isfinite(leaf).all() for leaf in (*names["by_masking"], *names["by_rule"].values()))
 
 
-@pytest.mark.parametrize("page", [README, *sorted((README.parent / "docs").glob("*.md"))], ids=lambda page: page.name)
+@pytest.mark.parametrize("page", [README, *sorted((README.parent / "docs").rglob("*.md"))], ids=lambda page: page.name)
 def test_every_link_to_a_file_leads_somewhere(page):
     links = re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8"))
     missing = [link for link in links if "://" not in link and not (page.parent / link).exists()]

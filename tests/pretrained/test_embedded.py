@@ -25,7 +25,7 @@ def test_the_files_are_small_enough_for_the_wheel():
 
 def test_the_model_is_the_documented_one():
     digest = hashlib.sha256(demo.MODEL.read_bytes()).hexdigest()
-    assert digest in (DOCS / "model.md").read_text()
+    assert digest in (DOCS / "research-notes" / "embedded-model.md").read_text()
     model = demo.demo_model()
     assert model.note.endswith("not for real footage")
     assert model.summary()["heads"] == ["camera", "depth", "points (untrained)", "tracks (untrained)"]

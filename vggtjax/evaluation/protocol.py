@@ -46,7 +46,7 @@ def score(
     empty: Empty = "davis",
     progress: Progress | None = None,
 ) -> Scores:
-    """Score a result by each protocol of docs/evaluation.md that the sequence has ground truth for.
+    """Score a result by each protocol of docs/reference/evaluation-protocols.md that the sequence has ground truth for.
 
     Args:
         result: of the sequence's frames, in their order.

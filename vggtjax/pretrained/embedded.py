@@ -25,9 +25,9 @@ _STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
 
 
 def demo_model(dtype: DType = "float32") -> Model:
-    """Return the embedded model, trained on generated static scenes; docs/model.md has its training and accuracy.
+    """Return the embedded model, trained on generated static scenes.
 
-    Raises CheckpointError if the file is missing.
+    docs/research-notes/embedded-model.md has its training and accuracy. Raises CheckpointError if the file is missing.
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
