@@ -91,7 +91,7 @@ def test_masks_and_previews(saved):
             np.testing.assert_array_equal(np.asarray(picture), make_room().instances[frame])
         for name in ("depth", "overlay"):
             with Image.open(saved / f"preview/{name}/{frame:06d}.png") as picture:
-                assert (picture.mode, picture.size) == ("RGB", (42, 28))
+                assert (picture.mode, picture.size) == ("RGB", (12 * 42, 12 * 28))  # the data keep their size
 
 
 def test_trajectory_has_the_clips_times_or_else_frame_numbers(saved, tmp_path):
@@ -144,7 +144,7 @@ def test_original_resolution(tmp_path):
         with Image.open(tmp_path / f"mask/{frame:06d}.png") as picture:
             np.testing.assert_array_equal(np.asarray(picture) > 0, expected.dynamic_mask)
         with Image.open(tmp_path / f"preview/overlay/{frame:06d}.png") as picture:
-            assert picture.size == (84, 56)
+            assert picture.size == (6 * 84, 6 * 56)
         cloud = read_ply(tmp_path / f"frames/{frame:06d}.ply")
         np.testing.assert_allclose(cloud.vertices, expected.world_points().reshape(-1, 3), rtol=1e-5, atol=1e-6)
         assert (cloud.colors[:, :3] == 50 * frame).all()

@@ -111,7 +111,7 @@ def test_confidence_that_was_zero_in_monst3r(tmp_path):
 
 def test_the_order_of_quaternions_must_be_said_and_matters(tmp_path):
     WRITERS["vggt4d"](tmp_path / "x")
-    with pytest.raises(InputError, match="does not say the order of its quaternions; give --quaternion wxyz"):
+    with pytest.raises(InputError, match="does not say the order of its quaternions; give quaternion 'wxyz'"):
         Reconstruction.load(tmp_path / "x", layout="vggt4d")
     wrong = Reconstruction.load(tmp_path / "x", layout="vggt4d", quaternion="xyzw")
     assert np.abs(wrong.camera_from_world - ROOM.camera_from_world).max() > 0.1

@@ -58,6 +58,21 @@ def test_sheet_shows_frames_in_columns(frames):
     assert min(frames, 8) <= len(starts) <= 2 * min(frames, 8)
 
 
+def test_a_sheet_has_no_row_for_no_saliency():
+    heights = [
+        previews.contact_sheet(make_room(2, saliency=saliency)).shape[0]
+        for saliency in (None, np.zeros((2, 2, 3)), np.full((2, 2, 3), np.nan), np.full((2, 2, 3), 0.1))
+    ]
+    assert heights[0] == heights[1] == heights[2] < heights[3]
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"), [((112, 112), (560, 560)), ((480, 14), (14, 480)), ((294, 518), (518, 294))]
+)
+def test_previews_are_enlarged_by_whole_factors(shape, size):
+    assert previews.enlarged(shape) == size
+
+
 def test_sheet_of_tall_pictures_without_times_or_depth():
     room = make_room(2, 140, 14, timestamps=None, depth=np.zeros((2, 140, 14)), saliency=np.full((2, 10, 1), np.nan))
     assert previews.contact_sheet(room).shape[0] < 1500

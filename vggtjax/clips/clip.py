@@ -149,7 +149,8 @@ def read_clip(source: Source, sampling: Sampling, fitter: Fitter, progress: Prog
     most = max(fits, key=lambda fit: fit.cut_share)
     if most.cut_share > _LARGE_CUT:
         size = "frames of {} x {} pixels lose".format(*most.source_size)
-        logger.warning("%s %.0f %% of their pixels above and below; --mode pad keeps all", size, 100 * most.cut_share)
+        cut = 100 * most.cut_share
+        logger.warning("%s %.0f %% of their pixels above and below; mode 'pad' (--preprocess pad) keeps all", size, cut)
     images, fits = _joined(pixels, fits)
     return Clip(
         images=images,

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Literal, TypedDict, get_args
+from typing import Annotated, Literal, TypedDict, get_args
 
 import numpy as np
+import tyro
 from jaxtyping import UInt8
 from PIL import Image
 
@@ -21,7 +22,7 @@ _MOST_PIXELS = 2**26  # of a resized frame, before it is cut: 8192 x 8192
 class Framing:
     """How pictures are fitted to the model. Raises InputError for an invalid value."""
 
-    mode: Mode = "crop"
+    mode: Annotated[Mode, tyro.conf.arg(name="preprocess")] = "crop"
     """"crop" makes frames `size` wide and cuts tall frames to `size`; "pad" keeps every pixel and pads to a square"""
     size: int | None = None
     """side in pixels to run at, a multiple of the patch size; the model's own by default"""

@@ -120,7 +120,8 @@ def _read(path: Path, clip: Clip) -> Queries:
             height, width = clip.source_size[frame]
             raise InputError(
                 f"{path} line {line}: ({place[0]:g}, {place[1]:g}) lies outside what the model sees of frame {frame}, "
-                f"a picture of {width} x {height}; expected a place inside (mode 'crop' cuts tall pictures)"
+                f"a picture of {width} x {height}; expected a place inside (mode 'crop' cuts tall pictures, 'pad' "
+                "does not: --preprocess pad)"
             )
         points.append(point)
         frames.append(frame)

@@ -44,6 +44,8 @@ COMMANDS = {
     "scenes": scenes,
 }
 
+_OLD_FLAGS = {"--mode": "--preprocess"}  # still understood
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, 1 if nobody reads the output, 2 for errors, 130 if interrupted."""
@@ -88,6 +90,11 @@ def _with_flag(message: str, arguments: Sequence[str]) -> str:
     return re.sub(r"(?:^|(?<= and ))\w+(?= is )", named, message)
 
 
+def _renamed(argument: str) -> str:
+    flag, equals, value = argument.partition("=")
+    return f"{_OLD_FLAGS.get(flag, flag)}{equals}{value}"
+
+
 def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
     """Return the command with its arguments, ready to be called.
 
@@ -108,7 +115,7 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
                 {name: later(command) for name, command in COMMANDS.items()},
                 prog="vggtjax",
                 description="4-D reconstruction of monocular video of a moving world. --version prints the version.",
-                args=arguments,
+                args=[_renamed(argument) for argument in arguments],
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )
     except SystemExit as stop:

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from vggtjax.evaluation.ladder import LadderRow
     from vggtjax.results.reconstruction import Reconstruction
 
+_LISTED_SECONDS = 0.5  # of compiling a program
+
 
 class Report:
     """Stages with a clock each, on standard error; tables on standard output.
@@ -51,16 +53,21 @@ class Report:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[Progress]:
-        """Time a stage and show it; yields the callable that shows its progress."""
-        label = "compile (once for clips of this shape)" if name == "compile" else name
+        """Time a stage and show it; yields the callable that shows its progress.
+
+        Stages that compile say that they come once. Those that a cache makes short are not listed when they are done.
+        """
+        compiles = name.startswith("compile ")
+        label = f"{name} (once for clips of this shape)" if compiles else name
         task = self._progress.add_task(label, total=None)
         started = time.perf_counter()
         yield lambda done, total: self._progress.update(task, completed=done, total=total)
         seconds = time.perf_counter() - started
         self._seconds[name] = self._seconds.get(name, 0.0) + seconds
         total = next(t.total for t in self._progress.tasks if t.id == task) or 1
-        self._progress.update(task, total=total, completed=total)
-        if not self._console.is_terminal:
+        is_listed = not compiles or seconds >= _LISTED_SECONDS
+        self._progress.update(task, total=total, completed=total, visible=is_listed)
+        if is_listed and not self._console.is_terminal:
             self.note(f"{label:<18} {seconds:8.2f} s")
 
     def summary(self, result: Reconstruction, out: Path, model: Model | None = None) -> None:

@@ -130,8 +130,7 @@ def reconstruct(
     )
     run = partial(run_stages, params=model.params, inputs=inputs, fusion=fusion, all_outputs=keep_passes)
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
-        with on_stage("compile"):
-            run(dataclasses.replace(stages, run=Compile()))
+        run(dataclasses.replace(stages, run=Compile(on_stage)))
         passes, assembly, by_frame = run(dataclasses.replace(stages, run=Execute(on_stage)))
     passes = jax.tree.map(lambda x: np.asarray(x)[:, :frames], passes)
     fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, frames))

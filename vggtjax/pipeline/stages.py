@@ -109,14 +109,19 @@ def inline(stage: str, program: Program, *arguments: Any, **options: Any) -> Any
 
 
 class Compile:
-    """Compiles each program for the shapes of its arguments; later calls with such arguments find it compiled."""
+    """Compiles each program for the shapes of its arguments; later calls with such arguments find it compiled.
 
-    def __init__(self) -> None:
+    Each program is a stage of its own, such as "compile first pass".
+    """
+
+    def __init__(self, on_stage: OnStage | None = None) -> None:
+        self._on_stage = on_stage or no_stage
         self.memory: dict[str, StageMemory] = {}
 
     def __call__(self, stage: str, program: Program, *arguments: Any, **options: Any) -> Any:
         """Return the shapes of the program's outputs."""
-        compiled, outputs = program.compile(*arguments, **options)
+        with self._on_stage(f"compile {stage}"):
+            compiled, outputs = program.compile(*arguments, **options)
         memory = compiled.memory_analysis()
         if memory is not None:  # some platforms do not tell
             self.memory[stage] = StageMemory(memory.temp_size_in_bytes, memory.output_size_in_bytes)

@@ -186,9 +186,9 @@ def _write_frames(
         instances = Image.fromarray(frame.instances)
         instances.putpalette(previews.INSTANCE_COLORS.ravel().tolist())
         instances.save(folder / f"instances/{name}.png", compress_level=_PNG_LEVEL)
-        _write_png(folder / f"preview/depth/{name}.png", previews.color_depth(frame.depth, valid, inverse_range))
+        _write_png(folder / f"preview/depth/{name}.png", previews.depth_picture(frame.depth, valid, inverse_range))
         moving = previews.moving_ids(frame.dynamic_mask, frame.instances)
-        _write_png(folder / f"preview/overlay/{name}.png", previews.overlay(frame.image, moving))
+        _write_png(folder / f"preview/overlay/{name}.png", previews.overlay_picture(frame.image, moving))
         write_ply(folder / f"frames/{name}.ply", frame_cloud(frame, pixels))
         if saving.format == "vggt4d":
             foreign.write_frame(folder / "vggt4d", number, frame)

@@ -107,8 +107,9 @@ def check_format(format: str, quaternion: str | None) -> None:
     check_choice("format", format, ("vggtjax", *FORMATS))
     if quaternion is None and format in _WITH_TRAJECTORY:
         raise InputError(
-            f"pred_traj.txt of {format} does not say the order of its quaternions; give --quaternion wxyz (as VGGT4D, "
-            "MonST3R, CUT3R, Easi3R and vggtjax write them) or xyzw (TUM's order, and that of earlier vggtjax)"
+            f"pred_traj.txt of {format} does not say the order of its quaternions; give quaternion 'wxyz' "
+            "(--quaternion wxyz), as VGGT4D, MonST3R, CUT3R, Easi3R and vggtjax write them, or 'xyzw', as TUM and "
+            "earlier vggtjax do"
         )
     if quaternion is not None and (quaternion not in get_args(Quaternion) or format not in _WITH_TRAJECTORY):
         raise InputError(

@@ -23,6 +23,7 @@ INSTANCE_COLORS = np.array(
 )
 _OUTLINE = np.array([255, 235, 60], np.uint8)
 
+_LEAST_SIDE = 480  # pixels of the longer side of a frame's preview
 _SHEET_FRAMES = 8
 _SHEET_WIDTH = 1800  # pixels of all columns
 _TITLE_WIDTH = 700  # least pixels of the title
@@ -71,8 +72,30 @@ def moving_ids(mask: Bool[np.ndarray, ...], instances: UInt8[np.ndarray, ...]) -
     return np.where(mask & (instances == 0), len(INSTANCE_COLORS) - 1, instances).astype(np.uint8)
 
 
+def enlarged(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Return the width and height to show pictures of this height and width at: a whole multiple, easily seen."""
+    height, width = shape[:2]
+    factor = max(1, -(-_LEAST_SIDE // max(height, width)))
+    return width * factor, height * factor
+
+
+def depth_picture(
+    depth: Float32[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"], inverse_range: tuple[float, float]
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return coloured depth, enlarged to see it."""
+    picture = Image.fromarray(color_depth(depth, valid, inverse_range))
+    return np.asarray(picture.resize(enlarged(depth.shape), Image.Resampling.LANCZOS))
+
+
+def overlay_picture(image: UInt8[np.ndarray, "H W 3"], moving: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the overlay, enlarged to see it, with a sharp outline."""
+    size = enlarged(moving.shape)
+    picture = Image.fromarray(image).resize(size, Image.Resampling.LANCZOS)
+    return overlay(np.asarray(picture), np.asarray(Image.fromarray(moving).resize(size, Image.Resampling.NEAREST)))
+
+
 def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw up to eight frames, evenly spread: columns of picture, depth, saliency where known, and moving objects."""
+    """Draw up to eight frames, evenly spread: columns of picture, depth, saliency if any, and moving objects."""
     frames, height, width = result.depth.shape
     shown = np.linspace(0, frames - 1, min(frames, _SHEET_FRAMES)).round().astype(int)
     scale = min(_THUMBNAIL[0] / width, _THUMBNAIL[1] / height, _SHEET_WIDTH / len(shown) / width)
@@ -123,7 +146,7 @@ def _thumbnails(
     """Return one column of the sheet, from top to bottom."""
     picture = Image.fromarray(result.images[frame]).resize(size, Image.Resampling.LANCZOS)
     column = {"Picture": picture, "Depth": Image.fromarray(depth).resize(size, Image.Resampling.LANCZOS)}
-    if result.saliency is not None:
+    if result.saliency is not None and np.nan_to_num(result.saliency).any():
         saliency = np.nan_to_num(result.saliency[frame]).clip(0, 1)
         saliency = np.asarray(Image.fromarray(saliency).resize(size, Image.Resampling.BILINEAR))
         column["Saliency"] = Image.fromarray(_SALIENCY_COLORS[(saliency * 255).round().astype(np.uint8)])
