@@ -169,7 +169,9 @@ def dataset_passes(
 
     Args:
         model: from `load_model`.
-        dataset, root, max_frames: as for `find_sequences`.
+        dataset: a name of `DATASETS`.
+        root: folder of the data set, or of one sequence of it.
+        max_frames: take at most this many frames of a sequence.
         settings: see `PassesSettings`.
 
     Raises InputError where no sequence has true depth.

@@ -125,7 +125,8 @@ def fit_fusion(
     loss there is returned. The paper's rule is evaluated first, and returned unless a later tree is better.
 
     Args:
-        fitted, held_out: at least one clip each.
+        fitted: clips to fit to, at least one.
+        held_out: clips that tell when to stop, at least one.
         config: settings of the fit.
         checkpoint: file for the state of every evaluation; a fit of the same settings and clips resumes from the file.
         progress: called with the steps done and their number.

@@ -82,8 +82,11 @@ def reconstruct_softly(
         masking: see `soft_masking`.
         fusion: a tree of the family; the paper's rule if None. Its offset and temperature blend the depths of the
             passes; those of the masking suppress keys.
-        gram, motion, compute_dtype: as for `run_passes`.
-        stop_camera_gradient, remat: as for `forward`.
+        gram: similarity of the motion cues.
+        motion: the table of cues; the configuration's own if None.
+        compute_dtype: type of the blocks' matrix products.
+        stop_camera_gradient: as for `forward`.
+        remat: compute activations again on the way back, which takes less memory.
     """
     clips = ClipBatch(images, encode(params, images, config, compute_dtype=compute_dtype, remat=remat))
     compute = Compute(compute_dtype, remat)

@@ -33,8 +33,10 @@ def fuse_depth(
     dynamic pixels the output is that of pass 1.
 
     Args:
-        depth1, confidence1: of the plain pass; any number of leading axes.
-        depth2, confidence2: of the mask-aware pass.
+        depth1: of the plain pass; any number of leading axes.
+        confidence1: of that depth.
+        depth2: of the mask-aware pass.
+        confidence2: of that depth.
         dynamic_mask: True where the scene moves.
         eps: keeps the weight finite where both confidences are 0.
 

@@ -71,7 +71,8 @@ def refine_masks(
         images: RGB in [0, 1].
         depth: z in the camera, in VGGT's unit: scenes are about 1 away, and the thresholds are lengths.
         dynamic_mask: the coarse mask; an empty mask stays empty.
-        camera_from_world, intrinsics: OpenCV cameras of little noise; intrinsics in pixels.
+        camera_from_world: OpenCV cameras of little noise.
+        intrinsics: in pixels.
         valid: False on padding, which is neither compared nor dynamic; None without padding.
         clusters: groups per frame.
         seed: of k-means.

@@ -190,7 +190,8 @@ def run_passes(
         config: the model's configuration.
         options: how motion is mined and keys are suppressed; masks are not refined.
         motion: the table of cues; the configuration's own if None.
-        clusters, threshold: how the mask is mined from the saliency, as for `mine_mask`; the method's own if None.
+        clusters: number of clusters that the saliency is averaged in, 0 for none; the method's own if None.
+        threshold: "otsu" or "multi-otsu", which cuts the saliency; the method's own if None.
         second: outputs of the second pass, () for no second pass; the outputs that the method needs if None.
         changes: fields of `options` by name, such as `gram="dot"`; `mask_pairs` can be traced.
     """

@@ -66,9 +66,11 @@ def reconstruct_many(
         model: what `load_model` returned.
         sources: clips by name, as for `load_clip`; the names become folders.
         out: the folder of these folders.
-        options, fusion, pad_frames: as for `reconstruct`; a mapping of the names in `changes`, of fusion and of
-            pad_frames serves as options, too.
-        framing, sampling: how frames are fitted and which are taken; the keywords of `load_clip` serve, too.
+        options: as for `reconstruct`; a mapping of the names in `changes`, of fusion and of pad_frames serves, too.
+        fusion: as for `reconstruct`.
+        pad_frames: as for `reconstruct`.
+        framing: how frames are fitted; the keywords of `load_clip` serve, too.
+        sampling: which frames are taken; the keywords of `load_clip` serve, too.
         saving: how results are written; the keywords of `Reconstruction.save` serve, too.
         progress: called before the first clip and after each computed clip, with the frames done and the frames of all
             clips but kept and failed ones; a clip of unknown length, such as a video, counts as the mean of the others.

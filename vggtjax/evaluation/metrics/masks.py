@@ -76,8 +76,9 @@ def mask_scores(
     """Return mean, recall and decay of J and F of a sequence (Perazzi et al. 2016).
 
     Args:
-        predicted, truth: masks of the same frames, at one size. All frames count; DAVIS itself skips the first and the
-            last frame if the method gets the first mask.
+        predicted: masks, True where something moves. All frames count; DAVIS itself skips the first and the last frame
+            if the method gets the first mask.
+        truth: masks of the same frames, at the same size.
         empty: J of a frame with two empty masks: 1 ("davis") or 0 ("vggt4d"). Its F is 1.
 
     Raises:

@@ -53,7 +53,8 @@ def point_cloud_errors(
     other.
 
     Args:
-        predicted, truth: points in one world and one unit; they are not aligned, filtered or thinned here.
+        predicted: points; they are not aligned, filtered or thinned here.
+        truth: points in the same world and unit.
         normals: unit normals of the predicted and of the true points, as from `normals_of`. The consistency is the
             mean |cosine| from prediction to truth and the mean from truth to prediction, averaged. Their sign does
             not matter, and pairs with a NaN do not count.

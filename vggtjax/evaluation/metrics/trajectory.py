@@ -126,7 +126,8 @@ def trajectory_errors(
     angle of E = (Q_i^-1 Q_i+1)^-1 (P_i^-1 P_i+1) over all consecutive pairs, P the aligned prediction, Q the truth.
 
     Args:
-        predicted, truth: rigid transforms, world from camera, of the same frames.
+        predicted: rigid transforms, world from camera.
+        truth: those of the same frames.
         align: "sim3" fits rotation, translation and scale to the centres first (Umeyama 1991), "se3" rotation and
             translation; "first" moves the first predicted pose to the true one and keeps the scale.
 
@@ -151,7 +152,8 @@ def associate(
     so on.
 
     Args:
-        times, other_times: seconds, in any order.
+        times: seconds, in any order.
+        other_times: seconds, in any order.
         tolerance: seconds; a pair exactly as far apart does not count.
 
     Returns:
