@@ -11,7 +11,7 @@ PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 # Tests that compile networks take nearly all of the time.
 SLOW = parity network method pipeline training calibration learning commands benchmarks pretrained
 
-.PHONY: demo docs test check lint format clean
+.PHONY: demo docs test check fast lint format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
@@ -24,7 +24,9 @@ test: lint
 	$(PYTEST) tests/parity
 	$(PYTEST) tests --ignore tests/parity --hasty
 
-check: lint
+check: lint fast
+
+fast: $(VENV)/.development
 	$(PYTEST) tests --hasty $(SLOW:%=--ignore tests/%)
 
 lint: $(VENV)/.development

@@ -7,6 +7,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+_MOST_BYTES = 30e6  # of the wheel; the embedded model is nearly all of it
 
 
 def test_the_wheel_works_outside_the_repository(tmp_path):
@@ -20,12 +21,14 @@ def test_the_wheel_works_outside_the_repository(tmp_path):
     made = subprocess.run(build, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stdout[-2000:] + made.stderr[-2000:]
     (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.stat().st_size < _MOST_BYTES
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()
         archive.extractall(tmp_path / "installed")
     tops = {name.split("/")[0] for name in names if not name.split("/")[0].endswith(".dist-info")}
     assert tops == {"vggtjax", "converters"}
-    assert {"vggtjax/__init__.pyi", "vggtjax/py.typed"} <= set(names)
+    needed_files = ("__init__.pyi", "py.typed", "pretrained/model.safetensors", "pretrained/WEIGHTS-LICENSE.md")
+    assert {f"vggtjax/{name}" for name in needed_files} <= set(names)
     (entry_points,) = (tmp_path / "installed").glob("*.dist-info/entry_points.txt")
     assert "vggtjax = vggtjax.__main__:run" in entry_points.read_text()
     (metadata,) = (tmp_path / "installed").glob("*.dist-info/METADATA")
