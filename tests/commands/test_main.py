@@ -4,11 +4,9 @@ import dataclasses
 import functools
 import json
 import re
-import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,8 +20,6 @@ from vggtjax.clips.sampling import Sampling
 from vggtjax.commands import main as cli
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
-
-README = Path(__file__).parents[2] / "README.md"
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
 
@@ -207,29 +203,6 @@ def test_an_odd_name_of_a_clip_is_printed_on_one_line(capsys, tmp_path, frames):
     assert code == 2
     assert "c d failed: a clip is named 'c\\nd'" in out
     assert "1/1 c d: failed" in err
-
-
-def _shell_lines():
-    blocks = README.read_text().split("```sh\n")[1:]
-    lines = [line for block in blocks for line in block.split("```")[0].splitlines()]
-    return [line for line in lines if line.startswith("vggtjax ")]
-
-
-def test_the_readme_has_commands():
-    assert len(_shell_lines()) >= 2
-
-
-@pytest.mark.parametrize("line", _shell_lines())
-def test_the_commands_of_the_readme_are_understood(line, monkeypatch):
-    called = []
-
-    def recorder(name, command):
-        return functools.wraps(command)(lambda *_, **__: called.append(name))
-
-    monkeypatch.setattr(cli, "COMMANDS", {name: recorder(name, command) for name, command in cli.COMMANDS.items()})
-    arguments = shlex.split(line)[1:]
-    assert cli.main(arguments) == 0
-    assert called == [arguments[0]]
 
 
 @pytest.mark.parametrize("command", ["reconstruct", "batch", "evaluate"])

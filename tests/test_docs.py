@@ -1,0 +1,144 @@
+"""The README and the pages of docs/: their Python runs, their commands are understood, their links lead somewhere."""
+
+from __future__ import annotations
+
+import functools
+import re
+import runpy
+import shlex
+import shutil
+import tomllib
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.documented import LANGUAGES, NOTEBOOKS, PAGES, ROOT, Block, blocks, commands, page_name
+from vggtjax.commands import main as cli
+from vggtjax.pretrained.embedded import demo_clip
+
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+TARGETS = re.findall(r"^([\w ]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+OTHERS = ("git", "hf", "ssh")  # programs that a reader has or does not have
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:the field of view"),
+    pytest.mark.filterwarnings("ignore:.*non-interactive:UserWarning"),
+]
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory) -> Path:
+    """Return a folder with what pages read: the embedded clip as frames/ and clip.mp4.
+
+    Clips of one shape share their compiled programs, so that only the first page takes long.
+    """
+    folder = tmp_path_factory.mktemp("docs")
+    pictures = (255 * demo_clip().images).round().astype(np.uint8)
+    (folder / "frames").mkdir()
+    with av.open(str(folder / "clip.mp4"), "w") as video:
+        stream = video.add_stream("mpeg4", rate=8)
+        stream.height, stream.width = pictures.shape[1:3]
+        stream.pix_fmt = "yuv420p"
+        for i, picture in enumerate(pictures):
+            Image.fromarray(picture).save(folder / f"frames/{i:02}.png")
+            video.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        video.mux(stream.encode())
+    return folder
+
+
+@pytest.fixture
+def workplace(prepared, tmp_path, monkeypatch) -> Path:
+    """Return the current folder of a page: a copy of the prepared one."""
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    folder = Path(shutil.copytree(prepared, tmp_path / "here"))
+    monkeypatch.chdir(folder)
+    return folder
+
+
+def _with(language: str) -> list[Path]:
+    return [page for page in PAGES if any(block.language == language for block in blocks(page))]
+
+
+@pytest.mark.parametrize("page", _with("python"), ids=page_name)
+def test_python_runs(page, workplace):
+    names: dict = {"__name__": "__main__"}
+    for block in blocks(page):
+        if block.language == "python":
+            code = compile("\n" * block.line + block.text, page_name(page), "exec")
+            if not block.rule.startswith("not run"):
+                exec(code, names)
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=page_name)
+def test_a_notebook_runs(notebook, workplace):
+    runpy.run_path(str(notebook), run_name="__main__")
+
+
+@pytest.mark.parametrize("page", _with("sh"), ids=page_name)
+def test_commands_are_understood(page, workplace, monkeypatch):
+    called = []
+
+    def recorder(name, command):
+        return functools.wraps(command)(lambda *_, **__: called.append(name))
+
+    real = cli.COMMANDS
+    recorders = {name: recorder(name, command) for name, command in real.items()}
+    for block in blocks(page):
+        for line in commands(block) if block.language == "sh" else ():
+            program, *arguments = shlex.split(line)
+            if program == "vggtjax":
+                monkeypatch.setattr(cli, "COMMANDS", real if block.rule == "run" else recorders)
+                called.clear()
+                assert cli.main(arguments) == 0, f"line {block.line}: {line}"
+                assert block.rule == "run" or called == arguments[:1] or arguments == ["--version"]
+            else:
+                assert _is_known(program, arguments), f"line {block.line}: {line}"
+
+
+def _is_known(program: str, arguments: list[str]) -> bool:
+    """Tell whether a command other than vggtjax names an extra, a target, a benchmark or an example that there is."""
+    if program == "pip":
+        named = re.findall(r"\[([\w,]+)\]", " ".join(arguments))
+        return arguments[0] == "install" and set(",".join(named).split(",")) <= {"", *EXTRAS}
+    if program == "make":
+        return {word for word in arguments if "=" not in word} <= {word for names in TARGETS for word in names.split()}
+    if program.startswith("python"):
+        return arguments[:2] in (["-m", "benchmarks"], ["-m", "venv"]) or (ROOT / arguments[0]).is_file()
+    return program in (*OTHERS, ".", "cd")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_blocks_and_links(page):
+    assert [block for block in blocks(page) if block.language.split(" ")[0] not in LANGUAGES] == []
+    text = page.read_text(encoding="utf-8")
+    assert text.count("```") % 2 == 0
+    links = re.findall(r"\]\(([^)#\s]+)", re.sub(r"```.*?```|`[^`\n]*`", "", text, flags=re.DOTALL))
+    missing = [link for link in links if "://" not in link and not _leads_somewhere(page, link)]
+    assert missing == []
+
+
+def _leads_somewhere(page: Path, link: str) -> bool:
+    """Tell whether a file is there; notebooks are pages that the build makes, and so are pictures in made/."""
+    target = page.parent / link
+    notebook = target.parent.name == "notebooks" and target.with_suffix(".py")
+    return target.exists() or target.parent.name == "made" or (bool(notebook) and notebook.exists())
+
+
+def test_the_rule_of_a_block_is_found(tmp_path):
+    page = tmp_path / "page.md"
+    python = "<!-- not run: needs a GPU -->\n\n```python\nx\n```\n\n"
+    shell = "- a\n\n    <!-- run -->\n    ```sh\n    a \\\n      b  # c\n    ```\n"
+    page.write_text(python + shell)
+    first, second = blocks(page)
+    assert first == Block("python", "x\n", 3, "not run: needs a GPU")
+    assert (second.rule, commands(second)) == ("run", ["a    b"])
+
+
+def test_an_unknown_extra_target_and_program_are_found():
+    assert _is_known("pip", ["install", ".[hub,cuda]"])
+    assert not _is_known("pip", ["install", ".[hubs]"])
+    assert not _is_known("make", ["everything"])
+    assert not _is_known("rm", ["-r"])
