@@ -1,0 +1,52 @@
+"""The command `vggtjax export`. Does not import jax."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from vggtjax.commands.report import Report
+from vggtjax.exports.table import ExportFormat
+
+
+def export(
+    result: tyro.conf.Positional[Path],
+    /,
+    out: Path,
+    *,
+    to: ExportFormat,
+    pictures: Annotated[str | None, tyro.conf.arg(metavar="SOURCE")] = None,
+    points: int = 100_000,
+    confidence_percentile: float = 20.0,
+) -> None:
+    """Write a result for another program: COLMAP, nerfstudio, gsplat, rerun, a glTF animation, OpenEXR, TUM, KITTI.
+
+    Args:
+        result: the folder of a result.
+        out: folder or file to write; it must not exist.
+        to: the format.
+        pictures: the source that the result was made from, to write pictures, depth and cameras at its size; by default
+            those of the model's size are written.
+        points: most static points to write.
+        confidence_percentile: percent of the pixels, the least confident, to leave out of the points.
+    """
+    report = Report()
+    with report.running():
+        from vggtjax.exports.write import Exporting, check_export, export_result
+
+        exporting = Exporting(points, confidence_percentile)
+        check_export(out, to)
+        source = None
+        if pictures is not None:
+            from vggtjax.clips.sources import open_source
+
+            source = open_source(pictures)
+        from vggtjax.results.reconstruction import Reconstruction
+
+        with report.stage("read"):
+            loaded = Reconstruction.load(result)
+        with report.stage("write") as progress:
+            export_result(loaded, out, to, source=source, exporting=exporting, progress=progress)
+    report.line(f"{to}: {out}")

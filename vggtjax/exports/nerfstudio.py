@@ -1,0 +1,60 @@
+"""A result as a data set of nerfstudio: transforms.json with pictures, depth, masks and points.
+
+The fields are those of nerfstudio's data conventions (https://docs.nerf.studio/quickstart/data_conventions.html): poses
+are world-from-camera in OpenGL's axes (x right, y up, z backward), masks are 0 where pixels are not trained on, and
+depth files hold a thousand times the depth, as the parser's default `depth_unit_scale_factor` is 0.001.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from vggtjax.exports.views import View
+from vggtjax.results.point_cloud import PointCloud, write_ply
+
+_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # of the camera's axes
+_DEPTH_SCALE = 1000.0
+
+
+def write_nerfstudio(folder: Path, items: Iterator[View], points: PointCloud) -> None:
+    """Write transforms.json, images/, depth/, masks/ and points.ply into an empty folder; moving pixels are masked."""
+    for name in ("images", "depth", "masks"):
+        (folder / name).mkdir()
+    frames: list[dict[str, Any]] = []
+    for view in items:
+        stem = Path(view.name).stem if len(view.name.split(".")) == 2 else view.name
+        view.write_picture(folder / "images")
+        depth = np.where(view.frame.valid, view.frame.depth * np.float32(_DEPTH_SCALE), 0).astype(np.float32)
+        np.save(folder / f"depth/{stem}.npy", depth, allow_pickle=False)
+        Image.fromarray(view.static.astype(np.uint8) * 255).save(folder / f"masks/{stem}.png")
+        frames.append(_frame(view, stem))
+    write_ply(folder / "points.ply", points)
+    scene = {"camera_model": "OPENCV", "ply_file_path": "points.ply", "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(scene, indent=1), encoding="utf-8")
+
+
+def _frame(view: View, stem: str) -> dict[str, Any]:
+    K, (height, width) = view.frame.intrinsics, view.size
+    pose = np.eye(4)
+    rotation, translation = view.camera_from_world[:, :3], view.camera_from_world[:, 3]
+    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ translation
+    return {
+        "file_path": f"images/{view.name}",
+        "depth_file_path": f"depth/{stem}.npy",
+        "mask_path": f"masks/{stem}.png",
+        "w": width,
+        "h": height,
+        "fl_x": K[0, 0],
+        "fl_y": K[1, 1],
+        "cx": K[0, 2],
+        "cy": K[1, 2],
+        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        "time": view.time,
+        "transform_matrix": (pose @ _FROM_OPENCV).tolist(),
+    }

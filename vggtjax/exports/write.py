@@ -1,0 +1,147 @@
+"""Writing a result in another program's format, as a whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from vggtjax.clips.sampling import Source
+from vggtjax.errors import InputError, OutputError, check_choice, check_extra, whole_number
+from vggtjax.exports.table import FORMATS, ExportFormat
+from vggtjax.exports.views import View, rigid, views
+from vggtjax.progress import Progress, no_progress
+from vggtjax.results.point_cloud import PointCloud
+from vggtjax.results.result import Result
+from vggtjax.results.shown import ShownPoints, shown_points
+from vggtjax.storage.trajectories import write_trajectory
+from vggtjax.storage.writing import writing
+
+POINTS = 100_000
+
+
+@dataclass(frozen=True)
+class Exporting:
+    """Which points an export holds. Raises InputError for a value out of range."""
+
+    points: int = POINTS
+    """most static points to write; moving points get as many in each frame"""
+    confidence_percentile: float = 20.0
+    """percent of the pixels, the least confident, to leave out of the points"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", whole_number("points", self.points, 1))
+        if not 0 <= self.confidence_percentile < 100:
+            raise InputError(
+                f"confidence_percentile is {self.confidence_percentile}; expected at least 0 and less than 100"
+            )
+
+
+def check_export(out: Path, form: ExportFormat) -> None:
+    """Check what can be checked before the result is read.
+
+    Raises InputError for an unknown format or a wrong suffix, MissingExtraError, and OutputError where `out` exists.
+    """
+    check_choice("format", form, get_args(ExportFormat))
+    needs = FORMATS[form]
+    if needs.extra:
+        check_extra(f"the format {form}", needs.extra, *needs.modules)
+    if needs.suffix and out.suffix != needs.suffix:
+        raise InputError(f"{out} is one file of the format {form}; give it a name that ends with {needs.suffix}")
+    if os.path.lexists(out) and not (out.is_dir() and not needs.suffix and not any(out.iterdir())):
+        raise OutputError(f"{out} exists and is not replaced; choose another name, or move it away")
+
+
+def export_result(
+    result: Result,
+    out: str | Path,
+    form: ExportFormat,
+    *,
+    source: Source | None = None,
+    exporting: Exporting = Exporting(),  # noqa: B008 - frozen
+    progress: Progress | None = None,
+) -> None:
+    """Write a result in another program's format.
+
+    Args:
+        result: of a clip.
+        out: the folder or file, which must not exist; a folder may be empty.
+        form: the format.
+        source: the clip's pictures, from `open_source`, for an export at their size; by default the model's size.
+        exporting: the points.
+        progress: called with the number of frames done, and of all.
+
+    Raises:
+        InputError: an unknown format, or a name without the format's suffix.
+        MissingExtraError: the format's library is not installed.
+        ClipError: the source lacks a frame of the result, or has pictures of another size.
+        OutputError: `out` exists or cannot be written.
+    """
+    out = Path(out)
+    check_export(out, form)
+    if out.is_dir():
+        out.rmdir()
+    with writing(out) as path:
+        if not FORMATS[form].suffix:
+            path.mkdir()
+        _write(result, path, form, _counted(views(result, source), len(result.depth), progress), exporting)
+
+
+def _write(result: Result, path: Path, form: ExportFormat, items: Iterator[View], exporting: Exporting) -> None:
+    match form:
+        case "colmap" | "colmap-text" | "gsplat":
+            from vggtjax.exports.colmap import write_colmap
+            from vggtjax.exports.observations import observe
+
+            static, _ = _shown(result, exporting)
+            write_colmap(path, items, observe(result, static), "text" if form == "colmap-text" else "binary")
+        case "nerfstudio":
+            from vggtjax.exports.nerfstudio import write_nerfstudio
+
+            static, _ = _shown(result, exporting)
+            write_nerfstudio(path, items, _cloud(result, static))
+        case "rerun":
+            from vggtjax.exports.rerun import write_rerun
+
+            static, moving = _shown(result, exporting)
+            write_rerun(path, items, _cloud(result, static), [_cloud(result, points) for points in moving])
+        case "glb-animated":
+            from vggtjax.exports.animated_glb import write_animated_glb
+
+            static, moving = _shown(result, exporting)
+            write_animated_glb(path, result, _cloud(result, static), [_cloud(result, points) for points in moving])
+        case "exr":
+            from vggtjax.exports.exr import write_exr
+
+            write_exr(path, items)
+        case "tum":
+            times = np.arange(len(result.depth)) if result.timestamps is None else result.timestamps
+            write_trajectory(path, result.world_from_camera, times.astype(np.float64), note=result.model_note)
+        case "kitti":
+            poses = result.world_from_camera[:, :3].reshape(-1, 12).astype(np.float64)
+            np.savetxt(path, poses, fmt="%.9g", encoding="utf-8")
+
+
+def _shown(result: Result, exporting: Exporting) -> tuple[ShownPoints, list[ShownPoints]]:
+    percentile = exporting.confidence_percentile
+    return shown_points(
+        result,
+        static_percentile=percentile,
+        dynamic_percentile=percentile,
+        most_static=exporting.points,
+        most_moving=exporting.points,
+    )
+
+
+def _cloud(result: Result, points: ShownPoints) -> PointCloud:
+    return PointCloud(points.positions, points.values(result.images))
+
+
+def _counted(items: Iterator[View], count: int, progress: Progress | None) -> Iterator[View]:
+    for number, view in enumerate(items, start=1):
+        yield view
+        (progress or no_progress)(number, count)
