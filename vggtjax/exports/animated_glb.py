@@ -69,5 +69,5 @@ def _accessor(tree: dict[str, Any], buffers: dict[str, bytes], values: np.ndarra
     accessor = {"bufferView": len(buffers) - 1, "componentType": _FLOAT, "count": len(data), "type": kind}
     lowest, highest = data.min(axis=0), data.max(axis=0)
     accessor |= {"min": np.atleast_1d(lowest).tolist(), "max": np.atleast_1d(highest).tolist()}
-    tree["accessors"].append(accessor)
+    tree["accessors"][f"animation_{number}"] = accessor  # trimesh makes a list of the values
     return number

@@ -1,0 +1,176 @@
+"""Results in the formats of other programs, read back by those programs' libraries or by plain readers."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from tests.room import make_room
+from vggtjax.clips.sources import open_source
+from vggtjax.errors import ClipError, InputError, OutputError
+from vggtjax.evaluation.datasets.colmap import read_views
+from vggtjax.exports.animated_glb import frame_times
+from vggtjax.exports.write import Exporting, export_result
+from vggtjax.storage.trajectories import read_trajectory
+
+FRAMES, H, W = 4, 84, 126
+
+
+@pytest.fixture(scope="module")
+def result():
+    return make_room(FRAMES, H, W, frame_names=[f"a{i}" for i in range(FRAMES)])
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory, result):
+    """Pictures of the source: twice as large as the result's frames, as .jpg and .png."""
+    folder = tmp_path_factory.mktemp("pictures")
+    for number, image in enumerate(result.images):
+        large = Image.fromarray(image).resize((2 * W, 2 * H))
+        large.save(folder / f"a{number}{'.JPG' if number % 2 else '.png'}", "JPEG" if number % 2 else "PNG")
+    Image.new("RGB", (2 * W, 2 * H)).save(folder / "a0b.png")  # not of the result
+    return folder
+
+
+@pytest.mark.parametrize("form", ["colmap", "colmap-text"])
+@pytest.mark.parametrize("original", [False, True])
+def test_colmap_reads_the_model_and_projects_its_points(tmp_path, result, pictures, form, original):
+    pycolmap = pytest.importorskip("pycolmap")
+    source = open_source(str(pictures)) if original else None
+    export_result(result, tmp_path / "out", form, source=source, exporting=Exporting(3000))
+    model = pycolmap.Reconstruction(str(tmp_path / "out/sparse/0"))
+    scale = 2 if original else 1
+    names = [f"a{i}{('.JPG' if i % 2 else '.png') if original else '.png'}" for i in range(FRAMES)]
+    assert sorted(image.name for image in model.images.values()) == names
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    seen = 0
+    for number, image in enumerate(images):
+        pose = image.cam_from_world().matrix()
+        np.testing.assert_allclose(pose, result.camera_from_world[number], atol=1e-6)
+        K = result.intrinsics[number] * np.array([[scale], [scale], [1]])
+        np.testing.assert_allclose(image.camera.calibration_matrix(), K, rtol=1e-6)
+        assert (image.camera.width, image.camera.height) == (scale * W, scale * H)
+        with Image.open(tmp_path / "out/images" / image.name) as picture:
+            assert picture.size == (scale * W, scale * H)
+        with Image.open(tmp_path / f"out/masks/{image.name}.png") as mask:
+            static = np.asarray(mask) > 0
+        for observed in image.points2D:
+            point = model.points3D[observed.point3D_id]
+            np.testing.assert_allclose(image.project_point(point.xyz), observed.xy, atol=0.01)
+            column, row = (observed.xy - 1e-9).astype(int)
+            assert static[row, column]
+            np.testing.assert_array_less(np.abs(point.color.astype(int) - 60) % 40, 1)  # of the wall
+            seen += 1
+    assert len(model.points3D) > 500
+    assert seen > 2 * len(model.points3D)
+    if form == "colmap":
+        for number, name in enumerate(names):
+            view = read_views(tmp_path / "out/sparse/0")[name]
+            np.testing.assert_allclose(view.camera_from_world, result.camera_from_world[number], atol=1e-6)
+            np.testing.assert_allclose(view.intrinsics[:2] / scale, result.intrinsics[number][:2], rtol=1e-6)
+
+
+def test_points_of_nerfstudio_s_depth_are_the_result_s(tmp_path, result):
+    export_result(result, tmp_path / "out", "nerfstudio")
+    scene = json.loads((tmp_path / "out/transforms.json").read_text())
+    assert scene["camera_model"] == "OPENCV"
+    assert len(scene["frames"]) == FRAMES
+    world = result.world_points()
+    for number, frame in enumerate(scene["frames"]):
+        depth = np.load(tmp_path / "out" / frame["depth_file_path"]) / 1000
+        y, x = np.mgrid[: frame["h"], : frame["w"]] + 0.5
+        right, up = (x - frame["cx"]) / frame["fl_x"], -(y - frame["cy"]) / frame["fl_y"]
+        camera = np.stack([right * depth, up * depth, -depth, np.ones_like(depth)], axis=-1)  # OpenGL's axes
+        points = camera @ np.array(frame["transform_matrix"]).T
+        np.testing.assert_allclose(points[..., :3], world[number], atol=1e-4)
+        with Image.open(tmp_path / "out" / frame["mask_path"]) as mask:
+            np.testing.assert_array_equal(np.asarray(mask) == 0, result.dynamic_mask[number])
+        with Image.open(tmp_path / "out" / frame["file_path"]) as picture:
+            np.testing.assert_array_equal(np.asarray(picture), result.images[number])
+    assert len(trimesh.load(tmp_path / "out" / scene["ply_file_path"]).vertices) > 1000
+
+
+def test_each_frame_of_the_animation_shows_its_own_points(tmp_path, result):
+    export_result(result, tmp_path / "scene.glb", "glb-animated")
+    data = (tmp_path / "scene.glb").read_bytes()
+    length = struct.unpack_from("<I", data, 12)[0]
+    tree, body = json.loads(data[20 : 20 + length]), data[28 + length :]
+
+    def values(number):
+        accessor = tree["accessors"][number]
+        view = tree["bufferViews"][accessor["bufferView"]]
+        count = accessor["count"] * {"SCALAR": 1, "VEC3": 3}[accessor["type"]]
+        return np.frombuffer(body, np.float32, count, view.get("byteOffset", 0)).reshape(accessor["count"], -1)
+
+    (animation,) = tree["animations"]
+    assert len(animation["channels"]) == FRAMES
+    times = frame_times(result)
+    for moment in range(FRAMES):
+        shown = []
+        for channel in animation["channels"]:
+            sampler = animation["samplers"][channel["sampler"]]
+            keys, scales = values(sampler["input"])[:, 0], values(sampler["output"])
+            assert sampler["interpolation"] == "STEP"
+            assert (np.diff(keys) > 0).all()
+            at = np.searchsorted(keys, (times[moment] + times[moment + 1]) / 2, side="right") - 1
+            if scales[at, 0]:
+                shown.append(tree["nodes"][channel["target"]["node"]]["name"])
+        assert shown == [f"dynamic_{moment:06d}"]
+
+
+def test_poses_of_tum_and_kitti_are_the_result_s(tmp_path, result):
+    export_result(result, tmp_path / "tum.txt", "tum")
+    export_result(result, tmp_path / "kitti.txt", "kitti")
+    times, poses = read_trajectory(tmp_path / "tum.txt")
+    np.testing.assert_allclose(times, result.timestamps, atol=1e-6)
+    np.testing.assert_allclose(poses, result.world_from_camera, atol=1e-6)
+    rows = np.loadtxt(tmp_path / "kitti.txt").reshape(FRAMES, 3, 4)
+    np.testing.assert_array_equal(rows.astype(np.float32), result.world_from_camera[:, :3])
+
+
+def test_channels_of_openexr(tmp_path, result):
+    exr = pytest.importorskip("OpenEXR")
+    export_result(result, tmp_path / "out", "exr")
+    channels = exr.File(str(tmp_path / "out/a1.exr"), separate_channels=True).channels()
+    np.testing.assert_array_equal(channels["Z"].pixels, result.depth[1])
+    np.testing.assert_array_equal(channels["confidence"].pixels, result.depth_confidence[1])
+    np.testing.assert_array_equal(channels["moving"].pixels, result.dynamic_mask[1])
+
+
+def test_a_recording_of_rerun_holds_every_frame(tmp_path, result):
+    pytest.importorskip("rerun")
+    export_result(result, tmp_path / "out.rrd", "rerun", exporting=Exporting(500))
+    assert (tmp_path / "out.rrd").read_bytes()[:4] == b"RRF2"
+
+
+@pytest.mark.parametrize("names", [["../x", "../y", "z", "w"], ["a", "A", "b", "c"], ["x" * 300, "a", "b", "c"]])
+def test_unsafe_names_give_way_to_numbers(tmp_path, names):
+    export_result(make_room(FRAMES, 28, 42, frame_names=names), tmp_path / "out", "nerfstudio")
+    written = sorted(path.name for path in (tmp_path / "out/images").iterdir())
+    assert written == [f"{number:06d}.png" for number in range(FRAMES)]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_bad_input_is_refused_and_nothing_is_written(tmp_path, result, pictures):
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full/mine").touch()
+    (tmp_path / "small").mkdir()
+    Image.new("RGB", (8, 8)).save(tmp_path / "small/a0.png")
+    before = sorted(tmp_path.rglob("*"))
+    cases = [
+        (OutputError, "exists and is not replaced", tmp_path / "full", "nerfstudio", None),
+        (InputError, "ends with .rrd", tmp_path / "scene.glb", "rerun", None),
+        (InputError, "expected one of", tmp_path / "out", "ply", None),
+        (ClipError, "a0' has 8 x 8 pixels", tmp_path / "out", "nerfstudio", tmp_path / "small"),
+        (ClipError, "no frame 'zz'", tmp_path / "out", "nerfstudio", pictures),
+    ]
+    for kind, words, out, form, folder in cases:
+        broken = result if "zz" not in words else make_room(FRAMES, H, W, frame_names=["a0", "zz", "a2", "a3"])
+        with pytest.raises(kind, match=words):
+            export_result(broken, out, form, source=folder and open_source(str(folder)))
+    assert sorted(tmp_path.rglob("*")) == before
+    with pytest.raises(InputError, match="points"):
+        Exporting(points=0)
