@@ -5,7 +5,6 @@ import struct
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 from tests.room import make_room
@@ -13,7 +12,8 @@ from vggtjax.clips.sources import open_source
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.evaluation.datasets.colmap import read_views
 from vggtjax.exports.animated_glb import frame_times
-from vggtjax.exports.write import Exporting, export_result
+from vggtjax.exports.table import Exporting
+from vggtjax.exports.write import export_result
 from vggtjax.storage.trajectories import read_trajectory
 
 FRAMES, H, W = 4, 84, 126
@@ -40,7 +40,7 @@ def pictures(tmp_path_factory, result):
 def test_colmap_reads_the_model_and_projects_its_points(tmp_path, result, pictures, form, original):
     pycolmap = pytest.importorskip("pycolmap")
     source = open_source(str(pictures)) if original else None
-    export_result(result, tmp_path / "out", form, source=source, exporting=Exporting(3000))
+    export_result(result, tmp_path / "out", form, source=source, exporting=Exporting(1500))
     model = pycolmap.Reconstruction(str(tmp_path / "out/sparse/0"))
     scale = 2 if original else 1
     names = [f"a{i}{('.JPG' if i % 2 else '.png') if original else '.png'}" for i in range(FRAMES)]
@@ -64,7 +64,7 @@ def test_colmap_reads_the_model_and_projects_its_points(tmp_path, result, pictur
             assert static[row, column]
             np.testing.assert_array_less(np.abs(point.color.astype(int) - 60) % 40, 1)  # of the wall
             seen += 1
-    assert len(model.points3D) > 500
+    assert len(model.points3D) > 400
     assert seen > 2 * len(model.points3D)
     if form == "colmap":
         for number, name in enumerate(names):
@@ -90,7 +90,8 @@ def test_points_of_nerfstudio_s_depth_are_the_result_s(tmp_path, result):
             np.testing.assert_array_equal(np.asarray(mask) == 0, result.dynamic_mask[number])
         with Image.open(tmp_path / "out" / frame["file_path"]) as picture:
             np.testing.assert_array_equal(np.asarray(picture), result.images[number])
-    assert len(trimesh.load(tmp_path / "out" / scene["ply_file_path"]).vertices) > 1000
+    header = (tmp_path / "out" / scene["ply_file_path"]).read_bytes()[:200].decode("latin-1")
+    assert int(header.split("element vertex ")[1].split()[0]) > 1000
 
 
 def test_each_frame_of_the_animation_shows_its_own_points(tmp_path, result):

@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from vggtjax.commands.report import Report
-from vggtjax.exports.table import ExportFormat
+from vggtjax.exports.table import ExportFormat, Exporting
 
 
 def export(
@@ -18,8 +18,7 @@ def export(
     *,
     to: ExportFormat,
     pictures: Annotated[str | None, tyro.conf.arg(metavar="SOURCE")] = None,
-    points: int = 100_000,
-    confidence_percentile: float = 20.0,
+    exporting: Annotated[Exporting, tyro.conf.arg(name="points")] = Exporting(),
 ) -> None:
     """Write a result for another program: COLMAP, nerfstudio, gsplat, rerun, a glTF animation, OpenEXR, TUM, KITTI.
 
@@ -29,14 +28,12 @@ def export(
         to: the format.
         pictures: the source that the result was made from, to write pictures, depth and cameras at its size; by default
             those of the model's size are written.
-        points: most static points to write.
-        confidence_percentile: percent of the pixels, the least confident, to leave out of the points.
+        exporting: the points
     """
     report = Report()
     with report.running():
-        from vggtjax.exports.write import Exporting, check_export, export_result
+        from vggtjax.exports.write import check_export, export_result
 
-        exporting = Exporting(points, confidence_percentile)
         check_export(out, to)
         source = None
         if pictures is not None:

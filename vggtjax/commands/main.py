@@ -22,6 +22,7 @@ from vggtjax.commands.calibrate_cues import calibrate_cues
 from vggtjax.commands.convert import convert, import_result, info
 from vggtjax.commands.demo import demo
 from vggtjax.commands.evaluate import evaluate
+from vggtjax.commands.export import export
 from vggtjax.commands.fit_fusion import fit_fusion
 from vggtjax.commands.process import keep_freed_memory
 from vggtjax.commands.reconstruct import reconstruct
@@ -34,6 +35,7 @@ COMMANDS = {
     "reconstruct": reconstruct,
     "batch": batch,
     "convert": convert,
+    "export": export,
     "import": import_result,
     "demo": demo,
     "info": info,

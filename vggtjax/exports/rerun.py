@@ -31,7 +31,9 @@ def write_rerun(path: Path, items: Iterator[View], static: PointCloud, moving: S
         recording.set_time("frame", sequence=number)
         recording.set_time("time", duration=view.time)
         recording.log("world/camera", rerun.Transform3D(translation=centre, mat3x3=rotation))
-        recording.log("world/camera/picture", rerun.Pinhole(image_from_camera=view.frame.intrinsics, resolution=[width, height]))
+        recording.log(
+            "world/camera/picture", rerun.Pinhole(image_from_camera=view.frame.intrinsics, resolution=[width, height])
+        )
         recording.log("world/camera/picture", rerun.Image(view.frame.image).compress(jpeg_quality=90))
         depth = np.where(view.frame.valid, view.frame.depth, 0)
         recording.log("world/camera/picture/depth", rerun.DepthImage(depth, meter=1.0))

@@ -1,12 +1,13 @@
-"""The table of export formats. Imports neither numpy nor the formats' libraries."""
+"""The table of export formats, and the options. Imports neither numpy nor the formats' libraries."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-ExportFormat = Literal[
-    "colmap", "colmap-text", "gsplat", "nerfstudio", "rerun", "glb-animated", "exr", "tum", "kitti"
-]
+from vggtjax.errors import InputError, whole_number
+
+ExportFormat = Literal["colmap", "colmap-text", "gsplat", "nerfstudio", "rerun", "glb-animated", "exr", "tum", "kitti"]
 
 
 class Format(NamedTuple):
@@ -28,3 +29,20 @@ FORMATS: dict[ExportFormat, Format] = {
     "tum": Format(None, (), ".txt"),
     "kitti": Format(None, (), ".txt"),
 }
+
+
+@dataclass(frozen=True)
+class Exporting:
+    """Which points an export holds. Raises InputError for a value out of range."""
+
+    points: int = 100_000
+    """most static points to write; moving points get as many in each frame"""
+    confidence_percentile: float = 20.0
+    """percent of the pixels, the least confident, to leave out of the points"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", whole_number("points", self.points, 1))
+        if not 0 <= self.confidence_percentile < 100:
+            raise InputError(
+                f"confidence_percentile is {self.confidence_percentile}; expected at least 0 and less than 100"
+            )

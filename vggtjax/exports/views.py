@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -100,13 +99,3 @@ def _pictures(result: Result, source: Source) -> Iterator[UInt8[np.ndarray, "h w
             size = "{} x {}".format(*frame.image.size)
             raise ClipError(f"frame {name!r} has {size} pixels; the result was made from {width} x {height}")
         yield np.asarray(frame.image)
-
-
-def shared_intrinsics(items: Sequence[View]) -> Float64[np.ndarray, "3 3"]:
-    """Return the median intrinsics of views of one size."""
-    return np.median([view.frame.intrinsics for view in items], axis=0)
-
-
-def numbered(names: Sequence[str]) -> Iterator[tuple[int, str]]:
-    """Yield names with numbers from 1, as COLMAP counts."""
-    return zip(itertools.count(1), names, strict=False)

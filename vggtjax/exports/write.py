@@ -4,41 +4,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
 from vggtjax.clips.sampling import Source
-from vggtjax.errors import InputError, OutputError, check_choice, check_extra, whole_number
-from vggtjax.exports.table import FORMATS, ExportFormat
-from vggtjax.exports.views import View, rigid, views
+from vggtjax.errors import InputError, OutputError, check_choice, check_extra
+from vggtjax.exports.table import FORMATS, ExportFormat, Exporting
+from vggtjax.exports.views import View, views
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, shown_points
 from vggtjax.storage.trajectories import write_trajectory
 from vggtjax.storage.writing import writing
-
-POINTS = 100_000
-
-
-@dataclass(frozen=True)
-class Exporting:
-    """Which points an export holds. Raises InputError for a value out of range."""
-
-    points: int = POINTS
-    """most static points to write; moving points get as many in each frame"""
-    confidence_percentile: float = 20.0
-    """percent of the pixels, the least confident, to leave out of the points"""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "points", whole_number("points", self.points, 1))
-        if not 0 <= self.confidence_percentile < 100:
-            raise InputError(
-                f"confidence_percentile is {self.confidence_percentile}; expected at least 0 and less than 100"
-            )
 
 
 def check_export(out: Path, form: ExportFormat) -> None:
@@ -62,7 +42,7 @@ def export_result(
     form: ExportFormat,
     *,
     source: Source | None = None,
-    exporting: Exporting = Exporting(),  # noqa: B008 - frozen
+    exporting: Exporting = Exporting(),
     progress: Progress | None = None,
 ) -> None:
     """Write a result in another program's format.
