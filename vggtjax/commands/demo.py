@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import tyro
+
 from vggtjax.commands.models import load
 from vggtjax.commands.report import Report
+from vggtjax.commands.view import serve
 from vggtjax.options import MethodName, Options
 
 
-def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-d") -> None:
+def demo(
+    *,
+    out: Path = Path("demo-output"),
+    method: MethodName = "4dvggt-d",
+    view: tyro.conf.FlagCreatePairsOff[bool] = False,
+) -> None:
     """Reconstruct the embedded clip with the embedded model, and measure the ladder of methods against its truth.
 
     Args:
         out: folder for the results.
         method: which passes give the depth and cameras that are written.
+        view: open the viewer at the end; `vggtjax view` has its options.
     """
     report = Report()
     with report.running():
@@ -42,6 +51,8 @@ def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-d") ->
             sheet = out / "preview" / "truth.png"
             with writing(sheet) as temporary:
                 Image.fromarray(truth_sheet(result, truth)).save(temporary)
+            page = out / "preview" / "viewer.html"
+            result.view(names=["demo"]).save(page)
         with report.stage("measure") as progress:
             from vggtjax.evaluation.ladder import ladder
 
@@ -49,3 +60,6 @@ def demo(*, out: Path = Path("demo-output"), method: MethodName = "4dvggt-d") ->
     report.summary(result, out, model)
     report.ladder(rows)
     report.line(f"Next to the truth: {sheet}")
+    report.line(f"Double-click to see it move: {page}")
+    if view:
+        serve(report, [result], ["demo"])

@@ -28,11 +28,13 @@ from vggtjax.commands.process import keep_freed_memory
 from vggtjax.commands.reconstruct import reconstruct
 from vggtjax.commands.scenes import scenes
 from vggtjax.commands.train import train
+from vggtjax.commands.view import view
 from vggtjax.errors import VggtjaxError
 from vggtjax.storage.cache import keep_compilations
 
 COMMANDS = {
     "reconstruct": reconstruct,
+    "view": view,
     "batch": batch,
     "convert": convert,
     "export": export,

@@ -13,6 +13,7 @@ from vggtjax.clips.sampling import Sampling
 from vggtjax.commands.arguments import Frames, Method, Output, Size, Sources
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
+from vggtjax.commands.view import serve
 from vggtjax.errors import InputError
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
@@ -74,6 +75,7 @@ def reconstruct(
     options: Method = Options(),
     known: Annotated[Known, tyro.conf.arg(name="mask")] = Known(),
     saving: Output = Saving(),
+    view: tyro.conf.FlagCreatePairsOff[bool] = False,
 ) -> None:
     """Cameras, depth, dynamic masks and a 4-D point cloud of a clip.
 
@@ -86,6 +88,7 @@ def reconstruct(
         options: how the clip is reconstructed
         known: masks and points of your own
         saving: how the result is written
+        view: open the viewer at the end; `vggtjax view` has its options.
     """
     if not source:
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
@@ -128,3 +131,5 @@ def reconstruct(
     report.summary(result, out, network)
     if known.tracks is not None and "tracks" in network.untrained_heads:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")
+    if view:
+        serve(report, [result], [str(out)])

@@ -18,6 +18,7 @@ from vggtjax.results.saving import Saving, SavingChanges
 from vggtjax.storage.writing import writing
 
 if TYPE_CHECKING:
+    from vggtjax.viewer.page import Viewer
     from vggtjax.storage.trajectories import Quaternion
 
 _DEFAULT = Saving()
@@ -65,6 +66,20 @@ class Reconstruction(Result):
     def save_archive(self, path: Path, *, files: Sequence[str] = ()) -> None:
         """Write all fields but `passes` to one compressed .npz file; `files` are the optional files beside it."""
         write_archive(path, self, files)
+
+    def view(self, *others: Result, names: Sequence[str] | None = None, height: int = 600) -> Viewer:
+        """Return a page that plays the result: a notebook shows it in its cell, `.save(path)` writes it to a file.
+
+        Args:
+            others: results to compare with, side by side or swapped by a key; up to eight.
+            names: one for each result; by default their methods and models.
+            height: of the cell, in pixels.
+
+        Raises InputError for too many results, or another number of names.
+        """
+        from vggtjax.viewer.page import Viewer, viewer_page
+
+        return Viewer(viewer_page([self, *others], names=names), height)
 
     @classmethod
     def load(

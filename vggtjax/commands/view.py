@@ -1,0 +1,132 @@
+"""The command `vggtjax view`, and `--view` of other commands. Does not import jax."""
+
+from __future__ import annotations
+
+import os
+import sys
+import webbrowser
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from vggtjax.commands.report import Report
+from vggtjax.errors import InputError
+
+if TYPE_CHECKING:
+    from vggtjax.results.result import Result
+
+_RESULTS = tyro.conf.arg(metavar="RESULT [RESULT ...]", help_behavior_hint="(required)")
+
+
+@dataclass(frozen=True)
+class Serving:
+    """Where the viewer is served."""
+
+    host: str = "127.0.0.1"
+    """address to serve on: this machine alone by default; on any other address the viewer asks for a token, which is
+    printed"""
+    port: int = 8080
+    """0 takes a free one"""
+    browser: tyro.conf.FlagCreatePairsOff[bool] = True
+    """open a browser; never over ssh"""
+
+
+def view(
+    results: Annotated[tuple[Path, ...], tyro.conf.Positional, _RESULTS],
+    /,
+    *,
+    export: Path | None = None,
+    format: Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] = "vggtjax",
+    quaternion: Literal["xyzw", "wxyz"] | None = None,
+    serving: Annotated[Serving, tyro.conf.arg(name="server")] = Serving(),
+) -> None:
+    """See results in a browser: play them, turn them, compare them; or write them as one file that opens offline.
+
+    Args:
+        results: folders of results, up to nine; several are shown side by side or swapped by a key.
+        export: write this .html file, which holds everything and opens without a server, and end; or a .viser file, for
+            viser's own player (extra "view").
+        format: the program that wrote the folders.
+        quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw.
+        serving: where the viewer is served
+    """
+    if not results:
+        raise InputError("no result; name the folder of one, such as demo-output")
+    if export is not None and export.suffix not in (".html", ".viser"):
+        raise InputError(f"export is {export}; expected a name that ends with .html or .viser")
+    report = Report()
+    with report.running():
+        from vggtjax.results.foreign import check_format
+        from vggtjax.viewer.page import check_count
+
+        check_count(len(results))
+        check_format(format, quaternion)
+        with report.stage("read") as progress:
+            from vggtjax.results.reconstruction import Reconstruction
+
+            loaded = []
+            for number, path in enumerate(results):
+                loaded.append(Reconstruction.load(path, format=format, quaternion=quaternion))
+                progress(number + 1, len(results))
+        names = _names(results)
+        if export is not None:
+            _export(report, loaded, names, export)
+    if export is not None:
+        report.line(f"Open in a browser: {export}" if export.suffix == ".html" else f"Written: {export}")
+    else:
+        serve(report, loaded, names, serving)
+
+
+def serve(report: Report, results: Sequence[Result], names: Sequence[str], serving: Serving = Serving()) -> None:
+    """Serve the viewer, say where, open a browser, and wait for Ctrl-C."""
+    from vggtjax.viewer.server import PageServer
+
+    with PageServer("", host=serving.host, port=serving.port) as server:  # a port in use is found before the work
+        with report.running(), report.stage("choose points") as progress:
+            from vggtjax.viewer.page import viewer_page
+
+            server.page = viewer_page(results, names=names, progress=progress).encode()
+        report.line(f"The viewer: {server.url}   (Ctrl-C ends it)")
+        if connection := os.environ.get("SSH_CONNECTION", "").split():
+            if server.token is None:
+                port = server.server_port
+                report.line(f"On your own machine, first: ssh -L {port}:{serving.host}:{port} {connection[2]}")
+        elif serving.browser and not _open_browser(server.url):
+            report.line("No browser could be opened here; open the address in one.")
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            report.line("The viewer has ended.")
+
+
+def _export(report: Report, results: Sequence[Result], names: Sequence[str], path: Path) -> None:
+    with report.stage("choose points") as progress:
+        if path.suffix == ".viser":
+            from vggtjax.viewer.recording import write_recording
+
+            write_recording(path, results[0], progress=progress)
+        else:
+            from vggtjax.viewer.page import Viewer, viewer_page
+
+            Viewer(viewer_page(results, names=names, progress=progress)).save(path)
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Return the paths without the folders that all of them share."""
+    resolved = [path.resolve() for path in paths]
+    if len(set(resolved)) < 2:
+        return [path.name or str(path) for path in resolved]
+    common = Path(os.path.commonpath(resolved))
+    return [str(path.relative_to(common)) if path != common else path.name for path in resolved]
+
+
+def _open_browser(url: str) -> bool:
+    """Open a browser with windows; return whether there is one."""
+    has_screen = sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    try:
+        return bool(has_screen) and webbrowser.open(url)
+    except webbrowser.Error:
+        return False

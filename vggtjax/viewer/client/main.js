@@ -1,0 +1,17 @@
+// Reads the data, starts the viewer, and plays.
+
+async function main() {
+  const message = element("message");
+  try {
+    const viewer = new Viewer(element("scene"), await readData());
+    const controls = new Controls(viewer);
+    window.vggtjax = { viewer, controls };
+    if (!matchMedia("(prefers-reduced-motion: reduce)").matches && viewer.result.frames > 1) controls.play(true);
+  } catch (error) {
+    message.textContent = error.message;
+    message.hidden = false;
+    throw error;
+  }
+}
+
+main();

@@ -1,0 +1,73 @@
+"""A result as a .viser file: a recording that viser's own player shows. Needs the extra "view"."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vggtjax.errors import check_extra
+from vggtjax.progress import Progress
+from vggtjax.results.result import Result
+from vggtjax.results.shown import shown_points
+from vggtjax.storage.writing import writing
+from vggtjax.viewer.scene import Budget, frame_rate, spacing
+
+_FRUSTUM = 0.07  # of the scene's radius
+
+
+def write_recording(
+    path: str | Path, result: Result, *, budget: Budget = Budget(), progress: Progress | None = None
+) -> None:
+    """Write the static points, the moving points of each frame and the cameras, one frame after the other.
+
+    Raises MissingExtraError without viser, and OutputError.
+    """
+    check_extra("a .viser file", "view", "viser")
+    import viser
+
+    from vggtjax.results.shown import middle_and_radius
+
+    frames, height, width = result.depth.shape
+    most_moving = budget.moving // frames
+    static, moving = shown_points(result, most_static=budget.static, most_moving=most_moving, progress=progress)
+    _, radius = middle_and_radius(result)
+    with contextlib.redirect_stdout(io.StringIO()):  # viser says where its server listens
+        server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+        try:
+            server.scene.set_up_direction(tuple(-result.camera_from_world[:, 1, :3].mean(axis=0)))
+            recording = server.get_scene_serializer()
+            size = spacing(static, radius)
+            colors = static.values(result.images)
+            server.scene.add_point_cloud("/static", static.positions, colors, point_size=size)
+            nodes = []
+            for frame, points in enumerate(moving):
+                colors, size = points.values(result.images), spacing(points, radius)
+                rotation = Rotation.from_matrix(result.world_from_camera[frame, :3, :3])
+                camera = server.scene.add_camera_frustum(
+                    f"/frame/{frame:06d}/camera",
+                    fov=float(2 * np.arctan(height / 2 / result.intrinsics[frame, 1, 1])),
+                    aspect=width / height,
+                    scale=_FRUSTUM * radius,
+                    image=result.images[frame],
+                    wxyz=rotation.as_quat(scalar_first=True),
+                    position=result.camera_centres[frame],
+                    visible=frame == 0,
+                )
+                name = f"/frame/{frame:06d}/points"
+                cloud = server.scene.add_point_cloud(name, points.positions, colors, point_size=size, visible=frame == 0)
+                nodes.append((camera, cloud))
+            for frame, shown in enumerate(nodes):
+                for node in nodes[frame - 1] if frame else ():
+                    node.visible = False
+                for node in shown:
+                    node.visible = True
+                recording.insert_sleep(1 / frame_rate(result))
+            written = recording.serialize()
+        finally:
+            server.stop()
+    with writing(path) as temporary:
+        temporary.write_bytes(written)

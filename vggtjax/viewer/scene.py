@@ -1,0 +1,253 @@
+"""One result as the data of the page: points with their colours, cameras, tracks and a sheet of small pictures."""
+
+from __future__ import annotations
+
+import base64
+import io
+from typing import Any, NamedTuple
+
+import numpy as np
+from cmap import Colormap
+from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8, UInt16
+from PIL import Image
+from scipy.spatial import cKDTree
+
+from vggtjax.cameras import frustum_corners
+from vggtjax.errors import one_line
+from vggtjax.progress import Progress
+from vggtjax.results.frame import frame_of
+from vggtjax.results.result import Result
+from vggtjax.results.shown import ShownPoints, middle_and_radius, shown_points
+from vggtjax.results.tracks import SEEN
+from vggtjax.viewer.colors import TIME_RAMP, confidence_ranks, lacks, offered_colors
+
+LARGEST_STEP = 0.3  # of depth between neighbours, as a share; pixels beside larger ones are never shown
+_LEAST_MOVING = 200  # points of a frame
+_STEEPEST = 8.0  # slope of a surface, up to which a step of depth is none
+_FRUSTUM = 0.07  # of the scene's radius
+_SPLAT = 1.3  # distances to the fourth neighbour: a point's width
+_PLAIN_RATE = 10.0  # frames a second without timestamps
+_TILE, _SHEET = 256, 4096  # pixels: the longer side of a small picture; a side of the sheet that every browser takes
+
+
+class Budget(NamedTuple):
+    """The most points of a result in the page."""
+
+    static: int = 160_000
+    moving: int = 800_000  # of all frames together
+
+
+class Place(NamedTuple):
+    """Where a result's world lies in the page's: x -> scale * rotation x + offset."""
+
+    scale: float
+    rotation: Float64[np.ndarray, "3 3"]
+    offset: Float64[np.ndarray, " 3"]
+
+    def points(self, points: Float[np.ndarray, "*N 3"]) -> Float32[np.ndarray, "*N 3"]:
+        return (self.scale * (points @ self.rotation.T) + self.offset).astype(np.float32)
+
+
+def place_beside(result: Result, first: Result) -> Place:
+    """Return the place at which the first camera is that of `first`, and the median depth of its frame the same."""
+    scale = _median_depth(first) / _median_depth(result)
+    ours, theirs = (one.camera_from_world[0].astype(np.float64) for one in (result, first))
+    rotation = theirs[:, :3].T @ ours[:, :3]
+    offset = theirs[:, :3].T @ (scale * ours[:, 3] - theirs[:, 3])
+    return Place(scale, rotation, offset)
+
+
+def scene_of(
+    result: Result, name: str, place: Place, *, budget: Budget, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Return what the page shows of a result: JSON values and arrays, by the names that client/*.js read."""
+    S = len(result.depth)
+    static, moving = shown_points(
+        result,
+        static_percentile=0,
+        dynamic_percentile=0,
+        edges=LARGEST_STEP,
+        most_static=budget.static,
+        most_moving=max(_LEAST_MOVING, budget.moving // S),
+        progress=progress,
+    )
+    random = np.random.default_rng(0)
+    parts = [_shuffled(part, random) for part in (static, *moving)]
+    points = ShownPoints(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+    middle, radius = middle_and_radius(result)
+    centre, radius = place.points(middle), radius * place.scale
+    positions = place.points(points.positions)
+    corners = frustum_corners(result.intrinsics, result.camera_from_world, *result.depth.shape[1:], 1)
+    corners = place.points(corners[:, :1] + (corners - corners[:, :1]) * (_FRUSTUM * radius / place.scale))
+    busiest = max(moving, key=lambda part: len(part.pixels))
+    return {
+        "name": one_line(name, 80),
+        "facts": _facts(result),
+        "note": one_line(result.model_note),
+        "frames": S,
+        "rate": frame_rate(result),
+        "times": None if result.timestamps is None else (result.timestamps - result.timestamps[0]).tolist(),
+        "centre": centre.tolist(),
+        "scale": radius,
+        "positions": contracted(positions, centre, radius).ravel(),
+        "quality": np.stack([confidence_ranks(result, points), _steps(result, points)], axis=-1).ravel(),
+        "staticCount": len(static.pixels),
+        "offsets": len(static.pixels) + np.cumsum([0, *(len(part.pixels) for part in moving)], dtype=np.uint32),
+        "largestStep": LARGEST_STEP,
+        "pointSize": place.scale * spacing(static, radius / place.scale),
+        "movingSize": place.scale * spacing(busiest, radius / place.scale),
+        "colors": offered_colors(result, points),
+        "corners": corners.ravel(),
+        "frustumSize": _FRUSTUM * radius,
+        "frameColors": TIME_RAMP[np.linspace(0, 230, S).round().astype(int)].ravel(),
+        "tracks": _tracks(result, place),
+        "home": _home(result, place, positions),
+        **_cameras(result, place),
+        **_sheet(result),
+    }
+
+
+def contracted(
+    positions: Float32[np.ndarray, "N 3"], centre: Float32[np.ndarray, " 3"], scale: float
+) -> UInt16[np.ndarray, "N 3"]:
+    """Return d / (scale + |d|) of the offsets d from the centre in 16 bits: fine near the centre, coarse far away."""
+    offsets = positions.astype(np.float64) - centre
+    inside = offsets / (scale + np.linalg.norm(offsets, axis=-1, keepdims=True))
+    return ((inside + 1) * 32767.5).round().astype(np.uint16)
+
+
+def _shuffled(points: ShownPoints, random: np.random.Generator) -> ShownPoints:
+    """Return the points in random order: the first ones of any number cover the scene."""
+    order = random.permutation(len(points.pixels))
+    return ShownPoints(*(field[order] for field in points))
+
+
+def _median_depth(result: Result) -> float:
+    frame = frame_of(result, 0)
+    return float(np.median(frame.depth[frame.valid])) if frame.valid.any() else 1.0
+
+
+def _facts(result: Result) -> str:
+    S, H, W = result.depth.shape
+    frames = f"{S} frame{'s' if S > 1 else ''} of {W} x {H}"
+    return one_line(f"{result.method} · {result.model_name} · {frames} · {result.dynamic_share:.0%} moving")
+
+
+def frame_rate(result: Result) -> float:
+    """Return frames a second."""
+    if result.timestamps is None or len(result.timestamps) < 2:
+        return _PLAIN_RATE
+    step = float(np.median(np.diff(result.timestamps)))
+    return float(np.clip(1 / step, 0.5, 60)) if step > 0 else _PLAIN_RATE
+
+
+def spacing(points: ShownPoints, radius: float) -> float:
+    """Return the width of a point that lets neighbours touch."""
+    if len(points.pixels) < 5:
+        return 0.005 * radius
+    chosen = points.positions[:: max(1, len(points.pixels) // 2000)]
+    distances, _ = cKDTree(points.positions).query(chosen, 5)
+    return float(np.clip(_SPLAT * np.median(distances[:, 4]), 1e-4 * radius, 0.05 * radius))
+
+
+def _steps(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
+    """Return the largest relative step of depth to a neighbour, 255 for `LARGEST_STEP`; 0 on steep surfaces."""
+    steps = np.zeros(len(points.pixels), np.uint8)
+    order = np.argsort(points.frames, kind="stable")
+    bounds = np.searchsorted(points.frames[order], np.arange(len(result.depth) + 1))
+    for number, (first, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+        chosen = order[first:end]
+        steps[chosen] = _frame_steps(result, number).ravel()[points.pixels[chosen]]
+    return steps
+
+
+def _frame_steps(result: Result, number: int) -> UInt8[np.ndarray, "H W"]:
+    frame = frame_of(result, number)
+    largest = np.zeros(frame.depth.shape)
+    for axis in range(2):
+        before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
+        one, other = frame.depth[before], frame.depth[after]
+        both = frame.valid[before] & frame.valid[after]
+        with np.errstate(all="ignore"):
+            step = np.where(both, np.abs(one - other) / np.minimum(one, other), 0)
+        step[~(step > _STEEPEST / frame.intrinsics[1 - axis, 1 - axis])] = 0
+        np.maximum(largest[before], step, out=largest[before])
+        np.maximum(largest[after], step, out=largest[after])
+    return (np.clip(largest / LARGEST_STEP, 0, 1) * 255).round().astype(np.uint8)
+
+
+def _cameras(result: Result, place: Place) -> dict[str, Any]:
+    """Return world-from-camera in the page's world, and the tangents of half the fields of view."""
+    _, H, W = result.depth.shape
+    poses = np.concatenate(
+        [
+            place.rotation @ result.world_from_camera[:, :3, :3],
+            place.points(result.camera_centres)[..., None],
+        ],
+        axis=-1,
+    )
+    tangents = np.array([W, H]) / 2 / result.intrinsics[:, [0, 1], [0, 1]]
+    return {"poses": poses.astype(np.float32).ravel(), "tangents": tangents.astype(np.float32).ravel()}
+
+
+def _home(result: Result, place: Place, positions: Float32[np.ndarray, "N 3"]) -> dict[str, list[float]]:
+    """Return the first view: from behind and above the cameras, on the middle of the points."""
+    axes = result.camera_from_world[:, :, :3].astype(np.float64).mean(axis=0) @ place.rotation.T
+    up = -axes[1] if np.linalg.norm(axes[1]) > 0.1 else np.array([0.0, -1.0, 0.0])
+    up /= np.linalg.norm(up)
+    middle = place.points(result.camera_centres).astype(np.float64).mean(axis=0)
+    target = np.median(positions, axis=0).astype(np.float64) if len(positions) else middle + axes[2]
+    away = target - middle
+    eye = middle - 0.6 * away + 0.4 * np.linalg.norm(away) * up
+    return {"eye": eye.tolist(), "target": target.tolist(), "up": up.tolist()}
+
+
+def _tracks(result: Result, place: Place) -> dict[str, Any] | None:
+    """Return the points of the tracks in the world, NaN where hidden or without depth, and a colour for each track."""
+    if result.track_positions is None or result.track_visibility is None or result.track_positions.size == 0:
+        return None
+    S, H, W = result.depth.shape
+    count = result.track_positions.shape[1]
+    columns, rows = (np.floor(result.track_positions[..., i]).astype(np.int64) for i in range(2))
+    inside = (columns >= 0) & (columns < W) & (rows >= 0) & (rows < H) & (result.track_visibility >= SEEN)
+    columns, rows = columns.clip(0, W - 1), rows.clip(0, H - 1)
+    positions = np.full((S, count, 3), np.nan, np.float32)
+    for number in range(S):
+        frame = frame_of(result, number)
+        known = inside[number] & _at(frame.valid, rows[number], columns[number])
+        positions[number, known] = place.points(frame.world_points()[rows[number], columns[number]][known])
+    hues = Colormap("hsv")(np.linspace(0, 1, count, endpoint=False))[:, :3]
+    return {"positions": positions.ravel(), "colors": (hues * 255).round().astype(np.uint8).ravel()}
+
+
+def _at(
+    picture: Bool[np.ndarray, "H W"], rows: Int[np.ndarray, " Q"], columns: Int[np.ndarray, " Q"]
+) -> Bool[np.ndarray, " Q"]:
+    return picture[rows, columns]
+
+
+def _sheet(result: Result) -> dict[str, Any]:
+    """Return the pictures of all frames, made small, in one JPEG as a data URL, row by row."""
+    S, H, W = result.depth.shape
+    scale = min(1.0, _TILE / max(H, W))
+    while True:
+        width, height = max(1, round(W * scale)), max(1, round(H * scale))
+        columns = max(1, min(S, _SHEET // width))
+        rows = -(-S // columns)
+        if rows * height <= _SHEET or max(width, height) <= 4:
+            break
+        scale *= 0.9
+    sheet = Image.new("RGB", (columns * width, rows * height))
+    for frame in range(S):
+        small = Image.fromarray(result.images[frame]).resize((width, height), Image.Resampling.LANCZOS)
+        sheet.paste(small, (frame % columns * width, frame // columns * height))
+    file = io.BytesIO()
+    sheet.save(file, "JPEG", quality=82)
+    url = f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"
+    return {
+        "sheet": url,
+        "columns": columns,
+        "rows": rows,
+        "tile": [width, height],
+        "hasPictures": not lacks(result, "images"),
+    }
