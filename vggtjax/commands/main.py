@@ -56,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keep_freed_memory()
     atexit.register(gc.freeze)  # at the end there is nothing to collect, and a last collection takes half a second
     logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
-    for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub"):
+    for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub", "websockets"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
     keep_compilations()  # after showwarning is set: keep_compilations replaces it for some warnings

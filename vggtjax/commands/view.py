@@ -30,8 +30,8 @@ class Serving:
     printed"""
     port: int = 8080
     """0 takes a free one"""
-    browser: tyro.conf.FlagCreatePairsOff[bool] = True
-    """open a browser; never over ssh"""
+    no_browser: tyro.conf.FlagCreatePairsOff[bool] = False
+    """open no browser; over ssh none is opened"""
 
 
 def view(
@@ -94,7 +94,7 @@ def serve(report: Report, results: Sequence[Result], names: Sequence[str], servi
             if server.token is None:
                 port = server.server_port
                 report.line(f"On your own machine, first: ssh -L {port}:{serving.host}:{port} {connection[2]}")
-        elif serving.browser and not _open_browser(server.url):
+        elif not serving.no_browser and not _open_browser(server.url):
             report.line("No browser could be opened here; open the address in one.")
         try:
             server.serve_forever()

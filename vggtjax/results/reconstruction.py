@@ -18,8 +18,8 @@ from vggtjax.results.saving import Saving, SavingChanges
 from vggtjax.storage.writing import writing
 
 if TYPE_CHECKING:
-    from vggtjax.viewer.page import Viewer
     from vggtjax.storage.trajectories import Quaternion
+    from vggtjax.viewer.page import Viewer
 
 _DEFAULT = Saving()
 

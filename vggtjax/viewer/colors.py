@@ -87,7 +87,7 @@ def _precision(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
 
 
 def _saliency(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
-    assert result.saliency is not None  # noqa: S101 - offered only then
+    assert result.saliency is not None
     _, H, W = result.depth.shape
     _, h, w = result.saliency.shape
     rows, columns = np.divmod(points.pixels, W)

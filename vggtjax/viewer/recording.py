@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from vggtjax.errors import check_extra
 from vggtjax.progress import Progress
 from vggtjax.results.result import Result
-from vggtjax.results.shown import shown_points
+from vggtjax.results.shown import middle_and_radius, shown_points
 from vggtjax.storage.writing import writing
 from vggtjax.viewer.scene import Budget, frame_rate, spacing
 
@@ -28,8 +28,6 @@ def write_recording(
     """
     check_extra("a .viser file", "view", "viser")
     import viser
-
-    from vggtjax.results.shown import middle_and_radius
 
     frames, height, width = result.depth.shape
     most_moving = budget.moving // frames
@@ -58,7 +56,9 @@ def write_recording(
                     visible=frame == 0,
                 )
                 name = f"/frame/{frame:06d}/points"
-                cloud = server.scene.add_point_cloud(name, points.positions, colors, point_size=size, visible=frame == 0)
+                cloud = server.scene.add_point_cloud(
+                    name, points.positions, colors, point_size=size, visible=frame == 0
+                )
                 nodes.append((camera, cloud))
             for frame, shown in enumerate(nodes):
                 for node in nodes[frame - 1] if frame else ():

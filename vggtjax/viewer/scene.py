@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 import io
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
 from cmap import Colormap
 from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8, UInt16
 from PIL import Image
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from vggtjax.cameras import frustum_corners
 from vggtjax.errors import one_line
@@ -61,7 +62,7 @@ def scene_of(
     result: Result, name: str, place: Place, *, budget: Budget, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Return what the page shows of a result: JSON values and arrays, by the names that client/*.js read."""
-    S = len(result.depth)
+    S, H, W = result.depth.shape
     static, moving = shown_points(
         result,
         static_percentile=0,
@@ -73,11 +74,12 @@ def scene_of(
     )
     random = np.random.default_rng(0)
     parts = [_shuffled(part, random) for part in (static, *moving)]
-    points = ShownPoints(*(np.concatenate(fields) for fields in zip(*parts, strict=True)))
+    positions, frames, pixels = (np.concatenate(fields) for fields in zip(*parts, strict=True))
+    points = ShownPoints(positions, frames, pixels)
     middle, radius = middle_and_radius(result)
     centre, radius = place.points(middle), radius * place.scale
     positions = place.points(points.positions)
-    corners = frustum_corners(result.intrinsics, result.camera_from_world, *result.depth.shape[1:], 1)
+    corners = frustum_corners(result.intrinsics, result.camera_from_world, H, W, 1)
     corners = place.points(corners[:, :1] + (corners - corners[:, :1]) * (_FRUSTUM * radius / place.scale))
     busiest = max(moving, key=lambda part: len(part.pixels))
     return {
@@ -119,7 +121,7 @@ def contracted(
 def _shuffled(points: ShownPoints, random: np.random.Generator) -> ShownPoints:
     """Return the points in random order: the first ones of any number cover the scene."""
     order = random.permutation(len(points.pixels))
-    return ShownPoints(*(field[order] for field in points))
+    return ShownPoints(points.positions[order], points.frames[order], points.pixels[order])
 
 
 def _median_depth(result: Result) -> float:
@@ -146,7 +148,7 @@ def spacing(points: ShownPoints, radius: float) -> float:
     if len(points.pixels) < 5:
         return 0.005 * radius
     chosen = points.positions[:: max(1, len(points.pixels) // 2000)]
-    distances, _ = cKDTree(points.positions).query(chosen, 5)
+    distances, _ = KDTree(points.positions).query(chosen, 5)
     return float(np.clip(_SPLAT * np.median(distances[:, 4]), 1e-4 * radius, 0.05 * radius))
 
 
@@ -155,7 +157,7 @@ def _steps(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
     steps = np.zeros(len(points.pixels), np.uint8)
     order = np.argsort(points.frames, kind="stable")
     bounds = np.searchsorted(points.frames[order], np.arange(len(result.depth) + 1))
-    for number, (first, end) in enumerate(zip(bounds[:-1], bounds[1:], strict=True)):
+    for number, (first, end) in enumerate(itertools.pairwise(bounds.tolist())):
         chosen = order[first:end]
         steps[chosen] = _frame_steps(result, number).ravel()[points.pixels[chosen]]
     return steps

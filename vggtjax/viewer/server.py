@@ -61,7 +61,7 @@ class PageServer(ThreadingHTTPServer):
 
 
 class _Handler(BaseHTTPRequestHandler):
-    server: PageServer
+    server: PageServer  # pyright: ignore[reportIncompatibleVariableOverride] - made by this server alone
     timeout = _SILENCE
     server_version, sys_version = "vggtjax", ""
 
