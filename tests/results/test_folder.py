@@ -13,9 +13,10 @@ from tests.results.test_export import files
 from tests.room import make_room
 from vggtjax.errors import OutputError
 from vggtjax.results import folder as folders
-from vggtjax.results.archive import ARCHIVE_NAME, saved_files
-from vggtjax.results.folder import NAMES, check_folder, find_archive, replacing
+from vggtjax.results.archive import ARCHIVE_NAME, saved_names
+from vggtjax.results.folder import check_folder, find_archive, replacing
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.saving import NAMES, OPTIONAL_FILES
 from vggtjax.storage.writing import _remove_leftovers
 
 
@@ -45,12 +46,12 @@ def killed_after(n):
             _remove_leftovers.cache_clear()  # as in the next process
 
 
-def save(folder, frames, optional):
+def save(folder, frames, names=NAMES):
     """Save a result whose files, but the archive, say only how many frames it has."""
-    with replacing(folder, optional) as staged:
-        for name in (*NAMES, *optional):
+    with replacing(folder, names) as staged:
+        for name in names:
             (staged / name).write_text(str(frames))
-        make_room(frames, 14, 14).save_archive(staged / ARCHIVE_NAME, files=optional)
+        make_room(frames, 14, 14).save_archive(staged / ARCHIVE_NAME, files=names)
 
 
 def frames_of(folder):
@@ -58,23 +59,27 @@ def frames_of(folder):
     result = Reconstruction.load(folder)
     others = {ARCHIVE_NAME, ".vggtjax.lock"}  # a killed process leaves the file of its lock, which is free
     texts = {path.name: path.read_text() for path in folder.iterdir() if path.name not in others}
-    assert set(texts) - set(saved_files(folder / ARCHIVE_NAME)) == set(NAMES)
-    assert set(texts.values()) == {str(len(result.depth))}
+    assert {ARCHIVE_NAME, *texts} == set(saved_names(folder / ARCHIVE_NAME))
+    assert set(texts.values()) <= {str(len(result.depth))}
     return len(result.depth)
 
 
-@pytest.mark.parametrize("optional", [None, (), ("vggt4d",)])
-def test_a_killed_replacement_is_finished_by_the_next(tmp_path, optional):
+ALL = (*NAMES, *OPTIONAL_FILES)
+FEW = ("scene.glb", "vggt4d")
+
+
+@pytest.mark.parametrize(("old", "new"), [(None, ALL), (NAMES, ALL), (ALL, NAMES), (ALL, FEW), (FEW, NAMES), (FEW, ())])
+def test_a_killed_replacement_is_finished_by_the_next(tmp_path, old, new):
     (tmp_path / "old").mkdir()
-    if optional is not None:
-        save(tmp_path / "old", 1, optional)
+    if old is not None:
+        save(tmp_path / "old", 1, old)
     lengths, n, folder = set(), 0, tmp_path
     for n in range(60):
         folder = tmp_path / str(n)
         shutil.copytree(tmp_path / "old", folder)
         try:
             with killed_after(n):
-                save(folder, 2, ("tracks.npz",))
+                save(folder, 2, new)
             break
         except Killed:
             pass
@@ -84,14 +89,14 @@ def test_a_killed_replacement_is_finished_by_the_next(tmp_path, optional):
         check_folder(folder)
         if loaded is not None:
             assert frames_of(folder) == (2 if pending else loaded), n
-        save(folder, 3, ())
+        save(folder, 3)
         assert frames_of(folder) == 3, n
-    assert 12 < n < 59
-    assert lengths == ({None, 2} if optional is None else {1, 2})
+    assert len(new) < n < 59
+    assert lengths == ({None, 2} if old is None else {1, 2})
     assert frames_of(folder) == 2
 
 
-@pytest.mark.parametrize("failing", range(0, 25, 3))
+@pytest.mark.parametrize("failing", range(1, 27, 3))
 def test_a_failed_replacement_is_undone(tmp_path, monkeypatch, failing):
     make_room(2).save(tmp_path)
     before = files(tmp_path)
@@ -104,7 +109,7 @@ def test_a_failed_replacement_is_undone(tmp_path, monkeypatch, failing):
         return rename(source, target)
 
     monkeypatch.setattr(Path, "rename", fail_once)
-    if failing < 23:
+    if failing < 24:
         with pytest.raises(OutputError, match="Permission denied"):
             make_room(3).save(tmp_path)
         assert files(tmp_path) == before
@@ -116,7 +121,7 @@ def test_a_failed_replacement_is_undone(tmp_path, monkeypatch, failing):
 SAVER = """
 import sys
 from pathlib import Path
-from tests.results.test_folder import save
+from tests.results.test_folder import NAMES, save
 folder, frames, pausing = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
 print("ready", flush=True)
 sys.stdin.readline()
@@ -130,7 +135,7 @@ if pausing:
         return rename(source, target)
     Path.rename = pause
 for _ in range(1 if pausing else 12):
-    save(folder, frames, ("tracks.npz",) if frames == 2 else ())
+    save(folder, frames, ("depth", "tracks.npz") if frames == 2 else NAMES)
 assert "jax" not in sys.modules
 """
 
@@ -165,7 +170,7 @@ def test_two_processes_save_into_one_folder(tmp_path, monkeypatch):
         assert heard(slow) == "moving"
         before = sorted(folder.rglob("*"))
         monkeypatch.setattr(folders, "_WAIT", 0.1)
-        for attempt in (lambda: check_folder(folder), lambda: save(folder, 4, ())):
+        for attempt in (lambda: check_folder(folder), lambda: save(folder, 4)):
             with pytest.raises(OutputError, match="another run is writing a result"):
                 attempt()
         assert sorted(folder.rglob("*")) == before

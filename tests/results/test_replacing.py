@@ -11,6 +11,7 @@ from vggtjax.errors import InputError, OutputError
 from vggtjax.results import export
 from vggtjax.results.folder import replacing
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.saving import GROUPS, Saving, parse_groups
 
 
 def test_earlier_result_is_replaced_as_a_whole(tmp_path):
@@ -78,7 +79,7 @@ def test_the_archive_leaves_first_and_arrives_last(tmp_path, monkeypatch):
 
     monkeypatch.setattr(type(tmp_path), "rename", watch)
     make_room(1).save(tmp_path)
-    assert seen == [True] + [False] * 21 + [True, True]  # first and last the hidden folder moves
+    assert seen == [True] + [False] * 22 + [True, True]  # first and last the hidden folder moves
 
 
 def test_error_of_the_callback_leaves_nothing_behind(tmp_path):
@@ -102,6 +103,39 @@ def test_percentile_out_of_range_writes_nothing(tmp_path):
     with pytest.raises(InputError, match="confidence_percentile is 100"):
         make_room(1).save(tmp_path / "result", confidence_percentile=100)
     assert not (tmp_path / "result").exists()
+
+
+def test_what_is_no_longer_written_goes_away_as_a_whole(tmp_path):
+    make_room(2).save(tmp_path, format="vggt4d")
+    make_room(3).save(tmp_path, only=("depth", "cameras"))
+    numbers = (f"depth/{frame:06d}.{kind}" for frame in range(3) for kind in ("npy", "png"))
+    assert set(files(tmp_path)) == {
+        "reconstruction.npz", "trajectory.txt", "intrinsics.txt", "depth/scale.txt", *numbers,
+    }  # fmt: skip
+    (tmp_path / "mask").mkdir()  # of this name, but not part of the result
+    make_room(2).save(tmp_path, only=("previews",))
+    with pytest.raises(OutputError, match="mask exists and is not part of an earlier result"):
+        make_room(2).save(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"reconstruction.npz", "preview", "mask"}
+
+
+@pytest.mark.parametrize("group", list(GROUPS))
+def test_every_group_is_written_alone(tmp_path, group):
+    track = {"track_positions": np.zeros((2, 1, 2)), "track_visibility": np.ones((2, 1))}
+    room = make_room(2, **track, track_confidence=np.ones((2, 1)), track_frames=np.zeros(1, np.int64))
+    room.save(tmp_path, only=(group,))
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written == {"reconstruction.npz", "tracks.npz", *GROUPS[group]}
+    assert len(Reconstruction.load(tmp_path).depth) == 2
+
+
+def test_groups_are_read_from_text():
+    assert parse_groups(" cameras,depth, depth,") == ("depth", "cameras")
+    with pytest.raises(InputError, match="only is 'nose'; expected one of depth, confidence, cameras, masks"):
+        parse_groups("depth,nose")
+    for wrong in ("depth", ("nose",)):
+        with pytest.raises(InputError, match="only"):
+            Saving(only=wrong)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_new_kind_of_file_is_not_lost(tmp_path):

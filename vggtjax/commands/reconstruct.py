@@ -102,15 +102,16 @@ def reconstruct(
         opened.total(sampling)
         next(opened.frames(Sampling()))  # finds a broken source before the model is loaded, which takes longer
         known.check(options)
-        optional = {"tracks.npz": known.tracks is not None, "vggt4d": saving.format == "vggt4d"}
-        check_folder(out, [name for name, is_written in optional.items() if is_written])
+        check_folder(out, saving.names(tracks=known.tracks is not None))
         network, fitted = files.load(report, options, [options.method])
         with report.stage("load clip") as progress:
             from vggtjax.clips.clip import read_clip
             from vggtjax.clips.queries import parse_queries
+            from vggtjax.results.disk import announce, forecast_bytes
 
             fitter = framing.fitter(size=network.config.image_size, patch=network.config.patch_size)
             clip = read_clip(opened, sampling, fitter, progress)
+            announce(out, forecast_bytes(clip.images.shape[:3], clip.source_size, saving))
             masks = known.masks_of(clip)
             queries = None if known.tracks is None else parse_queries(known.tracks, clip)
         from vggtjax.pipeline.run import reconstruct as run

@@ -73,6 +73,7 @@ class Report:
     def summary(self, result: Reconstruction, out: Path, model: Model | None = None) -> None:
         """Print what was reconstructed, by which model, the total time, and where the files are."""
         frames, height, width = result.depth.shape
+        pictures = [out / name for name in ("preview/sheet.png", "scene.glb") if (out / name).exists()]
         self.table(
             {
                 "frames": f"{frames} of {width} x {height} pixels",
@@ -81,8 +82,8 @@ class Report:
                 "total": f"{sum(self._seconds.values()):.2f} s",
                 "peak memory": _peak_memory(),
                 "results": f"{out}/",
-                "look at": f"{out / 'preview' / 'sheet.png'}, {out / 'scene.glb'}",
             }
+            | ({"look at": ", ".join(map(str, pictures))} if pictures else {})
         )
         if model is not None and model.note:
             self.line(model.warning)

@@ -24,6 +24,7 @@ from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
+from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
 from vggtjax.storage.json_values import read_json
@@ -134,6 +135,7 @@ class _Batch:
             "stride": self.sampling.step,
             **self.options.resolved().to_json(),
             **dataclasses.asdict(self.saving),
+            "only": None if self.saving.only is None else list(self.saving.only),
             "fusion": fusion_digest(self.fusion),
             "pad_frames": self.pad_frames,
         }
@@ -173,6 +175,7 @@ def _reconstruct_all(run: _Batch, sources: Mapping[str, ClipSource], out: Path, 
                 fill()
                 try:
                     clip = loaded.result()
+                    announce(out / name, forecast_bytes(clip.images.shape[:3], clip.source_size, run.saving))
                     result = run.reconstruct(clip)
                 except (VggtjaxError, MemoryError) as error:
                     work.finish(name, 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +12,20 @@ import numpy as np
 
 from vggtjax.errors import ResultError
 from vggtjax.results.result import ARRAYS, OPTIONAL, STRINGS, TRACKS, Result, check_shapes
+from vggtjax.results.saving import NAMES, OPTIONAL_FILES
 from vggtjax.storage.arrays import Header, read_arrays, read_headers, write_arrays
 
 ARCHIVE_NAME = "reconstruction.npz"
-OPTIONAL_FILES = ("tracks.npz", "vggt4d")  # of a result's folder
 _FORMAT_VERSION = 1
 _MOST_FILES = 100
 
 
 def write_archive(path: Path, result: Result, files: Sequence[str] = ()) -> None:
-    """Write the fields of a result; `files` are the optional files beside the archive that are part of the result."""
+    """Write the fields of a result; `files` are the files and folders beside the archive that are part of it."""
     arrays = {name: getattr(result, name) for name in ARRAYS if getattr(result, name) is not None}
     strings = {name: getattr(result, name) for name in STRINGS} | {"settings": json.dumps(result.settings)}
     arrays |= {name: np.array(value, np.str_) for name, value in strings.items()}
-    arrays |= {"format_version": np.array(_FORMAT_VERSION), "files": np.array(files, np.str_)}
+    arrays |= {"format_version": np.array(_FORMAT_VERSION), "files": np.array([ARCHIVE_NAME, *files], np.str_)}
     write_arrays(path, arrays)
 
 
@@ -54,15 +55,23 @@ def is_result(path: Path) -> bool:
         return False
 
 
-def saved_files(path: Path) -> tuple[str, ...]:
-    """Return the optional files beside a reconstruction.npz that are part of its result."""
-    try:
-        header = read_headers(path).get("files")
-        if header is None or len(header.shape) != 1 or header.shape[0] > _MOST_FILES or header.dtype.kind != "U":
-            return ()
-        return tuple(name for name in read_arrays(path, ["files"])["files"].tolist() if name in OPTIONAL_FILES)
-    except ResultError:
+def saved_names(path: Path) -> tuple[str, ...]:
+    """Return the names of all files and folders of the result of an archive, which is the first; () if it is none."""
+    if not is_result(path):
         return ()
+    saved: list[str] = []
+    with suppress(ResultError):
+        header = read_headers(path).get("files")
+        if (
+            header is not None
+            and len(header.shape) == 1
+            and header.shape[0] <= _MOST_FILES
+            and header.dtype.kind == "U"
+        ):
+            saved = read_arrays(path, ["files"])["files"].tolist()
+    if ARCHIVE_NAME not in saved:  # earlier archives tell the optional files alone
+        saved = [*NAMES, *saved]
+    return (ARCHIVE_NAME, *(name for name in (*NAMES, *OPTIONAL_FILES) if name in saved))
 
 
 def _check_headers(headers: Mapping[str, Header]) -> None:

@@ -16,6 +16,8 @@ In the folder, with a frame's number as its file name:
     frames/                 .ply of all points of a frame
     scene.glb               the clouds and the cameras for a viewer, y up
 
+`Saving.only` names the groups of these files that are written; the archive always is.
+
 At the resolution "original" the files of single frames, the clouds and intrinsics.txt are at the size of the source's
 pictures; the archive, the sheet, the scene and the tracks' pictures stay at the model's.
 
@@ -41,6 +43,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -54,7 +57,6 @@ from PIL.PngImagePlugin import PngInfo
 from vggtjax.errors import InputError
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results import foreign, previews, tracks
-from vggtjax.results.archive import OPTIONAL_FILES
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
 from vggtjax.results.glb import build_scene
 from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, joined, least_confidence, write_ply
@@ -68,12 +70,6 @@ _WORKERS = 8
 _MOST_INVALID = 0.5  # share of a clip's pixels; more are warned about
 
 logger = logging.getLogger(__name__)
-
-
-def optional_files(result: Result, saving: Saving) -> tuple[str, ...]:
-    """Return the names of `OPTIONAL_FILES` that this result has."""
-    written = result.track_positions is not None, saving.format == "vggt4d"
-    return tuple(itertools.compress(OPTIONAL_FILES, written))
 
 
 def check_saving(result: Result, saving: Saving, pictures: object) -> None:
@@ -92,28 +88,29 @@ def write_files(
     pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None,
     progress: Progress | None,
 ) -> int:
-    """Write all files but the archive into the empty `folder`; return the number of steps, one left for the archive."""
+    """Write the files that `saving` names, but the archive, into the empty `folder`.
+
+    Returns the number of steps, one of them left for the archive.
+    """
     done, total = itertools.count(1), len(result.depth) + 4
 
     def advance() -> None:
         (progress or no_progress)(next(done), total)
 
-    times, poses = result.timestamps, result.world_from_camera
-    times = np.arange(len(poses), dtype=np.float64) if times is None else times  # by default the frames' numbers
-    write_trajectory(folder / "trajectory.txt", poses, times, note=result.model_note)
     least = least_confidence(result, saving.confidence_percentile)
     written = _write_frames(result, _frames(result, saving.resolution, pictures), least, saving, folder, advance)
     advance()
-    intrinsics = [frame.intrinsics for frame in written]
-    sizes = [frame.size for frame in written]
-    write_intrinsics(folder / "intrinsics.txt", intrinsics, sizes, note=result.model_note)
+    if saving.writes("cameras"):
+        _write_cameras(result, written, folder)
     if saving.format == "vggt4d":
-        foreign.write_cameras(folder / "vggt4d", poses, intrinsics)
-    _build_scene(result, least).export(folder / "scene.glb")
+        foreign.write_cameras(folder / "vggt4d", result.world_from_camera, [frame.intrinsics for frame in written])
+    if saving.writes("scene"):
+        _build_scene(result, least).export(folder / "scene.glb")
     advance()
-    _write_png(folder / "preview/sheet.png", previews.contact_sheet(result))
+    if saving.writes("previews"):
+        _write_png(folder / "preview/sheet.png", previews.contact_sheet(result))
     if result.track_positions is not None:
-        _write_tracks(result, folder)
+        _write_tracks(result, folder, saving)
     advance()
     return total
 
@@ -161,50 +158,18 @@ def _write_frames(
     advance: Callable[[], None],
 ) -> list[_Written]:
     """Write the files of single frames, several frames at a time, and the static cloud."""
-    names = ("confidence", "depth", "mask", "instances", "preview/depth", "preview/overlay", "frames")
-    for name in (*names, "vggt4d") if saving.format == "vggt4d" else names:
-        (folder / name).mkdir(parents=True)
-    valid, pictured = result.valid_pixels, int(result.inside_pictures.sum())
-    invalid = pictured - int(valid.sum())
-    if invalid > _MOST_INVALID * pictured:
-        logger.warning(
-            "%d of %d pixels (%.2f%%) have an invalid depth or confidence and become no points; check the weights and "
-            "the inputs", invalid, pictured, 100 * invalid / pictured,
-        )  # fmt: skip
-    scale = depth_scale(result.depth, valid)
-    head = commented("depth = png / scale, one scale for the clip; 0 in the png: no depth", result.model_note)
-    (folder / "depth/scale.txt").write_text(f"{head}\n{scale!r}\n", encoding="utf-8")
-    inverse_range = previews.inverse_depth_range(result.depth, valid)
-
-    def write_frame(number: int, make: Callable[[], ResultFrame]) -> tuple[_Written, PointCloud]:
-        name, frame = f"{number:06d}", make()
-        valid, pixels = frame.valid, frame.confident(least)
-        np.save(folder / f"confidence/{name}.npy", frame.confidence, allow_pickle=False)
-        np.save(folder / f"depth/{name}.npy", frame.depth, allow_pickle=False)
-        _write_png(folder / f"depth/{name}.png", encode_depth(frame.depth, valid, scale), depth_scale=repr(scale))
-        _write_png(folder / f"mask/{name}.png", frame.dynamic_mask.astype(np.uint8) * 255)
-        instances = Image.fromarray(frame.instances)
-        instances.putpalette(previews.INSTANCE_COLORS.ravel().tolist())
-        instances.save(folder / f"instances/{name}.png", compress_level=_PNG_LEVEL)
-        _write_png(folder / f"preview/depth/{name}.png", previews.depth_picture(frame.depth, valid, inverse_range))
-        moving = previews.moving_ids(frame.dynamic_mask, frame.instances)
-        _write_png(folder / f"preview/overlay/{name}.png", previews.overlay_picture(frame.image, moving))
-        write_ply(folder / f"frames/{name}.ply", frame_cloud(frame, pixels))
-        if saving.format == "vggt4d":
-            foreign.write_frame(folder / "vggt4d", number, frame)
-        size = (frame.depth.shape[0], frame.depth.shape[1])
-        return _Written(size, frame.intrinsics), frame_cloud(frame, pixels & ~frame.dynamic_mask)
-
-    _ = result.instances  # computed once here, not by each thread
+    write_frame = _frame_writer(result, least, saving, folder)
     written: list[_Written] = []
     workers = min(_WORKERS, os.cpu_count() or 1)
-    with PlyWriter(folder / "static.ply") as static, ThreadPoolExecutor(workers) as pool:
-        running: deque[Future[tuple[_Written, PointCloud]]] = deque()
+    static_cloud = PlyWriter(folder / "static.ply") if saving.writes("clouds") else nullcontext()
+    with static_cloud as static, ThreadPoolExecutor(workers) as pool:
+        running: deque[Future[tuple[_Written, PointCloud | None]]] = deque()
 
         def finish() -> None:
             frame, cloud = running.popleft().result()
             written.append(frame)
-            static.add(cloud)
+            if static is not None and cloud is not None:
+                static.add(cloud)
             advance()
 
         try:
@@ -220,7 +185,68 @@ def _write_frames(
     return written
 
 
-def _write_tracks(result: Result, folder: Path) -> None:
+def _frame_writer(
+    result: Result, least: LeastConfidence, saving: Saving, folder: Path
+) -> Callable[[int, Callable[[], ResultFrame]], tuple[_Written, PointCloud | None]]:
+    """Return a function that writes the files of a frame and returns its static points, where clouds are written."""
+    names = [name for name in saving.names(tracks=False) if not Path(name).suffix]
+    for name in names:
+        (folder / name).mkdir(parents=True)
+    if saving.writes("previews"):
+        for name in ("depth", "overlay"):
+            (folder / "preview" / name).mkdir()
+    valid, pictured = result.valid_pixels, int(result.inside_pictures.sum())
+    invalid = pictured - int(valid.sum())
+    if invalid > _MOST_INVALID * pictured:
+        logger.warning(
+            "%d of %d pixels (%.2f%%) have an invalid depth or confidence and become no points; check the weights and "
+            "the inputs", invalid, pictured, 100 * invalid / pictured,
+        )  # fmt: skip
+    scale = depth_scale(result.depth, valid)
+    if saving.writes("depth"):
+        head = commented("depth = png / scale, one scale for the clip; 0 in the png: no depth", result.model_note)
+        (folder / "depth/scale.txt").write_text(f"{head}\n{scale!r}\n", encoding="utf-8")
+    inverse_range = previews.inverse_depth_range(result.depth, valid)
+    _ = result.instances  # computed once here, not by each thread
+
+    def write_frame(number: int, make: Callable[[], ResultFrame]) -> tuple[_Written, PointCloud | None]:
+        name, frame, cloud = f"{number:06d}", make(), None
+        if saving.writes("confidence"):
+            np.save(folder / f"confidence/{name}.npy", frame.confidence, allow_pickle=False)
+        if saving.writes("depth"):
+            np.save(folder / f"depth/{name}.npy", frame.depth, allow_pickle=False)
+            encoded = encode_depth(frame.depth, frame.valid, scale)
+            _write_png(folder / f"depth/{name}.png", encoded, depth_scale=repr(scale))
+        if saving.writes("masks"):
+            _write_png(folder / f"mask/{name}.png", frame.dynamic_mask.astype(np.uint8) * 255)
+            instances = Image.fromarray(frame.instances)
+            instances.putpalette(previews.INSTANCE_COLORS.ravel().tolist())
+            instances.save(folder / f"instances/{name}.png", compress_level=_PNG_LEVEL)
+        if saving.writes("previews"):
+            depth = previews.depth_picture(frame.depth, frame.valid, inverse_range)
+            moving = previews.moving_ids(frame.dynamic_mask, frame.instances)
+            _write_png(folder / f"preview/depth/{name}.png", depth)
+            _write_png(folder / f"preview/overlay/{name}.png", previews.overlay_picture(frame.image, moving))
+        if saving.writes("clouds"):
+            pixels = frame.confident(least)
+            write_ply(folder / f"frames/{name}.ply", frame_cloud(frame, pixels))
+            cloud = frame_cloud(frame, pixels & ~frame.dynamic_mask)
+        if saving.format == "vggt4d":
+            foreign.write_frame(folder / "vggt4d", number, frame)
+        return _Written((frame.depth.shape[0], frame.depth.shape[1]), frame.intrinsics), cloud
+
+    return write_frame
+
+
+def _write_cameras(result: Result, written: Sequence[_Written], folder: Path) -> None:
+    times, poses = result.timestamps, result.world_from_camera
+    times = np.arange(len(poses), dtype=np.float64) if times is None else times  # by default the frames' numbers
+    write_trajectory(folder / "trajectory.txt", poses, times, note=result.model_note)
+    intrinsics, sizes = [frame.intrinsics for frame in written], [frame.size for frame in written]
+    write_intrinsics(folder / "intrinsics.txt", intrinsics, sizes, note=result.model_note)
+
+
+def _write_tracks(result: Result, folder: Path, saving: Saving) -> None:
     scale, offset = result.source_scale[:, None], result.source_offset[:, None]
     arrays = {
         "positions": (result.track_positions * scale + offset).astype(np.float32),
@@ -229,8 +255,9 @@ def _write_tracks(result: Result, folder: Path) -> None:
         "frames": result.track_frames,
     }
     write_arrays(folder / "tracks.npz", arrays)
-    _write_png(folder / "preview/tracks.png", tracks.track_strip(result))
-    tracks.write_track_video(folder / "preview/tracks.mp4", result)
+    if saving.writes("previews"):
+        _write_png(folder / "preview/tracks.png", tracks.track_strip(result))
+        tracks.write_track_video(folder / "preview/tracks.mp4", result)
 
 
 def depth_scale(depth: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]) -> float:

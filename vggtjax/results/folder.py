@@ -1,8 +1,9 @@
 """Replacing the files of an earlier result as a whole, however the process ends.
 
 The new files are written in a hidden folder beside the old ones. Once they are whole, that folder is renamed to
-`.replacing`, with new/ and old/ in it. Then the old files move to old/, the archive first, and the new files into the
-folder, the archive last. If the process is killed, `.replacing` stays, and the next save finishes the moves. Until then
+`.replacing`, with new/, old/ and unmoved/ in it. Then the old files move to old/, the archive first; unmoved/ is
+renamed to moved/; and the new files move into the folder, the archive last. While unmoved/ stands, all files in the
+folder are old. If the process is killed, `.replacing` stays, and the next save finishes the moves. Until then
 `find_archive` returns the archive in the folder or, if it is missing, the archive in new/.
 """
 
@@ -13,14 +14,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
-from vggtjax.results.archive import ARCHIVE_NAME, OPTIONAL_FILES, is_result, saved_files
+from vggtjax.results.archive import ARCHIVE_NAME, saved_names
+from vggtjax.results.saving import NAMES, OPTIONAL_FILES
 from vggtjax.storage.writing import check_free, locked_folder, staging
 
-NAMES = (
-    "confidence", "depth", "mask", "instances", "preview", "frames",
-    "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb",
-)  # fmt: skip
-_ALL = {ARCHIVE_NAME, *NAMES, *OPTIONAL_FILES}
+_ALL = (*NAMES, *OPTIONAL_FILES, ARCHIVE_NAME)
 _REPLACING = ".replacing"
 _WAIT = 60  # seconds for the moves of another process
 
@@ -31,34 +29,33 @@ def find_archive(folder: Path) -> Path:
     return pending if pending.is_file() and not (folder / ARCHIVE_NAME).is_file() else folder / ARCHIVE_NAME
 
 
-def check_folder(folder: Path, optional: Sequence[str] = ()) -> None:
-    """Finish an interrupted replacement in `folder`, then check that a result with these `OPTIONAL_FILES` can be saved.
+def check_folder(folder: Path, names: Sequence[str] = NAMES) -> None:
+    """Finish an interrupted replacement in `folder`, then check that a result with files of these names can be saved.
 
     Raises OutputError where the folder cannot be made or written, holds files of our names that are not part of an
     earlier result, or is locked by another process for a minute.
     """
     with locked_folder(folder, "a result", _WAIT) if folder.is_dir() else nullcontext():
         _finish(folder)
-        archive = folder / ARCHIVE_NAME
-        ours = (ARCHIVE_NAME, *NAMES, *saved_files(archive)) if is_result(archive) else ()
-        names = [name for name in (ARCHIVE_NAME, *NAMES, *optional) if name not in ours]
-        check_free(folder, names, replaced=False, what="result")
+        ours = saved_names(folder / ARCHIVE_NAME)
+        others = [name for name in (ARCHIVE_NAME, *names) if name not in ours]
+        check_free(folder, others, replaced=False, what="result")
 
 
 @contextmanager
-def replacing(folder: Path, optional: Sequence[str]) -> Iterator[Path]:
-    """Yield an empty folder, whose files (the archive and all `NAMES` among them) replace those of `folder` at the end.
+def replacing(folder: Path, names: Sequence[str]) -> Iterator[Path]:
+    """Yield an empty folder, whose files (the archive, and files of these names) replace those of `folder` at the end.
 
     If anything fails, the earlier result is left untouched. Raises what `check_folder` raises, and ValueError for a new
     file of another name.
     """
-    check_folder(folder, optional)
+    check_folder(folder, names)
     with staging(folder) as staged:
-        for name in ("new", "old"):
+        for name in ("new", "old", "unmoved"):
             (staged / name).mkdir()
         yield staged / "new"
-        if unknown := {path.name for path in (staged / "new").iterdir()} - _ALL:
-            raise ValueError(f"{sorted(unknown)} would not be moved; add the name to NAMES or OPTIONAL_FILES")
+        if unknown := {path.name for path in (staged / "new").iterdir()} - {ARCHIVE_NAME, *names}:
+            raise ValueError(f"{sorted(unknown)} would not be moved; add the name to GROUPS or OPTIONAL_FILES")
         with locked_folder(folder, "a result", _WAIT):
             _finish(folder)
             staged.rename(folder / _REPLACING)
@@ -74,12 +71,11 @@ def _finish(folder: Path) -> None:
 
 def _swap(folder: Path) -> None:
     """Do the remaining moves of a replacement; undo them if one fails."""
-    new, old = folder / _REPLACING / "new", folder / _REPLACING / "old"
-    moves = [(new / name, folder / name) for name in (*NAMES, *OPTIONAL_FILES, ARCHIVE_NAME)]
-    if os.path.lexists(new / NAMES[0]):  # the first new file to move is still there: all files in the folder are old
-        archive = next((path for path in (old / ARCHIVE_NAME, folder / ARCHIVE_NAME) if path.is_file()), None)
-        earlier = () if archive is None else (ARCHIVE_NAME, *NAMES, *saved_files(archive))
-        moves = [(folder / name, old / name) for name in earlier] + moves
+    new, old, unmoved = (folder / _REPLACING / name for name in ("new", "old", "unmoved"))
+    moves = [(unmoved, unmoved.with_name("moved")), *((new / name, folder / name) for name in _ALL)]
+    if os.path.lexists(unmoved):  # all files in the folder are old
+        archive = old / ARCHIVE_NAME if os.path.lexists(old / ARCHIVE_NAME) else folder / ARCHIVE_NAME
+        moves = [(folder / name, old / name) for name in saved_names(archive)] + moves
     moves = [(source, target) for source, target in moves if os.path.lexists(source)]
     try:
         for source, target in moves:
@@ -88,7 +84,7 @@ def _swap(folder: Path) -> None:
         for source, target in reversed(moves):
             if os.path.lexists(target) and not os.path.lexists(source):
                 target.rename(source)
-        if os.path.lexists(new / NAMES[0]) and not any(old.iterdir()):  # all moves are undone
+        if os.path.lexists(unmoved) and not any(old.iterdir()):  # all moves are undone
             _remove(folder)
         raise
     _remove(folder)

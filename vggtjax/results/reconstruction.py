@@ -50,21 +50,24 @@ class Reconstruction(Result):
 
         Raises:
             InputError: a percentile outside [0, 100), an unknown name, or pictures that do not fit.
-            OutputError: the folder cannot be written, or holds files of the same names that are no earlier result.
+            OutputError: the folder cannot be written, has too little space, or holds files of the same names that are
+                no earlier result.
         """
-        from vggtjax.results.export import check_saving, optional_files, write_files
+        from vggtjax.results.disk import check_space, forecast_bytes
+        from vggtjax.results.export import check_saving, write_files
 
         saving = saving.changed(**changes)
         check_saving(self, saving, pictures)
-        optional = optional_files(self, saving)
-        with replacing(Path(folder), optional) as staged:
+        check_space(folder, forecast_bytes(self.depth.shape, self.source_size, saving))
+        names = saving.names(tracks=self.track_positions is not None)
+        with replacing(Path(folder), names) as staged:
             total = write_files(self, staged, saving, pictures, progress)
             with writing(staged / ARCHIVE_NAME) as path:
-                self.save_archive(path, files=optional)
+                self.save_archive(path, files=names)
             (progress or no_progress)(total, total)
 
     def save_archive(self, path: Path, *, files: Sequence[str] = ()) -> None:
-        """Write all fields but `passes` to one compressed .npz file; `files` are the optional files beside it."""
+        """Write all fields but `passes` to one compressed .npz file; `files` are the names beside it."""
         write_archive(path, self, files)
 
     def view(self, *others: Result, names: Sequence[str] | None = None, height: int = 600) -> Viewer:

@@ -3,14 +3,48 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, TypedDict
+from typing import Annotated, Literal, TypedDict, get_args
 
+import tyro
 from msgspec import Meta
 
+from vggtjax.errors import InputError, check_choice
 from vggtjax.storage.json_values import check_fields
 
 Resolution = Literal["model", "original"]
 Format = Literal["vggtjax", "vggt4d"]  # of a folder of files
+Group = Literal["depth", "confidence", "cameras", "masks", "previews", "clouds", "scene"]
+
+# Files and folders of a result by group, beside the archive, which every result has.
+GROUPS: dict[Group, tuple[str, ...]] = {
+    "depth": ("depth",),
+    "confidence": ("confidence",),
+    "cameras": ("trajectory.txt", "intrinsics.txt"),
+    "masks": ("mask", "instances"),
+    "previews": ("preview",),
+    "clouds": ("static.ply", "frames"),
+    "scene": ("scene.glb",),
+}
+NAMES = tuple(name for names in GROUPS.values() for name in names)
+OPTIONAL_FILES = ("tracks.npz", "vggt4d")  # written where points were tracked; for the format vggt4d
+
+
+def parse_groups(text: str) -> tuple[Group, ...]:
+    """Return the groups that a text names, such as "depth,cameras", each once. Raises InputError for unknown names."""
+    names = dict.fromkeys(name.strip() for name in text.split(",") if name.strip())
+    for name in names:
+        check_choice("only", name, get_args(Group))
+    return tuple(group for group in GROUPS if group in names)
+
+
+# One argument with commas; tyro's own reading of a tuple would take the words that follow.
+_Groups = tyro.constructors.PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="GROUP,GROUP",
+    instance_from_str=lambda words: parse_groups(words[0]),
+    is_instance=lambda value: isinstance(value, tuple),
+    str_from_instance=lambda value: [",".join(value)],
+)
 
 
 @dataclass(frozen=True)
@@ -23,9 +57,24 @@ class Saving:
     """size of the written files: the model's, or the source's own, with crop, scale and padding undone"""
     format: Format = "vggtjax"
     """"vggt4d" writes, beside the files of vggtjax, the folder vggt4d/ as VGGT4D does"""
+    only: Annotated[tuple[Group, ...] | None, _Groups] = None
+    """write only these groups of files, with commas: depth, confidence, cameras, masks, previews, clouds, scene;
+    reconstruction.npz, from which vggtjax reads everything back, is always written"""
 
     def __post_init__(self) -> None:
+        if isinstance(self.only, str):
+            raise InputError(f"only is {self.only!r}; expected a tuple of groups, such as ('depth', 'cameras')")
         check_fields(self)
+
+    def writes(self, group: Group) -> bool:
+        """Return whether the files of a group are written."""
+        return self.only is None or group in self.only
+
+    def names(self, *, tracks: bool) -> tuple[str, ...]:
+        """Return the files and folders that are written beside the archive, with points tracked or without."""
+        optional = zip(OPTIONAL_FILES, (tracks, self.format == "vggt4d"), strict=True)
+        groups = (name for group, names in GROUPS.items() if self.writes(group) for name in names)
+        return (*groups, *(name for name, is_written in optional if is_written))
 
     def changed(self, *, layout: Format | None = None, **changes: object) -> Saving:
         """Return a copy with other values; `layout` is the old name of `format`."""
@@ -39,3 +88,4 @@ class SavingChanges(TypedDict, total=False):
     resolution: Resolution
     format: Format
     layout: Format
+    only: tuple[Group, ...] | None
