@@ -30,5 +30,6 @@ from .pipeline.run import reconstruct as reconstruct
 from .pretrained.load import load_model as load_model
 from .results.frame import frame_of as frame_of
 from .results.reconstruction import Reconstruction as Reconstruction
+from .storage.cache import enable_compilation_cache as enable_compilation_cache
 
 __version__: str

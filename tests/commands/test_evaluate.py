@@ -3,6 +3,7 @@
 import json
 import shutil
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -38,6 +39,29 @@ def run(capsys, *arguments):
     code = cli.main([str(a) for a in arguments])
     shown = capsys.readouterr()
     return code, shown.out, shown.err
+
+
+FIRST_LINES = """
+import sys
+from vggtjax.commands import main as cli
+from vggtjax.evaluation import datasets
+def found(*_, **__):
+    print("jax" in sys.modules, file=sys.stderr)
+    return {f"s{number}": None for number in range(9)}
+datasets.find_sequences = found
+sys.exit(cli.main(["evaluate", "plain", "somewhere", "--out", sys.argv[1], "--model", "nothing.safetensors"]))
+"""
+
+
+def test_what_it_will_do_is_said_before_jax_is_imported(tmp_path):
+    command = [sys.executable, "-c", FIRST_LINES, str(tmp_path / "out")]
+    made = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert made.returncode == 2
+    said = made.stderr.splitlines()
+    assert said[0].startswith("score vggt, vggt4d, pose-decoupling, hard-replacement, 4dvggt-d with the model nothing")
+    assert said[0].endswith("on plain in somewhere")
+    assert said[1] == "False"
+    assert "9 sequences: s0, s1, s2, s3, s4, s5, s6, s7 and 1 more" in said
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,6 @@
 import functools
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from vggtjax.training import loop
 from vggtjax.training.loop import Status
 from vggtjax.training.metrics import read_metrics
 from vggtjax.training.options import RunOptions
+
+SMOKE = Path(__file__).parents[2] / "docs" / "recipes" / "smoke.json"
 
 
 @pytest.fixture
@@ -33,6 +36,18 @@ def test_train(recipe, tmp_path, capsys, monkeypatch):
     assert "6 of 6" in said
     assert str(out / "model.safetensors") in said
     assert len(read_metrics(out / "metrics.csv")) == 3
+
+
+def test_the_smoke_recipe_runs_in_seconds(tmp_path, capsys):
+    command.train(SMOKE, tmp_path, options=RunOptions(log_every=5))
+    captured = capsys.readouterr()
+    assert "10 of 10" in captured.out
+    assert "the first step compiles" in captured.err
+    rows = read_metrics(tmp_path / "metrics.csv")
+    assert len(rows) == 2
+    assert np.isfinite([row["loss"] for row in rows]).all()
+    model = read_model(tmp_path / "model.safetensors")
+    assert (model.config.heads, model.config.image_size) == (("camera",), 16)
 
 
 def test_fewer_steps_from_a_model(recipe, tmp_path, capsys):

@@ -7,12 +7,21 @@ from pathlib import Path
 
 import pytest
 
-from vggtjax.storage.cache import _show_warning, cache_folder, keep_compilations
+from vggtjax.storage.cache import _show_warning, cache_folder
 
 PROGRAM = """
-from vggtjax.storage.cache import keep_compilations
-assert keep_compilations()
+import sys
+if sys.argv[1:] == ["late"]:
+    import jax
+    jax.jit(lambda x: x + 1)(1.0)  # looks for a cache
+import vggtjax
+folder = vggtjax.enable_compilation_cache()
+assert vggtjax.enable_compilation_cache() == folder
+assert ("jax" in sys.modules) == (sys.argv[1:] == ["late"])
 import jax, jax.numpy as jnp
+assert jax.config.values["jax_compilation_cache_dir"] == str(folder)
+is_own = folder.parent != __import__("vggtjax.storage.cache", fromlist=["_"]).cache_folder()
+assert jax.config.values["jax_compilation_cache_max_size"] == (-1 if is_own else 2 * 2**30)
 jax.jit(lambda x: jnp.tanh(x @ x).sum())(jnp.ones((64, 64))).block_until_ready()
 """
 
@@ -24,19 +33,21 @@ def test_the_folder_can_be_named(monkeypatch, tmp_path):
     assert cache_folder().name == "vggtjax"
 
 
-def compiled(environment, folder: Path) -> int:
-    made = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=False)
+def compiled(environment, folder: Path, *arguments: str) -> int:
+    command = [sys.executable, "-c", PROGRAM, *arguments]
+    made = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr
     assert "Warning" not in made.stderr
     return len(list(folder.glob("*-cache"))) if folder.is_dir() else 0
 
 
-def test_compiled_programs_are_kept_where_the_user_says(tmp_path):
+@pytest.mark.parametrize("when", [(), ("late",)])
+def test_compiled_programs_are_kept_where_the_user_says(tmp_path, when):
     own = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     own |= {"VGGTJAX_CACHE": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    assert compiled(own, tmp_path / "compiled") > 0
+    assert compiled(own, tmp_path / "compiled", *when) > 0
     elsewhere = own | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "elsewhere"), "VGGTJAX_CACHE": str(tmp_path / "b")}
-    assert compiled(elsewhere, tmp_path / "elsewhere") > 0
+    assert compiled(elsewhere, tmp_path / "elsewhere", *when) > 0
     assert not (tmp_path / "b").exists()
 
 
@@ -57,22 +68,14 @@ def test_damaged_entries_are_made_anew(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["reading", "writing"])
-def test_a_cache_that_cannot_be_used_is_warned_about_once(tmp_path, monkeypatch, kind):
-    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+def test_a_cache_that_cannot_be_used_is_warned_about_once(tmp_path, kind):
     shown, said = set(), []
     text = f"Error {kind} persistent compilation cache entry for 'jit_f': OSError: [Errno 28] No space left on device"
     kept = tmp_path / "jit_g-0-cache", tmp_path / "jit_g-0-atime"
     for path in kept:
         path.touch()
     for _ in range(3):
-        _show_warning(said.append, shown, text)
-    _show_warning(said.append, shown, "another warning")
+        _show_warning(tmp_path, said.append, shown, text)
+    _show_warning(tmp_path, said.append, shown, "another warning")
     assert said == [text, "another warning"]
     assert all(path.exists() for path in kept)
-
-
-@pytest.mark.skipif("jax" not in sys.modules, reason="nothing here has imported jax")
-def test_nothing_changes_once_jax_is_imported(monkeypatch):
-    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-    assert not keep_compilations()
-    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ

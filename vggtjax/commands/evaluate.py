@@ -14,12 +14,14 @@ from vggtjax.clips.sampling import Sampling
 from vggtjax.commands.arguments import Size
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, one_line
 from vggtjax.options import METHODS, MethodName, Options, find_method
 
 if TYPE_CHECKING:
     from vggtjax.evaluation.records import Record
     from vggtjax.evaluation.sources import FolderSource, ModelSource
+
+_SHOWN = 8  # names of sequences in the first lines
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,7 @@ def evaluate(
     """
     report = Report()
     with report.running():
+        report.note(f"score {_subjects(candidates, folders)} on {one_line(dataset)} in {one_line(str(root))}")
         with report.stage("open data set"):
             from vggtjax import __version__
             from vggtjax.evaluation.datasets import DATASETS, find_sequences
@@ -141,6 +144,9 @@ def evaluate(
             check_report(out, store)
             chosen = None if scores.sequences is None else _words(scores.sequences)
             found = find_sequences(dataset, root, sequences=chosen, sampling=sampling, gt=scores.gt)
+        named = ", ".join(one_line(name, 60) for name in list(found)[:_SHOWN])
+        more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+        report.note(f"{len(found)} sequence{'' if len(found) == 1 else 's'}: {named}{more}")
         if folders.results:
             for name, value in vars(candidates).items():
                 if value is not None:
@@ -171,6 +177,14 @@ def evaluate(
         with report.stage("draw"):
             write_report(out, records, store, settings, warnings=source.warnings)
     _print(report, out, records, source.warnings)
+
+
+def _subjects(candidates: Candidates, folders: Folders) -> str:
+    """Return words for what is scored."""
+    if folders.results:
+        return one_line(", ".join(folders.results))
+    methods = candidates.methods or ", ".join(METHODS)
+    return one_line(f"{methods} with {'no model' if candidates.model is None else f'the model {candidates.model}'}")
 
 
 def _print(report: Report, out: Path, records: Sequence[Record], warnings: Sequence[str]) -> None:

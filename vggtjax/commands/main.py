@@ -30,7 +30,7 @@ from vggtjax.commands.scenes import scenes
 from vggtjax.commands.train import train
 from vggtjax.commands.view import view
 from vggtjax.errors import VggtjaxError
-from vggtjax.storage.cache import keep_compilations
+from vggtjax.storage.cache import enable_compilation_cache
 
 COMMANDS = {
     "reconstruct": reconstruct,
@@ -59,7 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub", "websockets"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
-    keep_compilations()  # after showwarning is set: keep_compilations replaces it for some warnings
+    if "jax" not in sys.modules:  # else a program calls this function, which decides for itself
+        enable_compilation_cache()  # after showwarning is set, which it replaces for some warnings
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         if list(arguments) in (["--version"], ["-V"]):

@@ -53,6 +53,7 @@ def train(
                 from vggtjax.pretrained.load import load_weights
 
                 model = load_weights(init, config=chosen.model, progress=progress)
+        report.note("the first step compiles, once for each size of a phase: seconds to minutes")
         with report.stage("train") as advance:
             shown = time.perf_counter()
 

@@ -14,6 +14,7 @@ from typing import Any
 
 COMPILED_BYTES = 2 * 2**30  # of kept compiled programs; the least recently used go first
 _DAMAGED = re.compile(r"Error (reading|writing) persistent compilation cache entry for '([^']+)'")
+_FOLDER = "jax_compilation_cache_dir"
 _SHORTEST = 0.05  # seconds; programs that compile faster are not kept
 
 
@@ -36,27 +37,39 @@ def lowered_folder() -> Path:
     return cache_folder() / "lowered"
 
 
-def keep_compilations() -> bool:
-    """Tell jax to keep compiled programs in the user's cache, so that the next process need not compile them again.
+def enable_compilation_cache() -> Path:
+    """Let jax keep compiled programs on the disk, so that the next process need not compile them again; as commands do.
 
-    This sets jax's environment variables, unless the user set them, for the whole process: commands call it before they
-    import jax; the library never does. Returns False, and changes nothing, if jax is already imported.
+    Call it at the start of a script; the library itself never does. It sets jax's options for the whole process. The
+    folder is `compiled/` in the user's cache of this library, which VGGTJAX_CACHE moves; it holds at most
+    `COMPILED_BYTES`, and the least recently used programs go first. A folder of your own, by JAX_COMPILATION_CACHE_DIR
+    or `jax.config`, is used as it is, without a limit; JAX_ENABLE_COMPILATION_CACHE=false turns all of it off.
+
+    Returns:
+        The folder of the compiled programs, which may be missing until the first one is kept.
     """
-    if "jax" in sys.modules:
-        return False
-    settings = {
-        "JAX_COMPILATION_CACHE_DIR": str(compiled_folder()),
-        "JAX_COMPILATION_CACHE_MAX_SIZE": str(COMPILED_BYTES),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": str(_SHORTEST),
-    }
+    jax = sys.modules.get("jax")
+    folder = os.environ.get(_FOLDER.upper()) if jax is None else jax.config.values[_FOLDER]
+    settings: dict[str, Any] = {"jax_persistent_cache_min_compile_time_secs": _SHORTEST}
+    if folder is None:
+        folder = str(compiled_folder())
+        settings |= {_FOLDER: folder, "jax_compilation_cache_max_size": COMPILED_BYTES}
     for name, value in settings.items():
-        os.environ.setdefault(name, value)
-    warnings.showwarning = partial(_show_warning, warnings.showwarning, set())
-    return True
+        if jax is None:
+            os.environ.setdefault(name.upper(), str(value))
+        elif name.upper() not in os.environ:
+            jax.config.update(name, value)
+    if jax is not None:  # it may have looked for a cache already, and found none
+        from jax.experimental.compilation_cache import compilation_cache
+
+        compilation_cache.reset_cache()
+    if getattr(warnings.showwarning, "func", None) is not _show_warning:
+        warnings.showwarning = partial(_show_warning, Path(folder), warnings.showwarning, set())
+    return Path(folder)
 
 
 def _show_warning(
-    show: Callable[..., object], shown: set[str], message: Warning | str, *details: Any, **options: Any
+    folder: Path, show: Callable[..., object], shown: set[str], message: Warning | str, *details: Any, **options: Any
 ) -> None:
     """Remove damaged entries of jax's cache instead of showing jax's warning: jax then compiles and keeps a new one.
 
@@ -68,7 +81,7 @@ def _show_warning(
         return
     kind, program = match.groups()
     is_mended = kind == "writing" and "-atime" in str(message)  # a killed process has not written that file
-    for entry in Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).glob("*-cache"):
+    for entry in folder.glob("*-cache"):
         used = entry.with_name(entry.name.removesuffix("cache") + "atime")
         if not used.exists() or (kind == "reading" and entry.name.startswith(f"{program}-")):
             with suppress(OSError):

@@ -1,7 +1,7 @@
 """Jitted functions that the next process need not trace again.
 
 Tracing and lowering the network take as long as loading its compiled form. If compiled programs are kept in the user's
-cache (`cache.keep_compilations`), so are, on a CPU, lowered programs (jax.export). Their key is the sources of this
+cache (`enable_compilation_cache`), so are, on a CPU, lowered programs (jax.export). Their key is the sources of this
 package, the versions of jax, the platform, the static options, and the shapes of the arguments.
 """
 
