@@ -12,6 +12,7 @@ from vggtjax.results.shown import shown_points
 from vggtjax.results.thinning import Candidates, EvenThinning, places_in_cube
 
 ALL: dict[str, Any] = {"static_percentile": 0, "dynamic_percentile": 0, "edges": None}
+OFF_EDGES: dict[str, Any] = {**ALL, "edges": 0.05}
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +44,7 @@ def test_pixels_beside_a_step_of_depth_are_left_out():
     depth[0, 10:20, 10:20] = 3.0
     depth[0, 0, 0] = 0  # unknown: no step beside it
     room = make_room(1, depth=depth, dynamic_mask=np.zeros((1, 28, 42), bool))
-    static, _ = shown_points(room, **(ALL | {"edges": 0.05}))
+    static, _ = shown_points(room, **OFF_EDGES)
     kept = np.zeros((28, 42), bool)
     kept.ravel()[static.pixels] = True
     expected = np.ones((28, 42), bool)
@@ -58,13 +59,13 @@ def test_a_floor_is_no_edge_in_a_coarse_picture():
     floor = np.where(rows > 0, 63 / np.maximum(rows, 0.5), 0)  # focal length 63, camera at height 1
     depth = np.tile(floor[:, None], (1, 70)).reshape(1, 70, 70).astype(np.float32)
     room = make_room(1, 70, 70, depth=depth, dynamic_mask=np.zeros((1, 70, 70), bool))
-    static, _ = shown_points(room, **(ALL | {"edges": 0.05}))
+    static, _ = shown_points(room, **OFF_EDGES)
     assert static.pixels.min() // 70 == 35 + 9  # the rows closer to the horizon than about 83 degrees are left out
 
 
 def test_static_pixels_beside_moving_ones_are_left_out(room):
     flat = make_room(4, depth=np.full((4, 28, 42), 2, np.float32))
-    static, moving = shown_points(flat, **(ALL | {"edges": 0.05}))
+    static, moving = shown_points(flat, **OFF_EDGES)
     assert sum(len(shown.pixels) for shown in moving) == flat.dynamic_mask.sum()
     shown = np.zeros(flat.dynamic_mask.shape, bool)
     shown.reshape(4, -1)[static.frames, static.pixels] = True

@@ -26,6 +26,7 @@ from vggtjax.commands.export import export
 from vggtjax.commands.fit_fusion import fit_fusion
 from vggtjax.commands.process import keep_freed_memory
 from vggtjax.commands.reconstruct import reconstruct
+from vggtjax.commands.render import render
 from vggtjax.commands.scenes import scenes
 from vggtjax.commands.train import train
 from vggtjax.commands.view import view
@@ -40,6 +41,7 @@ COMMANDS = {
     "export": export,
     "import": import_result,
     "demo": demo,
+    "render": render,
     "info": info,
     "train": train,
     "evaluate": evaluate,

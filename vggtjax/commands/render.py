@@ -1,0 +1,66 @@
+"""The command `vggtjax render`. Does not import jax."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from vggtjax.commands.report import Report
+from vggtjax.errors import InputError, OutputError
+
+_FILM = Path("preview", "turntable.mp4")  # in the folder of a result
+
+
+def render(
+    result: tyro.conf.Positional[Path],
+    /,
+    *,
+    path: Literal["orbit", "camera"] = "orbit",
+    seconds: float = 6.0,
+    size: str = "960x540",
+    fps: float = 24.0,
+    out: Path | None = None,
+    format: Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] = "vggtjax",
+    quaternion: Literal["xyzw", "wxyz"] | None = None,
+) -> None:
+    """Draw a result's points as a film: the static background stays, what moves plays.
+
+    Args:
+        result: folder of a result.
+        path: orbit swings around the scene, camera follows the filming camera.
+        seconds: length of the film.
+        size: width x height in pixels.
+        fps: frames per second.
+        out: the film, an .mp4, .gif or .webp; RESULT/preview/turntable.mp4 by default.
+        format: the program that wrote the folder.
+        quaternion: for vggt4d and monst3r, order of the quaternions in pred_traj.txt.
+    """
+    sides = _sides(size)
+    report = Report()
+    with report.running():
+        from vggtjax.rendering.film import check_film
+        from vggtjax.results.films import film_frames, write_film
+        from vggtjax.results.reconstruction import Reconstruction
+
+        film = out or (result.parent if result.is_file() else result) / _FILM
+        check_film(film, fps)
+        with report.stage("read"):
+            loaded = Reconstruction.load(result, format=format, quaternion=quaternion)
+        if not film.parent.is_dir():
+            raise OutputError(f"there is no folder {film.parent} for the film; make it, or choose another --out")
+        with report.stage("draw") as progress:
+            frames = film_frames(loaded, path=path, seconds=seconds, fps=fps, size=sides, progress=progress)
+            write_film(film, frames, fps)
+    report.table({"film": film})
+    if loaded.model_note:
+        report.line(f"The model: {loaded.model_note}")
+
+
+def _sides(size: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", size)
+    if match is None:
+        raise InputError(f"size is {size!r}; expected width x height, such as 960x540")
+    return int(match[1]), int(match[2])
