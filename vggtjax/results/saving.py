@@ -43,7 +43,7 @@ _Groups = tyro.constructors.PrimitiveConstructorSpec(
     metavar="GROUP,GROUP",
     instance_from_str=lambda words: parse_groups(words[0]),
     is_instance=lambda value: isinstance(value, tuple),
-    str_from_instance=lambda value: [",".join(value)],
+    str_from_instance=lambda value: [",".join(value or GROUPS)],  # None: all
 )
 
 
