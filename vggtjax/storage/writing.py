@@ -134,8 +134,10 @@ def _staged(folder: Path) -> Iterator[Path]:
         staged.mkdir()
         yield staged
     finally:
-        shutil.rmtree(staged, ignore_errors=True)
-        _release(lock)
+        try:
+            shutil.rmtree(staged, ignore_errors=True)
+        finally:
+            _release(lock)
 
 
 @lru_cache(maxsize=256)  # once in a process: a scan of 20,000 files takes as long as writing 50
@@ -182,6 +184,8 @@ def _acquire(path: Path, wait: float = 0) -> FileLock | None:
 def _release(lock: FileLock | None) -> None:
     if lock is None:
         return
-    with suppress(OSError):  # Windows cannot remove an open file
-        Path(lock.lock_file).unlink(missing_ok=True)  # before the release: afterwards another process may hold it
-    lock.release()
+    try:
+        with suppress(OSError):  # Windows cannot remove an open file
+            Path(lock.lock_file).unlink(missing_ok=True)  # before the release: afterwards another process may hold it
+    finally:  # also where Ctrl-C comes meanwhile
+        lock.release()
