@@ -23,6 +23,7 @@ from benchmarks.suite.command import suite
 from benchmarks.suite.gpu_targets import gpu_targets
 from benchmarks.suite.memory import memory
 from benchmarks.training_step import training_step
+from benchmarks.viewer import viewer
 from vggtjax.errors import VggtjaxError
 
 COMMANDS = {
@@ -42,6 +43,7 @@ COMMANDS = {
     "speed": speed,
     "suite": suite,
     "training-step": training_step,
+    "viewer": viewer,
 }
 
 

@@ -26,7 +26,7 @@ LARGEST_STEP = 0.3  # of depth between neighbours, as a share; pixels beside lar
 _LEAST_MOVING = 200  # points of a frame
 _STEEPEST = 8.0  # slope of a surface, up to which a step of depth is none
 _FRUSTUM = 0.07  # of the scene's radius
-_SPLAT = 1.3  # distances to the fourth neighbour: a point's width
+_SPLAT = 1.2  # distances to the fourth neighbour: a point's width
 _PLAIN_RATE = 10.0  # frames a second without timestamps
 _TILE, _SHEET = 256, 4096  # pixels: the longer side of a small picture; a side of the sheet that every browser takes
 

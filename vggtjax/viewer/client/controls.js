@@ -4,6 +4,7 @@ const element = (id) => document.getElementById(id);
 const SLIDERS = { size: "size", "least-static": "leastStatic", "least-moving": "leastMoving", steps: "steps", trail: "trail" };
 const SWITCHES = ["static", "moving", "cameras", "pictures", "path", "tracks", "loop"];
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
+const NARROW = 700; // pixels of a window that has no room for the settings beside the scene
 const TURN = 8000; // milliseconds of the turntable video
 
 class Controls {
@@ -15,6 +16,7 @@ class Controls {
     viewer.orbit.listen(viewer.canvas, () => this.leaveFlight());
     viewer.ondraw = () => this.refresh();
     this.offerResults();
+    document.documentElement.classList.toggle("bare", window.innerWidth < NARROW);
     this.choose(0);
   }
 
@@ -44,7 +46,7 @@ class Controls {
     const actions = {
       play: () => this.play(), fly: () => this.fly(), screenshot: () => this.screenshot(), turntable: () => this.turntable(),
       reset: () => { this.leaveFlight(); this.viewer.orbit.reset(); },
-      toggle: () => element("panel").classList.toggle("hidden"),
+      toggle: () => { document.documentElement.classList.toggle("bare"); this.viewer.wanted = true; },
     };
     for (const [id, action] of Object.entries(actions)) element(id).addEventListener("click", action);
   }

@@ -1,0 +1,146 @@
+"""The page in a real browser: it opens from a file, plays, and shows the frame that is due."""
+
+import io
+import shutil
+import threading
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from tests.room import make_room
+from vggtjax.viewer.page import viewer_page
+from vggtjax.viewer.server import PageServer
+
+sync_api = pytest.importorskip("playwright.sync_api")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
+
+FRAMES, HEIGHT, WIDTH = 6, 28, 42
+BAR = 46  # pixels of the time line
+SCREEN = {"width": 630, "height": 420 + BAR}  # the scene has the shape of a frame
+NAME = "</script><img src=x onerror=\"document.title='broken'\">"
+READY = "new Promise(done => { const look = () => window.vggtjax ? done(true) : setTimeout(look, 20); look(); })"
+DRAWN = """new Promise(done => {
+    const { viewer } = window.vggtjax;
+    const look = () => viewer.settledAt === null && !viewer.wanted ? requestAnimationFrame(() => done(true)) : setTimeout(look, 20);
+    look();
+})"""  # noqa: E501
+
+
+@pytest.fixture(scope="module")
+def room():
+    return make_room(FRAMES, HEIGHT, WIDTH)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser):
+    page = browser.new_page(viewport=SCREEN, reduced_motion="reduce")
+    page.complaints, page.asked = [], []
+    page.on("pageerror", lambda error: page.complaints.append(str(error)))
+    page.on("console", lambda line: page.complaints.append(line.text) if line.type == "error" else None)
+    page.on("request", lambda request: page.asked.append(request.url))
+    yield page
+    page.close()
+
+
+def red(page):
+    """Return the pixels of the moving box on the screen, at the size of a frame."""
+    page.evaluate(DRAWN)
+    shot = Image.open(io.BytesIO(page.screenshot(clip={"x": 0, "y": 0, "width": 630, "height": 420}))).convert("RGB")
+    pixels = np.asarray(shot, int)
+    found = (pixels[..., 0] > 150) & (pixels[..., 1] < 90) & (pixels[..., 2] < 90)
+    return found.reshape(HEIGHT, 420 // HEIGHT, WIDTH, 630 // WIDTH).mean(axis=(1, 3)) > 0.5
+
+
+def agreement(shown, mask):
+    """Return the intersection over union with a mask; the box's rim, a step of depth, is left out of the scene."""
+    box = ndimage.binary_erosion(mask)
+    return (shown & box).sum() / (shown | box).sum()
+
+
+def set_slider(page, name, value):
+    page.locator(name).evaluate("(one, value) => { one.value = value; one.dispatchEvent(new Event('input')) }", value)
+
+
+def look_through_the_clips_camera(page):
+    """The scene then is the picture."""
+    set_slider(page, "#least-moving", 0)
+    page.locator("#pictures").evaluate("box => box.click()")
+    page.keyboard.press("f")
+
+
+def test_the_page_opens_from_a_file_plays_and_shows_the_frame_that_is_due(page, room, tmp_path):
+    file = tmp_path / "viewer.html"
+    file.write_text(viewer_page([room], names=[NAME]), encoding="utf-8")
+    page.goto(file.as_uri())
+    page.evaluate(READY)
+    assert NAME.startswith(page.locator("h1").inner_text()[:20])
+    assert page.title() == NAME
+
+    page.keyboard.press("Space")
+    page.wait_for_timeout(400)
+    page.keyboard.press("Space")
+    assert page.evaluate("window.vggtjax.viewer.time") > 0
+
+    look_through_the_clips_camera(page)
+    for frame in (0, FRAMES // 2, FRAMES - 1):
+        set_slider(page, "#time", frame)
+        assert page.locator("#moment").inner_text().startswith(f"frame {frame} of {FRAMES - 1}")
+        assert agreement(red(page), room.dynamic_mask[frame]) > 0.75
+    with page.expect_download() as download:
+        page.keyboard.press("p")
+    with Image.open(download.value.path()) as picture:
+        assert picture.size == (630, 420)
+    assert page.complaints == []
+    assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_the_served_viewer_moves_with_its_time_line(page, room):
+    with PageServer(viewer_page([room]), port=0) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            page.goto(server.url)
+            page.evaluate(READY)
+            look_through_the_clips_camera(page)
+            set_slider(page, "#time", 0)
+            first = red(page)
+            set_slider(page, "#time", FRAMES - 1)
+            last = red(page)
+        finally:
+            server.shutdown()
+            thread.join()
+    assert agreement(first, room.dynamic_mask[0]) > 0.75
+    assert agreement(last, room.dynamic_mask[-1]) > 0.75
+    assert [line for line in page.complaints if "404" not in line] == []  # a browser asks for an icon
+
+
+def test_two_results_side_by_side_and_swapped_by_a_key(page, room, tmp_path):
+    file = tmp_path / "viewer.html"
+    file.write_text(viewer_page([room, make_room(FRAMES, HEIGHT, WIDTH, method="vggt")], names=["ours", "theirs"]))
+    page.goto(file.as_uri())
+    page.evaluate(READY)
+    page.keyboard.press("v")
+    page.locator("#pictures").evaluate("box => box.click()")
+    both = red(page)
+    assert both[:, : WIDTH // 2].any()
+    assert both[:, WIDTH // 2 :].any()
+    page.keyboard.press("2")
+    assert page.locator("h1").inner_text() == "theirs"
+    options = page.locator("#color option").all_inner_texts()
+    assert "picture" in options
+    assert "pass" not in options
+    page.keyboard.press("c")
+    assert page.locator("#color").input_value() == "1"
+    assert page.complaints == []

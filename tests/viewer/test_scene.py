@@ -1,0 +1,84 @@
+"""The data of the page: points where the result has them, colours that it offers, cameras that agree."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.room import make_room
+from vggtjax.results.shown import middle_and_radius
+from vggtjax.viewer.scene import Budget, Place, contracted, place_beside, scene_of
+
+SAME = Place(1.0, np.eye(3), np.zeros(3))
+
+
+def positions_of(scene):
+    """What client/data.js does."""
+    inside = scene["positions"].reshape(-1, 3) / 32767.5 - 1
+    return scene["centre"] + scene["scale"] * inside / (1 - np.linalg.norm(inside, axis=-1, keepdims=True))
+
+
+def names(result):
+    return [color["name"] for color in scene_of(result, "room", SAME, budget=Budget())["colors"]]
+
+
+def test_moving_points_lie_on_the_box_of_their_frame():
+    result = make_room(4)
+    scene = scene_of(result, "room", SAME, budget=Budget())
+    positions, points = positions_of(scene), result.world_points()
+    _, radius = middle_and_radius(result)
+    for frame in range(4):
+        chosen = positions[scene["offsets"][frame] : scene["offsets"][frame + 1]]
+        mask = result.dynamic_mask[frame]
+        distances = np.linalg.norm(chosen[:, None] - points[frame][mask], axis=-1).min(axis=1)
+        assert len(chosen) > 0.5 * mask.sum()
+        assert distances.max() < 1e-3 * radius
+    assert len(positions) == scene["offsets"][-1]
+    assert all(len(color["values"]) in (len(positions), 3 * len(positions)) for color in scene["colors"])
+
+
+def test_positions_are_fine_near_the_centre_and_finite_far_away():
+    centre = np.array([1.0, -2.0, 3.0], np.float32)
+    points = centre + np.array([[0, 0, 0], [0.5, 0, 0], [3e4, -2e4, 1e5]], np.float32)
+    scene = {"positions": contracted(points, centre, 2.0).ravel(), "centre": centre, "scale": 2.0}
+    back = positions_of(scene)
+    np.testing.assert_allclose(back[:2], points[:2], atol=2e-4)
+    assert np.isfinite(back).all()
+
+
+def test_only_colours_that_the_result_has_are_offered():
+    result = make_room(3)
+    everything = ["picture", "depth", "confidence", "mask", "object", "saliency", "pass", "time"]
+    assert names(result) == everything
+    fused = dataclasses.replace(result, settings={"fusion": "abc"})
+    assert names(fused) == [*everything[:3], "fused precision", *everything[3:]]
+    assert "pass" not in names(dataclasses.replace(result, method="vggt"))
+    foreign = dataclasses.replace(
+        result,
+        method="cut3r",
+        saliency=None,
+        dynamic_mask=np.zeros_like(result.dynamic_mask),
+        settings={"missing": ["images", "dynamic_mask", "depth_confidence"]},
+    )
+    assert names(foreign) == ["depth", "time"]
+
+
+def test_a_second_result_is_placed_on_the_first_camera_at_its_scale():
+    result = make_room(3)
+    turn = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)  # another world, half as large
+    moved = result.camera_from_world.copy()
+    moved[:, :, :3] = result.camera_from_world[:, :, :3] @ turn.T
+    moved[:, :, 3] = 0.5 * result.camera_from_world[:, :, 3] - moved[:, :, :3] @ [1, 2, 3]
+    other = dataclasses.replace(result, depth=0.5 * result.depth, camera_from_world=moved)
+    place = place_beside(other, result)
+    assert place.scale == pytest.approx(2, rel=1e-5)
+    np.testing.assert_allclose(place.points(other.world_points()), result.world_points(), atol=1e-4)
+    np.testing.assert_allclose(place.points(other.camera_centres), result.camera_centres, atol=1e-5)
+
+
+def test_results_at_the_edge_of_what_there_is(recwarn):
+    still = dataclasses.replace(make_room(1), dynamic_mask=np.zeros((1, 28, 42), bool), timestamps=None)
+    scene = scene_of(still, "still", SAME, budget=Budget())
+    assert scene["offsets"].tolist() == [scene["staticCount"]] * 2
+    empty = dataclasses.replace(make_room(2), depth=np.zeros((2, 28, 42), np.float32))
+    assert scene_of(empty, "empty", SAME, budget=Budget())["staticCount"] == 0

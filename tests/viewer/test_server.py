@@ -1,0 +1,77 @@
+"""The server answers with one page, to those who may see it."""
+
+import http.client
+import threading
+from contextlib import contextmanager
+
+import pytest
+
+from vggtjax.errors import InputError
+from vggtjax.viewer.server import PageServer
+
+UPGRADE = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "eA=="}
+
+
+@contextmanager
+def served(**options):
+    with PageServer("<p>the page</p>", port=0, **options) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def get(server, path, **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    body = answer.read().decode()
+    connection.close()
+    return answer.status, body, answer.headers
+
+
+def test_on_this_machine_the_page_needs_no_token_and_nothing_else_is_served():
+    with served() as server:
+        assert get(server, "/")[:2] == (200, "<p>the page</p>")
+        for path in ("/reconstruction.npz", "/../../etc/passwd", "/%2e%2e/etc/passwd", "//etc/passwd", "/index.html"):
+            assert get(server, path)[0] == 404
+        status, body, _ = get(server, "/", Host="evil.example:80")  # a site that points its name at this machine
+        assert status == 403
+        assert "the page" not in body
+
+
+def test_elsewhere_every_request_needs_the_token():
+    with served(host="0.0.0.0") as server:
+        assert server.token
+        assert server.url.endswith(f"/?token={server.token}")
+        cookie = f"vggtjax_{server.server_port}"
+        for path, headers in (
+            ("/", {}),
+            ("/?token=", {}),
+            ("/?token=wrong", {}),
+            (f"/?token={server.token}x", {}),
+            ("/?token=%C3%A9", {}),
+            ("/", {"Cookie": f"{cookie}=wrong"}),
+            ("/", UPGRADE),
+            ("/any", {}),
+        ):
+            status, body, _ = get(server, path, **headers)
+            assert status == 403
+            assert "the page" not in body
+        status, _, headers = get(server, f"/?token={server.token}")
+        assert (status, headers["Location"]) == (303, "/")
+        assert "HttpOnly" in headers["Set-Cookie"]
+        assert get(server, "/", Cookie=headers["Set-Cookie"].split(";")[0])[:2] == (200, "<p>the page</p>")
+        assert get(server, "/any", Cookie=headers["Set-Cookie"].split(";")[0])[0] == 404
+
+
+def test_a_port_in_use_and_a_strange_address_are_one_sentence():
+    with PageServer("", port=0) as server, pytest.raises(InputError, match=r"^port \d+ of 127.0.0.1 is in use; give"):
+        PageServer("", port=server.server_port)
+    with pytest.raises(InputError, match="no address of this machine"):
+        PageServer("", host="203.0.113.7", port=0)
+    with pytest.raises(InputError, match="expected 0 to 65535"):
+        PageServer("", port=70000)
