@@ -20,6 +20,7 @@ class ArrayFrames:
     """Frames [H, W, 3] in memory: uint8, uint16 or floating point in [0, 1]. The arrays are kept, not copied."""
 
     arrays: tuple[np.ndarray, ...]
+    name: str = ""
 
     @classmethod
     def from_arrays(cls, arrays: Any) -> ArrayFrames:

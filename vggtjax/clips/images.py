@@ -31,6 +31,12 @@ class ImageFiles:
 
     paths: tuple[Path, ...]
 
+    @property
+    def name(self) -> str:
+        """The folder's name, or that of a single image."""
+        path = self.paths[0].absolute()
+        return path.stem if len(self.paths) == 1 else path.parent.name
+
     def total(self, sampling: Sampling) -> int:
         """Return how many frames `sampling` takes."""
         return len(sampling.indices(len(self.paths)))

@@ -98,6 +98,11 @@ class Sampling:
 class Source(Protocol):
     """A source of frames that can be read again and again."""
 
+    @property
+    def name(self) -> str:
+        """Of the clip, without the folders above it; empty for frames in memory."""
+        ...
+
     def total(self, sampling: Sampling) -> int | None:
         """Return how many frames `sampling` takes, or None if only reading the source can tell."""
         ...

@@ -42,6 +42,11 @@ class VideoFile:
 
     path: Path
 
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.stem
+
     def total(self, sampling: Sampling) -> None:
         """Return None: only decoding tells how many frames there are."""
 

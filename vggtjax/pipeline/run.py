@@ -30,6 +30,7 @@ from vggtjax.options import Options
 from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, inline, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.report import versions
 
 _LESS_MEMORY = "fewer frames (max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
 
@@ -252,7 +253,8 @@ def _settings(
     settings |= {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
     settings |= {"masks": "given" if masks_given else "mined"}
     settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
-    return settings | ({"model_note": model.note} if model.note else {})
+    settings |= {"clip": clip.source.name} if clip.source.name else {}
+    return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}
 
 
 def _points_by_frame(queries: Queries) -> dict[int, Float[Array, "1 Q 2"]]:

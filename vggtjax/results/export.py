@@ -3,6 +3,7 @@
 In the folder, with a frame's number as its file name:
 
     reconstruction.npz      everything, for `Reconstruction.load`; written last: where it stands, all files are whole
+    report.html             everything to look at on one page, without a network
     preview/sheet.png       the clip at a glance
     preview/depth/          inverse depth in colour, one range for the clip
     preview/overlay/        frames with moving objects tinted, every object in a colour of its own
@@ -60,6 +61,7 @@ from vggtjax.results import foreign, previews, tracks
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
 from vggtjax.results.glb import build_scene
 from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, joined, least_confidence, write_ply
+from vggtjax.results.report import REPORT_NAME, RunFacts, write_report
 from vggtjax.results.result import Result
 from vggtjax.results.saving import Resolution, Saving
 from vggtjax.storage.arrays import write_arrays
@@ -87,12 +89,13 @@ def write_files(
     saving: Saving,
     pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None,
     progress: Progress | None,
+    facts: RunFacts | None = None,
 ) -> int:
     """Write the files that `saving` names, but the archive, into the empty `folder`.
 
     Returns the number of steps, one of them left for the archive.
     """
-    done, total = itertools.count(1), len(result.depth) + 4
+    done, total = itertools.count(1), len(result.depth) + 5
 
     def advance() -> None:
         (progress or no_progress)(next(done), total)
@@ -111,6 +114,9 @@ def write_files(
         _write_png(folder / "preview/sheet.png", previews.contact_sheet(result))
     if result.track_positions is not None:
         _write_tracks(result, folder, saving)
+    advance()
+    if saving.writes("report"):
+        write_report(folder / REPORT_NAME, result, facts)
     advance()
     return total
 

@@ -12,8 +12,9 @@ from skimage.segmentation import find_boundaries
 
 from vggtjax.results.result import Result
 
-_DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm
+DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm
 _SALIENCY_COLORS = (Colormap("inferno").lut(256)[:, :3] * 255).round().astype(np.uint8)
+CONFIDENCE_COLORS = (Colormap("viridis").lut(256)[:, :3] * 255).round().astype(np.uint8)  # unsure dark, sure bright
 _NO_DEPTH = np.array([40, 40, 46], np.uint8)
 # Of objects by id: hues spaced by the golden ratio; black for no object.
 INSTANCE_COLORS = np.array(
@@ -24,6 +25,7 @@ INSTANCE_COLORS = np.array(
 _OUTLINE = np.array([255, 235, 60], np.uint8)
 
 _LEAST_SIDE = 480  # pixels of the longer side of a frame's preview
+_MOST_SAMPLES = 2_000_000  # pixels of a percentile
 _SHEET_FRAMES = 8
 _SHEET_WIDTH = 1800  # pixels of all columns
 _TITLE_WIDTH = 700  # least pixels of the title
@@ -49,7 +51,29 @@ def color_depth(
     far, near = inverse_range
     inverse = 1 / np.where(valid, depth, 1).astype(np.float64)
     level = np.clip((inverse - far) / max(near - far, np.finfo(np.float64).tiny), 0, 1)
-    return np.where(valid[..., None], _DEPTH_COLORS[(level * 255).round().astype(np.uint8)], _NO_DEPTH)
+    return np.where(valid[..., None], DEPTH_COLORS[(level * 255).round().astype(np.uint8)], _NO_DEPTH)
+
+
+def log_confidence_range(
+    confidence: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]
+) -> tuple[float, float]:
+    """Return the 2nd and 98th percentile of log confidence over the valid pixels of a clip, (0, 1) without any."""
+    values = confidence[valid & (confidence > 0)]
+    if not len(values):
+        return 0.0, 1.0
+    low, high = np.percentile(values[:: max(1, len(values) // _MOST_SAMPLES)].astype(np.float64), (2, 98))
+    return float(np.log(low)), float(np.log(high))
+
+
+def color_confidence(
+    confidence: Float32[np.ndarray, "H W"], valid: Bool[np.ndarray, "H W"], log_range: tuple[float, float]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Colour log confidence from dark, at or below the first of `log_range`, to bright; grey where not valid."""
+    low, high = log_range
+    usable = valid & (confidence > 0)
+    level = (np.log(np.where(usable, confidence, 1).astype(np.float64)) - low) / max(high - low, 1e-12)
+    colored = CONFIDENCE_COLORS[(level.clip(0, 1) * 255).round().astype(np.uint8)]
+    return np.where(usable[..., None], colored, _NO_DEPTH)
 
 
 def overlay(
@@ -116,7 +140,7 @@ def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
 
     objects = int(result.instances.max())
     notes = (f"{result.dynamic_share:.1%} of pixels", f"{objects} object{'' if objects == 1 else 's'}")
-    legends = {"Depth": (_DEPTH_COLORS, "far", "near"), "Saliency": (_SALIENCY_COLORS, "0", "1")}
+    legends = {"Depth": (DEPTH_COLORS, "far", "near"), "Saliency": (_SALIENCY_COLORS, "0", "1")}
     for row, label in enumerate(labels):
         y = top + row * step_y
         draw.text((_MARGIN, y), label, TEXT, small)

@@ -18,6 +18,7 @@ from vggtjax.results.saving import Saving, SavingChanges
 from vggtjax.storage.writing import writing
 
 if TYPE_CHECKING:
+    from vggtjax.results.report import RunFacts
     from vggtjax.storage.trajectories import Quaternion
     from vggtjax.viewer.page import Viewer
 
@@ -34,6 +35,7 @@ class Reconstruction(Result):
         saving: Saving = _DEFAULT,
         pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None,
         progress: Progress | None = None,
+        facts: RunFacts | None = None,
         **changes: Unpack[SavingChanges],
     ) -> None:
         """Write the result into `folder`, made if missing; see vggtjax.results.export for the files.
@@ -46,6 +48,7 @@ class Reconstruction(Result):
             saving: share left out of the point clouds, size of the files, format.
             pictures: for the resolution "original", the source's (`Clip.pictures()`); by default the model's enlarged.
             progress: called with the number of steps done, and of all.
+            facts: what report.html says of the run beside the result: times of the stages, errors against the truth.
             changes: single values of `saving`, such as `resolution="original"`; `layout` is the old name of `format`.
 
         Raises:
@@ -61,7 +64,7 @@ class Reconstruction(Result):
         check_space(folder, forecast_bytes(self.depth.shape, self.source_size, saving))
         names = saving.names(tracks=self.track_positions is not None)
         with replacing(Path(folder), names) as staged:
-            total = write_files(self, staged, saving, pictures, progress)
+            total = write_files(self, staged, saving, pictures, progress, facts)
             with writing(staged / ARCHIVE_NAME) as path:
                 self.save_archive(path, files=names)
             (progress or no_progress)(total, total)

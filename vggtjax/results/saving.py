@@ -13,7 +13,7 @@ from vggtjax.storage.json_values import check_fields
 
 Resolution = Literal["model", "original"]
 Format = Literal["vggtjax", "vggt4d"]  # of a folder of files
-Group = Literal["depth", "confidence", "cameras", "masks", "previews", "clouds", "scene"]
+Group = Literal["depth", "confidence", "cameras", "masks", "previews", "clouds", "scene", "report"]
 
 # Files and folders of a result by group, beside the archive, which every result has.
 GROUPS: dict[Group, tuple[str, ...]] = {
@@ -24,6 +24,7 @@ GROUPS: dict[Group, tuple[str, ...]] = {
     "previews": ("preview",),
     "clouds": ("static.ply", "frames"),
     "scene": ("scene.glb",),
+    "report": ("report.html",),
 }
 NAMES = tuple(name for names in GROUPS.values() for name in names)
 OPTIONAL_FILES = ("tracks.npz", "vggt4d")  # written where points were tracked; for the format vggt4d
@@ -58,8 +59,8 @@ class Saving:
     format: Format = "vggtjax"
     """"vggt4d" writes, beside the files of vggtjax, the folder vggt4d/ as VGGT4D does"""
     only: Annotated[tuple[Group, ...] | None, _Groups] = None
-    """write only these groups of files, with commas: depth, confidence, cameras, masks, previews, clouds, scene;
-    reconstruction.npz, from which vggtjax reads everything back, is always written"""
+    """write only these groups of files, with commas: depth, confidence, cameras, masks, previews, clouds, scene,
+    report; reconstruction.npz, from which vggtjax reads everything back, is always written"""
 
     def __post_init__(self) -> None:
         if isinstance(self.only, str):
