@@ -41,24 +41,26 @@ def demo(
         from vggtjax.pipeline.run import reconstruct
 
         result = reconstruct(model, clip, options=Options(method), size=size, on_stage=report.stage)
+        with report.stage("measure") as progress:
+            from vggtjax.evaluation.ladder import error_table, ladder
+
+            errors = error_table(ladder(model, truth, progress=progress))
         with report.stage("write") as progress:
             from PIL import Image
 
             from vggtjax.evaluation.picture import truth_sheet
+            from vggtjax.results.report import RunFacts
             from vggtjax.storage.writing import writing
 
-            result.save(out, progress=progress)
+            beside = truth_sheet(result, truth)
+            result.save(out, progress=progress, facts=RunFacts(report.seconds, errors, beside))
             sheet = out / "preview" / "truth.png"
             with writing(sheet) as temporary:
-                Image.fromarray(truth_sheet(result, truth)).save(temporary)
+                Image.fromarray(beside).save(temporary)
             page = out / "preview" / "viewer.html"
             result.view(names=["demo"]).save(page)
-        with report.stage("measure") as progress:
-            from vggtjax.evaluation.ladder import ladder
-
-            rows = ladder(model, truth, progress=progress)
     report.summary(result, out, model)
-    report.ladder(rows)
+    report.errors(errors)
     report.line(f"Next to the truth: {sheet}")
     report.line(f"Double-click to see it move: {page}")
     if view:

@@ -115,6 +115,7 @@ def reconstruct(
             masks = known.masks_of(clip)
             queries = None if known.tracks is None else parse_queries(known.tracks, clip)
         from vggtjax.pipeline.run import reconstruct as run
+        from vggtjax.results.report import RunFacts
 
         result = run(
             network,
@@ -128,7 +129,8 @@ def reconstruct(
         )
         with report.stage("write") as progress:
             pictures = clip.pictures() if saving.resolution == "original" else None
-            result.save(out, saving=saving, pictures=pictures, progress=progress)
+            facts = RunFacts(report.seconds)
+            result.save(out, saving=saving, pictures=pictures, progress=progress, facts=facts)
     report.summary(result, out, network)
     if known.tracks is not None and "tracks" in network.untrained_heads:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")

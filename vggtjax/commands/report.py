@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,8 +19,8 @@ from vggtjax.progress import Progress
 
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
-    from vggtjax.evaluation.ladder import LadderRow
     from vggtjax.results.reconstruction import Reconstruction
+    from vggtjax.results.report import ErrorTable
 
 _LISTED_SECONDS = 0.5  # of compiling a program
 
@@ -43,7 +43,7 @@ class Report:
             console=self._console,
             disable=not self._console.is_terminal,
         )
-        self._seconds: dict[str, float] = {}
+        self.seconds: dict[str, float] = {}  # by stage, of those that have ended
 
     @contextmanager
     def running(self) -> Iterator[None]:
@@ -63,7 +63,7 @@ class Report:
         started = time.perf_counter()
         yield lambda done, total: self._progress.update(task, completed=done, total=total)
         seconds = time.perf_counter() - started
-        self._seconds[name] = self._seconds.get(name, 0.0) + seconds
+        self.seconds[name] = self.seconds.get(name, 0.0) + seconds
         total = next(t.total for t in self._progress.tasks if t.id == task) or 1
         is_listed = not compiles or seconds >= _LISTED_SECONDS
         self._progress.update(task, total=total, completed=total, visible=is_listed)
@@ -73,13 +73,13 @@ class Report:
     def summary(self, result: Reconstruction, out: Path, model: Model | None = None) -> None:
         """Print what was reconstructed, by which model, the total time, and where the files are."""
         frames, height, width = result.depth.shape
-        pictures = [out / name for name in ("preview/sheet.png", "scene.glb") if (out / name).exists()]
+        pictures = [out / name for name in ("report.html", "preview/sheet.png", "scene.glb") if (out / name).exists()]
         self.table(
             {
                 "frames": f"{frames} of {width} x {height} pixels",
                 "method": f"{result.method}, model {result.model_name}",
                 "dynamic": f"{100 * result.dynamic_share:.1f} % of the pixels",
-                "total": f"{sum(self._seconds.values()):.2f} s",
+                "total": f"{sum(self.seconds.values()):.2f} s",
                 "peak memory": _peak_memory(),
                 "results": f"{out}/",
             }
@@ -94,30 +94,15 @@ class Report:
         for name, value in rows.items():
             self.line(f"{name:<{width}}  {value}")  # never folded: a path can be copied
 
-    def ladder(self, rows: Sequence[LadderRow]) -> None:
-        """Print errors against the truth as a table, a row per method and mask."""
-        columns = {
-            "abs_rel": ("AbsRel", "{:.3f}"),
-            "abs_rel_static": ("static", "{:.3f}"),
-            "abs_rel_dynamic": ("dynamic", "{:.3f}"),
-            "rotation_error": ("rotation", "{:.2f}°"),
-            "centre_error_ratio": ("centres", "{:.3f}"),
-            "mask_jaccard": ("mask IoU", "{:.2f}"),
-        }
-        table = Table(
-            "method", "mask", title="errors against the truth", title_justify="left", box=None, pad_edge=False
-        )
-        for heading, _ in columns.values():
-            table.add_column(heading, justify="right")
-        for row in rows:
-            values = [(getattr(row, name), form) for name, (_, form) in columns.items()]
-            cells = ["-" if value is None else form.format(value) for value, form in values]
-            table.add_row(row.method, row.mask_source or "-", *cells)
+    def errors(self, errors: ErrorTable) -> None:
+        """Print errors against the truth as a table."""
+        table = Table(title="errors against the truth", title_justify="left", box=None, pad_edge=False)
+        for column, heading in enumerate(errors.headings):
+            table.add_column(heading, justify="right" if column > 1 else "left")
+        for row in errors.rows:
+            table.add_row(*row)
         self._out.print(table, soft_wrap=True)
-        self.line(
-            "AbsRel: of depth after one median scale. Rotation: mean, relative to the first frame. Centres: RMSE after "
-            "Sim(3), in median depths. Mask: mined from the first pass, or the true one."
-        )
+        self.line(errors.note)
 
     def means(self, means: Mapping[str, Mapping[str, float]]) -> None:
         """Print the means of an evaluation as a table, a row for every metric and a column for every method."""

@@ -24,6 +24,7 @@ from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.options import LADDER, ComputeDType, Options, find_method
 from vggtjax.pipeline.stages import Stages
 from vggtjax.progress import Progress
+from vggtjax.results.report import ErrorTable
 from vggtjax.storage.programs import Program
 
 MaskSource = Literal["mined", "true"]
@@ -151,6 +152,36 @@ def ladder(
             rows += _scored(Passes(first, second, saliency, mask), masked, scenes, setting)
             advance()
     return sorted(rows, key=lambda row: row.clip)
+
+
+_COLUMNS = {
+    "abs_rel": ("AbsRel", "{:.3f}"),
+    "abs_rel_static": ("static", "{:.3f}"),
+    "abs_rel_dynamic": ("dynamic", "{:.3f}"),
+    "rotation_error": ("rotation", "{:.2f}°"),
+    "centre_error_ratio": ("centres", "{:.3f}"),
+    "mask_jaccard": ("mask IoU", "{:.2f}"),
+}
+
+
+def error_table(rows: Sequence[LadderRow]) -> ErrorTable:
+    """Return the scores to print or to show on a page, a row per method and mask."""
+    cells = [
+        (
+            row.method,
+            row.mask_source or "-",
+            *(
+                "-" if (value := getattr(row, name)) is None else form.format(value)
+                for name, (_, form) in _COLUMNS.items()
+            ),
+        )
+        for row in rows
+    ]
+    note = (
+        "AbsRel: of depth after one median scale. Rotation: mean, relative to the first frame. Centres: RMSE after "
+        "Sim(3), in median depths. Mask: mined from the first pass, or the true one."
+    )
+    return ErrorTable(("method", "mask", *(heading for heading, _ in _COLUMNS.values())), cells, note)
 
 
 def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -20,7 +20,7 @@ _WIDTH, _HEIGHT, _EDGE = 560, 340, 18  # of a view, and its empty border
 _FRUSTA = 40  # most cameras that are drawn
 _PATH_STEPS = 400  # most segments of the path
 _POINTS = 2400  # most points of the scene that are drawn
-_CAMERA_SHARE = 0.4  # least share of a view's longer side that the cameras fill: as much of the scene is shown
+_CAMERA_SHARE = 0.15  # of the extent of the scene; smaller paths are drawn without the scene around them
 _BINS = 48
 _MOST_SAMPLES = 2_000_000  # pixels of the histogram
 
@@ -68,28 +68,16 @@ def camera_views(result: Result) -> list[tuple[str, Element]]:
     corners = frustum_corners(result.intrinsics[shown], result.camera_from_world[shown], height, width, size)
     corners = (corners - centre) @ rotation.T
     cameras = np.concatenate([corners.reshape(-1, 3), centres])
-    most = float(np.ptp(cameras, axis=0).max()) / _CAMERA_SHARE
-    boxes = [_box(view.flat(cameras), view.flat(points), most) for view in _VIEWS]
+    seen = np.percentile(points, (3, 97), axis=0) if len(points) else cameras[:0]
+    whole = np.concatenate([cameras, seen])
+    small = np.ptp(cameras, axis=0).max() < _CAMERA_SHARE * np.ptp(whole, axis=0).max()
+    boxes = [(flat.min(0), flat.max(0)) for flat in (view.flat(cameras if small else whole) for view in _VIEWS)]
     inner = np.array([_WIDTH - 2 * _EDGE, _HEIGHT - 2 * _EDGE])
-    scale = min(float((inner / (high - low)).min()) for low, high in boxes)
+    scale = min(float((inner / np.maximum(high - low, 1e-9)).min()) for low, high in boxes)
     return [
         (view.title, _draw_view(view, (low + high) / 2, scale, points, centres, (shown / max(frames - 1, 1), corners)))
         for view, (low, high) in zip(_VIEWS, boxes, strict=True)
     ]
-
-
-def _box(
-    cameras: Float[np.ndarray, "N 2"], points: Float[np.ndarray, "M 2"], most: float
-) -> tuple[Float[np.ndarray, " 2"], Float[np.ndarray, " 2"]]:
-    """Return the lowest and highest corner of a view: of all cameras, and of the scene up to `most` in all."""
-    low, high = cameras.min(0), cameras.max(0)
-    if len(points):
-        scene_low, scene_high = (np.percentile(points, share, axis=0) for share in (3, 97))
-        spare = np.maximum(most - (high - low), 0)
-        below, above = np.maximum(low - scene_low, 0), np.maximum(scene_high - high, 0)
-        share = np.minimum(1, spare / np.maximum(below + above, 1e-12))
-        low, high = low - share * below, high + share * above
-    return low, np.maximum(high, low + 1e-9)
 
 
 def _scene_points(result: Result) -> Float[np.ndarray, "N 3"]:

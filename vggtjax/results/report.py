@@ -182,7 +182,7 @@ def _strip(result: Result) -> Element:
 
     def moving(frame: int) -> UInt8[np.ndarray, "H W 3"]:
         ids = previews.moving_ids(result.dynamic_mask[frame], result.instances[frame])
-        return previews.overlay(result.images[frame], ids)
+        return previews.overlay_picture(result.images[frame], ids)
 
     low, high = (f"{np.exp(value):.3g}" for value in log_range)
     rows: list[tuple[Element, str, Callable[[int], UInt8[np.ndarray, "H W 3"]]]] = [
@@ -191,7 +191,7 @@ def _strip(result: Result) -> Element:
         (
             _label("Depth", ramp=(previews.DEPTH_COLORS, "far", "near")),
             "depth",
-            lambda frame: previews.color_depth(result.depth[frame], valid[frame], inverse_range),
+            lambda frame: previews.depth_picture(result.depth[frame], valid[frame], inverse_range),
         ),
         (
             _label(_confidence_name(result), ramp=(previews.CONFIDENCE_COLORS, low, high)),
@@ -245,28 +245,36 @@ def _histogram(result: Result) -> Element:
 def _tracks(result: Result) -> Element | None:
     if result.track_positions is None:
         return None
-    return _section("Tracks", _picture(webp(tracks.track_strip(result), _WIDE), "tracks over frames of the clip"))
+    drawn = _picture(webp(tracks.track_strip(result), _WIDE), "tracks over frames of the clip", class_="drawing")
+    return _section("Tracks", element("div", drawn, class_="scroll"))
 
 
 def _errors(facts: RunFacts) -> Element | None:
     if facts.errors is None:
         return None
+    drawn = None
+    if facts.truth is not None:
+        drawn = _picture(webp(facts.truth, _WIDE), "the result beside the truth", class_="drawing")
     head = element("tr", *(element("th", heading) for heading in facts.errors.headings))
     rows = (element("tr", *(element("td", cell) for cell in row)) for row in facts.errors.rows)
     return _section(
         "Errors against the truth",
         element("div", element("table", head, *rows, class_="grid"), class_="scroll"),
         element("p", facts.errors.note, class_="note"),
-        None if facts.truth is None else _picture(webp(facts.truth, _WIDE), "the result beside the truth"),
+        None if drawn is None else element("div", drawn, class_="scroll"),
     )
 
 
 def _timings(facts: RunFacts) -> Element | None:
     if not facts.seconds:
         return None
-    most = max(*facts.seconds.values(), 1e-9)
+    stages: dict[str, float] = {}
+    for name, seconds in facts.seconds.items():  # every stage that is compiled has a name of its own
+        name = "compile" if name.startswith("compile ") else name
+        stages[name] = stages.get(name, 0.0) + seconds
+    most = max(*stages.values(), 1e-9)
     bars: list[Element] = []
-    for name, seconds in facts.seconds.items():
+    for name, seconds in stages.items():
         bars += [
             element("span", one_line(name, 60)),
             element("span", class_="bar", style=f"width: {100 * seconds / most:.1f}%"),
