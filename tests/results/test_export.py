@@ -20,6 +20,7 @@ FILES = {
     "intrinsics.txt",
     "static.ply",
     "scene.glb",
+    "report.html",
     "depth/scale.txt",
     "preview/sheet.png",
 }
@@ -265,7 +266,7 @@ def test_padding_and_infinite_depth_never_become_points(tmp_path):
 def test_progress(tmp_path):
     calls = []
     make_room().save(tmp_path, progress=lambda done, total: calls.append((done, total)))
-    assert calls == [(done, 7) for done in range(1, 8)]
+    assert calls == [(done, 8) for done in range(1, 9)]
 
 
 @pytest.mark.parametrize("rows", [13, 27])

@@ -79,7 +79,7 @@ def test_the_archive_leaves_first_and_arrives_last(tmp_path, monkeypatch):
 
     monkeypatch.setattr(type(tmp_path), "rename", watch)
     make_room(1).save(tmp_path)
-    assert seen == [True] + [False] * 22 + [True, True]  # first and last the hidden folder moves
+    assert seen == [True] + [False] * 24 + [True, True]  # first and last the hidden folder moves
 
 
 def test_error_of_the_callback_leaves_nothing_behind(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import tyro
@@ -41,6 +42,7 @@ def demo(
         from vggtjax.pipeline.run import reconstruct
 
         result = reconstruct(model, clip, options=Options(method), size=size, on_stage=report.stage)
+        result = replace(result, settings=result.settings | {"clip": "Embedded clip"})
         with report.stage("measure") as progress:
             from vggtjax.evaluation.ladder import error_table, ladder
 

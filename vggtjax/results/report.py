@@ -255,12 +255,12 @@ def _errors(facts: RunFacts) -> Element | None:
     drawn = None
     if facts.truth is not None:
         drawn = _picture(webp(facts.truth, _WIDE), "the result beside the truth", class_="drawing")
-    head = element("tr", *(element("th", heading) for heading in facts.errors.headings))
-    rows = (element("tr", *(element("td", cell) for cell in row)) for row in facts.errors.rows)
+    head = element("tr", *(element("th", one_line(heading, 80)) for heading in facts.errors.headings))
+    rows = (element("tr", *(element("td", one_line(cell, 80)) for cell in row)) for row in facts.errors.rows)
     return _section(
         "Errors against the truth",
         element("div", element("table", head, *rows, class_="grid"), class_="scroll"),
-        element("p", facts.errors.note, class_="note"),
+        element("p", one_line(facts.errors.note, 600), class_="note"),
         None if drawn is None else element("div", drawn, class_="scroll"),
     )
 

@@ -1,0 +1,142 @@
+"""The report of a result: everything in it is shown, nothing of it is run, nothing is loaded from elsewhere."""
+
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from tests.chromium import browser, look
+from tests.room import make_room
+from vggtjax.results import charts
+from vggtjax.results.report import REPORT_NAME, ErrorTable, RunFacts, write_report
+
+HOSTILE = "<script>alert('1')</script><img src=x onerror=alert(2)>\"'&\n\u202e\ud800"
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes, and the text between them."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.texts = [], []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+def report(tmp_path, result, facts=None):
+    write_report(tmp_path / REPORT_NAME, result, facts)
+    text = (tmp_path / REPORT_NAME).read_text(encoding="utf-8")
+    return text, Reader(text)
+
+
+@pytest.fixture
+def hostile():
+    """A result in which every text is a stranger's."""
+    settings = {"clip": HOSTILE, "model_note": HOSTILE, "missing": [HOSTILE], HOSTILE: {HOSTILE: HOSTILE}}
+    settings |= {"versions": {HOSTILE: HOSTILE}}
+    names = {"method": HOSTILE, "model_name": HOSTILE, "frame_names": (HOSTILE,) * 3}
+    facts = RunFacts({HOSTILE: 1.5}, ErrorTable((HOSTILE,), ((HOSTILE,),), HOSTILE), np.zeros((9, 9, 3), np.uint8))
+    return make_room(**names, settings=settings), facts
+
+
+def test_it_shows_the_clip_the_method_and_the_numbers(tmp_path):
+    settings = {"clip": "dog", "mask_pairs": 5, "versions": {"jax": "0.9"}}
+    facts = RunFacts({"first pass": 2.25}, ErrorTable(("method", "AbsRel"), (("vggt", "0.453"),)))
+    _, page = report(tmp_path, make_room(settings=settings), facts)
+    for text in ("dog", "3 of 42 x 28 pixels", "mask_pairs", "jax", "0.9", "2.25 s", "0.453", "0.00 s to 0.08 s"):
+        assert any(text in shown for shown in page.texts), text
+    pictures = [attributes["src"] for tag, attributes in page.tags if tag == "img"]
+    assert len(pictures) >= 4 * 3
+    assert all(source.startswith("data:image/webp;base64,") for source in pictures)
+    links = [attributes["href"] for tag, attributes in page.tags if tag == "a"]
+    assert links == ["./reconstruction.npz"]  # nothing else is in the folder
+
+
+def test_texts_of_strangers_are_shown_and_not_run(tmp_path, hostile):
+    text, page = report(tmp_path, *hostile)
+    allowed = {"html", "head", "meta", "title", "style", "body", "main", "header", "section", "div", "span", "p", "b"}
+    allowed |= {"h1", "h2", "h3", "table", "tr", "th", "td", "code", "ul", "li", "a", "img", "input", "label"}
+    allowed |= {"svg", "path", "circle", "text"}
+    assert {tag for tag, _ in page.tags} == allowed
+    assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
+    assert any("<script>alert('1')</script>" in shown for shown in page.texts)
+    assert "\u202e" not in text
+    assert len(text) < 400_000
+
+
+def test_nothing_is_loaded_from_elsewhere(tmp_path, hostile):
+    text, page = report(tmp_path, *hostile)
+    assert not re.search(r"https?:|@import|url\(|//", re.sub(r"data:image/webp;base64,[\w+/=]+", "", text))
+    policies = [
+        a["content"] for tag, a in page.tags if tag == "meta" and a.get("http-equiv") == "Content-Security-Policy"
+    ]
+    assert len(policies) == 1
+    assert policies[0].startswith("default-src 'none'; img-src data:;")
+
+
+def test_long_texts_are_cut(tmp_path):
+    settings = {"clip": "x" * 10_000} | {f"name {i} {'n' * 500}": "y" * 10_000 for i in range(300)}
+    text, _ = report(tmp_path, make_room(1, settings=settings))
+    shorter, _ = report(tmp_path, make_room(1))
+    assert len(text) < len(shorter) + 60_000
+    assert "240 more are in reconstruction.npz" in text
+
+
+def test_equal_results_give_equal_bytes(tmp_path):
+    assert report(tmp_path, make_room())[0] == report(tmp_path, make_room())[0]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"depth_confidence": np.ones((2, 28, 42), np.float32)},
+        {"dynamic_mask": np.zeros((2, 28, 42), bool)},
+        {"dynamic_mask": np.ones((2, 28, 42), bool)},
+        {"depth": np.zeros((2, 28, 42), np.float32)},
+        {"camera_from_world": np.tile(np.eye(3, 4, dtype=np.float32), (2, 1, 1)), "saliency": None, "timestamps": None},
+        {"depth": np.full((2, 28, 42), 1e30, np.float32), "depth_confidence": np.full((2, 28, 42), 1e-30, np.float32)},
+    ],
+)
+def test_odd_results_have_a_report(tmp_path, changes):
+    text, _ = report(tmp_path, make_room(2, **changes))
+    assert "nan" not in re.sub(r"base64,[\w+/=]+", "", text)
+
+
+def test_the_path_by_hand():
+    """A camera that goes 2 to the right and 1 forward, seen from above: right is right, forward is up."""
+    poses = np.tile(np.eye(3, 4, dtype=np.float32), (3, 1, 1))
+    poses[:, 0, 3], poses[:, 2, 3] = (0, -1, -2), (0, 0, -1)
+    (above, drawing), (side, _) = charts.camera_views(make_room(camera_from_world=poses))
+    assert (above, side) == ("From above", "From the side")
+    steps = [path.get("d", "") for path in drawing if path.get("stroke-width") == "2.6"]
+    places = np.array([[float(x) for x in re.findall(r"-?[\d.]+", step)] for step in steps])
+    (x0, y0, x1, y1), (_, _, x2, y2) = places
+    assert (x2 - x1) == pytest.approx(x1 - x0, abs=0.2)
+    assert y1 == pytest.approx(y0, abs=0.2)
+    assert (y1 - y2) == pytest.approx(x2 - x1, abs=0.2)
+
+
+def test_colors_of_time():
+    assert [charts.path_color(share) for share in (0, 0.5, 1)] == ["#2f7ef7", "#a04bd8", "#f0542d"]
+
+
+def test_chromium_shows_it(tmp_path, hostile):
+    make_room(settings={"clip": "dog"}).save(tmp_path / "plain", facts=RunFacts({"write": 1.0}))
+    report(tmp_path, *hostile)
+    script = """() => [document.documentElement.scrollWidth, [...document.images].every(i => i.naturalWidth > 0),
+                       document.querySelector("h1").textContent]"""
+    with browser() as opened:
+        for file, width in ((tmp_path / "plain" / REPORT_NAME, 1280), (tmp_path / REPORT_NAME, 400)):
+            (wide, whole, _), events = look(opened, file, width, script)
+            assert not events
+            assert wide <= width
+            assert whole
+        (_, _, title), _ = look(opened, tmp_path / REPORT_NAME, 1280, script)
+        assert title.startswith("<script>alert('1')</script>")
