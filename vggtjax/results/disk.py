@@ -18,6 +18,7 @@ _GIGA = 1e9
 _ARCHIVE = 10.0  # bytes of a pixel at the model's size, compressed: pictures, depth, confidence
 _POINT = 16  # bytes of a point
 _MOST_SCENE = 20e6  # bytes: a scene has a limit of points
+_MOST_REPORT = 2e6  # bytes: a report shows a few frames and a short film
 _VGGT4D = 10.5  # bytes of a pixel: depth, confidence, picture
 _PIXEL: dict[Group, float] = {"depth": 5.5, "confidence": 4.0, "masks": 0.1}  # bytes of a written pixel
 _PREVIEW = 3.0  # bytes of a pixel of the previews: coloured depth and overlay, compressed
@@ -43,6 +44,8 @@ def forecast_bytes(shape: tuple[int, int, int], source_size: Int[np.ndarray, "S 
         total += 2 * _POINT * points  # each frame's, and the static ones of all frames
     if saving.writes("scene"):
         total += min(_POINT * points, _MOST_SCENE)
+    if saving.writes("report"):
+        total += min(at_model, _MOST_REPORT)
     if saving.writes("previews"):
         sides = source_size if original else np.tile([height, width], (frames, 1))
         total += _PREVIEW * sum(float(np.prod(enlarged(tuple(side)), dtype=np.float64)) for side in sides.tolist())
