@@ -127,6 +127,16 @@ def _leads_somewhere(page: Path, link: str) -> bool:
     return target.exists() or target.parent.name == "made" or (bool(notebook) and notebook.exists())
 
 
+@pytest.mark.parametrize("command", ["reconstruct", "view"])
+def test_the_reference_has_every_option(command):
+    hook = runpy.run_path(str(ROOT / "docs" / "hooks" / "command_line.py"))
+    flags = set(re.findall(r"^│ (--[a-z-]+)", hook["_help"](command), flags=re.MULTILINE))
+    page = hook["_section"](command)
+    assert {flag for flag in flags if f"`{flag}" not in page} == set()
+    assert "│" not in page
+    assert "(required)" in page
+
+
 def test_the_rule_of_a_block_is_found(tmp_path):
     page = tmp_path / "page.md"
     python = "<!-- not run: needs a GPU -->\n\n```python\nx\n```\n\n"
