@@ -61,12 +61,19 @@ def draw_splats(
     intrinsics = np.asarray(camera.intrinsics, np.float32) * np.array([[factor], [factor], [1]], np.float32)
     order, pixels, radii = _projected(splats, np.asarray(camera.camera_from_world), intrinsics, (width, height), near)
     ranks = _spread(pixels, radii, (width, height))
-    palette = np.concatenate([splats.colors[order], np.array([background], np.uint8)])  # rank -1: the background
-    picture = palette[ranks].reshape(height // factor, factor, width // factor, factor, 3)
-    if factor == 1:
-        return picture[:, 0, :, 0]
-    total = picture.sum(axis=(1, 3), dtype=np.uint32)
-    return ((2 * total + factor**2) // (2 * factor**2)).astype(np.uint8)  # rounded
+    palette = np.zeros((len(order) + 1, 4), np.uint8)  # four bytes, gathered as one number
+    palette[:-1, :3], palette[-1, :3] = splats.colors[order], background  # rank -1: the background
+    picture = palette.view(np.uint32)[:, 0][ranks].view(np.uint8).reshape(*ranks.shape, 4)
+    return _mean(picture, factor)[..., :3]
+
+
+def _mean(picture: UInt8[np.ndarray, "h w C"], factor: int) -> UInt8[np.ndarray, "H W C"]:
+    """Return the rounded mean of squares of `factor` x `factor` pixels."""
+    total = np.full(picture[::factor, ::factor].shape, factor**2 // 2, np.uint32)
+    for row in range(factor):
+        for column in range(factor):
+            total += picture[row::factor, column::factor]
+    return (total // factor**2).astype(np.uint8)
 
 
 def project(

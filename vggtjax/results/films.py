@@ -133,8 +133,8 @@ def middle_depth(cameras: Cameras, points: list[ShownPoints]) -> float:
 def _splats(result: Result, points: ShownPoints) -> Splats:
     """Return discs that reach the neighbouring points in the picture and in the cloud, within limits."""
     pixel, reach = np.zeros((2, len(points.pixels)), np.float32)
-    starts = np.searchsorted(points.frames, np.arange(len(result.depth) + 1))
-    for frame, (start, end) in enumerate(pairwise(starts)):
+    frames, starts = np.unique(points.frames, return_index=True)
+    for frame, (start, end) in zip(frames, pairwise([*starts, len(points.frames)]), strict=True):
         own = points.pixels[start:end]
         focal = result.intrinsics[frame, [0, 1], [0, 1]].min()
         pixel[start:end] = result.depth[frame].ravel()[own] / focal
