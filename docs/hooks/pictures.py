@@ -1,0 +1,302 @@
+"""The pictures of the concepts and the gallery, made from the embedded clip and generated scenes.
+
+mkdocs runs this before every build. Pictures are kept in docs/pictures/made, which git ignores, and are made again only
+when this file, the model, the clip or the version of vggtjax changes. By hand: python docs/hooks/pictures.py
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from vggtjax import Reconstruction
+    from vggtjax.checkpoint import Model
+    from vggtjax.clips.truth import Truth
+
+logger = logging.getLogger("mkdocs.hooks.pictures")
+
+FOLDER = Path(__file__).resolve().parents[1] / "pictures" / "made"
+SCENES, SCENE_SEED = 4, 200  # of the gallery: the first of the seed, whatever came out
+SCENE_FRAMES, SCENE_SIDE = 12, 64
+_BACKGROUND, _TEXT, _FAINT = "#14141a", "#ececf0", "#9696a0"
+_FIRST, _SECOND, _FUSED, _TRUE = "#6db7ff", "#ff9a4a", "#7ddc8b", "#f5f5f5"
+_STYLE: dict[Any, Any] = {
+    "figure.facecolor": _BACKGROUND, "savefig.facecolor": _BACKGROUND, "axes.facecolor": _BACKGROUND,
+    "text.color": _TEXT, "axes.labelcolor": _TEXT, "axes.edgecolor": _FAINT, "xtick.color": _FAINT,
+    "ytick.color": _FAINT, "axes.titlesize": 10, "axes.titleweight": "normal", "font.size": 9,
+    "legend.frameon": False, "axes.spines.top": False, "axes.spines.right": False,
+}  # fmt: skip
+
+
+class Clip(NamedTuple):
+    """A clip with its truth, both passes over it, and what each motion cue says: [S, h, w] by name."""
+
+    truth: Truth
+    result: Reconstruction
+    cues: dict[str, np.ndarray]
+
+
+def on_pre_build(config: Any) -> None:
+    """Make the pictures unless they are there (a hook of mkdocs)."""
+    make()
+
+
+def make(folder: Path = FOLDER) -> None:
+    """Make all pictures in `folder`, unless those there are of this code, model and clip."""
+    from vggtjax.storage.cache import keep_compilations
+
+    keep_compilations()  # before anything imports jax
+    import vggtjax
+    from vggtjax.pretrained.embedded import CLIP, MODEL
+
+    made_of = hashlib.sha256(vggtjax.__version__.encode())
+    for path in (Path(__file__), MODEL, CLIP):
+        made_of.update(path.read_bytes())
+    stamp = folder / "made-of.txt"
+    if stamp.is_file() and stamp.read_text() == made_of.hexdigest():
+        return
+    logger.info("Making the pictures of the concepts and the gallery, about a minute and only once")
+    import matplotlib
+
+    matplotlib.use("agg")
+    folder.mkdir(parents=True, exist_ok=True)
+    stamp.unlink(missing_ok=True)
+    model = vggtjax.load_model("demo")
+    clip = _demo_clip(model)
+    with matplotlib.rc_context(_STYLE):
+        for name, draw in {"passes": passes, "cues": cues, "mask": mask, "fusion": fusion}.items():
+            _save(draw(clip), folder / f"{name}.webp")
+        for number, scene in enumerate(_generated(model)):
+            _save(gallery_sheet(scene, number), folder / f"scene-{number}.webp")
+    stamp.write_text(made_of.hexdigest())
+
+
+def _demo_clip(model: Model) -> Clip:
+    import jax
+
+    import vggtjax
+    from vggtjax.method.cues import GramCues
+    from vggtjax.network.clip_batch import ClipBatch
+    from vggtjax.network.model import predict
+    from vggtjax.pretrained.embedded import demo_clip
+
+    truth, config = demo_clip(), model.config
+    clip = vggtjax.load_clip(truth.images, size=truth.images.shape[2], patch=config.patch_size)
+    result = vggtjax.reconstruct(model, clip, size=truth.images.shape[2], keep_passes=True)
+    gram = GramCues(config.motion, config.depth)
+    sums = predict(
+        model.params, ClipBatch(jax.numpy.asarray(clip.images[None])), config, outputs=(), accumulator=gram
+    ).cue_sums
+    assert sums is not None
+    shape = result.saliency.shape if result.saliency is not None else ()
+    maps = {name: np.asarray(values[0]).reshape(shape) for name, values in gram.maps(sums).items()}
+    inverted = {cue.name: cue.inverted for cue in config.motion.cues}
+    shown = {f"1 - {name}" if inverted[name] else name: 1 - m if inverted[name] else m for name, m in maps.items()}
+    return Clip(truth, result, shown)
+
+
+def _generated(model: Model) -> list[Clip]:
+    """Return the first held-out scenes of a seed that neither training nor a benchmark draws, reconstructed."""
+    import vggtjax
+    from vggtjax.clips.truth import Truth
+    from vggtjax.scenes.config import SceneConfig
+    from vggtjax.scenes.held_out import held_out_scenes
+
+    config = SceneConfig(height=SCENE_SIDE, width=SCENE_SIDE, frames=SCENE_FRAMES)
+    scenes = held_out_scenes("dynamic", SCENES, config, seed=SCENE_SEED)
+    found = []
+    for number in range(SCENES):
+        truth = Truth(*(getattr(scenes, name)[number] for name in Truth._fields))
+        clip = vggtjax.load_clip(truth.images, size=SCENE_SIDE, patch=model.config.patch_size)
+        found.append(Clip(truth, vggtjax.reconstruct(model, clip), {}))
+    return found
+
+
+def passes(clip: Clip) -> Figure:
+    """Pictures, the tokens whose keys the second pass ignores, depth of both passes and truth; cameras from above."""
+    from matplotlib import pyplot
+
+    from vggtjax.evaluation.metrics.depth import median_scale
+
+    truth, result = clip.truth, clip.result
+    first, second = (np.asarray(p.depth[0]) for p in (result.passes.first, result.passes.second))
+    patch = result.depth.shape[1] // (result.saliency.shape[1] if result.saliency is not None else 1)
+    blocks = result.dynamic_mask.reshape(len(first), -1, patch, first.shape[2] // patch, patch).any(axis=(2, 4))
+    hidden = blocks.repeat(patch, axis=1).repeat(patch, axis=2)
+    frames = (2, 7, 12)
+    figure = pyplot.figure(figsize=(11.5, 4.7), layout="constrained")
+    grid = figure.add_gridspec(3, 8)
+    titles = ("picture", "ignored keys", "depth, pass 1", "depth, pass 2", "true depth")
+    for row, frame in enumerate(frames):
+        dimmed = np.where(hidden[frame][..., None], 0.25 * result.images[frame], result.images[frame]).astype(np.uint8)
+        depths = [values[frame] * median_scale(values, truth.depth) for values in (first, second)]
+        shown = [result.images[frame], dimmed, *(_depth(d, truth.depth) for d in (*depths, truth.depth[frame]))]
+        for column, (picture, title) in enumerate(zip(shown, titles, strict=True)):
+            axes = figure.add_subplot(grid[row, column])
+            _image(axes, picture, title if row == 0 else "", f"frame {frame}" if column == 0 else "")
+    _cameras(figure.add_subplot(grid[:, 5:]), clip)
+    return figure
+
+
+def cues(clip: Clip) -> Figure:
+    """The five maps, as they enter the product, and the saliency that comes of them."""
+    from matplotlib import pyplot
+
+    result, frames = clip.result, (2, 7, 12)
+    columns = 3 + len(clip.cues)
+    figure, axes = pyplot.subplots(len(frames), columns, figsize=(11.5, 4.7), layout="constrained")
+    saliency = result.saliency
+    assert saliency is not None
+    maps = {name.replace("_", " ", 1).replace("_", "\n"): values for name, values in clip.cues.items()}
+    for row, frame in zip(axes, frames, strict=True):
+        top = frame == frames[0]
+        _image(row[0], result.images[frame], "picture" if top else "", f"frame {frame}")
+        for cell, (name, values) in zip(row[1:], (maps | {"saliency:\nthe product": saliency}).items(), strict=False):
+            _image(cell, values[frame], name if top else "", cmap="inferno", vmin=0, vmax=1)
+        _image(row[-1], clip.truth.dynamic_mask[frame], "what moves\n(truth)" if top else "", cmap="gray")
+    return figure
+
+
+def mask(clip: Clip) -> Figure:
+    """The histogram of the saliency of all pixels with Otsu's threshold, and the mask it gives."""
+    from matplotlib import pyplot
+
+    from vggtjax.method.mask import BINS, otsu_threshold, upsample
+    from vggtjax.results.previews import overlay
+
+    result, frames = clip.result, (2, 7, 12)
+    assert result.saliency is not None
+    pixels = np.asarray(upsample(result.saliency[None], result.depth.shape[1:3]))[0]  # pyright: ignore
+    threshold = float(otsu_threshold(pixels))  # pyright: ignore
+    figure = pyplot.figure(figsize=(11.5, 5.0), layout="constrained")
+    grid = figure.add_gridspec(3, 7)
+    axes = figure.add_subplot(grid[:, :4])
+    low = pixels[pixels < threshold]
+    width = float(np.ptp(pixels)) * 4 / BINS
+    edges = threshold + width * np.arange(-np.ceil(threshold / width), np.ceil((1 - threshold) / width) + 1)
+    axes.hist(low, edges, color="#5b5b8f", label=f"static: {low.size / pixels.size:.0%} of the pixels")
+    axes.hist(pixels[pixels >= threshold], edges, color=_SECOND, label=f"dynamic: {1 - low.size / pixels.size:.0%}")
+    axes.axvline(threshold, color=_TRUE, linewidth=1.2)
+    axes.annotate(f"Otsu's threshold, {threshold:.2f}", (threshold, axes.get_ylim()[1] * 0.8), (8, 0),
+                  textcoords="offset points")  # fmt: skip
+    axes.set(xlabel="saliency", ylabel="pixels of all frames", title="one threshold for the clip")
+    axes.legend(loc="upper right")
+    for row, frame in enumerate(frames):
+        found, true = (overlay(result.images[frame], of.dynamic_mask[frame]) for of in (result, clip.truth))
+        shown = ((pixels[frame], "saliency, pixels"), (found, "mask"), (true, "truth"))
+        for column, (picture, title) in enumerate(shown):
+            axes = figure.add_subplot(grid[row, 4 + column])
+            limits: dict[str, Any] = {"cmap": "inferno", "vmin": 0, "vmax": 1} if picture.ndim == 2 else {}
+            _image(axes, picture, title if row == 0 else "", f"frame {frame}" if column == 0 else "", **limits)
+    return figure
+
+
+def fusion(clip: Clip) -> Figure:
+    """Confidence of both passes, the weight of the second, and the errors of both and of the fused depth."""
+    from matplotlib import pyplot
+
+    from vggtjax.evaluation.metrics.depth import median_scale
+
+    truth, result = clip.truth, clip.result
+    both = (result.passes.first, result.passes.second)
+    confidence = [np.asarray(p.depth_confidence[0]) for p in both]
+    depths = [*(np.asarray(p.depth[0]) for p in both), result.depth]
+    weight = np.where(result.dynamic_mask, 0, confidence[1] / (confidence[0] + confidence[1]))
+    errors = [np.abs(d * median_scale(d, truth.depth) - truth.depth) / truth.depth for d in depths]
+    frames = (2, 7, 12)
+    figure, axes = pyplot.subplots(len(frames), 7, figsize=(11.5, 5.1), layout="constrained")
+    titles = ["picture", "confidence,\npass 1", "confidence,\npass 2", "weight of\npass 2"]
+    for name, error in zip(("pass 1", "pass 2", "fused"), errors, strict=True):
+        titles.append(f"error, {name}\nmean {error.mean():.3f}")
+    most = float(np.percentile(np.concatenate(confidence), 99))
+    ways: tuple[dict[str, Any], ...] = (
+        {}, *[{"cmap": "viridis", "vmin": 1, "vmax": most}] * 2, {"cmap": "cividis", "vmin": 0, "vmax": 1},
+        *[{"cmap": "magma", "vmin": 0, "vmax": 1}] * 3,
+    )  # fmt: skip
+    drawn = {}
+    for row, frame in zip(axes, frames, strict=True):
+        shown = (result.images, *confidence, weight, *errors)
+        for column, (cell, values) in enumerate(zip(row, shown, strict=True)):
+            title = titles[column] if frame == frames[0] else ""
+            drawn[column] = _image(cell, values[frame], title, f"frame {frame}" if column == 0 else "", **ways[column])
+    for columns, label in (((1, 2), "confidence"), ((3,), "0: pass 1 alone"), ((4, 5, 6), "|d - true| / true")):
+        figure.colorbar(drawn[columns[0]], ax=list(axes[:, columns].ravel()), location="bottom", label=label,
+                        fraction=0.05, aspect=12 * len(columns), pad=0.03)  # fmt: skip
+    return figure
+
+
+def gallery_sheet(clip: Clip, number: int) -> Figure:
+    """Six frames of a generated scene: picture, depth, objects found, what truly moves."""
+    from matplotlib import pyplot
+
+    from vggtjax.results.previews import moving_ids, overlay
+
+    result, truth = clip.result, clip.truth
+    frames = np.linspace(0, len(result.depth) - 1, 6).round().astype(int)
+    figure, axes = pyplot.subplots(4, len(frames), figsize=(9.2, 6.3), layout="constrained")
+    objects = int(result.instances.max())
+    figure.suptitle(f"scene {number}: {objects} object{'' if objects == 1 else 's'} found", fontsize=11)
+    for column, frame in enumerate(frames):
+        picture = result.images[frame]
+        moving = moving_ids(result.dynamic_mask[frame], result.instances[frame])
+        rows = {"picture": picture, "depth": _depth(result.depth[frame], result.depth),
+                "objects": overlay(picture, moving), "truth": overlay(picture, truth.dynamic_mask[frame])}  # fmt: skip
+        for row, (name, values) in enumerate(rows.items()):
+            _image(axes[row, column], values, f"frame {frame}" if row == 0 else "", name if column == 0 else "")
+    return figure
+
+
+def _cameras(axes: Any, clip: Clip) -> None:
+    """Plot the paths of both passes and the true one from above, in the axes of the first camera."""
+    from vggtjax.evaluation.metrics.trajectory import centres, umeyama_sim3
+    from vggtjax.network.pose import decode_pose
+
+    true = np.asarray(clip.truth.camera_from_world)
+    size = clip.result.depth.shape[1:3]
+    ways = {"truth": (centres(true), _TRUE)}
+    for name, predictions, colour in (
+        ("pass 1", clip.result.passes.first, _FIRST), ("pass 2", clip.result.passes.second, _SECOND),
+    ):  # fmt: skip
+        found = centres(np.asarray(decode_pose(predictions.pose_encoding, size)[0][0]))
+        ways[name] = (umeyama_sim3(found, centres(true)).apply(found), colour)
+    rotation, origin = true[0, :, :3], centres(true)[0]
+    for name, (way, colour) in ways.items():
+        x, _, z = ((way - origin) @ rotation.T).T
+        axes.plot(x, z, "o-", color=colour, label=name, markersize=3.5, linewidth=1.5)
+    axes.set(title="cameras from above, after Sim(3)", xlabel="x, metres", ylabel="z, metres")
+    axes.set_aspect("equal", "datalim")
+    axes.legend()
+
+
+def _depth(depth: np.ndarray, of_clip: np.ndarray) -> np.ndarray:
+    """Colour inverse depth by the range of the clip's."""
+    from vggtjax.results.previews import color_depth, inverse_depth_range
+
+    everywhere = np.ones(of_clip.shape, bool)
+    return color_depth(depth, np.ones(depth.shape, bool), inverse_depth_range(of_clip, everywhere))
+
+
+def _image(axes: Any, pixels: np.ndarray, title: str = "", label: str = "", **how: Any) -> Any:
+    axes.set(xticks=[], yticks=[], title=title, ylabel=label)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    return axes.imshow(pixels, interpolation="nearest" if pixels.shape[0] < 32 else "bilinear", **how)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    from matplotlib import pyplot
+
+    figure.savefig(path, dpi=130, pil_kwargs={"quality": 88})
+    pyplot.close(figure)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO)
+    make()
