@@ -44,6 +44,9 @@ def test_demo(tmp_path, capsys):
     assert "errors against the truth" in out
     assert "peak memory" in out
     assert (tmp_path / "result" / "preview" / "truth.png").stat().st_size > 10_000
+    page = tmp_path / "result" / "preview" / "viewer.html"
+    assert str(page) in out
+    assert page.stat().st_size > 100_000
     result = Reconstruction.load(tmp_path / "result")
     assert result.method == "4dvggt-d"
     assert (tmp_path / "result" / "scene.glb").stat().st_size > 1000

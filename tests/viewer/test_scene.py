@@ -76,7 +76,19 @@ def test_a_second_result_is_placed_on_the_first_camera_at_its_scale():
     np.testing.assert_allclose(place.points(other.camera_centres), result.camera_centres, atol=1e-5)
 
 
-def test_results_at_the_edge_of_what_there_is(recwarn):
+@pytest.mark.parametrize("factor", [1e-20, 1e15])
+def test_worlds_of_any_size(factor):
+    room = make_room(2)
+    cameras = room.camera_from_world.copy()
+    cameras[:, :, 3] *= factor
+    other = dataclasses.replace(room, depth=room.depth * np.float32(factor), camera_from_world=cameras)
+    for place in (SAME, place_beside(other, room)):
+        scene = scene_of(other, "other", place, budget=Budget())
+        assert scene["staticCount"] > 100
+        assert np.isfinite(positions_of(scene)).all()
+
+
+def test_results_at_the_edge_of_what_there_is():
     still = dataclasses.replace(make_room(1), dynamic_mask=np.zeros((1, 28, 42), bool), timestamps=None)
     scene = scene_of(still, "still", SAME, budget=Budget())
     assert scene["offsets"].tolist() == [scene["staticCount"]] * 2

@@ -46,7 +46,8 @@ class Place(NamedTuple):
     offset: Float64[np.ndarray, " 3"]
 
     def points(self, points: Float[np.ndarray, "*N 3"]) -> Float32[np.ndarray, "*N 3"]:
-        return (self.scale * (points @ self.rotation.T) + self.offset).astype(np.float32)
+        with np.errstate(over="ignore"):  # worlds of untrained weights
+            return (self.scale * (points @ self.rotation.T) + self.offset).astype(np.float32)
 
 
 def place_beside(result: Result, first: Result) -> Place:
@@ -113,7 +114,7 @@ def contracted(
     positions: Float32[np.ndarray, "N 3"], centre: Float32[np.ndarray, " 3"], scale: float
 ) -> UInt16[np.ndarray, "N 3"]:
     """Return d / (scale + |d|) of the offsets d from the centre in 16 bits: fine near the centre, coarse far away."""
-    offsets = positions.astype(np.float64) - centre
+    offsets = np.nan_to_num(positions).astype(np.float64) - centre
     inside = offsets / (scale + np.linalg.norm(offsets, axis=-1, keepdims=True))
     return ((inside + 1) * 32767.5).round().astype(np.uint16)
 

@@ -1,0 +1,64 @@
+"""The command view: what it writes, and one sentence for what it cannot do."""
+
+import socket
+
+import pytest
+
+from tests.room import make_room
+from vggtjax.commands import main as cli
+from vggtjax.errors import InputError
+from vggtjax.viewer.page import viewer_page
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results") / "room"
+    make_room(3).save(folder)
+    return folder
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    code = cli.main(["view", *map(str, arguments)])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_a_page_and_a_recording_are_written(tmp_path, capsys, folder):
+    page = tmp_path / "scene.html"
+    code, out, err = run(capsys, folder, folder, "--export", page)
+    assert code == 0, err
+    assert str(page) in out
+    assert page.read_text(encoding="utf-8").startswith("<!doctype html>")
+    pytest.importorskip("viser")
+    code, _, err = run(capsys, folder, "--export", tmp_path / "scene.viser")
+    assert code == 0, err
+    assert (tmp_path / "scene.viser").stat().st_size > 1000
+
+
+def test_what_cannot_be_viewed_is_one_sentence(tmp_path, capsys, folder):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        for arguments, sentence in (
+            ((), "no result; name the folder"),
+            ((tmp_path,), f"there is no {tmp_path}"),
+            ((folder, "--export", tmp_path / "scene.mp4"), "ends with .html or .viser"),
+            ((folder, "--port", port), f"port {port} of 127.0.0.1 is in use"),
+            ((folder, "--host", "203.0.113.7"), "no address of this machine"),
+            ((folder, "--format", "monst3r"), "--quaternion wxyz"),
+            ((folder,) * 10, "expected 1 to 9"),
+        ):
+            code, _, err = run(capsys, *arguments)
+            assert code == 2
+            assert sentence in err
+            assert err.strip().splitlines()[-1].startswith("vggtjax: ")
+            assert "Traceback" not in err
+
+
+def test_a_notebook_shows_a_result():
+    viewer = make_room(2).view(names=["<b>mine</b>"], height=300)
+    cell = viewer._repr_html_()
+    assert cell.startswith('<iframe srcdoc="&lt;!doctype html')
+    assert "height: 300px" in cell
+    assert "<b>" not in viewer.html
+    with pytest.raises(InputError, match="2 names for 1 results"):
+        viewer_page([make_room(2)], names=["one", "two"])
