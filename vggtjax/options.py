@@ -10,6 +10,7 @@ import tyro
 
 from vggtjax.config import Gram, Suppress
 from vggtjax.errors import InputError, check_choice, whole_number
+from vggtjax.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields
 
 Pass = Literal["first", "second"]
@@ -73,10 +74,8 @@ def odd_frames(frames: object) -> int:
 
 _READ_AFTER_THE_PASSES = ("method", "align_scale", "refine_mask")
 
-_Flag = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help_behavior_hint="")]
 
-
-def _refine_mask(refine_mask: _Flag = False, no_refine_mask: _Flag = False) -> bool | None:
+def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) -> bool | None:
     """Whether the mask is refined; the method's own choice by default.
 
     Args:
@@ -97,18 +96,19 @@ class Options:
     """How a clip is reconstructed. Raises InputError for an invalid value."""
 
     method: MethodName = "4dvggt-d"
-    """which passes give depth and cameras; see the table of methods in the README"""
-    gram: Gram | None = None
-    """similarity of the motion cues; the method's own by default"""
-    suppress: Suppress | None = None
-    """how the keys of dynamic tokens are suppressed; the method's own by default"""
+    """which passes give depth and cameras: vggt, the first pass; vggt4d, depth of the first and cameras of the second;
+    pose-decoupling, the second pass; hard-replacement, the second pass, with depth of the first where things move;
+    4dvggt-d, the same, with the depth of both passes fused where nothing moves"""
+    gram: InWords[Gram | None] = None
+    """similarity of the motion cues; by default dot for vggt4d, else cosine"""
+    suppress: InWords[Suppress | None] = None
+    """how the second pass ignores keys of dynamic tokens; by default drop for vggt4d, else zero"""
     mask_pairs: int = 5
-    """number of pairs of blocks in which the keys of dynamic tokens are suppressed (L_mask of the paper); a number
-    above the model's means all"""
-    align_scale: tyro.conf.FlagCreatePairsOff[bool] = False
+    """in how many pairs of blocks, from the first on, keys of dynamic tokens are ignored (L_mask of the paper)"""
+    align_scale: Switch = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1
-    """odd number of frames over which the saliency is averaged before thresholding (not in the papers)"""
+    """odd number of frames to average the saliency over before its threshold; 1 does not (not in the papers)"""
     refine_mask: _RefineMask = None
     """remove pixels from the mask that agree with other frames; the method's own choice by default"""
     compute_dtype: Annotated[

@@ -28,7 +28,7 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def _every_command() -> str:
-    commands = re.findall(r"• ([\w-]+)", _help())
+    commands = re.findall(r"(?m)^  ([\w-]+)  ", _help())
     with ThreadPoolExecutor() as pool:
         return "\n\n".join(pool.map(_section, commands))
 

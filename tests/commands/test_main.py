@@ -245,6 +245,44 @@ def test_foreign_files_are_said_before_the_model_is_loaded(tmp_path, capsys, fra
     assert "vggt4d exists and is not part of an earlier result" in err
 
 
+def test_the_overview_names_every_command_once(capsys):
+    code, out, err = run(capsys, "--help")
+    assert (code, err) == (0, "")
+    assert sorted(re.findall(r"(?m)^  (\S+)  ", out)) == sorted(cli.COMMANDS)
+    assert max(map(len, out.splitlines())) <= 90
+    assert run(capsys) == (2, "", out)
+
+
+def test_the_help_groups_options_in_the_order_of_use(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
+    for command in ("reconstruct", "batch", "evaluate"):
+        with pytest.raises(SystemExit, match="0"):
+            cli.main([command, "--help"])
+        page = capsys.readouterr().out
+        groups = re.findall(r"(?m)^\W*(\w+)[\w ]* options\b", page)
+        assert [name for name in groups if name in ("input", "model", "method", "output")] == [
+            "input", "model", "method", "output",
+        ]  # fmt: skip
+        assert "default: None" not in page
+        assert "default: False" not in page
+        assert "Union" not in page
+
+
+def test_groups_of_files_are_chosen(capsys, monkeypatch):
+    savings = []
+
+    @functools.wraps(cli.COMMANDS["reconstruct"])
+    def recorder(*_, saving=Saving(), **__):
+        savings.append(saving.only)
+
+    monkeypatch.setattr(cli, "COMMANDS", {"reconstruct": recorder, "info": cli.COMMANDS["info"]})
+    assert run(capsys, "reconstruct", "clip", "--out", "out", "--only", "depth,cameras")[0] == 0
+    assert savings == [("depth", "cameras")]
+    code, _, err = run(capsys, "reconstruct", "clip", "--out", "out", "--only", "nose")
+    assert code == 2
+    assert err.startswith("vggtjax: only is 'nose'; expected one of depth, confidence") or "--only is 'nose'" in err
+
+
 def test_version(capsys):
     assert run(capsys, "--version") == (0, f"vggtjax {vggtjax.__version__}\n", "")
 

@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from vggtjax.errors import ClipError, InputError, check_choice, whole_number
+from vggtjax.flags import InWords
 
 Mode = Literal["crop", "pad"]
 
@@ -23,9 +24,10 @@ class Framing:
     """How pictures are fitted to the model. Raises InputError for an invalid value."""
 
     mode: Annotated[Mode, tyro.conf.arg(name="preprocess")] = "crop"
-    """"crop" makes frames `size` wide and cuts tall frames to `size`; "pad" keeps every pixel and pads to a square"""
-    size: int | None = None
-    """side in pixels to run at, a multiple of the patch size; the model's own by default"""
+    """crop makes frames `size` wide and cuts tall frames above and below to `size`; pad keeps every pixel and pads to a
+    square"""
+    size: InWords[int | None] = None
+    """side in pixels to run at, a multiple of the model's patch size; the model's own size by default"""
 
     def __post_init__(self) -> None:
         check_choice("mode", self.mode, get_args(Mode))

@@ -11,6 +11,7 @@ from typing import Protocol, TypeVar
 from PIL import Image
 
 from vggtjax.errors import ClipError, InputError, whole_number
+from vggtjax.flags import InWords
 
 Item = TypeVar("Item")
 
@@ -31,13 +32,13 @@ class Sampling:
     """Which frames of a source are taken. Raises InputError for a value out of range."""
 
     start: int = 0
-    """index of the first frame to take, counted in frames of the source"""
-    stride: int | None = None
-    """take every stride-th frame; 1 by default, in an evaluation the published protocol's own"""
-    fps: float | None = None
-    """frames to take per second of a video, by presentation time; not together with stride"""
-    max_frames: int | None = None
-    """take at most this many frames"""
+    """first frame to take, counted from 0 in frames of the source"""
+    stride: InWords[int | None] = None
+    """take every n-th frame; every frame by default, in an evaluation those of the published protocol"""
+    fps: InWords[float | None] = None
+    """take so many frames per second of a video, by presentation time; not together with stride"""
+    max_frames: InWords[int | None] = None
+    """take at most so many frames; all by default"""
 
     def __post_init__(self) -> None:
         for name, lowest in (("start", 0), ("stride", 1), ("max_frames", 1)):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
+from vggtjax.flags import Switch
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 
@@ -15,7 +17,63 @@ _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(req
 
 Sources = Annotated[tuple[str, ...], tyro.conf.Positional, _SOURCES]
 ModelName = Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="(required)")]
-Frames = Annotated[Sampling, tyro.conf.arg(name="frame")]
-Size = Annotated[Framing, tyro.conf.arg(name="size")]
-Method = Annotated[Options, tyro.conf.arg(name="method")]
-Output = Annotated[Saving, tyro.conf.arg(name="output")]
+Frames = Annotated[Sampling, tyro.conf.arg(name="input", help="")]
+Size = Annotated[Framing, tyro.conf.arg(name="input", help="")]
+Method = Annotated[Options, tyro.conf.arg(name="method", help="")]
+Output = Annotated[Saving, tyro.conf.arg(name="output", help="")]
+
+
+def _result_folder(out: Path) -> Path:
+    """Return the folder.
+
+    Args:
+        out: folder for the result; an earlier result in it is replaced as a whole
+    """
+    return out
+
+
+def _batch_folder(out: Path) -> Path:
+    """Return the folder.
+
+    Args:
+        out: folder for the results, with one folder per clip, named after the clip
+    """
+    return out
+
+
+def _evaluation_folder(out: Path) -> Path:
+    """Return the folder.
+
+    Args:
+        out: folder for results.json, results.csv, table.md, table.tex and index.html
+    """
+    return out
+
+
+def _view(view: Switch = False) -> bool:
+    """Return the choice.
+
+    Args:
+        view: open the viewer at the end; vggtjax view has its options
+    """
+    return view
+
+
+def _pad_frames(pad_frames: Switch = False) -> bool:
+    """Return the choice.
+
+    Args:
+        pad_frames: pad clips to one of a few lengths, so that clips of similar length share compiled programs; for many
+            lengths on a GPU, where compiling takes longer than running
+    """
+    return pad_frames
+
+
+# The name puts a flag into the group of that name.
+ResultFolder = Annotated[Path, tyro.conf.arg(constructor=_result_folder, name="output", prefix_name=False, help="")]
+BatchFolder = Annotated[Path, tyro.conf.arg(constructor=_batch_folder, name="output", prefix_name=False, help="")]
+EvaluationFolder = Annotated[
+    Path, tyro.conf.arg(constructor=_evaluation_folder, name="output", prefix_name=False, help="")
+]
+View = Annotated[bool, tyro.conf.arg(constructor=_view, name="output", prefix_name=False, help="")]
+PadFrames = Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="method", prefix_name=False, help="")]

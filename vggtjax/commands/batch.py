@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import time
 from datetime import timedelta
-from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import Frames, Method, Output, Size, Sources
+from vggtjax.commands.arguments import BatchFolder, Frames, Method, Output, PadFrames, Size, Sources
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
@@ -23,13 +22,13 @@ from vggtjax.results.saving import Saving
 def batch(
     sources: Sources,
     /,
-    out: Path,
     *,
-    pad_frames: tyro.conf.FlagCreatePairsOff[bool] = False,
-    files: Annotated[ModelFiles, tyro.conf.arg(name="model")] = ModelFiles(),
     sampling: Frames = Sampling(),
     framing: Size = Framing(),
+    files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
     options: Method = Options(),
+    pad_frames: PadFrames = False,
+    out: BatchFolder,
     saving: Output = Saving(),
 ) -> None:
     """Reconstruct many clips, each into a folder of its own; run the same command again to resume.
@@ -38,13 +37,12 @@ def batch(
 
     Args:
         sources: folders of images, or videos; or one folder of such.
-        out: folder for the results, with one folder per clip, named after the clip.
-        pad_frames: pad clips to one of a few lengths, so that clips of similar length share compiled programs: for many
-            different lengths on a GPU, where compiling takes longer than running.
-        files: the model
         sampling: which frames of the source
         framing: how frames are fitted to the model
+        files: the model
         options: how the clip is reconstructed
+        pad_frames: whether clips are padded to one of a few lengths
+        out: folder for the results
         saving: how the result is written
     """
     report = Report()

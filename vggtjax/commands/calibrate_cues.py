@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from vggtjax.commands.report import Report
 from vggtjax.config import Gram
 from vggtjax.errors import InputError, whole_number
+from vggtjax.flags import InWords
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,7 +24,7 @@ def calibrate_cues(
     *,
     scenes: int = 64,
     frames: int = 12,
-    size: int | None = None,
+    size: InWords[int | None] = None,
     gram: Gram = "cosine",
     max_terms: int = 5,
     seed: int = 0,

@@ -9,6 +9,7 @@ import tyro
 
 from vggtjax.commands.models import load, read_config
 from vggtjax.commands.report import Report
+from vggtjax.flags import InWords
 from vggtjax.results.saving import Saving
 
 
@@ -17,8 +18,8 @@ def convert(
     destination: tyro.conf.Positional[Path],
     /,
     *,
-    config: Path | None = None,
-    heads: str | None = None,
+    config: InWords[Path | None] = None,
+    heads: InWords[str | None] = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
 ) -> None:
     """Convert a PyTorch VGGT checkpoint to one .safetensors with Flax names, and say what was read and written.
@@ -45,7 +46,7 @@ def import_result(
     out: Path,
     *,
     format: Literal["vggt4d", "monst3r", "cut3r", "da3"],
-    quaternion: Literal["xyzw", "wxyz"] | None = None,
+    quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
     confidence_percentile: float = 20.0,
 ) -> None:
     """Read the result folder of another project, and write it as ours: pictures, clouds, a scene to look at.
@@ -71,7 +72,7 @@ def import_result(
     report.summary(result, out)
 
 
-def info(model: tyro.conf.Positional[str] = "demo", /, *, config: Path | None = None) -> None:
+def info(model: tyro.conf.Positional[str] = "demo", /, *, config: InWords[Path | None] = None) -> None:
     """Print a model's configuration, heads, number of parameters and type.
 
     Args:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import tyro
-
 from vggtjax.commands.models import load
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
+from vggtjax.flags import Switch
 from vggtjax.options import MethodName, Options
 
 
@@ -17,7 +16,7 @@ def demo(
     *,
     out: Path = Path("demo-output"),
     method: MethodName = "4dvggt-d",
-    view: tyro.conf.FlagCreatePairsOff[bool] = False,
+    view: Switch = False,
 ) -> None:
     """Reconstruct the embedded clip with the embedded model, and measure the ladder of methods against its truth.
 

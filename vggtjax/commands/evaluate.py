@@ -11,10 +11,11 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import Size
+from vggtjax.commands.arguments import EvaluationFolder, Size
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
+from vggtjax.flags import InWords
 from vggtjax.options import METHODS, MethodName, Options, find_method
 
 if TYPE_CHECKING:
@@ -45,8 +46,8 @@ class Candidates(ModelFiles):
     model: Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="(required without --results)")] = (
         None
     )
-    methods: str | None = None
-    """names of methods, with commas; all five by default; methods that mine alike share one run of the passes"""
+    methods: Annotated[str | None, tyro.conf.arg(metavar="METHOD,METHOD", help_behavior_hint="")] = None
+    """names of methods, with commas: vggt, vggt4d, pose-decoupling, hard-replacement, 4dvggt-d; all by default"""
 
     def source(self, report: Report, options: Options, framing: Framing) -> ModelSource:
         """Return the results of the model, loaded as a stage of the report."""
@@ -63,11 +64,11 @@ class Candidates(ModelFiles):
 class Folders:
     """Results of other programs, or earlier ones of ours."""
 
-    results: tuple[str, ...] = ()
+    results: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FOLDER ...", help_behavior_hint="")] = ()
     """score results in these folders instead, NAME=FOLDER, each with a folder per sequence; no model is run"""
-    format: Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] | None = None
+    format: InWords[Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] | None] = None
     """the program that wrote the folders; vggtjax by default"""
-    quaternion: Literal["xyzw", "wxyz"] | None = None
+    quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None
     """order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw"""
 
     def source(self) -> FolderSource:
@@ -91,10 +92,10 @@ class Folders:
 class ScoreOptions:
     """What is scored, and how."""
 
-    sequences: str | None = None
+    sequences: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME", help_behavior_hint="")] = None
     """names, with commas; the sequences of the published protocol, or all, by default"""
-    gt: str | None = None
-    """ground truth to use, where a data set has several: for dycheck easi3r or lidar"""
+    gt: InWords[str | None] = None
+    """ground truth to use, where a data set has several: for dycheck easi3r (the default) or lidar"""
     depth_align: Literal["metric", "median", "scale", "scale-shift"] = "scale"
     """how video depth is brought to metres"""
     empty: Literal["davis", "vggt4d"] = "davis"
@@ -105,14 +106,14 @@ def evaluate(
     dataset: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATASET")],
     root: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ROOT")],
     /,
-    out: Path,
     *,
-    candidates: Annotated[Candidates, tyro.conf.arg(name="model")] = Candidates(),
-    folders: Annotated[Folders, tyro.conf.arg(name="folder")] = Folders(),
-    scores: Annotated[ScoreOptions, tyro.conf.arg(name="score")] = ScoreOptions(),
-    sampling: Annotated[EvaluatedFrames, tyro.conf.arg(name="frame")] = EvaluatedFrames(),
+    sampling: Annotated[EvaluatedFrames, tyro.conf.arg(name="input", help="")] = EvaluatedFrames(),
     framing: Size = Framing(),
-    options: Annotated[EvaluatedOptions, tyro.conf.arg(name="method")] = EvaluatedOptions(),
+    candidates: Annotated[Candidates, tyro.conf.arg(name="model", help="")] = Candidates(),
+    options: Annotated[EvaluatedOptions, tyro.conf.arg(name="method", help="")] = EvaluatedOptions(),
+    folders: Annotated[Folders, tyro.conf.arg(name="other results", help="")] = Folders(),
+    scores: Annotated[ScoreOptions, tyro.conf.arg(name="score", help="")] = ScoreOptions(),
+    out: EvaluationFolder,
 ) -> None:
     """Score methods on a data set with ground truth: cameras, point clouds, masks, depth, uncertainty.
 

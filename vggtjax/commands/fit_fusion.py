@@ -12,6 +12,7 @@ from msgspec import Meta
 from vggtjax.commands.models import load
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, check_extra
+from vggtjax.flags import InWords
 from vggtjax.options import MethodName, Options
 from vggtjax.storage.json_values import Count, check_fields
 
@@ -29,9 +30,9 @@ class Clips:
 
     data: tuple[str, ...] = ("generated=16",)
     """clips with true depth: "generated=N" for N generated scenes, or DATASET=FOLDER as for evaluate"""
-    max_frames: Count | None = None
+    max_frames: InWords[Count | None] = None
     """largest number of frames to take of each clip; generated clips have 12 by default, and no fewer"""
-    size: int | None = None
+    size: InWords[int | None] = None
     """side in pixels to run at; the model's own by default"""
 
     def __post_init__(self) -> None:

@@ -24,6 +24,7 @@ from vggtjax.commands.demo import demo
 from vggtjax.commands.evaluate import evaluate
 from vggtjax.commands.export import export
 from vggtjax.commands.fit_fusion import fit_fusion
+from vggtjax.commands.overview import overview
 from vggtjax.commands.process import keep_freed_memory
 from vggtjax.commands.reconstruct import reconstruct
 from vggtjax.commands.render import render
@@ -67,6 +68,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if list(arguments) in (["--version"], ["-V"]):
             sys.stdout.write(f"vggtjax {__version__}\n")
+        elif list(arguments) in (["--help"], ["-h"]):
+            sys.stdout.write(overview(COMMANDS))
+        elif not arguments:
+            sys.stderr.write(overview(COMMANDS))
+            return 2
         else:
             _parsed(arguments)()
         sys.stdout.flush()  # a broken pipe is noticed here

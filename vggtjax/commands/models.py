@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from vggtjax.commands.arguments import ModelName
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
+from vggtjax.flags import InWords
 from vggtjax.options import METHODS, Options
 from vggtjax.storage.json_values import read_json
 
@@ -39,11 +40,11 @@ class ModelFiles:
     """The files of a model and of a fitted rule of fusion."""
 
     model: ModelName = None
-    """a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or "demo", the small
+    """a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or demo, the small
     demonstration model, which is not for real footage"""
-    config: Path | None = None
-    """JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B"""
-    fusion: Path | None = None
+    config: InWords[Path | None] = None
+    """JSON file with the configuration of a PyTorch checkpoint; needed unless it is VGGT-1B"""
+    fusion: InWords[Path | None] = None
     """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""
 
     def load(self, report: Report, options: Options, methods: Sequence[str]) -> tuple[Model, FusionParams | None]:

@@ -10,11 +10,12 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import Frames, Method, Output, Size, Sources
+from vggtjax.commands.arguments import Frames, Method, Output, ResultFolder, Size, Sources, View
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
 from vggtjax.errors import InputError
+from vggtjax.flags import InWords, Switch
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 
@@ -28,13 +29,13 @@ if TYPE_CHECKING:
 class Known:
     """Masks and points of the user. Raises InputError for options that exclude each other."""
 
-    masks: Path | None = None
-    """folder of pictures, bright where something moves, one per frame; mined from the clip by default"""
-    no_masks: tyro.conf.FlagCreatePairsOff[bool] = False
+    masks: InWords[Path | None] = None
+    """folder of pictures, one per frame, bright where something moves; mined from the clip by default"""
+    no_masks: Switch = False
     """nothing moves: one pass is enough"""
-    tracks: str | None = None
-    """points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and, optionally,
-    frame, in pixels of the source"""
+    tracks: Annotated[str | None, tyro.conf.arg(metavar="GRID|FILE", help_behavior_hint="")] = None
+    """points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and, if wanted,
+    frame, in pixels of the source; none by default"""
 
     def __post_init__(self) -> None:
         if self.masks is not None and self.no_masks:
@@ -67,28 +68,28 @@ class Known:
 def reconstruct(
     source: Sources,
     /,
-    out: Path,
     *,
-    files: Annotated[ModelFiles, tyro.conf.arg(name="model")] = ModelFiles(),
     sampling: Frames = Sampling(),
     framing: Size = Framing(),
+    files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
     options: Method = Options(),
-    known: Annotated[Known, tyro.conf.arg(name="mask")] = Known(),
+    known: Annotated[Known, tyro.conf.arg(name="mask and track", help="")] = Known(),
+    out: ResultFolder,
     saving: Output = Saving(),
-    view: tyro.conf.FlagCreatePairsOff[bool] = False,
+    view: View = False,
 ) -> None:
     """Cameras, depth, dynamic masks and a 4-D point cloud of a clip.
 
     Args:
         source: a folder of images, a pattern, images, or a video.
-        out: folder for the results; an earlier result in it is replaced.
-        files: the model
         sampling: which frames of the source
         framing: how frames are fitted to the model
+        files: the model
         options: how the clip is reconstructed
         known: masks and points of your own
+        out: folder for the result
         saving: how the result is written
-        view: open the viewer at the end; `vggtjax view` has its options.
+        view: whether the viewer opens at the end
     """
     if not source:
         raise InputError("no input; name a folder of images, a pattern, images, or a video")

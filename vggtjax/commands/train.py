@@ -11,6 +11,7 @@ import tyro
 
 from vggtjax.commands.report import Report
 from vggtjax.errors import check_extra
+from vggtjax.flags import InWords
 from vggtjax.training.options import RunOptions
 
 if TYPE_CHECKING:
@@ -23,9 +24,9 @@ def train(
     recipe: Path,
     out: Path,
     *,
-    init: str | None = None,
-    steps: int | None = None,
-    options: Annotated[RunOptions, tyro.conf.OmitArgPrefixes] = RunOptions(),  # noqa: B008 (frozen)
+    init: InWords[str | None] = None,
+    steps: InWords[int | None] = None,
+    options: Annotated[RunOptions, tyro.conf.arg(name="run", help="")] = RunOptions(),  # noqa: B008 (frozen)
 ) -> None:
     """Train a model on generated scenes, or resume an interrupted run.
 

@@ -14,6 +14,7 @@ import tyro
 
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
+from vggtjax.flags import Switch
 
 if TYPE_CHECKING:
     from vggtjax.results.result import Result
@@ -30,7 +31,7 @@ class Serving:
     printed"""
     port: int = 8080
     """0 takes a free one"""
-    no_browser: tyro.conf.FlagCreatePairsOff[bool] = False
+    no_browser: Switch = False
     """open no browser; over ssh none is opened"""
 
 

@@ -9,6 +9,7 @@ import tyro
 from msgspec import Meta
 
 from vggtjax.errors import InputError, check_choice
+from vggtjax.flags import InWords
 from vggtjax.storage.json_values import check_fields
 
 Resolution = Literal["model", "original"]
@@ -43,8 +44,8 @@ _Groups = tyro.constructors.PrimitiveConstructorSpec(
     nargs=1,
     metavar="GROUP,GROUP",
     instance_from_str=lambda words: parse_groups(words[0]),
-    is_instance=lambda value: isinstance(value, tuple),
-    str_from_instance=lambda value: [",".join(value or GROUPS)],  # None: all
+    is_instance=lambda value: value is None or isinstance(value, tuple),
+    str_from_instance=lambda value: [",".join(value or GROUPS)],
 )
 
 
@@ -53,14 +54,14 @@ class Saving:
     """How a result is written. Raises InputError for a percentile outside [0, 100) or an unknown name."""
 
     confidence_percentile: Annotated[float, Meta(ge=0, lt=100)] = 20.0
-    """percent of the pixels, the least confident, to leave out of the point clouds"""
+    """percent of the pixels, the least confident ones, to leave out of the point clouds"""
     resolution: Resolution = "model"
-    """size of the written files: the model's, or the source's own, with crop, scale and padding undone"""
+    """size of the written files: model, or original, the source's own, with crop, scale and padding undone"""
     format: Format = "vggtjax"
-    """"vggt4d" writes, beside the files of vggtjax, the folder vggt4d/ as VGGT4D does"""
-    only: Annotated[tuple[Group, ...] | None, _Groups] = None
-    """write only these groups of files, with commas: depth, confidence, cameras, masks, previews, clouds, scene,
-    report; reconstruction.npz, from which vggtjax reads everything back, is always written"""
+    """vggt4d writes, beside the files of vggtjax, a folder vggt4d/ as VGGT4D does"""
+    only: InWords[Annotated[tuple[Group, ...] | None, _Groups]] = None
+    """write only these groups of files: depth, confidence, cameras, masks, previews, clouds, scene,
+    report; all by default. The archive, reconstruction.npz, is always written: vggtjax reads everything from it"""
 
     def __post_init__(self) -> None:
         if isinstance(self.only, str):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from vggtjax.flags import InWords
 from vggtjax.storage.json_values import Count, Positive, check_fields
 
 
@@ -15,13 +16,14 @@ class RunOptions:
     Attributes:
         log_every: steps that a row of metrics.csv averages over.
         checkpoint_seconds: time between checkpoints.
-        seconds: time limit, after which the run ends with a checkpoint; the same command resumes it.
+        seconds: time limit, after which the run ends with a checkpoint; the same command resumes it. None is set
+            by default.
         dtype: of the weights in model.safetensors.
     """
 
     log_every: Count = 50
     checkpoint_seconds: Positive = 600.0
-    seconds: Positive | None = None
+    seconds: InWords[Positive | None] = None
     dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:
