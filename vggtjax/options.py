@@ -10,7 +10,7 @@ import tyro
 
 from vggtjax.config import Gram, Suppress
 from vggtjax.errors import InputError, check_choice, whole_number
-from vggtjax.flags import InWords, Switch
+from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields
 
 Pass = Literal["first", "second"]

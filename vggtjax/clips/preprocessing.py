@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from vggtjax.errors import ClipError, InputError, check_choice, whole_number
-from vggtjax.flags import InWords
+from vggtjax.storage.flags import InWords
 
 Mode = Literal["crop", "pad"]
 

@@ -11,7 +11,7 @@ from typing import Protocol, TypeVar
 from PIL import Image
 
 from vggtjax.errors import ClipError, InputError, whole_number
-from vggtjax.flags import InWords
+from vggtjax.storage.flags import InWords
 
 Item = TypeVar("Item")
 

@@ -9,9 +9,9 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.flags import Switch
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
+from vggtjax.storage.flags import Switch
 
 _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(required)")
 

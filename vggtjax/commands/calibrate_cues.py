@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from vggtjax.commands.report import Report
 from vggtjax.config import Gram
 from vggtjax.errors import InputError, whole_number
-from vggtjax.flags import InWords
+from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
     import numpy as np

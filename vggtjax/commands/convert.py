@@ -9,8 +9,8 @@ import tyro
 
 from vggtjax.commands.models import load, read_config
 from vggtjax.commands.report import Report
-from vggtjax.flags import InWords
 from vggtjax.results.saving import Saving
+from vggtjax.storage.flags import InWords
 
 
 def convert(

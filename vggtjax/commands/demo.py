@@ -8,8 +8,8 @@ from pathlib import Path
 from vggtjax.commands.models import load
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
-from vggtjax.flags import Switch
 from vggtjax.options import MethodName, Options
+from vggtjax.storage.flags import Switch
 
 
 def demo(

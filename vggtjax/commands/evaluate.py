@@ -15,8 +15,8 @@ from vggtjax.commands.arguments import EvaluationFolder, Size
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
-from vggtjax.flags import InWords
 from vggtjax.options import METHODS, MethodName, Options, find_method
+from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
     from vggtjax.evaluation.records import Record

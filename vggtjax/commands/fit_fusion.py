@@ -12,8 +12,8 @@ from msgspec import Meta
 from vggtjax.commands.models import load
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, check_extra
-from vggtjax.flags import InWords
 from vggtjax.options import MethodName, Options
+from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import Count, check_fields
 
 if TYPE_CHECKING:

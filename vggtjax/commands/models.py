@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from vggtjax.commands.arguments import ModelName
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.flags import InWords
 from vggtjax.options import METHODS, Options
+from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import read_json
 
 if TYPE_CHECKING:

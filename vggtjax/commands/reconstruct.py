@@ -15,9 +15,9 @@ from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
 from vggtjax.errors import InputError
-from vggtjax.flags import InWords, Switch
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
+from vggtjax.storage.flags import InWords, Switch
 
 if TYPE_CHECKING:
     import numpy as np

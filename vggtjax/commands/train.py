@@ -11,7 +11,7 @@ import tyro
 
 from vggtjax.commands.report import Report
 from vggtjax.errors import check_extra
-from vggtjax.flags import InWords
+from vggtjax.storage.flags import InWords
 from vggtjax.training.options import RunOptions
 
 if TYPE_CHECKING:

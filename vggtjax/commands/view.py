@@ -14,7 +14,7 @@ import tyro
 
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
-from vggtjax.flags import Switch
+from vggtjax.storage.flags import Switch
 
 if TYPE_CHECKING:
     from vggtjax.results.result import Result

@@ -9,7 +9,7 @@ import tyro
 from msgspec import Meta
 
 from vggtjax.errors import InputError, check_choice
-from vggtjax.flags import InWords
+from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import check_fields
 
 Resolution = Literal["model", "original"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vggtjax.flags import InWords
+from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import Count, Positive, check_fields
 
 
