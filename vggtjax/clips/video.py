@@ -50,6 +50,20 @@ class VideoFile:
     def total(self, sampling: Sampling) -> None:
         """Return None: only decoding tells how many frames there are."""
 
+    def seconds(self) -> float | None:
+        """Return the length that the file states, or None where it states none. Raises ClipError as `frames` does."""
+        import av
+        import av.error
+
+        try:
+            with _opened(self.path, av) as container:
+                stream = _video_stream(container, self.path)
+                if stream.duration is not None and stream.time_base is not None:
+                    return float(stream.duration * stream.time_base)
+                return None if container.duration is None else container.duration / 1e6
+        except (av.error.FFmpegError, OSError, EOFError) as error:
+            raise _unreadable(self.path, 0, error) from error
+
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes; decoding stops after the last of them.
 
@@ -105,15 +119,20 @@ def _display_matrix(frame: VideoFrame, path: Path) -> np.ndarray:
     return turned
 
 
+def _opened(path: Path, av: ModuleType) -> InputContainer:
+    """Return the opened file, of one of the `_CONTAINERS` only."""
+    options: dict[str, Any] = {"container_options": {"format_whitelist": _CONTAINERS}}
+    if int(av.__version__.split(".")[0]) < 19:  # later ones never fail on titles in odd encodings
+        options["metadata_errors"] = "replace"
+    # An absolute path cannot be taken for a protocol such as "concat:".
+    return av.open(str(path.absolute()), **options)
+
+
 def _timed(path: Path, av: ModuleType) -> Iterator[tuple[float, VideoFrame]]:
     """Yield (seconds since the first frame, frame) of every frame of the file's best video stream."""
     count, first = 0, 0.0
     try:
-        # An absolute path cannot be taken for a protocol such as "concat:".
-        options: dict[str, Any] = {"container_options": {"format_whitelist": _CONTAINERS}}
-        if int(av.__version__.split(".")[0]) < 19:  # later ones never fail on titles in odd encodings
-            options["metadata_errors"] = "replace"
-        with av.open(str(path.absolute()), **options) as container:
+        with _opened(path, av) as container:
             stream = _video_stream(container, path)
             for frame in _decoded(container, stream):
                 if frame.pts is None or stream.time_base is None:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 import tyro
 
 from vggtjax import __version__
+from vggtjax.commands.app import app
 from vggtjax.commands.batch import batch
 from vggtjax.commands.calibrate_cues import calibrate_cues
 from vggtjax.commands.convert import convert, import_result, info
@@ -49,6 +50,7 @@ COMMANDS = {
     "calibrate-cues": calibrate_cues,
     "fit-fusion": fit_fusion,
     "scenes": scenes,
+    "app": app,
 }
 
 _OLD_FLAGS = {"--mode": "--preprocess"}  # still understood
@@ -59,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     keep_freed_memory()
     atexit.register(gc.freeze)  # at the end there is nothing to collect, and a last collection takes half a second
     logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
-    for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub", "websockets"):
+    for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub", "websockets", "numexpr"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
     if "jax" not in sys.modules:  # else a program calls this function, which decides for itself

@@ -1,0 +1,97 @@
+"""The guard around the app: a token where it is exposed, no other sites, nothing but the page and its results."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from vggtjax.app.limits import Limits
+
+pytest.importorskip("starlette", reason="the app needs the extra app")
+
+from vggtjax.app.access import Guard
+
+
+def ask(
+    guard: Guard, path: str = "/", *, method: str = "GET", query: str = "", **headers: str
+) -> tuple[int, dict[str, str]]:
+    """Return status and headers of a request."""
+    given = {"host": "127.0.0.1:7860"} | {name.replace("_", "-"): value for name, value in headers.items()}
+    scope = {
+        "type": "http",
+        "method": method,
+        "path": path,
+        "query_string": query.encode(),
+        "headers": [(name.encode(), value.encode()) for name, value in given.items()],
+    }
+    messages: list[dict[str, Any]] = []
+
+    async def receive() -> dict[str, Any]:
+        return {"type": "http.request", "body": b""}
+
+    async def send(message: Any) -> None:
+        messages.append(message)
+
+    asyncio.run(guard(scope, receive, send))
+    start = messages[0]
+    return start["status"], {name.decode(): value.decode() for name, value in start["headers"]}
+
+
+async def app(scope: Any, receive: Any, send: Any) -> None:
+    await send({"type": "http.response.start", "status": 200, "headers": []})
+    await send({"type": "http.response.body", "body": b"page"})
+
+
+@pytest.fixture
+def guard(tmp_path):
+    return lambda token=None: Guard(app, uploads=tmp_path, limits=Limits(max_upload_mb=1), token=token, port=7860)
+
+
+def test_without_a_token_only_this_machine_is_answered(guard):
+    for host in ("127.0.0.1:7860", "localhost:7860", "[::1]:7860", "localhost"):
+        assert ask(guard(), host=host)[0] == 200
+    for host in ("evil.example", "127.0.0.1.evil.example:7860", "[", ""):
+        assert ask(guard(), host=host)[0] == 403
+
+
+def test_the_token_opens_the_app_once_and_a_cookie_does_from_then(guard):
+    exposed = guard("secret")
+    assert ask(exposed, host="box:7860")[0] == 401
+    assert ask(exposed, query="token=wrong")[0] == 401
+    assert ask(exposed, "/results/a/b.zip")[0] == 401
+    status, headers = ask(exposed, query="token=secret", host="box:7860")
+    assert status == 303
+    assert "token" not in headers["location"]
+    cookie = headers["set-cookie"]
+    assert "HttpOnly" in cookie
+    assert ask(exposed, cookie=cookie.split(";")[0], host="box:7860")[0] == 200
+    assert ask(exposed, cookie="vggtjax-7860=wrong")[0] == 401
+    assert ask(exposed, cookie="vggtjax-7860=é; =;")[0] == 401
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "/gradio_api/file=/etc/passwd",
+        "/file=http://example.org",
+        "/gradio_api/info",
+        "/gradio_api/proxy=http://a.hf.space",
+    ],
+)
+def test_what_the_page_does_not_need_is_closed(guard, path):
+    assert ask(guard(), path)[0] == 404
+
+
+def test_uploads_are_bounded_before_they_are_read(guard):
+    path = "/gradio_api/upload"
+    assert ask(guard(), path, method="POST", content_length="900000")[0] == 200
+    assert ask(guard(), path, method="POST", content_length="9000000")[0] == 413
+    assert ask(guard(), path, method="POST")[0] == 411
+    assert ask(guard(), path, method="POST", content_length="9", sec_fetch_site="cross-site")[0] == 403
+
+
+def test_browsers_are_told_to_load_nothing_from_elsewhere(guard):
+    page, result = ask(guard())[1], ask(guard(), "/results/job/viewer.html")[1]
+    assert page["content-security-policy"].startswith("default-src 'self'")
+    assert "http" not in page["content-security-policy"]
+    assert "sandbox allow-scripts" in result["content-security-policy"]

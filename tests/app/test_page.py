@@ -1,0 +1,114 @@
+"""The app in a real browser: the demo clip runs to the end; viewer, films, sheet and zip are there."""
+
+import io
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from vggtjax.app.server import address, listening
+from vggtjax.commands.main import main
+from vggtjax.errors import InputError
+
+ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+@pytest.fixture
+def served(tmp_path):
+    """The address of the app, in a process of its own, that asks for a token; at the end it leaves no file."""
+    pytest.importorskip("gradio", reason="the app needs the extra app")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    log = tmp_path / "log"
+    (tmp_path / "temporary").mkdir()
+    command = [sys.executable, "-m", "vggtjax", "app", "--port", str(port), "--token", "secret"]
+    environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
+    with log.open("w") as output:
+        process = subprocess.Popen(command, stdout=output, stderr=output, env=environment)
+    try:
+        end = time.monotonic() + 60
+        while "Open http" not in log.read_text():
+            assert process.poll() is None, log.read_text()
+            assert time.monotonic() < end, log.read_text()
+            time.sleep(0.1)
+        yield f"http://127.0.0.1:{port}/"
+    finally:
+        process.terminate()
+        process.wait(30)
+    assert "Traceback" not in log.read_text()
+    assert not any((tmp_path / "temporary").iterdir())
+
+
+@pytest.fixture
+def browser():
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("there is no Chromium")
+    with playwright.sync_playwright() as driver:
+        opened = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+        yield opened
+        opened.close()
+
+
+def test_the_demo_clip_in_a_browser(served, browser):
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    requests: list[str] = []
+    page.on("request", lambda request: requests.append(request.url))
+    assert page.goto(served).status == 401
+    page.goto(f"{served}?token=secret")
+    page.click("#start")
+    page.wait_for_selector("text=No clip yet")
+    page.click("#example")
+    page.wait_for_selector("#cancel")
+    page.wait_for_selector(".job.done", timeout=60_000)
+    viewer = page.wait_for_selector("iframe.viewer").content_frame()
+    viewer.wait_for_selector("canvas", timeout=20_000)
+    for tab in ("Film", "Layers"):
+        page.get_by_role("tab", name=tab).click()
+        page.wait_for_function(f"document.querySelector('#{tab.lower()} video')?.videoWidth > 0")
+    page.get_by_role("tab", name="Sheet").click()
+    page.wait_for_function("document.querySelector('#sheet img')?.naturalWidth > 0")
+    link = page.get_by_role("link", name="Download everything").get_attribute("href")
+    with zipfile.ZipFile(io.BytesIO(page.request.get(served + link).body())) as archive:
+        names = {Path(name).name for name in archive.namelist()}
+    assert {"reconstruction.npz", "scene.glb", "viewer.html", "film.mp4", "layers.mp4", "sheet.png"} <= names
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390  # one column
+    foreign = [url for url in requests if not url.startswith((served, "data:", "blob:"))]
+    assert foreign == []
+
+
+def test_a_port_in_use_is_one_sentence(capsys):
+    with listening("127.0.0.1", 0) as taken:
+        port = taken.getsockname()[1]
+        assert main(["app", "--port", str(port)]) == 2
+    assert f"cannot listen on port {port} of 127.0.0.1: another program uses it" in capsys.readouterr().err
+    with pytest.raises(InputError, match="port is 70000; expected at most 65535"), listening("127.0.0.1", 70000):
+        pass
+
+
+def test_the_missing_extra_is_named(capsys, monkeypatch):
+    monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: None)
+    assert main(["app"]) == 2
+    assert "pip install 'vggtjax[app]'" in capsys.readouterr().err
+
+
+def test_the_command_line_imports_no_gradio():
+    code = (
+        "import sys, vggtjax.commands.main; print([name for name in ('gradio', 'viser', 'jax') if name in sys.modules])"
+    )
+    made = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert made.stdout == "[]\n"
+
+
+def test_the_printed_address():
+    assert address("127.0.0.1", 7860, None) == "http://127.0.0.1:7860/"
+    assert address("::1", 1, "a") == "http://[::1]:1/?token=a"
+    assert address("0.0.0.0", 1, None) == f"http://{socket.gethostname()}:1/"
