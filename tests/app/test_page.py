@@ -27,7 +27,7 @@ def served(tmp_path):
         port = free.getsockname()[1]
     log = tmp_path / "log"
     (tmp_path / "temporary").mkdir()
-    command = [sys.executable, "-m", "vggtjax", "app", "--port", str(port), "--token", "secret"]
+    command = [sys.executable, "-m", "vggtjax", "app", "--port", str(port), "--token", "secret", "--max-frames", "4"]
     environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
     with log.open("w") as output:
         process = subprocess.Popen(command, stdout=output, stderr=output, env=environment)

@@ -219,7 +219,7 @@ def run_job(job: Job, models: Models, limits: Limits) -> None:
         from vggtjax.clips.preprocessing import Fitter
 
         if checked is None:
-            clip = _demo_clip(model)
+            clip = _demo_clip(model, request.frames)
         else:
             fitter = Fitter("crop", model.config.image_size, model.config.patch_size)
             clip = read_clip(*checked, fitter, progress)
@@ -239,12 +239,12 @@ def run_job(job: Job, models: Models, limits: Limits) -> None:
     job.outputs = write_outputs(result, job.folder, name, job.on_stage)
 
 
-def _demo_clip(model: Model) -> Clip:
-    """Return the embedded clip, at its own size for the embedded model."""
+def _demo_clip(model: Model, frames: int) -> Clip:
+    """Return the first frames of the embedded clip, at its own size for the embedded model."""
     from vggtjax.clips.clip import load_clip
     from vggtjax.pretrained.embedded import NOTE, demo_clip
 
-    images = demo_clip().images
+    images = demo_clip().images[:frames]
     size = images.shape[2] if model.note == NOTE else model.config.image_size
     return load_clip(images, size=size, patch=model.config.patch_size)
 

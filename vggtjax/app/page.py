@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import gradio as gr
+from gradio.themes import Base, Soft
 
 from vggtjax.app import status
 from vggtjax.app.jobs import Desk, Job, Request
@@ -29,11 +30,11 @@ _FILM = "The camera circles the scene while the moving points play."
 CSS = (Path(__file__).with_name("page.css")).read_text(encoding="utf-8")
 
 
-def theme() -> gr.themes.Base:
+def theme() -> Base:
     """Return the look of the page, with fonts of the user's own system."""
     fonts = ("system-ui", "-apple-system", "Segoe UI", "Roboto", "sans-serif")
     mono = ("ui-monospace", "Menlo", "Consolas", "monospace")
-    look = gr.themes.Soft(primary_hue="teal", neutral_hue="slate", font=fonts, font_mono=mono)
+    look = Soft(primary_hue="teal", neutral_hue="slate", font=fonts, font_mono=mono)
     return look.set(
         block_title_background_fill="none",
         block_title_background_fill_dark="none",
@@ -112,7 +113,7 @@ def build_page(desk: Desk) -> gr.Blocks:
         }
         watched = _Watched(desk)
         start.click(watched.own, [files, model, method, frames, fps], **listener)
-        example.click(watched.demo, [method], **listener)
+        example.click(watched.demo, [method, frames], **listener)
         cancel.click(watched.cancel, None, None, queue=False, show_progress="hidden", api_visibility="private")
         page.unload(watched.leave)
     page.queue(max_size=10 * (limits.max_waiting + 1), api_open=False)
@@ -136,9 +137,9 @@ class _Watched:
         async for change in self._watch(Request(paths, model, method, int(frames), fps or None), request):
             yield change
 
-    async def demo(self, method: str, request: gr.Request) -> AsyncIterator[list[Any]]:
+    async def demo(self, method: str, frames: int, request: gr.Request) -> AsyncIterator[list[Any]]:
         """Run the embedded clip with the embedded model."""
-        async for change in self._watch(Request((), DEMO, method), request):
+        async for change in self._watch(Request((), DEMO, method, int(frames)), request):
             yield change
 
     def cancel(self, request: gr.Request) -> None:
