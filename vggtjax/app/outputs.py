@@ -20,7 +20,7 @@ from vggtjax.viewer.page import viewer_page
 if TYPE_CHECKING:
     from vggtjax.results.reconstruction import Reconstruction
 
-_FILM_SECONDS, _FILM_RATE, _FILM_SIZE = 6.0, 24.0, (960, 540)
+_FILM_SECONDS, _FILM_RATE, _FILM_SIZE = 4.0, 15.0, (640, 360)  # drawn in seconds; `vggtjax render` draws larger ones
 _CLIP_RATE = 8.0  # frames per second of clips without times
 _RATES = (2.0, 30.0)
 _LEAST_WIDTH, _GAP = 480, 4  # pixels of the layers' pictures, and between them

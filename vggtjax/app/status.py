@@ -91,7 +91,7 @@ def downloads(job: Job, outputs: Outputs) -> str:
 
 def _row(stage: Stage, *, is_last: bool) -> str:
     seconds = time.monotonic() - stage.started if stage.seconds is None else stage.seconds
-    name = "compile (once for clips of this shape)" if stage.name == "compile" else stage.name
+    name = f"{stage.name} (once for clips of this shape)" if stage.name.startswith("compile ") else stage.name
     count, bar = "", ""
     if stage.total and stage.total > 1:
         count = f"{stage.done} of {stage.total}"
