@@ -25,6 +25,7 @@ logger = logging.getLogger("mkdocs.hooks.pictures")
 FOLDER = Path(__file__).resolve().parents[1] / "pictures" / "made"
 SCENES, SCENE_SEED = 4, 200  # of the gallery: the first of the seed, whatever came out
 SCENE_FRAMES, SCENE_SIDE = 12, 64
+_TURNTABLE: dict[str, Any] = {"seconds": 5.0, "fps": 10.0, "size": (480, 300)}
 _BACKGROUND, _TEXT, _FAINT = "#14141a", "#ececf0", "#9696a0"
 _FIRST, _SECOND, _FUSED, _TRUE = "#6db7ff", "#ff9a4a", "#7ddc8b", "#f5f5f5"
 _STYLE: dict[Any, Any] = {
@@ -50,11 +51,9 @@ def on_pre_build(config: Any) -> None:
 
 def make(folder: Path = FOLDER) -> None:
     """Make all pictures in `folder`, unless those there are of this code, model and clip."""
-    from vggtjax.storage.cache import keep_compilations
-
-    keep_compilations()  # before anything imports jax
     import vggtjax
     from vggtjax.pretrained.embedded import CLIP, MODEL
+    from vggtjax.results.films import film_frames, write_film
 
     made_of = hashlib.sha256(vggtjax.__version__.encode())
     for path in (Path(__file__), MODEL, CLIP):
@@ -65,6 +64,7 @@ def make(folder: Path = FOLDER) -> None:
     logger.info("Making the pictures of the concepts and the gallery, about a minute and only once")
     import matplotlib
 
+    vggtjax.enable_compilation_cache()
     matplotlib.use("agg")
     folder.mkdir(parents=True, exist_ok=True)
     stamp.unlink(missing_ok=True)
@@ -75,6 +75,7 @@ def make(folder: Path = FOLDER) -> None:
             _save(draw(clip), folder / f"{name}.webp")
         for number, scene in enumerate(_generated(model)):
             _save(gallery_sheet(scene, number), folder / f"scene-{number}.webp")
+            write_film(folder / f"turntable-{number}.webp", film_frames(scene.result, **_TURNTABLE), _TURNTABLE["fps"])
     stamp.write_text(made_of.hexdigest())
 
 
