@@ -1,5 +1,5 @@
 # Everything in two commands on a machine with Python and git: `make demo` and `make test`.
-# The docs site, in site/: `make docs`.
+# The docs site, in site/: `make docs`; its pictures of the demo: `make pictures`.
 # While you work: `make check`, which is lint, types and the tests that run no network, in a few minutes.
 
 PYTHON ?= python3
@@ -11,10 +11,13 @@ PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 # Tests that compile networks take nearly all of the time.
 SLOW = parity network method pipeline training calibration learning commands benchmarks pretrained
 
-.PHONY: demo docs test check fast lint format clean
+.PHONY: demo pictures docs test check fast lint format clean
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
+
+pictures: demo
+	$(BIN)/python docs/pictures/make.py demo-output
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from cmap import Colormap
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
+from vggtjax.rendering.film import mp4_codec, write_film
 from vggtjax.results.previews import BACKGROUND, FAINT, TEXT
 from vggtjax.results.result import Result
 
@@ -44,21 +44,13 @@ def track_strip(result: Result) -> UInt8[np.ndarray, "height width 3"]:
 
 def write_track_video(path: Path, result: Result) -> None:
     """Write the clip with its tracks as an mp4; log a note if PyAV has no encoder for it."""
-    import av
-
-    _, H, W = result.depth.shape
-    factor = max(1, -(-_VIDEO_SIDE // max(H, W)))
-    size = (W * factor // 2 * 2, H * factor // 2 * 2)  # H.264 needs even sides
-    codec = next((name for name in ("libx264", "mpeg4") if name in av.codecs_available), None)
-    if codec is None:
+    if mp4_codec() is None:
         logger.info("tracks are drawn as pictures only; this PyAV has no encoder for an mp4")
         return
-    with av.open(str(path), "w", format="mp4") as container:
-        stream: Any = container.add_stream(codec, rate=_FRAMES_PER_SECOND)
-        stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        for frame in range(len(result.depth)):
-            container.mux(stream.encode(av.VideoFrame.from_image(_drawn(result, frame, size))))
-        container.mux(stream.encode())
+    S, H, W = result.depth.shape
+    factor = max(1, -(-_VIDEO_SIDE // max(H, W)))
+    size = (W * factor // 2 * 2, H * factor // 2 * 2)  # an .mp4 has even sides
+    write_film(path, (np.asarray(_drawn(result, frame, size)) for frame in range(S)), _FRAMES_PER_SECOND)
 
 
 def _drawn(result: Result, frame: int, size: tuple[int, int]) -> Image.Image:
