@@ -19,6 +19,7 @@ from vggtjax.storage.flags import Switch
 if TYPE_CHECKING:
     from vggtjax.results.result import Result
 
+_POINTS = 500_000, 1_500_000  # static and moving ones that are served; a file that is mailed has fewer
 _RESULTS = tyro.conf.arg(metavar="RESULT [RESULT ...]", help_behavior_hint="(required)")
 
 
@@ -81,15 +82,16 @@ def view(
         serve(report, loaded, names, serving)
 
 
-def serve(report: Report, results: Sequence[Result], names: Sequence[str], serving: Serving = Serving()) -> None:
+def serve(report: Report, results: Sequence[Result], names: Sequence[str], serving: Serving = Serving(port=0)) -> None:
     """Serve the viewer, say where, open a browser, and wait for Ctrl-C."""
     from vggtjax.viewer.server import PageServer
 
     with PageServer("", host=serving.host, port=serving.port) as server:  # a port in use is found before the work
         with report.running(), report.stage("choose points") as progress:
             from vggtjax.viewer.page import viewer_page
+            from vggtjax.viewer.scene import Budget
 
-            server.page = viewer_page(results, names=names, progress=progress).encode()
+            server.page = viewer_page(results, names=names, budget=Budget(*_POINTS), progress=progress).encode()
         report.line(f"The viewer: {server.url}   (Ctrl-C ends it)")
         if connection := os.environ.get("SSH_CONNECTION", "").split():
             if server.token is None:

@@ -89,7 +89,7 @@ class Model {
     let values = color.values;
     if (color.ramp) {
       values = new Uint8Array(3 * color.values.length);
-      color.values.forEach((value, i) => values.set(color.ramp.subarray(3 * value, 3 * value + 3), 3 * i));
+      for (let i = 0; i < values.length; i++) values[i] = color.ramp[3 * color.values[Math.floor(i / 3)] + (i % 3)];
     }
     gl.bindBuffer(gl.ARRAY_BUFFER, this.colorBuffer);
     gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
