@@ -1,4 +1,5 @@
 import io
+import json
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ import trimesh
 from tests.room import WALL, make_room
 from vggtjax.results import point_cloud
 from vggtjax.results.frame import frame_of
-from vggtjax.results.glb import build_scene
+from vggtjax.results.glb import _LINEAR, build_scene, glb_bytes
 
 
 def load_scene(room, percentile=0.0, **options):
@@ -18,8 +19,7 @@ def load_scene(room, percentile=0.0, **options):
         [point_cloud.frame_cloud(f, f.confident(least) & (f.dynamic_mask == own)) for f in frames]
         for own in (False, True)
     )
-    glb = build_scene(room, point_cloud.joined(static), dynamic, **options).export(file_type="glb")
-    assert isinstance(glb, bytes)
+    glb = glb_bytes(build_scene(room, point_cloud.joined(static), dynamic, **options))
     return trimesh.load_scene(io.BytesIO(glb), file_type="glb")
 
 
@@ -39,6 +39,27 @@ def test_colors_are_linear():
     moving = load_scene(make_room()).geometry["dynamic_000001"].colors
     # ((220 / 255 + 0.055) / 1.055) ** 2.4 = 0.7157; 40 -> 0.0212; 30 -> 0.0130
     assert (moving == (183, 5, 3, 255)).all()
+
+
+def test_dark_tones_stay_apart_and_nothing_is_lit():
+    assert (np.diff(_LINEAR) > 0).all()
+    np.testing.assert_allclose(_LINEAR[[0, 10, 255]], [0, 10 / 255 / 12.92, 1], rtol=1e-6)
+    cloud = point_cloud.PointCloud(
+        np.zeros((256, 3), np.float32), np.repeat(np.arange(256), 3).reshape(-1, 3).astype("u1")
+    )
+    glb = glb_bytes(build_scene(make_room(1), cloud, []))
+    size = int.from_bytes(glb[12:16], "little")
+    tree, buffer = json.loads(glb[20 : 20 + size]), glb[28 + size :]
+    assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
+    (material,) = tree["materials"]
+    assert "KHR_materials_unlit" in material["extensions"]
+    parts = {mesh["name"]: mesh["primitives"][0] for mesh in tree["meshes"]}
+    assert {part["material"] for part in parts.values()} == {0}
+    accessor = tree["accessors"][parts["static"]["attributes"]["COLOR_0"]]
+    assert (accessor["componentType"], accessor["type"], accessor["count"]) == (5126, "VEC3", 256)
+    view = tree["bufferViews"][accessor["bufferView"]]
+    values = np.frombuffer(buffer, np.float32, 3 * 256, view["byteOffset"]).reshape(-1, 3)
+    np.testing.assert_array_equal(values[:, 0], _LINEAR)
 
 
 @pytest.mark.parametrize("frame", [0, 1, 2])

@@ -59,7 +59,7 @@ from vggtjax.errors import InputError
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results import foreign, previews, tracks
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
-from vggtjax.results.glb import build_scene
+from vggtjax.results.glb import build_scene, glb_bytes
 from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, joined, least_confidence, write_ply
 from vggtjax.results.report import REPORT_NAME, RunFacts, write_report
 from vggtjax.results.result import Result
@@ -108,7 +108,7 @@ def write_files(
     if saving.format == "vggt4d":
         foreign.write_cameras(folder / "vggt4d", result.world_from_camera, [frame.intrinsics for frame in written])
     if saving.writes("scene"):
-        _build_scene(result, least).export(folder / "scene.glb")
+        (folder / "scene.glb").write_bytes(glb_bytes(_build_scene(result, least)))
     advance()
     if saving.writes("previews"):
         _write_png(folder / "preview/sheet.png", previews.contact_sheet(result))
