@@ -47,7 +47,7 @@ def shown_points(
     voxels grow with the distance. Moving points are thinned evenly over the picture. The choice is always the same.
 
     Args:
-        result: of a clip; 300 frames of 518 x 294 pixels take about ten seconds.
+        result: of a clip; 300 frames of 518 x 294 pixels take about half a minute of a core.
         static_percentile: percent of the static pixels, the least confident, to leave out.
         dynamic_percentile: the same for the moving ones.
         edges: leave out pixels whose depth differs by more than this share from a neighbour's, and static pixels beside
