@@ -27,7 +27,13 @@ def test_the_wheel_works_outside_the_repository(tmp_path):
         archive.extractall(tmp_path / "installed")
     tops = {name.split("/")[0] for name in names if not name.split("/")[0].endswith(".dist-info")}
     assert tops == {"vggtjax", "converters"}
-    needed_files = ("__init__.pyi", "py.typed", "pretrained/model.safetensors", "pretrained/WEIGHTS-LICENSE.md")
+    needed_files = (
+        "__init__.pyi",
+        "py.typed",
+        "pretrained/model.safetensors",
+        "pretrained/WEIGHTS-LICENSE.md",
+        "viewer/client/main.js",
+    )
     assert {f"vggtjax/{name}" for name in needed_files} <= set(names)
     (entry_points,) = (tmp_path / "installed").glob("*.dist-info/entry_points.txt")
     assert "vggtjax = vggtjax.__main__:run" in entry_points.read_text()

@@ -21,12 +21,11 @@ from vggtjax.errors import InputError, one_line
 from vggtjax.progress import Progress
 from vggtjax.results.result import Result
 from vggtjax.storage.writing import writing
-from vggtjax.viewer.scene import Budget, Place, place_beside, scene_of
+from vggtjax.viewer.scene import SAME_PLACE, Budget, place_beside, scene_of
 
 MOST_RESULTS = 9  # the keys 1 to 9 choose one
 # In the order in which they build on each other; joined to one script.
 _SCRIPTS = ("maths", "data", "shaders", "painter", "targets", "camera", "viewer", "controls", "main")
-_SAME_PLACE = Place(1.0, np.eye(3), np.zeros(3))
 
 
 def viewer_page(
@@ -56,7 +55,7 @@ def viewer_page(
     scenes, total = [], sum(len(result.depth) for result in results)
     for number, (result, name) in enumerate(zip(results, names, strict=True)):
         before = sum(len(earlier.depth) for earlier in results[:number])
-        place = _SAME_PLACE if number == 0 else place_beside(result, results[0])
+        place = SAME_PLACE if number == 0 else place_beside(result, results[0])
         step = None if progress is None else lambda done, _, before=before: progress(before + done, total)
         scenes.append(scene_of(result, name, place, budget=budget, progress=step))
     return _page(one_line(" | ".join(names), 120), scenes)

@@ -14,7 +14,7 @@ from vggtjax.progress import Progress
 from vggtjax.results.result import Result
 from vggtjax.results.shown import middle_and_radius, shown_points
 from vggtjax.storage.writing import writing
-from vggtjax.viewer.scene import Budget, frame_rate, spacing
+from vggtjax.viewer.scene import SAME_PLACE, Budget, frame_rate, home_view, spacing
 
 _FRUSTUM = 0.07  # of the scene's radius
 
@@ -36,7 +36,10 @@ def write_recording(
     with contextlib.redirect_stdout(io.StringIO()):  # viser says where its server listens
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
-            server.scene.set_up_direction(tuple(-result.camera_from_world[:, 1, :3].mean(axis=0)))
+            home = {name: np.array(value) for name, value in home_view(result, SAME_PLACE, static.positions).items()}
+            start = server.initial_camera
+            start.up, start.position, start.look_at = home["up"], home["eye"], home["target"]
+            server.scene.set_up_direction(home["up"])
             recording = server.get_scene_serializer()
             size = spacing(static, radius)
             colors = static.values(result.images)

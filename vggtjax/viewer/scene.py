@@ -50,6 +50,9 @@ class Place(NamedTuple):
             return (self.scale * (points @ self.rotation.T) + self.offset).astype(np.float32)
 
 
+SAME_PLACE = Place(1.0, np.eye(3), np.zeros(3))
+
+
 def place_beside(result: Result, first: Result) -> Place:
     """Return the place at which the first camera is that of `first`, and the median depth of its frame the same."""
     scale = _median_depth(first) / _median_depth(result)
@@ -104,7 +107,7 @@ def scene_of(
         "frustumSize": _FRUSTUM * radius,
         "frameColors": TIME_RAMP[np.linspace(0, 230, S).round().astype(int)].ravel(),
         "tracks": _tracks(result, place),
-        "home": _home(result, place, positions),
+        "home": home_view(result, place, positions),
         **_cameras(result, place),
         **_sheet(result),
     }
@@ -193,7 +196,7 @@ def _cameras(result: Result, place: Place) -> dict[str, Any]:
     return {"poses": poses.astype(np.float32).ravel(), "tangents": tangents.astype(np.float32).ravel()}
 
 
-def _home(result: Result, place: Place, positions: Float32[np.ndarray, "N 3"]) -> dict[str, list[float]]:
+def home_view(result: Result, place: Place, positions: Float32[np.ndarray, "N 3"]) -> dict[str, list[float]]:
     """Return the first view: from behind and above the cameras, on the middle of the points."""
     axes = result.camera_from_world[:, :, :3].astype(np.float64).mean(axis=0) @ place.rotation.T
     up = -axes[1] if np.linalg.norm(axes[1]) > 0.1 else np.array([0.0, -1.0, 0.0])
