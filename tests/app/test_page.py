@@ -76,10 +76,19 @@ def test_the_demo_clip_in_a_browser(served, browser):
         page.wait_for_function(f"document.querySelector('#{tab.lower()} video')?.videoWidth > 0")
     page.get_by_role("tab", name="Sheet").click()
     page.wait_for_function("document.querySelector('#sheet img')?.naturalWidth > 0")
+    page.wait_for_selector("#downloads a >> text=Report")
     link = page.get_by_role("link", name="Download everything").get_attribute("href")
     with zipfile.ZipFile(io.BytesIO(page.request.get(served + link).body())) as archive:
         names = {Path(name).name for name in archive.namelist()}
-    assert {"reconstruction.npz", "scene.glb", "viewer.html", "film.mp4", "layers.mp4", "sheet.png"} <= names
+    assert {
+        "reconstruction.npz",
+        "report.html",
+        "scene.glb",
+        "viewer.html",
+        "film.mp4",
+        "layers.mp4",
+        "sheet.png",
+    } <= names
     page.set_viewport_size({"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390  # one column
     foreign = [url for url in requests if not url.startswith((served, "data:", "blob:"))]

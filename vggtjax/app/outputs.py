@@ -35,6 +35,7 @@ class Outputs:
     film: Path
     layers: Path
     sheet: Path
+    report: Path
     archive: Path
     facts: str
     note: str  # a warning about the model, or nothing
@@ -60,7 +61,9 @@ def write_outputs(result: Reconstruction, folder: Path, name: str, on_stage: OnS
         write_zip(archive, saved, progress)
     frames, height, width = result.depth.shape
     facts = f"{frames} frames of {width} x {height} pixels, {result.dynamic_share:.1%} of them moving"
-    return Outputs(viewer, film, layers, saved / "preview" / "sheet.png", archive, facts, result.model_note)
+    return Outputs(
+        viewer, film, layers, saved / "preview" / "sheet.png", saved / "report.html", archive, facts, result.model_note
+    )
 
 
 def layer_frames(result: Reconstruction, progress: Progress | None = None) -> Iterator[UInt8[np.ndarray, "h w 3"]]:

@@ -84,6 +84,7 @@ def downloads(job: Job, outputs: Outputs) -> str:
     return (
         f'<div class="downloads"><p>{escape(outputs.facts)}</p>{note}<a class="button" download '
         f'href="{_address(job, outputs.archive)}">Download everything (zip, {size:.1f} MB)</a> '
+        f'<a class="button plain" target="_blank" rel="noopener" href="{_address(job, outputs.report)}">Report</a> '
         f'<a class="button plain" download href="{_address(job, outputs.film)}">Film (mp4)</a> '
         f'<a class="button plain" download href="{_address(job, outputs.viewer)}">Viewer (html)</a></div>'
     )
