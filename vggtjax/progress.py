@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 Progress = Callable[[int, int | None], object]
 """Called with the number of steps done, and of all steps (None while unknown)."""
@@ -19,3 +20,17 @@ def no_progress(done: int, total: int | None) -> None:
 def no_stage(name: str) -> AbstractContextManager[None]:
     """Return an empty context: an `OnStage`."""
     return nullcontext()
+
+
+class StageSeconds:
+    """How long stages take: `seconds` by name, of the stages that have ended; `stage` is an `OnStage`."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage."""
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started

@@ -21,6 +21,7 @@ from vggtjax.clips.sources import clips_by_name
 from vggtjax.commands.batch import _Clock
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.pipeline.batch import SETTINGS_NAME, reconstruct_many
+from vggtjax.pipeline.contact import PAGE_NAME
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
@@ -124,7 +125,11 @@ def test_the_command_goes_on_after_it_was_killed(model, tmp_path):
     assert again.returncode == 0, again.stderr
     results = {path.parent.name: path.stat().st_mtime_ns for path in out.rglob(ARCHIVE_NAME)}
     assert set(results) == set(lengths) - {"clip03"}
-    assert {path.name for path in out.iterdir()} == {*results, SETTINGS_NAME}  # once each, and nothing left over
+    assert {path.name for path in out.iterdir()} == {
+        *results,
+        SETTINGS_NAME,
+        PAGE_NAME,
+    }  # once each, and nothing left over
     for name in results:
         assert len(Reconstruction.load(out / name).depth) == lengths[name]
         assert (out / name / "scene.glb").stat().st_size > 1000
@@ -147,7 +152,7 @@ def test_what_a_killed_run_has_left_is_cleared_away(model, clips, tmp_path):
     assert [outcome.status for outcome in reconstruct_many(model, sources, tmp_path, options={"method": "vggt"})] == [
         "done"
     ]
-    assert {path.name for path in tmp_path.iterdir()} == {"clip0", SETTINGS_NAME}
+    assert {path.name for path in tmp_path.iterdir()} == {"clip0", SETTINGS_NAME, PAGE_NAME}
     assert not list(tmp_path.rglob("old.npy"))
 
 

@@ -23,6 +23,7 @@ FILES = {
     "report.html",
     "depth/scale.txt",
     "preview/sheet.png",
+    "preview/card.webp",
 }
 FRAME_FILES = (
     "confidence/{}.npy",

@@ -62,7 +62,24 @@ def test_it_shows_the_clip_the_method_and_the_numbers(tmp_path):
 def test_texts_of_strangers_are_shown_and_not_run(tmp_path, hostile):
     text, page = report(tmp_path, *hostile)
     allowed = {"html", "head", "meta", "title", "style", "body", "main", "header", "section", "div", "span", "p", "b"}
-    allowed |= {"h1", "h2", "h3", "table", "tr", "th", "td", "code", "ul", "li", "a", "img", "input", "label"}
+    allowed |= {
+        "h1",
+        "h2",
+        "h3",
+        "picture",
+        "source",
+        "table",
+        "tr",
+        "th",
+        "td",
+        "code",
+        "ul",
+        "li",
+        "a",
+        "img",
+        "input",
+        "label",
+    }
     allowed |= {"svg", "path", "circle", "text"}
     assert {tag for tag, _ in page.tags} == allowed
     assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)

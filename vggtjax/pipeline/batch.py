@@ -21,14 +21,16 @@ from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.options import Options
+from vggtjax.pipeline.contact import PAGE_NAME, ContactPage
 from vggtjax.pipeline.run import reconstruct
-from vggtjax.progress import Progress, no_progress
+from vggtjax.progress import Progress, StageSeconds, no_progress
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.report import RunFacts
 from vggtjax.results.saving import Saving
 from vggtjax.storage.json_values import read_json
-from vggtjax.storage.writing import locked_folder, writing
+from vggtjax.storage.writing import check_free, locked_folder, writing
 
 SETTINGS_NAME = "batch.json"
 _AHEAD = 1  # clips that are loaded before they are needed, and results that wait to be written
@@ -61,7 +63,7 @@ def reconstruct_many(
 
     Clips of one shape share compiled programs. A clip that fails, also for a name that is not a plain file name, does
     not stop the others. A later run with the same settings keeps finished clips, so an interrupted run resumes. A
-    clip's folder appears whole or not at all.
+    clip's folder appears whole or not at all. index.html shows the clips finished so far, and why others failed.
 
     Args:
         model: what `load_model` returned.
@@ -101,15 +103,12 @@ def reconstruct_many(
     )
     out = Path(out)
     with locked_folder(out, "a batch"):
+        check_free(out, (PAGE_NAME,), replaced=(out / SETTINGS_NAME).is_file(), what="batch")
         _settle(out, run.settings)
-        odd = {name for name in sources if name in ("", "..") or Path(name).name != name or not name.isprintable()}
-        reason = "a clip is named {!r}; expected a plain name, which becomes its folder"
-        yield from (ClipOutcome(name, "failed", reason.format(name)) for name in sources if name in odd)
-        kept = {name for name in sources if name not in odd and is_result(out / name / ARCHIVE_NAME)}
-        yield from (ClipOutcome(name, "kept") for name in sources if name in kept)
-        names = [name for name in sources if name not in odd and name not in kept]
-        work = _Work({name: _length(sources[name], run.sampling) for name in names}, progress or no_progress)
-        yield from _reconstruct_all(run, {name: sources[name] for name in names}, out, work)
+        page = ContactPage(out, len(sources))
+        for outcome in _outcomes(run, sources, out, progress or no_progress):
+            page.add(outcome.name, outcome.reason if outcome.status == "failed" else None)
+            yield outcome
 
 
 @dataclass(frozen=True)
@@ -143,18 +142,39 @@ class _Batch:
     def load(self, source: ClipSource) -> Clip:
         return read_clip(open_source(source), self.sampling, self.fitter)
 
-    def reconstruct(self, clip: Clip) -> Reconstruction:
+    def reconstruct(self, clip: Clip, seconds: StageSeconds) -> Reconstruction:
         size = self.fitter.size
         return reconstruct(
-            self.model, clip, options=self.options, size=size, fusion=self.fusion, pad_frames=self.pad_frames
+            self.model,
+            clip,
+            options=self.options,
+            size=size,
+            fusion=self.fusion,
+            pad_frames=self.pad_frames,
+            on_stage=seconds.stage,
         )
 
-    def write(self, name: str, clip: Clip, result: Reconstruction, folder: Path) -> ClipOutcome:
+    def write(
+        self, name: str, clip: Clip, result: Reconstruction, folder: Path, seconds: Mapping[str, float]
+    ) -> ClipOutcome:
         pictures = clip.pictures() if self.saving.resolution == "original" else None
         # A new folder appears whole or not at all.
         with nullcontext(folder) if folder.exists() else writing(folder) as place:
-            result.save(place, saving=self.saving, pictures=pictures)
+            result.save(place, saving=self.saving, pictures=pictures, facts=RunFacts(seconds))
         return ClipOutcome(name, "done", frames=len(clip))
+
+
+def _outcomes(run: _Batch, sources: Mapping[str, ClipSource], out: Path, progress: Progress) -> Generator[ClipOutcome]:
+    """Yield the outcomes of clips that cannot have a folder, then of kept ones, then of the others."""
+    taken = {"", "..", SETTINGS_NAME, PAGE_NAME}
+    odd = {name for name in sources if name in taken or Path(name).name != name or not name.isprintable()}
+    reason = "a clip is named {!r}; expected a plain name, which becomes its folder"
+    yield from (ClipOutcome(name, "failed", reason.format(name)) for name in sources if name in odd)
+    kept = {name for name in sources if name not in odd and is_result(out / name / ARCHIVE_NAME)}
+    yield from (ClipOutcome(name, "kept") for name in sources if name in kept)
+    names = [name for name in sources if name not in odd and name not in kept]
+    work = _Work({name: _length(sources[name], run.sampling) for name in names}, progress)
+    yield from _reconstruct_all(run, {name: sources[name] for name in names}, out, work)
 
 
 def _reconstruct_all(run: _Batch, sources: Mapping[str, ClipSource], out: Path, work: _Work) -> Generator[ClipOutcome]:
@@ -176,13 +196,13 @@ def _reconstruct_all(run: _Batch, sources: Mapping[str, ClipSource], out: Path, 
                 try:
                     clip = loaded.result()
                     announce(out / name, forecast_bytes(clip.images.shape[:3], clip.source_size, run.saving))
-                    result = run.reconstruct(clip)
+                    result = run.reconstruct(clip, seconds := StageSeconds())
                 except (VggtjaxError, MemoryError) as error:
                     work.finish(name, 0)
                     yield _failed(name, error)
                     continue
                 work.finish(name, len(clip))
-                writes.append((name, writer.submit(run.write, name, clip, result, out / name)))
+                writes.append((name, writer.submit(run.write, name, clip, result, out / name, seconds.seconds)))
                 del clip, result  # the writer holds them
                 while len(writes) > _AHEAD:
                     yield _written(*writes.popleft())

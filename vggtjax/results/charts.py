@@ -63,7 +63,7 @@ def camera_views(result: Result) -> list[tuple[str, Element]]:
     points = (points - centre) @ rotation.T
     middle = np.median(centres, axis=0)
     near = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 1.0
-    size = max(0.12 * float(np.ptp(centres, axis=0).max()), 0.1 * near, 1e-9)
+    size = max(0.12 * float(np.ptp(centres, axis=0).max()), 0.05 * near, 1e-9)
     shown = np.linspace(0, frames - 1, min(frames, _FRUSTA)).round().astype(int)
     corners = frustum_corners(result.intrinsics[shown], result.camera_from_world[shown], height, width, size)
     corners = (corners - centre) @ rotation.T

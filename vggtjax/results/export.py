@@ -5,6 +5,7 @@ In the folder, with a frame's number as its file name:
     reconstruction.npz      everything, for `Reconstruction.load`; written last: where it stands, all files are whole
     report.html             everything to look at on one page, without a network
     preview/sheet.png       the clip at a glance
+    preview/card.webp       a frame, its depth and what moves, beside each other
     preview/depth/          inverse depth in colour, one range for the clip
     preview/overlay/        frames with moving objects tinted, every object in a colour of its own
     confidence/             .npy float32
@@ -65,9 +66,11 @@ from vggtjax.results.report import REPORT_NAME, RunFacts, write_report
 from vggtjax.results.result import Result
 from vggtjax.results.saving import Resolution, Saving
 from vggtjax.storage.arrays import write_arrays
+from vggtjax.storage.markup import webp
 from vggtjax.storage.trajectories import commented, write_trajectory
 
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
+_CARD_WIDTH = 720  # pixels
 _WORKERS = 8
 _MOST_INVALID = 0.5  # share of a clip's pixels; more are warned about
 
@@ -112,6 +115,7 @@ def write_files(
     advance()
     if saving.writes("previews"):
         _write_png(folder / "preview/sheet.png", previews.contact_sheet(result))
+        (folder / "preview/card.webp").write_bytes(webp(previews.card(result), _CARD_WIDTH))
     if result.track_positions is not None:
         _write_tracks(result, folder, saving)
     advance()

@@ -118,6 +118,17 @@ def overlay_picture(image: UInt8[np.ndarray, "H W 3"], moving: UInt8[np.ndarray,
     return overlay(np.asarray(picture), np.asarray(Image.fromarray(moving).resize(size, Image.Resampling.NEAREST)))
 
 
+def card(result: Result) -> UInt8[np.ndarray, "h w 3"]:
+    """Draw the middle frame: picture, depth and moving objects beside each other."""
+    frame = len(result.depth) // 2
+    valid = result.valid_pixels
+    depth = depth_picture(result.depth[frame], valid[frame], inverse_depth_range(result.depth, valid))
+    moving = moving_ids(result.dynamic_mask[frame], result.instances[frame])
+    picture = Image.fromarray(result.images[frame]).resize(enlarged(moving.shape), Image.Resampling.LANCZOS)
+    gap = np.full((len(depth), max(4, depth.shape[1] // 60), 3), BACKGROUND, np.uint8)
+    return np.hstack([np.asarray(picture), gap, depth, gap, overlay_picture(result.images[frame], moving)])
+
+
 def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
     """Draw up to eight frames, evenly spread: columns of picture, depth, saliency if any, and moving objects."""
     frames, height, width = result.depth.shape

@@ -19,6 +19,7 @@ from vggtjax.errors import one_line
 from vggtjax.results import charts, previews, tracks
 from vggtjax.results.archive import ARCHIVE_NAME
 from vggtjax.results.result import Result
+from vggtjax.results.thumbnail import moving_thumbnail
 from vggtjax.storage.markup import data_uri, element, page, relative_link, table, webp, write_page
 
 REPORT_NAME = "report.html"
@@ -130,7 +131,13 @@ def _picture(data: bytes, alt: str, **attributes: object) -> Element:
 
 
 def _moving(result: Result) -> Element | None:
-    return None
+    made = moving_thumbnail(result)
+    if made is None:
+        return None
+    still = element("source", media="(prefers-reduced-motion: reduce)", srcset=data_uri(made.still))
+    film = _picture(made.film, "the points of the clip, seen from a camera that swings around them", class_="hero")
+    note = "Static points stay, moving points play; the camera swings around the scene."
+    return _section("In motion", element("picture", still, film), element("p", note, class_="note"))
 
 
 def _summary(result: Result) -> Element:

@@ -1,0 +1,116 @@
+"""The page of a batch: a card per clip, with a link to its report, written anew whenever a clip is finished."""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from vggtjax.errors import OutputError, ResultError, one_line
+from vggtjax.results.archive import ARCHIVE_NAME, is_result
+from vggtjax.results.report import REPORT_NAME
+from vggtjax.storage.arrays import read_arrays
+from vggtjax.storage.markup import element, page, relative_link, write_page
+from vggtjax.storage.writing import writing
+
+PAGE_NAME = "index.html"
+_PICTURES = ("preview/card.webp", "preview/sheet.png")  # the first that a clip's folder has is shown
+_TARGETS = (REPORT_NAME, "preview/sheet.png", ARCHIVE_NAME)  # the first that a clip's folder has is linked to
+
+logger = logging.getLogger(__name__)
+
+
+class _Clip(NamedTuple):
+    """What a card tells of a finished clip."""
+
+    frames: int
+    width: int
+    height: int
+    dynamic_share: float
+    method: str
+
+
+class ContactPage:
+    """The page of the batch in the folder `out`, where `clips` are to be reconstructed.
+
+    Results that earlier runs have left in the folder have cards too. A page that cannot be written is logged as a
+    warning: the results are worth more.
+    """
+
+    def __init__(self, out: Path, clips: int) -> None:
+        self._out, self._clips, self._told = out, clips, 0
+        self._cards: dict[str, Element] = {}
+        self._failures: dict[str, str] = {}
+        found = sorted(entry.name for entry in os.scandir(out) if entry.is_dir() and not entry.name.startswith("."))
+        for name in found:
+            if is_result(out / name / ARCHIVE_NAME):
+                self._cards[name] = _card(out, name)
+        self._write()
+
+    def add(self, name: str, failure: str | None = None) -> None:
+        """Tell that a clip is finished, or why it failed, and write the page."""
+        self._told += 1
+        if failure is not None:
+            self._failures[name] = failure
+        elif name not in self._cards:
+            self._cards[name] = _card(self._out, name)
+        self._write()
+
+    def _write(self) -> None:
+        try:
+            with writing(self._out / PAGE_NAME) as temporary:
+                write_page(temporary, self._text())
+        except OutputError as error:
+            logger.warning("%s", error)
+
+    def _text(self) -> str:
+        counts = [f"{len(self._cards)} clip{'' if len(self._cards) == 1 else 's'}"]
+        counts += [f"{len(self._failures)} failed"] if self._failures else []
+        left = self._clips - self._told
+        counts += [f"{left} to come"] if left else []
+        failures = (
+            element("p", element("b", one_line(name, 120)), f" failed: {one_line(reason, 600)}", class_="failed")
+            for name, reason in self._failures.items()
+        )
+        header = element("header", element("h1", "Clips"), element("p", ", ".join(counts), class_="faint"), *failures)
+        cards = (self._cards[name] for name in sorted(self._cards))
+        return page(
+            f"{counts[0]}: vggtjax", header, element("div", *cards, class_="cards"), pictures="'self' file: data:"
+        )
+
+
+def _card(out: Path, name: str) -> Element:
+    folder = out / name
+    picture, target = (next((n for n in names if (folder / n).is_file()), None) for names in (_PICTURES, _TARGETS))
+    image = None
+    if picture is not None:
+        alt = f"a frame of {one_line(name, 120)}, its depth and what moves"
+        image = element("img", src=relative_link(name, *picture.split("/")), alt=alt, loading="lazy")
+    try:
+        clip = _read(folder / ARCHIVE_NAME)
+        size = f"{clip.frames} frame{'' if clip.frames == 1 else 's'} of {clip.width} x {clip.height} pixels"
+        told = f"{size}, {clip.dynamic_share:.1%} moving, {one_line(clip.method, 60)}"
+    except ResultError as error:
+        told = f"cannot be read: {one_line(str(error))}"
+    link = {"href": relative_link(name, *(target or ARCHIVE_NAME).split("/"))}
+    note = element("p", told, class_="note")
+    return element(
+        "article",
+        element("a", image, **link) if image is not None else None,
+        element("div", element("h2", element("a", one_line(name, 120), **link)), note, class_="text"),
+    )
+
+
+def _read(path: Path) -> _Clip:
+    """Read what a card tells. Raises ResultError for a broken archive."""
+    arrays = read_arrays(path, ["dynamic_mask", "valid_box", "method"])
+    if len(arrays) < 3 or arrays["dynamic_mask"].ndim != 3 or arrays["valid_box"].shape[1:] != (4,):
+        raise ResultError(f"{path} has no masks of frames")
+    mask, box = arrays["dynamic_mask"], arrays["valid_box"].astype(np.float64)
+    frames, height, width = mask.shape
+    pictured = float(((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])).sum())
+    return _Clip(frames, width, height, float(mask.sum()) / max(pictured, 1.0), str(arrays["method"].item()))
