@@ -7,6 +7,7 @@ import pytest
 
 from tests.room import make_room
 from vggtjax.results.shown import middle_and_radius
+from vggtjax.viewer.page import viewer_page
 from vggtjax.viewer.scene import Budget, Place, contracted, place_beside, scene_of
 
 SAME = Place(1.0, np.eye(3), np.zeros(3))
@@ -94,3 +95,9 @@ def test_results_at_the_edge_of_what_there_is():
     assert scene["offsets"].tolist() == [scene["staticCount"]] * 2
     empty = dataclasses.replace(make_room(2), depth=np.zeros((2, 28, 42), np.float32))
     assert scene_of(empty, "empty", SAME, budget=Budget())["staticCount"] == 0
+
+
+def test_depth_at_the_end_of_float32_still_gives_a_page():
+    far = make_room(2, depth=np.full((2, 28, 42), 3e38, np.float32))
+    for results in ([far], [make_room(2), far], [far, make_room(2)]):
+        assert "Infinity" not in viewer_page(results)

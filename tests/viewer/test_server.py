@@ -38,9 +38,10 @@ def test_on_this_machine_the_page_needs_no_token_and_nothing_else_is_served():
         assert get(server, "/")[:2] == (200, "<p>the page</p>")
         for path in ("/reconstruction.npz", "/../../etc/passwd", "/%2e%2e/etc/passwd", "//etc/passwd", "/index.html"):
             assert get(server, path)[0] == 404
-        status, body, _ = get(server, "/", Host="evil.example:80")  # a site that points its name at this machine
-        assert status == 403
-        assert "the page" not in body
+        for host in ("evil.example:80", "["):  # a site that points its name at this machine; no name at all
+            status, body, _ = get(server, "/", Host=host)
+            assert status == 403
+            assert "the page" not in body
 
 
 def test_elsewhere_every_request_needs_the_token():
@@ -73,5 +74,7 @@ def test_a_port_in_use_and_a_strange_address_are_one_sentence():
         PageServer("", port=server.server_port)
     with pytest.raises(InputError, match="no address of this machine"):
         PageServer("", host="203.0.113.7", port=0)
+    with pytest.raises(InputError, match="host is empty"):
+        PageServer("", host="", port=0)
     with pytest.raises(InputError, match="expected 0 to 65535"):
         PageServer("", port=70000)

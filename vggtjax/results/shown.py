@@ -104,7 +104,7 @@ def middle_and_radius(result: Result) -> tuple[Float64[np.ndarray, " 3"], float]
     chosen = np.linspace(0, len(centres) - 1, min(len(centres), 16)).round().astype(int)
     frames = [frame_of(result, int(number)) for number in chosen]
     depth = np.concatenate([frame.depth[frame.valid] for frame in frames])
-    reach = float(np.median(depth)) if depth.size else 1.0
+    reach = float(np.median(depth.astype(np.float64))) if depth.size else 1.0
     return middle, reach + float(np.linalg.norm(centres - middle, axis=-1).max())
 
 

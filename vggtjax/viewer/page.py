@@ -23,6 +23,7 @@ from vggtjax.results.result import Result
 from vggtjax.storage.writing import writing
 from vggtjax.viewer.scene import SAME_PLACE, Budget, place_beside, scene_of
 
+_FARTHEST = 1e30
 MOST_RESULTS = 9  # the keys 1 to 9 choose one
 # In the order in which they build on each other; joined to one script.
 _SCRIPTS = ("maths", "data", "shaders", "painter", "targets", "camera", "viewer", "controls", "main")
@@ -55,9 +56,10 @@ def viewer_page(
     scenes, total = [], sum(len(result.depth) for result in results)
     for number, (result, name) in enumerate(zip(results, names, strict=True)):
         before = sum(len(earlier.depth) for earlier in results[:number])
-        place = SAME_PLACE if number == 0 else place_beside(result, results[0])
         step = None if progress is None else lambda done, _, before=before: progress(before + done, total)
-        scenes.append(scene_of(result, name, place, budget=budget, progress=step))
+        with np.errstate(over="ignore", invalid="ignore"):  # worlds of untrained weights
+            place = SAME_PLACE if number == 0 else place_beside(result, results[0])
+            scenes.append(scene_of(result, name, place, budget=budget, progress=step))
     return _page(one_line(" | ".join(names), 120), scenes)
 
 
@@ -126,6 +128,8 @@ class _Arrays:
             return {name: self.described(entry) for name, entry in value.items()}
         if isinstance(value, list | tuple):
             return [self.described(entry) for entry in value]
+        if isinstance(value, float):  # JSON has no infinity
+            return float(np.clip(np.nan_to_num(value), -_FARTHEST, _FARTHEST))
         if not isinstance(value, np.ndarray):
             return value
         part = np.ascontiguousarray(value, value.dtype.newbyteorder("<")).tobytes()

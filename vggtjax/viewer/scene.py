@@ -130,7 +130,7 @@ def _shuffled(points: ShownPoints, random: np.random.Generator) -> ShownPoints:
 
 def _median_depth(result: Result) -> float:
     frame = frame_of(result, 0)
-    return float(np.median(frame.depth[frame.valid])) if frame.valid.any() else 1.0
+    return float(np.median(frame.depth[frame.valid].astype(np.float64))) if frame.valid.any() else 1.0
 
 
 def _facts(result: Result) -> str:

@@ -44,6 +44,10 @@ class PageServer(ThreadingHTTPServer):
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         if not 0 <= port <= 65535:
             raise InputError(f"port is {port}; expected 0 to 65535")
+        if not host:
+            raise InputError(
+                "host is empty; give an address, such as 0.0.0.0 for all of this machine, or leave out --host"
+            )
         try:
             super().__init__((host, port), _Handler)
         except OSError as error:
@@ -91,7 +95,10 @@ class _Handler(BaseHTTPRequestHandler):
         """Log nothing: a request's address may hold the token."""
 
     def _names_this_machine(self) -> bool:
-        host = urlsplit(f"//{self.headers.get('Host', '')}").hostname or ""
+        try:
+            host = urlsplit(f"//{self.headers.get('Host', '')}").hostname or ""
+        except ValueError:  # of a bracket that is not closed
+            return False
         return host == self.server.host or _is_loopback(host)
 
     def _cookie_name(self) -> str:
