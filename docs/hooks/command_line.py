@@ -28,9 +28,11 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def _every_command() -> str:
-    commands = re.findall(r"(?m)^  ([\w-]+)  ", _help())
+    """Return the overview of the commands, and a section for each."""
+    from vggtjax.commands.main import COMMANDS
+
     with ThreadPoolExecutor() as pool:
-        return "\n\n".join(pool.map(_section, commands))
+        return "\n\n".join([f"```text\n{_help()}```", *pool.map(_section, COMMANDS)])
 
 
 def _help(*command: str) -> str:
