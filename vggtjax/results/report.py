@@ -233,7 +233,9 @@ def _cameras(result: Result) -> Element:
         "Camera path",
         element("div", element("span", "first frame", _ramp(colors), "last frame"), class_="legend"),
         element("div", *(element("div", element("h3", name), view) for name, view in views), class_="pair"),
-        element("p", "Both views have one scale; lengths are up to scale. Grey: static points.", class_="note"),
+        element(
+            "p", "Both views have one scale; lengths are up to scale. Grey, where near: static points.", class_="note"
+        ),
     )
 
 
