@@ -137,7 +137,7 @@ def test_given_masks_replace_the_mined_ones(params, config, tmp_path):
     of_source = masks.repeat(2, axis=1).repeat(2, axis=2)  # at the size of the source's pictures
     large = images.repeat(2, axis=1).repeat(2, axis=2)
     for index, picture in enumerate(large):
-        Image.fromarray(np.uint8(255 * picture)).save(tmp_path / f"{index}.png")
+        Image.fromarray((255 * picture).astype(np.uint8)).save(tmp_path / f"{index}.png")
     loaded = reconstruct(model, str(tmp_path), size=56, masks=of_source, method="vggt")  # a path instead of a clip
     assert np.array_equal(loaded.dynamic_mask, masks)
 
