@@ -12,7 +12,7 @@ from PIL import Image
 from vggtjax.results.films import film_frames
 from vggtjax.results.result import FieldOfViewWarning, Result
 
-_FRAMES, _SECONDS, _SIDE = 32, 4.0, 448  # of the film; the longer side in pixels
+_FRAMES, _SECONDS, _SIDE = 24, 4.0, 360  # of the film; the longer side in pixels
 _MOST_ENLARGED = 5  # times the result's own pixels: wider discs take long to draw and show no more
 _CLIP_FRAMES, _CLIP_PIXELS = 40, 240_000  # most of the coarse copy
 _MOST_BYTES = 1_100_000
