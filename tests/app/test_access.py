@@ -10,6 +10,7 @@ from vggtjax.app.limits import Limits
 pytest.importorskip("starlette", reason="the app needs the extra app")
 
 from vggtjax.app.access import Guard
+from vggtjax.app.space import Space
 
 
 def ask(
@@ -44,7 +45,7 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
 
 @pytest.fixture
 def guard(tmp_path):
-    return lambda token=None: Guard(app, uploads=tmp_path, limits=Limits(max_upload_mb=1), token=token, port=7860)
+    return lambda token=None: Guard(app, Space(tmp_path, Limits(max_upload_mb=1)), {0: 5}, token, 7860)
 
 
 def test_without_a_token_only_this_machine_is_answered(guard):
@@ -73,7 +74,9 @@ def test_the_token_opens_the_app_once_and_a_cookie_does_from_then(guard):
     "path",
     [
         "/gradio_api/file=/etc/passwd",
+        "/gradio_api/file//etc/passwd",
         "/file=http://example.org",
+        "/config",
         "/gradio_api/info",
         "/gradio_api/proxy=http://a.hf.space",
     ],
@@ -95,3 +98,48 @@ def test_browsers_are_told_to_load_nothing_from_elsewhere(guard):
     assert page["content-security-policy"].startswith("default-src 'self'")
     assert "http" not in page["content-security-policy"]
     assert "sandbox allow-scripts" in result["content-security-policy"]
+
+
+def test_uploads_at_once_fit_together(tmp_path):
+    """Of five uploads of 0.9 MB beside an earlier one, three arrive; the others are refused before they are read."""
+    space, largest = Space(tmp_path, Limits(max_upload_mb=1)), []
+    (tmp_path / "earlier").mkdir()
+    (tmp_path / "earlier" / "a.mp4").write_bytes(bytes(900_000))
+
+    async def slow(scope: Any, receive: Any, send: Any) -> None:
+        path = tmp_path / str(scope["number"])
+        path.write_bytes(bytes(900_000))
+        await asyncio.sleep(0.2)
+        largest.append(sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()))
+        await app(scope, receive, send)
+
+    async def upload(number: int) -> int:
+        headers = [(b"host", b"localhost"), (b"content-length", b"900000")]
+        scope = {
+            "type": "http",
+            "method": "POST",
+            "path": "/gradio_api/upload",
+            "query_string": b"",
+            "headers": headers,
+        }
+        messages: list[dict[str, Any]] = []
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "http.request", "body": b""}
+
+        async def send(message: Any) -> None:
+            messages.append(message)
+
+        await Guard(slow, space, {}, None, 7860)(scope | {"number": number, "headers": headers}, receive, send)
+        return messages[0]["status"]
+
+    async def uploads() -> list[int]:
+        return list(await asyncio.gather(*(upload(number) for number in range(5))))
+
+    statuses = asyncio.run(uploads())
+    assert 200 in statuses
+    assert 413 in statuses
+    assert max(largest) <= 3_000_000
+    assert not any(path.is_file() for path in tmp_path.iterdir())  # what broken uploads leave goes with the last one
+    with space.reserved(900_000):
+        pass

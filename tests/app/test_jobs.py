@@ -1,5 +1,6 @@
 """The jobs of the app, without a browser: checked uploads, one job at a time, cancel, bounded results."""
 
+import os
 import threading
 import time
 from pathlib import Path
@@ -12,7 +13,8 @@ from PIL import Image
 from vggtjax.app.jobs import Desk, Job, Request
 from vggtjax.app.limits import Limits
 from vggtjax.app.models import Models
-from vggtjax.app.uploads import check_clip, keep, make_space, safe_stem
+from vggtjax.app.space import Space
+from vggtjax.app.uploads import check_clip, keep, safe_stem
 from vggtjax.errors import InputError, ResultError
 
 
@@ -206,11 +208,14 @@ def test_pictures_keep_their_order_under_safe_names(tmp_path):
 
 def test_the_oldest_uploads_make_space(tmp_path):
     for number in range(4):
-        (tmp_path / f"{number}.mp4").write_bytes(bytes(900_000))
-    make_space(tmp_path, 900_000, Limits(max_upload_mb=1))
-    assert len(list(tmp_path.iterdir())) == 2
+        (tmp_path / f"{number}").mkdir()
+        (tmp_path / f"{number}" / "a.mp4").write_bytes(bytes(1_000_000))
+        os.utime(tmp_path / f"{number}" / "a.mp4", (number, number))
+    space = Space(tmp_path, Limits(max_upload_mb=1))
+    with space.reserved(1_000_000):
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["2", "3"]
     with pytest.raises(InputError, match=r"9\.0 MB; send at most 1 MB"):
-        make_space(tmp_path, 9_000_000, Limits(max_upload_mb=1))
+        space.reserve(9_000_000)
 
 
 def test_models_of_one_name_are_told_apart(tmp_path):

@@ -16,6 +16,7 @@ from vggtjax.app.server import address, listening
 from vggtjax.commands.main import main
 from vggtjax.errors import InputError
 
+TOKEN = "0123456789abcdef"
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
@@ -27,7 +28,7 @@ def served(tmp_path):
         port = free.getsockname()[1]
     log = tmp_path / "log"
     (tmp_path / "temporary").mkdir()
-    command = [sys.executable, "-m", "vggtjax", "app", "--port", str(port), "--token", "secret", "--max-frames", "4"]
+    command = [sys.executable, "-m", "vggtjax", "app", "--port", str(port), "--token", TOKEN, "--max-frames", "4"]
     environment = os.environ | {"TMPDIR": str(tmp_path / "temporary")}
     with log.open("w") as output:
         process = subprocess.Popen(command, stdout=output, stderr=output, env=environment)
@@ -63,7 +64,7 @@ def test_the_demo_clip_in_a_browser(served, browser):
     page.on("request", lambda request: requests.append(request.url))
     assert page.goto(served).status == 401
     page.set_default_timeout(60_000)  # of a busy machine
-    page.goto(f"{served}?token=secret")
+    page.goto(f"{served}?token={TOKEN}")
     page.click("#start")
     page.wait_for_selector("text=No clip yet")
     page.click("#example")
@@ -122,3 +123,8 @@ def test_the_printed_address():
     assert address("127.0.0.1", 7860, None) == "http://127.0.0.1:7860/"
     assert address("::1", 1, "a") == "http://[::1]:1/?token=a"
     assert address("0.0.0.0", 1, None) == f"http://{socket.gethostname()}:1/"
+
+
+def test_a_short_token_is_refused(capsys):
+    assert main(["app", "--token", "a"]) == 2
+    assert "expected letters and digits, at least 16" in capsys.readouterr().err

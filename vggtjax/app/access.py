@@ -1,10 +1,11 @@
-"""Who may ask the server for what: a token where it is exposed, nothing from other sites, uploads of bounded size."""
+"""Who may ask the server for what: a token where it is exposed, nothing from other sites, only what the page needs."""
 
 from __future__ import annotations
 
+import re
 import secrets
+from collections.abc import Mapping
 from http.cookies import CookieError, SimpleCookie
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -13,17 +14,17 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from vggtjax.app.limits import Limits
-from vggtjax.app.uploads import make_space
+from vggtjax.app.posted import MOST_BYTES, cleaned
+from vggtjax.app.space import Space
 from vggtjax.errors import InputError
 
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _UPLOAD = "/gradio_api/upload"
-# What gradio would serve besides the page: files of this machine, addresses of other machines, its description.
-_CLOSED = tuple(
-    f"{prefix}/{name}"
-    for prefix in ("", "/gradio_api")
-    for name in ("file=", "proxy=", "info", "openapi", "component_server", "stream", "monitoring", "mcp", "dev")
+_POSTED = ("/gradio_api/queue/join", "/gradio_api/run/predict")
+# All that the page asks for. Gradio would also serve files of this machine and of others, and much else.
+_READ = re.compile(
+    r"/|/favicon\.ico|/theme\.css|/(assets|static|results)/.+"
+    r"|/gradio_api/(queue/data|upload_progress|heartbeat/[A-Za-z0-9]{1,64})"
 )
 # Everything comes from this server: no fonts, scripts or reports elsewhere. The page's framework needs inline scripts.
 _POLICY = (
@@ -36,17 +37,20 @@ _SANDBOX = "; sandbox allow-scripts allow-downloads"  # pages of results, in a t
 class Guard:
     """Wraps the app (ASGI): refuses what is not allowed before the app sees it."""
 
-    def __init__(self, app: ASGIApp, *, uploads: Path, limits: Limits, token: str | None, port: int) -> None:
-        """Without a `token`, only requests to this machine's own names are answered."""
-        self._app, self._uploads, self._limits, self._token = app, uploads, limits, token
+    def __init__(self, app: ASGIApp, space: Space, inputs: Mapping[int, int], token: str | None, port: int) -> None:
+        """`inputs` has the number of values of each of the page's functions.
+
+        Without a `token`, only requests to this machine's own names are answered.
+        """
+        self._app, self._space, self._inputs, self._token = app, space, inputs, token
         self._cookie = f"vggtjax-{port}"  # browsers share cookies among the ports of a machine
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
         elif scope["type"] == "http":
-            answer = self._refusal(scope) or await self._upload_refusal(scope)
-            await (answer or self._app)(scope, receive, _with_headers(scope, send))
+            answer = self._refusal(scope) or self._for_path(scope)
+            await answer(scope, receive, _with_headers(scope, send))
         # no web sockets: the page uses none
 
     def _refusal(self, scope: Scope) -> ASGIApp | None:
@@ -63,21 +67,59 @@ class Guard:
             return answer
         if scope["method"] not in ("GET", "HEAD") and headers.get("sec-fetch-site", "none") == "cross-site":
             return _text(403, "This request came from another site.")
-        if scope["path"].startswith(_CLOSED):
-            return _text(404, "There is nothing here.")
         return None
 
-    async def _upload_refusal(self, scope: Scope) -> ASGIApp | None:
-        if not scope["path"].startswith(_UPLOAD) or scope["method"] != "POST":
-            return None
-        length = Headers(scope=scope).get("content-length", "")
-        if not length.isdecimal():
-            return _text(411, "The upload does not say how long it is.")
+    def _for_path(self, scope: Scope) -> ASGIApp:
+        path, method = scope["path"], scope["method"]
+        if method in ("GET", "HEAD") and _READ.fullmatch(path):
+            if path == "/":
+                scope["query_string"] = b""  # gradio would read a state of its own from there
+            return self._app
+        if method == "POST" and path == _UPLOAD:
+            return self._upload
+        return self._posted if method == "POST" and path in _POSTED else _NOTHING
+
+    async def _upload(self, scope: Scope, receive: Receive, send: Send) -> None:
+        headers = Headers(scope=scope)
+        length = headers.get("content-length", "")
+        if not length.isdecimal() or "transfer-encoding" in headers:
+            await _text(411, "The upload does not say how long it is.")(scope, receive, send)
+            return
         try:
-            await run_in_threadpool(make_space, self._uploads, int(length), self._limits)
+            await run_in_threadpool(self._space.reserve, int(length))
         except InputError as error:
-            return _text(413, str(error))
-        return None
+            await _text(413, str(error))(scope, receive, send)
+            return
+        try:
+            await self._app(scope, receive, send)
+        finally:
+            self._space.release(int(length))
+
+    async def _posted(self, scope: Scope, receive: Receive, send: Send) -> None:
+        body, is_whole = b"", False
+        while not is_whole and len(body) <= MOST_BYTES:
+            message = await receive()
+            if message["type"] == "http.disconnect":
+                return
+            body += message.get("body", b"")
+            is_whole = not message.get("more_body", False)
+        if len(body) > MOST_BYTES:
+            await _text(413, "This request is too long.")(scope, receive, send)
+            return
+        try:
+            body = cleaned(body, self._inputs)
+        except InputError as error:
+            await _text(400, str(error))(scope, receive, send)
+            return
+        headers = MutableHeaders(scope=scope)
+        headers["content-length"], headers["content-type"] = str(len(body)), "application/json"
+        del headers["transfer-encoding"]
+        messages: list[Message] = [{"type": "http.request", "body": body}]
+
+        async def received() -> Message:
+            return messages.pop() if messages else await receive()
+
+        await self._app(scope, received, send)
 
     def _is_known(self, headers: Headers) -> bool:
         cookie: SimpleCookie = SimpleCookie()
@@ -112,3 +154,6 @@ def _host_name(host: str) -> str:
 
 def _text(status: int, text: str) -> Any:
     return PlainTextResponse(f"{text}\n", status_code=status)
+
+
+_NOTHING = _text(404, "There is nothing here.")

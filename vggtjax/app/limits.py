@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from vggtjax.storage.json_values import check_fields
 
+LEAST_TOKEN = 16  # characters
 _Count = Annotated[int, Meta(ge=1, le=100_000)]
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import gradio as gr
+import msgspec
+from gradio.data_classes import GradioRootModel
 from gradio.themes import Base, Soft
 
 from vggtjax.app import status
@@ -62,6 +64,7 @@ def build_page(desk: Desk) -> gr.Blocks:
                     height=170,
                     elem_id="clip",
                 )
+                files.data_model = _Names
                 gr.Markdown(
                     f"At most {limits.max_upload_mb} MB, and {limits.max_seconds} s of video.", elem_classes="limits"
                 )
@@ -75,7 +78,7 @@ def build_page(desk: Desk) -> gr.Blocks:
                     list(METHODS), value="4dvggt-d", label="Method", info="4dvggt-d is the best; vggt the fastest."
                 )
                 frames = gr.Slider(
-                    min(_LEAST_FRAMES, limits.max_frames),
+                    min(_LEAST_FRAMES, limits.max_frames - 1),  # below its greatest
                     limits.max_frames,
                     value=min(_FRAMES, limits.max_frames),
                     step=1,
@@ -108,6 +111,7 @@ def build_page(desk: Desk) -> gr.Blocks:
         listener = {
             "outputs": outputs,
             "concurrency_limit": None,
+            "preprocess": False,  # the callbacks check all values, and say what is wrong
             "show_progress": "hidden",
             "api_visibility": "private",
         }
@@ -120,6 +124,12 @@ def build_page(desk: Desk) -> gr.Blocks:
     return page
 
 
+class _Names(GradioRootModel):
+    """Names of uploads, which the guard puts in place of gradio's paths."""
+
+    root: Any
+
+
 class _Watched:
     """The page's callbacks."""
 
@@ -127,19 +137,18 @@ class _Watched:
         self._desk = desk
 
     async def own(
-        self, files: list[str] | None, model: str, method: str, frames: int, fps: float, request: gr.Request
+        self, files: Any, model: Any, method: Any, frames: Any, fps: Any, request: gr.Request
     ) -> AsyncIterator[list[Any]]:
-        """Run the user's own clip."""
-        paths = tuple(Path(file) for file in files or ())
-        if not paths:
+        """Run the user's own clip; files are names of uploads."""
+        if not files:
             yield _changes(status.refusal("no clip yet: drop a video or pictures first, or try the demo clip"))
             return
-        async for change in self._watch(Request(paths, model, method, int(frames), fps or None), request):
+        async for change in self._watch((files, model, method, frames, fps), request):
             yield change
 
-    async def demo(self, method: str, frames: int, request: gr.Request) -> AsyncIterator[list[Any]]:
+    async def demo(self, method: Any, frames: Any, request: gr.Request) -> AsyncIterator[list[Any]]:
         """Run the embedded clip with the embedded model."""
-        async for change in self._watch(Request((), DEMO, method, int(frames)), request):
+        async for change in self._watch(([], DEMO, method, frames, 0), request):
             yield change
 
     def cancel(self, request: gr.Request) -> None:
@@ -149,9 +158,14 @@ class _Watched:
         """Cancel the job of a closed page."""
         self._desk.cancel(str(request.session_hash))
 
-    async def _watch(self, asked: Request, request: gr.Request) -> AsyncIterator[list[Any]]:
+    async def _watch(self, values: tuple[Any, ...], request: gr.Request) -> AsyncIterator[list[Any]]:
         try:
+            files, model, method, frames, fps = msgspec.convert(values, tuple[list[str], str, str, int, float])
+            asked = Request(tuple(self._desk.uploads / file for file in files), model, method, frames, fps or None)
             job = await asyncio.to_thread(self._desk.submit, asked, str(request.session_hash))
+        except msgspec.ValidationError:
+            yield _changes(status.refusal("the page sent a value of the wrong kind; load the page again"))
+            return
         except InputError as error:
             yield _changes(status.refusal(str(error)))
             return

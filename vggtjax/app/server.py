@@ -109,13 +109,16 @@ def build_application(desk: Desk, token: str | None, port: int) -> Any:
 
     from vggtjax.app.access import Guard
     from vggtjax.app.page import CSS, build_page, theme
+    from vggtjax.app.space import Space
     from vggtjax.app.status import RESULTS
 
+    page = build_page(desk)
+    page.has_launched = True  # gradio's own check of paths is off before
     application = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     application.mount(f"/{RESULTS}", StaticFiles(directory=desk.results))
     gr.mount_gradio_app(
         application,
-        build_page(desk),
+        page,
         "/",
         server_name="127.0.0.1",
         server_port=port,
@@ -131,7 +134,8 @@ def build_application(desk: Desk, token: str | None, port: int) -> Any:
         theme=theme(),
         css=CSS,
     )
-    return Guard(application, uploads=desk.uploads, limits=desk.limits, token=token, port=port)
+    inputs = {number: len(function.inputs) for number, function in page.fns.items()}
+    return Guard(application, Space(desk.uploads, desk.limits), inputs, token, port)
 
 
 def _interrupt(*_: object) -> None:

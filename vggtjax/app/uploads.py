@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 
 from vggtjax.app.limits import Limits
@@ -14,11 +13,10 @@ from vggtjax.clips.images import is_image_name
 from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.clips.sources import natural_key, open_source
 from vggtjax.clips.video import VideoFile, is_video_name
-from vggtjax.errors import ClipError, InputError, one_line
+from vggtjax.errors import ClipError, one_line
 
 _MOST_PICTURES = 1000
 _UNKNOWN_LENGTH_FPS = 4.0  # frames per second of a video that does not say how long it is
-_KEPT_UPLOADS = 3  # full uploads, beside those of waiting jobs
 
 
 def keep(files: Sequence[Path], uploads: Path, folder: Path, limits: Limits) -> Path | tuple[Path, ...]:
@@ -77,26 +75,6 @@ def check_clip(
 def safe_stem(name: str) -> str:
     """Return a file's name without its suffix, of letters, digits, dots and dashes only, at most 60 of them."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", Path(name).stem)[:60].strip(".-") or "clip"
-
-
-def make_space(uploads: Path, coming: int, limits: Limits) -> None:
-    """Remove the oldest uploads until `coming` bytes fit beside the others. Raises InputError for too many bytes.
-
-    Uploads of waiting jobs are kept elsewhere by a second link.
-    """
-    if coming > limits.upload_bytes + 2**20:  # the form around the files
-        raise InputError(f"the upload has {coming / 1e6:.1f} MB; send at most {limits.max_upload_mb} MB")
-    files = []
-    for path in uploads.rglob("*"):
-        with suppress(FileNotFoundError):  # removed or renamed meanwhile
-            if path.is_file():
-                files.append((path.stat().st_mtime, path.stat().st_size, path))
-    used = sum(size for _, size, _ in files)
-    for _, size, path in sorted(files):
-        if used + coming <= _KEPT_UPLOADS * limits.upload_bytes:
-            return
-        path.unlink(missing_ok=True)
-        used -= size
 
 
 def _link(path: Path, place: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import tyro
 
-from vggtjax.app.limits import Limits
+from vggtjax.app.limits import LEAST_TOKEN, Limits
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, check_extra
 
@@ -35,8 +35,8 @@ def app(
     from vggtjax.app.models import Models
     from vggtjax.app.server import address, bounded_folder, listening, made_token, needs_token, serve
 
-    if token is not None and not token.isalnum():
-        raise InputError(f"token is {token!r}; expected letters and digits, at least one")
+    if token is not None and not (token.isascii() and token.isalnum() and len(token) >= LEAST_TOKEN):
+        raise InputError(f"token is {token!r}; expected letters and digits, at least {LEAST_TOKEN}")
     if token is None and needs_token(host):
         token = made_token()
     report, models = Report(), Models(model)
