@@ -31,7 +31,7 @@ def app(
         token: what a browser must send once, in the address; by default made up where other machines reach the app
         limits: what users may ask
     """
-    check_extra("the app", "app", "gradio", "viser")
+    check_extra("the app", "app", "gradio")
     from vggtjax.app.models import Models
     from vggtjax.app.server import address, bounded_folder, listening, made_token, needs_token, serve
 
