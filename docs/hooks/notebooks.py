@@ -13,6 +13,8 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     """Add a page for every notebook, with a link to its file."""
     for notebook in sorted(Path(config.docs_dir, "notebooks").glob("*.py")):
         page = jupytext.writes(jupytext.read(notebook, fmt="py:percent"), fmt="md")
-        text = f"{page}\n\n[This page as a Python file]({notebook.name}), which Jupyter opens with jupytext.\n"
+        title, _, body = page.partition("\n")
+        note = f"*Open [{notebook.name}]({notebook.name}) in Jupyter, with jupytext, and run it to see the pictures.*"
+        text = f"{title}\n\n{note}\n{body}"
         files.append(File.generated(config, f"notebooks/{notebook.stem}.md", content=text))
     return files
