@@ -8,6 +8,7 @@ from tests.room import make_room
 from vggtjax.commands import main as cli
 from vggtjax.errors import InputError
 from vggtjax.viewer.page import viewer_page
+from vggtjax.viewer.server import PageServer
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +43,7 @@ def test_what_cannot_be_viewed_is_one_sentence(tmp_path, capsys, folder):
             ((), "no result; name the folder"),
             ((tmp_path,), f"there is no {tmp_path}"),
             ((folder, "--export", tmp_path / "scene.mp4"), "ends with .html or .viser"),
+            ((folder, tmp_path, "--export", tmp_path / "scene.viser"), "2 results for"),
             ((folder, "--port", port), f"port {port} of 127.0.0.1 is in use"),
             ((folder, "--host", "203.0.113.7"), "no address of this machine"),
             ((folder, "--format", "monst3r"), "--quaternion wxyz"),
@@ -52,6 +54,55 @@ def test_what_cannot_be_viewed_is_one_sentence(tmp_path, capsys, folder):
             assert sentence in err
             assert err.strip().splitlines()[-1].startswith("vggtjax: ")
             assert "Traceback" not in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_help_tells_defaults_in_words(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        cli.main(["view", "--help"])
+    assert "None" not in capsys.readouterr().out
+
+
+class Ended:
+    """Stands for the server's loop: it ends at once, as by Ctrl-C."""
+
+    def __init__(self, monkeypatch, ssh):
+        self.page, self.opened = "", []
+        monkeypatch.setattr(PageServer, "serve_forever", lambda server: self.end(server))
+        monkeypatch.setattr("webbrowser.open", lambda url: self.opened.append(url))
+        monkeypatch.setenv("DISPLAY", ":0")
+        monkeypatch.delenv("SSH_CONNECTION", raising=False)
+        if ssh:
+            monkeypatch.setenv("SSH_CONNECTION", "198.51.100.2 50000 198.51.100.7 22")
+
+    def end(self, server):
+        self.page, self.port = server.page.decode(), server.server_port
+        raise KeyboardInterrupt
+
+
+def test_over_ssh_the_tunnel_is_told_and_no_browser_opened(monkeypatch, capsys, folder):
+    ended = Ended(monkeypatch, ssh=True)
+    code, out, _ = run(capsys, folder, "--port", 0)
+    assert code == 0
+    assert f"The viewer: http://127.0.0.1:{ended.port}/" in out
+    assert f"ssh -L {ended.port}:127.0.0.1:{ended.port} 198.51.100.7\n" in out
+    assert ended.opened == []
+    assert ended.page.startswith("<!doctype html>")
+    assert "The viewer has ended." in out
+
+
+def test_where_no_browser_opens_the_address_is_told(monkeypatch, capsys, folder):
+    ended = Ended(monkeypatch, ssh=False)
+    code, out, _ = run(capsys, folder, "--port", 0)  # the browser's opener says that it did not
+    assert code == 0
+    assert ended.opened == [f"http://127.0.0.1:{ended.port}/"]
+    assert "open the address in one" in out
+    assert "ssh -L" not in out
+    ended.opened.clear()
+    code, out, _ = run(capsys, folder, "--port", 0, "--no-browser")
+    assert code == 0
+    assert ended.opened == []
+    assert "No browser" not in out
 
 
 def test_a_notebook_shows_a_result():

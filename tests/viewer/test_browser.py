@@ -149,3 +149,23 @@ def test_two_results_side_by_side_and_swapped_by_a_key(page, room, tmp_path):
     page.keyboard.press("c")
     assert page.locator("#color").input_value() == "1"
     assert page.complaints == []
+
+
+def test_of_five_results_four_stand_side_by_side_under_their_names(page, room, tmp_path):
+    file = tmp_path / "viewer.html"
+    file.write_text(viewer_page([room] * 5, names=list("abcde")))
+    page.goto(file.as_uri())
+    page.evaluate(READY)
+    for key, names in (("1", "abcd"), ("2", "bcde"), ("5", "bcde")):
+        page.keyboard.press(key)
+        page.keyboard.press("v")
+        assert page.locator("#columns h2").all_inner_texts() == list(names)
+        assert page.evaluate("window.vggtjax.viewer.views().map(view => view.model.result.name)") == list(names)
+        width = page.evaluate("window.vggtjax.viewer.canvas.clientWidth")
+        for number, name in enumerate(page.locator("#columns div").all()):
+            assert name.bounding_box()["x"] == pytest.approx(number * width / 4, abs=1)
+    assert not page.locator("h1").is_visible()
+    page.evaluate("MediaRecorder.isTypeSupported = () => false")
+    page.keyboard.press("t")
+    assert "records no video" in page.locator("#message").inner_text()
+    assert page.complaints == []

@@ -14,7 +14,7 @@ import tyro
 
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
-from vggtjax.storage.flags import Switch
+from vggtjax.storage.flags import InWords, Switch
 
 if TYPE_CHECKING:
     from vggtjax.results.result import Result
@@ -40,25 +40,28 @@ def view(
     results: Annotated[tuple[Path, ...], tyro.conf.Positional, _RESULTS],
     /,
     *,
-    export: Path | None = None,
+    export: InWords[Path | None] = None,
     format: Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] = "vggtjax",
-    quaternion: Literal["xyzw", "wxyz"] | None = None,
+    quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
     serving: Annotated[Serving, tyro.conf.arg(name="server")] = Serving(),
 ) -> None:
     """See results in a browser: play them, turn them, compare them; or write them as one file that opens offline.
 
     Args:
         results: folders of results, up to nine; several are shown side by side or swapped by a key.
-        export: write this .html file, which holds everything and opens without a server, and end; or a .viser file, for
-            viser's own player (extra "view").
+        export: write this .html file, which holds everything and opens without a server, and end; or a .viser file of
+            one result, for viser's own player (extra "view"); by default the viewer is served.
         format: the program that wrote the folders.
-        quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw.
+        quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw;
+            only their formats need it.
         serving: where the viewer is served
     """
     if not results:
         raise InputError("no result; name the folder of one, such as demo-output")
     if export is not None and export.suffix not in (".html", ".viser"):
         raise InputError(f"export is {export}; expected a name that ends with .html or .viser")
+    if export is not None and export.suffix == ".viser" and len(results) > 1:
+        raise InputError(f"{len(results)} results for {export}; a .viser file holds one, an .html file up to nine")
     report = Report()
     with report.running():
         from vggtjax.results.foreign import check_format

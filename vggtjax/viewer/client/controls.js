@@ -6,6 +6,7 @@ const SWITCHES = ["static", "moving", "cameras", "pictures", "path", "tracks", "
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 4];
 const NARROW = 700; // pixels of a window that has no room for the settings beside the scene
 const TURN = 8000; // milliseconds of the turntable video
+const READING = 8000; // milliseconds that a message stays
 
 class Controls {
   constructor(viewer) {
@@ -22,6 +23,7 @@ class Controls {
 
   listenToInputs() {
     const { viewer } = this;
+    element("steps").max = viewer.result.largestStep; // points beside larger ones are not in the page
     for (const [id, name] of Object.entries(SLIDERS)) {
       const input = element(id);
       input.value = viewer.settings[name];
@@ -93,16 +95,23 @@ class Controls {
 
   describe() {
     const { viewer } = this, { result, results, settings } = viewer;
-    element("name").textContent = settings.side ? results[0].name : result.name;
-    element("second-name").textContent = settings.side && results.length === 2 ? results[1].name : "";
-    element("facts").textContent = settings.side && results.length > 2 ? results.map(({ name }) => name).join("  ·  ") : result.facts;
-    element("note").textContent = result.note;
+    for (const name of ["name", "facts", "note"]) element(name).textContent = result[name];
+    element("about").hidden = settings.side;
+    element("columns").replaceChildren(...(settings.side ? viewer.shownModels : []).map((model) => this.column(model.result)));
     [...element("results").children].forEach((button, i) => button.setAttribute("aria-pressed", i === results.length ? settings.side : !settings.side && i === settings.active));
     element("time").max = result.frames - 1;
     element("tracks").parentElement.hidden = !results.some(({ tracks }) => tracks);
     element("color").replaceChildren(...result.colors.map(({ name }, i) => new Option(name, i)));
     const moving = result.positions.length / 3 - result.staticCount;
     element("counts").textContent = `${result.staticCount.toLocaleString("en")} static and ${moving.toLocaleString("en")} moving points`;
+  }
+
+  // What stands above a result side by side.
+  column({ name, facts, note }) {
+    const column = document.createElement("div");
+    const line = (kind, text) => Object.assign(document.createElement(kind), { textContent: text });
+    column.append(line("h2", name), line("p", facts), line("p", note));
+    return column;
   }
 
   color(index) {
@@ -166,6 +175,13 @@ class Controls {
     canvas.getContext("2d").drawImage(result.sheet, (frame % result.columns) * width, Math.floor(frame / result.columns) * height, width, height, 0, 0, width, height);
   }
 
+  say(sentence) {
+    element("message").textContent = sentence;
+    element("message").hidden = false;
+    clearTimeout(this.silence);
+    this.silence = setTimeout(() => { element("message").hidden = true; }, READING);
+  }
+
   save(blob, ending) {
     const stem = this.viewer.result.name.replace(/[^\w.-]+/g, "_").slice(0, 60) || "result";
     const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: `${stem}_${ending}` });
@@ -180,9 +196,13 @@ class Controls {
 
   turntable() {
     const { viewer } = this;
-    if (this.recorder || !window.MediaRecorder) return;
+    if (this.recorder) return;
+    const type = ["video/webm;codecs=vp9", "video/webm", "video/mp4"].find((name) => window.MediaRecorder?.isTypeSupported(name));
+    if (!type) {
+      this.say("This browser records no video. Open the page in another browser, or make a film with vggtjax render.");
+      return;
+    }
     this.leaveFlight();
-    const type = ["video/webm;codecs=vp9", "video/webm", "video/mp4"].find((name) => MediaRecorder.isTypeSupported(name));
     const recorder = (this.recorder = new MediaRecorder(viewer.canvas.captureStream(30), { mimeType: type, videoBitsPerSecond: 12e6 }));
     const pieces = [], yaw = viewer.orbit.yaw, started = performance.now();
     recorder.ondataavailable = ({ data }) => pieces.push(data);

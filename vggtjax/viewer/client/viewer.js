@@ -35,7 +35,12 @@ class Viewer {
 
   get result() { return this.results[this.settings.active]; }
   get frame() { return Math.min(Math.floor(this.time), this.result.frames - 1); }
-  get shownModels() { return this.settings.side ? this.models.slice(0, MOST_VIEWS) : [this.models[this.settings.active]]; }
+  // Side by side, as many as fit, among them the active one.
+  get shownModels() {
+    const { active, side } = this.settings;
+    const first = side ? Math.min(active, Math.max(this.models.length - MOST_VIEWS, 0)) : active;
+    return this.models.slice(first, first + (side ? MOST_VIEWS : 1));
+  }
 
   set(changes) {
     Object.assign(this.settings, changes);
