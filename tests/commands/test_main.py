@@ -15,9 +15,11 @@ from PIL import Image
 import vggtjax
 from benchmarks.seeded import seeded_images, seeded_state_dict
 from vggtjax import Reconstruction, __main__
+from vggtjax.clips.clip import load_clip
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
 from vggtjax.commands import main as cli
+from vggtjax.commands.reconstruct import _taken
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 
@@ -315,3 +317,33 @@ def test_stages_and_the_kind_of_model_are_said_once(tmp_path, capsys, frames):
     assert re.findall(r"(?m)^.*first pass", err) in (["first pass"], ["compile first pass", "first pass"])
     assert "The model demo is a small demonstration model" in out
     assert Reconstruction.load(tmp_path / "out").settings["model_note"].startswith("small demonstration model")
+
+
+def test_a_mistyped_command_or_flag_names_the_one_that_was_meant(capsys):
+    code, _, err = run(capsys, "recontsruct", "clip.mp4")
+    assert code == 2
+    assert err == ("vggtjax: there is no command 'recontsruct'; did you mean reconstruct? vggtjax --help lists all\n")
+    assert "did you mean" not in run(capsys, "zzzz")[2]
+    with pytest.raises(SystemExit) as stop:
+        run(capsys, "reconstruct", "clip.mp4", "--out", "x", "--max-frame", "8")
+    assert stop.value.code == 2
+    err = capsys.readouterr().err
+    assert "--max-frames" in err
+    assert "evaluate" not in err
+    assert "vggtjax reconstruct --help" in err
+
+
+@pytest.mark.parametrize(
+    ("count", "available", "stride", "ending"),
+    [
+        (4, 49, None, "; --stride 13 spreads them over the whole source"),
+        (4, 49, 13, ""),
+        (4, 4, None, ""),
+        (4, None, None, ""),
+    ],
+)
+def test_the_frames_that_were_taken_are_named(count, available, stride, ending):
+    clip = load_clip(np.zeros((count, 20, 40, 3), np.uint8), size=56)
+    clip = dataclasses.replace(clip, sampling=Sampling(stride=stride, max_frames=count))
+    frames = f"{count} of {available}" if available and available > count else f"{count}"
+    assert _taken(clip, available) == f"{frames} frames of 40 x 20 pixels, fitted to 56 x 28{ending}"

@@ -60,7 +60,10 @@ class Sampling:
     def indices(self, count: int) -> range:
         """Return the indices taken of `count` still frames. Raises InputError for `fps`, ClipError for a late start."""
         if self.fps is not None:
-            raise InputError(f"fps is {self.fps}, but still images have no presentation times; use stride")
+            raise InputError(
+                f"fps is {self.fps}, but still images have no presentation times; leave fps out, or take every "
+                "n-th image with stride"
+            )
         if self.start >= count:
             raise ClipError(f"start is {self.start}, but the source has only {count} frames; expected below {count}")
         return range(self.start, count, self.step)[: self.max_frames]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import difflib
 import functools
 import gc
 import io
@@ -32,7 +33,7 @@ from vggtjax.commands.render import render
 from vggtjax.commands.scenes import scenes
 from vggtjax.commands.train import train
 from vggtjax.commands.view import view
-from vggtjax.errors import VggtjaxError
+from vggtjax.errors import InputError, VggtjaxError, one_line
 from vggtjax.storage.cache import enable_compilation_cache
 
 COMMANDS = {
@@ -116,21 +117,24 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
     tyro prints errors of the option dataclasses in a box. Find the error in the chain of exceptions and raise it.
     """
 
-    def later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
-        @functools.wraps(command)
-        def ready(*positional: object, **options: object) -> Callable[[], None]:
-            return functools.partial(command, *positional, **options)
+    name, *others = arguments
+    if name not in COMMANDS:
+        similar = difflib.get_close_matches(name, COMMANDS, n=1)
+        guess = f"did you mean {similar[0]}? " if similar else ""
+        raise InputError(f"there is no command {one_line(name, 40)!r}; {guess}vggtjax --help lists all")
+    command = COMMANDS[name]
 
-        return ready
+    @functools.wraps(command)
+    def ready(*positional: object, **options: object) -> Callable[[], None]:
+        return functools.partial(command, *positional, **options)
 
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.extras.subcommand_cli_from_dict(  # type: ignore[return-value]
-                {name: later(command) for name, command in COMMANDS.items()},
-                prog="vggtjax",
-                description="4-D reconstruction of monocular video of a moving world. --version prints the version.",
-                args=[_renamed(argument) for argument in arguments],
+            return tyro.cli(
+                ready,
+                prog=f"vggtjax {name}",
+                args=[_renamed(argument) for argument in others],
                 config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
             )
     except SystemExit as stop:

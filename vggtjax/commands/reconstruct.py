@@ -115,6 +115,7 @@ def reconstruct(
             announce(out, forecast_bytes(clip.images.shape[:3], clip.source_size, saving))
             masks = known.masks_of(clip)
             queries = None if known.tracks is None else parse_queries(known.tracks, clip)
+        report.note(_taken(clip, opened.total(Sampling())))
         from vggtjax.pipeline.run import reconstruct as run
         from vggtjax.results.report import RunFacts
 
@@ -137,3 +138,16 @@ def reconstruct(
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")
     if view:
         serve(report, [result], [str(out)])
+
+
+def _taken(clip: Clip, available: int | None) -> str:
+    """Say which frames were taken, and at which size."""
+    count, height, width = clip.images.shape[:3]
+    source_height, source_width = clip.source_size[0]
+    frames = f"{count}" if available in (None, count) else f"{count} of {available}"
+    text = f"{frames} frames of {source_width} x {source_height} pixels, fitted to {width} x {height}"
+    if clip.sampling.max_frames == count and available is not None and clip.sampling.start + count < available:
+        spread = -(-(available - clip.sampling.start) // count)
+        if clip.sampling.step < spread and clip.sampling.fps is None:
+            text += f"; --stride {spread} spreads them over the whole source"
+    return text
