@@ -8,8 +8,11 @@ import pytest
 
 from tests.chromium import browser, look
 from tests.room import make_room
-from vggtjax.results import charts
-from vggtjax.results.report import REPORT_NAME, ErrorTable, RunFacts, write_report
+from vggtjax.errors import OutputError
+from vggtjax.results import charts, export
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.report import REPORT_NAME, ErrorTable, RunFacts, report_page
+from vggtjax.storage.markup import write_page
 
 HOSTILE = "<script>alert('1')</script><img src=x onerror=alert(2)>\"'&\n\u202e\ud800"
 
@@ -31,7 +34,7 @@ class Reader(HTMLParser):
 
 
 def report(tmp_path, result, facts=None):
-    write_report(tmp_path / REPORT_NAME, result, facts)
+    write_page(tmp_path / REPORT_NAME, report_page(tmp_path, result, facts))
     text = (tmp_path / REPORT_NAME).read_text(encoding="utf-8")
     return text, Reader(text)
 
@@ -124,6 +127,28 @@ def test_equal_results_give_equal_bytes(tmp_path):
 def test_odd_results_have_a_report(tmp_path, changes):
     text, _ = report(tmp_path, make_room(2, **changes))
     assert "nan" not in re.sub(r"base64,[\w+/=]+", "", text)
+
+
+def test_a_report_that_fails_costs_no_result(tmp_path, monkeypatch, caplog):
+    def broken(*_):
+        raise ValueError("a chart\nof nothing")
+
+    make_room().save(tmp_path)
+    monkeypatch.setattr(charts, "camera_views", broken)
+    make_room(2).save(tmp_path)
+    assert len(Reconstruction.load(tmp_path).depth) == 2
+    assert not (tmp_path / REPORT_NAME).exists()
+    assert "saved without report.html, which could not be made (ValueError: a chart of nothing)" in caplog.text
+
+
+def test_a_full_disk_is_no_fault_of_the_report(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(export, "write_page", full)
+    with pytest.raises(OutputError, match="No space left on device"):
+        make_room().save(tmp_path)
+    assert not (tmp_path / "reconstruction.npz").exists()
 
 
 def test_the_path_by_hand():

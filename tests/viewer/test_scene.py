@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.room import make_room
+from vggtjax.results.result import missing_fields
 from vggtjax.results.shown import middle_and_radius
 from vggtjax.viewer.page import viewer_page
 from vggtjax.viewer.scene import Budget, Place, contracted, place_beside, scene_of
@@ -45,6 +46,13 @@ def test_positions_are_fine_near_the_centre_and_finite_far_away():
     back = positions_of(scene)
     np.testing.assert_allclose(back[:2], points[:2], atol=2e-4)
     assert np.isfinite(back).all()
+
+
+@pytest.mark.parametrize("missing", [7, "images", {"images": 1}, [["images"], 7, None]])
+def test_odd_settings_say_that_nothing_is_missing(missing):
+    result = make_room(2, settings={"missing": missing})
+    assert missing_fields(result) == ()
+    assert names(result)[0] == "picture"
 
 
 def test_only_colours_that_the_result_has_are_offered():

@@ -20,7 +20,7 @@ from vggtjax.evaluation.metrics.video_depth import Align, depth_alignment, video
 from vggtjax.evaluation.truth_at_pixels import AbsentError, TruthAtPixels, known_points
 from vggtjax.progress import Progress
 from vggtjax.results.frame import source_pixels
-from vggtjax.results.result import Result
+from vggtjax.results.result import Result, missing_fields
 
 _HISTOGRAM = np.geomspace(1e-3, 10, 41)  # metres, bins of point distances
 _PICTURED = 4  # frames whose maps are in the curves
@@ -87,7 +87,7 @@ def score(
 
 def _check_predicted(result: Result, field: str, what: str) -> None:
     """Raise AbsentError for a field with constants in place of a prediction."""
-    if field in result.settings.get("missing", ()):
+    if field in missing_fields(result):
         raise AbsentError(f"the result has no {what}")
 
 

@@ -108,9 +108,17 @@ def _card(out: Path, name: str) -> Element:
 def _read(path: Path) -> _Clip:
     """Read what a card tells. Raises ResultError for a broken archive."""
     arrays = read_arrays(path, ["dynamic_mask", "valid_box", "method"])
-    if len(arrays) < 3 or arrays["dynamic_mask"].ndim != 3 or arrays["valid_box"].shape[1:] != (4,):
-        raise ResultError(f"{path} has no masks of frames")
+    for name, kinds, axes in (("dynamic_mask", "b", (-1, -1, -1)), ("valid_box", "iu", (-1, 4)), ("method", "U", ())):
+        array = arrays.get(name)
+        if array is None or array.dtype.kind not in kinds or not _has_axes(array.shape, axes):
+            found = "nothing" if array is None else f"{array.dtype} {array.shape}"
+            raise ResultError(f"its {name} is {found}; expected that of a saved result")
     mask, box = arrays["dynamic_mask"], arrays["valid_box"].astype(np.float64)
     frames, height, width = mask.shape
     pictured = float(((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])).sum())
     return _Clip(frames, width, height, float(mask.sum()) / max(pictured, 1.0), str(arrays["method"].item()))
+
+
+def _has_axes(shape: tuple[int, ...], axes: tuple[int, ...]) -> bool:
+    """Return whether a shape has these sides, -1 being any."""
+    return len(shape) == len(axes) and all(side in (-1, own) for side, own in zip(axes, shape, strict=True))

@@ -56,17 +56,17 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, one_line
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results import foreign, previews, tracks
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
 from vggtjax.results.glb import build_scene, glb_bytes
 from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, joined, least_confidence, write_ply
-from vggtjax.results.report import REPORT_NAME, RunFacts, write_report
+from vggtjax.results.report import REPORT_NAME, RunFacts, report_page
 from vggtjax.results.result import Result
 from vggtjax.results.saving import Resolution, Saving
 from vggtjax.storage.arrays import write_arrays
-from vggtjax.storage.markup import webp
+from vggtjax.storage.markup import webp, write_page
 from vggtjax.storage.trajectories import commented, write_trajectory
 
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
@@ -120,9 +120,20 @@ def write_files(
         _write_tracks(result, folder, saving)
     advance()
     if saving.writes("report"):
-        write_report(folder / REPORT_NAME, result, facts)
+        _write_report(folder, result, facts)
     advance()
     return total
+
+
+def _write_report(folder: Path, result: Result, facts: RunFacts | None) -> None:
+    """Write the report, or log why it cannot be made: the computation is worth more. A full disk raises OSError."""
+    try:
+        text = report_page(folder, result, facts)
+    except Exception as error:  # of any chart or picture; the page is made in memory
+        reason = one_line(f"{type(error).__name__}: {error}")
+        logger.warning("the result is saved without %s, which could not be made (%s)", REPORT_NAME, reason)
+        return
+    write_page(folder / REPORT_NAME, text)
 
 
 def _frames(

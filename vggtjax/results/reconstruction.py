@@ -66,7 +66,7 @@ class Reconstruction(Result):
         with replacing(Path(folder), names) as staged:
             total = write_files(self, staged, saving, pictures, progress, facts)
             with writing(staged / ARCHIVE_NAME) as path:
-                self.save_archive(path, files=names)
+                self.save_archive(path, files=[name for name in names if (staged / name).exists()])
             (progress or no_progress)(total, total)
 
     def save_archive(self, path: Path, *, files: Sequence[str] = ()) -> None:

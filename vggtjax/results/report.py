@@ -18,9 +18,9 @@ from jaxtyping import UInt8
 from vggtjax.errors import one_line
 from vggtjax.results import charts, previews, tracks
 from vggtjax.results.archive import ARCHIVE_NAME
-from vggtjax.results.result import Result
+from vggtjax.results.result import Result, missing_fields
 from vggtjax.results.thumbnail import moving_thumbnail
-from vggtjax.storage.markup import data_uri, element, page, relative_link, table, webp, write_page
+from vggtjax.storage.markup import data_uri, element, page, relative_link, table, webp
 
 REPORT_NAME = "report.html"
 _STRIP_FRAMES = 8
@@ -82,11 +82,11 @@ def versions() -> dict[str, str]:
     return found
 
 
-def write_report(path: Path, result: Result, facts: RunFacts | None = None) -> None:
-    """Write the page; equal results and facts give equal bytes.
+def report_page(folder: Path, result: Result, facts: RunFacts | None = None) -> str:
+    """Return the page; equal results and facts give equal text.
 
     Args:
-        path: the file, in the folder of the result, whose other files it links to.
+        folder: of the result, whose files it links to.
         result: all fields.
         facts: of the run, where known.
     """
@@ -101,14 +101,13 @@ def write_report(path: Path, result: Result, facts: RunFacts | None = None) -> N
         _errors(facts),
         element("div", _histogram(result), _timings(facts), class_="pair"),
         _settings(result),
-        _files(path.parent),
+        _files(folder),
     ]
-    write_page(path, page(f"{title}: {result.method}", *body))
+    return page(f"{title}: {result.method}", *body)
 
 
 def _header(title: str, result: Result) -> Element:
-    missing = result.settings.get("missing")
-    lacking = "" if not isinstance(missing, list) else ", ".join(one_line(str(name), 40) for name in missing[:20])
+    lacking = ", ".join(one_line(name, 40) for name in missing_fields(result)[:20])
     return element(
         "header",
         element("h1", title),

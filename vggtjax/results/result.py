@@ -197,6 +197,12 @@ OPTIONAL = TRACKS | {"timestamps", "saliency"}
 STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": (), "model_name": (), "settings": ()}
 
 
+def missing_fields(result: Result) -> tuple[str, ...]:
+    """Return the fields that another program did not write, and for which plain values stand."""
+    missing = result.settings.get("missing")
+    return tuple(name for name in missing if isinstance(name, str)) if isinstance(missing, list) else ()
+
+
 def inside_box(box: Int[np.ndarray, "*F 4"], size: tuple[int, ...]) -> Bool[np.ndarray, "*F H W"]:
     """Return the pixels of a picture of this height and width that lie in a box of left, top, right, bottom."""
     rows, columns = np.arange(size[0])[:, None], np.arange(size[1])

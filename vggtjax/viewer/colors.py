@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from vggtjax.options import METHODS
 from vggtjax.results.previews import INSTANCE_COLORS, inverse_depth_range, moving_ids
-from vggtjax.results.result import Result
+from vggtjax.results.result import Result, missing_fields
 from vggtjax.results.shown import ShownPoints
 
 _MOST_NAMES = 8  # of objects in a legend
@@ -45,7 +45,7 @@ def offered_colors(result: Result, points: ShownPoints) -> list[dict[str, Any]]:
 
 def lacks(result: Result, field: str) -> bool:
     """Return whether plain values stand for a field that another program did not write."""
-    return field in (result.settings.get("missing") or ())
+    return field in missing_fields(result)
 
 
 def confidence_ranks(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
