@@ -52,7 +52,7 @@ for row, (name, values) in zip(axes, rows.items(), strict=True):
 # %% [markdown]
 # ## Points and cameras
 #
-# `world_points()` lifts every pixel into the world, whose axes are about those of the first camera: x right, y down,
+# `world_points()` lifts every pixel into the world, whose axes are approximately the first camera's: x right, y down,
 # z forward. Project a point into another frame, and you get a pixel of that frame:
 
 # %%
