@@ -6,6 +6,7 @@ import pytest
 
 from tests.room import make_room
 from vggtjax.commands import main as cli
+from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.viewer.page import viewer_page
 from vggtjax.viewer.server import PageServer
@@ -113,3 +114,12 @@ def test_a_notebook_shows_a_result():
     assert "<b>" not in viewer.html
     with pytest.raises(InputError, match="2 names for 1 results"):
         viewer_page([make_room(2)], names=["one", "two"])
+
+
+def test_the_summary_tells_how_to_see_a_result(tmp_path, capsys):
+    room, folder = make_room(2), tmp_path / "my dog"
+    room.save(folder)
+    Report().summary(room, folder)
+    assert f"vggtjax view '{folder}'\n" in capsys.readouterr().out
+    Report().summary(room, tmp_path)  # a folder without the arrays
+    assert "vggtjax view" not in capsys.readouterr().out

@@ -9,7 +9,7 @@ from tests.room import make_room
 from vggtjax.results.result import missing_fields
 from vggtjax.results.shown import middle_and_radius
 from vggtjax.viewer.page import viewer_page
-from vggtjax.viewer.scene import Budget, Place, contracted, place_beside, scene_of
+from vggtjax.viewer.scene import Budget, Place, contracted, home_view, place_beside, scene_of
 
 SAME = Place(1.0, np.eye(3), np.zeros(3))
 
@@ -109,3 +109,16 @@ def test_depth_at_the_end_of_float32_still_gives_a_page():
     far = make_room(2, depth=np.full((2, 28, 42), 3e38, np.float32))
     for results in ([far], [make_room(2), far], [far, make_room(2)]):
         assert "Infinity" not in viewer_page(results)
+
+
+def test_the_first_view_stands_behind_and_above_the_middle_camera_and_looks_along_it():
+    result = make_room(3)
+    home = home_view(result, SAME)
+    camera = result.camera_from_world[1]
+    eye, target = (camera[:, :3] @ home[name] + camera[:, 3] for name in ("eye", "target"))
+    depth = np.median(result.depth[1])
+    np.testing.assert_allclose(target, [0, 0, depth], atol=1e-4)
+    assert abs(eye[0]) < 1e-4
+    assert -0.2 * depth < eye[1] < 0  # y is down
+    assert -0.7 * depth < eye[2] < -0.1 * depth
+    np.testing.assert_allclose(home["tangents"], [21 / 37.8, 14 / 37.8], rtol=1e-5)

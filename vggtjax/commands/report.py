@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -83,6 +84,7 @@ class Report:
                 "peak memory": _peak_memory(),
                 "results": f"{out}/",
             }
+            | ({"see it": f"vggtjax view {shlex.quote(str(out))}"} if (out / "reconstruction.npz").exists() else {})
             | ({"look at": ", ".join(map(str, pictures))} if pictures else {})
         )
         if model is not None and model.note:

@@ -36,7 +36,7 @@ def write_recording(
     with contextlib.redirect_stdout(io.StringIO()):  # viser says where its server listens
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
-            home = {name: np.array(value) for name, value in home_view(result, SAME_PLACE, static.positions).items()}
+            home = {name: np.array(value) for name, value in home_view(result, SAME_PLACE).items()}
             start = server.initial_camera
             start.up, start.position, start.look_at = home["up"], home["eye"], home["target"]
             server.scene.set_up_direction(home["up"])

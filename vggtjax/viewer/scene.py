@@ -25,7 +25,8 @@ from vggtjax.viewer.colors import TIME_RAMP, confidence_ranks, lacks, offered_co
 LARGEST_STEP = 0.3  # of depth between neighbours, as a share; pixels beside larger ones are never shown
 _LEAST_MOVING = 200  # points of a frame
 _STEEPEST = 8.0  # slope of a surface, up to which a step of depth is none
-_FRUSTUM = 0.07  # of the scene's radius
+_FRUSTUM = 0.045  # of the scene's radius
+_BEHIND, _ABOVE = 0.18, 0.11  # of the median depth: where the first view stands from a camera
 _SPLAT = 1.2  # distances to the fourth neighbour: a point's width
 _PLAIN_RATE = 10.0  # frames a second without timestamps
 _TILE, _SHEET = 256, 4096  # pixels: the longer side of a small picture; a side of the sheet that every browser takes
@@ -107,7 +108,7 @@ def scene_of(
         "frustumSize": _FRUSTUM * radius,
         "frameColors": TIME_RAMP[np.linspace(0, 230, S).round().astype(int)].ravel(),
         "tracks": _tracks(result, place),
-        "home": home_view(result, place, positions),
+        "home": home_view(result, place),
         **_cameras(result, place),
         **_sheet(result),
     }
@@ -128,8 +129,8 @@ def _shuffled(points: ShownPoints, random: np.random.Generator) -> ShownPoints:
     return ShownPoints(points.positions[order], points.frames[order], points.pixels[order])
 
 
-def _median_depth(result: Result) -> float:
-    frame = frame_of(result, 0)
+def _median_depth(result: Result, number: int = 0) -> float:
+    frame = frame_of(result, number)
     return float(np.median(frame.depth[frame.valid].astype(np.float64))) if frame.valid.any() else 1.0
 
 
@@ -184,7 +185,6 @@ def _frame_steps(result: Result, number: int) -> UInt8[np.ndarray, "H W"]:
 
 def _cameras(result: Result, place: Place) -> dict[str, Any]:
     """Return world-from-camera in the page's world, and the tangents of half the fields of view."""
-    _, H, W = result.depth.shape
     poses = np.concatenate(
         [
             place.rotation @ result.world_from_camera[:, :3, :3],
@@ -192,20 +192,27 @@ def _cameras(result: Result, place: Place) -> dict[str, Any]:
         ],
         axis=-1,
     )
-    tangents = np.array([W, H]) / 2 / result.intrinsics[:, [0, 1], [0, 1]]
-    return {"poses": poses.astype(np.float32).ravel(), "tangents": tangents.astype(np.float32).ravel()}
+    return {"poses": poses.astype(np.float32).ravel(), "tangents": _tangents(result).astype(np.float32).ravel()}
 
 
-def home_view(result: Result, place: Place, positions: Float32[np.ndarray, "N 3"]) -> dict[str, list[float]]:
-    """Return the first view: from behind and above the cameras, on the middle of the points."""
-    axes = result.camera_from_world[:, :, :3].astype(np.float64).mean(axis=0) @ place.rotation.T
-    up = -axes[1] if np.linalg.norm(axes[1]) > 0.1 else np.array([0.0, -1.0, 0.0])
-    up /= np.linalg.norm(up)
-    middle = place.points(result.camera_centres).astype(np.float64).mean(axis=0)
-    target = np.median(positions, axis=0).astype(np.float64) if len(positions) else middle + axes[2]
-    away = target - middle
-    eye = middle - 0.6 * away + 0.4 * np.linalg.norm(away) * up
-    return {"eye": eye.tolist(), "target": target.tolist(), "up": up.tolist()}
+def _tangents(result: Result) -> Float[np.ndarray, "S 2"]:
+    """Return the tangents of half the fields of view, of the width and of the height."""
+    _, H, W = result.depth.shape
+    return np.array([W, H]) / 2 / result.intrinsics[:, [0, 1], [0, 1]]
+
+
+def home_view(result: Result, place: Place) -> dict[str, Any]:
+    """Return the first view: slightly behind and above the middle camera, along its axis, as wide as its picture."""
+    number = len(result.depth) // 2
+    axes = result.camera_from_world[number, :, :3].astype(np.float64) @ place.rotation.T
+    centres = place.points(result.camera_centres).astype(np.float64)
+    depth = place.scale * _median_depth(result, number)
+    farthest_back = -((centres - centres[number]) @ axes[2]).min()
+    behind = _BEHIND * depth + np.clip(farthest_back, 0, depth / 2)
+    eye = centres[number] - behind * axes[2] - _ABOVE * depth * axes[1]
+    target = centres[number] + depth * axes[2]
+    view = {"eye": eye, "target": target, "up": -axes[1], "tangents": _tangents(result)[number]}
+    return {name: np.nan_to_num(value).tolist() for name, value in view.items()}
 
 
 def _tracks(result: Result, place: Place) -> dict[str, Any] | None:

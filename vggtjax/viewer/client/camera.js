@@ -1,11 +1,12 @@
 // The viewer's camera: it turns about a target, or follows the camera of the clip.
 
-const TALL = 0.5; // tangent of half the vertical field of view
+const [NARROWEST, WIDEST] = [0.2, 0.8]; // tangents of half a field of view
 const STEEPEST = 1.5; // radians
 
 class Orbit {
-  // home: {eye, target, up} in the world.
+  // home: {eye, target, up} in the world, and the tangents of half the fields of view that fill the canvas.
   constructor(home) {
+    [this.wide, this.tall] = home.tangents.map((tangent) => Math.min(Math.max(tangent, NARROWEST), WIDEST));
     this.home = home;
     this.up = normalised(home.up);
     const ahead = subtract(home.target, home.eye);
@@ -28,6 +29,11 @@ class Orbit {
     this.pitch = Math.asin(Math.min(Math.max(-dot(forward, this.up), -1), 1));
   }
 
+  // Tangent of half the vertical field of view, on a canvas of this shape.
+  tallOn(aspect) {
+    return Math.max(this.tall, this.wide / aspect);
+  }
+
   pose() {
     const [c, s] = [Math.cos(this.yaw), Math.sin(this.yaw)];
     const level = add(scaled(this.ahead, c), scaled(this.side, s));
@@ -41,10 +47,10 @@ class Orbit {
     this.pitch = Math.min(Math.max(this.pitch + 0.005 * y, -STEEPEST), STEEPEST);
   }
 
-  // By pixels of a canvas of this height.
-  move(x, y, height) {
+  // By pixels of a canvas.
+  move(x, y, { clientWidth, clientHeight }) {
     const { right, down } = this.pose();
-    const step = (2 * TALL * this.distance) / height;
+    const step = (2 * this.tallOn(clientWidth / clientHeight) * this.distance) / clientHeight;
     this.target = subtract(this.target, add(scaled(right, x * step), scaled(down, y * step)));
   }
 
@@ -70,8 +76,8 @@ class Orbit {
       if (other) {
         const spread = (place) => Math.hypot(place[0] - other[1][0], place[1] - other[1][1]);
         this.zoom(spread(last) / Math.max(spread(now), 1));
-        this.move(x / 2, y / 2, canvas.clientHeight);
-      } else if (event.buttons & 6 || event.shiftKey) this.move(x, y, canvas.clientHeight);
+        this.move(x / 2, y / 2, canvas);
+      } else if (event.buttons & 6 || event.shiftKey) this.move(x, y, canvas);
       else this.turn(x, y);
       pointers.set(event.pointerId, now);
     });

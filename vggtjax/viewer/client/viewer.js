@@ -1,6 +1,6 @@
 // What is shown, and when it is drawn again.
 
-const BACKGROUND = [20 / 255, 20 / 255, 24 / 255];
+const BACKGROUND = [38 / 255, 38 / 255, 46 / 255];
 const SLOW = 42, FAST = 24; // milliseconds of a picture, above and below which fewer and more points are drawn
 const STILL = 160; // milliseconds without a change of the view, after which all points are drawn
 const FEWEST = 6000; // points of the background while the view moves
@@ -81,11 +81,11 @@ class Viewer {
       const left = Math.round((width * i) / models.length);
       const span = Math.round((width * (i + 1)) / models.length) - left;
       const aspect = span / height;
-      let [pose, tall] = [null, TALL * Math.max(1, 1 / aspect)];
+      let [pose, tall] = [this.orbit.pose(), this.orbit.tallOn(aspect)];
       if (this.settings.fly) {
         const camera = clipCamera(model.result, Math.min(this.time, model.result.frames - 1));
         [pose, tall] = [camera.pose, Math.max(camera.tall, camera.wide / aspect)];
-      } else pose = this.orbit.pose();
+      }
       const near = 0.004 * model.result.scale;
       const matrix = multiply(projectionMatrix(tall, aspect, near, 2e6 * near), viewMatrix(pose));
       return { model, left, width: span, height, tall, near, matrix };
