@@ -29,7 +29,7 @@ class Cameras(NamedTuple):
     intrinsics: Float[Any, "*F 3 3"]
 
 
-def camera_centres(camera_from_world: Float32[np.ndarray, "S 3 4"]) -> Float32[np.ndarray, "S 3"]:
+def camera_centres(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float[np.ndarray, "S 3"]:
     """Return the camera centres in the world, -R^T t."""
     rotation, translation = camera_from_world[..., :3], camera_from_world[..., 3]
     return -np.einsum("sji,sj->si", rotation, translation)
@@ -111,12 +111,12 @@ def clamp_intrinsics(
 
 
 def frustum_corners(
-    intrinsics: Float32[np.ndarray, "S 3 3"],
-    camera_from_world: Float32[np.ndarray, "S 3 4"],
+    intrinsics: Float[np.ndarray, "S 3 3"],
+    camera_from_world: Float[np.ndarray, "S 3 4"],
     height: int,
     width: int,
     size: float,
-) -> Float32[np.ndarray, "S 5 3"]:
+) -> Float[np.ndarray, "S 5 3"]:
     """Return the world points that outline each camera: its centre, then the picture's corners.
 
     Corners go top left, top right, bottom right, bottom left, `size` away from the centre along their rays, so that

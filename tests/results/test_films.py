@@ -4,6 +4,7 @@ import pytest
 from tests.room import make_room
 from vggtjax.errors import InputError
 from vggtjax.rendering.splats import BACKGROUND
+from vggtjax.results import films
 from vggtjax.results.films import due_frames, film_frames
 
 RED = np.array([220, 40, 30])
@@ -87,3 +88,22 @@ def test_progress_counts_frames(room):
 def test_bad_options_are_found_before_drawing(room, options, message):
     with pytest.raises(InputError, match=message):
         film_frames(room, **options)
+
+
+@pytest.mark.parametrize(("size", "factor"), [((84, 56), 2), ((960, 640), 1)])
+def test_wide_discs_are_not_supersampled(room, monkeypatch, size, factor):
+    seen = []
+    monkeypatch.setattr(
+        films,
+        "draw_splats",
+        lambda *_, supersampling, **__: seen.append(supersampling) or np.zeros((8, 8, 3), np.uint8),
+    )
+    film(room, size=size)
+    assert seen == [factor] * 4
+
+
+def test_points_of_a_frame_are_prepared_once(room, monkeypatch):
+    made, prepare = [], films._splats
+    monkeypatch.setattr(films, "_splats", lambda *given: made.append(given) or prepare(*given))
+    film(room, seconds=2, fps=8)
+    assert len(made) == 1 + 4

@@ -113,6 +113,12 @@ def test_equal_results_give_equal_bytes(tmp_path):
     assert report(tmp_path, make_room())[0] == report(tmp_path, make_room())[0]
 
 
+def placed(far):
+    poses = make_room(2).camera_from_world.copy()
+    poses[1, :, 3] = far
+    return poses
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -121,6 +127,9 @@ def test_equal_results_give_equal_bytes(tmp_path):
         {"dynamic_mask": np.ones((2, 28, 42), bool)},
         {"depth": np.zeros((2, 28, 42), np.float32)},
         {"camera_from_world": np.tile(np.eye(3, 4, dtype=np.float32), (2, 1, 1)), "saliency": None, "timestamps": None},
+        {"camera_from_world": placed(1e30)},
+        {"camera_from_world": placed(3e38)},
+        {"depth_confidence": np.where(np.arange(42) % 2, 1, 3e38) * np.ones((2, 28, 1), np.float32)},
         {"depth": np.full((2, 28, 42), 1e30, np.float32), "depth_confidence": np.full((2, 28, 42), 1e-30, np.float32)},
     ],
 )

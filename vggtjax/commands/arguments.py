@@ -16,6 +16,7 @@ from vggtjax.storage.flags import Switch
 _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(required)")
 
 Sources = Annotated[tuple[str, ...], tyro.conf.Positional, _SOURCES]
+ResultPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")]
 ModelName = Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="(required)")]
 Frames = Annotated[Sampling, tyro.conf.arg(name="input", help="")]
 Size = Annotated[Framing, tyro.conf.arg(name="input", help="")]

@@ -7,17 +7,18 @@ from typing import Annotated
 
 import tyro
 
+from vggtjax.commands.arguments import ResultPath
 from vggtjax.commands.report import Report
 from vggtjax.exports.table import ExportFormat, Exporting
 
 
 def export(
-    result: tyro.conf.Positional[Path],
+    result: ResultPath,
     /,
-    out: Path,
+    out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
     *,
     to: ExportFormat,
-    pictures: Annotated[str | None, tyro.conf.arg(metavar="SOURCE")] = None,
+    pictures: Annotated[str | None, tyro.conf.arg(metavar="SOURCE", help_behavior_hint="")] = None,
     exporting: Annotated[Exporting, tyro.conf.arg(name="points")] = Exporting(),
 ) -> None:
     """Write a result for another program: COLMAP, nerfstudio, gsplat, rerun, a glTF animation, OpenEXR, TUM, KITTI.

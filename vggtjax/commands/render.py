@@ -4,27 +4,29 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from vggtjax.commands.arguments import ResultPath
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, OutputError
+from vggtjax.storage.flags import InWords
 
-_FILM = Path("preview", "turntable.mp4")  # in the folder of a result
+_FILM = "turntable.mp4"
 
 
 def render(
-    result: tyro.conf.Positional[Path],
+    result: ResultPath,
     /,
     *,
     path: Literal["orbit", "camera"] = "orbit",
     seconds: float = 6.0,
-    size: str = "960x540",
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "960x540",
     fps: float = 24.0,
-    out: Path | None = None,
+    out: Annotated[Path | None, tyro.conf.arg(metavar="FILM", help_behavior_hint="")] = None,
     format: Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] = "vggtjax",
-    quaternion: Literal["xyzw", "wxyz"] | None = None,
+    quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
 ) -> None:
     """Draw a result's points as a film: the static background stays, what moves plays.
 
@@ -34,7 +36,8 @@ def render(
         seconds: length of the film.
         size: width x height in pixels.
         fps: frames per second.
-        out: the film, an .mp4, .gif or .webp; RESULT/preview/turntable.mp4 by default.
+        out: the film, an .mp4, .gif or .webp; RESULT/preview/turntable.mp4 by default, RESULT/turntable.mp4 where
+            the result has no previews.
         format: the program that wrote the folder.
         quaternion: for vggt4d and monst3r, order of the quaternions in pred_traj.txt.
     """
@@ -45,7 +48,7 @@ def render(
         from vggtjax.results.films import film_frames, write_film
         from vggtjax.results.reconstruction import Reconstruction
 
-        film = out or (result.parent if result.is_file() else result) / _FILM
+        film = out or _film_of(result.parent if result.is_file() else result)
         check_film(film, fps)
         with report.stage("read"):
             loaded = Reconstruction.load(result, format=format, quaternion=quaternion)
@@ -57,6 +60,12 @@ def render(
     report.table({"film": film})
     if loaded.model_note:
         report.line(f"The model: {loaded.model_note}")
+
+
+def _film_of(folder: Path) -> Path:
+    """Return where the film of a result goes: beside its previews, which the next result replaces, if it has some."""
+    previews = folder / "preview"
+    return (previews if previews.is_dir() else folder) / _FILM
 
 
 def _sides(size: str) -> tuple[int, int]:

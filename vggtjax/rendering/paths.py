@@ -31,7 +31,7 @@ def fitted_intrinsics(cameras: Cameras, source: tuple[int, int], size: tuple[int
 
 def middle_camera(cameras: Cameras) -> int:
     """Return the real camera that stands nearest to the median place of all."""
-    centres = camera_centres(np.asarray(cameras.camera_from_world))
+    centres = camera_centres(np.asarray(cameras.camera_from_world, np.float64))  # squares of far places are finite
     return int(np.linalg.norm(centres - np.median(centres, axis=0), axis=-1).argmin())
 
 

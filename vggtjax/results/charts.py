@@ -9,7 +9,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from jaxtyping import Float
 
-from vggtjax.cameras import frustum_corners
+from vggtjax.cameras import camera_centres, frustum_corners
 from vggtjax.results.frame import frame_of
 from vggtjax.results.result import Result
 from vggtjax.storage.markup import element
@@ -58,14 +58,16 @@ def camera_views(result: Result) -> list[tuple[str, Element]]:
     """
     frames, height, width = result.depth.shape
     points = _scene_points(result)
-    rotation, centre = result.camera_from_world[0, :, :3], result.camera_centres[0]
-    centres = (result.camera_centres - centre) @ rotation.T
+    poses = result.camera_from_world.astype(np.float64)  # squares of far places are finite
+    world_centres = camera_centres(poses)
+    rotation, centre = poses[0, :, :3], world_centres[0]
+    centres = (world_centres - centre) @ rotation.T
     points = (points - centre) @ rotation.T
     middle = np.median(centres, axis=0)
     near = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 1.0
     size = max(0.12 * float(np.ptp(centres, axis=0).max()), 0.05 * near, 1e-9)
     shown = np.linspace(0, frames - 1, min(frames, _FRUSTA)).round().astype(int)
-    corners = frustum_corners(result.intrinsics[shown], result.camera_from_world[shown], height, width, size)
+    corners = frustum_corners(result.intrinsics[shown], poses[shown], height, width, size)
     corners = (corners - centre) @ rotation.T
     cameras = np.concatenate([corners.reshape(-1, 3), centres])
     seen = np.percentile(points, (3, 97), axis=0) if len(points) else cameras[:0]
@@ -91,7 +93,7 @@ def _scene_points(result: Result) -> Float[np.ndarray, "N 3"]:
         pixels[step // 2 :: step, step // 2 :: step] = True
         pixels &= frame.valid & ~frame.dynamic_mask
         if pixels.any():
-            pixels &= frame.confidence >= np.median(frame.confidence[pixels])
+            pixels &= frame.confidence >= np.median(frame.confidence[pixels].astype(np.float64))
         found.append(frame.world_points()[pixels])
     points = np.concatenate(found).astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]

@@ -26,6 +26,7 @@ _PLAYED = 10.0  # frames of the clip per second, where its times are not known
 _OVERLAP = 1.42  # width of a disc over the distance of neighbours: four discs of a square leave no gap
 _SPARSEST = 2.0  # pixels of its own picture: the widest that a disc gets where neighbours are far
 _NEIGHBOURS = 4
+_WIDE = 6.0  # pixels; discs that are wider take long to draw, and are coarser than any edge: they are not supersampled
 _LEFT_OUT = 10.0  # percent of the pixels, the least confident: holes look worse than unsure points
 _MIDDLE = 40  # percentile of the depths that is the scene's middle: objects are nearer than walls
 _NEAR = 0.1  # of the middle's depth; nearer points are not drawn
@@ -109,15 +110,25 @@ def _draw(
     background_splats = _splats(result, static)
     lines = _cameras(result, depth) if with_cameras else None
     shown, splats = -1, background_splats
+    kept: dict[int, Splats] = {}
+    factor = _supersampling(background_splats, intrinsics[0, 0] / depth)
     for number, frame in enumerate(due.tolist()):
         if frame != shown:
-            shown, parts = frame, [background_splats, _splats(result, moving[frame])]
+            if frame not in kept:  # the clip may be played again
+                kept[frame] = _splats(result, moving[frame])
+            shown, parts = frame, [background_splats, kept[frame]]
             if lines is not None:
                 parts.append(_colored(lines, frame, depth / intrinsics[0, 0]))
             splats = Splats.joined(*parts)
         camera = Cameras(virtual.camera_from_world[number], virtual.intrinsics[number])
-        yield draw_splats(splats, camera, size, background=background, near=_NEAR * depth)
+        yield draw_splats(splats, camera, size, background=background, near=_NEAR * depth, supersampling=factor)
         progress(number + 1, len(due))
+
+
+def _supersampling(splats: Splats, scale: float) -> int:
+    """Return how many pixels are drawn along a side of one; `scale` is the pixels of a length at the middle's depth."""
+    width = scale * float(np.median(splats.diameters)) if len(splats.diameters) else 0.0
+    return 1 if width > _WIDE else 2
 
 
 def middle_depth(cameras: Cameras, points: list[ShownPoints]) -> float:
@@ -161,10 +172,12 @@ def _steps(depth: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
 def _cameras(result: Result, depth: float) -> Float32[np.ndarray, "S L 3"]:
     """Return points along the lines of all cameras."""
     _, height, width = result.depth.shape
-    corners = frustum_corners(result.intrinsics, result.camera_from_world, height, width, _CAMERA_SIZE * depth)
+    poses = result.camera_from_world.astype(np.float64)
+    corners = frustum_corners(result.intrinsics, poses, height, width, _CAMERA_SIZE * depth)
     start, end = corners[:, _EDGES[:, 0], None], corners[:, _EDGES[:, 1], None]  # [S, 8, 1, 3]
     share = np.linspace(0, 1, _EDGE_POINTS, dtype=np.float32)[:, None]
-    return (start + share * (end - start)).reshape(len(corners), -1, 3)
+    with np.errstate(over="ignore"):  # what is infinitely far is not drawn
+        return (start + share * (end - start)).reshape(len(corners), -1, 3).astype(np.float32)
 
 
 def _colored(lines: Float32[np.ndarray, "S L 3"], due: int, pixel: float) -> Splats:

@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from jaxtyping import UInt8
 
+from vggtjax.cameras import camera_centres
 from vggtjax.errors import one_line
 from vggtjax.results import charts, previews, tracks
 from vggtjax.results.archive import ARCHIVE_NAME
@@ -144,7 +145,8 @@ def _summary(result: Result) -> Element:
     sizes = sorted({(int(w), int(h)) for h, w in result.source_size.tolist()}, reverse=True)
     objects = int(result.instances.max())
     valid = result.valid_pixels
-    length = float(np.linalg.norm(np.diff(result.camera_centres, axis=0), axis=1).sum())
+    centres = camera_centres(result.camera_from_world.astype(np.float64))  # squares of far places are finite
+    length = float(np.linalg.norm(np.diff(centres, axis=0), axis=1).sum())
     rows: list[tuple[str, str | Element]] = [
         ("Frames", f"{frames} of {width} x {height} pixels"),
         ("Source", "{} x {} pixels".format(*sizes[0]) + (f" and {len(sizes) - 1} other sizes" if sizes[1:] else "")),

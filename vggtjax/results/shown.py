@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 
+from vggtjax.cameras import camera_centres
 from vggtjax.errors import InputError, whole_number
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.frame import SAME_SURFACE, ResultFrame, frame_of
@@ -99,7 +100,7 @@ def middle_and_radius(result: Result) -> tuple[Float64[np.ndarray, " 3"], float]
 
     It is the median depth of the clip, plus the distance of the camera farthest from the middle.
     """
-    centres = result.camera_centres.astype(np.float64)
+    centres = camera_centres(result.camera_from_world.astype(np.float64))  # squares of far places are finite
     middle = centres.mean(axis=0)
     chosen = np.linspace(0, len(centres) - 1, min(len(centres), 16)).round().astype(int)
     frames = [frame_of(result, int(number)) for number in chosen]
