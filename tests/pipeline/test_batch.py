@@ -263,7 +263,7 @@ def test_a_name_that_is_no_folder_fails_alone(model, clips, tmp_path, name):
     assert (odd.name, odd.status) == (name, "failed")
     assert "a clip is named" in odd.reason
     assert "1.png" in other.reason
-    assert [path.name for path in (tmp_path / "out").iterdir()] == [SETTINGS_NAME]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {SETTINGS_NAME, "index.html"}
 
 
 def test_only_settings_that_change_results_are_compared_and_they_are_named(model, tmp_path):
