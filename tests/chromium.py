@@ -8,15 +8,25 @@ from typing import Any
 
 import pytest
 
+_NAMES = ("chromium", "chromium-browser", "google-chrome")
+_WEBGL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # by the CPU
+
+
+def chromium() -> str:
+    """Return the program's path, or skip the test."""
+    path = next(filter(None, map(shutil.which, _NAMES)), None)
+    if path is None:
+        pytest.skip("there is no Chromium on this machine")
+    return path
+
 
 @contextmanager
-def browser() -> Iterator[Any]:
+def browser(*, webgl: bool = False) -> Iterator[Any]:
     """Yield a browser of playwright, or skip the test."""
     api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if (path := shutil.which("chromium") or shutil.which("google-chrome")) is None:
-        pytest.skip("there is no Chromium on this machine")
+    path = chromium()
     with api.sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        opened = playwright.chromium.launch(executable_path=path, args=["--no-sandbox", *(_WEBGL if webgl else ())])
         yield opened
         opened.close()
 

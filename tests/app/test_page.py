@@ -2,7 +2,6 @@
 
 import io
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -12,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from tests import chromium
 from vggtjax.app.server import address, listening
 from vggtjax.commands.main import main
 from vggtjax.errors import InputError
 
 TOKEN = "0123456789abcdef"
-ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 @pytest.fixture
@@ -48,14 +47,8 @@ def served(tmp_path):
 
 @pytest.fixture
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright drives the browser")
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("there is no Chromium")
-    with playwright.sync_playwright() as driver:
-        opened = driver.chromium.launch(executable_path=chromium, args=ARGUMENTS)
+    with chromium.browser(webgl=True) as opened:
         yield opened
-        opened.close()
 
 
 def test_the_demo_clip_in_a_browser(served, browser):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.chromium import chromium
 from vggtjax import cameras as geometry
 from vggtjax.commands import main as cli
 from vggtjax.pretrained.embedded import demo_clip
@@ -186,9 +187,7 @@ def test_files_of_others_are_never_replaced(dataset, tmp_path, capsys, name):
 
 
 def test_the_page_in_a_browser(evaluated, tmp_path):
-    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if browser is None:
-        pytest.skip("no Chromium on this machine")
+    browser = chromium()
     shot = tmp_path / "page.png"
 
     def photograph(address: str) -> bool:

@@ -1,7 +1,6 @@
 """The page in a real browser: it opens from a file, plays, and shows the frame that is due."""
 
 import io
-import shutil
 import threading
 
 import numpy as np
@@ -9,13 +8,10 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
+from tests import chromium
 from tests.room import make_room
 from vggtjax.viewer.page import viewer_page
 from vggtjax.viewer.server import PageServer
-
-sync_api = pytest.importorskip("playwright.sync_api")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium on this machine")
 
 FRAMES, HEIGHT, WIDTH = 6, 28, 42
 BAR = 46  # pixels of the time line
@@ -41,11 +37,8 @@ def room():
 
 @pytest.fixture(scope="module")
 def browser():
-    flags = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with sync_api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=flags)
-        yield chromium
-        chromium.close()
+    with chromium.browser(webgl=True) as opened:
+        yield opened
 
 
 @pytest.fixture
@@ -59,11 +52,16 @@ def page(browser):
     page.close()
 
 
+def drawn(page):
+    """Return the pixels above the time line."""
+    page.evaluate(DRAWN)
+    shot = page.screenshot(clip={"x": 0, "y": 0, "width": 630, "height": 420})
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), int)
+
+
 def red(page):
     """Return the pixels of the moving box on the screen, at the size of a frame."""
-    page.evaluate(DRAWN)
-    shot = Image.open(io.BytesIO(page.screenshot(clip={"x": 0, "y": 0, "width": 630, "height": 420}))).convert("RGB")
-    pixels = np.asarray(shot, int)
+    pixels = drawn(page)
     found = (pixels[..., 0] > 150) & (pixels[..., 1] < 90) & (pixels[..., 2] < 90)
     return found.reshape(HEIGHT, 420 // HEIGHT, WIDTH, 630 // WIDTH).mean(axis=(1, 3)) > 0.5
 
@@ -169,3 +167,40 @@ def test_of_five_results_four_stand_side_by_side_under_their_names(page, room, t
     page.keyboard.press("t")
     assert "records no video" in page.locator("#message").inner_text()
     assert page.complaints == []
+
+
+def test_every_slider_and_the_tracks_change_what_is_drawn(page, room, tmp_path):
+    depth = np.where(room.dynamic_mask, np.float32(4), room.depth)  # steps of depth that the slider reaches
+    along = np.linspace(6, 30, FRAMES)[:, None, None] * [1.0, 0.5]
+    tracked = {
+        "track_positions": (along + np.arange(3)[:, None] * [3.0, 2.0]).astype(np.float32),
+        "track_visibility": np.ones((FRAMES, 3), np.float32),
+        "track_confidence": np.ones((FRAMES, 3), np.float32),
+        "track_frames": np.zeros(3, np.int32),
+    }
+    file = tmp_path / "viewer.html"
+    file.write_text(viewer_page([make_room(FRAMES, HEIGHT, WIDTH, depth=depth, **tracked)]), encoding="utf-8")
+    page.goto(file.as_uri())
+    page.evaluate(READY)
+    assert page.locator("#steps").get_attribute("max") == "0.3"
+    set_slider(page, "#time", FRAMES - 1)
+    before = drawn(page)
+    sliders = {"size": 3, "least-static": 70, "least-moving": 70, "steps": 0.3, "trail": 4}
+    for name, value in sliders.items():
+        set_slider(page, f"#{name}", value)
+        after = drawn(page)
+        assert (after != before).any(axis=-1).mean() > 1e-3, name
+        before = after
+    page.locator("#tracks").evaluate("box => box.click()")
+    assert (drawn(page) != before).any(axis=-1).sum() > 20
+    assert page.complaints == []
+
+
+def test_by_itself_it_plays_and_on_a_narrow_window_without_the_settings(browser, room, tmp_path):
+    file = tmp_path / "viewer.html"
+    file.write_text(viewer_page([room]), encoding="utf-8")
+    page = browser.new_page(viewport={"width": 500, "height": 700}, reduced_motion="no-preference")
+    page.goto(file.as_uri())
+    page.evaluate(until("window.vggtjax?.viewer.frame > 0"))
+    assert not page.locator("#panel").is_visible()
+    page.close()
