@@ -170,7 +170,9 @@ def test_of_five_results_four_stand_side_by_side_under_their_names(page, room, t
 
 
 def test_every_slider_and_the_tracks_change_what_is_drawn(page, room, tmp_path):
-    depth = np.where(room.dynamic_mask, np.float32(4), room.depth)  # steps of depth that the slider reaches
+    depth = np.where(
+        room.dynamic_mask, 0.8 * room.depth.max(axis=(1, 2), keepdims=True), room.depth
+    )  # steps of depth that the slider reaches
     along = np.linspace(6, 30, FRAMES)[:, None, None] * [1.0, 0.5]
     tracked = {
         "track_positions": (along + np.arange(3)[:, None] * [3.0, 2.0]).astype(np.float32),
@@ -185,7 +187,7 @@ def test_every_slider_and_the_tracks_change_what_is_drawn(page, room, tmp_path):
     assert page.locator("#steps").get_attribute("max") == "0.3"
     set_slider(page, "#time", FRAMES - 1)
     before = drawn(page)
-    sliders = {"size": 3, "least-static": 70, "least-moving": 70, "steps": 0.3, "trail": 4}
+    sliders = {"steps": 0.3, "size": 3, "least-static": 70, "least-moving": 70, "trail": 4}
     for name, value in sliders.items():
         set_slider(page, f"#{name}", value)
         after = drawn(page)
