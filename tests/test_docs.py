@@ -31,7 +31,7 @@ pytestmark = [
 
 @pytest.fixture(scope="module")
 def prepared(tmp_path_factory) -> Path:
-    """Return a folder with what pages read: the embedded clip as frames/ and clip.mp4.
+    """Return a folder with what pages read: the embedded clip as frames/ and clip.mp4, and the result of the latter.
 
     Clips of one shape share their compiled programs, so that only the first page takes long.
     """
@@ -46,6 +46,8 @@ def prepared(tmp_path_factory) -> Path:
             Image.fromarray(picture).save(folder / f"frames/{i:02}.png")
             video.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         video.mux(stream.encode())
+    arguments = ("--max-frames", "4", "--model", "demo", "--out", str(folder / "result"))
+    assert cli.main(["reconstruct", str(folder / "clip.mp4"), *arguments]) == 0
     return folder
 
 
