@@ -193,7 +193,7 @@ def test_the_page_in_a_browser(evaluated, tmp_path):
     def photograph(address: str) -> bool:
         shot.unlink(missing_ok=True)
         made = subprocess.run(
-            [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--window-size=1280,2400",
+            [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--window-size=1280,3200",
              f"--user-data-dir={tmp_path / 'profile'}", f"--screenshot={shot}", address],
             capture_output=True, timeout=120, check=False,
         )  # fmt: skip
@@ -204,7 +204,7 @@ def test_the_page_in_a_browser(evaluated, tmp_path):
     assert photograph((evaluated / "index.html").as_uri())
     with Image.open(shot) as picture:
         page = np.asarray(picture.convert("RGB")).astype(int)
-    assert page.shape == (2400, 1280, 3)
+    assert page.shape == (3200, 1280, 3)
     ink = (page.max(axis=2) < 120).mean(axis=1)  # dark pixels of each row: text and axes
     assert (ink[:1200] > 0.005).mean() > 0.1
     colorful = (page.max(axis=2) - page.min(axis=2) > 60).mean()
