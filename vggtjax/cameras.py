@@ -75,6 +75,20 @@ def unproject(
     return points.reshape(*frames, H, W, 3)
 
 
+def project(
+    points: Float[np.ndarray, "N 3"],
+    camera_from_world: Float[np.ndarray, "3 4"],
+    intrinsics: Float[np.ndarray, "3 3"],
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Return x and y in pixels, and depth, in the type of the points; x and y are only right where depth is above 0."""
+    pose, K = camera_from_world.astype(points.dtype), intrinsics.astype(points.dtype)
+    right, down, away = (
+        points[:, 0] * pose[axis, 0] + points[:, 1] * pose[axis, 1] + points[:, 2] * pose[axis, 2] + pose[axis, 3]
+        for axis in range(3)
+    )
+    return right / away * K[0, 0] + K[0, 2], down / away * K[1, 1] + K[1, 2], away
+
+
 def clamp_field_of_view(fov: Float[np.ndarray, "S 2"]) -> tuple[Float[np.ndarray, "S 2"], tuple[int, ...]]:
     """Clamp fields of view, two radians a frame, to FIELD_OF_VIEW_RANGE: untrained weights give 0 or more than pi.
 

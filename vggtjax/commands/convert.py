@@ -9,7 +9,7 @@ import tyro
 
 from vggtjax.commands.models import load, read_config
 from vggtjax.commands.report import Report
-from vggtjax.results.saving import Saving
+from vggtjax.results.saving import ForeignFormat, Saving
 from vggtjax.storage.flags import InWords
 
 
@@ -45,7 +45,7 @@ def import_result(
     /,
     out: Path,
     *,
-    format: Literal["vggt4d", "monst3r", "cut3r", "da3"],
+    format: ForeignFormat,
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
     confidence_percentile: float = 20.0,
 ) -> None:

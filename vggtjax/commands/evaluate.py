@@ -16,6 +16,7 @@ from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
 from vggtjax.options import METHODS, MethodName, Options, find_method
+from vggtjax.results.saving import ReadFormat
 from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
@@ -66,7 +67,7 @@ class Folders:
 
     results: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FOLDER ...", help_behavior_hint="")] = ()
     """score results in these folders instead, NAME=FOLDER, each with a folder per sequence; no model is run"""
-    format: InWords[Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] | None] = None
+    format: InWords[ReadFormat | None] = None
     """the program that wrote the folders; vggtjax by default"""
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None
     """order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw"""

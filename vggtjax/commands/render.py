@@ -11,6 +11,7 @@ import tyro
 from vggtjax.commands.arguments import ResultPath
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, OutputError
+from vggtjax.results.saving import ReadFormat
 from vggtjax.storage.flags import InWords
 
 _FILM = "turntable.mp4"
@@ -25,7 +26,7 @@ def render(
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "960x540",
     fps: float = 24.0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILM", help_behavior_hint="")] = None,
-    format: Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] = "vggtjax",
+    format: ReadFormat = "vggtjax",
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
 ) -> None:
     """Draw a result's points as a film: the static background stays, what moves plays.

@@ -14,6 +14,7 @@ import tyro
 
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
+from vggtjax.results.saving import ReadFormat
 from vggtjax.storage.flags import InWords, Switch
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ def view(
     /,
     *,
     export: InWords[Path | None] = None,
-    format: Literal["vggtjax", "vggt4d", "monst3r", "cut3r", "da3"] = "vggtjax",
+    format: ReadFormat = "vggtjax",
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
     serving: Annotated[Serving, tyro.conf.arg(name="server")] = Serving(),
 ) -> None:

@@ -41,9 +41,6 @@ def write_nerfstudio(folder: Path, items: Iterator[View], points: PointCloud) ->
 
 def _frame(view: View, stem: str) -> dict[str, Any]:
     K, (height, width) = view.frame.intrinsics, view.size
-    pose = np.eye(4)
-    rotation, translation = view.camera_from_world[:, :3], view.camera_from_world[:, 3]
-    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ translation
     return {
         "file_path": f"images/{view.name}",
         "depth_file_path": f"depth/{stem}.npy",
@@ -56,5 +53,5 @@ def _frame(view: View, stem: str) -> dict[str, Any]:
         "cy": K[1, 2],
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
         "time": view.time,
-        "transform_matrix": (pose @ _FROM_OPENCV).tolist(),
+        "transform_matrix": (view.world_from_camera @ _FROM_OPENCV).tolist(),
     }

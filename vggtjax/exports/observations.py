@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from vggtjax.cameras import project
 from vggtjax.exports.views import View, rigid
 from vggtjax.results.frame import SAME_SURFACE
 from vggtjax.results.result import Result
@@ -43,18 +44,15 @@ def observe(result: Result, shown: ShownPoints) -> Observations:
     return Observations(points, shown.values(result.images), frames[chosen], indices[chosen])
 
 
-def project(view: View, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 2"]:
+def pixels_of(view: View, points: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 2"]:
     """Return where points fall in the picture of a view; pixel edges are at whole numbers."""
-    pose, K = view.camera_from_world, view.frame.intrinsics
-    x, y, z = (points @ pose[:, :3].T + pose[:, 3]).T
-    return np.column_stack([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]])
+    return np.column_stack(project(points, view.camera_from_world, view.frame.intrinsics)[:2])
 
 
 def _seen(result: Result, number: int, points: Float64[np.ndarray, "N 3"]) -> Int64[np.ndarray, " K"]:
-    pose, K, depth = rigid(result.camera_from_world[number]), result.intrinsics[number], result.depth[number]
-    x, y, z = (points @ pose[:, :3].T + pose[:, 3]).T
+    depth = result.depth[number]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        column, row, z = project(points, rigid(result.camera_from_world[number]), result.intrinsics[number])
     height, width = depth.shape
     indices = np.flatnonzero((z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height))
     at = row[indices].astype(int), column[indices].astype(int)
@@ -86,4 +84,4 @@ def view_observations(
     """Yield each view with the indices of the points that it sees, and where they fall in its picture."""
     for number, view in enumerate(items):
         indices = observations.of_frame(number)
-        yield view, indices, project(view, observations.points[indices])
+        yield view, indices, pixels_of(view, observations.points[indices])

@@ -25,8 +25,7 @@ def write_rerun(path: Path, items: Iterator[View], static: PointCloud, moving: S
     centres = []
     for number, view in enumerate(items):
         height, width = view.size
-        pose = view.camera_from_world
-        rotation, centre = pose[:, :3].T, -pose[:, :3].T @ pose[:, 3]
+        rotation, centre = view.world_from_camera[:3, :3], view.world_from_camera[:3, 3]
         centres.append(centre)
         recording.set_time("frame", sequence=number)
         recording.set_time("time", duration=view.time)

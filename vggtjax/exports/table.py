@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
-from vggtjax.errors import InputError, whole_number
+from msgspec import Meta
+
+from vggtjax.storage.json_values import check_fields
 
 ExportFormat = Literal["colmap", "colmap-text", "gsplat", "nerfstudio", "rerun", "glb-animated", "exr", "tum", "kitti"]
 
@@ -35,14 +37,10 @@ FORMATS: dict[ExportFormat, Format] = {
 class Exporting:
     """Which points an export holds. Raises InputError for a value out of range."""
 
-    points: int = 100_000
+    points: Annotated[int, Meta(ge=1)] = 100_000
     """most static points to write; moving points get as many in each frame"""
-    confidence_percentile: float = 20.0
+    confidence_percentile: Annotated[float, Meta(ge=0, lt=100)] = 20.0
     """percent of the pixels, the least confident, to leave out of the points"""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "points", whole_number("points", self.points, 1))
-        if not 0 <= self.confidence_percentile < 100:
-            raise InputError(
-                f"confidence_percentile is {self.confidence_percentile}; expected at least 0 and less than 100"
-            )
+        check_fields(self)

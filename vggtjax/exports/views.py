@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64, UInt8
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from vggtjax.cameras import world_from_camera
 from vggtjax.clips.images import ImageFiles
 from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.errors import ClipError
@@ -38,6 +39,11 @@ class View(NamedTuple):
     def camera_from_world(self) -> Float64[np.ndarray, "3 4"]:
         """The pose with a rotation that is one to float64."""
         return rigid(self.frame.camera_from_world)
+
+    @property
+    def world_from_camera(self) -> Float64[np.ndarray, "4 4"]:
+        """The inverse of `camera_from_world`."""
+        return world_from_camera(self.camera_from_world[None])[0]
 
     @property
     def static(self) -> Bool[np.ndarray, "h w"]:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int, Int32, UInt8
 
-from vggtjax.cameras import Cameras
+from vggtjax.cameras import Cameras, project
 from vggtjax.errors import InputError, whole_number
 
 BACKGROUND = (20, 20, 24)
@@ -74,23 +74,6 @@ def _mean(picture: UInt8[np.ndarray, "h w C"], factor: int) -> UInt8[np.ndarray,
         for column in range(factor):
             total += picture[row::factor, column::factor]
     return (total // factor**2).astype(np.uint8)
-
-
-def project(
-    positions: Float[np.ndarray, "N 3"],
-    camera_from_world: Float[np.ndarray, "3 4"],
-    intrinsics: Float[np.ndarray, "3 3"],
-) -> tuple[Float32[np.ndarray, " N"], Float32[np.ndarray, " N"], Float32[np.ndarray, " N"]]:
-    """Return x and y in pixels, edges at whole numbers, and depth; x and y are only right where depth is above 0."""
-    pose = camera_from_world.astype(np.float32)
-    right, down, away = (
-        positions[:, 0] * pose[axis, 0] + positions[:, 1] * pose[axis, 1] + positions[:, 2] * pose[axis, 2]
-        + pose[axis, 3]
-        for axis in range(3)
-    )  # fmt: skip
-    x = right / away * np.float32(intrinsics[0, 0]) + np.float32(intrinsics[0, 2])
-    y = down / away * np.float32(intrinsics[1, 1]) + np.float32(intrinsics[1, 2])
-    return x, y, away
 
 
 def pixel_radii(

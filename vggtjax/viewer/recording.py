@@ -14,9 +14,7 @@ from vggtjax.progress import Progress
 from vggtjax.results.result import Result
 from vggtjax.results.shown import middle_and_radius, shown_points
 from vggtjax.storage.writing import writing
-from vggtjax.viewer.scene import SAME_PLACE, Budget, frame_rate, home_view, spacing
-
-_FRUSTUM = 0.07  # of the scene's radius
+from vggtjax.viewer.scene import FRUSTUM, SAME_PLACE, Budget, frame_rate, home_view, spacing
 
 
 def write_recording(
@@ -52,7 +50,7 @@ def write_recording(
                     f"/frame/{frame:06d}/camera",
                     fov=float(2 * np.arctan(height / 2 / result.intrinsics[frame, 1, 1])),
                     aspect=width / height,
-                    scale=_FRUSTUM * radius,
+                    scale=FRUSTUM * radius,
                     image=result.images[frame],
                     wxyz=rotation.as_quat(scalar_first=True),
                     position=result.camera_centres[frame],

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from cmap import Colormap
-from jaxtyping import Bool, Float, Float32, Float64, Int, UInt8, UInt16
+from jaxtyping import Float, Float32, Float64, UInt8, UInt16
 from PIL import Image
 from scipy.spatial import KDTree
 
@@ -25,7 +25,7 @@ from vggtjax.viewer.colors import TIME_RAMP, confidence_ranks, lacks, offered_co
 LARGEST_STEP = 0.3  # of depth between neighbours, as a share; pixels beside larger ones are never shown
 _LEAST_MOVING = 200  # points of a frame
 _STEEPEST = 8.0  # slope of a surface, up to which a step of depth is none
-_FRUSTUM = 0.045  # of the scene's radius
+FRUSTUM = 0.045  # of the scene's radius
 _BEHIND, _ABOVE = 0.18, 0.11  # of the median depth: where the first view stands from a camera
 _SPLAT = 1.2  # distances to the fourth neighbour: a point's width
 _PLAIN_RATE = 10.0  # frames a second without timestamps
@@ -85,7 +85,7 @@ def scene_of(
     centre, radius = place.points(middle), radius * place.scale
     positions = place.points(points.positions)
     corners = frustum_corners(result.intrinsics, result.camera_from_world, H, W, 1)
-    corners = place.points(corners[:, :1] + (corners - corners[:, :1]) * (_FRUSTUM * radius / place.scale))
+    corners = place.points(corners[:, :1] + (corners - corners[:, :1]) * (FRUSTUM * radius / place.scale))
     busiest = max(moving, key=lambda part: len(part.pixels))
     return {
         "name": one_line(name, 80),
@@ -105,7 +105,7 @@ def scene_of(
         "movingSize": place.scale * spacing(busiest, radius / place.scale),
         "colors": offered_colors(result, points),
         "corners": corners.ravel(),
-        "frustumSize": _FRUSTUM * radius,
+        "frustumSize": FRUSTUM * radius,
         "frameColors": TIME_RAMP[np.linspace(0, 230, S).round().astype(int)].ravel(),
         "tracks": _tracks(result, place),
         "home": home_view(result, place),
@@ -227,16 +227,10 @@ def _tracks(result: Result, place: Place) -> dict[str, Any] | None:
     positions = np.full((S, count, 3), np.nan, np.float32)
     for number in range(S):
         frame = frame_of(result, number)
-        known = inside[number] & _at(frame.valid, rows[number], columns[number])
+        known = inside[number] & frame.valid[rows[number], columns[number]]
         positions[number, known] = place.points(frame.world_points()[rows[number], columns[number]][known])
     hues = Colormap("hsv")(np.linspace(0, 1, count, endpoint=False))[:, :3]
     return {"positions": positions.ravel(), "colors": (hues * 255).round().astype(np.uint8).ravel()}
-
-
-def _at(
-    picture: Bool[np.ndarray, "H W"], rows: Int[np.ndarray, " Q"], columns: Int[np.ndarray, " Q"]
-) -> Bool[np.ndarray, " Q"]:
-    return picture[rows, columns]
 
 
 def _sheet(result: Result) -> dict[str, Any]:
