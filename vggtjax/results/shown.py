@@ -17,6 +17,7 @@ from vggtjax.results.thinning import Candidates, EvenThinning, places_in_cube
 
 MOST_STATIC, MOST_MOVING = 1_000_000, 50_000  # points of the clip, points of a frame
 _STEEPEST = 8.0  # slope of a surface, away over across, beyond which neighbours belong to two: 83 degrees
+_NEIGHBOURS = ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:]))  # pixels and the next ones, by axis
 
 
 class ShownPoints(NamedTuple):
@@ -109,19 +110,26 @@ def middle_and_radius(result: Result) -> tuple[Float64[np.ndarray, " 3"], float]
     return middle, reach + float(np.linalg.norm(centres - middle, axis=-1).max())
 
 
+def relative_steps(frame: ResultFrame) -> Float32[np.ndarray, "h w"]:
+    """Return the largest step of depth to a valid neighbour, over the smaller of both; 0 on slopes up to 83 degrees."""
+    steps = np.zeros(frame.depth.shape, np.float32)
+    for axis, (before, after) in enumerate(_NEIGHBOURS):
+        one, other = frame.depth[before], frame.depth[after]
+        with np.errstate(all="ignore"):
+            step = np.where(frame.valid[before] & frame.valid[after], np.abs(one - other) / np.minimum(one, other), 0)
+        slope = _STEEPEST / frame.intrinsics[1 - axis, 1 - axis]  # a pixel spans the angle 1 / focal length
+        step[~(step > slope)] = 0
+        np.maximum(steps[before], step, out=steps[before])
+        np.maximum(steps[after], step, out=steps[after])
+    return steps
+
+
 def _on_edges(frame: ResultFrame, edges: float) -> Bool[np.ndarray, "h w"]:
     """Return the pixels beside a step of depth, on both of its sides, and the static pixels beside moving ones."""
-    found = np.zeros(frame.depth.shape, bool)
-    valid, moving = frame.valid, frame.dynamic_mask
-    for axis in range(2):
-        most = max(edges, _STEEPEST / frame.intrinsics[1 - axis, 1 - axis])  # a pixel spans the angle 1 / focal length
-        before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
-        one, other = frame.depth[before], frame.depth[after]
-        with np.errstate(invalid="ignore", over="ignore"):
-            step = np.abs(one - other) > most * np.minimum(one, other)
-        step &= valid[before] & valid[after]
-        found[before] |= step | (moving[after] & ~moving[before])
-        found[after] |= step | (moving[before] & ~moving[after])
+    found, moving = relative_steps(frame) > edges, frame.dynamic_mask
+    for before, after in _NEIGHBOURS:
+        found[before] |= moving[after] & ~moving[before]
+        found[after] |= moving[before] & ~moving[after]
     return found
 
 

@@ -18,13 +18,12 @@ from vggtjax.errors import one_line
 from vggtjax.progress import Progress
 from vggtjax.results.frame import frame_of
 from vggtjax.results.result import Result
-from vggtjax.results.shown import ShownPoints, middle_and_radius, shown_points
+from vggtjax.results.shown import ShownPoints, middle_and_radius, relative_steps, shown_points
 from vggtjax.results.tracks import SEEN
 from vggtjax.viewer.colors import TIME_RAMP, confidence_ranks, lacks, offered_colors
 
 LARGEST_STEP = 0.3  # of depth between neighbours, as a share; pixels beside larger ones are never shown
 _LEAST_MOVING = 200  # points of a frame
-_STEEPEST = 8.0  # slope of a surface, up to which a step of depth is none
 FRUSTUM = 0.045  # of the scene's radius
 _BEHIND, _ABOVE = 0.18, 0.11  # of the median depth: where the first view stands from a camera
 _SPLAT = 1.2  # distances to the fourth neighbour: a point's width
@@ -169,18 +168,8 @@ def _steps(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
 
 
 def _frame_steps(result: Result, number: int) -> UInt8[np.ndarray, "H W"]:
-    frame = frame_of(result, number)
-    largest = np.zeros(frame.depth.shape)
-    for axis in range(2):
-        before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
-        one, other = frame.depth[before], frame.depth[after]
-        both = frame.valid[before] & frame.valid[after]
-        with np.errstate(all="ignore"):
-            step = np.where(both, np.abs(one - other) / np.minimum(one, other), 0)
-        step[~(step > _STEEPEST / frame.intrinsics[1 - axis, 1 - axis])] = 0
-        np.maximum(largest[before], step, out=largest[before])
-        np.maximum(largest[after], step, out=largest[after])
-    return (np.clip(largest / LARGEST_STEP, 0, 1) * 255).round().astype(np.uint8)
+    steps = relative_steps(frame_of(result, number))
+    return (np.clip(steps / LARGEST_STEP, 0, 1) * 255).round().astype(np.uint8)
 
 
 def _cameras(result: Result, place: Place) -> dict[str, Any]:
