@@ -9,9 +9,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 
-from vggtjax.errors import ResultError
+from vggtjax.errors import InputError, ResultError
 
 if TYPE_CHECKING:
     import jax
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _Array = TypeVar("_Array", np.ndarray, "jax.Array")
 
 FIELD_OF_VIEW_RANGE = (0.01, 3.1)  # radians; beyond it a pinhole camera has no usable focal length
+_NOT_RIGID = 1e-2  # largest difference of R^T R from the identity
 _FIELD_OF_VIEW_SLACK = 1e-6  # radians; a clamped camera that went through float32 is not clamped again
 
 
@@ -27,6 +28,20 @@ class Cameras(NamedTuple):
 
     camera_from_world: Float[Any, "*F 3 4"]
     intrinsics: Float[Any, "*F 3 3"]
+
+
+def checked_poses(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarray, "S 3 4"]:
+    """Return poses in float64; raises InputError unless they are rigid transforms [S, 3, 4]."""
+    poses = np.asarray(camera_from_world, np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (3, 4):
+        raise InputError(f"camera poses have shape {poses.shape}; expected [S, 3, 4]")
+    if not np.isfinite(poses).all():
+        raise InputError("camera poses have values that are not finite; expected rotations and translations")
+    rotation = poses[:, :, :3]
+    skewed = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2)) > _NOT_RIGID
+    if (wrong := np.flatnonzero(skewed | (np.linalg.det(rotation) < 0))).size:
+        raise InputError(f"the camera pose of frame {wrong[0]} is not a rotation and a translation")
+    return poses
 
 
 def camera_centres(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float[np.ndarray, "S 3"]:

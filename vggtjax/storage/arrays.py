@@ -1,4 +1,7 @@
-"""Files of plain arrays (.npz, .npy): nothing is unpickled, and sizes are checked before arrays are read."""
+"""Files of plain arrays (.npz, .npy): nothing is unpickled, and sizes are checked before arrays are read.
+
+Large arrays that stand uncompressed in an .npz are not read but mapped: their pages are read when they are used.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import ast
 import re
 import struct
 import sys
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator, Mapping
@@ -23,6 +27,11 @@ SIZE_LIMIT = 64 * 2**30  # bytes of all arrays of one file
 _LENGTHS = {(1, 0): 2, (2, 0): 4}  # version of the format -> bytes of the length of a header
 _MOST_HEADER_BYTES = 2**14
 _MOST_AXES = 32
+_LEAST_MAPPED = 2**20  # bytes of an array; smaller ones are read
+_ALIGNMENT = 64  # bytes; arrays that are mapped start at such places
+_LOCAL_HEADER, _ZIP64_BYTES = 30, 20  # bytes of a zip's header before each file, without names; of its sizes of 64 bits
+_PADDING = 0xD935  # a zip's name for bytes that align what follows
+_MOST_SPREAD = 2**25  # values of a mapped array of which statistics are made
 _DESCR = re.compile(r"[<>|=]?(?:[?biufcmM]|[SUV][1-9])\d{0,10}(\[\w{1,10}\])?")
 # Exceptions of zipfile, numpy and Python's parser for truncated or damaged files.
 _BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, SyntaxError, RuntimeError, MemoryError)
@@ -36,11 +45,44 @@ class Header(NamedTuple):
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Write `arrays` to a compressed .npz file."""
+    """Write `arrays` to an .npz file, compressed but for mapped arrays, which are mapped again when they are read."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_DEFLATE_LEVEL) as archive:
         for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+            member: zipfile.ZipInfo | str = f"{name}.npy"
+            if is_mapped(array) and archive.fp is not None:
+                member = zipfile.ZipInfo(f"{name}.npy")  # is stored, not compressed
+                place = archive.fp.tell() + _LOCAL_HEADER + len(member.filename) + _ZIP64_BYTES + 4
+                padding = -place % _ALIGNMENT
+                member.extra = struct.pack("<HH", _PADDING, padding) + bytes(padding)
+            with archive.open(member, "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, np.asarray(array, order="C"), allow_pickle=False)
+
+
+def is_mapped(array: object) -> bool:
+    """Return whether an array is a mapped file: as large as a disk, and read when it is used."""
+    return isinstance(array, np.memmap)
+
+
+def zeros_beside(array: np.ndarray, dtype: type, shape: tuple[int, ...] | None = None) -> np.ndarray:
+    """Return zeros of an array's shape: in memory, or for a mapped array in a file without a name."""
+    shape = array.shape if shape is None else shape
+    if not is_mapped(array) or not prod(shape):
+        return np.zeros(shape, dtype)
+    with tempfile.TemporaryFile() as file:  # the map keeps it open
+        return np.memmap(file, dtype, "w+", shape=shape)
+
+
+def spread_frames(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return what statistics are made of: the arrays, or some of their frames, evenly spread, where they are mapped.
+
+    Of a mapped array about 2**25 values are taken; all arrays have the frames of the first.
+    """
+    first = arrays[0]
+    if not is_mapped(first) or first.size <= _MOST_SPREAD:
+        return arrays
+    count = max(1, _MOST_SPREAD // (first.size // len(first)))
+    chosen = np.linspace(0, len(first) - 1, count).round().astype(int)
+    return tuple(np.asarray(array[chosen]) for array in arrays)
 
 
 def read_headers(path: Path) -> dict[str, Header]:
@@ -67,6 +109,7 @@ def read_array(path: Path) -> np.ndarray:
 def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """Return all arrays of an .npz file, or those with these names; raises ResultError as `read_headers` does.
 
+    Those that stand uncompressed and take 1 MB or more are mapped. They may be written to; the file stays as it is.
     Check the headers of an untrusted file first: a small compressed file can hold large arrays.
     """
     arrays = {}
@@ -74,13 +117,30 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, n
         for name, member, file in _members(archive):
             if names is not None and name not in names:
                 continue
-            _read_header(file, member.filename, member.file_size)
+            header = _read_header(file, member.filename, member.file_size)
+            if member.compress_type == zipfile.ZIP_STORED and member.file_size >= _LEAST_MAPPED:
+                arrays[name] = _mapped(path, member, file.tell(), header)
+                continue
             file.seek(0)
             array = np.lib.format.read_array(file, allow_pickle=False)
             if array.dtype.kind == "U" and (np.atleast_1d(array).view(np.uint32) > sys.maxunicode).any():
                 raise ResultError(f"{member.filename} holds text that is not Unicode")
             arrays[name] = array
     return arrays
+
+
+def _mapped(path: Path, member: zipfile.ZipInfo, offset: int, header: Header) -> np.ndarray:
+    """Return an array that stands uncompressed in a zip, `offset` bytes into its file, as a mapped file."""
+    with path.open("rb") as file:
+        file.seek(member.header_offset)
+        local = file.read(_LOCAL_HEADER)
+    if len(local) < _LOCAL_HEADER or header.dtype.kind not in "biuf":
+        raise ResultError(f"{member.filename} is not a whole array of numbers")
+    names = sum(struct.unpack("<HH", local[26:]))
+    place = member.header_offset + _LOCAL_HEADER + names + offset
+    if place + prod(header.shape) * header.dtype.itemsize > path.stat().st_size:
+        raise ResultError(f"{member.filename} ends after the file does; it is not a whole .npz file")
+    return np.memmap(path, header.dtype, "c", place, header.shape)
 
 
 @contextmanager

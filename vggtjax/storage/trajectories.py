@@ -7,15 +7,17 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float64, Int
 from scipy.spatial.transform import Rotation
 
-from vggtjax.errors import ResultError, check_choice, reading
+from vggtjax.errors import InputError, ResultError, check_choice, reading
 
 Quaternion = Literal["xyzw", "wxyz"]
 
 _MOST_BYTES = 2**27  # of a text file; a million poses
 _UNIT = 0.01  # by which a quaternion's length may differ from 1
+_WIDER = 1.01  # times the tolerance is the search range for partners: sums of times are rounded
+_MOST_CANDIDATES = 10_000_000  # pairs of timestamps within the tolerance; 160 MB of indices
 _COLUMNS = {"xyzw": "qx qy qz qw", "wxyz": "qw qx qy qz"}
 
 
@@ -72,9 +74,65 @@ def read_trajectory(
     return rows[:, 0], poses
 
 
-def read_numbers(path: str | Path, columns: int) -> Float[np.ndarray, "S columns"]:
-    """Read a text file of `columns` finite numbers per line. Raises ResultError for anything else."""
+def associate(
+    times: Float[np.ndarray, " N"], other_times: Float[np.ndarray, " M"], tolerance: float = 0.02
+) -> Int[np.ndarray, "K 2"]:
+    """Return pairs of timestamps, as TUM's tools for RGB-D sequences pair them.
+
+    Of all pairs less than `tolerance` apart the closest comes first, then the closest pair of unpaired timestamps, and
+    so on.
+
+    Args:
+        times: seconds, in any order.
+        other_times: seconds, in any order.
+        tolerance: seconds; a pair exactly as far apart does not count.
+
+    Returns:
+        Indices into `times` and `other_times`, in the order of `times`; empty if no pair is close enough.
+
+    Raises:
+        InputError: times that are not finite or not one-dimensional, a tolerance that is not above 0, or more than ten
+            million pairs within the tolerance.
+    """
+    first, second = (_timestamps(name, values) for name, values in (("times", times), ("other_times", other_times)))
+    if not tolerance > 0:
+        raise InputError(f"tolerance is {tolerance}; expected seconds above 0")
+    order = np.argsort(second, kind="stable")
+    starts = np.searchsorted(second[order], first - _WIDER * tolerance, side="left")
+    counts = np.searchsorted(second[order], first + _WIDER * tolerance, side="right") - starts
+    if counts.sum() > _MOST_CANDIDATES:
+        raise InputError(f"{counts.sum()} pairs of times are within {tolerance} s; expected a smaller tolerance")
+    left = np.repeat(np.arange(len(first)), counts)
+    offsets = np.arange(len(left)) - np.repeat(counts.cumsum() - counts, counts)
+    right = order[np.repeat(starts, counts) + offsets]
+    apart = np.abs(first[left] - second[right])
+    near = np.flatnonzero(apart < tolerance)
+    near = near[np.lexsort((second[right[near]], first[left[near]], apart[near]))]
+    partner = np.full(len(first), -1)
+    taken = np.zeros(len(second), bool)
+    for i, j in zip(left[near].tolist(), right[near].tolist(), strict=True):
+        if partner[i] < 0 and not taken[j]:
+            partner[i], taken[j] = j, True
+    paired = np.flatnonzero(partner >= 0)
+    paired = paired[np.argsort(first[paired], kind="stable")]
+    return np.stack([paired, partner[paired]], axis=1)
+
+
+def _timestamps(name: str, times) -> Float64[np.ndarray, " N"]:
+    times = np.asarray(times, np.float64)
+    if times.ndim != 1 or not np.isfinite(times).all():
+        raise InputError(f"{name} has shape {times.shape}; expected finite seconds [N]")
+    return times
+
+
+def read_numbers(path: str | Path, columns: int | tuple[int, ...]) -> Float[np.ndarray, "S columns"]:
+    """Read a text file of finite numbers, `columns` in every line, or one of several numbers of columns.
+
+    Raises ResultError for anything else.
+    """
     path = Path(path)
+    choices = (columns,) if isinstance(columns, int) else columns
+    expected = " or ".join(map(str, choices))
     with reading(path, ResultError), path.open(encoding="utf-8") as file, warnings.catch_warnings():
         if path.stat().st_size > _MOST_BYTES:
             raise ResultError(f"{path} has {path.stat().st_size} bytes; expected at most {_MOST_BYTES}")
@@ -83,10 +141,10 @@ def read_numbers(path: str | Path, columns: int) -> Float[np.ndarray, "S columns
             array = np.loadtxt((line.replace(",", " ") for line in file), ndmin=2)
         except ValueError as error:  # not text, not numbers, or lines of different length
             reason = str(error).split(";")[0].split("\n")[0][:100]
-            raise ResultError(f"{path} is not a table of {columns} numbers a line ({reason})") from None
-    if array.shape[1] != columns or not len(array):
+            raise ResultError(f"{path} is not a table of {expected} numbers a line ({reason})") from None
+    if array.shape[1] not in choices or not len(array):
         problem = f"has {array.shape[1]} numbers a line" if len(array) else "is empty"
-        raise ResultError(f"{path} {problem}; expected {columns} numbers a line")
+        raise ResultError(f"{path} {problem}; expected {expected} numbers a line")
     if not np.isfinite(array).all():
         raise ResultError(f"{path} holds {array[~np.isfinite(array)][0]}; expected finite numbers")
     return array

@@ -7,21 +7,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from benchmarks.blind import (
-    still,
-)
+from benchmarks.blind import still
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.trajectory import (
-    Similarity,
-    align,
-    associate,
-    centre_error,
-    centres,
-    from_first,
-    rotation_error,
-    trajectory_errors,
-    umeyama_sim3,
-)
+from vggtjax.evaluation.metrics.trajectory import associate, centre_error, from_first, rotation_error, trajectory_errors
+from vggtjax.geometry.similarity import Similarity, align, centres, umeyama_sim3
 
 
 def cameras(points, rotation=None) -> np.ndarray:

@@ -1,0 +1,1 @@
+"""Geometry of space that is not of one camera."""
