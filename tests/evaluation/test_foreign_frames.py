@@ -27,6 +27,9 @@ def of_size(width, height, frames=2):
 def test_our_own_know_by_themselves():
     room = make_room(2, frame_names=("a", "b"))  # from pictures of twice the size
     assert placed(room, "vggtjax", [(84, 56)] * 2, ["a", "b"]) is room
+    frames = placed(room, "vggtjax", [(42, 28)] * 2, ["a", "b"])  # the frames themselves, as exports hold them
+    assert frames.source_size.tolist() == [[28, 42]] * 2
+    assert (frames.source_scale.tolist(), frames.source_offset.tolist()) == ([[1, 1]] * 2, [[0, 0]] * 2)
     with pytest.raises(InputError, match=r"frame 1 of the result was 84 x 56, the sequence's picture is \(80, 56\)"):
         placed(room, "vggtjax", [(84, 56), (80, 56)], ["a", "b"])
     with pytest.raises(InputError, match=r"the result is of frames a, b, \.\.\. and the sequence has b, c"):

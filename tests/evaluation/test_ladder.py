@@ -12,7 +12,7 @@ from tests.tiny import tiny_config
 from vggtjax import Model, Passes, assemble, infer, init_params, load_clip, reconstruct
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
-from vggtjax.evaluation.ladder import LadderRow, ladder
+from vggtjax.evaluation.ladder import LadderRow, error_table, ladder, second_pass_in_words
 from vggtjax.evaluation.metrics.depth import depth_errors, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
@@ -179,6 +179,30 @@ def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):
     assert row.abs_rel is row.abs_rel_static is row.delta1 is row.rotation_error is row.saliency_auc is None
     for sentence in ("predicted depths are not finite", "camera poses have values that are not finite"):
         assert sentence in row.failure
+
+
+@pytest.mark.parametrize(
+    ("rotation", "centres", "abs_rel", "expected"),
+    [
+        (1.5, 0.01, 0.1, "the second pass steadies the cameras (rotation 2.00° -> 1.50°, centres 0.020 -> 0.010), "
+         "and depth is better (AbsRel 0.200 -> 0.100)"),
+        (2.5, 0.03, 0.2, "does not steady the cameras (rotation 2.00° -> 2.50°, centres 0.020 -> 0.030), and depth is "
+         "no better"),
+        (2.0, 0.01, 0.3, "steadies the centres of the cameras only"),
+        (1.0, 0.02, 0.3, "steadies the rotation of the cameras only"),
+    ],
+)  # fmt: skip
+def test_words_follow_the_numbers(rows, rotation, centres, abs_rel, expected):
+    first = replace(only(rows, clip=0, method="vggt"), rotation_error=2.0, centre_error_ratio=0.02, abs_rel=0.2)
+    second = replace(
+        first, method="4dvggt-d", mask_source="mined", rotation_error=rotation, centre_error_ratio=centres,
+        abs_rel=abs_rel,
+    )  # fmt: skip
+    words = second_pass_in_words([first, second])
+    assert words.startswith("Mined masks: the second pass ")
+    assert expected in words
+    assert second_pass_in_words([first]) == second_pass_in_words([first, replace(second, abs_rel=None)]) == ""
+    assert error_table([first, second]).note.startswith(words)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, UInt8
 
+from vggtjax.captures.frames import CaptureFrames
 from vggtjax.clips.preprocessing import Fit, Fitter, Mode
 from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.clips.sources import ClipSource, open_source
@@ -35,7 +36,7 @@ class Clip:
 
     images: Float32[np.ndarray, "S H W 3"] = field(repr=False)  # RGB in [0, 1]
     frame_names: list[str] = field(repr=False)  # stem of the image file, or 000000-style index in the source
-    timestamps: Float64[np.ndarray, " S"] | None = field(repr=False)  # seconds from the video's first frame; or None
+    timestamps: Float64[np.ndarray, " S"] | None = field(repr=False)  # seconds from the source's first frame; or None
     mode: Mode
     size: int
     patch: int
@@ -96,8 +97,9 @@ def load_clip(
     Args:
         source: a folder of images, a pattern such as "frames/*.png", an image or video file, a list of image paths,
             a list of PIL images or of arrays [H, W, 3], or one array [S, H, W, 3] (uint8, uint16, or floating point
-            in [0, 1], all brought to 8 bits). Files of folders and patterns are taken in natural order (frame_2 before
-            frame_10), hidden files and files that are not images left out; a list keeps its order.
+            in [0, 1], all brought to 8 bits), or a capture of an app (see `vggtjax.captures.find_capture`).
+            Files of folders and patterns are taken in natural order (frame_2 before frame_10), hidden files and files
+            that are not images left out; a list keeps its order.
         mode: "crop" makes frames `size` wide and cuts the height to at most `size`; "pad" makes the long side `size`
             and pads the frame with white to a square.
         size: width, or side of the square; a multiple of `patch`.
@@ -121,6 +123,9 @@ def load_clip(
 
 def read_clip(source: Source, sampling: Sampling, fitter: Fitter, progress: Progress | None = None) -> Clip:
     """Read the frames of a source that `sampling` takes, fitted to the model; `load_clip` says more."""
+    if isinstance(source, CaptureFrames):
+        for note in source.capture.left_out:
+            logger.warning("%s: %s", source.capture.path, note)
     total = source.total(sampling)
     names: list[str] = []
     times: list[float] = []

@@ -37,6 +37,11 @@ class ImageFiles:
         path = self.paths[0].absolute()
         return path.stem if len(self.paths) == 1 else path.parent.name
 
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """The names of all frames."""
+        return tuple(path.stem for path in self.paths)
+
     def total(self, sampling: Sampling) -> int:
         """Return how many frames `sampling` takes."""
         return len(sampling.indices(len(self.paths)))

@@ -20,7 +20,7 @@ TIME_ROUNDING = 1e-3  # seconds; containers such as Matroska round presentation 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of a source: its name, its upright RGB image and, for video, its time in seconds."""
+    """One frame of a source: its name, its upright RGB image and, for a video or some captures, its time in seconds."""
 
     name: str
     image: Image.Image

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import glob
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -12,11 +11,14 @@ from typing import Any, TypeAlias
 import numpy as np
 from PIL import Image, ImageOps
 
+from vggtjax.captures.frames import CaptureFrames
+from vggtjax.captures.table import capture_kind, find_capture
 from vggtjax.clips.arrays import ArrayFrames
 from vggtjax.clips.images import ImageFiles, is_image_name, to_rgb
+from vggtjax.clips.order import natural_key
 from vggtjax.clips.sampling import Source
 from vggtjax.clips.video import VideoFile, is_video_name
-from vggtjax.errors import ClipError, reading
+from vggtjax.errors import ClipError, InputError, reading
 
 Name: TypeAlias = str | os.PathLike[str]
 ClipSource: TypeAlias = Name | Sequence[Name] | Sequence[Image.Image] | Sequence[np.ndarray] | np.ndarray
@@ -62,9 +64,8 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
             if not path.exists():
                 raise _missing(text)
             entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
-            whole = not path.is_dir() or any(is_image_name(entry) for entry in entries)
-        visible = [entry for entry in entries if not entry.name.startswith(".")]
-        clips = [path] if whole else [entry for entry in visible if entry.is_dir() or is_video_name(entry)]
+            whole = not path.is_dir() or any(is_image_name(entry) for entry in entries) or bool(capture_kind(path))
+            clips = [path] if whole else [entry for entry in entries if _is_clip(entry)]
         if not clips:
             raise ClipError(f"{path} is not a clip and holds no clips; expected folders of images, or videos")
         for clip in clips:
@@ -77,12 +78,8 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def natural_key(path: Path) -> list[list[str | int]]:
-    """Return a key that sorts frame_2 before frame_10: runs of digits in each part of the path are numbers."""
-    return [
-        [int(piece) if piece.isdecimal() else piece.casefold() for piece in re.split(r"(\d+)", part)]
-        for part in path.parts
-    ]
+def _is_clip(entry: Path) -> bool:
+    return not entry.name.startswith(".") and (entry.is_dir() or is_video_name(entry) or bool(capture_kind(entry)))
 
 
 def _from_path(name: str) -> Source:
@@ -90,6 +87,8 @@ def _from_path(name: str) -> Source:
     with reading(name, ClipError):
         if not name or "\0" in name:
             raise ClipError(f"{name!r} is not a path; expected a folder, a pattern, or an image or video file")
+        if (capture := _capture(path)) is not None:
+            return capture
         if path.is_dir():
             entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
             return _images(entries, f"folder {path} holds", "name the folder or file with the frames")
@@ -101,6 +100,14 @@ def _from_path(name: str) -> Source:
             matches = [Path(match) for match in glob.glob(name, recursive=True)]  # noqa: PTH207 - absolute patterns too
             return _images(matches, f"pattern {name} matches", "expected images")
     raise _missing(name)
+
+
+def _capture(path: Path) -> CaptureFrames | None:
+    try:
+        capture = find_capture(path)
+    except InputError as error:
+        raise ClipError(f"{error}; name the folder of the pictures to leave its cameras out") from error
+    return None if capture is None else CaptureFrames(tuple(path.absolute() for path in capture.pictures), capture)
 
 
 def _missing(name: str) -> ClipError:

@@ -23,7 +23,8 @@ def placed(
 
     Folders of other projects do not record this place; it follows from the project: VGGT4D resizes to a width and cuts
     tall frames; Depth Anything 3 resizes both sides; MonST3R and CUT3R resize the long side and cut both sides to
-    multiples of 16 about the middle. Results of vggtjax record the place themselves.
+    multiples of 16 about the middle. Results of vggtjax record the place themselves; pictures of exactly their frames'
+    size are taken for the frames.
 
     Args:
         result: the loaded result.
@@ -43,7 +44,10 @@ def placed(
                 f"the result is of frames {', '.join(result.frame_names[:3])}, ... and the sequence has "
                 f"{', '.join(names[:3])}, ...; expected a result of the sequence's pictures"
             )
-        if wrong := [i for i, (w, h) in enumerate(sizes) if tuple(result.source_size[i]) != (h, w)]:
+        wrong = [i for i, (w, h) in enumerate(sizes) if tuple(result.source_size[i]) != (h, w)]
+        if wrong and set(sizes) == {(W, H)}:  # the frames themselves, as an export at the model's size holds them
+            return _replaced(result, sizes, [_SAME] * S)
+        if wrong:
             height, width = result.source_size[wrong[0]]
             raise InputError(
                 f"frame {wrong[0]} of the result was {width} x {height}, the sequence's picture is {sizes[wrong[0]]}; "
@@ -56,11 +60,15 @@ def placed(
             raise InputError(
                 f"frames of {W} x {H} do not come from pictures of {width} x {height} as {format} makes them"
             )
+    return _replaced(result, sizes, [place for place in places if place])
+
+
+def _replaced(result: Reconstruction, sizes: Sequence[tuple[int, int]], places: Sequence[Place]) -> Reconstruction:
     return dataclasses.replace(
         result,
         source_size=np.array([(height, width) for width, height in sizes]),
-        source_scale=np.array([place[0] for place in places if place]),
-        source_offset=np.array([place[1] for place in places if place]),
+        source_scale=np.array([place[0] for place in places]),
+        source_offset=np.array([place[1] for place in places]),
     )
 
 

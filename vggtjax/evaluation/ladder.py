@@ -178,10 +178,43 @@ def error_table(rows: Sequence[LadderRow]) -> ErrorTable:
         for row in rows
     ]
     note = (
-        "AbsRel: of depth after one median scale. Rotation: mean, relative to the first frame. Centres: RMSE after "
-        "Sim(3), in median depths. Mask: mined from the first pass, or the true one."
+        f"{second_pass_in_words(rows)} AbsRel: of depth after one median scale. Rotation: mean, relative to the first "
+        "frame. Centres: RMSE after Sim(3), in median depths. Mask: mined from the first pass, or the true one."
     )
-    return ErrorTable(("method", "mask", *(heading for heading, _ in _COLUMNS.values())), cells, note)
+    return ErrorTable(("method", "mask", *(heading for heading, _ in _COLUMNS.values())), cells, note.lstrip())
+
+
+def second_pass_in_words(rows: Sequence[LadderRow]) -> str:
+    """Return what 4dvggt-d changes compared with vggt, the first pass alone: a sentence for each source of masks.
+
+    The rows are those of one clip; rows of the other methods, and rows without scores, are not read.
+    """
+    first = next((row for row in rows if row.method == "vggt"), None)
+    return " ".join(
+        f"{source.capitalize()} masks: {_change_in_words(first, row)}."
+        for source in get_args(MaskSource)
+        for row in rows
+        if first is not None and row.method == "4dvggt-d" and row.mask_source == source
+        if None not in {getattr(scores, name) for scores in (first, row) for name in ("abs_rel", *_CAMERA_SCORES)}
+    )
+
+
+_CAMERA_SCORES = ("rotation_error", "centre_error_ratio")
+
+
+def _change_in_words(first: LadderRow, second: LadderRow) -> str:
+    def change(name: str) -> str:
+        heading, form = _COLUMNS[name]
+        return f"{heading} {form.format(getattr(first, name))} -> {form.format(getattr(second, name))}"
+
+    better = [getattr(second, name) < getattr(first, name) for name in _CAMERA_SCORES]
+    effect = "steadies the cameras" if all(better) else "does not steady the cameras"
+    if any(better) and not all(better):
+        improved = _COLUMNS[_CAMERA_SCORES[better.index(True)]][0]
+        effect = f"steadies the {improved} of the cameras only"
+    cameras = ", ".join(map(change, _CAMERA_SCORES))
+    depth = "better" if second.abs_rel < first.abs_rel else "no better"  # type: ignore[operator]
+    return f"the second pass {effect} ({cameras}), and depth is {depth} ({change('abs_rel')})"
 
 
 def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

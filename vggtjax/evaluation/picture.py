@@ -8,7 +8,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from vggtjax.clips.truth import Truth
 from vggtjax.evaluation.metrics.depth import median_scale
-from vggtjax.evaluation.metrics.trajectory import centres, moves, umeyama_sim3
+from vggtjax.geometry.similarity import centres, moves, umeyama_sim3
 from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_depth, inverse_depth_range, overlay
 from vggtjax.results.reconstruction import Reconstruction
 

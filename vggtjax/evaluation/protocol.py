@@ -14,10 +14,11 @@ from scipy.ndimage import map_coordinates
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.masks import Empty, auc, frame_scores, mask_statistics
 from vggtjax.evaluation.metrics.point_clouds import nearest_distances, paired_distance, statistics
-from vggtjax.evaluation.metrics.trajectory import Similarity, centres, trajectory_errors, umeyama_sim3
+from vggtjax.evaluation.metrics.trajectory import trajectory_errors
 from vggtjax.evaluation.metrics.uncertainty import reliability_curve, sparsification_curve, uncertainty_scores
 from vggtjax.evaluation.metrics.video_depth import Align, depth_alignment, video_depth_errors
 from vggtjax.evaluation.truth_at_pixels import AbsentError, TruthAtPixels, known_points
+from vggtjax.geometry.similarity import Similarity, centres, umeyama_sim3
 from vggtjax.progress import Progress
 from vggtjax.results.frame import source_pixels
 from vggtjax.results.result import Result, missing_fields

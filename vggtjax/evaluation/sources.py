@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from vggtjax.captures.pictures import picture_size
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.pictures import picture_size
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.foreign_frames import placed
 from vggtjax.evaluation.records import shown_name
@@ -169,10 +169,9 @@ class FolderSource:
         """Load the results of one group, and place their frames in the sequence's pictures."""
         del on_stage
         sizes = [picture_size(path) for path in sequence.pictures]
-        stems = [path.stem for path in sequence.pictures]
         results = {}
         for name in names:
             folder = self.folders[name] / sequence.name
             result = Reconstruction.load(folder, format=self.format, quaternion=self.quaternion)
-            results[name] = placed(result, self.format, sizes, stems)
+            results[name] = placed(result, self.format, sizes, sequence.frame_names)
         return results

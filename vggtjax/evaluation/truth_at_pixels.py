@@ -11,7 +11,7 @@ from vggtjax.cameras import unproject, world_from_camera
 from vggtjax.clips.truth import Placed, at_clip_pixels, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
-from vggtjax.evaluation.metrics.trajectory import FEWEST_POSES, moves
+from vggtjax.geometry.similarity import FEWEST_POSES, moves
 
 PIXEL_OFFSET = 0.0  # of points: the protocol lifts whole pixel numbers, predicted and true ones alike
 

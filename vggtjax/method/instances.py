@@ -10,6 +10,7 @@ from scipy import ndimage
 from scipy.optimize import linear_sum_assignment
 
 from vggtjax.errors import InputError
+from vggtjax.storage.arrays import zeros_beside
 
 MOST = 255  # objects: ids fit the palette of a picture
 LEAST_SHARE = 5e-4  # of a frame's pixels, for a region to be an object
@@ -60,7 +61,7 @@ def find_instances(
         raise InputError(f"dynamic_mask is {dynamic_mask.dtype} {dynamic_mask.shape}; expected bool [S, H, W]")
     if gap < 0 or not 0 <= least_share <= 1:
         raise InputError(f"gap is {gap} and least_share {least_share}; expected at least 0, and 0 to 1")
-    ids = np.zeros(dynamic_mask.shape, np.int32)
+    ids = zeros_beside(dynamic_mask, np.int32)
     objects: list[_Object] = []
     for frame, mask in enumerate(dynamic_mask):
         regions = _regions(mask, max(1, least_share * mask.size))
@@ -80,7 +81,10 @@ def find_instances(
     names = np.zeros(len(objects) + 1, np.uint8)
     for name, owner in enumerate(sorted(objects, key=lambda owner: -owner.volume)[:MOST], 1):
         names[owner.id] = name
-    return names[ids]
+    named = zeros_beside(dynamic_mask, np.uint8)
+    for frame, of_frame in enumerate(ids):
+        named[frame] = names[of_frame]
+    return named
 
 
 def _regions(mask: Bool[np.ndarray, "H W"], least: float) -> list[Int[np.ndarray, "N 2"]]:

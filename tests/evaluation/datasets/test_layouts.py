@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.dataset_files import QUARTER_ABOUT_Y, SINTEL_TAG, cam, depth_png, dpt, opened, picture, write
+from vggtjax.captures.depth_files import read_dpt
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.depth_files import read_dpt
 
 SINTEL_K = [[1120.0, 0, 511.5], [0, 1120.0, 217.5], [0, 0, 1]]
 

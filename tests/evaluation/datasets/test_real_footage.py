@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.dataset_files import opened
+from vggtjax.cameras import checked_poses
 from vggtjax.clips.images import read_image
-from vggtjax.evaluation.metrics.trajectory import checked_poses
 
 DAVIS_LENGTHS = {
     "breakdance": 84,
@@ -91,6 +91,10 @@ def test_depth_poses_and_intrinsics_of_tum_agree(clips, tmp_path):
     assert np.allclose(sequence.intrinsics[7], [[517.3, 0, 319.1], [0, 516.5, 255.8], [0, 0, 1]])
     assert np.allclose(np.diff(sequence.timestamps), 1 / 30, atol=0.02)
     assert np.median(depth_differences(sequence, 5, 12)) < 0.02
+    (capture,) = opened("capture", tmp_path)
+    np.testing.assert_array_equal(capture.world_from_camera, sequence.world_from_camera)
+    np.testing.assert_array_equal(capture.intrinsics, sequence.intrinsics)
+    np.testing.assert_array_equal(capture.depth(12), sequence.depth(12))
     moved = sequence.intrinsics.copy()
     moved[:, :2, 2] -= 60
     wrong = type(sequence)("wrong", sequence.pictures, sequence.depth, None, sequence.world_from_camera, moved)

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.dataset_files import QUARTER_ABOUT_Y, depth_png, opened, picture, write
+from vggtjax.cameras import checked_poses
+from vggtjax.captures.tum import partners
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.tum import partners
-from vggtjax.evaluation.metrics.trajectory import checked_poses
 
 
 def tum_folder(folder, times, depth_times=None, pose_times=None):

@@ -8,8 +8,9 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+from vggtjax.captures.files import files
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.folders import files, subfolders
+from vggtjax.evaluation.datasets.folders import subfolders
 from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import mask_reader, read_labels
 from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener

@@ -10,7 +10,7 @@ flow3d_preprocessed/ adds cameras refined with COLMAP (colmap/sparse) and dispar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,20 +18,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.cameras import (
+from vggtjax.captures.cameras import (
     DISTORTED,
     checked_intrinsics,
     checked_world_from_camera,
     resized_intrinsics,
     world_from_camera_of,
 )
-from vggtjax.evaluation.datasets.colmap import read_views
-from vggtjax.evaluation.datasets.depth_files import read_npy
-from vggtjax.evaluation.datasets.folders import files, inside, sequence_folders
+from vggtjax.captures.colmap_model import read_views
+from vggtjax.captures.depth_files import read_npy
+from vggtjax.captures.files import files, inside
+from vggtjax.captures.numbers import numbers
+from vggtjax.captures.pictures import picture_size
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.folders import sequence_folders
 from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
-from vggtjax.evaluation.datasets.pictures import picture_size
 from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
 from vggtjax.storage.json_values import read_json
 
@@ -133,28 +135,18 @@ def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cam
     for path, picture in zip(paths, pictures, strict=True):
         camera = read_json(path, dict[str, Any], "camera")
         pose = np.eye(4)
-        pose[:3, :3] = _numbers(camera, "orientation", (3, 3), path).T  # the file has camera-from-world
-        pose[:3, 3] = _numbers(camera, "position", (3,), path)
+        pose[:3, :3] = numbers(camera, "orientation", ((3, 3),), path).T  # the file has camera-from-world
+        pose[:3, 3] = numbers(camera, "position", ((3,),), path)
         poses.append(checked_world_from_camera(pose[None], path)[0])
         focal, skew, ratio = (
-            float(_numbers(camera, key, (), path)) for key in ("focal_length", "skew", "pixel_aspect_ratio")
+            float(numbers(camera, key, ((),), path)) for key in ("focal_length", "skew", "pixel_aspect_ratio")
         )
-        cx, cy = _numbers(camera, "principal_point", (2,), path)
-        width, height = _numbers(camera, "image_size", (2,), path).tolist()
+        cx, cy = numbers(camera, "principal_point", ((2,),), path)
+        width, height = numbers(camera, "image_size", ((2,),), path).tolist()
         if min(width, height) < 1:
             raise InputError(f"{path} has an image_size of {width:g} x {height:g}; expected pixels")
         matrix = checked_intrinsics(np.array([[focal, skew, cx], [0, focal * ratio, cy], [0, 0, 1]]), path)
         intrinsics.append(resized_intrinsics(matrix, (width, height), picture_size(picture), path))
         for key, count in (("radial_distortion", 3), ("tangential_distortion", 2)):
-            distorted |= bool(_numbers(camera, key, (count,), path).any())
+            distorted |= bool(numbers(camera, key, ((count,),), path).any())
     return _Cameras(np.stack(poses), np.stack(intrinsics), (DISTORTED,) * distorted)
-
-
-def _numbers(camera: Mapping[str, Any], key: str, shape: tuple[int, ...], path: Path) -> Float64[np.ndarray, ...]:
-    try:
-        value = np.asarray(camera[key], np.float64)
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
-        raise InputError(f"{path} has no numbers under '{key}'; expected a camera of DyCheck") from None
-    if value.shape != shape or not np.isfinite(value).all():
-        raise InputError(f"{path} has a '{key}' of shape {value.shape}; expected finite numbers of shape {shape}")
-    return value

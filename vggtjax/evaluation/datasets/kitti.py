@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from vggtjax.captures.cameras import intrinsics_matrix
+from vggtjax.captures.depth_files import read_png
+from vggtjax.captures.files import files, read_text
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.cameras import intrinsics_matrix
-from vggtjax.evaluation.datasets.depth_files import read_png
-from vggtjax.evaluation.datasets.folders import files, read_text, subfolders
+from vggtjax.evaluation.datasets.folders import subfolders
 from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
 from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32, Shaped
 
+from vggtjax.captures.pictures import PNG, opening, picture_size
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.pictures import PNG, opening, picture_size
 from vggtjax.evaluation.datasets.sequence import DepthReader, MaskReader
 
 

@@ -4,8 +4,8 @@ Clips of `vggtjax scenes` are read too: images/, intrinsics.txt and trajectory.t
 
 Depth is PNG of 16 bits in millimetres, 0 where it is unknown; masks are pictures, bright where the world moves. K.txt
 has three rows of three numbers for all frames, or three rows for each; world_from_camera.txt a row of 16 numbers for
-each frame, in metres. Intrinsics are not shifted by half a pixel: the pixel origin of the HoloLens is unknown, and half
-a pixel is below the accuracy of its poses and depth.
+each frame, or of 12 as KITTI's, in metres. Intrinsics are not shifted by half a pixel: the pixel origin of the HoloLens
+is unknown, and half a pixel is below the accuracy of its poses and depth.
 """
 
 from __future__ import annotations
@@ -17,13 +17,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from vggtjax.captures.cameras import checked_intrinsics, checked_world_from_camera
+from vggtjax.captures.depth_files import read_png
+from vggtjax.captures.files import files
 from vggtjax.clips.images import is_image_name
 from vggtjax.clips.masks import read_mask
-from vggtjax.clips.sources import natural_key
+from vggtjax.clips.order import natural_key
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.cameras import checked_intrinsics, checked_world_from_camera
-from vggtjax.evaluation.datasets.depth_files import read_png
-from vggtjax.evaluation.datasets.folders import files, sequence_folders
+from vggtjax.evaluation.datasets.folders import sequence_folders
 from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader, mask_reader
 from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
@@ -106,7 +107,10 @@ def _poses(folder: Path) -> Float64[np.ndarray, "S 4 4"] | None:
     path, trajectory = folder / "world_from_camera.txt", folder / "trajectory.txt"
     if not path.is_file():
         return read_trajectory(trajectory)[1] if trajectory.is_file() else None
-    return checked_world_from_camera(read_numbers(path, 16).reshape(-1, 4, 4), path)
+    rows = read_numbers(path, (12, 16))
+    if rows.shape[1] == 12:
+        rows = np.column_stack([rows, np.tile([0.0, 0, 0, 1], (len(rows), 1))])
+    return checked_world_from_camera(rows.reshape(-1, 4, 4), path)
 
 
 def _intrinsics(folder: Path, count: int) -> Float64[np.ndarray, "S 3 3"] | None:

@@ -32,11 +32,20 @@ class LabelledSequence:
     intrinsics: Float64[np.ndarray, "S 3 3"] | None = None
     timestamps: Float64[np.ndarray, " S"] | None = None
     notes: tuple[str, ...] = ()  # a sentence for each missing or skipped part
+    frame_names: tuple[str, ...] = ()  # the pictures' names without endings by default
+    archive: object | None = None  # keeps the temporary files that `pictures` are, if any
 
     def __post_init__(self) -> None:
         if not self.pictures:
             raise InputError(f"sequence {self.name} has no frames; expected at least one")
-        for name, shape in (("world_from_camera", (4, 4)), ("intrinsics", (3, 3)), ("timestamps", ())):
+        if not self.frame_names:
+            object.__setattr__(self, "frame_names", tuple(path.stem for path in self.pictures))
+        for name, shape in (
+            ("world_from_camera", (4, 4)),
+            ("intrinsics", (3, 3)),
+            ("timestamps", ()),
+            ("frame_names", ()),
+        ):
             value = getattr(self, name)
             if value is not None and np.shape(value) != (len(self), *shape):
                 raise InputError(f"{name} of {self.name} has shape {np.shape(value)}; expected {(len(self), *shape)}")

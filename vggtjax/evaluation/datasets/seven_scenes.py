@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from vggtjax.captures.cameras import checked_world_from_camera, intrinsics_matrix
+from vggtjax.captures.depth_files import read_png
+from vggtjax.captures.files import files
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.cameras import checked_world_from_camera, intrinsics_matrix
-from vggtjax.evaluation.datasets.depth_files import read_png
-from vggtjax.evaluation.datasets.folders import files, sequence_folders
+from vggtjax.evaluation.datasets.folders import sequence_folders
 from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
 from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener

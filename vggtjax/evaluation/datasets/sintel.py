@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
+from vggtjax.captures.cameras import PIXEL_CENTRE, checked_intrinsics, world_from_camera_of
+from vggtjax.captures.depth_files import SINTEL_TAG, read_dpt
+from vggtjax.captures.files import files, read_bytes
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.cameras import PIXEL_CENTRE, checked_intrinsics, world_from_camera_of
-from vggtjax.evaluation.datasets.depth_files import SINTEL_TAG, read_dpt
-from vggtjax.evaluation.datasets.folders import files, read_bytes, subfolders
+from vggtjax.evaluation.datasets.folders import subfolders
 from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.maps import depth_reader
 from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener

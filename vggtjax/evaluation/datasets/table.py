@@ -12,6 +12,7 @@ from pathlib import Path
 from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import InputError, reading
 from vggtjax.evaluation.datasets import published
+from vggtjax.evaluation.datasets.captures import captures
 from vggtjax.evaluation.datasets.davis import davis
 from vggtjax.evaluation.datasets.dycheck import TRUTHS, dycheck
 from vggtjax.evaluation.datasets.folders import listed
@@ -49,6 +50,7 @@ _ROOM = ("depth", "poses", "intrinsics")
 DATASETS: Mapping[str, Dataset] = {
     "plain": Dataset(plain, "folders of rgb/, depth/, mask/, cameras; clips of vggtjax scenes", (*_ROOM, "masks")),
     "composite": Dataset(plain, "filmed objects pasted into a filmed room", (*_ROOM, "masks")),
+    "capture": Dataset(captures, "captures of Record3D, Polycam, nerfstudio, COLMAP; exports of results", _ROOM),
     "hololens": Dataset(plain, "a static room, filmed in two takes", _ROOM),
     "tum": Dataset(tum, "TUM RGB-D, moving people", _ROOM, FrameChoice(stride=3, most=90), published.TUM),
     "bonn": Dataset(bonn, "Bonn RGB-D Dynamic", _ROOM, FrameChoice(slice(30, 140)), published.BONN, max_depth=70.0),
@@ -73,7 +75,8 @@ def find_sequences(
 
     Args:
         name: one of DATASETS.
-        root: the data set's folder; for "plain", "tum", "bonn", "dycheck" and "7scenes", one sequence's folder too.
+        root: the data set's folder; for "plain", "capture", "tum", "bonn", "dycheck" and "7scenes", one sequence's
+            folder too.
         sequences: names of the sequences to open, in order. None takes the published sequences in the root, or all
             sequences if it has none of them; the notes of every sequence and the log name missing and skipped ones.
         sampling: frames of each sequence; its stride replaces the data set's own, a window or cap of the data set

@@ -1,4 +1,4 @@
-"""Files of one depth map each: 16-bit PNG, Sintel's .dpt, .npy. Does not import jax."""
+"""Files of one depth map each: 16-bit PNG, Sintel's .dpt, .npy, OpenEXR. Does not import jax."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.folders import read_bytes
-from vggtjax.evaluation.datasets.pictures import PNG, opening
+from vggtjax.captures.files import read_bytes
+from vggtjax.captures.pictures import PNG, opening
+from vggtjax.errors import InputError, check_extra, one_line
 from vggtjax.storage.arrays import read_array
 
 SINTEL_TAG = b"PIEH"  # the float 202021.25, little-endian: the first bytes of .dpt and .cam
 _DPT_HEADER = 12  # bytes: the tag, width, height
+_MOST_PIXELS = 10**8  # of an OpenEXR file
 _SIXTEEN_BITS = ("I;16", "I;16B", "I")
 
 
@@ -52,3 +53,27 @@ def read_npy(path: Path) -> Float32[np.ndarray, "h w"]:
     if values.ndim != 2 or values.dtype.kind not in "fiu":
         raise InputError(f"{path} has shape {values.shape} of {values.dtype}; expected (h, w) or (h, w, 1) of numbers")
     return values.astype(np.float32)
+
+
+def read_exr(path: Path) -> Float32[np.ndarray, "h w"]:
+    """Read an OpenEXR file of one channel without a unit; needs the extra 'exr'.
+
+    Raises InputError for anything else, MissingExtraError without the library.
+    """
+    check_extra("depth in OpenEXR files", "exr", "OpenEXR")
+    import OpenEXR
+
+    try:
+        header = OpenEXR.File(str(path), header_only=True).header()
+        if len(header["channels"]) != 1:  # before they are decoded
+            names = ", ".join(channel.name for channel in header["channels"])
+            raise InputError(f"{path} has the channels {one_line(names)}; expected one, of depth")
+        lowest, highest = header["dataWindow"]
+        width, height = (int(side) for side in highest.astype(np.int64) - lowest + 1)
+        if not 0 < width * height <= _MOST_PIXELS or width < 1:
+            raise InputError(f"{path} has {width} x {height} pixels; expected at most {_MOST_PIXELS}")
+        channels = OpenEXR.File(str(path), separate_channels=True).channels()
+    except (RuntimeError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is not an OpenEXR file that can be read: {error}") from None
+    (channel,) = channels.values()
+    return np.asarray(channel.pixels, np.float32)

@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float64
 
-from vggtjax.cameras import world_from_camera
+from vggtjax.cameras import checked_poses, world_from_camera
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.trajectory import checked_poses
 
 DISTORTED = "lens distortion is not undone, and not part of the intrinsics"  # a note
 PIXEL_CENTRE = 0.5  # of the first pixel; 0 for data sets that count from the centre
@@ -67,3 +66,11 @@ def world_from_camera_of(
 ) -> Float64[np.ndarray, "S 4 4"]:
     """Return the inverse of poses; raises what `checked_world_from_camera` raises."""
     return checked_world_from_camera(world_from_camera(np.asarray(camera_from_world, np.float64)), source)
+
+
+def from_opengl(poses: Float[np.ndarray, "S 4 4"], source: Path | str) -> Float64[np.ndarray, "S 4 4"]:
+    """Return world-from-camera poses of cameras in OpenGL's axes (y up, z backward) as those of OpenCV's.
+
+    The world stays as it is. Raises what `checked_world_from_camera` raises.
+    """
+    return checked_world_from_camera(poses, source) @ np.diag([1.0, -1.0, -1.0, 1.0])

@@ -14,6 +14,7 @@ from vggtjax.errors import InputError
 PNG = ("PNG",)
 _ORIENTATION = 0x0112  # EXIF; from 5 on, width and height are swapped
 _FIRST_TURNED = 5
+_SAME_SIDES = (2, 3, 4)  # turned or mirrored, with width and height as they were
 _BROKEN = (*UNREADABLE, Image.DecompressionBombWarning)
 
 
@@ -35,3 +36,12 @@ def picture_size(path: Path) -> tuple[int, int]:
     with opening(path, known_formats()) as image:
         width, height = image.size
         return (height, width) if image.getexif().get(_ORIENTATION, 1) >= _FIRST_TURNED else (width, height)
+
+
+def has_unclear_pixels(path: Path) -> bool:
+    """Return whether a picture is stored mirrored or upside down, at the size of the upright one.
+
+    Raises InputError for any other file.
+    """
+    with opening(path, known_formats()) as image:
+        return image.getexif().get(_ORIENTATION, 1) in _SAME_SIDES

@@ -1,0 +1,450 @@
+"""Captures of every kind: known points fall on the squares that the pictures have, and broken captures are refused."""
+
+import gc
+import json
+import shutil
+import zipfile
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.captures import folders
+from tests.captures.folders import FRAMES, HEIGHT, WIDTH, make_truth
+from vggtjax.cameras import project
+from vggtjax.captures.cameras import DISTORTED
+from vggtjax.captures.table import KINDS, find_capture, read_capture
+from vggtjax.clips.clip import load_clip
+from vggtjax.clips.sampling import Sampling
+from vggtjax.clips.sources import clips_by_name, open_source
+from vggtjax.commands import main as cli
+from vggtjax.errors import ClipError, InputError, MissingExtraError
+
+TRUTH = make_truth()
+SHARED = make_truth(shared=True)
+NAMES = {
+    "record3d": [str(frame) for frame in range(FRAMES)],
+    "polycam": [f"{638443502000 + 100_000 * frame}" for frame in range(FRAMES)],
+    "nerfstudio": [f"frame_{8 + frame}" for frame in range(FRAMES)],
+    "colmap": [f"view_{8 + frame}" for frame in range(FRAMES)],
+    "tum": [f"{100 + frame / 10:.6f}" for frame in range(FRAMES)],
+}
+
+
+def read(*arguments: Any) -> Any:
+    """Read a capture, of no type: a test knows what there is."""
+    return read_capture(*arguments)
+
+
+def find(path) -> Any:
+    return find_capture(path)
+
+
+def write(kind, folder):
+    if kind == "record3d":
+        pytest.importorskip("lzfse")
+    writer = folders.colmap_text if kind == "colmap" else getattr(folders, kind)
+    return writer(folder, SHARED if kind == "tum" else TRUTH)
+
+
+def check(capture, truth, *, smaller=1, sure=10.0, atol=1e-6):
+    """Points fall on the squares of their own picture, within `atol` pixels of where they were drawn."""
+    np.testing.assert_allclose(capture.intrinsics, truth.intrinsics, atol=1e-9)
+    assert capture.sizes == ((WIDTH, HEIGHT),) * FRAMES
+    assert not capture.distorted
+    for frame, path in enumerate(capture.pictures):
+        pose = np.linalg.inv(capture.world_from_camera[frame])[:3]
+        x, y, z = project(truth.points, pose, capture.intrinsics[frame])
+        np.testing.assert_allclose(np.stack([x, y], axis=1), truth.pixels[frame], atol=atol)
+        with Image.open(path) as picture:
+            brightness = np.asarray(picture.convert("L"))
+        assert (brightness[y.astype(int), x.astype(int)] > 200).all()
+        if (depth := capture.depth(frame)) is None:
+            continue
+        at = (y / smaller).astype(int), (x / smaller).astype(int)
+        np.testing.assert_allclose(depth[at], np.where(z < sure, z, 0), atol=6e-4)  # half a millimetre of rounding
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_points_fall_on_their_squares(tmp_path, kind):
+    capture = find(write(kind, tmp_path / "scene"))
+    assert capture is not None
+    assert capture.kind == kind
+    assert list(capture.frame_names) == NAMES[kind]
+    arkit = kind in ("record3d", "polycam")
+    truth = SHARED if kind == "tum" else TRUTH
+    check(capture, truth, smaller=2 if arkit else 1, sure=2.75 if arkit else 10, atol=1e-5)
+    assert (capture.depth(0) is None) == (kind == "colmap")
+    assert capture.metric == (kind not in ("colmap", "nerfstudio"))
+    assert capture.notes == ()
+    if kind in ("record3d", "polycam", "tum"):
+        np.testing.assert_allclose(np.diff(capture.timestamps), 1 / 30 if kind == "record3d" else 0.1, atol=1e-6)
+
+
+def test_a_file_of_record3d_is_its_folder(tmp_path):
+    folder = write("record3d", tmp_path / "scene")
+    capture = read(folders.zipped(folder, tmp_path / "walk.r3d"))
+    check(capture, TRUTH, smaller=2, sure=2.75, atol=1e-5)
+    assert not any(path.name in ("icon", "sound.m4a") for path in capture.pictures[0].parents[1].iterdir())
+    assert open_source(str(tmp_path / "walk.r3d")).name == "walk"
+    part, place = capture.for_frames(["2"]), capture.pictures[0].parent
+    assert read(tmp_path / "walk.r3d").pictures[0].parent == place  # not unpacked again
+    del capture
+    gc.collect()
+    assert part.pictures[0].is_file()
+    del part
+    gc.collect()
+    assert not place.exists()
+    K = json.loads((folder / "metadata").read_text())["K"]
+    assert K[6:8] == [50, 33]  # column after column
+    old = read(folders.record3d(tmp_path / "old", SHARED, perFrameIntrinsicCoeffs=None, frameTimestamps=None))
+    check(old, SHARED, smaller=2, sure=2.75, atol=1e-5)
+    np.testing.assert_allclose(old.timestamps, np.arange(FRAMES) / 30)
+
+
+def test_an_export_of_record3d_to_exr_and_jpg(tmp_path):
+    pytest.importorskip("lzfse")
+    OpenEXR = pytest.importorskip("OpenEXR")
+    folder = folders.record3d_export(tmp_path, TRUTH)
+    capture = find(folder)
+    assert (capture.kind, list(capture.frame_names)) == ("record3d", NAMES["record3d"])
+    check(capture, TRUTH, smaller=2, atol=1e-5)
+    cases = {
+        "an OpenEXR file that can be read": lambda path: path.write_bytes(b"no depth"),
+        "expected one, of depth": lambda path: OpenEXR.File(
+            {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage},
+            {name: np.ones((36, 48), np.float32) for name in ("Z", "A")},
+        ).write(str(path)),
+    }
+    for words, spoil in cases.items():
+        spoil(folder / "depth/0.exr")
+        with pytest.raises(InputError, match=words):
+            capture.depth(0)
+    (folder / "depth/0.exr").unlink()
+    assert read(folder).depth(0) is None
+
+
+def test_polycam_s_own_cameras_stand_in_for_optimised_ones(tmp_path):
+    capture = read(folders.polycam(tmp_path, TRUTH, corrected=False))
+    assert capture.distorted
+    assert capture.notes == ("its poses are ARKit's own: Polycam did not optimise them", DISTORTED)
+    np.testing.assert_allclose(capture.world_from_camera, TRUTH.world_from_camera, atol=1e-12)
+
+
+def test_numbers_at_the_top_of_transforms_json(tmp_path):
+    K = SHARED.intrinsics[0]
+    top = {"w": WIDTH, "h": HEIGHT, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    drop = dict.fromkeys(("w", "h", "fl_x", "fl_y", "cx", "cy"))
+    check(read(folders.nerfstudio(tmp_path / "top", SHARED, top=top, frame_fields=drop)), SHARED)
+    angle = {"camera_angle_x": 2 * np.arctan(WIDTH / 2 / 80)}
+    blender = read(folders.nerfstudio(tmp_path / "blender", SHARED, top=angle, frame_fields=drop))
+    np.testing.assert_allclose(blender.intrinsics[0], [[80, 0, WIDTH / 2], [0, 80, HEIGHT / 2], [0, 0, 1]])
+    halved = {"w": 2 * WIDTH, "h": 2 * HEIGHT, "cx": 100.0, "cy": 66.0, "fl_x": 160.0, "fl_y": 156.0}
+    check(read(folders.nerfstudio(tmp_path / "half", SHARED, frame_fields=halved)), SHARED)
+    lens = read(folders.nerfstudio(tmp_path / "lens", SHARED, top={"k1": 0.1}))
+    assert lens.distorted
+    assert lens.notes == (DISTORTED,)
+
+
+def test_names_without_a_suffix_are_those_of_blender_s_scenes(tmp_path):
+    folder = folders.nerfstudio(tmp_path, TRUTH)
+    text = (folder / "transforms.json").read_text()
+    (folder / "transforms.json").unlink()
+    (folder / "transforms_train.json").write_text(text.replace('.png", "w"', '", "w"'))
+    assert 'frame_8"' in (folder / "transforms_train.json").read_text()
+    check(find(folder), TRUTH)
+
+
+def test_what_nerfstudio_applied_to_the_world_is_undone(tmp_path):
+    applied = np.array([[0.0, 0, 1, 0.3], [1, 0, 0, -0.2], [0, 1, 0, 0.1]])  # as its reader of Polycam, and a shift
+    scale = 0.25
+    folder = folders.nerfstudio(tmp_path, TRUTH, top={"applied_transform": applied.tolist(), "applied_scale": scale})
+    scene = json.loads((folder / "transforms.json").read_text())
+    for frame in scene["frames"]:
+        moved = np.vstack([applied, [0, 0, 0, 1]]) @ frame["transform_matrix"]
+        moved[:3, 3] *= scale
+        frame["transform_matrix"] = moved.tolist()
+    (folder / "transforms.json").write_text(json.dumps(scene))
+    check(read(folder), TRUTH)
+
+
+@pytest.mark.parametrize("model", ["sparse/0", "sparse", "colmap/sparse/0"])
+def test_places_of_a_colmap_model(tmp_path, model):
+    check(read(folders.colmap_text(tmp_path, TRUTH, model)), TRUTH)
+    if model == "sparse/0":
+        check(find(tmp_path / model), TRUTH)  # the model's own folder, with the pictures above it
+    Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "images/unseen.png")
+    assert read(tmp_path).notes == ("1 of 5 pictures have no pose and are left out, unseen first",)
+
+
+@pytest.mark.parametrize("form", ["binary", "text"])
+def test_colmap_s_own_files(tmp_path, form):
+    pycolmap = pytest.importorskip("pycolmap")
+    folders.colmap_text(tmp_path / "scene", TRUTH)
+    images = (tmp_path / "scene/sparse/0/images.txt").read_text().replace("1.5 2.5 -1 3.5 4.5 7", "")
+    (tmp_path / "scene/sparse/0/images.txt").write_text(images)
+    (tmp_path / "scene/sparse/0/points3D.txt").write_text("")
+    model = pycolmap.Reconstruction(str(tmp_path / "scene/sparse/0"))
+    shutil.rmtree(tmp_path / "scene/sparse/0")
+    (tmp_path / "scene/sparse/0").mkdir()
+    (model.write_binary if form == "binary" else model.write_text)(str(tmp_path / "scene/sparse/0"))
+    check(read(tmp_path / "scene"), TRUTH)
+
+
+def test_frames_keep_their_cameras_by_name(tmp_path):
+    folder = write("nerfstudio", tmp_path / "scene")
+    clip = load_clip(folder, size=28, patch=14, start=1, stride=2)
+    assert clip.frame_names == ["frame_9", "frame_11"]
+    assert clip.source.name == "scene"
+    chosen = read(folder).for_frames(reversed(clip.frame_names))
+    np.testing.assert_array_equal(chosen.intrinsics, TRUTH.intrinsics[[3, 1]])
+    np.testing.assert_allclose(chosen.world_from_camera, TRUTH.world_from_camera[[3, 1]])
+    np.testing.assert_allclose(chosen.depth(0)[chosen.depth(0) > 0].min(), TRUTH.depth[3].min(), atol=1e-5)
+    assert chosen.frame_names == ("frame_11", "frame_9")
+    with pytest.raises(InputError, match="has no frame 'frame_8'; it has 2 frames, from 'frame_11' to 'frame_9'"):
+        chosen.for_frames(["frame_8"])
+
+
+def test_equal_stems_of_two_folders_are_told_apart(tmp_path):
+    folder = write("nerfstudio", tmp_path / "scene")
+    scene = json.loads((folder / "transforms.json").read_text())
+    for frame, name in zip(scene["frames"], ("b/1.png", "b/0.png", "a/1.png", "a/0.png"), strict=True):
+        (folder / f"images/{name}").parent.mkdir(exist_ok=True)
+        (folder / frame["file_path"]).rename(folder / f"images/{name}")
+        frame["file_path"] = f"images/{name}"
+    (folder / "transforms.json").write_text(json.dumps(scene))
+    capture = read(folder)
+    assert capture.frame_names == ("a_0", "a_1", "b_0", "b_1")
+    check(capture, TRUTH)
+    part = capture.for_frames(["b_1", "a_1"])
+    assert part.for_frames(["a_1"]).pictures == (folder / "images/a/1.png",)
+    assert [frame.name for frame in open_source(str(folder)).frames(Sampling())] == ["a_0", "a_1", "b_0", "b_1"]
+
+
+def test_pictures_that_are_left_out_are_told_when_a_clip_is_read(tmp_path, caplog):
+    folder = write("colmap", tmp_path / "scene")
+    Image.new("RGB", (WIDTH, HEIGHT)).save(folder / "images/unseen.png")
+    load_clip(folder, size=28, patch=14)
+    assert caplog.text.count("scene: 1 of 5 pictures have no pose and are left out, unseen first") == 1
+
+
+def test_pictures_stored_upside_down_are_refused(tmp_path):
+    folder = write("nerfstudio", tmp_path / "scene")
+    path = folder / "images/frame_9.png"
+    with Image.open(path) as picture:
+        picture.load()
+        picture.getexif()[0x0112] = 3
+        picture.save(path, exif=picture.getexif())
+    with pytest.raises(InputError, match=r"frame_9\.png is stored upside down or mirrored"):
+        read(folder)
+
+
+def test_times_of_a_capture_choose_frames_by_second(tmp_path):
+    source = open_source(str(write("tum", tmp_path / "scene")))
+    taken = list(source.frames(Sampling(fps=5)))
+    assert [frame.name for frame in taken] == ["100.000000", "100.200000"]
+    assert [frame.time and round(frame.time, 6) for frame in taken] == [0, 0.2]
+    assert source.total(Sampling(fps=5)) == 2
+    with pytest.raises(InputError, match="still images have no presentation times"):
+        open_source(str(write("colmap", tmp_path / "other"))).total(Sampling(fps=5))
+
+
+def test_a_folder_of_captures_is_a_batch(tmp_path):
+    for kind in ("colmap", "tum"):
+        write(kind, tmp_path / f"all/{kind}")
+    folders.zipped(write("record3d", tmp_path / "scene"), tmp_path / "all/walk.r3d")
+    assert list(clips_by_name([str(tmp_path / "all")])) == ["colmap", "tum", "walk"]
+    assert list(clips_by_name([str(tmp_path / "all/colmap"), str(tmp_path / "all/walk.r3d")])) == ["colmap", "walk"]
+
+
+def test_folders_that_are_no_capture(tmp_path):
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    (tmp_path / "images.txt").write_text("my pictures")
+    assert find(tmp_path) is None
+    for name in ("keyframes/b.png", "rgb/1x/0.png"):  # chosen pictures; the layout of Nerfies
+        (tmp_path / name).parent.mkdir(parents=True)
+        shutil.copy(tmp_path / "a.png", tmp_path / name)
+    (tmp_path / "metadata.json").write_text("{}")
+    assert find(tmp_path) is None
+    assert find(tmp_path / "a.png") is None
+    assert find(tmp_path / "nothing") is None
+    with pytest.raises(InputError, match="is no capture; expected a folder of Record3D"):
+        read(tmp_path)
+    with pytest.raises(InputError, match="kind is 'scannet'; expected one of record3d"):
+        read(tmp_path, "scannet")
+
+
+def edited(path, **changes):
+    """Change fields of a JSON file, in every frame of a scene."""
+    value = json.loads(path.read_text())
+    for target in value.get("frames", [value]):
+        target.update(changes)
+    path.write_text(json.dumps(value))
+
+
+def scene(**changes):
+    return lambda folder: edited(folder / "transforms.json", **changes)
+
+
+def camera(**changes):
+    return lambda folder: edited(next((folder / "keyframes/corrected_cameras").iterdir()), **changes)
+
+
+def metadata(**changes):
+    return lambda folder: edited(folder / "metadata", **changes)
+
+
+def text(name, content):
+    return lambda folder: (folder / name).write_text(content)
+
+
+def without(name):
+    return lambda folder: shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink()
+
+
+IMAGES, CAMERAS = "sparse/0/images.txt", "sparse/0/cameras.txt"
+BROKEN = [
+    ("nerfstudio", without("images/frame_9.png"), "frame_9.png is missing, but .*transforms.json names"),
+    ("nerfstudio", without("depth/1.npy"), "1.npy is missing"),
+    ("nerfstudio", without("images"), "is missing, but"),
+    ("nerfstudio", text("transforms.json", "[]"), "expected an object"),
+    ("nerfstudio", text("transforms.json", '{"frames": {}}'), "has no list 'frames'"),
+    ("nerfstudio", text("transforms.json", '{"frames": [3]}'), "has no list 'frames'"),
+    ("nerfstudio", text("transforms.json", '{"frames": [{"transform_matrix": [NaN]}]}'), "is not JSON"),
+    ("nerfstudio", scene(file_path="../secret.png"), "expected a path inside"),
+    ("nerfstudio", scene(depth_file_path="/etc/passwd"), "expected a path inside"),
+    ("nerfstudio", scene(file_path=3), "without a 'file_path'"),
+    ("nerfstudio", scene(file_path="1" * 5000), "(name too long|is missing)"),
+    ("nerfstudio", scene(file_path="images/frame_9.png"), "names a picture twice"),
+    ("nerfstudio", scene(transform_matrix=[[1]]), r"'transform_matrix' of shape \(1, 1\)"),
+    ("nerfstudio", scene(transform_matrix=None), "no numbers under 'transform_matrix'"),
+    ("nerfstudio", scene(transform_matrix=np.ones((4, 4)).tolist()), "invalid poses"),
+    ("nerfstudio", scene(fl_x=0), "focal lengths above 0"),
+    ("nerfstudio", scene(fl_x="wide"), "no numbers under 'fl_x'"),
+    ("nerfstudio", scene(w=-4), "camera of -4 x 72 pixels"),
+    ("nerfstudio", scene(w=HEIGHT, h=WIDTH), "expected the same shape"),
+    ("nerfstudio", scene(camera_model="OPENCV_FISHEYE"), "undistort the pictures"),
+    ("polycam", without("keyframes/corrected_images"), "cameras/.*json; export Polycam's raw data"),
+    ("polycam", without("keyframes/corrected_images/638443502000.jpg"), "and no picture for it"),
+    ("polycam", camera(t_12=None), "numbers under 't_12'"),
+    ("polycam", camera(t_00=5.0), "invalid poses"),
+    ("polycam", camera(width=0), "picture of 0 x 72"),
+    ("record3d", without("rgbd/2.jpg"), "has 3 pictures and 4 poses"),
+    ("record3d", metadata(poses=[]), r"'poses' of shape \(0,\)"),
+    ("record3d", metadata(poses=[[0, 0, 0, 2, 0, 0, 0]] * 4), "quaternion of length 2.000"),
+    ("record3d", metadata(perFrameIntrinsicCoeffs=[[1, 1, 1, 1]]), r"shape \(1, 4\)"),
+    ("record3d", metadata(dw=10**9), "has depth of 1000000000 x 36 pixels"),
+    ("colmap", without(IMAGES), "cannot read .*images.txt"),
+    ("colmap", without("images"), "no folder images; put the model's pictures there"),
+    ("colmap", without("images/view_9.png"), "view_9.png is missing, but .*images.txt names it"),
+    ("colmap", text(IMAGES, ""), "has no image; expected a model"),
+    ("colmap", text(IMAGES, "1 2 3"), "expected IMAGE_ID QW QX QY QZ"),
+    ("colmap", text(IMAGES, "1 1 0 0 0 nan 0 0 1 a.png"), "an invalid pose of 'a.png'"),
+    ("colmap", text(IMAGES, "1 1 0 0 0 0 0 0 1 ../a.png"), "expected a path inside"),
+    ("colmap", text(IMAGES, "1 1 0 0 0 0 0 0 9 a.png"), "no such camera"),
+    ("colmap", text(CAMERAS, "1 OPENCV_FISHEYE 9 9 1"), "kind OPENCV_FISHEYE; expected one of"),
+    ("colmap", text(CAMERAS, "1 PINHOLE 9 9 1 1"), "2 parameters of a PINHOLE"),
+    ("colmap", text(CAMERAS, "1 PINHOLE wide"), "expected CAMERA_ID MODEL"),
+    ("colmap", text(CAMERAS, f"1 PINHOLE {'9' * 400} 9 1 1 1 1"), "expected sides of 1 to 1000000"),
+    ("colmap", text(IMAGES, f"1 1 0 0 0 0 0 0 1 {'1' * 5000}.png"), "(name too long|is missing)"),
+    ("tum", without("depth"), "is missing, but depth.txt names it"),
+    ("tum", text("groundtruth.txt", "5 0 0 0 0 0 0 1"), "no picture of .* has a pose within 0.02 s"),
+    ("tum", text("groundtruth.txt", "100 nan 0 0 0 0 0 1"), "expected finite numbers"),
+]
+
+
+@pytest.mark.parametrize(("kind", "spoil", "words"), BROKEN)
+def test_a_broken_capture_is_refused_in_one_sentence(tmp_path, kind, spoil, words):
+    folder = write(kind, tmp_path / "scene")
+    spoil(folder)
+    with pytest.raises(InputError, match=words) as problem:
+        find(folder)
+    assert "\n" not in str(problem.value)
+    with pytest.raises(ClipError, match="name the folder of the pictures to leave its cameras out"):
+        open_source(str(folder))
+
+
+def test_a_broken_capture_ends_a_command_before_a_model_is_loaded(tmp_path, capsys):
+    folder = write("colmap", tmp_path / "scene")
+    (folder / "images/view_9.png").unlink()
+    out = tmp_path / "out"
+    assert cli.main(["reconstruct", str(folder), "--model", "nothing", "--out", str(out)]) == 2
+    said = capsys.readouterr().err
+    assert "view_9.png is missing" in said
+    assert "Traceback" not in said
+    assert not out.exists()
+
+
+def test_frames_without_a_pose_are_left_out(tmp_path):
+    folder = write("tum", tmp_path)
+    lines = (folder / "groundtruth.txt").read_text().splitlines()
+    (folder / "groundtruth.txt").write_text("\n".join(lines[:2] + lines[3:]))
+    capture = read(folder)
+    assert capture.frame_names == ("100.000000", "100.200000", "100.300000")
+    assert capture.notes == ("1 of 4 pictures have no pose within 0.02 s and are left out, 100.100000 first",)
+    np.testing.assert_allclose(capture.world_from_camera, SHARED.world_from_camera[[0, 2, 3]], atol=1e-6)
+    (folder / "groundtruth.txt").unlink()
+    assert read(folder).world_from_camera is None
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("../out", "expected a path inside"), ("/out", "expected a path inside"), ("rgbd\\..\\out", "expected a path")],
+)
+def test_names_that_leave_an_archive_are_refused(tmp_path, name, words):
+    path = folders.zipped(write("record3d", tmp_path / "scene"), tmp_path / "walk.r3d", **{name: b"x"})
+    with pytest.raises(InputError, match=words):
+        read(path)
+    assert not (tmp_path / "out").exists()
+
+
+def test_archives_that_are_none_or_too_large(tmp_path):
+    path = tmp_path / "walk.r3d"
+    path.write_bytes(b"PK\3\4 no zip")
+    with pytest.raises(InputError, match="is not a whole zip, as Record3D writes it"):
+        read(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("metadata", bytes(80 << 20))
+    with pytest.raises(InputError, match="has 1 files of 83886080 bytes; expected at most"):
+        read(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        for name in ("metadata", "rgbd/0.jpg"):
+            archive.writestr(name, name * 100)
+    data = path.read_bytes()
+    path.write_bytes(data.replace(data[50:60], bytes(10), 1))
+    with pytest.raises(InputError, match="is not a whole zip"):
+        read(path)
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("walk/metadata", "{}")
+    with pytest.raises(InputError, match=r"walk\.r3d has no metadata at its top; .* zip the content of a folder"):
+        read(path)
+
+
+def test_depth_of_record3d_is_bounded_and_needs_its_extra(tmp_path, monkeypatch):
+    folder = write("record3d", tmp_path)
+    import lzfse
+
+    capture = read(folder)
+    path = folder / "rgbd/0.depth"
+    cases = {
+        b"": "is not a map of at most 6912 bytes",
+        b"bvx2" * 40: "is not a map",  # each block could hold 26 MB
+        b"bvx2" + bytes(40): "cannot be decompressed",
+        lzfse.compress(bytes(100_000)): "holds 100000 bytes; expected 36 x 48 values of 4 bytes",
+    }
+    for data, words in cases.items():
+        path.write_bytes(data)
+        with pytest.raises(InputError, match=words):
+            capture.depth(0)
+    monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: None)
+    with pytest.raises(MissingExtraError, match=r"needs the extra 'record3d'"):
+        capture.depth(1)
+
+
+def test_depth_of_another_shape_than_its_picture_is_refused(tmp_path):
+    folder = write("nerfstudio", tmp_path)
+    np.save(folder / "depth/1.npy", np.ones((WIDTH, HEIGHT), np.float32))
+    capture = read(folder)
+    with pytest.raises(InputError, match=r"1\.npy has 72 x 96 pixels and its picture 96 x 72; expected the same shape"):
+        capture.depth(1)

@@ -1,0 +1,52 @@
+"""Captures as ground truth."""
+
+import numpy as np
+import pytest
+
+from tests.captures import folders
+from tests.captures.folders import FRAMES, HEIGHT, WIDTH, make_truth
+from tests.dataset_files import opened
+from vggtjax.errors import InputError
+
+TRUTH = make_truth()
+
+
+def test_a_capture_is_a_sequence(tmp_path):
+    folders.polycam(tmp_path / "kitchen", TRUTH)
+    folders.nerfstudio(tmp_path / "porch", TRUTH)
+    kitchen, porch = opened("capture", tmp_path, stride=2)
+    assert [kitchen.name, porch.name] == ["kitchen", "porch"]
+    for sequence in (kitchen, porch):
+        assert len(sequence) == FRAMES // 2
+        np.testing.assert_allclose(sequence.world_from_camera, TRUTH.world_from_camera[::2])
+        np.testing.assert_allclose(sequence.intrinsics, TRUTH.intrinsics[::2])
+    assert kitchen.notes == ()
+    assert porch.notes == ("porch: its unit is not the metre, but one of its program's own",)
+    assert porch.frame_names == ("frame_8", "frame_10")
+    depth = kitchen.depth(1)  # of pixels twice as large as the picture's
+    assert depth.shape == (HEIGHT, WIDTH)
+    (column, row), z = np.floor(TRUTH.pixels[2][0]).astype(int), TRUTH.depth[2][0]
+    even = row // 2 * 2, column // 2 * 2
+    np.testing.assert_allclose(depth[even[0] : even[0] + 2, even[1] : even[1] + 2], z, atol=6e-4)
+    assert not depth[even[0] - 1, column]
+
+
+def test_files_of_record3d_stand_beside_folders(tmp_path):
+    pytest.importorskip("lzfse")
+    (tmp_path / "all").mkdir()
+    (tmp_path / "blind").mkdir()
+    folder = folders.record3d(tmp_path / "unpacked", TRUTH)
+    folders.zipped(folder, tmp_path / "all/walk.r3d")
+    folders.colmap_text(tmp_path / "all/yard", TRUTH)
+    walk, yard = opened("capture", tmp_path / "all")
+    assert (walk.name, yard.name) == ("walk", "yard")
+    assert walk.depth(0).any()
+    for path in folder.glob("rgbd/*.depth"):
+        path.unlink()
+    (blind,) = opened("capture", folders.zipped(folder, tmp_path / "blind/blind.r3d").parent)
+    assert blind.depth is None
+    assert blind.pictures[0].is_file()  # of an archive that only the sequence keeps
+    assert yard.depth is None
+    assert yard.notes[-1] == "yard: it has no depth"
+    with pytest.raises(InputError, match="holds no sequence; expected a capture"):
+        opened("capture", tmp_path / "all/yard/images")

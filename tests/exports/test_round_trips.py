@@ -1,0 +1,146 @@
+"""What `vggtjax export` writes, read back as a capture and as the ground truth of the result itself."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from tests.room import make_room
+from vggtjax.cameras import world_from_camera
+from vggtjax.captures.table import read_capture
+from vggtjax.clips.clip import load_clip
+from vggtjax.clips.sources import open_source
+from vggtjax.commands import main as cli
+from vggtjax.exports.table import Exporting
+from vggtjax.exports.views import rigid
+from vggtjax.exports.write import export_result
+from vggtjax.known.poses import read_poses
+
+FORMS = ("colmap", "colmap-text", "gsplat", "nerfstudio")
+FRAMES, H, W = 4, 42, 56
+
+number = st.floats(-1, 1, allow_subnormal=False)
+vector = st.tuples(number, number, number)
+
+
+def needed(form):
+    if form not in ("nerfstudio", "tum", "kitti"):
+        pytest.importorskip("pycolmap")
+
+
+@pytest.mark.parametrize("form", [*FORMS, "tum", "kitti"])
+def test_cameras_survive_the_way_out_and_back(tmp_path_factory, form):
+    needed(form)
+
+    @settings(max_examples=12, deadline=None)
+    @given(
+        turns=st.lists(vector, min_size=2, max_size=2),
+        shifts=st.lists(vector, min_size=2, max_size=2),
+        focals=st.tuples(st.floats(5, 500), st.floats(5, 500)),
+        size=st.sampled_from([1e-3, 1.0, 1e3]),
+    )
+    def back(turns, shifts, focals, size):
+        rotation = Rotation.from_rotvec(np.pi * np.array(turns)).as_matrix()
+        poses = np.concatenate([rotation, size * np.array(shifts)[..., None]], axis=-1).astype(np.float32)
+        intrinsics = np.tile(np.eye(3), (2, 1, 1))
+        intrinsics[:, 0, 0], intrinsics[:, 1, 1] = focals, focals[::-1]
+        intrinsics[:, :2, 2] = W / 2 + 1.25, H / 2 - 0.75
+        result = make_room(2, H, W, camera_from_world=poses, intrinsics=intrinsics.astype(np.float32))
+        tolerance = 1e-6 * max(size, 1)
+        if form in ("tum", "kitti"):
+            path = tmp_path_factory.mktemp("way") / "poses.txt"
+            export_result(result, path, form)
+            np.testing.assert_allclose(read_poses(path, result), result.world_from_camera, atol=tolerance)
+            return
+        folder = tmp_path_factory.mktemp("way") / "out"
+        export_result(result, folder, form, exporting=Exporting(points=20))
+        capture: Any = read_capture(folder)
+        np.testing.assert_allclose(capture.intrinsics, result.intrinsics, rtol=1e-7, atol=1e-6)
+        wanted = world_from_camera(np.stack([rigid(pose) for pose in poses]))
+        np.testing.assert_allclose(capture.world_from_camera[:, :3, :3], wanted[:, :3, :3], atol=1e-6)
+        np.testing.assert_allclose(capture.world_from_camera[:, :3, 3], wanted[:, :3, 3], atol=tolerance)
+
+    back()
+
+
+@pytest.fixture(scope="module")
+def result():
+    return make_room(FRAMES, H, W, frame_names=["frame_9", "frame_10", "frame_11", "frame_12"], timestamps=None)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory, result):
+    """A folder of results that holds the result of the sequence "out"."""
+    folder = tmp_path_factory.mktemp("results")
+    result.save(folder / "out")
+    return folder
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_result_has_no_error_against_its_own_export(tmp_path, result, results, capsys, form):
+    needed(form)
+    export_result(result, tmp_path / "scenes/out", form, exporting=Exporting(points=300))
+    capture: Any = read_capture(tmp_path / "scenes/out")
+    assert capture.frame_names == result.frame_names
+    scores = tmp_path / "scores"
+    arguments = ["evaluate", "capture", str(tmp_path / "scenes"), "--out", str(scores), "--depth-align", "metric"]
+    assert cli.main([*arguments, "--results", f"mine={results}"]) == 0, capsys.readouterr().out
+    (record,) = json.loads((scores / "results.json").read_text())["sequences"]
+    assert (record["name"], record["method"], record["status"]) == ("out", "mine", "ok")
+    metrics = record["metrics"]
+    assert metrics["ate"] < 1e-6
+    assert metrics["rte"] < 1e-6
+    assert metrics["rre"] < 1e-4  # degrees
+    assert any("not the metre" in note for note in record["notes"])
+    if form == "nerfstudio":
+        assert metrics["abs_rel"] < 1e-6
+        assert metrics["distance_paired_mean"] < 1e-6
+    else:
+        assert "abs_rel" not in metrics
+        assert any("it has no depth" in note for note in record["notes"])
+
+
+def test_an_export_is_a_clip_of_the_result_s_frames(tmp_path, result):
+    export_result(result, tmp_path / "out", "nerfstudio")
+    clip = load_clip(tmp_path / "out", size=W, patch=14, start=1, max_frames=2)
+    assert clip.frame_names == ["frame_10", "frame_11"]
+    np.testing.assert_array_equal(np.rint(255 * clip.images), result.images[1:3])
+    chosen: Any = read_capture(tmp_path / "out").for_frames(clip.frame_names)
+    np.testing.assert_allclose(chosen.depth(1), np.where(result.valid_pixels[2], result.depth[2], 0), rtol=1e-6)
+
+
+def test_an_export_at_the_source_s_size_keeps_cameras_and_depth_to_compare(tmp_path, result, results):
+    (tmp_path / "pictures").mkdir()
+    for name, image in zip(result.frame_names, result.images, strict=True):
+        Image.fromarray(image).resize((2 * W, 2 * H)).save(tmp_path / f"pictures/{name}.png")
+    source = open_source(str(tmp_path / "pictures"))
+    export_result(result, tmp_path / "scenes/out", "nerfstudio", source=source, exporting=Exporting(points=300))
+    capture: Any = read_capture(tmp_path / "scenes/out")
+    assert capture.sizes == ((2 * W, 2 * H),) * FRAMES
+    np.testing.assert_allclose(capture.intrinsics[:, :2], 2 * result.intrinsics[:, :2], rtol=1e-6)
+    scores, mine = tmp_path / "scores", f"mine={results}"
+    assert cli.main(["evaluate", "capture", str(tmp_path / "scenes"), "--out", str(scores), "--results", mine]) == 0
+    metrics = json.loads((scores / "results.json").read_text())["sequences"][0]["metrics"]
+    assert metrics["ate"] < 1e-6
+    assert metrics["abs_rel"] < 0.01  # depth is brought to the larger size in two ways, which differ at edges
+
+
+@pytest.mark.parametrize(("form", "name"), [("tum", "trajectory.txt"), ("kitti", "world_from_camera.txt")])
+def test_poses_of_a_text_file_are_read_back(tmp_path, result, results, form, name):
+    export_result(result, tmp_path / "poses.txt", form)
+    np.testing.assert_allclose(read_poses(tmp_path / "poses.txt", result), result.world_from_camera, atol=1e-6)
+    folder = tmp_path / "scenes/out"  # a plain data set, of the poses and the pictures
+    (folder / "rgb").mkdir(parents=True)
+    for frame, image in zip(result.frame_names, result.images, strict=True):
+        Image.fromarray(image).save(folder / f"rgb/{frame}.png")
+    (tmp_path / "poses.txt").rename(folder / name)
+    scores, mine = tmp_path / "scores", f"mine={results}"
+    assert cli.main(["evaluate", "plain", str(tmp_path / "scenes"), "--out", str(scores), "--results", mine]) == 0
+    metrics = json.loads((scores / "results.json").read_text())["sequences"][0]["metrics"]
+    assert metrics["ate"] < 1e-6
+    assert metrics["rre"] < 1e-4

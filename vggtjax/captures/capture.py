@@ -1,0 +1,157 @@
+"""What an app or another program recorded of a clip: pictures, and the cameras and depth that it knows.
+
+Does not import jax.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64
+
+from vggtjax.captures.cameras import checked_intrinsics, checked_world_from_camera, resized_intrinsics
+from vggtjax.captures.pictures import has_unclear_pixels, picture_size
+from vggtjax.errors import InputError
+
+CaptureKind = Literal["record3d", "polycam", "nerfstudio", "colmap", "tum"]
+DepthFileReader = Callable[[Path], Float32[np.ndarray, "h w"]]
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """Pictures in order, and what is known of each of them: OpenCV's axes, pixels of the upright pictures.
+
+    Intrinsics put the outer corner of the first pixel at (0, 0) and its centre at (0.5, 0.5). Raises InputError for
+    arrays of another number of frames, and for cameras that are none.
+    """
+
+    kind: CaptureKind
+    path: Path  # the folder, or the file of Record3D
+    pictures: tuple[Path, ...] = field(repr=False)
+    sizes: tuple[tuple[int, int], ...] = field(repr=False)  # width and height of each picture
+    intrinsics: Float64[np.ndarray, "S 3 3"] | None = field(default=None, repr=False)
+    world_from_camera: Float64[np.ndarray, "S 4 4"] | None = field(default=None, repr=False)
+    distorted: bool = False  # the lens has a distortion, which the intrinsics lack
+    metric: bool = False  # poses and depth are in metres, not in a unit of the program's own
+    depth_files: tuple[Path | None, ...] | None = field(default=None, repr=False)
+    read_depth_file: DepthFileReader | None = field(default=None, repr=False)
+    timestamps: Float64[np.ndarray, " S"] | None = field(default=None, repr=False)  # seconds
+    left_out: tuple[str, ...] = ()  # a sentence on pictures that are not among these
+    notes: tuple[str, ...] = ()  # a sentence for each part that is missing or not as it seems
+    archive: object | None = field(default=None, repr=False)  # keeps the temporary files that `pictures` are, if any
+
+    def __post_init__(self) -> None:
+        if not self.pictures:
+            raise InputError(f"{self.path} has no picture with a camera; expected at least one")
+        shapes = {"intrinsics": (3, 3), "world_from_camera": (4, 4), "timestamps": ()}
+        for name, shape in {**shapes, "sizes": (2,)}.items():
+            value = getattr(self, name)
+            if value is not None and np.shape(value) != (len(self), *shape):
+                raise InputError(f"{name} of {self.path} have shape {np.shape(value)}; expected {(len(self), *shape)}")
+        if self.intrinsics is not None:
+            checked_intrinsics(self.intrinsics, self.path)
+        if self.world_from_camera is not None:
+            checked_world_from_camera(self.world_from_camera, self.path)
+        if self.timestamps is not None and not np.isfinite(self.timestamps).all():
+            raise InputError(f"{self.path} has timestamps that are not finite; expected seconds")
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    @cached_property
+    def frame_names(self) -> tuple[str, ...]:
+        """A name for each frame, as `reconstruct` names the frames of this capture: unique in the capture.
+
+        Names are the stems of the files; where two stems are equal, the folders stand before them (cam1_0001).
+        """
+        stems = [path.stem for path in self.pictures]
+        if max(Counter(stems).values()) == 1:
+            return tuple(stems)
+        parts = [path.with_suffix("").parts for path in self.pictures]
+        shared = 0
+        while len({part[: shared + 1] for part in parts}) == 1:
+            shared += 1
+        names = ["_".join(part[shared:]) for part in parts]
+        unique = max(Counter(names).values()) == 1
+        return tuple(names) if unique else tuple(f"{number:06d}" for number in range(len(names)))
+
+    def for_frames(self, frame_names: Iterable[str]) -> Capture:
+        """Return the capture of these frames, in this order; raises InputError for a frame that it lacks."""
+        places = {name: place for place, name in enumerate(self.frame_names)}
+        names = list(frame_names)
+        if missing := [name for name in names if name not in places]:
+            raise InputError(
+                f"{self.path} has no frame {missing[0]!r}; it has {len(self)} frames, from {self.frame_names[0]!r} to "
+                f"{self.frame_names[-1]!r}"
+            )
+        return self._at([places[name] for name in names], names)
+
+    def depth(self, frame: int) -> Float32[np.ndarray, "h w"] | None:
+        """Return the depth of a frame along z, 0 where it is unknown, or None for a frame without depth.
+
+        It spans the picture, often with fewer pixels; it is in metres if the capture is `metric`, else in the unit of
+        the poses. Raises InputError for an unreadable file, MissingExtraError where a format's library is missing.
+        """
+        if self.depth_files is None or self.read_depth_file is None or (path := self.depth_files[frame]) is None:
+            return None
+        values = self.read_depth_file(path)
+        (width, height), (rows, columns) = self.sizes[frame], values.shape
+        if abs(columns * height - rows * width) > max(width, height):  # more than one pixel of rounding
+            raise InputError(
+                f"{path} has {columns} x {rows} pixels and its picture {width} x {height}; expected the same shape"
+            )
+        return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+
+    def _at(self, places: list[int], names: Sequence[str]) -> Capture:
+        def chosen(values: Any) -> Any:
+            if isinstance(values, tuple):
+                return tuple(values[place] for place in places)
+            return None if values is None else values[places]
+
+        fields = ("pictures", "sizes", "intrinsics", "world_from_camera", "depth_files", "timestamps")
+        capture = dataclasses.replace(self, **{name: chosen(getattr(self, name)) for name in fields})
+        capture.__dict__["frame_names"] = tuple(names)  # of the whole capture, also where fewer would be unique
+        return capture
+
+
+def checked_sizes(pictures: Sequence[Path], source: Path) -> tuple[tuple[int, int], ...]:
+    """Return width and height of pictures; raises InputError for a missing one, which `source` names."""
+    for path in pictures:
+        if not path.is_file():
+            raise InputError(f"{path} is missing, but {source} names it; get the capture whole")
+        if has_unclear_pixels(path):
+            raise InputError(
+                f"{path} is stored upside down or mirrored (its EXIF orientation), and its camera may count the stored "
+                "pixels or the shown ones; write the pictures upright, and make the cameras anew"
+            )
+    return tuple(picture_size(path) for path in pictures)
+
+
+def fitted_intrinsics(
+    intrinsics: Sequence[Float64[np.ndarray, "3 3"]],
+    camera_sizes: Sequence[tuple[int, int]],
+    sizes: Sequence[tuple[int, int]],
+    source: Path,
+) -> Float64[np.ndarray, "S 3 3"]:
+    """Return intrinsics of cameras of (width, height) at the pictures' sizes; raises InputError for another shape."""
+    cameras = zip(intrinsics, camera_sizes, sizes, strict=True)
+    return np.stack([resized_intrinsics(matrix, size, picture, source) for matrix, size, picture in cameras])
+
+
+def left_out(missing: Sequence[str], count: int, what: str) -> tuple[str, ...]:
+    """Return a note on pictures that a capture leaves out because they lack something; none if there are none."""
+    if not missing:
+        return ()
+    return (f"{len(missing)} of {count} pictures have no {what} and are left out, {missing[0]} first",)
+
+
+def known(values: Float32[np.ndarray, "h w"], sure: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
+    """Return depth with 0 where it is not sure."""
+    return np.where(sure, values, 0).astype(np.float32)

@@ -1,0 +1,45 @@
+"""The pictures of a capture as the source of a clip. Does not import jax."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from vggtjax.captures.capture import Capture
+from vggtjax.clips.images import ImageFiles, read_image
+from vggtjax.clips.sampling import Frame, Sampling
+
+
+@dataclass(frozen=True)
+class CaptureFrames(ImageFiles):
+    """The frames of a capture, in its order and by its names, with its times where it has some."""
+
+    capture: Capture
+
+    @property
+    def name(self) -> str:
+        """The name of the capture's folder, or of its file without the suffix."""
+        path = self.capture.path.resolve()
+        return path.name if self.capture.path.is_dir() else path.stem
+
+    @property
+    def frame_names(self) -> tuple[str, ...]:
+        """Those of the capture."""
+        return self.capture.frame_names
+
+    def total(self, sampling: Sampling) -> int:
+        """Return how many frames `sampling` takes."""
+        return len(self._taken(sampling))
+
+    def frames(self, sampling: Sampling) -> Iterator[Frame]:
+        """Yield the frames that `sampling` takes. Raises ClipError for a file that cannot be read."""
+        times = self.capture.timestamps
+        for index in self._taken(sampling):
+            time = None if times is None else float(times[index] - times[0])
+            yield Frame(self.frame_names[index], read_image(self.paths[index]), time)
+
+    def _taken(self, sampling: Sampling) -> list[int]:
+        times = self.capture.timestamps
+        if sampling.fps is None or times is None:
+            return list(sampling.indices(len(self.paths)))
+        return [index for index, _, _ in sampling.select((float(time - times[0]), None) for time in times)]

@@ -1,0 +1,108 @@
+"""The raw data that Polycam exports of a lidar capture (developer mode). Does not import jax.
+
+keyframes/images and keyframes/cameras hold ARKit's pictures and poses, corrected_images and corrected_cameras those
+after Polycam's optimisation, without lens distortion. A camera is JSON: width, height, fx, fy, cx, cy, and t_00 to
+t_23, three rows of world-from-camera in ARKit's axes: the camera looks along -z, the world's y is up, the unit is a
+metre. depth/ is PNG of 16 bits in millimetres, with fewer pixels than the pictures; confidence/ has 0 where it is low.
+Files are named after the time in microseconds. Pixels are taken to count from the outer corner of the first.
+https://github.com/PolyCam/polyform
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from vggtjax.captures.cameras import DISTORTED, PIXEL_CENTRE, from_opengl, intrinsics_matrix
+from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, known, left_out
+from vggtjax.captures.depth_files import read_png
+from vggtjax.captures.files import files
+from vggtjax.captures.numbers import number
+from vggtjax.captures.pictures import PNG, opening
+from vggtjax.clips.images import is_image_name
+from vggtjax.clips.order import natural_key
+from vggtjax.errors import InputError
+from vggtjax.storage.json_values import read_json
+
+_KEYFRAMES = "keyframes"
+_PER_METRE = 1000.0
+_NOT_OPTIMISED = "its poses are ARKit's own: Polycam did not optimise them"  # a note
+
+
+def is_polycam(folder: Path) -> bool:
+    """Return whether a folder has the names of Polycam's raw data; a folder keyframes alone may hold anything."""
+    return any((folder / _KEYFRAMES / name).is_dir() for name in ("cameras", "corrected_cameras"))
+
+
+def read_polycam(folder: Path) -> Capture:
+    """Read raw data of Polycam: the optimised cameras with their pictures where there are some, else ARKit's."""
+    root = folder / _KEYFRAMES
+    corrected = bool(files(root / "corrected_cameras", ".json")) and (root / "corrected_images").is_dir()
+    prefix = "corrected_" if corrected else ""
+    cameras = files(root / f"{prefix}cameras", ".json")
+    if not cameras:
+        raise InputError(f"{root} has no cameras/*.json; export Polycam's raw data, with developer mode on")
+    pictures = _pictures(root / f"{prefix}images")
+    if alone := [name for name in cameras if name not in pictures]:
+        raise InputError(f"{root} has the camera {alone[0]} and no picture for it; get the capture whole")
+    lost = [name for name in pictures if name not in cameras]
+    paths = tuple(pictures[name] for name in cameras)
+    sizes = checked_sizes(paths, root)
+    read = [_camera(path) for path in cameras.values()]
+    depths = files(root / "depth", ".png")
+    missing = left_out(lost, len(pictures), "camera")
+    return Capture(
+        "polycam",
+        folder,
+        paths,
+        sizes,
+        fitted_intrinsics([matrix for matrix, _, _ in read], [size for _, size, _ in read], sizes, root),
+        from_opengl(np.stack([pose for _, _, pose in read]), root),
+        distorted=not corrected,
+        metric=True,
+        depth_files=tuple(depths.get(name) for name in cameras) if depths else None,
+        read_depth_file=_read_depth,
+        timestamps=_times(list(cameras)),
+        left_out=missing,
+        notes=missing + (() if corrected else (_NOT_OPTIMISED, DISTORTED)),
+    )
+
+
+def _pictures(folder: Path) -> dict[str, Path]:
+    found = folder.iterdir() if folder.is_dir() else ()
+    paths = [path for path in found if is_image_name(path) and not path.name.startswith(".")]
+    return {path.stem: path for path in sorted(paths, key=natural_key)}
+
+
+def _camera(path: Path) -> tuple[Float64[np.ndarray, "3 3"], tuple[int, int], Float64[np.ndarray, "4 4"]]:
+    values = read_json(path, dict[str, Any], "camera")
+    width, height = int(number(values, "width", path)), int(number(values, "height", path))
+    if min(width, height) < 1:
+        raise InputError(f"{path} has a picture of {width} x {height} pixels; expected sizes above 0")
+    fx, fy, cx, cy = (number(values, key, path) for key in ("fx", "fy", "cx", "cy"))
+    rows = [[number(values, f"t_{row}{column}", path) for column in range(4)] for row in range(3)]
+    matrix = intrinsics_matrix(fx, fy, cx, cy, first_pixel=PIXEL_CENTRE, source=path)
+    return matrix, (width, height), np.array([*rows, [0, 0, 0, 1]], np.float64)
+
+
+def _read_depth(path: Path) -> Float32[np.ndarray, "h w"]:
+    """Read metres, 0 where the confidence is low."""
+    depth = read_png(path, _PER_METRE)
+    confidence = path.parent.with_name("confidence") / path.name
+    if not confidence.is_file():
+        return depth
+    with opening(confidence, PNG) as image:
+        sure = np.asarray(image.convert("L")) > 0
+    if sure.shape != depth.shape:
+        raise InputError(f"{confidence} has shape {sure.shape}; expected {depth.shape}, that of the depth")
+    return known(depth, sure)
+
+
+def _times(names: list[str]) -> Float64[np.ndarray, " S"] | None:
+    if not all(name.isdecimal() and len(name) <= 20 for name in names):
+        return None
+    times = np.array([int(name) * 1e-6 for name in names])
+    return times if (np.diff(times) > 0).all() else None

@@ -1,0 +1,65 @@
+"""Captures of apps and other programs as ground truth: what `vggtjax.captures` reads. Does not import jax."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from vggtjax.captures.capture import Capture
+from vggtjax.captures.files import files
+from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, read_capture
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.folders import sequence_folders
+from vggtjax.evaluation.datasets.frames import FrameChoice
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
+
+_OWN_UNIT = "its unit is not the metre, but one of its program's own"  # a note
+
+
+def captures(root: Path) -> dict[str, Opener]:
+    """Find the captures of a folder: the folder itself, or folders and .r3d files in it."""
+    found: dict[str, Path] = dict(files(root, RECORD3D_SUFFIX)) if capture_kind(root) is None else {}
+    try:
+        found |= sequence_folders(root, lambda folder: capture_kind(folder) is not None, "a capture")
+    except InputError:
+        if not found:
+            raise
+    return {name: partial(_read, path, name) for name, path in found.items()}
+
+
+def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
+    whole = read_capture(path)
+    capture = whole.for_frames(frames.of(whole.frame_names, name))
+    maps = capture.depth_files or (None,) * len(capture)
+    missing = [frame for frame, file in zip(capture.frame_names, maps, strict=True) if file is None]
+    notes = capture.notes + (() if capture.metric else (_OWN_UNIT,))
+    if len(missing) == len(capture):
+        notes += ("it has no depth",)
+    elif missing:
+        notes += (f"{len(missing)} of {len(capture)} frames have no depth, {missing[0]} first",)
+    return LabelledSequence(
+        name,
+        capture.pictures,
+        None if len(missing) == len(capture) else partial(_depth, capture),
+        world_from_camera=capture.world_from_camera,
+        intrinsics=capture.intrinsics,
+        timestamps=capture.timestamps,
+        notes=notes,
+        frame_names=capture.frame_names,
+        archive=capture.archive,
+    )
+
+
+def _depth(capture: Capture, frame: int) -> Float32[np.ndarray, "h w"]:
+    """Return the depth at the picture's pixels: each takes that of the map's pixel around its centre."""
+    width, height = capture.sizes[frame]
+    if (depth := capture.depth(frame)) is None:
+        return np.zeros((height, width), np.float32)
+    rows, columns = (
+        ((np.arange(side) + 0.5) * count / side).astype(int)
+        for side, count in zip((height, width), depth.shape, strict=True)
+    )
+    return depth[rows[:, None], columns]
