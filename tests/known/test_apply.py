@@ -1,0 +1,123 @@
+"""Several known things together, what a capture tells, and pixels that are left out."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.textured_room import textured_room
+from vggtjax.captures.capture import Capture
+from vggtjax.errors import InputError
+from vggtjax.known.apply import apply_known, scaled
+from vggtjax.known.given import read_known
+from vggtjax.known.options import KnownGeometry
+
+TRUE = textured_room(4)
+SOURCE_K = TRUE.intrinsics * np.array([[2], [2], [1]])  # its source has twice its pixels
+
+
+def _capture(**changes):
+    """Return what an app recorded of the room, with depth at half of the result's pixels."""
+    fields = {
+        "kind": "polycam",
+        "path": Path("capture"),
+        "pictures": tuple(Path(f"{name}.jpg") for name in TRUE.frame_names),
+        "sizes": ((168, 112),) * 4,
+        "metric": True,
+    }
+    capture = Capture(**(fields | changes))
+    capture.__dict__["frame_names"] = TRUE.frame_names
+    return capture
+
+
+def test_intrinsics_poses_and_depth_come_from_the_source():
+    known = KnownGeometry(intrinsics="source", poses="source", known_depths="source")
+    maps = {Path(f"{frame}.npy"): TRUE.depth[frame, ::2, ::2] for frame in range(4)}
+    capture = _capture(
+        intrinsics=SOURCE_K.astype(np.float64),
+        world_from_camera=TRUE.world_from_camera.astype(np.float64),
+        depth_files=tuple(maps),
+        read_depth_file=maps.__getitem__,
+    )
+    found, unit = apply_known(scaled(TRUE, 0.5), read_known(known, scaled(TRUE, 0.5), capture=capture))
+    np.testing.assert_allclose(found.depth, TRUE.depth, rtol=1e-3)
+    np.testing.assert_allclose(found.camera_from_world, TRUE.camera_from_world, atol=1e-3)
+    assert unit == pytest.approx(2, rel=1e-3)
+    assert found.length_unit == "metre"
+    assert set(found.known_facts) == {"intrinsics", "poses", "depth by poses", "scale"}
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        ({"intrinsics": "source"}, "capture has no intrinsics"),
+        ({"poses": "source"}, "capture has no poses"),
+        ({"known_depths": "source"}, "capture has no depth maps"),
+    ],
+)
+def test_a_capture_that_lacks_something_is_refused(known, message):
+    with pytest.raises(InputError, match=message):
+        apply_known(TRUE, read_known(KnownGeometry(**known), TRUE, capture=_capture()))
+
+
+def test_depth_in_a_unit_of_the_capture_is_not_in_metres():
+    maps = {Path(f"{frame}.npy"): 3 * TRUE.depth[frame] for frame in range(4)}
+    capture = _capture(metric=False, depth_files=tuple(maps), read_depth_file=maps.__getitem__)
+    found, unit = apply_known(TRUE, read_known(KnownGeometry(known_depths="source"), TRUE, capture=capture))
+    assert unit == pytest.approx(3, rel=1e-5)
+    assert found.length_unit == "unit of the capture"
+    assert found.known_facts["scale"].startswith("3 units of the capture per unit")
+
+
+def test_depth_maps_of_a_capture_are_read_before_the_work():
+    def broken(path):
+        raise InputError(f"{path} is broken")
+
+    capture = _capture(depth_files=(None, None, None, Path("3.png")), read_depth_file=broken)
+    with pytest.raises(InputError, match=r"3\.png is broken"):
+        read_known(KnownGeometry(known_depths="source"), TRUE, capture=capture)
+
+
+def test_a_source_that_is_no_capture_is_refused():
+    with pytest.raises(InputError, match=r"intrinsics and poses shall come from the source, .* is no capture"):
+        apply_known(TRUE, read_known(KnownGeometry(intrinsics="source", poses="source"), TRUE))
+
+
+def test_pixels_left_out_have_no_points_and_do_not_move():
+    sky = np.zeros(TRUE.depth.shape, bool)
+    sky[:, :40] = True
+    found = apply_known(TRUE, read_known(KnownGeometry(), TRUE, leave_out=sky)).result
+    assert not found.valid_pixels[sky].any()
+    assert not found.dynamic_mask[sky].any()
+    np.testing.assert_array_equal(found.depth[~sky], TRUE.depth[~sky])
+    assert found.known_facts["left out"] == "71.4% of the pixels"
+    inside = np.ones_like(sky)
+    inside[:, :, :3] = False  # padding is never left out
+    padded = textured_room(4, valid_box=np.tile([3, 0, *TRUE.depth.shape[:0:-1]], (4, 1)))
+    for clip, masks in ((TRUE, np.ones_like(sky)), (padded, inside)):
+        with pytest.raises(InputError, match="covers every pixel"):
+            read_known(KnownGeometry(), clip, leave_out=masks)
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        ({"intrinsics": "1,1,1,1", "shared_focal": True}, "exclude each other"),
+        ({"baseline": "0,1,1", "camera_height": 1.5}, "--baseline and --camera-height each set the scale"),
+        ({"camera_height": -1.0}, "expected 0.01 to 10000 metres"),
+    ],
+)
+def test_opposites_are_refused(known, message):
+    with pytest.raises(InputError, match=message):
+        KnownGeometry(**known)
+
+
+@pytest.mark.parametrize("name", ["intrinsics", "poses", "known_depths", "leave_out"])
+def test_missing_files_are_found_before_the_work(name):
+    value: Any = Path("nothing") if name == "leave_out" else "nothing"
+    too_long: Any = 300 * "a"
+    with pytest.raises(InputError, match=f"{name} is 'nothing'"):
+        KnownGeometry(**{name: value}).check_files()
+    with pytest.raises(InputError, match=f"{name} is 'aaa"):
+        KnownGeometry(**{name: too_long}).check_files()

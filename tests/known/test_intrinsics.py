@@ -1,0 +1,137 @@
+"""Known intrinsics: their files, the way to a result's pixels, and poses that keep what the network saw."""
+
+import numpy as np
+import pytest
+
+from tests.room import make_room
+from vggtjax.errors import InputError
+from vggtjax.known.apply import apply_known, with_intrinsics
+from vggtjax.known.given import read_known
+from vggtjax.known.intrinsics import at_clip_pixels, known_values, read_intrinsics, shared_focal
+from vggtjax.known.options import KnownGeometry
+
+SOURCE_K = [75.6, 75.6, 42.0, 28.0]  # of the room, whose source has twice its 42 x 28 pixels
+
+
+@pytest.mark.parametrize(
+    ("text", "shape"),
+    [
+        ("75.6 0 42\n0 75.6 28\n0 0 1\n", (1, 3, 3)),
+        ("75.6 75.6 42 28\n", (1, 3, 3)),
+        ("# fx fy cx cy\n" + "75.6, 75.6, 42, 28\n" * 3, (3, 3, 3)),
+        ("75.6 0 42 0 75.6 28 0 0 1\n" * 3, (3, 3, 3)),
+    ],
+)
+def test_every_kind_of_file_gives_the_matrix_in_the_pixels_of_the_result(tmp_path, text, shape):
+    (tmp_path / "K.txt").write_text(text)
+    found = read_intrinsics(str(tmp_path / "K.txt"))
+    assert found.shape == shape
+    np.testing.assert_allclose(at_clip_pixels(found, make_room(), "K"), make_room().intrinsics, rtol=1e-6)
+    np.testing.assert_array_equal(found[0], read_intrinsics("75.6,75.6,42,28")[0])
+
+
+def test_a_crop_moves_the_principal_point():
+    room = make_room(source_offset=np.tile([10.0, 4.0], (3, 1)), source_size=np.tile([64, 104], (3, 1)))
+    found = at_clip_pixels(read_intrinsics("75.6,75.6,52,32"), room, "K")
+    np.testing.assert_allclose(found, room.intrinsics, rtol=1e-6)
+
+
+def test_exact_intrinsics_change_nothing():
+    room = make_room(frames=6)
+    known, residual = with_intrinsics(room, room.intrinsics.astype(np.float64))
+    np.testing.assert_allclose(known.camera_from_world, room.camera_from_world, atol=1e-5)
+    assert residual < 1e-4
+
+
+def test_the_truth_comes_back_from_a_wrong_focal_length_that_kept_the_correspondences():
+    # Without rotation, f -> s f, z -> s z in depth and in the cameras' places keeps every correspondence.
+    true = make_room(frames=6)
+    poses = np.tile(np.eye(3, 4), (6, 1, 1))
+    poses[:, :, 3] = -true.camera_centres
+    depth = 5 - true.camera_centres[:, 2, None, None] + np.zeros_like(true.depth)
+    still = np.zeros_like(true.dynamic_mask)
+    stretch = 1.3
+    wrong_K, wrong_poses = true.intrinsics.copy(), poses.copy()
+    wrong_K[:, [0, 1], [0, 1]] *= stretch
+    wrong_poses[:, 2, 3] *= stretch
+    seen = make_room(
+        frames=6, intrinsics=wrong_K, camera_from_world=wrong_poses, depth=stretch * depth, dynamic_mask=still
+    )
+    found = apply_known(seen, read_known(KnownGeometry(intrinsics="75.6,75.6,42,28"), seen)).result
+    expected = poses.copy()
+    expected[:, :, 3] *= stretch  # the truth, up to the one scale
+    expected[:, :, 3] -= expected[0, :, 3] - found.camera_from_world[0, :, 3]  # the first camera stays
+    np.testing.assert_allclose(found.intrinsics, true.intrinsics, rtol=1e-6)
+    np.testing.assert_allclose(found.camera_from_world, expected, atol=2e-5)
+    np.testing.assert_allclose(found.depth, stretch * depth, rtol=1e-6)
+
+
+def test_a_single_frame_has_no_correspondences_to_keep():
+    found = apply_known(make_room(frames=1), read_known(KnownGeometry(shared_focal=True), make_room(frames=1))).result
+    assert found.known_facts["shared focal length"].endswith("against the prediction; no correspondences to keep")
+
+
+def test_values_of_a_file_change_with_the_file(tmp_path):
+    known = KnownGeometry(intrinsics=str(tmp_path / "K.txt"))
+    (tmp_path / "K.txt").write_text("75 75 42 28")
+    first = known_values(known)
+    (tmp_path / "K.txt").write_text("80 75 42 28")
+    assert first == {"intrinsics": [[[75, 0, 42], [0, 75, 28], [0, 0, 1]]]}
+    assert known_values(known)["intrinsics"][0][0] == [80, 0, 42]
+    assert known_values(KnownGeometry(intrinsics="source")) == {"intrinsics": "source"}
+
+
+def test_movers_take_no_part():
+    room = make_room(frames=6)
+    broken = np.where(room.dynamic_mask, np.float32(40), room.depth)
+    wider = room.intrinsics.astype(np.float64)
+    wider[:, [0, 1], [0, 1]] *= 0.9
+    first, _ = with_intrinsics(room, wider)
+    second, _ = with_intrinsics(make_room(frames=6, depth=broken), wider)
+    np.testing.assert_array_equal(first.camera_from_world, second.camera_from_world)
+
+
+def test_a_shared_focal_length_is_the_median_in_source_pixels():
+    K = make_room().intrinsics.copy()
+    K[:, 0, 0], K[:, 1, 1] = [30.0, 40.0, 90.0], [15.0, 20.0, 45.0]  # source pixels: both axes 60, 80, 180
+    room = make_room(intrinsics=K, source_scale=np.tile([2.0, 4.0], (3, 1)), source_size=np.tile([112, 84], (3, 1)))
+    found = shared_focal(room)
+    np.testing.assert_allclose(found[:, 0, 0], 40, rtol=1e-6)
+    np.testing.assert_allclose(found[:, 1, 1], 20, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("75,75,42", "four numbers"),
+        ("75,75,42,nan", "four numbers"),
+        ("75,75,420,28", r"cx 420, cy 28 for frame 0 of 84 x 56 pixels: the principal point lies at the border"),
+        ("151,151,84,56", "the principal point lies at the border .* scale those of another size"),
+        ("1," * 200, "four numbers"),
+        ("4,4,42,28", r"expected focal lengths of 8.4 to 4200 pixels"),
+        ("nothing.txt", "cannot read"),
+    ],
+)
+def test_intrinsics_that_do_not_fit_are_refused(text, message):
+    with pytest.raises(InputError, match=message):
+        apply_known(make_room(), read_known(KnownGeometry(intrinsics=text), make_room()))
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (["75 75 42 28"] * 2, "2 sets of intrinsics; expected 1, or 3"),
+        (["75 0 42", "0 75 28"], "2 rows of 3 numbers"),
+        (["75 9 42", "0 75 28", "0 0 1"], "without skew"),
+        (["75 75 42 28 1"], "5 numbers a line; expected 3 or 4 or 9"),
+    ],
+)
+def test_files_that_do_not_fit_are_refused(tmp_path, lines, message):
+    (tmp_path / "K.txt").write_text("\n".join(lines) + "\n")
+    with pytest.raises(InputError, match=message):
+        apply_known(make_room(), read_known(KnownGeometry(intrinsics=str(tmp_path / "K.txt")), make_room()))
+
+
+def test_a_principal_point_of_another_size_is_warned_about(caplog):
+    at_clip_pixels(read_intrinsics("75,75,21,14"), make_room(), "K.txt")
+    assert "are the intrinsics those of another size?" in caplog.text

@@ -1,0 +1,97 @@
+"""What the options name, read and checked against a clip before any long work. Does not import jax."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from vggtjax.captures.capture import Capture
+from vggtjax.errors import InputError
+from vggtjax.known.depths import DepthSamples, check_depths, read_depths
+from vggtjax.known.frames import Frames
+from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
+from vggtjax.known.options import SOURCE, Baseline, KnownGeometry, parse_baseline
+from vggtjax.known.poses import checked_known_poses, read_poses
+
+
+class Given(NamedTuple):
+    """Known cameras and lengths of a clip of S frames, as far as they are given."""
+
+    options: KnownGeometry
+    intrinsics: Float64[np.ndarray, "S 3 3"] | None = None  # pixels of the clip
+    poses: Float64[np.ndarray, "S 4 4"] | None = None  # world-from-camera
+    poses_name: str = ""  # where the poses come from
+    baseline: Baseline | None = None
+    depths: DepthSamples | None = None  # of a file
+    leave_out: Bool[np.ndarray, "S H W"] | None = None
+    capture: Capture | None = None  # of the clip's frames, where an option asks for it
+
+
+def read_known(
+    known: KnownGeometry,
+    frames: Frames,
+    *,
+    leave_out: Bool[np.ndarray, "S H W"] | None = None,
+    capture: Capture | None = None,
+) -> Given:
+    """Read what the options name, and check it against the frames.
+
+    Args:
+        known: the options; the folder of masks is not read here.
+        frames: the clip, or its result.
+        leave_out: pixels without depth.
+        capture: that the clip comes from, if it does.
+
+    Raises:
+        InputError: values that do not fit the clip, and "source" without a capture, or with one that lacks them.
+    """
+    count = len(frames.images)
+    if leave_out is not None and all(mask[_inside(frames, i)].all() for i, mask in enumerate(leave_out)):
+        raise InputError("leave_out covers every pixel; expected pictures that are bright where depth is left out")
+    capture = _of_frames(known, frames, capture) if known.from_source else None
+    intrinsics = poses = baseline = depths = None
+    poses_name = ""
+    if known.intrinsics is not None:
+        matrices = _recorded(capture, "intrinsics") if known.intrinsics == SOURCE else read_intrinsics(known.intrinsics)
+        intrinsics = at_clip_pixels(matrices, frames, "intrinsics")
+    if known.poses is not None:
+        from_source = known.poses == SOURCE
+        poses = _recorded(capture, "world_from_camera") if from_source else read_poses(known.poses, frames)
+        poses_name = str(capture.path) if from_source and capture is not None else known.poses
+        poses = checked_known_poses(poses, count, poses_name)
+    if known.baseline is not None:
+        baseline = parse_baseline(known.baseline)
+        if max(baseline.first, baseline.second) >= count:
+            raise InputError(
+                f"baseline names frames {baseline.first} and {baseline.second}; expected frames 0 to {count - 1}"
+            )
+    if known.known_depths == SOURCE and capture is not None:
+        check_depths(capture)
+    elif known.known_depths is not None:
+        depths = read_depths(known.known_depths, frames)
+    return Given(known, intrinsics, poses, poses_name, baseline, depths, leave_out, capture)
+
+
+def _inside(frames: Frames, frame: int) -> tuple[slice, slice]:
+    left, top, right, bottom = frames.valid_box[frame].tolist()
+    return slice(top, bottom), slice(left, right)
+
+
+def _of_frames(known: KnownGeometry, frames: Frames, capture: Capture | None) -> Capture:
+    if capture is None:
+        raise InputError(
+            f"{' and '.join(known.from_source)} shall come from the source, and the clip's source is no capture; "
+            "expected a folder of COLMAP, nerfstudio, Record3D, Polycam or TUM"
+        )
+    return capture.for_frames(frames.frame_names)
+
+
+def _recorded(capture: Capture | None, name: str) -> Float64[np.ndarray, "S n n"]:
+    values = getattr(capture, name)
+    if values is None:
+        words = {"intrinsics": "intrinsics", "world_from_camera": "poses"}
+        path = "" if capture is None else capture.path
+        raise InputError(f"{path} has no {words[name]}; give them as a file, or leave the option out")
+    return values

@@ -1,0 +1,125 @@
+"""What the user knows of a clip's cameras and scale, as options. Does not import jax."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import tyro
+
+from vggtjax.errors import InputError, one_line
+from vggtjax.storage.flags import InWords, Switch
+from vggtjax.storage.json_values import check_fields
+
+SOURCE = "source"  # in place of a file: what the capture that the clip comes from says
+
+
+class Baseline(NamedTuple):
+    """The distance between the camera centres of two frames."""
+
+    first: int
+    second: int
+    metres: float
+
+
+def _words(metavar: str):
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
+
+
+@dataclass(frozen=True)
+class KnownGeometry:
+    """Known cameras and lengths. Raises InputError for an invalid value, or for options that exclude each other."""
+
+    intrinsics: Annotated[str | None, _words("FX,FY,CX,CY|FILE|source")] = None
+    """known focal lengths and principal point in pixels of the source: four numbers, or a file with a 3 x 3 matrix or
+    with four numbers or nine a line, for all frames or for each; source: those of the capture's folder"""
+    shared_focal: Switch = False
+    """one focal length for the whole clip, the median of the predicted ones"""
+    poses: Annotated[str | None, _words("FILE|source")] = None
+    """known camera poses, world-from-camera: TUM's eight numbers a line or KITTI's twelve; source: those of the
+    capture's folder"""
+    baseline: Annotated[str | None, _words("I,J,METRES")] = None
+    """metric scale: the distance between the cameras of frames I and J, such as 0,7,0.85"""
+    camera_height: InWords[float | None] = None
+    """metric scale: the mean height of the cameras above the floor, in metres"""
+    known_depths: Annotated[str | None, _words("FILE|source")] = None
+    """metric scale: a CSV file with columns frame, x, y and depth, in pixels of the source and metres; source: the
+    depth maps of the capture's folder"""
+    leave_out: InWords[Path | None] = None
+    """folder of pictures, one per frame, bright where depth is left out, such as in the sky"""
+
+    def __post_init__(self) -> None:
+        if isinstance(self.leave_out, str):
+            object.__setattr__(self, "leave_out", Path(self.leave_out))
+        check_fields(self)
+        if self.intrinsics is not None and self.shared_focal:
+            raise InputError("--intrinsics and --shared-focal exclude each other; give one of them")
+        scales = {
+            "--baseline": self.baseline,
+            "--camera-height": self.camera_height,
+            "--known-depths": self.known_depths,
+        }
+        given = [flag for flag, value in scales.items() if value is not None]
+        if len(given) > 1:
+            raise InputError(f"{' and '.join(given)} each set the scale; give one of them")
+        if self.baseline is not None:
+            parse_baseline(self.baseline)
+        if self.camera_height is not None and not 0.01 <= self.camera_height <= 10_000:
+            raise InputError(f"camera_height is {self.camera_height}; expected 0.01 to 10000 metres")
+
+    def __bool__(self) -> bool:
+        """Whether anything is known."""
+        return self != KnownGeometry()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what is given, as JSON values."""
+        given = {name: value for name, value in asdict(self).items() if value not in (None, False)}
+        return given | ({} if self.leave_out is None else {"leave_out": str(self.leave_out)})
+
+    @property
+    def from_source(self) -> tuple[str, ...]:
+        """The options that the capture's folder answers."""
+        return tuple(name for name in ("intrinsics", "poses", "known_depths") if getattr(self, name) == SOURCE)
+
+    def check_many(self) -> None:
+        """Raise InputError for what is known of one clip alone: call it where there are many."""
+        alone = {
+            "--baseline": self.baseline is not None,
+            "--leave-out": self.leave_out is not None,
+            "--poses with a file": self.poses not in (None, SOURCE),
+            "--known-depths with a file": self.known_depths not in (None, SOURCE),
+        }
+        if given := [name for name, is_given in alone.items() if is_given]:
+            raise InputError(f"{given[0]} is of one clip; expected what all clips share, or source")
+
+    def check_files(self) -> None:
+        """Raise InputError for a missing file or folder: call it before long work."""
+        files = {"intrinsics": self.intrinsics, "poses": self.poses, "known_depths": self.known_depths}
+        for name, value in files.items():
+            numbers = name == "intrinsics" and value is not None and "," in value
+            # os.path says False, where a Path raises an error, of an over-long name.
+            if value is not None and value != SOURCE and not numbers and not os.path.isfile(value):  # noqa: PTH113
+                other = "fx,fy,cx,cy, " if name == "intrinsics" else ""
+                raise InputError(
+                    f"{name} is {one_line(value)!r}, and there is no such file; expected {other}a file or source"
+                )
+        if self.leave_out is not None and not os.path.isdir(self.leave_out):  # noqa: PTH112 - as above
+            raise InputError(f"leave_out is {str(self.leave_out)!r}; expected a folder of pictures")
+
+
+def parse_baseline(text: str) -> Baseline:
+    """Return the frames and the distance of `I,J,METRES`; raises InputError for anything else."""
+    words = text.split(",")
+    try:
+        first, second, metres = int(words[0]), int(words[1]), float(words[2])
+    except (IndexError, ValueError):
+        first = second = -1
+        metres = 0.0
+    if len(words) != 3 or min(first, second) < 0 or first == second or not 0 < metres < 1e6:
+        raise InputError(
+            f"baseline is {one_line(text)!r}; expected I,J,METRES: two different frames, counted from 0, and the "
+            "distance between their cameras"
+        )
+    return Baseline(first, second, metres)
