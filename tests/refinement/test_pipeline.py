@@ -1,0 +1,51 @@
+"""Refinement of cameras through the whole reconstruction."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pycolmap", reason="needs the extra colmap")
+
+from tests.corner import make_corner, paint
+from tests.tiny import tiny_config
+from vggtjax import KnownGeometry, init_params, load_clip, reconstruct
+from vggtjax.checkpoint import Model
+from vggtjax.errors import InputError
+from vggtjax.options import Options
+from vggtjax.pipeline.several import reconstruct_methods
+from vggtjax.progress import StageSeconds
+
+
+@pytest.fixture(scope="module")
+def model():
+    config = tiny_config()
+    return Model(config, init_params(0, config), "tiny")
+
+
+@pytest.mark.filterwarnings("ignore:the field of view")
+def test_the_option_and_its_outcome_reach_the_result(model, tmp_path):
+    clip = load_clip(paint(make_corner(3, 0.5)), size=56)
+    times = StageSeconds()
+    known = KnownGeometry(intrinsics="170,170,96,72", baseline="0,2,1.5")
+    result = reconstruct(model, clip, method="vggt", refine_cameras=True, known=known, on_stage=times.stage)
+    assert "refine cameras" in times.seconds
+    assert result.settings["refine_cameras"] is True
+    outcome = result.settings["refined_cameras"]
+    assert outcome["frames"] == 3
+    assert result.known_facts["cameras"] == outcome["sentence"]
+    np.testing.assert_allclose(result.intrinsics[:, [0, 1], [0, 1]], 170 * 56 / 192, rtol=0.02)  # the known ones
+    assert np.linalg.norm(np.subtract(*result.camera_centres[[0, 2]])) == pytest.approx(1.5, rel=1e-4)
+    result.save(tmp_path / "out", only=("report",))
+    assert outcome["sentence"] in (tmp_path / "out" / "report.html").read_text().replace("-&gt;", "->")
+    assert "refine_cameras" not in Options().to_json()
+
+
+def test_known_poses_are_not_refined(model, tmp_path):
+    (tmp_path / "poses.txt").write_text("")
+    clip = load_clip(paint(make_corner(2, 0.5)), size=56)
+    with pytest.raises(InputError, match="refine_cameras and known poses exclude each other"):
+        reconstruct(model, clip, refine_cameras=True, known=KnownGeometry(poses=str(tmp_path / "poses.txt")))
+
+
+def test_several_methods_are_not_refined_at_once(model):
+    with pytest.raises(InputError, match="refine_cameras is for one method"):
+        reconstruct_methods(model, load_clip(paint(make_corner(2, 0.5)), size=56), ["vggt"], refine_cameras=True)
