@@ -8,7 +8,9 @@ from .render import Surface as Surface
 from .render import SyntheticClip as SyntheticClip
 from .render import cast as cast
 from .render import generate as generate
+from .render import render as render
 from .sampling import sample_scene as sample_scene
 from .scene import Scene as Scene
 from .textures import Textures as Textures
 from .textures import load_textures as load_textures
+from .walks import closed_walk as closed_walk

@@ -49,7 +49,12 @@ def generate(key: Array, textures: Textures, config: SceneConfig) -> SyntheticCl
     The same key and textures give the same clip, whatever the batch.
     """
     scene_key, noise_key = jax.random.split(key)
-    scene = sample_scene(scene_key, textures.tiles, config)
+    return render(sample_scene(scene_key, textures.tiles, config), noise_key, textures, config)
+
+
+@full_precision
+def render(scene: Scene, noise_key: Array, textures: Textures, config: SceneConfig) -> SyntheticClip:
+    """Return the clip of a scene, with noise of a key. Pure: jit with `config` static."""
     step = 1 / max(config.frames - 1, 1)
     times = jnp.asarray(np.arange(config.frames, dtype=np.float32) * np.float32(step))
     clip = jax.lax.map(lambda time: _frame(scene, textures, config, time, step), times)

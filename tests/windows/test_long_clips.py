@@ -1,0 +1,132 @@
+"""Long clips end to end, with a double of the network that knows the truth: exact paths, movers, kills, bad input."""
+
+import logging
+import shutil
+
+import numpy as np
+import pytest
+
+from tests.windows.walk import CONFIG, FRAMES, movers, walk, window_result
+from vggtjax.clips.preprocessing import Fitter
+from vggtjax.errors import ClipError, InputError, OutputError
+from vggtjax.geometry.similarity import centres, umeyama_sim3
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.saving import Saving
+from vggtjax.storage.writing import locked_folder
+from vggtjax.windows.join import JoinRule
+from vggtjax.windows.plan import Windows
+from vggtjax.windows.run import LongRun, Tools, run_windows
+from vggtjax.windows.store import FOLDER
+
+FITTER = Fitter(size=CONFIG.width, patch=8)
+NOTHING = np.zeros((FRAMES, CONFIG.height, CONFIG.width), bool)
+
+
+def describe(images):
+    """Return small pictures as features: frames of one place look alike."""
+    return images[:, ::4, ::4].reshape(len(images), -1)
+
+
+def reconstructed(out, run, *, loops=False, masks=True, source=None) -> Reconstruction:
+    windows = Windows(16, 4, no_loops=not loops)
+    plan = LongRun(windows, fitter=FITTER, saving=Saving(only=("cameras", "depth")), rule=JoinRule(masks=masks))
+    images = np.asarray(walk().images) if source is None else source
+    return run_windows(images, out, plan, Tools(run, describe), {"seed": 0})
+
+
+def path_error(result) -> float:
+    """Return the largest distance of a camera from the truth after Sim(3), as a share of the path's extent."""
+    found, true = centres(result.camera_from_world), centres(walk().camera_from_world)
+    return np.linalg.norm(umeyama_sim3(found, true).apply(found) - true, axis=1).max() / np.ptp(true, axis=0).max()
+
+
+@pytest.mark.parametrize("loops", [False, True])
+def test_exact_windows_give_the_exact_path_and_depth(tmp_path, loops):
+    result = reconstructed(tmp_path, lambda clip: window_result(clip, 0, NOTHING), loops=loops)
+    true = walk()
+    assert path_error(result) < 1e-5
+    scale = umeyama_sim3(centres(result.camera_from_world), centres(true.camera_from_world)).scale
+    assert np.abs(scale * result.depth / true.depth - 1).max() < 1e-5
+    assert np.array_equal(result.images, np.round(255 * true.images).astype(np.uint8))
+    assert result.frame_names == tuple(f"{frame:06d}" for frame in range(FRAMES))
+    used = [loop["used"] for loop in result.settings["windows"]["loops"]]
+    assert bool(used) == loops
+    assert all(used)
+
+
+@pytest.mark.parametrize(("share", "off", "worse"), [(0.4, 0.03, 5e-4), (0.6, 0.1, 0.02)])
+def test_movers_spoil_the_path_unless_the_masks_leave_them_out(tmp_path, share, off, worse):
+    moving = movers(share)
+
+    def run(clip):
+        return window_result(clip, 0, moving, off)
+
+    assert path_error(reconstructed(tmp_path / "masks", run)) < 1e-5
+    assert path_error(reconstructed(tmp_path / "none", run, masks=False)) > worse
+
+
+def test_windows_without_shared_static_pixels_are_joined_by_their_cameras(tmp_path, caplog):
+    with caplog.at_level(logging.WARNING):
+        result = reconstructed(tmp_path, lambda clip: window_result(clip, 0, ~NOTHING))
+    assert "windows 0 and 1, which share frames 11 to 15, share no static pixels" in caplog.text
+    assert "joined by their cameras" in caplog.text
+    assert path_error(result) < 1e-4
+    assert result.settings["windows"]["static_pixels"] == [0] * 4
+
+
+def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(tmp_path):
+    class Killed(BaseException):
+        pass
+
+    calls: list[str] = []
+
+    def run(clip, stop=None):
+        if len(calls) == stop:
+            raise Killed
+        calls.append(clip.frame_names[0])
+        return window_result(clip, 0, movers(), 0.03)
+
+    reconstructed(tmp_path / "whole", run, loops=True)
+    every, calls = calls, []
+    assert len(every) > 5  # five windows, and those of loops
+    for stop in (2, 5):  # among the windows, at the first loop
+        with pytest.raises(Killed):
+            reconstructed(tmp_path / "killed", lambda clip, stop=stop: run(clip, stop), loops=True)
+        assert not (tmp_path / "killed" / "reconstruction.npz").exists()
+    reconstructed(tmp_path / "killed", run, loops=True)
+    assert calls == every  # nothing is computed twice
+    files = sorted(path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*") if path.is_file())
+    there = sorted(path.relative_to(tmp_path / "killed") for path in (tmp_path / "killed").rglob("*") if path.is_file())
+    assert there == files  # and the folder of the windows is gone
+    assert all((tmp_path / "whole" / name).read_bytes() == (tmp_path / "killed" / name).read_bytes() for name in files)
+
+
+def test_stored_windows_of_other_frames_are_not_used(tmp_path):
+    def fails_late(clip):
+        if clip.frame_names[0] != "000000":
+            raise RuntimeError("killed")
+        return window_result(clip, 0, NOTHING)
+
+    images = np.asarray(walk().images)
+    with pytest.raises(RuntimeError):
+        reconstructed(tmp_path, fails_late)
+    result = reconstructed(tmp_path, lambda clip: window_result(clip, 0, NOTHING), source=images[:, ::-1].copy())
+    assert np.array_equal(result.images[0], np.round(255 * images[0, ::-1]).astype(np.uint8))
+
+
+def test_bad_input_is_one_sentence_and_leaves_no_result(tmp_path):
+    def run(clip):
+        return window_result(clip, 0, NOTHING)
+
+    with pytest.raises(InputError, match="the clip has 16 frames and window is 16; expected a longer clip"):
+        reconstructed(tmp_path / "short", run, source=np.asarray(walk().images[:16]))
+    sizes = [np.zeros((32, 48, 3), np.uint8)] * 20 + [np.zeros((48, 48, 3), np.uint8)] * 20
+    with pytest.raises(ClipError, match="48 x 48 pixels and those before it to 48 x 32; windows need frames of one"):
+        reconstructed(tmp_path / "sizes", run, source=sizes)
+    with (
+        locked_folder(tmp_path / "used" / FOLDER, "a clip"),
+        pytest.raises(OutputError, match="another run is writing"),
+    ):
+        reconstructed(tmp_path / "used", run)
+    assert not list(tmp_path.rglob("reconstruction.npz"))
+    shutil.rmtree(tmp_path / "used")

@@ -1,0 +1,63 @@
+"""Which frames each window has."""
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vggtjax.errors import InputError
+from vggtjax.windows.plan import Windows, blend_weights, plan_windows, shared_frames
+
+
+def test_a_plan_by_hand():
+    assert plan_windows(20, 8, 2) == [range(8), range(6, 14), range(12, 20)]
+    assert plan_windows(9, 8, 2) == [range(8), range(1, 9)]  # the last window is as long as the first
+    assert shared_frames(range(8), range(6, 14)) == range(6, 8)
+
+
+@given(window=st.integers(4, 40), data=st.data())
+def test_every_plan_covers_the_clip_with_equal_windows_and_as_few_as_can_be(window, data):
+    overlap = data.draw(st.integers(2, window // 2))
+    frames = data.draw(st.integers(window + 1, 400))
+    windows = plan_windows(frames, window, overlap)
+    assert windows[0].start == 0
+    assert windows[-1].stop == frames
+    assert {len(w) for w in windows} == {window}
+    assert all(len(shared_frames(a, b)) >= overlap for a, b in pairwise(windows))
+    assert frames > (len(windows) - 1) * (window - overlap) + overlap  # one window fewer does not reach the end
+
+
+@given(window=st.integers(4, 30), frames=st.integers(31, 120))
+def test_weights_of_a_frame_sum_to_one_and_fall_towards_the_end_of_a_window(window, frames):
+    windows = plan_windows(frames, window, max(2, window // 4))
+    table = [blend_weights(frame, windows) for frame in range(frames)]
+    assert all(sum(weights.values()) == pytest.approx(1) for weights in table)
+    for a, b in zip(range(len(windows)), range(1, len(windows)), strict=False):
+        both = [weights[a] - weights[b] for weights in table if set(weights) == {a, b}]
+        assert both == sorted(both, reverse=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (
+            {"window": 15, "overlap": 8},
+            "window is 15 and overlap is 8; expected a window of at least twice the overlap",
+        ),
+        ({"window": 16, "overlap": 1}, "overlap is 1; expected a whole number of at least 2"),
+        ({"window": 3}, "window is 3; expected a whole number of at least 4"),
+        ({"overlap": 4}, "overlap is 4, but there are no windows; give window too"),
+    ],
+)
+def test_windows_that_cannot_be(options, sentence):
+    with pytest.raises(InputError, match=sentence):
+        Windows(**options)
+
+
+def test_a_clip_of_a_window_or_less_is_not_cut():
+    windows = Windows(16)
+    assert windows.shared == 4
+    assert not windows.cuts(16)
+    assert windows.cuts(17)
+    assert not Windows().cuts(10_000)

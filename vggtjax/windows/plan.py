@@ -1,0 +1,79 @@
+"""Which frames each window of a long clip has. Does not import jax."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vggtjax.errors import InputError, whole_number
+from vggtjax.storage.flags import InWords, Switch
+
+LEAST_OVERLAP = 2  # frames; one frame tells nothing of how cameras move
+
+
+@dataclass(frozen=True)
+class Windows:
+    """How a long clip is cut. Raises InputError for a value out of range."""
+
+    window: InWords[int | None] = None
+    """run the clip in windows of so many frames and join them: memory then does not depend on the clip's length; by
+    default all frames together"""
+    overlap: InWords[int | None] = None
+    """frames that neighbouring windows share, at least 2 and at most half a window; a quarter of a window by default"""
+    no_loops: Switch = False
+    """do not look for places that the camera comes back to"""
+
+    def __post_init__(self) -> None:
+        if self.window is None:
+            if self.overlap is not None:
+                raise InputError(f"overlap is {self.overlap}, but there are no windows; give window too")
+            return
+        object.__setattr__(self, "window", whole_number("window", self.window, 2 * LEAST_OVERLAP))
+        given = max(LEAST_OVERLAP, self.window // 4) if self.overlap is None else self.overlap
+        object.__setattr__(self, "overlap", whole_number("overlap", given, LEAST_OVERLAP))
+        if self.window < 2 * self.shared:
+            raise InputError(
+                f"window is {self.window} and overlap is {self.shared}; expected a window of at least twice the overlap"
+            )
+
+    @property
+    def shared(self) -> int:
+        """Frames that neighbouring windows share at least."""
+        return LEAST_OVERLAP if self.overlap is None else self.overlap
+
+    def cuts(self, frames: int) -> bool:
+        """Return whether a clip of so many frames is cut: it is longer than a window."""
+        return self.window is not None and frames > self.window
+
+
+def plan_windows(frames: int, window: int, overlap: int) -> list[range]:
+    """Return the frames of each window: all of one length, so that one compiled program runs them all.
+
+    There are as few windows as `overlap` allows. They are spread evenly, so that the last is as long as the others, and
+    neighbours share at least `overlap` frames.
+
+    Args:
+        frames: of the clip, more than `window`.
+        window: frames of a window.
+        overlap: the least number of frames that neighbours share, at most half a window.
+    """
+    last = frames - window
+    count = -(-last // (window - overlap)) + 1
+    starts = [number * last // (count - 1) for number in range(count)]
+    return [range(start, start + window) for start in starts]
+
+
+def blend_weights(frame: int, windows: Sequence[range]) -> dict[int, float]:
+    """Return the weight of each window that has a frame, by number; they sum to 1.
+
+    A window weighs the less the nearer the frame is to its end, so that depth and cameras change without a step where a
+    window begins or ends.
+    """
+    inside = {number: min(frame - w.start, w.stop - 1 - frame) + 1 for number, w in enumerate(windows) if frame in w}
+    total = sum(inside.values())
+    return {number: depth / total for number, depth in inside.items()}
+
+
+def shared_frames(first: range, second: range) -> range:
+    """Return the frames that two windows share."""
+    return range(max(first.start, second.start), max(min(first.stop, second.stop), max(first.start, second.start)))

@@ -1,0 +1,190 @@
+"""A long clip and a model -> a result on disk, window by window: memory does not depend on the clip's length."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float32
+
+from vggtjax.checkpoint import Model
+from vggtjax.clips.clip import Clip
+from vggtjax.clips.masks import load_masks
+from vggtjax.clips.preprocessing import Fitter
+from vggtjax.clips.sampling import Sampling
+from vggtjax.clips.sources import ClipSource, open_source
+from vggtjax.errors import InputError
+from vggtjax.method.fusion_family import FusionParams
+from vggtjax.method.fusion_file import check_fuses, fusion_digest
+from vggtjax.options import Options
+from vggtjax.pipeline.run import reconstruct
+from vggtjax.pipeline.stages import Stages
+from vggtjax.progress import OnStage, StageSeconds, no_stage
+from vggtjax.results.disk import announce, forecast_bytes
+from vggtjax.results.folder import check_folder
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.report import RunFacts, versions
+from vggtjax.results.saving import Saving
+from vggtjax.storage.writing import locked_folder
+from vggtjax.windows.frames import count_frames, window_clips
+from vggtjax.windows.join import JoinRule
+from vggtjax.windows.plan import Windows, plan_windows
+from vggtjax.windows.store import FOLDER, WindowStore
+from vggtjax.windows.whole import Whole, store_window
+
+_JOINED = 12.0 + 12.0  # bytes of a pixel, beside the files of a result: blended arrays, windows
+
+
+class Tools(NamedTuple):
+    """What is done with a window's frames."""
+
+    run: Callable[[Clip], Reconstruction]
+    describe: Callable[[Float32[np.ndarray, "F H W 3"]], Float32[np.ndarray, "F C"]]  # features for finding loops
+
+
+class LongRun(NamedTuple):
+    """How a long clip is read, cut and written."""
+
+    windows: Windows
+    frames: int | None = None  # of the clip, where it is known; else they are counted
+    sampling: Sampling = Sampling()
+    fitter: Fitter = Fitter()
+    saving: Saving = Saving()
+    rule: JoinRule = JoinRule()
+    on_stage: OnStage = no_stage
+
+
+def reconstruct_long(
+    model: Model,
+    source: ClipSource,
+    out: str | Path,
+    windows: Windows,
+    *,
+    options: Options = Options(),
+    long_run: LongRun | None = None,
+    fusion: FusionParams | None = None,
+    masks: str | Path | bool | None = None,
+    **changes: Any,
+) -> Reconstruction:
+    """Reconstruct a clip in windows, which are joined, and write the result: memory does not depend on the length.
+
+    Each window is run by `reconstruct`. What is done is kept in a folder inside `out`, so that the same call goes on
+    where a killed run stopped; the folder is removed at the end.
+
+    Args:
+        model: what `load_model` returned.
+        source: as for `load_clip`; at least one frame more than a window.
+        out: the folder of the result, as for `Reconstruction.save`.
+        windows: how the clip is cut.
+        options: as for `reconstruct`.
+        long_run: how the clip is read and written; its `windows` are replaced. By default the model's size.
+        fusion: as for `reconstruct`.
+        masks: folder of pictures of what moves, named like the frames; False: nothing moves; None: mined.
+        changes: fields of `options` by name.
+
+    Returns:
+        The result, opened lazily from `out`.
+
+    Raises:
+        InputError: an invalid option, or a clip that is not longer than a window.
+        ClipError: a source that cannot be read, that changes, or whose frames have several sizes.
+        OutputError: the folder cannot be written, or another run is writing it.
+        DeviceMemoryError: a window does not fit in the memory of the device.
+    """
+    options = options.changed(**changes).resolved()
+    check_fuses(fusion, options.method)
+    if options.refine_cameras:
+        raise InputError("refine_cameras is for clips that are run at once; leave it out, or take fewer frames")
+    config = model.config
+    fitter = Fitter(size=config.image_size, patch=config.patch_size)
+    plan = (long_run or LongRun(windows, fitter=fitter))._replace(windows=windows)
+
+    settings = {
+        "model": model.identity.to_json(),
+        "options": options.to_json(),
+        "fusion": fusion_digest(fusion),
+        "masks": str(masks),
+        "versions": versions(),
+    }
+    return run_windows(
+        source, Path(out), plan, tools_of(model, options, plan.fitter.size, fusion=fusion, masks=masks), settings
+    )
+
+
+def tools_of(
+    model: Model,
+    options: Options = Options(),
+    size: int | None = None,
+    *,
+    fusion: FusionParams | None = None,
+    masks: str | Path | bool | None = None,
+) -> Tools:
+    """Return what runs a window by `reconstruct`, and describes frames by the means of their patch tokens."""
+    config, options = model.config, options.resolved()
+
+    def run(clip: Clip) -> Reconstruction:
+        moving = None
+        if masks is not None:
+            moving = load_masks(str(masks), clip) if masks is not False else np.zeros(clip.images.shape[:3], bool)
+        return reconstruct(model, clip, options=options, size=size, masks=moving, fusion=fusion)
+
+    def describe(images: Float32[np.ndarray, "F H W 3"]) -> Float32[np.ndarray, "F C"]:
+        stages = Stages(config, options, len(images), (images.shape[1], images.shape[2]))
+        tokens = stages.image_features(model.params, jax.device_put(images[None]))
+        return np.asarray(tokens[0], np.float32).mean(axis=1)
+
+    return Tools(run, describe)
+
+
+def run_windows(source: ClipSource, out: Path, plan: LongRun, tools: Tools, settings: dict[str, Any]) -> Reconstruction:
+    """Run, join and write the windows of a clip; `reconstruct_long` says more.
+
+    Args:
+        source: of the frames.
+        out: the folder of the result.
+        plan: how the clip is read, cut and written.
+        tools: what runs and describes the frames of a window.
+        settings: all else that decides the windows, as JSON values; stored windows of other settings are not used.
+    """
+    opened, windows, seconds = open_source(source), plan.windows, StageSeconds()
+    check_folder(out, plan.saving.names(tracks=False))
+    frames = count_frames(opened, plan.sampling) if plan.frames is None else plan.frames
+    if not windows.cuts(frames):
+        raise InputError(f"the clip has {frames} frames and window is {windows.window}; expected a longer clip")
+    assert windows.window is not None
+    cut = plan_windows(frames, windows.window, windows.shared)
+    decides = settings | {
+        "sampling": dataclasses.asdict(plan.sampling),
+        "fitter": dataclasses.asdict(plan.fitter),
+        "windows": [frames, windows.window, windows.shared],
+    }
+    with locked_folder(out / FOLDER, "the windows of a clip"):
+        store = WindowStore(out, decides)
+        whole = Whole(store, cut, tools.run, plan.rule, plan.on_stage)
+        with seconds.stage("windows"), plan.on_stage("windows") as progress:
+            clip = None
+            for number, clip in enumerate(window_clips(opened, plan.sampling, plan.fitter, cut)):
+                if number == 0:
+                    pixels = frames * clip.images[0, ..., 0].size
+                    sizes = np.repeat(clip.source_size[:1], frames, axis=0)
+                    shape = (frames, *clip.images.shape[1:3])
+                    announce(out, forecast_bytes(shape, sizes, plan.saving) + _JOINED * pixels)
+                store_window(number, clip, cut[number], store, tools.run, tools.describe)
+                if progress is not None:
+                    progress(number + 1, len(cut))
+        assert clip is not None
+        with seconds.stage("join and blend"):
+            result = whole.result(clip, loops=not windows.no_loops)
+        with plan.on_stage("write") as progress:
+            pictures = None
+            if plan.saving.resolution == "original":
+                pictures = (np.asarray(frame.image) for frame in opened.frames(plan.sampling))
+            facts = RunFacts(seconds.seconds)
+            result.save(out, saving=plan.saving, pictures=pictures, progress=progress, facts=facts)
+        del result
+        store.remove()
+    return Reconstruction.load(out)
