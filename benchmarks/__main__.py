@@ -11,10 +11,13 @@ from benchmarks.batch import batch
 from benchmarks.demo_model import demo_model
 from benchmarks.embed import embed
 from benchmarks.gradient import gradient
+from benchmarks.known import known
 from benchmarks.leads import leads
+from benchmarks.long_clips import long_clips
 from benchmarks.make_checkpoint import main as make_checkpoint
 from benchmarks.masks import masks
 from benchmarks.point_clouds import point_clouds
+from benchmarks.refine_cameras import refine_cameras
 from benchmarks.refinement import refinement
 from benchmarks.resolution import resolution
 from benchmarks.second_pass import second_pass
@@ -32,11 +35,14 @@ COMMANDS = {
     "embed": embed,
     "gpu-targets": gpu_targets,
     "gradient": gradient,
+    "known": known,
     "leads": leads,
+    "long-clips": long_clips,
     "make-checkpoint": make_checkpoint,
     "masks": masks,
     "memory": memory,
     "point-clouds": point_clouds,
+    "refine-cameras": refine_cameras,
     "refinement": refinement,
     "resolution": resolution,
     "second-pass": second_pass,

@@ -7,8 +7,10 @@ from jaxtyping import Float, Float64
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+from vggtjax.cameras import checked_poses
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.trajectory import centres, checked_poses, from_first
+from vggtjax.evaluation.metrics.trajectory import from_first
+from vggtjax.geometry.similarity import centres
 
 _TOLERANCE = 1e-8  # radians per frame
 _FIRST_STEP = 0.02  # radians per frame; first step of the search

@@ -51,9 +51,9 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     other = {"gram": "dot", "suppress": "drop", "mask_pairs": 2, "smooth_frames": 3, "compute_dtype": "bfloat16"}
     fields = {field.name for field in dataclasses.fields(Options)}
     key = Options().passes_settings
-    assert set(key) == fields - {"method", "align_scale", "refine_mask"} | {"clusters", "threshold"}
+    assert set(key) == fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters", "threshold"}
     assert all(Options(**{name: value}).passes_settings != key for name, value in other.items())
-    assert Options(align_scale=True, refine_mask=True).passes_settings == key
+    assert Options(align_scale=True, refine_mask=True, refine_cameras=True).passes_settings == key
     same = {name for name in METHODS if Options(name).passes_settings == key}  # pyright: ignore[reportArgumentType]
     assert same == set(METHODS) - {"vggt4d"}
 

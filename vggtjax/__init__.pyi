@@ -7,6 +7,7 @@ from .config import MotionConfig as MotionConfig
 from .config import VGGTConfig as VGGTConfig
 from .config import vggt_1b as vggt_1b
 from .errors import VggtjaxError as VggtjaxError
+from .known.options import KnownGeometry as KnownGeometry
 from .method.fusion import fuse_depth as fuse_depth
 from .method.instances import find_instances as find_instances
 from .method.mask_refinement import refine_masks as refine_masks
@@ -31,5 +32,7 @@ from .pretrained.load import load_model as load_model
 from .results.frame import frame_of as frame_of
 from .results.reconstruction import Reconstruction as Reconstruction
 from .storage.cache import enable_compilation_cache as enable_compilation_cache
+from .windows.plan import Windows as Windows
+from .windows.run import reconstruct_long as reconstruct_long
 
 __version__: str

@@ -72,7 +72,7 @@ def odd_frames(frames: object) -> int:
     return number
 
 
-_READ_AFTER_THE_PASSES = ("method", "align_scale", "refine_mask")
+_READ_AFTER_THE_PASSES = ("method", "align_scale", "refine_mask", "refine_cameras")
 
 
 def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) -> bool | None:
@@ -111,6 +111,9 @@ class Options:
     """odd number of frames to average the saliency over before its threshold; 1 does not (not in the papers)"""
     refine_mask: _RefineMask = None
     """remove pixels from the mask that agree with other frames; the method's own choice by default"""
+    refine_cameras: Switch = False
+    """adjust cameras and focal length to matches between the source's pictures, where nothing moves (bundle adjustment;
+    needs the extra colmap)"""
     compute_dtype: Annotated[
         ComputeDType,
         tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint="(default: float32)"),  # pyright: ignore
@@ -158,5 +161,5 @@ class Options:
         return dataclasses.replace(self, **changes) if changes else self
 
     def to_json(self) -> dict[str, Any]:
-        """Return the options as JSON values."""
-        return dataclasses.asdict(self)
+        """Return the options as JSON values; without `refine_cameras` where that is off, as results had before it."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if value or name != "refine_cameras"}

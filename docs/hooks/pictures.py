@@ -256,7 +256,7 @@ def gallery_sheet(clip: Clip, number: int) -> Figure:
 
 def _cameras(axes: Any, clip: Clip) -> None:
     """Plot the paths of both passes and the true one from above, in the axes of the first camera."""
-    from vggtjax.evaluation.metrics.trajectory import centres, umeyama_sim3
+    from vggtjax.geometry.similarity import centres, umeyama_sim3
     from vggtjax.network.pose import decode_pose
 
     true = np.asarray(clip.truth.camera_from_world)

@@ -16,12 +16,8 @@ from benchmarks.blind import (
 )
 from tests.evaluation.metrics.test_trajectory import about, cameras, random_cameras, seeds
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.trajectory import (
-    centre_error,
-    centres,
-    rotation_error,
-    umeyama_sim3,
-)
+from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
+from vggtjax.geometry.similarity import centres, umeyama_sim3
 
 
 @settings(max_examples=20, deadline=None)

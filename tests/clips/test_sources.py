@@ -8,8 +8,9 @@ from PIL import Image
 
 from vggtjax.clips.arrays import ArrayFrames
 from vggtjax.clips.images import ImageFiles
+from vggtjax.clips.order import natural_key
 from vggtjax.clips.sampling import Sampling
-from vggtjax.clips.sources import natural_key, open_source
+from vggtjax.clips.sources import open_source
 from vggtjax.clips.video import VideoFile
 from vggtjax.errors import ClipError
 

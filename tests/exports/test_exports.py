@@ -1,16 +1,20 @@
 """Results in the formats of other programs, read back by those programs' libraries or by plain readers."""
 
 import json
+import os
+import re
 import struct
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from tests.room import make_room
+from vggtjax.captures.colmap_model import read_views
 from vggtjax.clips.sources import open_source
 from vggtjax.errors import ClipError, InputError, OutputError
-from vggtjax.evaluation.datasets.colmap import read_views
 from vggtjax.exports.animated_glb import frame_times
 from vggtjax.exports.table import Exporting
 from vggtjax.exports.write import export_result
@@ -141,10 +145,33 @@ def test_channels_of_openexr(tmp_path, result):
     np.testing.assert_array_equal(channels["moving"].pixels, result.dynamic_mask[1])
 
 
-def test_a_recording_of_rerun_holds_every_frame(tmp_path, result):
+def test_rerun_opens_the_recording_and_finds_every_frame(tmp_path, result):
     pytest.importorskip("rerun")
     export_result(result, tmp_path / "out.rrd", "rerun", exporting=Exporting(500))
-    assert (tmp_path / "out.rrd").read_bytes()[:4] == b"RRF2"
+
+    def rerun(*arguments):
+        command = [sys.executable, "-m", "rerun", "rrd", *arguments, str(tmp_path / "out.rrd")]
+        environment = os.environ | {"XDG_CONFIG_HOME": str(tmp_path / "config")}  # of its own settings
+        return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+
+    assert rerun("verify").returncode == 0
+    chunks = re.findall(r"with (\d+) rows .*? - (/\S+) - data columns: \[(.*)\]", rerun("print", "-v").stdout)
+    rows = {column.split("@")[1]: (path, int(count)) for count, path, names in chunks for column in names.split()}
+    for column, wanted in {
+        "ViewCoordinates:xyz": ("/world", 1),
+        "LineStrips3D:strips": ("/world/path", 1),
+        "Transform3D:translation": ("/world/camera", FRAMES),
+        "Pinhole:image_from_camera": ("/world/camera/picture", FRAMES),
+        "EncodedImage:blob": ("/world/camera/picture", FRAMES),
+        "DepthImage:buffer": ("/world/camera/picture/depth", FRAMES),
+        "SegmentationImage:buffer": ("/world/camera/picture/moving", FRAMES),
+    }.items():
+        assert rows[column] == wanted
+    points = {(path, int(count)) for count, path, names in chunks if "Points3D:positions" in names}
+    assert points == {("/world/static", 1), ("/world/moving", FRAMES)}
+    data = (tmp_path / "out.rrd").read_bytes()
+    (tmp_path / "out.rrd").write_bytes(data[: len(data) // 2])
+    assert rerun("verify").returncode != 0  # so a recording that is not whole would be noticed
 
 
 @pytest.mark.parametrize("names", [["../x", "../y", "z", "w"], ["a", "A", "b", "c"], ["x" * 300, "a", "b", "c"]])

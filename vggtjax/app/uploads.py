@@ -10,8 +10,9 @@ from pathlib import Path
 
 from vggtjax.app.limits import Limits
 from vggtjax.clips.images import is_image_name
+from vggtjax.clips.order import natural_key
 from vggtjax.clips.sampling import Sampling, Source
-from vggtjax.clips.sources import natural_key, open_source
+from vggtjax.clips.sources import open_source
 from vggtjax.clips.video import VideoFile, is_video_name
 from vggtjax.errors import ClipError, one_line
 

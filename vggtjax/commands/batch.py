@@ -14,9 +14,12 @@ from vggtjax.commands.arguments import BatchFolder, Frames, Method, Output, PadF
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
+from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
 from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving
+
+_NOTHING_KNOWN = KnownGeometry()
 
 
 def batch(
@@ -28,6 +31,7 @@ def batch(
     files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
     options: Method = Options(),
     pad_frames: PadFrames = False,
+    known: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = _NOTHING_KNOWN,
     out: BatchFolder,
     saving: Output = Saving(),
 ) -> None:
@@ -36,20 +40,25 @@ def batch(
     A clip that fails is named and does not stop the others; the exit code is 2 only if every clip fails.
 
     Args:
-        sources: folders of images, or videos; or one folder of such.
+        sources: folders of images, videos, or captures of apps; or one folder of such.
         sampling: which frames of the source
         framing: how frames are fitted to the model
         files: the model
         options: how the clip is reconstructed
         pad_frames: whether clips are padded to one of a few lengths
+        known: cameras and lengths that all clips share, or that "source" names
         out: folder for the results
         saving: how the result is written
     """
     report = Report()
     with report.running():
         from vggtjax.clips.sources import clips_by_name
+        from vggtjax.refinement.refine import check_refinement
 
+        check_refinement(options.refine_cameras)
         named = clips_by_name(sources)
+        known.check_many()
+        known.check_files()
         network, fitted = files.load(report, options, [options.method])
         from vggtjax.pipeline.batch import reconstruct_many
 
@@ -65,6 +74,7 @@ def batch(
                 sampling=sampling,
                 saving=saving,
                 fusion=fitted,
+                known=known,
                 pad_frames=pad_frames,
                 progress=clock.progress,
             ):

@@ -31,6 +31,7 @@ class EvaluatedOptions(Options):
     """The options of all methods; `--methods` names the methods."""
 
     method: tyro.conf.Suppress[MethodName] = "4dvggt-d"
+    refine_cameras: tyro.conf.Suppress[bool] = False
 
 
 @dataclass(frozen=True)

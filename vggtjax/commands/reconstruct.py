@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import tyro
 
@@ -15,14 +15,39 @@ from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
 from vggtjax.errors import InputError
+from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 from vggtjax.storage.flags import InWords, Switch
+from vggtjax.windows.plan import Windows
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from vggtjax.checkpoint import Model
     from vggtjax.clips.clip import Clip
+    from vggtjax.clips.preprocessing import Fitter
+    from vggtjax.clips.sampling import Source
+    from vggtjax.method.fusion_family import FusionParams
+    from vggtjax.results.reconstruction import Reconstruction
+
+
+_NOTHING_KNOWN = KnownGeometry()
+
+
+@dataclass(frozen=True)
+class More:
+    """Options in groups of their own. Raises InputError for options that exclude each other."""
+
+    geometry: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = _NOTHING_KNOWN
+    windows: Annotated[Windows, tyro.conf.arg(name="long clip", help="")] = Windows()
+
+    def __post_init__(self) -> None:
+        if self.windows.window is not None and self.geometry:
+            raise InputError(
+                "known cameras or lengths and --window exclude each other: they are brought into a clip "
+                "that is run as a whole"
+            )
 
 
 @dataclass(frozen=True)
@@ -41,8 +66,12 @@ class Known:
         if self.masks is not None and self.no_masks:
             raise InputError("--masks and --no-masks are opposites; give one of them")
 
-    def check(self, options: Options) -> None:
-        """Raise InputError for missing files, or for options that need mined masks."""
+    def check(self, options: Options, windows: Windows) -> None:
+        """Raise InputError for missing files, for options that need mined masks, or for points and windows."""
+        if self.tracks is not None and windows.window is not None:
+            raise InputError("--tracks and --window exclude each other: points are followed over all frames at once")
+        if options.refine_cameras and windows.window is not None:
+            raise InputError("--refine-cameras and --window exclude each other: cameras are adjusted over all frames")
         if self.masks is not None or self.no_masks:
             options.check_given_masks()
         if self.masks is not None:
@@ -74,6 +103,7 @@ def reconstruct(
     files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
     options: Method = Options(),
     known: Annotated[Known, tyro.conf.arg(name="mask and track", help="")] = Known(),
+    more: Annotated[More, tyro.conf.arg(name="", help="")] = More(),
     out: ResultFolder,
     saving: Output = Saving(),
     view: View = False,
@@ -81,12 +111,13 @@ def reconstruct(
     """Cameras, depth, dynamic masks and a 4-D point cloud of a clip.
 
     Args:
-        source: a folder of images, a pattern, images, or a video.
+        source: a folder of images, a pattern, images, a video, or a capture of an app (Record3D, COLMAP, ...).
         sampling: which frames of the source
         framing: how frames are fitted to the model
         files: the model
         options: how the clip is reconstructed
         known: masks and points of your own
+        more: known cameras and lengths, and how a long clip is cut
         out: folder for the result
         saving: how the result is written
         view: whether the viewer opens at the end
@@ -97,47 +128,103 @@ def reconstruct(
     report = Report()
     with report.running():
         from vggtjax.clips.sources import open_source
+        from vggtjax.refinement.refine import check_refinement
         from vggtjax.results.folder import check_folder
 
         opened = open_source(frames)
         opened.total(sampling)
         next(opened.frames(Sampling()))  # finds a broken source before the model is loaded, which takes longer
-        known.check(options)
+        windows, geometry = more.windows, more.geometry
+        known.check(options, windows)
+        check_refinement(options.refine_cameras, geometry.poses is not None)
+        geometry.check_files()
         check_folder(out, saving.names(tracks=known.tracks is not None))
         network, fitted = files.load(report, options, [options.method])
-        with report.stage("load clip") as progress:
-            from vggtjax.clips.clip import read_clip
-            from vggtjax.clips.queries import parse_queries
-            from vggtjax.results.disk import announce, forecast_bytes
+        count = _cut_frames(report, opened, sampling, windows)
+        fitter = framing.fitter(size=network.config.image_size, patch=network.config.patch_size)
+        if count is not None:
+            from vggtjax.windows.run import LongRun, reconstruct_long
 
-            fitter = framing.fitter(size=network.config.image_size, patch=network.config.patch_size)
-            clip = read_clip(opened, sampling, fitter, progress)
-            announce(out, forecast_bytes(clip.images.shape[:3], clip.source_size, saving))
-            masks = known.masks_of(clip)
-            queries = None if known.tracks is None else parse_queries(known.tracks, clip)
-        report.note(_taken(clip, opened.total(Sampling())))
-        from vggtjax.pipeline.run import reconstruct as run
-        from vggtjax.results.report import RunFacts
-
-        result = run(
-            network,
-            clip,
-            options=options,
-            size=fitter.size,
-            masks=masks,
-            tracks=queries,
-            fusion=fitted,
-            on_stage=report.stage,
-        )
-        with report.stage("write") as progress:
-            pictures = clip.pictures() if saving.resolution == "original" else None
-            facts = RunFacts(report.seconds)
-            result.save(out, saving=saving, pictures=pictures, progress=progress, facts=facts)
+            plan = LongRun(windows, count, sampling, fitter, saving, on_stage=report.stage)
+            masks = False if known.no_masks else known.masks
+            result = reconstruct_long(
+                network, frames, out, windows, options=options, long_run=plan, fusion=fitted, masks=masks
+            )
+        else:
+            result = _together(
+                report, Reading(opened, sampling, fitter), network, fitted, options, known, geometry, out, saving
+            )
     report.summary(result, out, network)
     if known.tracks is not None and "tracks" in network.untrained_heads:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")
     if view:
         serve(report, [result], [str(out)])
+
+
+class Reading(NamedTuple):
+    """How the frames of a clip are read."""
+
+    source: Source
+    sampling: Sampling
+    fitter: Fitter
+
+
+def _together(
+    report: Report,
+    reading: Reading,
+    network: Model,
+    fitted: FusionParams | None,
+    options: Options,
+    known: Known,
+    geometry: KnownGeometry,
+    out: Path,
+    saving: Saving,
+) -> Reconstruction:
+    """Reconstruct all frames of a clip at once, and write the result."""
+    opened, sampling, fitter = reading
+    with report.stage("load clip") as progress:
+        from vggtjax.clips.clip import read_clip
+        from vggtjax.clips.queries import parse_queries
+        from vggtjax.results.disk import announce, forecast_bytes
+
+        clip = read_clip(opened, sampling, fitter, progress)
+        announce(out, forecast_bytes(clip.images.shape[:3], clip.source_size, saving))
+        masks = known.masks_of(clip)
+        queries = None if known.tracks is None else parse_queries(known.tracks, clip)
+    report.note(_taken(clip, opened.total(Sampling())))
+    from vggtjax.pipeline.run import reconstruct as run
+    from vggtjax.results.report import RunFacts
+
+    result = run(
+        network,
+        clip,
+        options=options,
+        size=fitter.size,
+        masks=masks,
+        tracks=queries,
+        fusion=fitted,
+        known=geometry,
+        on_stage=report.stage,
+    )
+    with report.stage("write") as progress:
+        pictures = clip.pictures() if saving.resolution == "original" else None
+        result.save(out, saving=saving, pictures=pictures, progress=progress, facts=RunFacts(report.seconds))
+    return result
+
+
+def _cut_frames(report: Report, opened: Source, sampling: Sampling, windows: Windows) -> int | None:
+    """Return the number of frames of a clip that is cut into windows; None for one that is run as a whole."""
+    if windows.window is None:
+        return None
+    from vggtjax.windows.frames import count_frames
+
+    with report.stage("count frames"):
+        count = count_frames(opened, sampling)
+    if not windows.cuts(count):
+        report.note(f"the clip has {count} frames, no more than a window of {windows.window}: all are run together")
+        return None
+    report.note(f"{count} frames in windows of {windows.window} that share at least {windows.shared}")
+    return count
 
 
 def _taken(clip: Clip, available: int | None) -> str:

@@ -16,6 +16,7 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 from rich.text import Text
 
+from vggtjax.errors import one_line
 from vggtjax.progress import Progress
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ class Report:
                 "frames": f"{frames} of {width} x {height} pixels",
                 "method": f"{result.method}, model {result.model_name}",
                 "dynamic": f"{100 * result.dynamic_share:.1f} % of the pixels",
+                **{one_line(name, 40): one_line(text) for name, text in result.known_facts.items()},
                 "total": f"{sum(self.seconds.values()):.2f} s",
                 "peak memory": _peak_memory(),
                 "results": f"{out}/",

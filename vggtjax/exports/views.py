@@ -86,7 +86,8 @@ def view_names(result: Result, source: Source | None) -> list[str]:
     suffix = ".png" if source is None else ".jpg"
     names = [f"{name}{suffix}" for name in result.frame_names]
     if isinstance(source, ImageFiles):
-        files = {path.stem: path.name for path in source.paths if path.suffix.lower() in _WRITTEN}
+        pictures = zip(source.frame_names, source.paths, strict=True)
+        files = {name: path.name for name, path in pictures if path.suffix.lower() in _WRITTEN}
         names = [files.get(stem, name) for stem, name in zip(result.frame_names, names, strict=True)]
     if len({name.casefold() for name in names}) == len(names) and all(_SAFE.fullmatch(name) for name in names):
         return names

@@ -18,12 +18,15 @@ from vggtjax.clips.preprocessing import Fitter, Framing, FramingChanges
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, VggtjaxError
+from vggtjax.known.intrinsics import known_values
+from vggtjax.known.options import KnownGeometry
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.options import Options
 from vggtjax.pipeline.contact import PAGE_NAME, ContactPage
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.progress import Progress, StageSeconds, no_progress
+from vggtjax.refinement.refine import check_refinement
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.reconstruction import Reconstruction
@@ -55,6 +58,7 @@ def reconstruct_many(
     sampling: Sampling | Mapping[str, Any] | None = None,
     saving: Saving | Mapping[str, Any] | None = None,
     fusion: FusionParams | None = None,
+    known: KnownGeometry | None = None,
     pad_frames: bool = False,
     progress: Progress | None = None,
     **changes: Any,
@@ -71,6 +75,8 @@ def reconstruct_many(
         out: the folder of these folders.
         options: as for `reconstruct`; a mapping of the names in `changes`, of fusion and of pad_frames serves, too.
         fusion: as for `reconstruct`.
+        known: as for `reconstruct`, as far as all clips share it: intrinsics, a shared focal length, the height of the
+            cameras, and what "source" names.
         pad_frames: as for `reconstruct`.
         framing: how frames are fitted; the keywords of `load_clip` serve, too.
         sampling: which frames are taken; the keywords of `load_clip` serve, too.
@@ -92,6 +98,10 @@ def reconstruct_many(
     framing = dataclasses.replace(framing or Framing(), **of_framing)
     options = (options or Options()).changed(**words)
     check_fuses(fusion, options.method)
+    if known is not None:
+        known.check_many()
+        known.check_files()
+    check_refinement(options.refine_cameras, known is not None and known.poses is not None)
     run = _Batch(
         model=model,
         options=options,
@@ -99,6 +109,7 @@ def reconstruct_many(
         sampling=Sampling(**sampling) if isinstance(sampling, Mapping) else sampling or Sampling(),
         saving=Saving().changed(**saving) if isinstance(saving, Mapping) else saving or Saving(),
         fusion=fusion,
+        known=known or None,
         pad_frames=pad_frames,
     )
     out = Path(out)
@@ -121,6 +132,7 @@ class _Batch:
     sampling: Sampling
     saving: Saving
     fusion: FusionParams | None
+    known: KnownGeometry | None
     pad_frames: bool
 
     @property
@@ -136,6 +148,7 @@ class _Batch:
             **dataclasses.asdict(self.saving),
             "only": None if self.saving.only is None else list(self.saving.only),
             "fusion": fusion_digest(self.fusion),
+            **({} if self.known is None else {"known": known_values(self.known)}),
             "pad_frames": self.pad_frames,
         }
 
@@ -150,6 +163,7 @@ class _Batch:
             options=self.options,
             size=size,
             fusion=self.fusion,
+            known=self.known,
             pad_frames=self.pad_frames,
             on_stage=seconds.stage,
         )

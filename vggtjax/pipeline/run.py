@@ -12,13 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, load_clip
-from vggtjax.clips.masks import masks_at_clip_pixels
+from vggtjax.clips.masks import load_masks, masks_at_clip_pixels
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.sources import ClipSource
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError, device_memory_errors
+from vggtjax.known.apply import apply_known, scaled
+from vggtjax.known.given import Given, read_known
+from vggtjax.known.options import KnownGeometry
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.mask_refinement import refine_masks
@@ -29,10 +33,13 @@ from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
 from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, inline, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress, no_stage
+from vggtjax.refinement.refine import check_refinement, refine_cameras
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import versions
 
-_LESS_MEMORY = "fewer frames (max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
+_LESS_MEMORY = (
+    "fewer frames at once (window, max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
+)
 
 
 def infer(
@@ -80,6 +87,7 @@ def reconstruct(
     masks: Bool[np.ndarray, "S h w"] | str | Path | None = None,
     tracks: Queries | None = None,
     fusion: FusionParams | None = None,
+    known: KnownGeometry | None = None,
     pad_frames: bool = False,
     keep_passes: bool = False,
     on_stage: OnStage | None = None,
@@ -97,6 +105,7 @@ def reconstruct(
             fitted, or of the source's pictures, or a folder of pictures. If no pixel moves, the second pass is not run.
         tracks: points to follow, in pixels of the frames; points of a later frame than the first cost one more pass.
         fusion: a fitted rule (`load_fusion`), whose confidence is the fused precision; None: the paper's rule.
+        known: intrinsics, poses or lengths that are known, and pixels without depth: the prediction is brought to them.
         pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs; the
             result is the same to rounding. Not for clips with tracks.
         keep_passes: keep both passes on the result, as `.passes`.
@@ -104,17 +113,23 @@ def reconstruct(
         changes: fields of `options` by name, such as `method="vggt4d"`.
 
     Raises:
-        InputError: an invalid option, masks of another size, or a size that is not a multiple of the patch size.
+        InputError: an invalid option, masks of another size, a size that is not a multiple of the patch size, or known
+            geometry that does not fit the clip.
         ClipError: the source of the clip cannot be read.
         DeviceMemoryError: the clip does not fit in the memory of the device.
+        MissingExtraError: cameras are to be refined, and pycolmap is not installed.
     """
     options = options.changed(**changes).resolved()
     on_stage = on_stage or no_stage
     check_fuses(fusion, options.method)
     if masks is not None:
         options.check_given_masks()
+    if known is not None:
+        known.check_files()
+    check_refinement(options.refine_cameras, known is not None and known.poses is not None)
     source, (clip, tracks) = clip, _fitted(model, clip, size, tracks, on_stage)
     given = None if masks is None else masks_at_clip_pixels(masks, clip, source if isinstance(source, Clip) else clip)
+    geometry = _given_geometry(known, clip) if known else None
     frames, height, width = clip.images.shape[:3]
     stages = Stages(model.config, options, frames, (height, width))
     padding = padded_frames(frames, model.config.motion.offsets) - frames if pad_frames and tracks is None else 0
@@ -145,9 +160,10 @@ def reconstruct(
         settings=_settings(model, clip, options, masks is not None, fusion),
         passes=passes if keep_passes else None,
     )
+    result, unit = _with_geometry(result, clip, options, geometry, on_stage)
     if options.refine_mask:
         with on_stage("refine mask") as progress:
-            result = refined(result, progress)
+            result = refined(result, progress, unit)
     return result
 
 
@@ -208,13 +224,33 @@ def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:
     }
 
 
-def refined(result: Reconstruction, progress: Progress | None) -> Reconstruction:
-    """Return the result without the mask's pixels that agree with other frames, by the result's depth and cameras."""
-    images, cameras = result.images / np.float32(255), (result.camera_from_world, result.intrinsics)
-    mask = refine_masks(
-        images, result.depth, result.dynamic_mask, *cameras, valid=result.inside_pictures, progress=progress
-    )
+def refined(result: Reconstruction, progress: Progress | None, unit: float = 1.0) -> Reconstruction:
+    """Return the result without the mask's pixels that agree with other frames, by the result's depth and cameras.
+
+    `unit` is the length of the network's unit in the result's.
+    """
+    own = result if unit == 1 else scaled(result, 1 / unit)
+    images, cameras = result.images / np.float32(255), (own.camera_from_world, own.intrinsics)
+    seen = result.inside_pictures & (result.depth != 0)
+    mask = refine_masks(images, own.depth, result.dynamic_mask, *cameras, valid=seen, progress=progress)
     return dataclasses.replace(result, dynamic_mask=mask)
+
+
+def _with_geometry(
+    result: Reconstruction, clip: Clip, options: Options, geometry: Given | None, on_stage: OnStage
+) -> tuple[Reconstruction, float]:
+    """Return the result with refined cameras and what is known, and how long the prediction's unit is in its own."""
+    if geometry is None and not options.refine_cameras:
+        return result, 1.0
+    with on_stage("refine cameras" if options.refine_cameras else "known geometry") as progress:
+
+        def refine(result: Reconstruction) -> Reconstruction:
+            fixed = geometry is not None and geometry.intrinsics is not None
+            return refine_cameras(result, clip.pictures(), fixed_intrinsics=fixed, progress=progress)[0]
+
+        if geometry is None:
+            return refine(result), 1.0
+        return apply_known(result, geometry, refine if options.refine_cameras else None)
 
 
 def _fitted(
@@ -235,6 +271,12 @@ def _fitted(
             loaded, clip = clip, clip.refit(size, config.patch_size)
             tracks = None if tracks is None else tracks.moved(loaded, clip)
     return clip, tracks
+
+
+def _given_geometry(known: KnownGeometry, clip: Clip) -> Given:
+    masks = None if known.leave_out is None else load_masks(known.leave_out, clip)
+    capture = clip.source.capture if isinstance(clip.source, CaptureFrames) else None
+    return read_known(known, clip, leave_out=masks, capture=capture)
 
 
 def _clip_fields(clip: Clip) -> dict[str, Any]:

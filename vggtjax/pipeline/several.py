@@ -9,6 +9,7 @@ from typing import Any
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
+from vggtjax.errors import InputError
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.options import Options
@@ -45,6 +46,8 @@ def reconstruct_methods(
     """
     options = options.changed(**changes)
     check_fuses(fusion, *methods)
+    if options.refine_cameras:
+        raise InputError("refine_cameras is for one method; reconstruct with each method by itself")
     results: dict[str, Reconstruction] = {}
     for group in groups_of_methods(methods, options):
         shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(refine_mask=False)

@@ -60,18 +60,19 @@ from vggtjax.errors import InputError, one_line
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results import foreign, previews, tracks
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
-from vggtjax.results.glb import build_scene, glb_bytes
+from vggtjax.results.glb import POINT_LIMIT, build_scene, glb_bytes
 from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, joined, least_confidence, write_ply
 from vggtjax.results.report import REPORT_NAME, RunFacts, report_page
 from vggtjax.results.result import Result
 from vggtjax.results.saving import Resolution, Saving
-from vggtjax.storage.arrays import write_arrays
+from vggtjax.storage.arrays import is_mapped, write_arrays
 from vggtjax.storage.markup import webp, write_page
 from vggtjax.storage.trajectories import commented, write_trajectory
 
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
 _CARD_WIDTH = 720  # pixels
 _WORKERS = 8
+_SCENE_POINTS = 8 * POINT_LIMIT  # of a mapped result, before those of the scene are chosen
 _MOST_INVALID = 0.5  # share of a clip's pixels; more are warned about
 
 logger = logging.getLogger(__name__)
@@ -155,9 +156,13 @@ def _frames(
 def _build_scene(result: Result, least: LeastConfidence) -> trimesh.Scene:
     """Return the scene for viewers, at the model's size: they show no more points."""
     static, dynamic = [], []
+    share = _SCENE_POINTS / result.depth.size if is_mapped(result.depth) else 1.0  # the scene keeps fewer in any case
+    random = np.random.default_rng(0)
     for number in range(len(result.depth)):
         frame = frame_of(result, number)
         confident = frame.confident(least)
+        if share < 1:
+            confident &= random.random(confident.shape) < share
         static.append(frame_cloud(frame, confident & ~frame.dynamic_mask))
         dynamic.append(frame_cloud(frame, confident & frame.dynamic_mask))
     return build_scene(result, joined(static), dynamic)
@@ -216,7 +221,7 @@ def _frame_writer(
     if saving.writes("previews"):
         for name in ("depth", "overlay"):
             (folder / "preview" / name).mkdir()
-    valid, pictured = result.valid_pixels, int(result.inside_pictures.sum())
+    valid, pictured = result.valid_pixels, result.pictured
     invalid = pictured - int(valid.sum())
     if invalid > _MOST_INVALID * pictured:
         logger.warning(
@@ -283,7 +288,7 @@ def _write_tracks(result: Result, folder: Path, saving: Saving) -> None:
 
 def depth_scale(depth: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]) -> float:
     """Return the factor from the largest valid depth of a clip to 65535, or 1 where no depth is valid."""
-    return 65535 / float(depth[valid].max()) if valid.any() else 1.0
+    return 65535 / float(depth.max(where=valid, initial=0)) if valid.any() else 1.0
 
 
 def encode_depth(

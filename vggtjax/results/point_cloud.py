@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float32, UInt8
 
 from vggtjax.results.frame import LeastConfidence, ResultFrame
 from vggtjax.results.result import Result
+from vggtjax.storage.arrays import spread_frames
 
 _VERTEX = np.dtype([("points", "<f4", 3), ("colors", "u1", 3), ("alpha", "u1")])
 _HEADER = """ply
@@ -49,10 +50,11 @@ def least_confidence(
     `dynamic_percentile` is another share for the dynamic ones.
     """
 
-    def percentile(pixels: Bool[np.ndarray, "S H W"], share: float) -> float:
-        return float(np.percentile(result.depth_confidence[pixels], share)) if pixels.any() else 0.0
+    confidence, valid, moving = spread_frames(result.depth_confidence, result.valid_pixels, result.dynamic_mask)
 
-    valid, moving = result.valid_pixels, result.dynamic_mask
+    def percentile(pixels: Bool[np.ndarray, "S H W"], share: float) -> float:
+        return float(np.percentile(confidence[pixels], share)) if pixels.any() else 0.0
+
     share = confidence_percentile if dynamic_percentile is None else dynamic_percentile
     return LeastConfidence(percentile(valid & ~moving, confidence_percentile), percentile(valid & moving, share))
 

@@ -11,6 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 from skimage.segmentation import find_boundaries
 
 from vggtjax.results.result import Result
+from vggtjax.storage.arrays import spread_frames
 
 DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm
 _SALIENCY_COLORS = (Colormap("inferno").lut(256)[:, :3] * 255).round().astype(np.uint8)
@@ -36,6 +37,7 @@ BACKGROUND, TEXT, FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)  # of e
 
 def inverse_depth_range(depth: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]) -> tuple[float, float]:
     """Return the 2nd and 98th percentile of 1/depth over the valid pixels of a clip, (0, 1) without any."""
+    depth, valid = spread_frames(depth, valid)
     if not valid.any():
         return 0.0, 1.0
     with np.errstate(over="ignore"):
@@ -58,6 +60,7 @@ def log_confidence_range(
     confidence: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]
 ) -> tuple[float, float]:
     """Return the 2nd and 98th percentile of log confidence over the valid pixels of a clip, (0, 1) without any."""
+    confidence, valid = spread_frames(confidence, valid)
     values = confidence[valid & (confidence > 0)]
     if not len(values):
         return 0.0, 1.0

@@ -21,6 +21,7 @@ from vggtjax.results import charts, previews, tracks
 from vggtjax.results.archive import ARCHIVE_NAME
 from vggtjax.results.result import Result, missing_fields
 from vggtjax.results.thumbnail import moving_thumbnail
+from vggtjax.storage.arrays import spread_frames
 from vggtjax.storage.markup import data_uri, element, page, relative_link, table, webp
 
 REPORT_NAME = "report.html"
@@ -32,6 +33,12 @@ _ABOUT_CONFIDENCE = (
     "Share of the pixels of each region, over confidence on a logarithmic axis. Higher is more certain; compare by "
     "rank, not by value."
 )
+_LENGTHS = {
+    "metre": "Lengths are in metres.",
+    "unit of the poses": "Lengths are in the unit of the given poses.",
+    "unit of the capture": "Lengths are in the unit of the capture.",
+    "unit of the model": "Lengths are up to one scale per clip.",
+}
 _LINKS = {
     ARCHIVE_NAME: "the whole result, for Reconstruction.load",
     "scene.glb": "points and cameras, for any 3-D viewer",
@@ -155,15 +162,17 @@ def _summary(result: Result) -> Element:
         rows.append(("Time", f"{result.timestamps[0]:.2f} s to {result.timestamps[-1]:.2f} s"))
     rows.append(("Moving", f"{result.dynamic_share:.1%} of the pixels, {objects} object{'' if objects == 1 else 's'}"))
     if valid.any():
-        low, middle, high = np.percentile(result.depth[valid][:: max(1, int(valid.sum()) // 1_000_000)], (5, 50, 95))
+        depth, known = spread_frames(result.depth, valid)
+        low, middle, high = np.percentile(depth[known][:: max(1, int(known.sum()) // 1_000_000)], (5, 50, 95))
         rows.append(("Depth", f"{middle:.3g} in the middle, 90 % within {low:.3g} to {high:.3g}"))
     rows.append(("Camera path", f"{length:.3g} long"))
-    unknown = 1 - float(valid.sum() / result.inside_pictures.sum())
+    unknown = 1 - float(valid.sum() / result.pictured)
     if unknown > 0:
         rows.append(("No depth", f"{unknown:.2%} of the pixels"))
     if result.track_frames is not None:
         rows.append(("Tracks", f"{len(result.track_frames)}"))
-    return _section("At a glance", table(rows), element("p", "Lengths are up to one scale per clip.", class_="note"))
+    rows += [(one_line(name.capitalize(), 40), one_line(text)) for name, text in list(result.known_facts.items())[:10]]
+    return _section("At a glance", table(rows), element("p", _LENGTHS[result.length_unit], class_="note"))
 
 
 def _ramp(colors: UInt8[np.ndarray, "256 3"]) -> Element:

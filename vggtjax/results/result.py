@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
 from vggtjax.cameras import FIELD_OF_VIEW_RANGE, camera_centres, clamp_intrinsics, unproject, world_from_camera
 from vggtjax.errors import ResultError
 from vggtjax.method.instances import find_instances
+from vggtjax.storage.arrays import is_mapped, zeros_beside
 
 _MOST_SIDE, _MOST_PIXELS = 1 << 20, 1 << 28  # of a source's picture
 
@@ -32,7 +33,8 @@ class Result:
     view outside [0.01, 3.1] rad are clamped with a FieldOfViewWarning that names the frames.
 
     Raises ResultError if the fields do not fit together, or if all depths or all confidences of a frame are NaN or
-    infinite, which broken weights cause. A frame of unknown depth has depth 0.
+    infinite, which broken weights cause. A frame of unknown depth has depth 0. Of a long result, as `reconstruct_long`
+    gives it, the large arrays are mapped files, whose values are read when they are used and not checked.
     """
 
     depth: Float32[np.ndarray, "S H W"]  # z in the camera, up to scale
@@ -69,10 +71,11 @@ class Result:
         self._set("intrinsics", intrinsics)
         self._check_cameras()
         self._check_places()
-        padding = ~self.inside_pictures
-        self._check_depth(padding)
-        if (self.dynamic_mask & padding).any():
-            self._set("dynamic_mask", self.dynamic_mask & ~padding)
+        if not is_mapped(self.depth):  # reading all of a mapped file would take as long as computing with it
+            padding = ~self.inside_pictures
+            self._check_depth(padding)
+            if (self.dynamic_mask & padding).any():
+                self._set("dynamic_mask", self.dynamic_mask & ~padding)
         if clamped:
             listed = ", ".join(map(str, clamped[:10])) + (f" and {len(clamped) - 10} more" if len(clamped) > 10 else "")
             warnings.warn(
@@ -145,12 +148,29 @@ class Result:
     @property
     def valid_pixels(self) -> Bool[np.ndarray, "S H W"]:
         """Pixels that show a point: not padding, with a finite depth above 0 and a finite confidence."""
-        return show_points(self.depth, self.depth_confidence, self.inside_pictures)
+        return self._mapped_valid if is_mapped(self.depth) else self._valid(slice(None))
+
+    @cached_property
+    def _mapped_valid(self) -> Bool[np.ndarray, "S H W"]:
+        valid = zeros_beside(self.depth, bool)
+        for frame in range(len(valid)):
+            valid[frame] = self._valid(frame)
+        return valid
+
+    def _valid(self, frames: int | slice) -> Bool[np.ndarray, "*F H W"]:
+        inside = inside_box(self.valid_box[frames], self.depth.shape[1:])
+        return show_points(self.depth[frames], self.depth_confidence[frames], inside)
 
     @property
     def dynamic_share(self) -> float:
         """Share of the pixels that are dynamic, of those that are not padding."""
-        return float(self.dynamic_mask.sum() / self.inside_pictures.sum())
+        return float(self.dynamic_mask.sum() / self.pictured)
+
+    @property
+    def pictured(self) -> int:
+        """Number of pixels that are not padding."""
+        left, top, right, bottom = self.valid_box.T
+        return int(((right - left) * (bottom - top)).sum())
 
     @cached_property
     def instances(self) -> UInt8[np.ndarray, "S H W"]:
@@ -171,6 +191,25 @@ class Result:
     def model_note(self) -> str:
         """A caution about the model for readers of the files, on one line; empty for most models."""
         return " ".join(str(self.settings.get("model_note", "")).split()).encode(errors="replace").decode()
+
+    @property
+    def known_facts(self) -> dict[str, str]:
+        """How the cameras were refined and brought to known ones and to lengths: a sentence by step, none without."""
+        refined, found = self.settings.get("refined_cameras"), self._known.get("found")
+        facts = {"cameras": refined.get("sentence")} if isinstance(refined, dict) else {}
+        facts |= found if isinstance(found, dict) else {}
+        return {name: text for name, text in facts.items() if isinstance(text, str)}
+
+    @property
+    def length_unit(self) -> str:
+        """The unit of depth and cameras: "metre", or "unit of the poses" (given ones), "... capture", "... model"."""
+        unit = self._known.get("lengths")
+        return unit if unit in ("metre", "unit of the poses", "unit of the capture") else "unit of the model"
+
+    @property
+    def _known(self) -> dict[str, Any]:
+        known = self.settings.get("known")
+        return known if isinstance(known, dict) else {}
 
     def world_points(self, *, pixel_offset: float = 0.5) -> Float32[np.ndarray, "S H W 3"]:
         """Lift every pixel to its point in the world, padding and unsure pixels too.
@@ -243,7 +282,7 @@ def check_shapes(shapes: Mapping[str, tuple[int, ...]]) -> None:
 
 
 def _cast(name: str, value: Any, dtype: np.dtype) -> np.ndarray:
-    array = np.asarray(value)
+    array = value if is_mapped(value) else np.asarray(value)
     if not np.can_cast(array.dtype, dtype, "same_kind"):
         raise ResultError(f"{name} has type {array.dtype}; expected {dtype}")
     return array.astype(dtype, copy=False)
