@@ -399,6 +399,24 @@ def test_names_that_leave_an_archive_are_refused(tmp_path, name, words):
     assert not (tmp_path / "out").exists()
 
 
+def _read_everything(path):
+    capture = read(path)
+    list(open_source(str(path)).frames(Sampling()))
+    capture.depth(1)
+
+
+@pytest.mark.parametrize("name", ["metadata", "rgbd/1.jpg", "rgbd/1.depth"])
+def test_errors_name_the_archive_and_not_where_it_is_unpacked(tmp_path, name):
+    pytest.importorskip("lzfse")
+    folder = write("record3d", tmp_path / "scene")
+    (folder / name).write_bytes(b"{ broken")
+    path = folders.zipped(folder, tmp_path / "walk.r3d")
+    with pytest.raises(InputError) as caught:
+        _read_everything(path)
+    assert f"{path}/{name}" in str(caught.value)
+    assert "vggtjax-capture" not in str(caught.value)
+
+
 def test_archives_that_are_none_or_too_large(tmp_path):
     path = tmp_path / "walk.r3d"
     path.write_bytes(b"PK\3\4 no zip")

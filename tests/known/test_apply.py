@@ -10,7 +10,7 @@ from tests.textured_room import textured_room
 from vggtjax.captures.capture import Capture
 from vggtjax.errors import InputError
 from vggtjax.known.apply import apply_known, scaled
-from vggtjax.known.given import read_known
+from vggtjax.known.given import check_readable, read_known
 from vggtjax.known.options import KnownGeometry
 
 TRUE = textured_room(4)
@@ -121,3 +121,12 @@ def test_missing_files_are_found_before_the_work(name):
         KnownGeometry(**{name: value}).check_files()
     with pytest.raises(InputError, match=f"{name} is 'aaa"):
         KnownGeometry(**{name: too_long}).check_files()
+
+
+@pytest.mark.parametrize("name", ["intrinsics", "poses"])
+def test_unreadable_files_are_found_before_the_work(tmp_path, name):
+    path = tmp_path / "numbers.txt"
+    path.write_text("1 2 nan\n")
+    known: dict[str, Any] = {name: str(path)}
+    with pytest.raises(InputError, match=r"numbers\.txt"):
+        check_readable(KnownGeometry(**known))

@@ -34,4 +34,4 @@ def test_costs_are_those_of_pixels_moved_one_by_one():
         alone = sweep_costs(views, np.array([factor]), 1)[0, 0]  # with frame 2 alone
         np.testing.assert_allclose(alone, np.where(shown, expected, 1), atol=2e-3)
         assert 0.05 < shown.mean() < 0.95
-    assert (found[:, 1] <= found[:, 0] + 0.3).mean() > 0.9
+    assert found[:, 1].mean() < 0.5 * found[:, 0].mean()  # the true depth looks alike

@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +19,7 @@ from jaxtyping import Bool, Float32, Float64
 
 from vggtjax.captures.cameras import checked_intrinsics, checked_world_from_camera, resized_intrinsics
 from vggtjax.captures.pictures import has_unclear_pixels, picture_size
+from vggtjax.captures.unpacked import Unpacked
 from vggtjax.errors import InputError
 
 CaptureKind = Literal["record3d", "polycam", "nerfstudio", "colmap", "tum"]
@@ -45,7 +47,7 @@ class Capture:
     timestamps: Float64[np.ndarray, " S"] | None = field(default=None, repr=False)  # seconds
     left_out: tuple[str, ...] = ()  # a sentence on pictures that are not among these
     notes: tuple[str, ...] = ()  # a sentence for each part that is missing or not as it seems
-    archive: object | None = field(default=None, repr=False)  # keeps the temporary files that `pictures` are, if any
+    archive: Unpacked | None = field(default=None, repr=False)  # keeps the temporary files that `pictures` are, if any
 
     def __post_init__(self) -> None:
         if not self.pictures:
@@ -93,6 +95,10 @@ class Capture:
             )
         return self._at([places[name] for name in names], names)
 
+    def naming_files(self) -> AbstractContextManager[None]:
+        """Return a context for reading `pictures`: errors in it name the file of Record3D, not where it is unpacked."""
+        return nullcontext() if self.archive is None else self.archive.named(self.path)
+
     def depth(self, frame: int) -> Float32[np.ndarray, "h w"] | None:
         """Return the depth of a frame along z, 0 where it is unknown, or None for a frame without depth.
 
@@ -101,12 +107,13 @@ class Capture:
         """
         if self.depth_files is None or self.read_depth_file is None or (path := self.depth_files[frame]) is None:
             return None
-        values = self.read_depth_file(path)
-        (width, height), (rows, columns) = self.sizes[frame], values.shape
-        if abs(columns * height - rows * width) > max(width, height):  # more than one pixel of rounding
-            raise InputError(
-                f"{path} has {columns} x {rows} pixels and its picture {width} x {height}; expected the same shape"
-            )
+        with self.naming_files():
+            values = self.read_depth_file(path)
+            (width, height), (rows, columns) = self.sizes[frame], values.shape
+            if abs(columns * height - rows * width) > max(width, height):  # more than one pixel of rounding
+                raise InputError(
+                    f"{path} has {columns} x {rows} pixels and its picture {width} x {height}; expected the same shape"
+                )
         return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
 
     def _at(self, places: list[int], names: Sequence[str]) -> Capture:

@@ -36,7 +36,9 @@ class CaptureFrames(ImageFiles):
         times = self.capture.timestamps
         for index in self._taken(sampling):
             time = None if times is None else float(times[index] - times[0])
-            yield Frame(self.frame_names[index], read_image(self.paths[index]), time)
+            with self.capture.naming_files():
+                image = read_image(self.paths[index])
+            yield Frame(self.frame_names[index], image, time)
 
     def _taken(self, sampling: Sampling) -> list[int]:
         times = self.capture.timestamps

@@ -23,7 +23,7 @@ from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, 
 from vggtjax.captures.depth_files import read_exr
 from vggtjax.captures.files import files, read_bytes
 from vggtjax.captures.numbers import number, numbers
-from vggtjax.captures.unpacked import unpacked
+from vggtjax.captures.unpacked import Unpacked, unpacked
 from vggtjax.errors import InputError, check_extra
 from vggtjax.storage.json_values import read_json
 
@@ -57,8 +57,14 @@ def read_record3d(path: Path) -> Capture:
 
     Depth needs the extra 'record3d', that of an export the extra 'exr', and only when it is read.
     """
-    archive = unpacked(path, (_OWN.metadata, _OWN.pictures)) if path.is_file() else None
-    folder = path if archive is None else archive.folder
+    if path.is_dir():
+        return _read(path, path, None)
+    archive = unpacked(path, (_OWN.metadata, _OWN.pictures))
+    with archive.named(path):
+        return _read(path, archive.folder, archive)
+
+
+def _read(path: Path, folder: Path, archive: Unpacked | None) -> Capture:
     layout = _OWN if (folder / _OWN.metadata).is_file() else _EXPORT
     source = folder / layout.metadata
     values = read_json(source, dict[str, Any], "metadata", most_bytes=_MOST_BYTES)

@@ -9,6 +9,8 @@ import tempfile
 import weakref
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from weakref import WeakValueDictionary
 
@@ -30,6 +32,14 @@ class Unpacked:
     def __init__(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="vggtjax-capture-"))
         weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+    @contextmanager
+    def named(self, path: Path) -> Iterator[None]:
+        """Let errors of the body name the archive `path`, which the user knows, instead of the temporary folder."""
+        try:
+            yield
+        except InputError as error:
+            raise type(error)(str(error).replace(str(self.folder), str(path))) from None
 
 
 _KNOWN: WeakValueDictionary[tuple[Path, int, int, tuple[str, ...]], Unpacked] = WeakValueDictionary()

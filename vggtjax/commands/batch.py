@@ -53,12 +53,13 @@ def batch(
     report = Report()
     with report.running():
         from vggtjax.clips.sources import clips_by_name
+        from vggtjax.known.given import check_readable
         from vggtjax.refinement.refine import check_refinement
 
         check_refinement(options.refine_cameras)
         named = clips_by_name(sources)
         known.check_many()
-        known.check_files()
+        check_readable(known)
         network, fitted = files.load(report, options, [options.method])
         from vggtjax.pipeline.batch import reconstruct_many
 

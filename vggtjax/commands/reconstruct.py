@@ -128,6 +128,7 @@ def reconstruct(
     report = Report()
     with report.running():
         from vggtjax.clips.sources import open_source
+        from vggtjax.known.given import check_readable
         from vggtjax.refinement.refine import check_refinement
         from vggtjax.results.folder import check_folder
 
@@ -137,7 +138,7 @@ def reconstruct(
         windows, geometry = more.windows, more.geometry
         known.check(options, windows)
         check_refinement(options.refine_cameras, geometry.poses is not None)
-        geometry.check_files()
+        check_readable(geometry)
         check_folder(out, saving.names(tracks=known.tracks is not None))
         network, fitted = files.load(report, options, [options.method])
         count = _cut_frames(report, opened, sampling, windows)

@@ -13,7 +13,8 @@ from vggtjax.known.depths import DepthSamples, check_depths, read_depths
 from vggtjax.known.frames import Frames
 from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
 from vggtjax.known.options import SOURCE, Baseline, KnownGeometry, parse_baseline
-from vggtjax.known.poses import checked_known_poses, read_poses
+from vggtjax.known.poses import POSE_COLUMNS, checked_known_poses, read_poses
+from vggtjax.storage.trajectories import read_numbers
 
 
 class Given(NamedTuple):
@@ -27,6 +28,15 @@ class Given(NamedTuple):
     depths: DepthSamples | None = None  # of a file
     leave_out: Bool[np.ndarray, "S H W"] | None = None
     capture: Capture | None = None  # of the clip's frames, where an option asks for it
+
+
+def check_readable(known: KnownGeometry) -> None:
+    """Raise InputError or ResultError for files that are missing or unreadable: call it before long work."""
+    known.check_files()
+    if known.intrinsics not in (None, SOURCE):
+        read_intrinsics(known.intrinsics)
+    if known.poses not in (None, SOURCE):
+        read_numbers(known.poses, POSE_COLUMNS)
 
 
 def read_known(

@@ -16,7 +16,7 @@ from vggtjax.errors import InputError
 from vggtjax.known.frames import Frames
 from vggtjax.storage.trajectories import associate, read_numbers, read_trajectory
 
-_TUM, _KITTI = 8, 12  # numbers a line
+_TUM, _KITTI = POSE_COLUMNS = (8, 12)  # numbers a line
 _FEWEST = 3
 _NO_MOTION = 1e-6  # a path, or its share of the distance from the origin, below which cameras stand still
 _FAR_AWAY = 1e-4  # share of the distance from the origin; the motion loses a thousandth to 32 bits
@@ -44,7 +44,7 @@ def read_poses(path: str | Path, clip: Frames) -> Float64[np.ndarray, "S 4 4"]:
 
     Raises InputError or ResultError for an unreadable file, another number of poses, or a frame without a pose.
     """
-    rows = read_numbers(path, (_TUM, _KITTI))
+    rows = read_numbers(path, POSE_COLUMNS)
     frames = len(clip.images)
     if rows.shape[1] == _KITTI:
         poses = np.tile(np.eye(4), (len(rows), 1, 1))

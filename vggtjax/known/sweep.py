@@ -101,10 +101,11 @@ def _sampled(
     """Return an image between its pixels (bilinear), and whether the nearest pixel is usable."""
     H, W = image.shape
     column, row = jnp.clip(column, 0, W - 1), jnp.clip(row, 0, H - 1)
-    left, top = jnp.minimum(column.astype(int), W - 2), jnp.minimum(row.astype(int), H - 2)
-    a, b, at, values = column - left, row - top, top * W + left, image.ravel()
-    upper = values[at] * (1 - a) + values[at + 1] * a
-    lower = values[at + W] * (1 - a) + values[at + W + 1] * a
+    left, top = column.astype(int), row.astype(int)
+    right, bottom = jnp.minimum(left + 1, W - 1), jnp.minimum(top + 1, H - 1)
+    a, b, values = column - left, row - top, image.ravel()
+    upper = values[top * W + left] * (1 - a) + values[top * W + right] * a
+    lower = values[bottom * W + left] * (1 - a) + values[bottom * W + right] * a
     nearest = jnp.rint(row).astype(int) * W + jnp.rint(column).astype(int)
     return upper * (1 - b) + lower * b, usable.ravel()[nearest]
 

@@ -18,6 +18,7 @@ from vggtjax.clips.preprocessing import Fitter, Framing, FramingChanges
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, VggtjaxError
+from vggtjax.known.given import check_readable
 from vggtjax.known.intrinsics import known_values
 from vggtjax.known.options import KnownGeometry
 from vggtjax.method.fusion_family import FusionParams
@@ -100,7 +101,7 @@ def reconstruct_many(
     check_fuses(fusion, options.method)
     if known is not None:
         known.check_many()
-        known.check_files()
+        check_readable(known)
     check_refinement(options.refine_cameras, known is not None and known.poses is not None)
     run = _Batch(
         model=model,

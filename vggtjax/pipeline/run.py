@@ -21,7 +21,7 @@ from vggtjax.clips.sources import ClipSource
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError, device_memory_errors
 from vggtjax.known.apply import apply_known, scaled
-from vggtjax.known.given import Given, read_known
+from vggtjax.known.given import Given, check_readable, read_known
 from vggtjax.known.options import KnownGeometry
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
@@ -125,7 +125,7 @@ def reconstruct(
     if masks is not None:
         options.check_given_masks()
     if known is not None:
-        known.check_files()
+        check_readable(known)
     check_refinement(options.refine_cameras, known is not None and known.poses is not None)
     source, (clip, tracks) = clip, _fitted(model, clip, size, tracks, on_stage)
     given = None if masks is None else masks_at_clip_pixels(masks, clip, source if isinstance(source, Clip) else clip)

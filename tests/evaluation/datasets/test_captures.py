@@ -38,8 +38,11 @@ def test_files_of_record3d_stand_beside_folders(tmp_path):
     folder = folders.record3d(tmp_path / "unpacked", TRUTH)
     folders.zipped(folder, tmp_path / "all/walk.r3d")
     folders.colmap_text(tmp_path / "all/yard", TRUTH)
-    walk, yard = opened("capture", tmp_path / "all")
-    assert (walk.name, yard.name) == ("walk", "yard")
+    folders.colmap_text(tmp_path / "all/both", TRUTH)
+    folders.zipped(folder, tmp_path / "all/both.R3D")
+    both, with_suffix, walk, yard = sorted(opened("capture", tmp_path / "all"), key=lambda sequence: sequence.name)
+    assert (both.name, with_suffix.name, walk.name, yard.name) == ("both", "both.R3D", "walk", "yard")
+    assert with_suffix.depth is not None
     assert walk.depth(0).any()
     for path in folder.glob("rgbd/*.depth"):
         path.unlink()

@@ -20,13 +20,20 @@ _OWN_UNIT = "its unit is not the metre, but one of its program's own"  # a note
 
 
 def captures(root: Path) -> dict[str, Opener]:
-    """Find the captures of a folder: the folder itself, or folders and .r3d files in it."""
-    found: dict[str, Path] = dict(files(root, RECORD3D_SUFFIX)) if capture_kind(root) is None else {}
+    """Find the captures of a folder: the folder itself, or folders and .r3d files in it.
+
+    A file has its name without the suffix, and with it where a folder has that name.
+    """
+    archives = [path for path in files(root, "").values() if path.suffix.lower() == RECORD3D_SUFFIX]
+    if capture_kind(root) is not None:
+        archives = []
+    found: dict[str, Path] = {}
     try:
         found |= sequence_folders(root, lambda folder: capture_kind(folder) is not None, "a capture")
     except InputError:
-        if not found:
+        if not archives:
             raise
+    found |= {path.name if path.stem in found else path.stem: path for path in archives}
     return {name: partial(_read, path, name) for name, path in found.items()}
 
 
