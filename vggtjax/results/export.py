@@ -51,7 +51,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -60,19 +59,18 @@ from vggtjax.errors import InputError, one_line
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results import foreign, previews, tracks
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
-from vggtjax.results.glb import POINT_LIMIT, build_scene, glb_bytes
-from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, joined, least_confidence, write_ply
+from vggtjax.results.glb import build_scene, clip_clouds
+from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, least_confidence, write_ply
 from vggtjax.results.report import REPORT_NAME, RunFacts, report_page
 from vggtjax.results.result import Result
 from vggtjax.results.saving import Resolution, Saving
-from vggtjax.storage.arrays import is_mapped, write_arrays
+from vggtjax.storage.arrays import write_arrays
 from vggtjax.storage.markup import webp, write_page
 from vggtjax.storage.trajectories import commented, write_trajectory
 
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
 _CARD_WIDTH = 720  # pixels
 _WORKERS = 8
-_SCENE_POINTS = 8 * POINT_LIMIT  # of a mapped result, before those of the scene are chosen
 _MOST_INVALID = 0.5  # share of a clip's pixels; more are warned about
 
 logger = logging.getLogger(__name__)
@@ -112,7 +110,7 @@ def write_files(
     if saving.format == "vggt4d":
         foreign.write_cameras(folder / "vggt4d", result.world_from_camera, [frame.intrinsics for frame in written])
     if saving.writes("scene"):
-        (folder / "scene.glb").write_bytes(glb_bytes(_build_scene(result, least)))
+        build_scene(result, clip_clouds(result, least)).write(folder / "scene.glb")
     advance()
     if saving.writes("previews"):
         _write_png(folder / "preview/sheet.png", previews.contact_sheet(result))
@@ -151,21 +149,6 @@ def _frames(
         yield partial(frame_of, result, number, resolution, picture=picture)
     if pictures is not None and next(shown, None) is not None:
         raise InputError(f"there are more pictures than the {count} frames; expected one for each")
-
-
-def _build_scene(result: Result, least: LeastConfidence) -> trimesh.Scene:
-    """Return the scene for viewers, at the model's size: they show no more points."""
-    static, dynamic = [], []
-    share = _SCENE_POINTS / result.depth.size if is_mapped(result.depth) else 1.0  # the scene keeps fewer in any case
-    random = np.random.default_rng(0)
-    for number in range(len(result.depth)):
-        frame = frame_of(result, number)
-        confident = frame.confident(least)
-        if share < 1:
-            confident &= random.random(confident.shape) < share
-        static.append(frame_cloud(frame, confident & ~frame.dynamic_mask))
-        dynamic.append(frame_cloud(frame, confident & frame.dynamic_mask))
-    return build_scene(result, joined(static), dynamic)
 
 
 class _Written(NamedTuple):

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from cmap import Colormap
-from jaxtyping import Float, Int
-from trimesh.exchange.gltf import export_glb
-from trimesh.visual import ColorVisuals
+from jaxtyping import Bool, Float, Int, UInt8
 
 from vggtjax.cameras import frustum_corners
-from vggtjax.results.point_cloud import PointCloud
+from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
+from vggtjax.results.point_cloud import PointCloud, frame_cloud
 from vggtjax.results.result import Result
+from vggtjax.storage.arrays import zeros_beside
+from vggtjax.storage.glb_file import POINTS, TRIANGLES, GlbFile
 
 _LEVELS = np.arange(256) / 255  # of sRGB
 _LINEAR = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4).astype(np.float32)
-_FLOAT = 5126  # glTF's name
-_UNLIT = {
-    "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
-    "extensions": {"KHR_materials_unlit": {}},
-}
 POINT_LIMIT = 1_000_000  # viewers in a browser still turn so many points smoothly
+_STATIC = "static"
 _TO_GLTF = np.array([1, -1, -1], np.float32)  # half a turn about x: y down and z forward become y up and z backward
 _CAMERA_SIZE = 0.06  # of the median distance from the middle of the cameras to the points
+_MOST_DISTANCES = 200_000  # of a cloud, of which the median is taken
 _BAR_SIZE = 0.015  # of a camera: half the thickness of its edges
 
 # Corners of `frustum_corners`: 0 the centre, then 1 top left, 2 top right, 3 bottom right, 4 bottom left.
@@ -34,45 +31,126 @@ _FRUSTUM_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4
 _BAR_FACES = np.array([[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])
 
 
-def build_scene(
-    result: Result, static: PointCloud, dynamic: Sequence[PointCloud], *, point_limit: int = POINT_LIMIT
-) -> trimesh.Scene:
+class CameraMesh(NamedTuple):
+    """The cameras of a clip and the path between them, in the world, y down."""
+
+    vertices: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    colors: UInt8[np.ndarray, "V 3"]  # sRGB
+
+
+def clip_clouds(result: Result, least: LeastConfidence, *, point_limit: int = POINT_LIMIT) -> dict[str, PointCloud]:
+    """Return the points of a scene by the names of their nodes; those of a mapped result are mapped.
+
+    `static` are those of all frames, `dynamic_000000` the moving ones of a frame. Of more than `point_limit` points
+    every cloud keeps the same share, drawn with a fixed seed.
+    """
+    frames = range(len(result.depth))
+    counts = np.array([[part.sum() for part in _static_and_moving(frame_of(result, n), least)] for n in frames])
+    choice = _EvenChoice(int(counts.sum()), point_limit)
+    static, moving = (_Store(result, choice, int(count)) for count in counts.sum(axis=0))
+    clouds: dict[str, PointCloud] = {}
+    for number in frames:
+        frame = frame_of(result, number)
+        of_static, of_moving = (frame_cloud(frame, pixels) for pixels in _static_and_moving(frame, least))
+        static.add(of_static)
+        clouds[_moving_name(number)] = moving.add(of_moving)
+    return {_STATIC: static.all(), **clouds}
+
+
+def limited_clouds(
+    static: PointCloud, moving: Sequence[PointCloud], *, point_limit: int = POINT_LIMIT
+) -> dict[str, PointCloud]:
+    """Return the static cloud of a clip and the moving ones of its frames, limited and named as by `clip_clouds`."""
+    choice = _EvenChoice(len(static) + sum(map(len, moving)), point_limit)
+    clouds = {_STATIC: static} | {_moving_name(frame): cloud for frame, cloud in enumerate(moving)}
+    return {name: choice(cloud) for name, cloud in clouds.items()}
+
+
+def build_scene(result: Result, clouds: Mapping[str, PointCloud]) -> GlbFile:
     """Return the scene, with y up.
 
-    Nodes: `static`, `dynamic_000000` for each frame with moving points, and `cameras`: a frustum per frame, open in the
-    viewing direction, with a filled triangle on its upper edge, coloured from the first frame to the last, and the path
-    between them. Of more than `point_limit` points every cloud keeps the same share, drawn with a fixed seed. Colours
-    are sRGB; `glb_bytes` writes them as glTF wants them.
+    Nodes: one for each cloud with points, and `cameras`: a frustum per frame, open in the viewing direction, with a
+    filled triangle on its upper edge, coloured from the first frame to the last, and the path between them. Colours of
+    clouds are sRGB; glTF's are linear, which takes float32: in 8 bits the dark tones of linear colours fall together
+    (the first 64 levels of sRGB become 14, which looks dark and banded).
     """
-    clouds = {"static": static} | {f"dynamic_{frame:06d}": cloud for frame, cloud in enumerate(dynamic)}
-    share = min(1.0, point_limit / max(1, sum(map(len, clouds.values()))))
-    random = np.random.default_rng(0)
+    shown = {name: cloud for name, cloud in clouds.items() if len(cloud)}
+    glb = GlbFile()
+    for name, cloud in shown.items():
+        glb.node(name, POINTS, _attributes(glb, cloud.points, cloud.colors))
+    cameras = camera_mesh(result, _camera_size(result, shown.values()))
+    faces = glb.array(cameras.faces.reshape(-1).astype(np.uint32))
+    glb.node("cameras", TRIANGLES, _attributes(glb, cameras.vertices, cameras.colors), faces)
+    return glb
+
+
+def _attributes(glb: GlbFile, points: Float[np.ndarray, "N 3"], colors: UInt8[np.ndarray, "N 3"]) -> dict[str, int]:
+    return {
+        "POSITION": glb.array(points, lambda piece: (piece * _TO_GLTF).astype(np.float32), bounds=True),
+        "COLOR_0": glb.array(colors, lambda piece: _LINEAR[piece]),
+    }
+
+
+def _moving_name(frame: int) -> str:
+    return f"dynamic_{frame:06d}"
+
+
+def _static_and_moving(
+    frame: ResultFrame, least: LeastConfidence
+) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
+    confident = frame.confident(least)
+    return confident & ~frame.dynamic_mask, confident & frame.dynamic_mask
+
+
+class _EvenChoice:
+    """Keeps the same share of every cloud, drawn with a fixed seed, at most `limit` of all points."""
+
+    def __init__(self, total: int, limit: int) -> None:
+        self._share = min(1.0, limit / max(1, total))
+        self._random = np.random.default_rng(0)
+
+    def kept(self, count: int) -> int:
+        """Return how many of so many points are kept."""
+        return int(self._share * count)
+
+    def __call__(self, cloud: PointCloud, before: int = 0) -> PointCloud:
+        """Return the kept points of a cloud, which comes after `before` points of the same one."""
+        count = self.kept(before + len(cloud)) - self.kept(before)
+        chosen = self._random.choice(len(cloud), count, replace=False, shuffle=False)
+        return PointCloud(cloud.points[chosen], cloud.colors[chosen])
+
+
+class _Store:
+    """Room for the kept points of a clip: in memory, or for a mapped result in files."""
+
+    def __init__(self, result: Result, choice: _EvenChoice, total: int) -> None:
+        room = choice.kept(total)
+        self._points = zeros_beside(result.depth, np.float32, (room, 3))
+        self._colors = zeros_beside(result.depth, np.uint8, (room, 3))
+        self._choice, self._seen, self._filled = choice, 0, 0
+
+    def add(self, cloud: PointCloud) -> PointCloud:
+        """Keep points of a cloud, and return them as they are stored."""
+        kept = self._choice(cloud, self._seen)
+        here = slice(self._filled, self._filled + len(kept))
+        self._points[here], self._colors[here] = kept.points, kept.colors
+        self._seen, self._filled = self._seen + len(cloud), here.stop
+        return PointCloud(self._points[here], self._colors[here])
+
+    def all(self) -> PointCloud:
+        return PointCloud(self._points[: self._filled], self._colors[: self._filled])
+
+
+def _camera_size(result: Result, clouds: Iterable[PointCloud]) -> float:
     middle = result.camera_centres.mean(axis=0, dtype=np.float64)
-    distances = []
-    scene = trimesh.Scene()
-    for name, cloud in clouds.items():
-        chosen = random.choice(len(cloud), int(share * len(cloud)), replace=False, shuffle=False)
-        if chosen.size:
-            points, colors = cloud.points[chosen], cloud.colors[chosen]
-            scene.add_geometry(trimesh.PointCloud(points * _TO_GLTF, colors), node_name=name, geom_name=name)
-            distances.append(np.linalg.norm(points - middle, axis=-1))
-    size = _CAMERA_SIZE * (float(np.median(np.concatenate(distances))) if distances else 1.0)
-    scene.add_geometry(_cameras(result, size), node_name="cameras", geom_name="cameras")
-    return scene
+    points = [cloud.points[:: -(-len(cloud) // _MOST_DISTANCES)] for cloud in clouds]
+    distances = [np.linalg.norm(some - middle, axis=-1) for some in points]
+    return _CAMERA_SIZE * (float(np.median(np.concatenate(distances))) if distances else 1.0)
 
 
-def glb_bytes(scene: trimesh.Scene, edit: Callable[[dict[str, bytes], dict[str, Any]], None] | None = None) -> bytes:
-    """Return the scene as a GLB file; `edit` may change its buffers and its tree, as a `buffer_postprocessor`."""
-
-    def finish(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
-        _colors_of_gltf(buffers, tree)
-        if edit is not None:
-            edit(buffers, tree)
-
-    return export_glb(scene, buffer_postprocessor=finish)
-
-
-def _cameras(result: Result, size: float) -> trimesh.Trimesh:
+def camera_mesh(result: Result, size: float) -> CameraMesh:
+    """Return the cameras of a result, each as long as `size` from its centre to its corners."""
     frames, height, width = result.depth.shape
     corners = frustum_corners(result.intrinsics, result.camera_from_world, height, width, size)  # [S, 5, 3]
     corners = corners.astype(np.float64)
@@ -87,13 +165,10 @@ def _cameras(result: Result, size: float) -> trimesh.Trimesh:
     roofs = np.stack([left, right, (left + right) / 2 + 0.4 * (left - low)], axis=1).reshape(-1, 3)
     roof_faces = np.arange(3 * frames).reshape(-1, 3)
     roof_faces = np.concatenate([roof_faces, roof_faces[:, ::-1]])  # seen from both sides
-
-    mesh = trimesh.Trimesh(
-        np.concatenate([bars, roofs]) * _TO_GLTF, np.concatenate([bar_faces, roof_faces + len(bars)]), process=False
-    )
     vertex_frames = np.concatenate([np.repeat(edge_frames[bar_edges], 8), np.repeat(np.arange(frames), 3)])
-    mesh.visual = ColorVisuals(mesh, vertex_colors=colors[vertex_frames])
-    return mesh
+    return CameraMesh(
+        np.concatenate([bars, roofs]), np.concatenate([bar_faces, roof_faces + len(bars)]), colors[vertex_frames]
+    )
 
 
 def _bars(
@@ -111,32 +186,3 @@ def _bars(
     vertices = (edges[used][:, :, None] + square[:, None]).reshape(-1, 3)
     faces = (8 * np.arange(len(used))[:, None, None] + _BAR_FACES).reshape(-1, 3)
     return vertices, faces, used
-
-
-def _colors_of_gltf(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
-    """Make the 8-bit sRGB colours of trimesh's vertices linear, and show them as they are, without lights.
-
-    glTF's vertex colours are linear, and viewers encode them for the screen: numbers of sRGB would look pale there. In
-    8 bits the dark tones of linear colours fall together (the first 64 levels of sRGB become 14, which looks dark and
-    banded), and trimesh reads 16 bits wrongly, so they are float32. Without KHR_materials_unlit viewers light the
-    frusta, which are black where there is no light.
-    """
-    names = list(buffers)
-    for accessor in {number for mesh in tree["meshes"] for number in _colors_of(mesh)}:
-        entry = list(tree["accessors"].values())[accessor]
-        name = names[entry["bufferView"]]
-        colors = np.frombuffer(buffers[name], np.uint8).reshape(-1, 4)[: entry["count"], :3]
-        buffers[name] = _LINEAR[colors].tobytes()
-        entry |= {"componentType": _FLOAT, "type": "VEC3"}
-        for key in ("normalized", "min", "max"):
-            entry.pop(key, None)
-    tree["materials"] = [_UNLIT]
-    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), *_UNLIT["extensions"]})
-    for mesh in tree["meshes"]:
-        for primitive in mesh["primitives"]:
-            primitive["material"] = 0
-
-
-def _colors_of(mesh: dict[str, Any]) -> Iterator[int]:
-    """Yield the numbers of the accessors of a mesh's colours."""
-    return (part["attributes"]["COLOR_0"] for part in mesh["primitives"] if "COLOR_0" in part["attributes"])

@@ -6,6 +6,7 @@ Large arrays that stand uncompressed in an .npz are not read but mapped: their p
 from __future__ import annotations
 
 import ast
+import os
 import re
 import struct
 import sys
@@ -31,7 +32,7 @@ _LEAST_MAPPED = 2**20  # bytes of an array; smaller ones are read
 _ALIGNMENT = 64  # bytes; arrays that are mapped start at such places
 _LOCAL_HEADER, _ZIP64_BYTES = 30, 20  # bytes of a zip's header before each file, without names; of its sizes of 64 bits
 _PADDING = 0xD935  # a zip's name for bytes that align what follows
-_MOST_SPREAD = 2**25  # values of a mapped array of which statistics are made
+_MOST_SPREAD = 2**23  # values of a mapped array of which statistics are made
 _DESCR = re.compile(r"[<>|=]?(?:[?biufcmM]|[SUV][1-9])\d{0,10}(\[\w{1,10}\])?")
 # Exceptions of zipfile, numpy and Python's parser for truncated or damaged files.
 _BROKEN = (zipfile.BadZipFile, zlib.error, struct.error, ValueError, EOFError, SyntaxError, RuntimeError, MemoryError)
@@ -64,18 +65,25 @@ def is_mapped(array: object) -> bool:
 
 
 def zeros_beside(array: np.ndarray, dtype: type, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """Return zeros of an array's shape: in memory, or for a mapped array in a file without a name."""
+    """Return zeros of an array's shape: in memory, or for a mapped array in a file without a name.
+
+    The file lies in the folder of the mapped one where that can be written: a system's folder for temporary files may
+    itself be memory.
+    """
     shape = array.shape if shape is None else shape
-    if not is_mapped(array) or not prod(shape):
+    if not isinstance(array, np.memmap) or not prod(shape):
         return np.zeros(shape, dtype)
-    with tempfile.TemporaryFile() as file:  # the map keeps it open
+    folder = None if array.filename is None else Path(array.filename).parent
+    if folder is not None and not os.access(folder, os.W_OK):
+        folder = None
+    with tempfile.TemporaryFile(dir=folder) as file:  # the map keeps it open
         return np.memmap(file, dtype, "w+", shape=shape)
 
 
 def spread_frames(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return what statistics are made of: the arrays, or some of their frames, evenly spread, where they are mapped.
 
-    Of a mapped array about 2**25 values are taken; all arrays have the frames of the first.
+    Of a mapped array about 2**23 values are taken; all arrays have the frames of the first.
     """
     first = arrays[0]
     if not is_mapped(first) or first.size <= _MOST_SPREAD:
