@@ -21,12 +21,14 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.depth import depth_errors
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error, umeyama_sim3
 from vggtjax.known.apply import apply_known
+from vggtjax.known.depths import DepthSamples
 from vggtjax.known.given import Given
 from vggtjax.known.options import Baseline, KnownGeometry
 from vggtjax.pretrained.load import load_model
 from vggtjax.results.reconstruction import Reconstruction
 
 _EVERY = 7  # pixels of a clip, for the points
+_DEPTHS = 5  # known ones, in frame 0
 
 
 class Errors(NamedTuple):
@@ -37,7 +39,7 @@ class Errors(NamedTuple):
     centres: float  # RMSE after Sim(3), in median depths
     abs_rel: float  # after one median scale
     points: float  # mean distance after Sim(3), in median depths
-    metric: float  # AbsRel without a scale; NaN without a metric scale
+    metric: float  # AbsRel without a scale: a unit of the network's counts as a metre unless a scale is known
 
 
 HEADINGS = ("focal (%)", "rotation (deg)", "centres", "AbsRel", "points", "metric AbsRel")
@@ -55,20 +57,28 @@ def _distance(clip: KnownClip) -> Given:
     return Given(KnownGeometry(), baseline=Baseline(int(first), int(second), float(apart.max())))
 
 
-ROWS: dict[str, tuple[Callable[[KnownClip], Given], bool]] = {  # and whether the scale is metric
-    NOTHING: (lambda clip: Given(KnownGeometry()), False),
-    "shared focal length": (lambda clip: Given(KnownGeometry(shared_focal=True)), False),
-    "intrinsics": (lambda clip: Given(KnownGeometry(), intrinsics=clip.intrinsics.astype(np.float64)), False),
-    "poses": (lambda clip: Given(KnownGeometry(), poses=_poses(clip)), True),
-    "intrinsics and poses": (
-        lambda clip: Given(KnownGeometry(), intrinsics=clip.intrinsics.astype(np.float64), poses=_poses(clip)),
-        True,
-    ),
-    "a distance": (_distance, True),
-    "intrinsics and a distance": (
-        lambda clip: _distance(clip)._replace(intrinsics=clip.intrinsics.astype(np.float64)),
-        True,
-    ),
+def _depths(clip: KnownClip) -> Given:
+    """Return the true depth of a few pixels of frame 0."""
+    rows, columns = np.nonzero(clip.result.valid_pixels[0])
+    chosen = np.linspace(0, len(rows) - 1, _DEPTHS).astype(int)
+    rows, columns = rows[chosen], columns[chosen]
+    samples = DepthSamples(np.zeros_like(rows), rows, columns, clip.depth[0, rows, columns].astype(np.float64))
+    return Given(KnownGeometry(), depths=samples)
+
+
+def _intrinsics(clip: KnownClip) -> np.ndarray:
+    return clip.intrinsics.astype(np.float64)
+
+
+ROWS: dict[str, Callable[[KnownClip], Given]] = {
+    NOTHING: lambda clip: Given(KnownGeometry()),
+    "shared focal length": lambda clip: Given(KnownGeometry(shared_focal=True)),
+    "intrinsics": lambda clip: Given(KnownGeometry(), intrinsics=_intrinsics(clip)),
+    "poses": lambda clip: Given(KnownGeometry(), poses=_poses(clip)),
+    "intrinsics and poses": lambda clip: Given(KnownGeometry(), intrinsics=_intrinsics(clip), poses=_poses(clip)),
+    "a distance": _distance,
+    "intrinsics and a distance": lambda clip: _distance(clip)._replace(intrinsics=_intrinsics(clip)),
+    f"{_DEPTHS} depths": _depths,
 }
 
 
@@ -105,20 +115,20 @@ def _of_seed(model: str, clips: int, folder: Path, seed: int) -> dict[str, list[
     found: dict[str, list[Errors | str]] = {name: [] for name in ROWS}
     made = clips_of_seed(load_model(model), seed, clips, folder)
     for clip in track(made, f"seed {seed}", clips, console=Console(stderr=True)):
-        for name, (given, metric) in ROWS.items():
-            found[name].append(_measured(clip, given(clip), metric))
+        for name, given in ROWS.items():
+            found[name].append(_measured(clip, given(clip)))
     return found
 
 
-def _measured(clip: KnownClip, given: Given, metric: bool) -> Errors | str:
+def _measured(clip: KnownClip, given: Given) -> Errors | str:
     try:
         result = apply_known(clip.result, given).result
     except InputError as error:
         return str(error)
-    return errors_of(result, clip, metric)
+    return errors_of(result, clip)
 
 
-def errors_of(result: Reconstruction, clip: KnownClip, metric: bool) -> Errors:
+def errors_of(result: Reconstruction, clip: KnownClip) -> Errors:
     """Return the errors of a result of a clip."""
     unit = float(np.median(clip.depth))
     ratio = result.intrinsics[:, [0, 1], [0, 1]] / clip.intrinsics[:, [0, 1], [0, 1]]
@@ -135,7 +145,7 @@ def errors_of(result: Reconstruction, clip: KnownClip, metric: bool) -> Errors:
         centre_error(result.camera_from_world, clip.camera_from_world) / unit,
         depth_errors(result.depth, clip.depth).abs_rel,
         float(np.linalg.norm(umeyama_sim3(points, truth).apply(points) - truth, axis=1).mean() / unit),
-        depth_errors(result.depth, clip.depth, scale=1.0).abs_rel if metric else np.nan,
+        depth_errors(result.depth, clip.depth, scale=1.0).abs_rel,
     )
 
 
@@ -160,9 +170,6 @@ def _table(seeds: list[dict[str, list[Errors | str]]]) -> str:
                 )
                 for seed in seeds
             ]
-            if any(np.isnan(rows[:, 0]).any() for rows in pairs):
-                cells.append("-")
-                continue
             text = str(spread([float(average(rows[:, 0])) for rows in pairs]))
             value, base = np.concatenate(pairs).T
             changed = (np.abs(value - base) > 1e-6).any()
