@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from hypothesis import settings
 
 from benchmarks.seeded import seeded_state_dict
 from converters import convert_state_dict
@@ -16,6 +17,8 @@ CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 _MAPPINGS = 2**14  # Linux allows 65530
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of the code
+settings.load_profile("untimed")
 
 
 def pytest_addoption(parser):

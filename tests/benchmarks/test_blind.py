@@ -20,7 +20,7 @@ from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.geometry.similarity import centres, umeyama_sim3
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=seeds)
 def test_blind_centres(seed):
     truth = random_cameras(np.random.default_rng(seed))
@@ -43,7 +43,7 @@ def test_turning_by_hand():
     assert np.degrees(mean_angular_velocity(poses)) == pytest.approx([0, 15, 0])
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=seeds, speed=st.floats(0.001, 0.3))
 def test_the_oracle_finds_a_constant_rate_and_is_never_worse_than_none(seed, speed):
     generator = np.random.default_rng(seed)

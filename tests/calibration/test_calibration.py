@@ -184,7 +184,7 @@ def test_two_maps_whose_product_is_the_truth():
     assert chosen.steps[-1].rating == (1, 1)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=st.integers(0, 10**6), min_gain=st.sampled_from([0.0, 0.002, 0.05]), terms=st.integers(1, 4))
 def test_every_cue_after_the_first_gains_on_both_halves(seed, min_gain, terms):
     made = make_sweep(seed, random_truth(seed + 1))

@@ -221,7 +221,8 @@ def test_commands_that_reconstruct_have_all_options(command, capsys):
         "preprocess",
     }
     names = names | {"model", "config", "fusion"}
-    absent = {"--method", "--fps"} if command == "evaluate" else set()  # --methods there, and pictures without times
+    # evaluate has --methods, takes pictures without times, and measures methods as they are.
+    absent = {"--method", "--fps", "--refine-cameras"} if command == "evaluate" else set()
     assert {f"--{name.replace('_', '-')}" for name in names} - flags == absent
 
 

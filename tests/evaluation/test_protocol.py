@@ -71,7 +71,7 @@ def test_a_worse_result_scores_worse():
     assert metrics["ause"] > 0
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=8)
 @given(
     scale=st.floats(0.2, 5),
     turn=st.tuples(*[st.floats(-3, 3)] * 3),

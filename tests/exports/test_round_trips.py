@@ -37,7 +37,7 @@ def needed(form):
 def test_cameras_survive_the_way_out_and_back(tmp_path_factory, form):
     needed(form)
 
-    @settings(max_examples=12, deadline=None)
+    @settings(max_examples=12)
     @given(
         turns=st.lists(vector, min_size=2, max_size=2),
         shifts=st.lists(vector, min_size=2, max_size=2),

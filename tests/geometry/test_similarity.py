@@ -25,7 +25,7 @@ def test_after_by_hand():
     assert np.allclose(turned.after(moved).apply(point), [[-5, 2, 0]])  # -> (1, 3, 0) -> (-6 + 1, 2, 0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=seeds)
 def test_the_inverse_undoes(seed):
     generator = np.random.default_rng(seed)
@@ -34,7 +34,7 @@ def test_the_inverse_undoes(seed):
     assert np.allclose(similarity.after(similarity.inverse()).apply(points), points)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=seeds)
 def test_a_whole_weight_is_as_many_points(seed):
     generator = np.random.default_rng(seed)

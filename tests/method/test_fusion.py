@@ -31,7 +31,7 @@ def test_hard_replacement_by_hand():
 _maps = hnp.arrays(np.float32, (2, 3, 4), elements=st.floats(1, 100, width=32))
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(_maps, _maps, _maps, _maps, hnp.arrays(bool, (2, 3, 4)))
 def test_fusion_equals_the_formula_and_stays_between_the_passes(d1, c1, d2, c2, dynamic):
     depth, confidence = fuse_depth(d1, c1, d2, c2, dynamic)

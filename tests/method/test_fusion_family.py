@@ -41,7 +41,7 @@ def seen(d1: Any, c1: Any, d2: Any, c2: Any, dynamic: Any, features: Any = None)
     return Observations(d1, jnp.log(c1), d2, jnp.log(c2), dynamic, dynamic - 0.5, features)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(_maps, _logs, _maps, _logs, hnp.arrays(bool, SHAPE))
 def test_the_identity_is_the_papers_rule(d1, log1, d2, log2, dynamic):
     """For confidences from 1 to 1e30; a precision is as exact as its logarithm, which it is kept as."""
@@ -63,7 +63,7 @@ def test_every_start_is_a_rule_near_the_papers():
         assert np.allclose(fused.log_precision, paper.log_precision, atol=3e-2), name
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(
     variances=st.tuples(st.floats(0.01, 100), st.floats(0.01, 100)),
     correlation=st.floats(-0.95, 0.95),

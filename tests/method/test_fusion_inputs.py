@@ -17,7 +17,7 @@ from vggtjax.network.model import Predictions
 _distance = jax.jit(edge_distance)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**31), share=st.sampled_from([0.0005, 0.01, 0.3, 0.9]))
 def test_the_distance_is_exact(seed, share):
     mask = np.random.default_rng(seed).random((40, 90)) < share

@@ -86,7 +86,7 @@ def test_the_largest_of_many_are_kept():
 
 
 @given(st.integers(0, 10**6), st.floats(0.05, 0.6))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_of_one_frame_they_are_scikit_images_labels(seed, share):
     mask = np.random.default_rng(seed).random((1, 6, 9)) < share
     ids, labels = find_instances(mask, least_share=0), np.array(label(mask[0], connectivity=2))
@@ -96,7 +96,7 @@ def test_of_one_frame_they_are_scikit_images_labels(seed, share):
 
 
 @given(st.integers(0, 10**6), st.integers(1, 5), st.floats(0, 0.7), st.integers(0, 2))
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 def test_a_region_has_one_id_and_nothing_else_has_any(seed, frames, share, gap):
     mask = np.random.default_rng(seed).random((frames, 7, 8)) < share
     ids = find_instances(mask, gap=gap, least_share=0)

@@ -22,7 +22,7 @@ from vggtjax.method.mask import (
 _otsu = jax.jit(otsu_threshold)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     share=st.floats(0.01, 0.99),

@@ -15,7 +15,7 @@ _decode = jax.jit(lambda pose: decode_pose(pose, (140, 168)))
 _encode = jax.jit(lambda extrinsics, intrinsics: encode_pose(extrinsics, intrinsics, (140, 168)))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(st.tuples(_unit, _unit, _unit, _unit).filter(lambda q: np.linalg.norm(q) > 0.1), st.floats(0.1, 3.0))
 def test_encode_inverts_decode(quaternion, fov):
     pose = np.array([1.0, -2.0, 3.0, *quaternion, fov, 0.9 * fov], np.float32)
@@ -26,7 +26,7 @@ def test_encode_inverts_decode(quaternion, fov):
     assert np.allclose(made[[0, 1, 2, 7, 8]], pose[[0, 1, 2, 7, 8]], atol=2e-5)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1))
 def test_rotations_agree_with_scipy(seed):
     rotation = Rotation.random(rng=np.random.default_rng(seed))

@@ -36,7 +36,7 @@ def drawn_slowly(splats, view, size, supersampling=1):
     return np.floor(parts.mean(axis=(1, 3)) + 0.5).astype(np.uint8)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(0, 25), st.sampled_from([1, 2, 3]), st.integers(3, 9), st.integers(3, 9))
 def test_equals_a_loop_over_points_and_pixels(seed, count, supersampling, width, height):
     random = np.random.default_rng(seed)

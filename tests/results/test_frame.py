@@ -89,7 +89,7 @@ def test_points_are_those_of_the_small_result():
 
 
 @given(st.integers(2, 9), st.integers(1, 40), st.integers(0, 10**6))
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_no_depth_is_invented_between_surfaces(side, count, seed):
     generator = np.random.default_rng(seed)
     depth = generator.choice([1.0, 1.02, 2.0, 0.0, np.inf], size=(side, side))

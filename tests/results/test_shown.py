@@ -91,7 +91,7 @@ def test_a_result_without_points_shows_none():
     assert static.values(np.zeros((2, 28, 42, 3))).shape == (0, 3)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 5), st.booleans())
 def test_each_voxel_keeps_its_most_confident_point(seed, budget, chunks, ties):
     random = np.random.default_rng(seed)

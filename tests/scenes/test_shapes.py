@@ -82,7 +82,7 @@ extent = st.floats(0.2, 2)
 
 
 @pytest.mark.parametrize("shape", list(SHAPES))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(start=vector, through=vector, size=st.tuples(extent, extent, extent))
 def test_a_ray_enters_and_leaves_on_the_surface(shape, start, through, size):
     origin, size = 8 * np.array(start), np.array(size)

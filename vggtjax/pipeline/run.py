@@ -124,9 +124,9 @@ def reconstruct(
     check_fuses(fusion, options.method)
     if masks is not None:
         options.check_given_masks()
+    check_refinement(options.refine_cameras, known is not None and known.poses is not None)
     if known is not None:
         check_readable(known)
-    check_refinement(options.refine_cameras, known is not None and known.poses is not None)
     source, (clip, tracks) = clip, _fitted(model, clip, size, tracks, on_stage)
     given = None if masks is None else masks_at_clip_pixels(masks, clip, source if isinstance(source, Clip) else clip)
     geometry = _given_geometry(known, clip) if known else None

@@ -133,7 +133,7 @@ def slow_associate(first, second, apart):
 seconds = st.lists(st.integers(0, 60).map(lambda n: n / 200), min_size=1, max_size=12)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(first=seconds, second=seconds)
 def test_association_is_that_of_all_pairs(first, second):
     assert partners(np.array(first), np.array(second)).tolist() == slow_associate(first, second, 0.02)

@@ -29,7 +29,7 @@ def test_only_valid_pixels_count():
     assert measured(np.array([0, -1, np.nan, np.inf, 3])).tolist() == [False, False, False, False, True]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=st.integers(0, 2**32 - 1), scale=st.floats(1e-3, 1e3))
 def test_scale_does_not_matter(seed, scale):
     generator = np.random.default_rng(seed)

@@ -29,7 +29,7 @@ def test_auc_by_hand():
     assert auc(-mask.astype(float), mask) == 0
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=st.integers(0, 2**32 - 1), levels=st.integers(1, 30))
 def test_auc_is_the_share_of_pairs(seed, levels):
     generator = np.random.default_rng(seed)
@@ -201,7 +201,7 @@ def test_pooled_scores_weigh_frames_alike():
     assert pooled_scores([(nothing, nothing)], empty="vggt4d").j_mean == 0
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_mask_scores_do_not_know_which_is_the_truth(seed):
     generator = np.random.default_rng(seed)

@@ -79,7 +79,7 @@ def test_paired_distance_by_hand():
     assert paired_distance(TRUTH, TRUTH) == (0, 0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=seeds, count=st.integers(1, 60), other=st.integers(1, 60))
 def test_swapping_the_clouds_swaps_accuracy_and_completeness(seed, count, other):
     predicted, truth = clouds(seed, (count, other))
@@ -96,7 +96,7 @@ def test_swapping_the_clouds_swaps_accuracy_and_completeness(seed, count, other)
     assert same.normal_consistency == pytest.approx(1)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=seeds, noise=st.floats(1e-3, 10))
 def test_a_paired_point_is_never_nearer_than_the_nearest(seed, noise):
     truth, offsets = clouds(seed, (30, 30))
@@ -106,7 +106,7 @@ def test_a_paired_point_is_never_nearer_than_the_nearest(seed, noise):
     assert paired.median >= max(errors.accuracy.median, errors.completeness.median) - 1e-12
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=seeds, scale=st.floats(0.01, 100))
 def test_a_common_motion_does_nothing_and_a_common_scale_scales(seed, scale):
     predicted, truth = clouds(seed)

@@ -63,7 +63,7 @@ def test_umeyama_turns_a_mirrored_triangle_over():
     assert np.linalg.det(found.rotation) == pytest.approx(1)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=seeds, count=st.integers(4, 40))
 def test_umeyama_recovers_any_similarity(seed, count):
     generator = np.random.default_rng(seed)
@@ -75,7 +75,7 @@ def test_umeyama_recovers_any_similarity(seed, count):
     assert np.linalg.det(found.rotation) == pytest.approx(1)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(seed=seeds, mirrored=st.booleans())
 def test_no_similarity_is_better_than_umeyamas(seed, mirrored):
     """Noise, and a mirror image, for which the determinant has to be corrected; scipy searches around it."""
@@ -122,7 +122,7 @@ def test_points_on_a_line_can_be_allowed():
     assert np.allclose(found.apply(line), wanted.apply(line))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=seeds)
 def test_errors_vanish_for_the_same_trajectory_in_another_world(seed):
     generator = np.random.default_rng(seed)
@@ -257,7 +257,7 @@ def test_rotation_errors_in_degrees_by_hand():
     assert errors.rte == pytest.approx(np.sqrt(2 / 3) * 2 * np.sin(np.radians(1.5)))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=seeds)
 def test_the_world_of_the_prediction_does_not_matter(seed):
     generator = np.random.default_rng(seed)
@@ -339,7 +339,7 @@ def test_associate_by_hand():
     assert associate(np.array([]), np.array([1.0])).shape == (0, 2)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seed=seeds, tolerance=st.floats(0.001, 0.1))
 def test_associate_is_greedy_over_all_pairs(seed, tolerance):
     generator = np.random.default_rng(seed)

@@ -63,7 +63,7 @@ def test_pixels_of_one_confidence_share_their_errors():
     assert constant.remaining == pytest.approx(4)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=seeds)
 def test_only_the_order_of_the_confidence_counts(seed):
     generator = np.random.default_rng(seed)
@@ -86,7 +86,7 @@ def test_likelihood_by_hand():
     assert gaussian_nll(np.zeros(3), np.full(3, 2 * np.pi)) == pytest.approx(0)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(seed=seeds, wrong=st.floats(0.01, 100))
 def test_the_calibrated_scale_has_the_greatest_likelihood(seed, wrong):
     errors, precision = claims(seed, 100, wrong)

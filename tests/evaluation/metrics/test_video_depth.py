@@ -74,7 +74,7 @@ def test_a_depth_behind_the_camera_is_close_to_nothing():
     assert errors.abs_rel == pytest.approx((2.5 + 1 + 0) / 3)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(seed=seeds, scale=st.floats(1e-2, 1e2), shift=st.floats(-3, 3))
 def test_what_the_alignment_finds_does_not_matter(seed, scale, shift):
     predicted, truth = depths(seed)
