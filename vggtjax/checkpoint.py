@@ -147,6 +147,17 @@ def read_model(path: str | Path, *, dtype: DType | None = None, **fields: Any) -
     return model
 
 
+def check_finite(model: Model) -> None:
+    """Raise CheckpointError, which names the first parameter that is not finite; reads all of them."""
+    flat: dict[str, Any] = flatten_dict(model.params, sep=".")
+    for path, leaf in flat.items():
+        values = np.asarray(leaf).astype(np.float32, copy=False)
+        if lost := values.size - np.count_nonzero(np.isfinite(values)):
+            raise CheckpointError(
+                f"{lost} of {values.size} values of {path} of the model {model.name} are not finite; get it again"
+            )
+
+
 def save_model(path: str | Path, params: Params, config: VGGTConfig, **labels: Any) -> Path:
     """Write parameters, nested dicts of float32 or bfloat16 arrays, as a checkpoint of this library; return its path.
 

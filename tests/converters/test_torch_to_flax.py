@@ -120,6 +120,14 @@ def test_one_problem_of_each_kind(state_dict, config):
     assert f"1 problem: key {BIAS} has type int64" in message
 
 
+def test_values_that_are_not_finite_are_refused_by_name(state_dict, config):
+    key = next(key for key in state_dict if key.endswith("norm1.weight"))
+    changed = state_dict[key].copy()
+    changed[3] = np.inf
+    with pytest.raises(CheckpointError, match=rf"1 of {changed.size} values of {key} are not finite"):
+        convert_state_dict({**state_dict, key: changed}, config)
+
+
 def test_all_problems_at_once(state_dict, config):
     del state_dict[BIAS]
     state_dict["extra.weight"] = np.ones(3)

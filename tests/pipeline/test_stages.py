@@ -8,7 +8,7 @@ import pytest
 from tests.tiny import tiny_config
 from vggtjax import Model, compile_ahead, encode, forward, load_clip, reconstruct
 from vggtjax.config import MotionConfig, VGGTConfig
-from vggtjax.errors import InputError
+from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.passes import first_pass, second_pass
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.model import init_params
@@ -159,3 +159,20 @@ def test_only_what_a_method_reads_of_the_second_pass_is_computed(model):
     kept = reconstruct(model, clip, method="vggt4d", keep_passes=True)
     assert np.abs(made.camera_from_world - kept.camera_from_world).max() < 1e-5
     assert kept.passes.second.depth is not None
+
+
+def test_equal_frames_show_nothing_that_moves(model):
+    still = np.repeat(pictures(1), 3, axis=0)
+    result = reconstruct(model, load_clip(still, size=SIDE, patch=14), size=SIDE)
+    assert not result.dynamic_mask.any()
+    assert result.settings["masks"] == "none: all frames are equal"
+    still[2, :2, :2] = 1 - still[2, :2, :2].round()  # four pixels change, as a small mover's do
+    assert reconstruct(model, load_clip(still, size=SIDE, patch=14), size=SIDE).settings["masks"] == "mined"
+
+
+def test_a_parameter_that_is_not_finite_is_named(model):
+    norm = model.params["camera_head"]["token_norm"]
+    broken = {**model.params["camera_head"], "token_norm": {**norm, "bias": norm["bias"].at[0].set(np.nan)}}
+    lost = Model(model.config, {**model.params, "camera_head": broken}, "lost")
+    with pytest.raises(CheckpointError, match=r"1 of 32 values of camera_head\.token_norm\.bias of the model lost"):
+        reconstruct(lost, load_clip(pictures(2), size=SIDE, patch=14), size=SIDE)

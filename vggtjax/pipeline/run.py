@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.captures.frames import CaptureFrames
-from vggtjax.checkpoint import Model
+from vggtjax.checkpoint import Model, check_finite
 from vggtjax.clips.clip import Clip, load_clip
 from vggtjax.clips.masks import load_masks, masks_at_clip_pixels
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.sources import ClipSource
 from vggtjax.config import MotionConfig, VGGTConfig
-from vggtjax.errors import InputError, device_memory_errors
+from vggtjax.errors import InputError, ResultError, device_memory_errors
 from vggtjax.known.apply import apply_known, scaled
 from vggtjax.known.given import Given, check_readable, read_known
 from vggtjax.known.options import KnownGeometry
@@ -102,7 +102,8 @@ def reconstruct(
         options: the method and its settings.
         size: side in pixels to run at, a multiple of the patch size; the model's own if None.
         masks: what moves, instead of the mined masks: boolean at the size of the clip's frames, as given or as
-            fitted, or of the source's pictures, or a folder of pictures. If no pixel moves, the second pass is not run.
+            fitted, or of the source's pictures, or a folder of pictures. If no pixel moves, the second pass is not run;
+            so it is, without masks, where all frames are one picture.
         tracks: points to follow, in pixels of the frames; points of a later frame than the first cost one more pass.
         fusion: a fitted rule (`load_fusion`), whose confidence is the fused precision; None: the paper's rule.
         known: intrinsics, poses or lengths that are known, and pixels without depth: the prediction is brought to them.
@@ -115,6 +116,7 @@ def reconstruct(
     Raises:
         InputError: an invalid option, masks of another size, a size that is not a multiple of the patch size, or known
             geometry that does not fit the clip.
+        CheckpointError: the model has parameters that are not finite, and so has its prediction.
         ClipError: the source of the clip cannot be read.
         DeviceMemoryError: the clip does not fit in the memory of the device.
         MissingExtraError: cameras are to be refined, and pycolmap is not installed.
@@ -129,6 +131,9 @@ def reconstruct(
         check_readable(known)
     source, (clip, tracks) = clip, _fitted(model, clip, size, tracks, on_stage)
     given = None if masks is None else masks_at_clip_pixels(masks, clip, source if isinstance(source, Clip) else clip)
+    mask_source = "mined" if masks is None else "given"
+    if masks is None and clip.is_still:
+        given, mask_source = np.zeros(clip.images.shape[:3], bool), "none: all frames are equal"
     geometry = _given_geometry(known, clip) if known else None
     frames, height, width = clip.images.shape[:3]
     stages = Stages(model.config, options, frames, (height, width))
@@ -150,16 +155,20 @@ def reconstruct(
         passes, assembly, by_frame = run(dataclasses.replace(stages, run=Execute(on_stage)))
     passes = jax.tree.map(lambda x: np.asarray(x)[:, :frames], passes)
     fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, frames))
-    result = Reconstruction(
-        **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
-        **fields,
-        saliency=passes.saliency[0],
-        dynamic_mask=passes.dynamic_mask[0],
-        method=options.method,
-        model_name=model.name,
-        settings=_settings(model, clip, options, masks is not None, fusion),
-        passes=passes if keep_passes else None,
-    )
+    try:
+        result = Reconstruction(
+            **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
+            **fields,
+            saliency=passes.saliency[0],
+            dynamic_mask=passes.dynamic_mask[0],
+            method=options.method,
+            model_name=model.name,
+            settings=_settings(model, clip, options, mask_source, fusion),
+            passes=passes if keep_passes else None,
+        )
+    except ResultError:
+        check_finite(model)  # they may be the reason
+        raise
     result, unit = _with_geometry(result, clip, options, geometry, on_stage)
     if options.refine_mask:
         with on_stage("refine mask") as progress:
@@ -288,12 +297,12 @@ def _clip_fields(clip: Clip) -> dict[str, Any]:
 
 
 def _settings(
-    model: Model, clip: Clip, options: Options, masks_given: bool, fusion: FusionParams | None
+    model: Model, clip: Clip, options: Options, mask_source: str, fusion: FusionParams | None
 ) -> dict[str, Any]:
     """Return the settings that a result depends on besides the method, as JSON values."""
     settings = {name: value for name, value in options.to_json().items() if name != "method"}
     settings |= {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
-    settings |= {"masks": "given" if masks_given else "mined"}
+    settings |= {"masks": mask_source}
     settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
     settings |= {"clip": clip.source.name} if clip.source.name else {}
     return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}
