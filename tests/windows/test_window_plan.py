@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vggtjax.errors import InputError
@@ -16,6 +16,7 @@ def test_a_plan_by_hand():
     assert shared_frames(range(8), range(6, 14)) == range(6, 8)
 
 
+@settings(deadline=None)  # a busy machine is slow
 @given(window=st.integers(4, 40), data=st.data())
 def test_every_plan_covers_the_clip_with_equal_windows_and_as_few_as_can_be(window, data):
     overlap = data.draw(st.integers(2, window // 2))
@@ -28,6 +29,7 @@ def test_every_plan_covers_the_clip_with_equal_windows_and_as_few_as_can_be(wind
     assert frames > (len(windows) - 1) * (window - overlap) + overlap  # one window fewer does not reach the end
 
 
+@settings(deadline=None)  # a busy machine is slow
 @given(window=st.integers(4, 30), frames=st.integers(31, 120))
 def test_weights_of_a_frame_sum_to_one_and_fall_towards_the_end_of_a_window(window, frames):
     windows = plan_windows(frames, window, max(2, window // 4))

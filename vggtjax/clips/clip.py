@@ -127,11 +127,15 @@ def load_clip(
     return read_clip(open_source(source), sampling, fitter, progress)
 
 
-def read_clip(source: Source, sampling: Sampling, fitter: Fitter, progress: Progress | None = None) -> Clip:
-    """Read the frames of a source that `sampling` takes, fitted to the model; `load_clip` says more."""
-    if isinstance(source, CaptureFrames):
-        for note in source.capture.left_out:
-            logger.warning("%s: %s", source.capture.path, note)
+def read_clip(
+    source: Source, sampling: Sampling, fitter: Fitter, progress: Progress | None = None, *, warn: bool = True
+) -> Clip:
+    """Read the frames of a source that `sampling` takes, fitted to the model; `load_clip` says more.
+
+    With `warn` what the source leaves out, large cuts and padding are logged.
+    """
+    if warn:
+        warn_of_left_out(source)
     total = source.total(sampling)
     names: list[str] = []
     times: list[float] = []
@@ -158,11 +162,11 @@ def read_clip(source: Source, sampling: Sampling, fitter: Fitter, progress: Prog
             (progress or no_progress)(len(fits), total)
         pixels.extend(render.result() for render in rendering)
     most = max(fits, key=lambda fit: fit.cut_share)
-    if most.cut_share > _LARGE_CUT:
+    if warn and most.cut_share > _LARGE_CUT:
         size = "frames of {} x {} pixels lose".format(*most.source_size)
         cut = 100 * most.cut_share
         logger.warning("%s %.0f %% of their pixels above and below; mode 'pad' (--preprocess pad) keeps all", size, cut)
-    images, fits = _joined(pixels, fits)
+    images, fits = _joined(pixels, fits, warn=warn)
     return Clip(
         images=images,
         frame_names=names,
@@ -179,13 +183,20 @@ def read_clip(source: Source, sampling: Sampling, fitter: Fitter, progress: Prog
     )
 
 
+def warn_of_left_out(source: Source) -> None:
+    """Log what a capture has and its clip leaves out."""
+    if isinstance(source, CaptureFrames):
+        for note in source.capture.left_out:
+            logger.warning("%s: %s", source.capture.path, note)
+
+
 def _joined(
-    pixels: list[UInt8[np.ndarray, "H W 3"]], fits: list[Fit]
+    pixels: list[UInt8[np.ndarray, "H W 3"]], fits: list[Fit], *, warn: bool
 ) -> tuple[Float32[np.ndarray, "S H W 3"], list[Fit]]:
     """Return the frames in one array, smaller frames centred on white, and their new fits."""
     sizes = {fit.frame_size for fit in fits}
     width, height = max(size[0] for size in sizes), max(size[1] for size in sizes)
-    if len(sizes) > 1:
+    if warn and len(sizes) > 1:
         listed = ", ".join(f"{size[0]} x {size[1]}" for size in sorted(sizes)[:4])
         logger.warning("frames have different sizes (%s); they are padded with white to %d x %d", listed, width, height)
     images = np.ones((len(pixels), height, width, 3), np.float32)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -41,6 +42,7 @@ class VideoFile:
     """A video file; frames are named by their index in it, and times count from its first frame."""
 
     path: Path
+    _odd: set[Fraction] = field(default_factory=set, init=False, repr=False, compare=False)  # aspects warned about
 
     @property
     def name(self) -> str:
@@ -57,7 +59,7 @@ class VideoFile:
 
         try:
             with _opened(self.path, av) as container:
-                stream = _video_stream(container, self.path)
+                stream = _video_stream(container, self.path, self._odd)
                 if stream.duration is not None and stream.time_base is not None:
                     return float(stream.duration * stream.time_base)
                 return None if container.duration is None else container.duration / 1e6
@@ -73,7 +75,7 @@ class VideoFile:
         import av.error
 
         rotation, matrix = None, np.eye(2)
-        for index, time, frame in sampling.select(_timed(self.path, av)):
+        for index, time, frame in sampling.select(_timed(self.path, av, self._odd)):
             if frame.rotation != rotation:  # asking a frame for its matrix keeps it alive until garbage is collected
                 rotation, matrix = frame.rotation, _display_matrix(frame, self.path)
             try:
@@ -128,12 +130,12 @@ def _opened(path: Path, av: ModuleType) -> InputContainer:
     return av.open(str(path.absolute()), **options)
 
 
-def _timed(path: Path, av: ModuleType) -> Iterator[tuple[float, VideoFrame]]:
+def _timed(path: Path, av: ModuleType, odd: set[Fraction]) -> Iterator[tuple[float, VideoFrame]]:
     """Yield (seconds since the first frame, frame) of every frame of the file's best video stream."""
     count, first = 0, 0.0
     try:
         with _opened(path, av) as container:
-            stream = _video_stream(container, path)
+            stream = _video_stream(container, path, odd)
             for frame in _decoded(container, stream):
                 if frame.pts is None or stream.time_base is None:
                     raise ClipError(f"frame {count} of video {path} has no presentation time; write the video as MP4")
@@ -151,15 +153,17 @@ def _timed(path: Path, av: ModuleType) -> Iterator[tuple[float, VideoFrame]]:
         raise _unreadable(path, count, error) from error
 
 
-def _video_stream(container: InputContainer, path: Path) -> VideoStream:
+def _video_stream(container: InputContainer, path: Path, odd: set[Fraction]) -> VideoStream:
     from av.stream import Disposition
 
     stream = cast("VideoStream | None", container.streams.best("video"))
     if stream is None or stream.disposition & Disposition.attached_pic:  # the cover of a piece of music
         raise ClipError(f"{path} has no video stream; expected a whole video file")
     stream.thread_type = "AUTO"
-    if stream.sample_aspect_ratio not in (None, 0, 1):
-        logger.warning("%s has pixels of aspect %s; they are taken as square", path, stream.sample_aspect_ratio)
+    aspect = stream.sample_aspect_ratio
+    if aspect not in (None, 0, 1) and aspect not in odd:
+        odd.add(aspect)
+        logger.warning("%s has pixels of aspect %s; they are taken as square", path, aspect)
     return stream
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -43,7 +44,7 @@ class More:
     windows: Annotated[Windows, tyro.conf.arg(name="long clip", help="")] = Windows()
 
     def __post_init__(self) -> None:
-        if self.windows.window is not None and self.geometry:
+        if self.windows.window and self.geometry:
             raise InputError(
                 "known cameras or lengths and --window exclude each other: they are brought into a clip "
                 "that is run as a whole"
@@ -68,9 +69,9 @@ class Known:
 
     def check(self, options: Options, windows: Windows) -> None:
         """Raise InputError for missing files, for options that need mined masks, or for points and windows."""
-        if self.tracks is not None and windows.window is not None:
+        if self.tracks is not None and windows.window:
             raise InputError("--tracks and --window exclude each other: points are followed over all frames at once")
-        if options.refine_cameras and windows.window is not None:
+        if options.refine_cameras and windows.window:
             raise InputError("--refine-cameras and --window exclude each other: cameras are adjusted over all frames")
         if self.masks is not None or self.no_masks:
             options.check_given_masks()
@@ -141,8 +142,18 @@ def reconstruct(
         check_readable(geometry)
         check_folder(out, saving.names(tracks=known.tracks is not None))
         network, fitted = files.load(report, options, [options.method])
-        count = _cut_frames(report, opened, sampling, windows)
         fitter = framing.fitter(size=network.config.image_size, patch=network.config.patch_size)
+        reading = Reading(opened, sampling, fitter)
+        if windows.window is None:
+            needs = {
+                "--tracks": known.tracks,
+                "known cameras or lengths": geometry,
+                "--refine-cameras": options.refine_cameras,
+            }
+            at_once = [name for name, given in needs.items() if given]
+            windows, count = _chosen(report, reading, network, out, at_once)
+        else:
+            count = _cut_frames(report, opened, sampling, windows)
         if count is not None:
             from vggtjax.windows.run import LongRun, reconstruct_long
 
@@ -152,9 +163,7 @@ def reconstruct(
                 network, frames, out, windows, options=options, long_run=plan, fusion=fitted, masks=masks
             )
         else:
-            result = _together(
-                report, Reading(opened, sampling, fitter), network, fitted, options, known, geometry, out, saving
-            )
+            result = _together(report, reading, network, fitted, options, known, geometry, out, saving)
     report.summary(result, out, network)
     if known.tracks is not None and "tracks" in network.untrained_heads:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")
@@ -215,7 +224,7 @@ def _together(
 
 def _cut_frames(report: Report, opened: Source, sampling: Sampling, windows: Windows) -> int | None:
     """Return the number of frames of a clip that is cut into windows; None for one that is run as a whole."""
-    if windows.window is None:
+    if not windows.window:
         return None
     from vggtjax.windows.frames import count_frames
 
@@ -226,6 +235,33 @@ def _cut_frames(report: Report, opened: Source, sampling: Sampling, windows: Win
         return None
     report.note(f"{count} frames in windows of {windows.window} that share at least {windows.shared}")
     return count
+
+
+def _chosen(
+    report: Report, reading: Reading, network: Model, out: Path, at_once: Sequence[str]
+) -> tuple[Windows, int | None]:
+    """Return windows and the number of frames of a clip that does not fit in memory, or that was begun in windows.
+
+    `at_once` names options that need all frames together: the clip is then not cut.
+    """
+    from vggtjax.windows.choice import choose_windows
+    from vggtjax.windows.store import unfinished_cut
+
+    begun = unfinished_cut(out)
+    if begun is not None and not at_once:
+        windows = Windows(*begun)
+        report.note(f"{out} holds a run in windows that was stopped: it goes on; --window 0 runs all frames together")
+        return windows, _cut_frames(report, reading.source, reading.sampling, windows)
+    with report.stage("check memory"):
+        choice = choose_windows(network, *reading)
+    if choice is None:
+        return Windows(), None
+    if at_once:
+        verb = "needs" if len(at_once) == 1 else "need"
+        report.note(f"{choice.sizes}, but {' and '.join(at_once)} {verb} all frames at once: they are run together")
+        return Windows(), None
+    report.note(choice.sentence)
+    return choice.windows, choice.frames if choice.windows.cuts(choice.frames) else None
 
 
 def _taken(clip: Clip, available: int | None) -> str:

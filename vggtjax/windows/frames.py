@@ -12,7 +12,7 @@ from itertools import islice
 
 import numpy as np
 
-from vggtjax.clips.clip import Clip, read_clip
+from vggtjax.clips.clip import Clip, read_clip, warn_of_left_out
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sampling import Frame, Sampling, Source
 from vggtjax.errors import ClipError
@@ -36,24 +36,25 @@ class _Next:
         return islice(self.reading, self.count)
 
 
-def count_frames(source: Source, sampling: Sampling) -> int:
-    """Return how many frames are taken; a video is decoded for it, a frame at a time."""
+def count_frames(source: Source, sampling: Sampling, most: int | None = None) -> int:
+    """Return how many frames are taken; a video is decoded for it, a frame at a time, up to `most` frames."""
     total = source.total(sampling)
-    return sum(1 for _ in source.frames(sampling)) if total is None else total
+    return sum(1 for _ in islice(source.frames(sampling), most)) if total is None else total
 
 
 def window_clips(source: Source, sampling: Sampling, fitter: Fitter, windows: Sequence[range]) -> Iterator[Clip]:
-    """Yield the clip of each window; the source is read once, in order.
+    """Yield the clip of each window; the source is read once, in order, and what is to be warned about is logged once.
 
     Raises ClipError where the source has fewer frames than planned, or its frames have several sizes.
     """
+    warn_of_left_out(source)
     reading = source.frames(sampling)
     held: Clip | None = None
     read = 0
     for window in windows:
         count = window.stop - read
         try:
-            fresh = read_clip(_Next(source.name, reading, count), Sampling(), fitter)
+            fresh = read_clip(_Next(source.name, reading, count), Sampling(), fitter, warn=held is None)
         except ValueError as error:
             if isinstance(error, ClipError):
                 raise

@@ -13,18 +13,18 @@ LEAST_OVERLAP = 2  # frames; one frame tells nothing of how cameras move
 
 @dataclass(frozen=True)
 class Windows:
-    """How a long clip is cut. Raises InputError for a value out of range."""
+    """How a long clip is cut: without a window, or with window 0, not at all. Raises InputError for a bad value."""
 
     window: InWords[int | None] = None
-    """run the clip in windows of so many frames and join them: memory then does not depend on the clip's length; by
-    default all frames together"""
+    """run the clip in windows of so many frames and join them: memory then does not depend on the clip's length; 0 runs
+    all frames together; by default they are run together where they fit in memory, else in windows of up to 64"""
     overlap: InWords[int | None] = None
     """frames that neighbouring windows share, at least 2 and at most half a window; a quarter of a window by default"""
     no_loops: Switch = False
     """do not look for places that the camera comes back to"""
 
     def __post_init__(self) -> None:
-        if self.window is None:
+        if self.window is None or self.window == 0:
             if self.overlap is not None:
                 raise InputError(f"overlap is {self.overlap}, but there are no windows; give window too")
             return
@@ -43,7 +43,7 @@ class Windows:
 
     def cuts(self, frames: int) -> bool:
         """Return whether a clip of so many frames is cut: it is longer than a window."""
-        return self.window is not None and frames > self.window
+        return bool(self.window) and frames > self.window
 
 
 def plan_windows(frames: int, window: int, overlap: int) -> list[range]:

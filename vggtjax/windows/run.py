@@ -33,7 +33,7 @@ from vggtjax.storage.writing import locked_folder
 from vggtjax.windows.frames import count_frames, window_clips
 from vggtjax.windows.join import JoinRule
 from vggtjax.windows.plan import Windows, plan_windows
-from vggtjax.windows.store import FOLDER, WindowStore
+from vggtjax.windows.store import FOLDER, WindowStore, write_cut
 from vggtjax.windows.whole import Whole, store_window
 
 _JOINED = 12.0 + 12.0  # bytes of a pixel, beside the files of a result: blended arrays, windows
@@ -164,6 +164,7 @@ def run_windows(source: ClipSource, out: Path, plan: LongRun, tools: Tools, sett
     }
     with locked_folder(out / FOLDER, "the windows of a clip"):
         store = WindowStore(out, decides)
+        write_cut(out, windows.window, windows.shared)
         whole = Whole(store, cut, tools.run, plan.rule, plan.on_stage)
         with seconds.stage("windows"), plan.on_stage("windows") as progress:
             clip = None

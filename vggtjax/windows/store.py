@@ -6,6 +6,7 @@ In the folder of the result, while it is being made:
         0000.npz                the archive of a window's result
         0000.npy                features of some of its frames, for finding loops
         joined/                 arrays of the whole clip
+    .vggtjax-windows/cut.json   frames of a window and overlap, for a run that goes on
 """
 
 from __future__ import annotations
@@ -27,6 +28,22 @@ from vggtjax.storage.arrays import read_array
 from vggtjax.storage.writing import write_errors, writing
 
 FOLDER = ".vggtjax-windows"
+_CUT = "cut.json"
+
+
+def write_cut(out: Path, window: int, overlap: int) -> None:
+    """Note how the clip of a result's folder is cut, until the result is whole."""
+    with writing(out / FOLDER / _CUT) as path:
+        path.write_text(json.dumps([window, overlap]))
+
+
+def unfinished_cut(out: Path) -> tuple[int, int] | None:
+    """Return the frames of a window and the overlap of a run that was stopped; None without one."""
+    try:
+        window, overlap = json.loads((out / FOLDER / _CUT).read_text())
+        return int(window), int(overlap)
+    except (OSError, ValueError, TypeError):
+        return None
 
 
 class WindowStore:
