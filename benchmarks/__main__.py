@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import tyro
 
+from benchmarks.approximations import approximations
 from benchmarks.batch import batch
 from benchmarks.demo_model import demo_model
 from benchmarks.embed import embed
@@ -30,6 +31,7 @@ from benchmarks.viewer import viewer
 from vggtjax.errors import VggtjaxError
 
 COMMANDS = {
+    "approximations": approximations,
     "batch": batch,
     "demo-model": demo_model,
     "embed": embed,

@@ -22,11 +22,13 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError, check_choice, problems_sentence
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
+from vggtjax.network.quantised import Quantised, is_quantised, quantise
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.programs import kept_text
 from vggtjax.storage.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
 
 DType = Literal["float32", "bfloat16"]
+LoadedDType = Literal["float32", "bfloat16", "int8"]
 
 FORMAT = "vggtjax"
 VERSION = "1"
@@ -72,7 +74,8 @@ class Model:
     @property
     def parameter_count(self) -> int:
         """Number of parameters."""
-        return sum(leaf.size for leaf in jax.tree.leaves(self.params))
+        leaves = jax.tree.leaves(self.params, is_leaf=lambda leaf: isinstance(leaf, Quantised))
+        return sum((leaf.values if isinstance(leaf, Quantised) else leaf).size for leaf in leaves)
 
     @property
     def parameter_bytes(self) -> int:
@@ -118,12 +121,13 @@ def is_checkpoint(path: str | Path) -> bool:
     return is_tensor_file(path) and read_tensors(path).metadata.get("format") == FORMAT
 
 
-def read_model(path: str | Path, *, dtype: DType | None = None, **fields: Any) -> Model:
+def read_model(path: str | Path, *, dtype: LoadedDType | None = None, **fields: Any) -> Model:
     """Read a checkpoint of this library.
 
     Args:
         path: the file.
-        dtype: of the parameters; None for the types in the file.
+        dtype: of the parameters; None for the types in the file. "int8" rounds the kernels of the blocks to 8 bits and
+            leaves the others as they are in the file: an approximation.
         fields: fields of `Model` in place of those in the file: name, note, untrained_heads.
 
     Raises CheckpointError, which lists all problems, unless the file is a whole checkpoint of this library that fits
@@ -135,14 +139,17 @@ def read_model(path: str | Path, *, dtype: DType | None = None, **fields: Any) -
     config, stored_fields = _read_metadata(path, metadata)
     check_parameters(f"{path} does not fit its own configuration", tensors, config)
     content = np.asarray(np.memmap(path, np.uint8, mode="r"))
-    flat = {}
+    flat: dict[str, Any] = {}
     for key, stored in tensors.items():
         tensor = stored.within(content)
-        if dtype is not None:
+        if dtype == "int8" and is_quantised(key):
+            flat[key] = jax.block_until_ready(quantise(tensor))
+            continue
+        if dtype not in (None, "int8"):
             tensor = tensor.astype(numpy_dtype(dtype), copy=False)
         flat[key] = jax.device_put(tensor).block_until_ready()  # on a CPU, a view of the file if aligned
     model = Model(config, unflatten_dict(flat, sep="."), path=path, **(stored_fields | fields))
-    if all(flat[key].dtype == stored.dtype for key, stored in tensors.items()):
+    if dtype != "int8" and all(flat[key].dtype == stored.dtype for key, stored in tensors.items()):
         object.__setattr__(model, "_file", facts)
     return model
 
@@ -166,6 +173,8 @@ def save_model(path: str | Path, params: Params, config: VGGTConfig, **labels: A
     file cannot be written.
     """
     flat: dict[str, Any] = flatten_dict(params, sep=".")
+    if any(isinstance(leaf, Quantised) for leaf in flat.values()):
+        raise CheckpointError("the parameters are int8; expected float32 or bfloat16: save the model as it was before")
     check_parameters("the parameters do not fit the configuration", flat, config)
     specs = {key: Spec(leaf.shape, leaf.dtype) for key, leaf in flat.items()}
     return write_checkpoint(path, specs, lambda key: [np.asarray(flat[key])], config, **labels)
@@ -291,7 +300,8 @@ def _params_digest(model: Model) -> str:
     digest = hashlib.sha256(model.config.to_json().encode())
     flat: dict[str, Any] = flatten_dict(model.params, sep=".")
     for name, leaf in sorted(flat.items()):
-        values = np.ascontiguousarray(leaf)
-        digest.update(f"{name} {values.dtype} {values.shape}".encode())
-        digest.update(values.reshape(-1).view(np.uint8).data)
+        for part in jax.tree.leaves(leaf):  # two of a quantised kernel
+            values = np.ascontiguousarray(part)
+            digest.update(f"{name} {values.dtype} {values.shape}".encode())
+            digest.update(values.reshape(-1).view(np.uint8).data)
     return digest.hexdigest()

@@ -16,6 +16,7 @@ from vggtjax.storage.json_values import check_fields
 Pass = Literal["first", "second"]
 Threshold = Literal["otsu", "multi-otsu"]
 _ShownDType = Literal["float32", "bfloat16"]  # on the command line
+Attention = Literal["exact", "merged"]
 ComputeDType = Literal["float32", "bfloat16", "float64"]
 MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d"]
 
@@ -87,6 +88,8 @@ def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) ->
     return True if refine_mask else False if no_refine_mask else None
 
 
+_LATER = {"refine_cameras": False, "attention": "exact"}  # options that older results lack, and their defaults
+
 # The name puts both flags into the group of the method in the help.
 _RefineMask = Annotated[bool | None, tyro.conf.arg(constructor=_refine_mask, name="method", prefix_name=False)]
 
@@ -119,6 +122,9 @@ class Options:
         tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint="(default: float32)"),  # pyright: ignore
     ] = "float32"
     """type of the blocks' matrix products"""
+    attention: InWords[Attention] = "exact"
+    """how frames attend to each other: exact; merged, an approximation that merges similar tokens: several times faster
+    for long clips, with other numbers (its errors are in the docs)"""
 
     def __post_init__(self) -> None:
         find_method(self.method)
@@ -161,5 +167,5 @@ class Options:
         return dataclasses.replace(self, **changes) if changes else self
 
     def to_json(self) -> dict[str, Any]:
-        """Return the options as JSON values; without `refine_cameras` where that is off, as results had before it."""
-        return {name: value for name, value in dataclasses.asdict(self).items() if value or name != "refine_cameras"}
+        """Return the options as JSON values, without those of `_LATER` at their default: as in results before them."""
+        return {name: value for name, value in dataclasses.asdict(self).items() if (name, value) not in _LATER.items()}

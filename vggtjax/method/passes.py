@@ -197,7 +197,7 @@ def run_passes(
     """
     mask_pairs: Any = changes.pop("mask_pairs", options.mask_pairs)  # not in the options: the number can be traced
     options = options.changed(**changes)
-    method, compute = options.row, Compute(options.compute_dtype)
+    method, compute = options.row, Compute(options.compute_dtype, attention=options.attention)
     if second is None:
         second = method.second_outputs(options.align_scale) if method.needs_second_pass else ()
     patch_tokens = encode(params, images, config, compute_dtype=options.compute_dtype)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
 import jax
@@ -14,12 +15,19 @@ from vggtjax.config import VGGTConfig
 from vggtjax.network.block import Block
 from vggtjax.network.clip_batch import real_frames
 from vggtjax.network.layers import Params
+from vggtjax.network.merging import merged_attention
 from vggtjax.network.precision import Compute, full_precision, widened
 from vggtjax.network.rope import rope_table
-from vggtjax.network.suppression import SuppressedKeys, Suppression
+from vggtjax.network.suppression import Attend, SuppressedKeys, Suppression, suppressed_attention
 
 REGISTERS = 4
 SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
+
+# (S, grid, special tokens) -> attention over the S frames of a clip
+GLOBAL_ATTENTION: Mapping[str, Callable[[int, tuple[int, int], int], Attend]] = {
+    "exact": lambda S, grid, special_tokens: suppressed_attention,
+    "merged": merged_attention,
+}
 
 Capture = Callable[[Float[Array, "B S T E"]], Any]
 
@@ -81,12 +89,15 @@ def aggregate(
         accumulator: what to sum over q and k of the global blocks, such as motion cues, or None.
         frame_count: number of real frames of each clip, at least one; padded frames follow and do not change them.
         suppression: the keys to suppress, in both blocks of a pair.
-        compute: type of the products; with `remat`, only the input of every pair is stored for the gradient.
+        compute: type of the products; how global attention is computed; with `remat`, only the input of every pair is
+            stored for the gradient.
     """
     params = params["aggregator"]
     B, S, P, C = patch_tokens.shape
     T = SPECIAL_TOKENS + P
     block = _block(config, compute.compute_dtype)
+    attend = compute.attention if callable(compute.attention) else GLOBAL_ATTENTION[compute.attention]
+    global_block = dataclasses.replace(block, attend=attend(S, grid, SPECIAL_TOKENS))
     rope = rope_table(grid, SPECIAL_TOKENS, C // config.num_heads)
     real = real_frames(frame_count, S)
     real_tokens = None if real is None else jnp.repeat(real, T, axis=1)
@@ -100,7 +111,7 @@ def aggregate(
         frame_params, global_params, active, tapped, counts = layer
         x, _, _ = block(frame_params, x.reshape(B * S, T, C), rope, suppressed(active, B * S))
         frame = x
-        x, q, k = block(global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens)
+        x, q, k = global_block(global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens)
         if accumulator is not None:
             q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
             sums = accumulator.add(sums, counts, q, k, frame_count)

@@ -11,8 +11,9 @@ from jaxtyping import Array, Bool, Float
 
 from vggtjax.network.layers import MLP, DType, LayerNorm, Params, apply, declare
 from vggtjax.network.pieces import in_pieces, replaced_in_pieces
+from vggtjax.network.quantised import dequantised
 from vggtjax.network.rope import Rope, apply_rope
-from vggtjax.network.suppression import SuppressedKeys, suppressed_attention
+from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
 
 
 @dataclass(frozen=True)
@@ -26,6 +27,7 @@ class Block:
     qk_norm: bool = False
     epsilon: float = 1e-5
     dtype: DType = jnp.float32
+    attend: Attend = suppressed_attention
 
     def __call__(
         self,
@@ -38,13 +40,14 @@ class Block:
         """Return the tokens after the block, and q and k after norm and rotation, for the motion cues.
 
         Args:
-            params: the block's own, as `declare` declares them.
+            params: the block's own, as `declare` declares them; kernels may be `Quantised`.
             x: B sequences of L tokens.
             rope: the angles of T tokens, where L is a multiple of T; or None.
             suppressed: the keys to suppress, or None.
             is_real: tokens that others attend to; None for all.
         """
         B, L, C = x.shape
+        params = dequantised(params)
         heads = (self.num_heads, C // self.num_heads)
         tokens = x.reshape(B * L, C)
 
@@ -72,7 +75,7 @@ class Block:
 
         place = jnp.arange(B * L) % (L if rope is None else rope.cos.shape[0])
         q, k, v = (y.reshape(B, L, *heads) for y in in_pieces(before, (tokens, place)))
-        y = suppressed_attention(q, k, v, suppressed, is_real).reshape(B * L, C)
+        y = self.attend(q, k, v, suppressed, is_real).reshape(B * L, C)
         return replaced_in_pieces(after, tokens, y).reshape(B, L, C), q, k
 
     def declare(self, C: int) -> Params:

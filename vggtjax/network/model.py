@@ -52,6 +52,7 @@ class ForwardChanges(TypedDict, total=False):
     stop_camera_gradient: bool
     compute_dtype: str
     remat: bool
+    attention: str
 
 
 def forward(
@@ -84,7 +85,8 @@ def forward(
         cues: motion cues, or another accumulator, whose sums become `.cue_sums`.
         suppression: the keys to suppress; none for the plain pass.
         changes: fields of `Suppression` (`dynamic_tokens`, `suppress`, `mask_pairs`, `strength`) in place of those of
-            `suppression`, and fields of `Compute` (`compute_dtype`, `remat`, `stop_camera_gradient`).
+            `suppression`, and fields of `Compute` (`compute_dtype`, `remat`, `stop_camera_gradient`,
+            `attention`).
 
     Raises:
         InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing.

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vggtjax.errors import InputError, check_choice
-from vggtjax.options import ComputeDType
+from vggtjax.options import Attention, ComputeDType
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -28,14 +28,19 @@ class Compute:
         remat: compute activations of blocks and dense heads again in the backward pass: less memory, more time.
         stop_camera_gradient: treat the previous estimate as a constant in every iteration of the camera head, as in
             VGGT's training.
+        attention: how global attention is computed: "exact", "merged" (an approximation, see `network.merging`), or a
+            function (S, grid, special tokens) -> attention, as an experiment.
     """
 
     compute_dtype: str = "float32"
     remat: bool = False
     stop_camera_gradient: bool = True
+    attention: str | Callable = "exact"
 
     def __post_init__(self) -> None:
         check_compute_dtype(self.compute_dtype)
+        if not callable(self.attention):
+            check_choice("attention", self.attention, get_args(Attention))
 
 
 def check_compute_dtype(name: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import get_args
@@ -85,6 +86,10 @@ class SuppressedKeys:
     keys: Bool[Array, "B T"] | Float[Array, "B T"]
     active: Bool[Array, ""] | Float[Array, ""]
     suppress: Suppress
+
+
+# (q, k, v, suppressed keys, real tokens) -> outputs: `suppressed_attention`, or an approximation of it
+Attend = Callable[[Array, Array, Array, SuppressedKeys | None, Array | None], Array]
 
 
 def suppressed_attention(

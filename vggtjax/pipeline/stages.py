@@ -22,6 +22,7 @@ from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
 from vggtjax.network.precision import Compute
+from vggtjax.network.quantised import Quantised
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
@@ -43,18 +44,20 @@ def padded_frames(frames: int, offsets: tuple[int, ...]) -> int:
     return -(-frames // step) * step
 
 
-def _first(params, clips, query_points=None, *, compute_dtype, **options):
-    return first_pass(params, clips, query_points=query_points, compute=Compute(compute_dtype), **options)
+def _first(params, clips, query_points=None, *, compute_dtype, attention, **options):
+    compute = Compute(compute_dtype, attention=attention)
+    return first_pass(params, clips, query_points=query_points, compute=compute, **options)
 
 
-def _second(params, clips, dynamic_mask, first, *, suppress, mask_pairs, compute_dtype, **options):
+def _second(params, clips, dynamic_mask, first, *, suppress, mask_pairs, compute_dtype, attention, **options):
     suppression = Suppression(suppress=suppress, mask_pairs=mask_pairs)
-    compute = Compute(compute_dtype)
+    compute = Compute(compute_dtype, attention=attention)
     return second_pass(params, clips, dynamic_mask, plain=first, suppression=suppression, compute=compute, **options)
 
 
-def _track(params, clips, query_points, frame, *, config, compute_dtype):
-    return track_from(params, clips, query_points, frame, config, compute=Compute(compute_dtype))
+def _track(params, clips, query_points, frame, *, config, compute_dtype, attention):
+    compute = Compute(compute_dtype, attention=attention)
+    return track_from(params, clips, query_points, frame, config, compute=compute)
 
 
 def _mine(
@@ -74,12 +77,13 @@ def _assemble(
 
 
 _encode = Program(encode, static=("config", "compute_dtype"))
-_first_pass = Program(_first, static=("config", "gram", "compute_dtype"))
+_first_pass = Program(_first, static=("config", "gram", "compute_dtype", "attention"))
 _mine_mask = Program(_mine, static=("frames", "size", "clusters", "threshold", "smooth_frames"))
-_second_pass = Program(_second, static=("config", "suppress", "outputs", "compute_dtype"))  # mask_pairs is traced
-_track_from = Program(_track, static=("config", "compute_dtype"))
+_SECOND_STATIC = ("config", "suppress", "outputs", "compute_dtype", "attention")  # mask_pairs is traced
+_second_pass = Program(_second, static=_SECOND_STATIC)
+_track_from = Program(_track, static=("config", "compute_dtype", "attention"))
 _assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
-for _kind in (ClipBatch, Predictions, Passes, Cameras, Assembly, Tracks):
+for _kind in (ClipBatch, Predictions, Passes, Cameras, Assembly, Tracks, Quantised):
     keep_type(_kind)
 
 
@@ -145,6 +149,10 @@ class Stages:
     def _network(self) -> dict[str, Any]:
         return {"config": self.config, "compute_dtype": self.options.compute_dtype}
 
+    @property
+    def _passes(self) -> dict[str, Any]:
+        return self._network | {"attention": self.options.attention}
+
     def image_features(self, params: Params, images: Float[Array, "B F H W 3"]) -> Float[Array, "B F P C"]:
         return self.run("image features", _encode, params, images, **self._network)
 
@@ -156,7 +164,7 @@ class Stages:
     ) -> tuple[Predictions, Float[Array, "B F h w"]]:
         """Return what the plain pass predicts, and the motion saliency."""
         points = () if query_points is None else (query_points,)
-        return self.run("first pass", _first_pass, params, clips, *points, gram=self.options.row.gram, **self._network)
+        return self.run("first pass", _first_pass, params, clips, *points, gram=self.options.row.gram, **self._passes)
 
     def dynamic_mask(
         self, saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"]
@@ -179,7 +187,7 @@ class Stages:
         method = self.options.row
         outputs = ("camera", "depth") if all_outputs else method.second_outputs(self.options.align_scale)
         options = {"suppress": method.suppress, "mask_pairs": self.options.mask_pairs, "outputs": outputs}
-        return self.run("second pass", _second_pass, params, clips, dynamic_mask, first, **self._network, **options)
+        return self.run("second pass", _second_pass, params, clips, dynamic_mask, first, **self._passes, **options)
 
     def assemble(self, passes: Passes, fusion: FusionParams | None = None) -> Assembly:
         """Return the method's depth, confidence and cameras of the real frames, fused by `fusion` if given."""
@@ -191,7 +199,7 @@ class Stages:
         self, params: Params, clips: ClipBatch, query_points: Float[Array, "B Q 2"], frame: Int[Array, ""]
     ) -> Tracks:
         """Return the tracks of points of a later frame."""
-        return self.run("tracks", _track_from, params, clips, query_points, frame, **self._network)
+        return self.run("tracks", _track_from, params, clips, query_points, frame, **self._passes)
 
 
 class ClipInputs(NamedTuple):

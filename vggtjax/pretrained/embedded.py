@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vggtjax.checkpoint import DType, Model, read_model
+from vggtjax.checkpoint import LoadedDType, Model, read_model
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import CheckpointError, ClipError
 from vggtjax.storage.writing import writing
@@ -24,7 +24,7 @@ _NEAREST = np.float32(1e-3)  # metres
 _STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
 
 
-def demo_model(dtype: DType = "float32") -> Model:
+def demo_model(dtype: LoadedDType = "float32") -> Model:
     """Return the embedded model, trained on generated static scenes.
 
     docs/research-notes/embedded-model.md has its training and accuracy. Raises CheckpointError if the file is missing.

@@ -7,13 +7,14 @@ import logging
 import re
 from contextlib import suppress
 from pathlib import Path
+from typing import get_args
 
 from converters.files import weight_files
 from converters.locate import Weights, locate
 from converters.torch_to_flax import convert_weights
-from vggtjax.checkpoint import VERSION, DType, Model, is_checkpoint, numpy_dtype, read_model
+from vggtjax.checkpoint import VERSION, DType, LoadedDType, Model, is_checkpoint, read_model
 from vggtjax.config import VGGTConfig, vggt_1b
-from vggtjax.errors import CheckpointError
+from vggtjax.errors import CheckpointError, check_choice
 from vggtjax.pretrained.embedded import demo_model, embedded_labels
 from vggtjax.progress import Progress
 from vggtjax.storage.cache import cache_folder
@@ -25,7 +26,7 @@ def load_model(
     name_or_path: str | Path,
     *,
     config: VGGTConfig | None = None,
-    dtype: DType | None = None,
+    dtype: LoadedDType | None = None,
     progress: Progress | None = None,
 ) -> Model:
     """Load a model by path or name.
@@ -38,7 +39,8 @@ def load_model(
         name_or_path: "demo" (the small model in the package), a checkpoint of this library, PyTorch weights
             (.safetensors, index or folder of shards, .pt, .pth), or a hub id such as "facebook/VGGT-1B".
         config: the configuration of PyTorch weights; None for VGGT-1B. A checkpoint of this library contains its own.
-        dtype: of the parameters; None for the types in the checkpoint, and float32 for PyTorch weights.
+        dtype: of the parameters; None for the types in the checkpoint, and float32 for PyTorch weights. "int8" rounds
+            the kernels of the blocks to 8 bits as they are read: an approximation (docs/research-notes).
         progress: called during a conversion with the number of steps done and the total.
 
     Raises:
@@ -55,18 +57,19 @@ def load_weights(
     name_or_path: str | Path,
     *,
     config: VGGTConfig | None = None,
-    dtype: DType | None = None,
+    dtype: LoadedDType | None = None,
     progress: Progress | None = None,
 ) -> Model:
     """Load a model as `load_model` does, but accept a checkpoint of this library with another configuration."""
     if dtype is not None:
-        numpy_dtype(dtype)
+        check_choice("dtype", dtype, get_args(LoadedDType))
     if str(name_or_path) == "demo":
         return demo_model(dtype or "float32")
     weights = locate(name_or_path)
     path = weights.path
     if not is_checkpoint(path):
-        path = _converted(path, weights.name, config or vggt_1b(), dtype or "float32", progress)
+        stored = "float32" if dtype in (None, "int8") else dtype
+        path = _converted(path, weights.name, config or vggt_1b(), stored, progress)
     return read_model(path, dtype=dtype, **embedded_labels(path))
 
 

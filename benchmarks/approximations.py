@@ -1,0 +1,237 @@
+"""Errors and speed of cheaper global attention, against exact: python -m benchmarks approximations."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.block_sparse import sparse_attention
+from vggtjax.cameras import unproject
+from vggtjax.checkpoint import Model
+from vggtjax.commands.process import keep_freed_memory
+from vggtjax.config import VGGTConfig
+from vggtjax.errors import InputError
+from vggtjax.evaluation.metrics.depth import median_scale
+from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
+from vggtjax.network.aggregator import SPECIAL_TOKENS
+from vggtjax.network.block import Block
+from vggtjax.network.layers import Params
+from vggtjax.network.merging import merged_attention
+from vggtjax.network.model import forward, init_params
+from vggtjax.network.pose import decode_pose
+from vggtjax.network.precision import full_precision
+from vggtjax.network.quantised import is_quantised, quantise
+from vggtjax.network.rope import rope_table
+from vggtjax.network.suppression import suppressed_attention
+from vggtjax.pretrained.load import load_model
+from vggtjax.scenes import SceneConfig, held_out_scenes
+
+_SPARSE = {"queries": 32, "keys": 16}  # patches of a block in a frame of 64 patches: as large a share as 128 of 777
+WAYS: dict[str, str | Callable] = {
+    "exact": "exact",
+    "merged, 2 x 2": "merged",
+    "merged, 3 x 3": partial(merged_attention, region=3, stride=None),
+    "merged, 4 x 4": partial(merged_attention, region=4, stride=None),
+    "sparse, 50 %": partial(sparse_attention, keep=0.5),
+    "sparse, 25 %": partial(sparse_attention, keep=0.25),
+    "exact, int8 weights": "exact",
+}
+_FULL_SIZE = VGGTConfig(heads=("camera", "depth"))
+_HEADS, _WIDTH = 16, 1024
+
+
+def approximations(
+    *,
+    model: str = "demo",
+    scenes: int = 16,
+    frames: tuple[int, ...] = (16, 32),
+    size: int | None = None,
+    seed: int = 3,
+    speed: tuple[int, ...] = (2, 4, 8, 16),
+    height: int = 294,
+    width: int = 518,
+    repeats: int = 2,
+    full_size: int = 0,
+) -> None:
+    """Measure errors of a plain pass and the time of blocks, with exact, merged and block-sparse global attention.
+
+    Args:
+        model: "demo", or weights as for vggtjax reconstruct.
+        scenes: held-out dynamic scenes.
+        frames: numbers of frames of the scenes, at least 12; () for no errors.
+        size: side of the scenes' frames in pixels; the model's own by default.
+        seed: another seed draws other scenes.
+        speed: numbers of frames of which blocks of VGGT-1B's width are timed; () for no times.
+        height: of those frames, in pixels.
+        width: of those frames, in pixels.
+        repeats: timed runs of each; the fastest counts.
+        full_size: frames of 112 x 112 pixels on which VGGT-1B with random weights is compared; 0 for none. It takes 5
+            GB of memory.
+    """
+    if min(scenes, repeats) < 1:
+        raise InputError(f"scenes and repeats are {scenes} and {repeats}; expected at least 1")
+    keep_freed_memory()
+    console = Console()
+    console.width = max(console.width, 120)  # rich assumes 80 for a file
+    if frames:
+        loaded = load_model(model)
+        for count in frames:
+            console.print(_errors(loaded, count, scenes, size or loaded.config.image_size, seed))
+    if full_size:
+        console.print(_full_size(full_size))
+    for count in speed:
+        console.print(_times(count, (height // 14, width // 14), repeats))
+
+
+def _of_small_frames(way: str | Callable) -> str | Callable:
+    """Return block-sparse attention with blocks that suit frames of 64 patches."""
+    return partial(way, **_SPARSE) if isinstance(way, partial) and way.func is sparse_attention else way
+
+
+def _weights(name: str, params: Params, prefix: str = "") -> Params:
+    """Return the weights of a way, in 8 bits if its name says so; `prefix` goes before the names of parameters."""
+    if not name.endswith("int8 weights"):
+        return params
+    flat = flatten_dict(params, sep=".")
+    rounded = {key: quantise(np.asarray(leaf)) if is_quantised(prefix + key) else leaf for key, leaf in flat.items()}
+    return unflatten_dict(rounded, sep=".")
+
+
+def _run(params: Params, images: Any, config: VGGTConfig, way: str | Callable) -> Callable[..., Any]:
+    compute: Any = {"attention": _of_small_frames(way)}
+    return jax.jit(lambda params, images: forward(params, images, config, **compute)).lower(params, images).compile()
+
+
+def _errors(model: Model, frames: int, scenes: int, side: int, seed: int) -> Table:
+    config = model.config
+    clips = held_out_scenes("dynamic", scenes, SceneConfig(height=side, width=side, frames=frames), seed=seed)
+    table = Table(title=f"{scenes} scenes of {frames} frames of {side} x {side} pixels", box=None)
+    for heading in ("attention", "depth", "rotation", "centres", "depth to exact", "rotation", "points"):
+        table.add_column(heading, justify="left" if heading == "attention" else "right")
+    exact: list[tuple] = []
+    for name, way in WAYS.items():
+        params = _weights(name, model.params)
+        run = _run(params, jnp.asarray(clips.images[:1]), config, way)
+        outputs, rows = [], []
+        for index in range(scenes):
+            predictions = run(params, jnp.asarray(clips.images[index : index + 1]))
+            cameras, intrinsics = decode_pose(predictions.pose_encoding, (side, side))
+            outputs.append(tuple(np.asarray(x[0]) for x in (predictions.depth, cameras, intrinsics)))
+            truth = (clips.depth[index], clips.camera_from_world[index])
+            to_exact = (exact or outputs)[index]
+            rows.append((*_apart(outputs[-1], truth), *_apart(outputs[-1], to_exact), _points(outputs[-1], to_exact)))
+        exact = exact or outputs
+        depth, rotation, centres, to_depth, to_rotation, _, points = np.mean(rows, axis=0)
+        cells = (f"{depth:.3f}", f"{rotation:.2f}°", f"{centres:.4f}", f"{to_depth:.2%}", f"{to_rotation:.2f}°")
+        table.add_row(name, *cells, f"{points:.2%}")
+    table.caption = (
+        "to the truth, means over scenes: median relative error of depth after its median scale, rotations, centres in "
+        "median depths; to exact: mean relative difference of depth, rotations, median distance of points in median "
+        "depths"
+    )
+    return table
+
+
+def _apart(outputs: tuple, others: tuple) -> tuple[float, float, float]:
+    """Return the difference of depth, of rotations in degrees, and of centres in median depths.
+
+    Depth of the truth is compared by its median error, as a few pixels of it are near 0; that of exact by the mean.
+    """
+    (depth, cameras), (other, other_cameras) = outputs[:2], others[:2]
+    relative = np.abs(depth * median_scale(depth, other) - other) / other
+    error = np.median(relative) if len(others) == 2 else relative.mean()
+    centres = centre_error(cameras, other_cameras) / np.median(other)
+    return float(error), rotation_error(cameras, other_cameras), float(centres)
+
+
+def _points(outputs: tuple, others: tuple) -> float:
+    """Return the median distance of the points of each pixel, in median depths, after the median scale of depth."""
+    scale = median_scale(outputs[0], others[0])
+    ours, theirs = (unproject(depth, k, cameras, pixel_offset=0.5) for depth, cameras, k in (outputs, others))
+    return float(
+        np.median(np.linalg.norm(scale * np.asarray(ours) - np.asarray(theirs), axis=-1)) / np.median(others[0])
+    )
+
+
+def _full_size(frames: int) -> Table:
+    """Compare VGGT-1B with random weights, whose LayerScale is that of benchmarks/seeded.py."""
+
+    def layer_scale(path, leaf):
+        return jnp.full_like(leaf, 0.3) if path[-1].key in ("scale1", "scale2") else leaf
+
+    params = jax.tree_util.tree_map_with_path(layer_scale, init_params(0, _FULL_SIZE))
+    images = jnp.asarray(np.random.default_rng(0).random((1, frames, 112, 112, 3), np.float32))
+    table = Table(title=f"VGGT-1B with random weights, {frames} frames of 112 x 112 pixels", box=None)
+    for heading in ("attention", "pose encoding", "depth"):
+        table.add_column(heading, justify="left" if heading == "attention" else "right")
+    exact = None
+    for name, way in WAYS.items():
+        weights = _weights(name, params)
+        predictions = _run(weights, images, _FULL_SIZE, way)(weights, images)
+        outputs = [np.asarray(x) for x in (predictions.pose_encoding, predictions.depth)]
+        exact = exact or outputs
+        apart = [np.abs(a - b).mean() / np.abs(b).mean() for a, b in zip(outputs, exact, strict=True)]
+        table.add_row(name, *(f"{value:.2%}" for value in apart))
+    table.caption = "mean difference to exact in mean sizes"
+    return table
+
+
+def _times(frames: int, grid: tuple[int, int], repeats: int) -> Table:
+    """Time a block of VGGT-1B's width over each frame, and over all frames with each way."""
+    tokens = SPECIAL_TOKENS + grid[0] * grid[1]
+    generator = np.random.default_rng(0)
+    block = Block(_HEADS, qk_norm=True)
+    shapes = jax.eval_shape(lambda: block.declare(_WIDTH))
+    params = jax.tree.map(lambda leaf: jnp.asarray(0.03 * generator.standard_normal(leaf.shape, np.float32)), shapes)
+    x = jnp.asarray(generator.standard_normal((frames, tokens, _WIDTH), np.float32))
+    rope = rope_table(grid, SPECIAL_TOKENS, _WIDTH // _HEADS)
+
+    def compiled(name: str, way: Callable | None) -> Callable[[], Any]:
+        def run(params, x):
+            if way is None:
+                return block(params, x, rope)[0]
+            attend = way(frames, grid, SPECIAL_TOKENS)
+            return dataclasses.replace(block, attend=attend)(params, x.reshape(1, -1, _WIDTH), rope)[0]
+
+        inputs = _weights(name, params, "aggregator.global_blocks."), x
+        return partial(jax.jit(full_precision(run)).lower(*inputs).compile(), *inputs)
+
+    named = {"exact": lambda *_: suppressed_attention, "merged": merged_attention}
+    ways: dict[str, Any] = {"a frame": None}
+    ways |= {name: way if callable(way) else named[way] for name, way in WAYS.items()}
+    programs = {name: compiled(name, way) for name, way in ways.items()}
+    best = dict.fromkeys(programs, (np.inf, np.inf))
+    for repeat in range(repeats + 1):
+        for name, program in programs.items():
+            began, worked = time.perf_counter(), time.process_time()
+            jax.block_until_ready(program())
+            if repeat:  # the first is a warm-up
+                spent = (time.perf_counter() - began, time.process_time() - worked)
+                best[name] = tuple(min(pair) for pair in zip(best[name], spent, strict=True))
+    table = Table(title=f"{frames} frames of {tokens} tokens, {_WIDTH} channels, float32", box=None)
+    for heading in (
+        "attention",
+        "global block, s",
+        "processor s",
+        "ratio",
+        "72 blocks, processor s",
+        "ratio",
+    ):
+        table.add_column(heading, justify="left" if heading == "attention" else "right")
+    frame = best.pop("a frame")
+    whole = {name: 24 * (2 * frame[1] + spent[1]) for name, spent in best.items()}
+    for name, (wall, worked) in best.items():
+        faster = (f"{best['exact'][1] / worked:.2f}", f"{whole[name]:.0f}", f"{whole['exact'] / whole[name]:.2f}")
+        table.add_row(name, f"{wall:.2f}", f"{worked:.2f}", *faster)
+    table.caption = "72 blocks: 24 global ones, and 48 by the time of one over each frame"
+    return table
