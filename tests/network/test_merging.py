@@ -129,11 +129,10 @@ def test_padded_frames_change_nothing(model):
 
 def test_both_passes_run_merged(model):
     config, params, images = model
-    exact, merged = (
-        run_passes(params, images, config, options=Options(attention=name)) for name in ("exact", "merged")
-    )
-    assert np.isfinite(merged.second.depth).all()
-    assert (np.asarray(exact.second.pose_encoding) != np.asarray(merged.second.pose_encoding)).any()
+    passes = jax.jit(partial(run_passes, config=config, attention="merged"))(params, images)
+    assert np.isfinite(passes.second.depth).all()
+    alone = jax.jit(partial(forward, config=config, outputs=("camera",), attention="merged"))(params, images)
+    assert np.allclose(passes.first.pose_encoding, alone.pose_encoding, atol=1e-4)
 
 
 def test_an_unknown_attention_is_refused(model):
