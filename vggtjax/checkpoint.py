@@ -157,7 +157,7 @@ def read_model(path: str | Path, *, dtype: LoadedDType | None = None, **fields: 
 def check_finite(model: Model) -> None:
     """Raise CheckpointError, which names the first parameter that is not finite; reads all of them."""
     flat: dict[str, Any] = flatten_dict(model.params, sep=".")
-    for path, leaf in flat.items():
+    for path, leaf in ((path, part) for path, leaf in flat.items() for part in jax.tree.leaves(leaf)):
         values = np.asarray(leaf).astype(np.float32, copy=False)
         if lost := values.size - np.count_nonzero(np.isfinite(values)):
             raise CheckpointError(

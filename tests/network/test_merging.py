@@ -3,6 +3,7 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -28,6 +29,10 @@ def tokens():
     suppressed[:, :, :SPECIAL] = False
     real = np.repeat(np.arange(S)[None] < np.array([[3], [4]]), T, axis=1)
     return q, k, v, suppressed.reshape(2, -1), real
+
+
+def hide(keys, active, suppress):
+    return SuppressedKeys(jnp.asarray(keys), jnp.asarray(active), suppress)
 
 
 def reference(q, k, v, suppressed, real, suppress):
@@ -57,7 +62,7 @@ def reference(q, k, v, suppressed, real, suppress):
 @pytest.mark.parametrize("suppress", [None, "zero", "drop"])
 def test_equals_groups_formed_one_by_one(tokens, suppress):
     q, k, v, suppressed, real = tokens
-    keys = None if suppress is None else SuppressedKeys(suppressed, np.array(True), suppress)
+    keys = None if suppress is None else hide(suppressed, True, suppress)
     out = np.asarray(merged_attention(S, GRID, SPECIAL)(q, k, v, keys, real))
     for clip in range(2):
         hidden = suppressed[clip] if suppress else np.zeros_like(suppressed[clip])
@@ -69,7 +74,7 @@ def test_equals_groups_formed_one_by_one(tokens, suppress):
 @pytest.mark.parametrize("active", [True, False])
 def test_keeping_all_tokens_is_exact(tokens, suppress, active):
     q, k, v, suppressed, real = tokens
-    keys = None if suppress is None else SuppressedKeys(suppressed, np.array(active), suppress)
+    keys = None if suppress is None else hide(suppressed, active, suppress)
     out = merged_attention(S, GRID, SPECIAL, region=1)(q, k, v, keys, real)
     expected = suppressed_attention(q, k, v, keys, real)
     assert np.abs(np.asarray(out) - np.asarray(expected))[real].max() < 2e-6
@@ -78,7 +83,7 @@ def test_keeping_all_tokens_is_exact(tokens, suppress, active):
 def test_shares_of_zero_and_one_are_flags(tokens):
     q, k, v, suppressed, _ = tokens
     attend = merged_attention(S, GRID, SPECIAL, region=1)
-    outputs = [attend(q, k, v, SuppressedKeys(suppressed.astype(t), np.ones((), t), "zero")) for t in (bool, "float32")]
+    outputs = [attend(q, k, v, hide(suppressed.astype(kind), kind(1), "zero"), None) for kind in (bool, np.float32)]
     assert np.abs(np.asarray(outputs[0]) - np.asarray(outputs[1])).max() < 2e-6
 
 

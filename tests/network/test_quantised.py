@@ -1,6 +1,7 @@
 """Kernels in 8 bits: the rounding by hand, what a model keeps of its predictions, and how it is loaded."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -34,7 +35,7 @@ def test_a_model_is_smaller_and_nearly_the_same(models):
     assert rounded.parameter_count == exact.parameter_count
     assert rounded.parameter_bytes < 0.4 * exact.parameter_bytes
     assert rounded.identity != exact.identity
-    images = np.random.default_rng(0).random((1, 2, 64, 64, 3), np.float32)
+    images = jnp.asarray(np.random.default_rng(0).random((1, 2, 64, 64, 3), np.float32))
     run = jax.jit(lambda params: forward(params, images, exact.config).depth)
     off = np.asarray(run(rounded.params) / run(exact.params) - 1)
     assert 0 < np.abs(off).mean() < 0.01
