@@ -217,7 +217,7 @@ def _times(frames: int, grid: tuple[int, int], repeats: int) -> Table:
             jax.block_until_ready(program())
             if repeat:  # the first is a warm-up
                 spent = (time.perf_counter() - began, time.process_time() - worked)
-                best[name] = tuple(min(pair) for pair in zip(best[name], spent, strict=True))
+                best[name] = min(best[name][0], spent[0]), min(best[name][1], spent[1])
     table = Table(title=f"{frames} frames of {tokens} tokens, {_WIDTH} channels, float32", box=None)
     for heading in (
         "attention",

@@ -104,8 +104,8 @@ def test_type_on_loading(saved_once, tree):
     model = load_model(saved_once, dtype="bfloat16")
     same = jax.tree.map(lambda a, b: np.array_equal(a, b.astype(ml_dtypes.bfloat16)), model.params, tree)
     assert jax.tree.all(same)
-    with pytest.raises(InputError, match="dtype is 'int8'; expected one of"):
-        load_model(saved_once, dtype="int8")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InputError, match="dtype is 'int4'; expected one of"):
+        load_model(saved_once, dtype="int4")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.skipif(

@@ -157,8 +157,9 @@ def read_model(path: str | Path, *, dtype: LoadedDType | None = None, **fields: 
 def check_finite(model: Model) -> None:
     """Raise CheckpointError, which names the first parameter that is not finite; reads all of them."""
     flat: dict[str, Any] = flatten_dict(model.params, sep=".")
-    for path, leaf in ((path, part) for path, leaf in flat.items() for part in jax.tree.leaves(leaf)):
-        values = np.asarray(leaf).astype(np.float32, copy=False)
+    parts = ((path, part) for path, leaf in flat.items() for part in jax.tree.leaves(leaf))
+    for path, part in parts:
+        values = np.asarray(part).astype(np.float32, copy=False)
         if lost := values.size - np.count_nonzero(np.isfinite(values)):
             raise CheckpointError(
                 f"{lost} of {values.size} values of {path} of the model {model.name} are not finite; get it again"

@@ -8,7 +8,7 @@ import pytest
 from vggtjax import load_model
 from vggtjax.checkpoint import save_model
 from vggtjax.clips.clip import load_clip
-from vggtjax.errors import CheckpointError, InputError
+from vggtjax.errors import CheckpointError
 from vggtjax.network.model import forward
 from vggtjax.network.quantised import Quantised, dequantised, quantise
 from vggtjax.pipeline.run import reconstruct
@@ -50,5 +50,3 @@ def test_what_cannot_be_done_is_one_sentence(models, tmp_path):
     rounded = models[1]
     with pytest.raises(CheckpointError, match="int8; expected float32 or bfloat16"):
         save_model(tmp_path / "model.safetensors", rounded.params, rounded.config)
-    with pytest.raises(InputError, match="int4"):
-        load_model("demo", dtype="int4")  # type: ignore[arg-type]
