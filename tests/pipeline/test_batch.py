@@ -256,6 +256,35 @@ def test_two_batches_on_one_folder(model, clips, tmp_path):
     assert again == ["kept", "kept"]
 
 
+def test_shards_at_once_are_one_batch(model, clips, tmp_path):
+    sources = clips_by_name([str(clips)])
+    list(reconstruct_many(model, sources, tmp_path / "one", method="vggt"))
+    out = tmp_path / "shards"
+    shards = [reconstruct_many(model, sources, out, method="vggt", shard=f"{k}/3") for k in (1, 2, 3)]
+    outcomes = [next(shard) for shard in shards]
+    for number in (1, 3):
+        with pytest.raises(OutputError, match=f"another run is writing shard {number}/3 of the batch"):
+            next(reconstruct_many(model, sources, out, method="vggt", shard=f"{number}/3"))
+    with pytest.raises(OutputError, match="another run is writing shard 1/3 of the batch"):
+        next(reconstruct_many(model, sources, out, method="vggt"))
+    outcomes += [outcome for shard in shards for outcome in shard]
+    assert sorted(outcome.name for outcome in outcomes) == list(sources)
+    assert [outcome.name for outcome in outcomes if outcome.status != "done"] == ["clip2"]
+    assert not (out / PAGE_NAME).exists()
+    again = list(reconstruct_many(model, sources, out, method="vggt"))
+    assert {outcome.name for outcome in again if outcome.status == "kept"} == set(sources) - {"clip2"}
+    assert {path.name for path in out.iterdir()} == {path.name for path in (tmp_path / "one").iterdir()}
+    for path in (tmp_path / "one").glob(f"*/{ARCHIVE_NAME}"):
+        assert (out / path.relative_to(tmp_path / "one")).read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("shard", ["", "3", "0/3", "4/3", "-1/3", "1/0", "a/b", "1/99999999"])
+def test_shards_that_are_none_are_refused(model, clips, tmp_path, shard):
+    with pytest.raises(InputError, match="expected K/N with K from 1 to N, such as 3/16"):
+        next(reconstruct_many(model, {"a": str(clips / "clip0")}, tmp_path / "out", shard=shard))
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("name", ["", "..", "a/b", "a\n"])
 def test_a_name_that_is_no_folder_fails_alone(model, clips, tmp_path, name):
     sources = {name: str(clips / "clip0"), "b": str(clips / "clip2")}  # clip2 is corrupt: it fails in its turn

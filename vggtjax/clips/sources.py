@@ -15,6 +15,7 @@ from vggtjax.captures.frames import CaptureFrames
 from vggtjax.captures.table import capture_kind, find_capture
 from vggtjax.clips.arrays import ArrayFrames
 from vggtjax.clips.images import ImageFiles, is_image_name, to_rgb
+from vggtjax.clips.manifest import is_manifest, read_manifest
 from vggtjax.clips.order import natural_key
 from vggtjax.clips.sampling import Source
 from vggtjax.clips.video import VideoFile, is_video_name
@@ -52,10 +53,11 @@ def open_source(source: ClipSource) -> Source:
 
 
 def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
-    """Return the paths of clips by name. `paths` are folders of images, videos, or folders that hold such clips.
+    """Return the paths of clips by name.
 
-    A clip is named after its folder, or its video without the suffix. Raises ClipError for a path without clips, or
-    two clips of one name.
+    `paths` are folders of images, videos, folders that hold such clips, or lists of clips (`read_manifest`). A clip is
+    named as its list says, after its folder, or after its video without the suffix. Raises ClipError for a path without
+    clips, or two clips of one name.
     """
     found: dict[str, str] = {}
     for text in paths:
@@ -63,6 +65,12 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
         with reading(path, ClipError):
             if not path.exists():
                 raise _missing(text)
+            if is_manifest(path):
+                listed = read_manifest(path)
+                if known := [name for name in listed if name in found]:
+                    raise ClipError(f"two clips are named {known[0]}: {found[known[0]]} and one of {path}; rename one")
+                found |= {name: str(source) for name, source in listed.items()}
+                continue
             entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
             whole = not path.is_dir() or any(is_image_name(entry) for entry in entries) or bool(capture_kind(path))
             clips = [path] if whole else [entry for entry in entries if _is_clip(entry)]

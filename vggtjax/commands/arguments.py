@@ -70,6 +70,15 @@ def _pad_frames(pad_frames: Switch = False) -> bool:
     return pad_frames
 
 
+def _shard(shard: Annotated[str | None, tyro.conf.arg(metavar="K/N", help_behavior_hint="")] = None) -> str | None:
+    """Return the choice.
+
+    Args:
+        shard: take every N-th clip, from the K-th on: runs for K from 1 to N do the batch together, in one folder
+    """
+    return shard
+
+
 # The name puts a flag into the group of that name.
 ResultFolder = Annotated[Path, tyro.conf.arg(constructor=_result_folder, name="output", prefix_name=False, help="")]
 BatchFolder = Annotated[Path, tyro.conf.arg(constructor=_batch_folder, name="output", prefix_name=False, help="")]
@@ -77,4 +86,5 @@ EvaluationFolder = Annotated[
     Path, tyro.conf.arg(constructor=_evaluation_folder, name="output", prefix_name=False, help="")
 ]
 View = Annotated[bool, tyro.conf.arg(constructor=_view, name="output", prefix_name=False, help="")]
+Shards = Annotated[str | None, tyro.conf.arg(constructor=_shard, name="output", prefix_name=False, help="")]
 PadFrames = Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="method", prefix_name=False, help="")]

@@ -10,7 +10,7 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import BatchFolder, Frames, Method, Output, PadFrames, Size, Sources
+from vggtjax.commands.arguments import BatchFolder, Frames, Method, Output, PadFrames, Shards, Size, Sources
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
@@ -34,13 +34,14 @@ def batch(
     known: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = _NOTHING_KNOWN,
     out: BatchFolder,
     saving: Output = Saving(),
+    shard: Shards = None,
 ) -> None:
     """Reconstruct many clips, each into a folder of its own; run the same command again to resume.
 
     A clip that fails is named and does not stop the others; the exit code is 2 only if every clip fails.
 
     Args:
-        sources: folders of images, videos, or captures of apps; or one folder of such.
+        sources: folders of images, videos, or captures of apps; a folder of such; or a list of them, .csv or .jsonl.
         sampling: which frames of the source
         framing: how frames are fitted to the model
         files: the model
@@ -49,15 +50,20 @@ def batch(
         known: cameras and lengths that all clips share, or that "source" names
         out: folder for the results
         saving: how the result is written
+        shard: which part of the clips is done
     """
     report = Report()
     with report.running():
         from vggtjax.clips.sources import clips_by_name
         from vggtjax.known.given import check_readable
+        from vggtjax.pipeline.shards import parse_shard
         from vggtjax.refinement.refine import check_refinement
 
         check_refinement(options.refine_cameras)
         named = clips_by_name(sources)
+        part = named if shard is None else parse_shard(shard).share(named)
+        if not part:
+            raise InputError(f"shard {shard} of {len(named)} clips has none; expected at most {len(named)} shards")
         known.check_many()
         check_readable(known)
         network, fitted = files.load(report, options, [options.method])
@@ -77,12 +83,13 @@ def batch(
                 fusion=fitted,
                 known=known,
                 pad_frames=pad_frames,
+                shard=shard,
                 progress=clock.progress,
             ):
                 outcomes.append(outcome)
                 reason = f" ({outcome.reason})" if outcome.reason else ""
                 name = one_line(outcome.name)
-                report.note(f"{len(outcomes)}/{len(named)} {name}: {outcome.status}{reason}{clock.left()}")
+                report.note(f"{len(outcomes)}/{len(part)} {name}: {outcome.status}{reason}{clock.left()}")
     counts = {status: sum(outcome.status == status for outcome in outcomes) for status in ("done", "kept", "failed")}
     report.table({"clips": len(outcomes), **counts, "results": f"{out}/"})
     for outcome in outcomes:

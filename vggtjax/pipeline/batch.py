@@ -7,7 +7,7 @@ import json
 from collections import deque
 from collections.abc import Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -26,6 +26,7 @@ from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.options import Options
 from vggtjax.pipeline.contact import PAGE_NAME, ContactPage
 from vggtjax.pipeline.run import reconstruct
+from vggtjax.pipeline.shards import parse_shard, running, starting
 from vggtjax.progress import Progress, StageSeconds, no_progress
 from vggtjax.refinement.refine import check_refinement
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
@@ -34,7 +35,7 @@ from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import RunFacts
 from vggtjax.results.saving import Saving
 from vggtjax.storage.json_values import read_json
-from vggtjax.storage.writing import check_free, locked_folder, writing
+from vggtjax.storage.writing import check_free, writing
 
 SETTINGS_NAME = "batch.json"
 _AHEAD = 1  # clips that are loaded before they are needed, and results that wait to be written
@@ -61,6 +62,7 @@ def reconstruct_many(
     fusion: FusionParams | None = None,
     known: KnownGeometry | None = None,
     pad_frames: bool = False,
+    shard: str | None = None,
     progress: Progress | None = None,
     **changes: Any,
 ) -> Generator[ClipOutcome]:
@@ -82,6 +84,8 @@ def reconstruct_many(
         framing: how frames are fitted; the keywords of `load_clip` serve, too.
         sampling: which frames are taken; the keywords of `load_clip` serve, too.
         saving: how results are written; the keywords of `Reconstruction.save` serve, too.
+        shard: "K/N" takes every N-th of the sources, from the K-th on. Runs for K from 1 to N together do the batch, at
+            the same time or not, in one folder; none of them writes index.html. A later run without `shard` does.
         progress: called before the first clip and after each computed clip, with the frames done and the frames of all
             clips but kept and failed ones; a clip of unknown length, such as a video, counts as the mean of the others.
         changes: fields of `framing` and `options` by name, such as `mode="pad"`.
@@ -91,6 +95,7 @@ def reconstruct_many(
         OutputError: the folder cannot be written, or another run is writing it.
         TypeError: a name that is no option.
     """
+    part = None if shard is None else parse_shard(shard)
     words: dict[str, Any] = dict(changes)
     if isinstance(options, Mapping):
         words, options = words | dict(options), None
@@ -113,14 +118,20 @@ def reconstruct_many(
         known=known or None,
         pad_frames=pad_frames,
     )
-    out = Path(out)
-    with locked_folder(out, "a batch"):
+    out, progress = Path(out), progress or no_progress
+    with ExitStack() as whole:
+        whole.enter_context(starting(out, part))
         check_free(out, (PAGE_NAME,), replaced=(out / SETTINGS_NAME).is_file(), what="batch")
         _settle(out, run.settings)
-        page = ContactPage(out, len(sources))
-        for outcome in _outcomes(run, sources, out, progress or no_progress):
-            page.add(outcome.name, outcome.reason if outcome.status == "failed" else None)
-            yield outcome
+        with running(out, part):
+            if part is not None:
+                whole.close()  # for the other shards
+                yield from _outcomes(run, part.share(sources), out, progress)
+                return
+            page = ContactPage(out, len(sources))
+            for outcome in _outcomes(run, sources, out, progress):
+                page.add(outcome.name, outcome.reason if outcome.status == "failed" else None)
+                yield outcome
 
 
 @dataclass(frozen=True)
