@@ -1,7 +1,5 @@
 import io
 import json
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -9,19 +7,13 @@ import trimesh
 
 from tests.room import WALL, make_room
 from vggtjax.results import point_cloud
-from vggtjax.results.glb import _LINEAR, build_scene, camera_mesh, clip_clouds, limited_clouds
-
-
-def glb_bytes(room, clouds) -> bytes:
-    with TemporaryDirectory() as folder:
-        build_scene(room, clouds).write(Path(folder) / "scene.glb")
-        return (Path(folder) / "scene.glb").read_bytes()
+from vggtjax.results.glb import _LINEAR, build_scene, camera_mesh, clip_clouds, glb_bytes, limited_clouds
 
 
 def load_scene(room, percentile=0.0, **options):
     """Return the scene of a result, through a GLB file."""
     clouds = clip_clouds(room, point_cloud.least_confidence(room, percentile), **options)
-    return trimesh.load_scene(io.BytesIO(glb_bytes(room, clouds)), file_type="glb")
+    return trimesh.load_scene(io.BytesIO(glb_bytes(build_scene(room, clouds))), file_type="glb")
 
 
 def test_nodes_and_points():
@@ -48,7 +40,7 @@ def test_dark_tones_stay_apart_and_nothing_is_lit():
     cloud = point_cloud.PointCloud(
         np.zeros((256, 3), np.float32), np.repeat(np.arange(256), 3).reshape(-1, 3).astype("u1")
     )
-    glb = glb_bytes(make_room(1), limited_clouds(cloud, []))
+    glb = glb_bytes(build_scene(make_room(1), limited_clouds(cloud, [])))
     size = int.from_bytes(glb[12:16], "little")
     tree, buffer = json.loads(glb[20 : 20 + size]), glb[28 + size :]
     assert tree["extensionsUsed"] == ["KHR_materials_unlit"]

@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import trimesh
 from cmap import Colormap
 from jaxtyping import Bool, Float, Int, UInt8
+from trimesh.exchange.gltf import export_glb
+from trimesh.visual import ColorVisuals
 
 from vggtjax.cameras import frustum_corners
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
-from vggtjax.results.point_cloud import PointCloud, frame_cloud
+from vggtjax.results.point_cloud import PointCloud, frame_cloud, joined
 from vggtjax.results.result import Result
-from vggtjax.storage.arrays import zeros_beside
-from vggtjax.storage.glb_file import POINTS, TRIANGLES, GlbFile
+from vggtjax.storage.arrays import is_mapped
 
 _LEVELS = np.arange(256) / 255  # of sRGB
 _LINEAR = np.where(_LEVELS <= 0.04045, _LEVELS / 12.92, ((_LEVELS + 0.055) / 1.055) ** 2.4).astype(np.float32)
+_FLOAT = 5126  # glTF's name
+_UNLIT = {
+    "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
+    "extensions": {"KHR_materials_unlit": {}},
+}
 POINT_LIMIT = 1_000_000  # viewers in a browser still turn so many points smoothly
+_MAPPED_LIMIT = 400_000  # of a mapped result: a point takes up to 100 bytes of memory while the file is made
 _STATIC = "static"
 _TO_GLTF = np.array([1, -1, -1], np.float32)  # half a turn about x: y down and z forward become y up and z backward
 _CAMERA_SIZE = 0.06  # of the median distance from the middle of the cameras to the points
@@ -39,23 +47,27 @@ class CameraMesh(NamedTuple):
     colors: UInt8[np.ndarray, "V 3"]  # sRGB
 
 
-def clip_clouds(result: Result, least: LeastConfidence, *, point_limit: int = POINT_LIMIT) -> dict[str, PointCloud]:
-    """Return the points of a scene by the names of their nodes; those of a mapped result are mapped.
+def clip_clouds(result: Result, least: LeastConfidence, *, point_limit: int | None = None) -> dict[str, PointCloud]:
+    """Return the points of a scene by the names of their nodes.
 
     `static` are those of all frames, `dynamic_000000` the moving ones of a frame. Of more than `point_limit` points
-    every cloud keeps the same share, drawn with a fixed seed.
+    (by default a million, 400,000 of a mapped result) every cloud keeps the same share, drawn with a fixed seed. No
+    more than these, and those of a frame, are in memory at once.
     """
+    if point_limit is None:
+        point_limit = _MAPPED_LIMIT if is_mapped(result.depth) else POINT_LIMIT
     frames = range(len(result.depth))
     counts = np.array([[part.sum() for part in _static_and_moving(frame_of(result, n), least)] for n in frames])
     choice = _EvenChoice(int(counts.sum()), point_limit)
-    static, moving = (_Store(result, choice, int(count)) for count in counts.sum(axis=0))
+    static, seen = [], 0
     clouds: dict[str, PointCloud] = {}
     for number in frames:
         frame = frame_of(result, number)
-        of_static, of_moving = (frame_cloud(frame, pixels) for pixels in _static_and_moving(frame, least))
-        static.add(of_static)
-        clouds[_moving_name(number)] = moving.add(of_moving)
-    return {_STATIC: static.all(), **clouds}
+        still, moving = (frame_cloud(frame, pixels) for pixels in _static_and_moving(frame, least))
+        static.append(choice(still, seen))
+        seen += len(still)
+        clouds[_moving_name(number)] = choice(moving)
+    return {_STATIC: joined(static), **clouds}
 
 
 def limited_clouds(
@@ -67,29 +79,33 @@ def limited_clouds(
     return {name: choice(cloud) for name, cloud in clouds.items()}
 
 
-def build_scene(result: Result, clouds: Mapping[str, PointCloud]) -> GlbFile:
+def build_scene(result: Result, clouds: Mapping[str, PointCloud]) -> trimesh.Scene:
     """Return the scene, with y up.
 
     Nodes: one for each cloud with points, and `cameras`: a frustum per frame, open in the viewing direction, with a
-    filled triangle on its upper edge, coloured from the first frame to the last, and the path between them. Colours of
-    clouds are sRGB; glTF's are linear, which takes float32: in 8 bits the dark tones of linear colours fall together
-    (the first 64 levels of sRGB become 14, which looks dark and banded).
+    filled triangle on its upper edge, coloured from the first frame to the last, and the path between them. Colours
+    are sRGB; `glb_bytes` writes them as glTF wants them.
     """
+    scene = trimesh.Scene()
     shown = {name: cloud for name, cloud in clouds.items() if len(cloud)}
-    glb = GlbFile()
     for name, cloud in shown.items():
-        glb.node(name, POINTS, _attributes(glb, cloud.points, cloud.colors))
+        scene.add_geometry(trimesh.PointCloud(cloud.points * _TO_GLTF, cloud.colors), node_name=name, geom_name=name)
     cameras = camera_mesh(result, _camera_size(result, shown.values()))
-    faces = glb.array(cameras.faces.reshape(-1).astype(np.uint32))
-    glb.node("cameras", TRIANGLES, _attributes(glb, cameras.vertices, cameras.colors), faces)
-    return glb
+    mesh = trimesh.Trimesh(cameras.vertices * _TO_GLTF, cameras.faces, process=False)
+    mesh.visual = ColorVisuals(mesh, vertex_colors=cameras.colors)
+    scene.add_geometry(mesh, node_name="cameras", geom_name="cameras")
+    return scene
 
 
-def _attributes(glb: GlbFile, points: Float[np.ndarray, "N 3"], colors: UInt8[np.ndarray, "N 3"]) -> dict[str, int]:
-    return {
-        "POSITION": glb.array(points, lambda piece: (piece * _TO_GLTF).astype(np.float32), bounds=True),
-        "COLOR_0": glb.array(colors, lambda piece: _LINEAR[piece]),
-    }
+def glb_bytes(scene: trimesh.Scene, edit: Callable[[dict[str, bytes], dict[str, Any]], None] | None = None) -> bytes:
+    """Return the scene as a GLB file; `edit` may change its buffers and its tree, as a `buffer_postprocessor`."""
+
+    def finish(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
+        _colors_of_gltf(buffers, tree)
+        if edit is not None:
+            edit(buffers, tree)
+
+    return export_glb(scene, buffer_postprocessor=finish)
 
 
 def _moving_name(frame: int) -> str:
@@ -119,27 +135,6 @@ class _EvenChoice:
         count = self.kept(before + len(cloud)) - self.kept(before)
         chosen = self._random.choice(len(cloud), count, replace=False, shuffle=False)
         return PointCloud(cloud.points[chosen], cloud.colors[chosen])
-
-
-class _Store:
-    """Room for the kept points of a clip: in memory, or for a mapped result in files."""
-
-    def __init__(self, result: Result, choice: _EvenChoice, total: int) -> None:
-        room = choice.kept(total)
-        self._points = zeros_beside(result.depth, np.float32, (room, 3))
-        self._colors = zeros_beside(result.depth, np.uint8, (room, 3))
-        self._choice, self._seen, self._filled = choice, 0, 0
-
-    def add(self, cloud: PointCloud) -> PointCloud:
-        """Keep points of a cloud, and return them as they are stored."""
-        kept = self._choice(cloud, self._seen)
-        here = slice(self._filled, self._filled + len(kept))
-        self._points[here], self._colors[here] = kept.points, kept.colors
-        self._seen, self._filled = self._seen + len(cloud), here.stop
-        return PointCloud(self._points[here], self._colors[here])
-
-    def all(self) -> PointCloud:
-        return PointCloud(self._points[: self._filled], self._colors[: self._filled])
 
 
 def _camera_size(result: Result, clouds: Iterable[PointCloud]) -> float:
@@ -186,3 +181,32 @@ def _bars(
     vertices = (edges[used][:, :, None] + square[:, None]).reshape(-1, 3)
     faces = (8 * np.arange(len(used))[:, None, None] + _BAR_FACES).reshape(-1, 3)
     return vertices, faces, used
+
+
+def _colors_of_gltf(buffers: dict[str, bytes], tree: dict[str, Any]) -> None:
+    """Make the 8-bit sRGB colours of trimesh's vertices linear, and show them as they are, without lights.
+
+    glTF's vertex colours are linear, and viewers encode them for the screen: numbers of sRGB would look pale there. In
+    8 bits the dark tones of linear colours fall together (the first 64 levels of sRGB become 14, which looks dark and
+    banded), and trimesh reads 16 bits wrongly, so they are float32. Without KHR_materials_unlit viewers light the
+    frusta, which are black where there is no light.
+    """
+    names = list(buffers)
+    for accessor in {number for mesh in tree["meshes"] for number in _colors_of(mesh)}:
+        entry = list(tree["accessors"].values())[accessor]
+        name = names[entry["bufferView"]]
+        colors = np.frombuffer(buffers[name], np.uint8).reshape(-1, 4)[: entry["count"], :3]
+        buffers[name] = _LINEAR[colors].tobytes()
+        entry |= {"componentType": _FLOAT, "type": "VEC3"}
+        for key in ("normalized", "min", "max"):
+            entry.pop(key, None)
+    tree["materials"] = [_UNLIT]
+    tree["extensionsUsed"] = sorted({*tree.get("extensionsUsed", ()), *_UNLIT["extensions"]})
+    for mesh in tree["meshes"]:
+        for primitive in mesh["primitives"]:
+            primitive["material"] = 0
+
+
+def _colors_of(mesh: dict[str, Any]) -> Iterator[int]:
+    """Yield the numbers of the accessors of a mesh's colours."""
+    return (part["attributes"]["COLOR_0"] for part in mesh["primitives"] if "COLOR_0" in part["attributes"])
