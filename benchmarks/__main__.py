@@ -10,6 +10,7 @@ import tyro
 from benchmarks.approximations import approximations
 from benchmarks.batch import batch
 from benchmarks.demo_model import demo_model
+from benchmarks.devices import devices
 from benchmarks.embed import embed
 from benchmarks.gradient import gradient
 from benchmarks.known import known
@@ -34,6 +35,7 @@ COMMANDS = {
     "approximations": approximations,
     "batch": batch,
     "demo-model": demo_model,
+    "devices": devices,
     "embed": embed,
     "gpu-targets": gpu_targets,
     "gradient": gradient,

@@ -9,6 +9,7 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
+from vggtjax.errors import whole_number
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 from vggtjax.storage.flags import Switch
@@ -79,6 +80,15 @@ def _shard(shard: Annotated[str | None, tyro.conf.arg(metavar="K/N", help_behavi
     return shard
 
 
+def _devices(devices: int = 1) -> int:
+    """Return the number.
+
+    Args:
+        devices: share the frames of a clip among so many devices, each with a copy of the weights
+    """
+    return whole_number("devices", devices, 1)
+
+
 # The name puts a flag into the group of that name.
 ResultFolder = Annotated[Path, tyro.conf.arg(constructor=_result_folder, name="output", prefix_name=False, help="")]
 BatchFolder = Annotated[Path, tyro.conf.arg(constructor=_batch_folder, name="output", prefix_name=False, help="")]
@@ -87,4 +97,5 @@ EvaluationFolder = Annotated[
 ]
 View = Annotated[bool, tyro.conf.arg(constructor=_view, name="output", prefix_name=False, help="")]
 Shards = Annotated[str | None, tyro.conf.arg(constructor=_shard, name="output", prefix_name=False, help="")]
+Devices = Annotated[int, tyro.conf.arg(constructor=_devices, name="method", prefix_name=False, help="")]
 PadFrames = Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="method", prefix_name=False, help="")]

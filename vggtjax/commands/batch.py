@@ -10,7 +10,7 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import BatchFolder, Frames, Method, Output, PadFrames, Shards, Size, Sources
+from vggtjax.commands.arguments import BatchFolder, Devices, Frames, Method, Output, PadFrames, Shards, Size, Sources
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
@@ -30,6 +30,7 @@ def batch(
     framing: Size = Framing(),
     files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
     options: Method = Options(),
+    devices: Devices = 1,
     pad_frames: PadFrames = False,
     known: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = _NOTHING_KNOWN,
     out: BatchFolder,
@@ -46,6 +47,7 @@ def batch(
         framing: how frames are fitted to the model
         files: the model
         options: how the clip is reconstructed
+        devices: how many devices share the frames
         pad_frames: whether clips are padded to one of a few lengths
         known: cameras and lengths that all clips share, or that "source" names
         out: folder for the results
@@ -56,6 +58,7 @@ def batch(
     with report.running():
         from vggtjax.clips.sources import clips_by_name
         from vggtjax.known.given import check_readable
+        from vggtjax.pipeline.devices import frames_mesh
         from vggtjax.pipeline.shards import parse_shard
         from vggtjax.refinement.refine import check_refinement
 
@@ -66,6 +69,7 @@ def batch(
             raise InputError(f"shard {shard} of {len(named)} clips has none; expected at most {len(named)} shards")
         known.check_many()
         check_readable(known)
+        frames_mesh(devices)
         network, fitted = files.load(report, options, [options.method])
         from vggtjax.pipeline.batch import reconstruct_many
 
@@ -84,6 +88,7 @@ def batch(
                 known=known,
                 pad_frames=pad_frames,
                 shard=shard,
+                devices=devices,
                 progress=clock.progress,
             ):
                 outcomes.append(outcome)

@@ -11,7 +11,7 @@ import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import Frames, Method, Output, ResultFolder, Size, Sources, View
+from vggtjax.commands.arguments import Devices, Frames, Method, Output, ResultFolder, Size, Sources, View
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
@@ -103,6 +103,7 @@ def reconstruct(
     framing: Size = Framing(),
     files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
     options: Method = Options(),
+    devices: Devices = 1,
     known: Annotated[Known, tyro.conf.arg(name="mask and track", help="")] = Known(),
     more: Annotated[More, tyro.conf.arg(name="", help="")] = More(),
     out: ResultFolder,
@@ -117,6 +118,7 @@ def reconstruct(
         framing: how frames are fitted to the model
         files: the model
         options: how the clip is reconstructed
+        devices: how many devices share the frames
         known: masks and points of your own
         more: known cameras and lengths, and how a long clip is cut
         out: folder for the result
@@ -125,11 +127,14 @@ def reconstruct(
     """
     if not source:
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
+    if devices > 1 and more.windows.window is not None:
+        raise InputError("--devices and --window exclude each other: a window is run on one device")
     frames = source[0] if len(source) == 1 else list(source)
     report = Report()
     with report.running():
         from vggtjax.clips.sources import open_source
         from vggtjax.known.given import check_readable
+        from vggtjax.pipeline.devices import frames_mesh
         from vggtjax.refinement.refine import check_refinement
         from vggtjax.results.folder import check_folder
 
@@ -140,6 +145,7 @@ def reconstruct(
         known.check(options, windows)
         check_refinement(options.refine_cameras, geometry.poses is not None)
         check_readable(geometry)
+        frames_mesh(devices)
         check_folder(out, saving.names(tracks=known.tracks is not None))
         network, fitted = files.load(report, options, [options.method])
         fitter = framing.fitter(size=network.config.image_size, patch=network.config.patch_size)
@@ -149,6 +155,7 @@ def reconstruct(
                 "--tracks": known.tracks,
                 "known cameras or lengths": geometry,
                 "--refine-cameras": options.refine_cameras,
+                "--devices": devices > 1,
             }
             at_once = [name for name, given in needs.items() if given]
             windows, count = _chosen(report, reading, network, out, at_once)
@@ -163,7 +170,7 @@ def reconstruct(
                 network, frames, out, windows, options=options, long_run=plan, fusion=fitted, masks=masks
             )
         else:
-            result = _together(report, reading, network, fitted, options, known, geometry, out, saving)
+            result = _together(report, reading, network, fitted, (options, devices), known, geometry, out, saving)
     report.summary(result, out, network)
     if known.tracks is not None and "tracks" in network.untrained_heads:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")
@@ -184,14 +191,14 @@ def _together(
     reading: Reading,
     network: Model,
     fitted: FusionParams | None,
-    options: Options,
+    how: tuple[Options, int],
     known: Known,
     geometry: KnownGeometry,
     out: Path,
     saving: Saving,
 ) -> Reconstruction:
-    """Reconstruct all frames of a clip at once, and write the result."""
-    opened, sampling, fitter = reading
+    """Reconstruct all frames of a clip at once with some options on some devices, and write the result."""
+    (opened, sampling, fitter), (options, devices) = reading, how
     with report.stage("load clip") as progress:
         from vggtjax.clips.clip import read_clip
         from vggtjax.clips.queries import parse_queries
@@ -214,6 +221,7 @@ def _together(
         tracks=queries,
         fusion=fitted,
         known=geometry,
+        devices=devices,
         on_stage=report.stage,
     )
     with report.stage("write") as progress:

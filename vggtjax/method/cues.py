@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from vggtjax.config import Cue, Gram, MotionConfig
 from vggtjax.errors import check_choice
+from vggtjax.network.frames import Frames
 from vggtjax.network.precision import widened
 
 FRAMES_AT_ONCE = 4
@@ -27,11 +28,15 @@ Sums = tuple[Array, ...]
 
 @dataclass(frozen=True)
 class GramCues:
-    """An `Accumulator` of a table of cues, for a model with `depth` pairs and one similarity; one sum per cue."""
+    """An `Accumulator` of a table of cues, for a model with `depth` pairs and one similarity; one sum per cue.
+
+    Source frames on other devices are fetched from there, in the pairs that a cue reads.
+    """
 
     motion: MotionConfig
     depth: int
     gram: Gram = "cosine"
+    frames: Frames = Frames()
 
     def __post_init__(self) -> None:
         check_choice("gram", self.gram, get_args(Gram))
@@ -58,7 +63,7 @@ class GramCues:
         only the real frames are sources, and each real frame needs a source at one of the offsets.
         """
         B, S, _, heads, _ = q.shape
-        index, weights = sources(S, self.motion.offsets)
+        index, weights, reach = self._sources_here(S)
         weights = jnp.broadcast_to(weights, (B, *weights.shape))
         if frame_count is not None:
             weights = jnp.where(index[None] < frame_count[:, None, None], weights, 0)
@@ -79,15 +84,17 @@ class GramCues:
 
                 def deviation(frame):
                     row, index, weights = frame
-                    source = jnp.einsum("m,mpnd->pnd", weights, vectors(columns[index]))
+                    source = jnp.einsum("m,mpnd->pnd", weights, vectors(near[index]))
                     gram = jnp.einsum("pnd,jnd->pj", vectors(row), source) / heads
                     return gram if self._keeps_gram(cue) else _sample_std(gram)
 
-                frames = (rows, index, weights)
+                near, first_near = columns, 0
                 if cue.statistic == "std":
-                    return _over_frames(deviation, frames)
+                    near, first_near = self.frames.around(columns, reach, axis=0)
+                    return _over_frames(deviation, (rows, index - first_near, weights))
                 means = _over_frames(lambda column: vectors(column).mean(axis=0), columns)  # [S, N, D]
-                return _over_frames(mean_similarity, frames)
+                means = self.frames.gather(means, axis=0)
+                return _over_frames(mean_similarity, (rows, index, weights))
 
             def branch(total, count, q, k):
                 rows, columns = ({"q": q, "k": k}[name] for name in (cue.rows, cue.columns))
@@ -115,12 +122,24 @@ class GramCues:
         """
         maps = self.maps(sums)
         product = jnp.ones_like(next(iter(maps.values())))
-        if product.shape[1] == 1:
+        if self.frames.counted(product.shape[1]) == 1:
             return jnp.zeros_like(product)
         for i, cue in enumerate(self.motion.cues):
             factor = 1 - maps[cue.name] if cue.inverted else maps[cue.name]
             product = product * (factor if exponents is None else _power(factor, exponents[i]))
         return normalise(product)
+
+    def _sources_here(self, S: int) -> tuple[Array | np.ndarray, Array | np.ndarray, int]:
+        """Return `sources` of the S frames here, with numbers among those of all devices; and how far they are off."""
+        counted, total = self.frames.counted(S), self.frames.total(S)
+        index, weights = sources(counted, self.motion.offsets)
+        added = total - counted  # they are their own sources, without weight
+        index = np.concatenate([index, np.repeat(np.arange(counted, total)[:, None], index.shape[1], axis=1)])
+        weights = np.concatenate([weights, np.zeros((added, weights.shape[1]), np.float32)])
+        if self.frames.mesh is None:
+            return index, weights, 0
+        index_here, weights_here = (self.frames.share(jnp.asarray(table), S, axis=0) for table in (index, weights))
+        return index_here, weights_here, int(np.abs(index - np.arange(total)[:, None]).max())
 
     def _layers(self, cue: Cue) -> tuple[int, ...]:
         return self.motion.layers(cue, self.depth)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from vggtjax.method.median import median_over_frames
+from vggtjax.network.frames import Frames
+
 EPSILON = 1e-6
 
 
@@ -50,9 +53,12 @@ def fuse_depth(
 
 
 def scale_between(
-    depth1: Float[Array, "B S H W"], depth2: Float[Array, "B S H W"], dynamic_mask: Bool[Array, "B S H W"]
+    depth1: Float[Array, "B S H W"],
+    depth2: Float[Array, "B S H W"],
+    dynamic_mask: Bool[Array, "B S H W"],
+    frames: Frames = Frames(),
 ) -> Float[Array, " B"]:
     """Return the factor from depth2 to depth1 of each clip: the median ratio over static pixels, 1 without any."""
     ratio = jnp.where(dynamic_mask, jnp.nan, depth1 / depth2)
-    median = jnp.nanmedian(ratio.reshape(ratio.shape[0], -1), axis=-1)
+    median = median_over_frames(ratio, frames)
     return jnp.where(jnp.isfinite(median), median, 1.0)

@@ -10,7 +10,9 @@ from vggtjax.errors import InputError
 from vggtjax.method.fusion import scale_between
 from vggtjax.method.fusion_family import FusionParams, Observations, fuse
 from vggtjax.method.mask import upsample
+from vggtjax.method.median import median_over_frames
 from vggtjax.method.passes import Assembly, Passes
+from vggtjax.network.frames import Frames
 
 REACH = 64  # pixels; larger distances to the mask's edge are infinite
 _SMALLEST = 1e-6
@@ -18,17 +20,25 @@ _STILL = -1e3  # margin of pixels that are static at any temperature
 
 
 def apply_fusion(
-    assembly: Assembly, passes: Passes, fusion: FusionParams, patch_size: int, *, align_scale: bool = False
+    assembly: Assembly,
+    passes: Passes,
+    fusion: FusionParams,
+    patch_size: int,
+    *,
+    align_scale: bool = False,
+    frames: Frames = Frames(),
 ) -> Assembly:
     """Return an assembly with depth and confidence by a fitted rule; the confidence is the fused precision."""
     scale = None
     if align_scale and passes.second is not None:
-        scale = scale_between(passes.first.depth, passes.second.depth, passes.dynamic_mask)  # pyright: ignore
-    fused = fuse(fusion, observe(passes, patch_size, scale=scale))
+        scale = scale_between(passes.first.depth, passes.second.depth, passes.dynamic_mask, frames)  # pyright: ignore
+    fused = fuse(fusion, observe(passes, patch_size, scale=scale, frames=frames))
     return assembly._replace(depth=fused.depth, confidence=fused.precision)
 
 
-def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None = None) -> Observations:
+def observe(
+    passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None = None, frames: Frames = Frames()
+) -> Observations:
     """Return the inputs of `fuse` for two passes.
 
     The features are the saliency; log depth of pass 1 over the clip's median; exp(-d / patch size) with the distance
@@ -38,6 +48,7 @@ def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None
         passes: both, with depth; the mask is boolean or of shares in [0, 1].
         patch_size: of the model, in pixels.
         scale: factor on the depth of the second pass, as from `scale_between`; 1 if None.
+        frames: where the frames of the passes are.
 
     Raises InputError where a pass, its depth or its confidence is missing.
     """
@@ -51,7 +62,7 @@ def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None
     dynamic = passes.dynamic_mask.astype(depth1.dtype)
     saliency = upsample(passes.saliency, (depth1.shape[2], depth1.shape[3]))
     hard = jax.lax.stop_gradient(dynamic) >= 0.5
-    median = jnp.median(depth1.reshape(len(depth1), -1), axis=1)[:, None, None, None]
+    median = median_over_frames(depth1, frames)[:, None, None, None]
     log_depth = jnp.log(jnp.maximum(depth1, _SMALLEST)) - jnp.log(jnp.maximum(median, _SMALLEST))
     features = [saliency, log_depth, jax.vmap(jax.vmap(lambda frame: edge_proximity(frame, patch_size)))(hard), dynamic]
     return Observations(
@@ -60,7 +71,7 @@ def observe(passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None
         depth2,
         _log_confidence(second.depth_confidence),
         dynamic,
-        jax.vmap(_margin)(saliency, hard),
+        jax.vmap(lambda saliency, hard: _margin(saliency, hard, frames))(saliency, hard),
         jnp.stack(features, axis=-1),
     )
 
@@ -97,18 +108,21 @@ def _squared_distance(mask: Bool[Array, "H W"]) -> Float[Array, "H W"]:
     return jax.lax.scan(nearer, column, jnp.arange(2 * REACH + 1))[0]
 
 
-def _margin(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"]) -> Float[Array, "S H W"]:
+def _margin(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"], frames: Frames) -> Float[Array, "S H W"]:
     """Return the saliency minus the threshold of the mask, clipped to the mask's side of 0.
 
     The threshold is midway between the largest static and the smallest dynamic saliency, for a full mask 1/2 below the
     smallest. Saliency and mask disagree where the mask was supplied by the user or smoothed. An empty mask has no edge.
     """
-    low = jnp.where(dynamic, -jnp.inf, saliency).max()
-    high = jnp.where(dynamic, saliency, jnp.inf).min()
+    still = ~dynamic
+    if (is_real := frames.are_real(None, 1, len(saliency))) is not None:
+        still = still & is_real[0][:, None, None]
+    low = frames.max(jnp.where(still, saliency, -jnp.inf).max())
+    high = frames.min(jnp.where(dynamic, saliency, jnp.inf).min())
     low, high = jnp.where(jnp.isfinite(low), low, high - 1), jnp.where(jnp.isfinite(high), high, low + 1)
     margin = saliency - (low + high) / 2
     margin = jnp.where(dynamic, jnp.maximum(margin, 0), jnp.minimum(margin, -_SMALLEST))
-    return jnp.where(dynamic.any(), margin, _STILL)
+    return jnp.where(frames.any(dynamic.any()), margin, _STILL)
 
 
 def _log_confidence(confidence: Float[Array, "*S"]) -> Float[Array, "*S"]:

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.method.clustering import kmeans
 from vggtjax.method.cues import normalise
+from vggtjax.network.frames import Frames
 from vggtjax.options import Threshold, odd_frames
 
 BINS = 256
@@ -21,17 +22,21 @@ def upsample(saliency: Float[Array, "B S h w"], size: tuple[int, int]) -> Float[
     return jax.image.resize(saliency, (*saliency.shape[:2], *size), "bilinear", antialias=False)
 
 
-def otsu_threshold(values: Float[Array, ...], bins: int = BINS) -> Float[Array, ""]:
+def otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS, frames: Frames = Frames()) -> Float[Array, ""]:
     """Return Otsu's threshold: the bin centre of the largest variance between the two classes.
 
     The histogram has `bins` bins from the smallest to the largest value, as scikit-image's `threshold_otsu`. Of equal
-    centres the lowest is returned; of constant values, the value.
+    centres the lowest is returned; of constant values, the value. With `frames` the values are of all devices.
     """
-    values = values.ravel()
-    low, high = values.min(), values.max()
+    is_real = frames.are_real(None, 1, len(values))
+    low, high = _extremes(values, frames)
+    count = values.size // len(values) * frames.counted(len(values))
     width = (high - low) / bins
-    index = jnp.floor((values - low) / jnp.where(width > 0, width, 1)).astype(jnp.int32)
-    counts = jnp.bincount(jnp.clip(index, 0, bins - 1), length=bins) / values.size
+    index = jnp.floor((values.ravel() - low) / jnp.where(width > 0, width, 1)).astype(jnp.int32)
+    index = jnp.clip(index, 0, bins - 1)
+    if is_real is not None:  # others fall into a bin of their own
+        index = jnp.where(jnp.repeat(is_real[0], values.size // len(values)), index, bins)
+    counts = frames.sum(jnp.bincount(index, length=bins + (is_real is not None))[:bins]) / count
     centres = low + width * (jnp.arange(bins) + 0.5)
     offsets = jnp.arange(bins) + 0.5  # means in units of bins, which keeps every sum of order one
     below, above = jnp.cumsum(counts), jnp.cumsum(counts[::-1])[::-1]
@@ -42,7 +47,11 @@ def otsu_threshold(values: Float[Array, ...], bins: int = BINS) -> Float[Array, 
 
 
 def dynamic_pixels(
-    saliency: Float[Array, "B S h w"], size: tuple[int, int], *, threshold: Threshold = "otsu"
+    saliency: Float[Array, "B S h w"],
+    size: tuple[int, int],
+    *,
+    threshold: Threshold = "otsu",
+    frames: Frames = Frames(),
 ) -> Bool[Array, "B S H W"]:
     """Return the dynamic pixels of every clip by one threshold for all pixels of the clip.
 
@@ -52,16 +61,21 @@ def dynamic_pixels(
         saliency: of every patch, in [0, 1].
         size: height and width of the frames in pixels.
         threshold: "otsu" (at or above, 4DVGGT-D) or "multi-otsu" (above, VGGT4D), which is computed on the host.
+        frames: where the frames are; those that make shares equal have no dynamic pixels.
     """
+    is_real = frames.are_real(None, *saliency.shape[:2])
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
-        varies = pixels.max() - pixels.min() >= CONSTANT
+        low, high = _extremes(pixels, frames)
+        varies = high - low >= CONSTANT
         if threshold == "otsu":
-            return (pixels >= otsu_threshold(pixels)) & varies
+            return (pixels >= otsu_threshold(pixels, frames=frames)) & varies
         scalar = jax.ShapeDtypeStruct((), jnp.float32)
-        return (pixels > jax.pure_callback(_multi_otsu, scalar, pixels, vmap_method="sequential")) & varies
+        every = frames.gather(pixels, axis=0)[: frames.counted(len(pixels))]
+        return (pixels > jax.pure_callback(_multi_otsu, scalar, every, vmap_method="sequential")) & varies
 
-    return jax.vmap(one_clip)(upsample(saliency, size))
+    mask = jax.vmap(one_clip)(upsample(saliency, size))
+    return mask if is_real is None else mask & is_real[:, :, None, None]
 
 
 def mine_mask(
@@ -72,6 +86,7 @@ def mine_mask(
     clusters: int = 0,
     threshold: Threshold = "otsu",
     smooth_frames: int = 1,
+    frames: Frames = Frames(),
 ) -> Bool[Array, "B S H W"]:
     """Return a method's dynamic pixels: the saliency, averaged within clusters if requested, above a threshold.
 
@@ -85,53 +100,78 @@ def mine_mask(
         threshold: "otsu" or "multi-otsu".
         smooth_frames: odd number of frames over which the saliency is averaged before the threshold (see
             `smooth_over_time`; not in the papers).
+        frames: where the frames are; those that make shares equal change nothing and have no dynamic pixels.
     """
     saliency, patch_tokens = jax.lax.stop_gradient((saliency, patch_tokens))
     if clusters:
-        saliency = smooth_by_clusters(saliency, patch_tokens, clusters)
-    saliency = smooth_over_time(saliency, smooth_frames)
-    return dynamic_pixels(saliency, size, threshold=threshold)
+        saliency = smooth_by_clusters(saliency, patch_tokens, clusters, frames)
+    saliency = smooth_over_time(saliency, smooth_frames, frames)
+    return dynamic_pixels(saliency, size, threshold=threshold, frames=frames)
 
 
 def smooth_by_clusters(
-    saliency: Float[Array, "B S h w"], patch_tokens: Float[Array, "B S P C"], clusters: int
+    saliency: Float[Array, "B S h w"],
+    patch_tokens: Float[Array, "B S P C"],
+    clusters: int,
+    frames: Frames = Frames(),
 ) -> Float[Array, "B S h w"]:
     """Give every token the mean saliency of its cluster, min-max normalised per frame again (VGGT4D).
 
     The backbone's features of all frames of a clip are clustered together.
     """
+    is_real = frames.are_real(None, 1, saliency.shape[1])
+    is_real = None if is_real is None else is_real[0]
 
     def one_clip(clip: tuple[Array, Array]) -> Float[Array, "S h w"]:
         values, features = clip
-        labels = kmeans(jax.random.key(0), features.reshape(-1, features.shape[-1]), clusters).labels
-        return cluster_means(values, labels.reshape(values.shape), clusters)
+        weights = None if is_real is None else jnp.repeat(is_real, features.shape[1])
+        points = features.reshape(-1, features.shape[-1])
+        labels = kmeans(jax.random.key(0), points, clusters, weights, frames=frames).labels
+        return cluster_means(values, labels.reshape(values.shape), clusters, frames)
 
     return jax.lax.map(one_clip, (saliency, patch_tokens.astype(jnp.float32)))
 
 
-def smooth_over_time(saliency: Float[Array, "B S h w"], frames: int) -> Float[Array, "B S h w"]:
-    """Average every patch over `frames` frames around its own; at the ends of the clip, over the existing ones.
+def smooth_over_time(
+    saliency: Float[Array, "B S h w"], smooth_frames: int, frames: Frames = Frames()
+) -> Float[Array, "B S h w"]:
+    """Average every patch over `smooth_frames` frames around its own; at the ends of the clip, over the existing ones.
 
     Patches are averaged at fixed places in the picture, which suits dense clips of slow cameras.
 
     Raises InputError for an even number.
     """
-    frames = odd_frames(frames)
-    if frames == 1:
+    smooth_frames = odd_frames(smooth_frames)
+    if smooth_frames == 1:
         return saliency
-    S, reach = saliency.shape[1], frames // 2
-    near = jnp.abs(jnp.arange(S)[:, None] - jnp.arange(S)[None]) <= reach
-    weights = near / near.sum(axis=1, keepdims=True)
-    return jnp.einsum("st,bthw->bshw", weights, saliency, precision="highest")
+    S, reach = saliency.shape[1], smooth_frames // 2
+    every = frames.gather(saliency)[:, : frames.counted(S)]
+    near = jnp.abs(jnp.asarray(frames.numbers(S))[:, None] - jnp.arange(every.shape[1])[None]) <= reach
+    weights = near / jnp.maximum(near.sum(axis=1, keepdims=True), 1)
+    return jnp.einsum("st,bthw->bshw", weights, every, precision="highest")
 
 
-def cluster_means(saliency: Float[Array, "S h w"], labels: Int[Array, "S h w"], clusters: int) -> Float[Array, "S h w"]:
+def cluster_means(
+    saliency: Float[Array, "S h w"], labels: Int[Array, "S h w"], clusters: int, frames: Frames = Frames()
+) -> Float[Array, "S h w"]:
     """Return every token's mean over its cluster, min-max normalised per frame."""
     flat = labels.ravel()
-    total = jnp.zeros(clusters).at[flat].add(saliency.ravel())
-    count = jnp.zeros(clusters).at[flat].add(1)
+    if (is_real := frames.are_real(None, 1, len(saliency))) is not None:  # others are in no cluster
+        flat = jnp.where(jnp.repeat(is_real[0], saliency[0].size), flat, clusters)
+    zeros = frames.varying(jnp.zeros(clusters))
+    total = frames.sum(zeros.at[flat].add(saliency.ravel()))
+    count = frames.sum(zeros.at[flat].add(1))
     mean = (total / jnp.maximum(count, 1))[flat]
     return normalise(mean.reshape(1, len(saliency), -1))[0].reshape(saliency.shape)
+
+
+def _extremes(values: Float[Array, "S ..."], frames: Frames) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the smallest and the largest value of all real frames."""
+    if (is_real := frames.are_real(None, 1, len(values))) is None:
+        return frames.min(values.min()), frames.max(values.max())
+    is_real = is_real.reshape(-1, *(1,) * (values.ndim - 1))
+    low, high = jnp.where(is_real, values, jnp.inf).min(), jnp.where(is_real, values, -jnp.inf).max()
+    return frames.min(low), frames.max(high)
 
 
 def multi_otsu_threshold(values: np.ndarray) -> float:

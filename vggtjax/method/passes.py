@@ -17,6 +17,7 @@ from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
 from vggtjax.method.mask import dynamic_tokens, mine_mask
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions, predict
 from vggtjax.network.pose import decode_pose
@@ -69,7 +70,7 @@ def first_pass(
 
     Predictions of padded frames are meaningless. `exponents` has one power per cue, applied before their product.
     """
-    cues = GramCues(motion or config.motion, config.depth, gram)
+    cues = GramCues(motion or config.motion, config.depth, gram, compute.frames)
     predictions = predict(
         params,
         clips,
@@ -120,7 +121,7 @@ def second_pass(
     wanted = {name: getattr(plain, name, None) for output in outputs for name in fields.get(output, (output,))}
     if plain is None or any(value is None for value in wanted.values()) or dynamic_mask.dtype != bool:
         return masked()
-    return jax.lax.cond(dynamic_mask.any(), masked, lambda: Predictions(**wanted))
+    return jax.lax.cond(compute.frames.any(dynamic_mask.any()), masked, lambda: Predictions(**wanted))
 
 
 def track_from(
@@ -142,10 +143,11 @@ def track_from(
         config: the model's configuration.
         compute: as for `predict`.
     """
-    rolled = jax.tree.map(lambda x: jnp.roll(x, -frame, axis=1), clips)
+    frames = compute.frames
+    rolled = jax.tree.map(lambda x: frames.roll(x, -frame), clips)
     predictions = predict(params, rolled, config, outputs=("tracks",), query_points=query_points, compute=compute)
     tracks = (predictions.tracks, predictions.track_visibility, predictions.track_confidence)
-    return Tracks(*(jnp.roll(_present(value), frame, axis=1) for value in tracks))
+    return Tracks(*(frames.roll(_present(value), frame) for value in tracks))
 
 
 def motion_saliency(
@@ -218,7 +220,9 @@ def run_passes(
     return Passes(first, second_pass(params, clips, mask, config, **masking), saliency, mask)
 
 
-def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False) -> Assembly:
+def assemble(
+    passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False, frames: Frames = Frames()
+) -> Assembly:
     """Return a method's depth, confidence and cameras from two passes; the methods of `LADDER` share one run of them.
 
     Args:
@@ -226,6 +230,7 @@ def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = Fa
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
             pixels before it is used. Not in the paper.
+        frames: where the frames of the passes are.
     """
     row = find_method(method)
     if passes.second is None and row.needs_second_pass:
@@ -233,7 +238,7 @@ def assemble(passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = Fa
     first, second = passes.first, passes.second or passes.first
     scale = jnp.ones(passes.dynamic_mask.shape[0])
     if align_scale and passes.second is not None:
-        scale = scale_between(_present(first.depth), _present(second.depth), passes.dynamic_mask)
+        scale = scale_between(_present(first.depth), _present(second.depth), passes.dynamic_mask, frames)
 
     def of_first() -> tuple[Array, Array]:
         return _present(first.depth), _present(first.depth_confidence)

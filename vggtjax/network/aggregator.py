@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -12,8 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
+from vggtjax.errors import InputError
 from vggtjax.network.block import Block
-from vggtjax.network.clip_batch import real_frames
+from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.merging import merged_attention
 from vggtjax.network.precision import Compute, full_precision, widened
@@ -90,16 +92,16 @@ def aggregate(
         frame_count: number of real frames of each clip, at least one; padded frames follow and do not change them.
         suppression: the keys to suppress, in both blocks of a pair.
         compute: type of the products; how global attention is computed; with `remat`, only the input of every pair is
-            stored for the gradient.
+            stored for the gradient; where the frames are: global attention gathers keys and values, all else is local.
     """
     params = params["aggregator"]
     B, S, P, C = patch_tokens.shape
     T = SPECIAL_TOKENS + P
     block = _block(config, compute.compute_dtype)
-    attend = compute.attention if callable(compute.attention) else GLOBAL_ATTENTION[compute.attention]
-    global_block = dataclasses.replace(block, attend=attend(S, grid, SPECIAL_TOKENS))
+    global_block = dataclasses.replace(block, attend=_global_attention(compute, S, grid))
     rope = rope_table(grid, SPECIAL_TOKENS, C // config.num_heads)
-    real = real_frames(frame_count, S)
+    frames = compute.frames
+    real = frames.are_real(frame_count, B, S)
     real_tokens = None if real is None else jnp.repeat(real, T, axis=1)
     keys = suppression.keys(SPECIAL_TOKENS)
 
@@ -130,12 +132,12 @@ def aggregate(
         jnp.asarray(np.arange(config.depth)[:, None] == np.asarray(config.taps)[None]),
         None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
     )
-    sums = None if accumulator is None else accumulator.zeros(B, S, P)
+    sums = None if accumulator is None else frames.varying(accumulator.zeros(B, S, P))
     if real is not None:  # 0 x NaN is NaN: padded frames are set to 0
         patch_tokens = jnp.where(real[:, :, None, None], patch_tokens, 0)
-    tokens = _tokens(params, widened(patch_tokens))
-    camera = jnp.zeros((B, S, 2 * C), tokens.dtype)
-    taps = tuple(_empty(capture, (B, S, T, 2 * C), tokens.dtype) for capture in captures)
+    tokens = _tokens(params, widened(patch_tokens), frames)
+    camera = frames.varying(jnp.zeros((B, S, 2 * C), tokens.dtype))
+    taps = frames.varying(tuple(_empty(capture, (B, S, T, 2 * C), tokens.dtype) for capture in captures))
     step = jax.checkpoint(pair, prevent_cse=False) if compute.remat else pair
     (_, camera, taps, sums), _ = jax.lax.scan(step, (tokens, camera, taps, sums), layers)
     return camera, taps, sums
@@ -157,11 +159,21 @@ def _block(config: VGGTConfig, dtype: str = "float32") -> Block:
     return Block(config.num_heads, qk_norm=True, dtype=jnp.dtype(dtype))
 
 
-def _tokens(params: Params, patch_tokens: Float[Array, "B S P C"]) -> Float[Array, "B S T C"]:
+def _global_attention(compute: Compute, S: int, grid: tuple[int, int]) -> Attend:
+    """Return attention over S frames of a clip, or over those of all devices. Raises InputError for approximations."""
+    if compute.frames.mesh is None:
+        attend = compute.attention if callable(compute.attention) else GLOBAL_ATTENTION[compute.attention]
+        return attend(S, grid, SPECIAL_TOKENS)
+    if compute.attention != "exact":
+        raise InputError(f"attention is {compute.attention!r} on several devices; expected 'exact', or one device")
+    return partial(suppressed_attention, frames=compute.frames)
+
+
+def _tokens(params: Params, patch_tokens: Float[Array, "B S P C"], frames: Frames) -> Float[Array, "B S T C"]:
     """Prepend camera and register tokens: variant 0 for the clip's first frame, variant 1 for all others."""
     B, S, _, C = patch_tokens.shape
     special = jnp.concatenate([params["camera_token"], params["register_tokens"]], axis=1)  # [2, 5, C]
-    special = special.astype(patch_tokens.dtype)[(np.arange(S) > 0).astype(int)]  # [S, 5, C]
+    special = special.astype(patch_tokens.dtype)[(frames.numbers(S) > 0).astype(int)]  # [S, 5, C]
     return jnp.concatenate([jnp.broadcast_to(special, (B, S, SPECIAL_TOKENS, C)), patch_tokens], axis=2)
 
 

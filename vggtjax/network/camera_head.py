@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.block import Block
-from vggtjax.network.clip_batch import real_frames
+from vggtjax.network.frames import Frames
 from vggtjax.network.layers import MLP, LayerNorm, Params, apply, declare
 from vggtjax.network.pose import POSE_SIZE
 from vggtjax.network.precision import full_precision
@@ -25,6 +25,7 @@ def predict_pose(
     *,
     frame_count: Int[Array, " B"] | None = None,
     stop_gradient: bool = True,
+    frames: Frames = Frames(),
 ) -> Float[Array, "B S 9"]:
     """Return the pose encoding [t(3), quaternion xyzw(4), fov_h, fov_w] of every frame.
 
@@ -34,13 +35,17 @@ def predict_pose(
         config: the model's configuration.
         frame_count: number of real frames of each clip, its first ones; None for all.
         stop_gradient: treat the previous estimate as a constant in each iteration, as in VGGT's training.
+        frames: where the frames are; every device computes the poses of all frames, which takes little.
     """
     params = params["camera_head"]
+    S = camera_tokens.shape[1]
+    is_real = frames.are_real(frame_count, *camera_tokens.shape[:2])
+    is_real = None if is_real is None else frames.gather(is_real)
+    camera_tokens = frames.gather(camera_tokens)
     E = config.tap_dim
     block = Block(config.camera_num_heads, dtype=camera_tokens.dtype)
     tokens = apply(LayerNorm(), params["token_norm"], camera_tokens)
     normed = apply(LayerNorm(1e-6, use_bias=False, use_scale=False), {}, tokens)
-    is_real = real_frames(frame_count, tokens.shape[1])
     empty = jnp.broadcast_to(params["empty_pose"], (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
 
     def iteration(estimates, _):
@@ -54,7 +59,9 @@ def predict_pose(
         pose = pose + apply(_branch(config), params["pose_branch"], x)
         return (pose, jax.lax.stop_gradient(pose) if stop_gradient else pose), None
 
-    (pose, _), _ = jax.lax.scan(iteration, (jnp.zeros_like(empty), empty), length=ITERATIONS)
+    start = frames.varying((jnp.zeros_like(empty), empty))
+    (pose, _), _ = jax.lax.scan(iteration, start, length=ITERATIONS)
+    pose = frames.share(pose, S)
     return jnp.concatenate([pose[..., :7], nn.relu(pose[..., 7:])], axis=-1)
 
 

@@ -19,6 +19,7 @@ from vggtjax.network.backbone import declare_backbone, encode, patch_grid
 from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict_pose
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_tap
+from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
@@ -53,6 +54,7 @@ class ForwardChanges(TypedDict, total=False):
     compute_dtype: str
     remat: bool
     attention: str
+    frames: Frames
 
 
 def forward(
@@ -86,7 +88,7 @@ def forward(
         suppression: the keys to suppress; none for the plain pass.
         changes: fields of `Suppression` (`dynamic_tokens`, `suppress`, `mask_pairs`, `strength`) in place of those of
             `suppression`, and fields of `Compute` (`compute_dtype`, `remat`, `stop_camera_gradient`,
-            `attention`).
+            `attention`, `frames`).
 
     Raises:
         InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing.
@@ -148,7 +150,12 @@ def predict(
     fields: dict[str, Any] = {"cue_sums": sums}
     if "camera" in outputs:
         fields["pose_encoding"] = predict_pose(
-            params, camera_tokens, config, frame_count=clips.frame_count, stop_gradient=compute.stop_camera_gradient
+            params,
+            camera_tokens,
+            config,
+            frame_count=clips.frame_count,
+            stop_gradient=compute.stop_camera_gradient,
+            frames=compute.frames,
         )
     regress = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4)) if compute.remat else predict_dense
     for name, field in (("depth", "depth"), ("points", "world_points")):
@@ -158,7 +165,7 @@ def predict(
             fields |= {field: values[..., 0] if name == "depth" else values, f"{field}_confidence": confidence}
     if query_points is not None:
         head = HEADS["tracks"]
-        tracks = predict_tracks(params[head], [tap[head] for tap in taps], query_points, config, grid)
+        tracks = predict_tracks(params[head], [tap[head] for tap in taps], query_points, config, grid, compute.frames)
         fields |= zip(("tracks", "track_visibility", "track_confidence"), tracks, strict=True)
     return Predictions(**fields)
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vggtjax.errors import InputError, check_choice
+from vggtjax.network.frames import Frames
 from vggtjax.options import Attention, ComputeDType
 
 _Parameters = ParamSpec("_Parameters")
@@ -30,12 +31,14 @@ class Compute:
             VGGT's training.
         attention: how global attention is computed: "exact", "merged" (an approximation, see `network.merging`), or a
             function (S, grid, special tokens) -> attention, as an experiment.
+        frames: where the frames of the clips are; all here by default, else the call is inside `Frames.on_devices`.
     """
 
     compute_dtype: str = "float32"
     remat: bool = False
     stop_camera_gradient: bool = True
     attention: str | Callable = "exact"
+    frames: Frames = Frames()
 
     def __post_init__(self) -> None:
         check_compute_dtype(self.compute_dtype)

@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress
 from vggtjax.errors import InputError, check_choice, whole_number
-from vggtjax.network.attention import attention
+from vggtjax.network.frames import Frames
+from vggtjax.network.gathered_attention import gathered_attention
 
 
 @partial(
@@ -98,13 +99,18 @@ def suppressed_attention(
     v: Float[Array, "B T N D"],
     suppressed: SuppressedKeys | None,
     is_real: Bool[Array, "B T"] | None = None,
+    frames: Frames = Frames(),
 ) -> Float[Array, "B T N D"]:
     """Return attention with suppressed keys where the pair's flag is set; keys that are not real are always excluded.
 
     "zero" replaces a suppressed key by 0; its logit 0 stays in the softmax (4DVGGT-D). "drop" excludes key and value
     (VGGT4D). The flag is a scalar per pair, so the choice is a branch, not a select. A share m scales the key by 1 - m,
-    which equals "zero" for shares of 0 and 1.
+    which equals "zero" for shares of 0 and 1. With `frames` on several devices, queries see the keys of all of them.
     """
+
+    def attention(q, k, v, visible):
+        return gathered_attention(q, k, v, visible, frames)
+
     if suppressed is None:
         return attention(q, k, v, is_real)
     if jnp.issubdtype(suppressed.keys.dtype, jnp.floating):

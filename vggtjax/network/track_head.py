@@ -11,8 +11,9 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.attention import attention
 from vggtjax.network.dpt_head import DPTFeatures, add_positions, declare_features, frames_at_once, resize_aligned
+from vggtjax.network.frames import Frames
+from vggtjax.network.gathered_attention import gathered_attention
 from vggtjax.network.layers import MLP, LayerNorm, Params, apply, declare
 from vggtjax.network.precision import full_precision
 from vggtjax.network.sampling import bilinear, neighbours
@@ -41,6 +42,7 @@ def predict_tracks(
     query_points: Float[Array, "B Q 2"],
     config: VGGTConfig,
     grid: tuple[int, int],
+    frames: Frames = Frames(),
 ) -> Tracks:
     """Return the tracks of points of the first frame.
 
@@ -54,6 +56,7 @@ def predict_tracks(
         query_points: x, y in pixels of the first frame.
         config: the model's configuration.
         grid: rows and columns of patches.
+        frames: where the frames are: attention over time gathers keys and values of every track, all else is local.
     """
     B, S = taps[0].shape[:2]
     F = config.track_features
@@ -61,12 +64,12 @@ def predict_tracks(
     size = (maps.shape[2], maps.shape[3])
     query = query_points / STRIDE
     inside = jnp.clip(query, 0, jnp.asarray([[[size[1] - 1, size[0] - 1]]]))
-    features = jax.vmap(bilinear)(maps[:, 0], inside)  # [B, Q, F]
+    features = frames.of_first(jax.vmap(bilinear)(maps[:, 0], inside))  # [B, Q, F]
     features = jnp.broadcast_to(features[:, None], (B, S, *features.shape[1:]))
     pyramid = _pyramid(maps, config.track_corr_levels, config.track_corr_radius)
     place = _position_embedding(inside, size, 3 * F + 4)[:, :, None]  # [B, Q, 1, E]
-    later = (np.arange(S) > 0).astype(np.int32)
-    kind = params["query_token"][later][None, None]  # [1, 1, S, E]
+    later = frames.numbers(S) > 0
+    kind = params["query_token"][later.astype(np.int32)][None, None]  # [1, 1, S, E]
     start = jnp.broadcast_to(query[:, None], (B, S, *query.shape[1:]))
 
     def iteration(state, _):
@@ -74,18 +77,18 @@ def predict_tracks(
         positions = jax.lax.stop_gradient(positions)  # as in VGGT's training
         similar = jax.vmap(_correlations, (0, 0, 0, None, None))(pyramid, features, positions, size, config)
         similar = apply(MLP(config.track_hidden, F), params["correlation_mlp"], similar)
-        flow = positions - positions[:, :1]
+        flow = positions - jax.lax.stop_gradient(start[:, :1])
         x = jnp.concatenate(
             [_flow_embedding(flow, F // 2), flow / FLOW_SCALE, flow / FLOW_SCALE, similar, features], -1
         )
         x = x.swapaxes(1, 2) + place + kind  # [B, Q, S, E]
-        delta = _updates(params, x, config).swapaxes(1, 2)  # [B, S, Q, 2 + F]
+        delta = _updates(params, x, config, frames).swapaxes(1, 2)  # [B, S, Q, 2 + F]
         update = apply(LayerNorm(), params["feature_norm"], delta[..., 2:])
         update = nn.gelu(apply(nn.Dense(F), params["feature_update"], update), approximate=False)
-        positions = (positions + delta[..., :2]).at[:, 0].set(query)
+        positions = jnp.where(jnp.asarray(later)[None, :, None, None], positions + delta[..., :2], start)
         return (positions, features + update), None
 
-    (positions, features), _ = jax.lax.scan(iteration, (start, features), length=ITERATIONS)
+    (positions, features), _ = jax.lax.scan(iteration, frames.varying((start, features)), length=ITERATIONS)
     visibility, confidence = (
         jax.nn.sigmoid(apply(nn.Dense(1), params[name], features)[..., 0]) for name in ("visibility", "confidence")
     )
@@ -204,7 +207,7 @@ def _flow_embedding(flow: Float[Array, "... 2"], channels: int) -> Float[Array, 
     return jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1).reshape(*flow.shape[:-1], 2 * channels)
 
 
-def _updates(params: Params, x: Float[Array, "B Q S E"], config: VGGTConfig) -> Float[Array, "B Q S O"]:
+def _updates(params: Params, x: Float[Array, "B Q S E"], config: VGGTConfig, frames: Frames) -> Float[Array, "B Q S O"]:
     """Return the transformer's output: layers alternate over time in every track and over tracks in every frame.
 
     Tracks attend to each other through virtual tracks: these attend to all tracks and to one another, and all tracks
@@ -217,7 +220,7 @@ def _updates(params: Params, x: Float[Array, "B Q S E"], config: VGGTConfig) -> 
     names = ("time", "virtual_to_point", "virtual", "point_to_virtual")
 
     def layer(tokens: Float[Array, "B N S C"], blocks: dict[str, Params]):
-        tokens = _block(blocks["time"], tokens)
+        tokens = _block(blocks["time"], tokens, frames=frames)
         tokens = tokens.swapaxes(1, 2)  # [B, S, N, C]
         points, virtual = tokens[:, :, :Q], tokens[:, :, Q:]
         virtual = _block(blocks["virtual_to_point"], virtual, points)
@@ -232,8 +235,16 @@ def _updates(params: Params, x: Float[Array, "B Q S E"], config: VGGTConfig) -> 
     return apply(nn.Dense(config.track_features + 2), params["flow_projection"], x)
 
 
-def _block(params: Params, x: Float[Array, "B G T C"], context: Float[Array, "B G K C"] | None = None) -> Array:
-    """Return attention, to `context` if given, and MLP. The skip starts after the first norm."""
+def _block(
+    params: Params,
+    x: Float[Array, "B G T C"],
+    context: Float[Array, "B G K C"] | None = None,
+    frames: Frames = Frames(),
+) -> Float[Array, "B G T C"]:
+    """Return attention, to `context` if given, and MLP. The skip starts after the first norm.
+
+    With `frames`, T are frames, and attention is over those of all devices.
+    """
     B, G, T, C = x.shape
     x = apply(LayerNorm(), params["norm1"], x)
     source: Array = x if context is None else apply(LayerNorm(), params["norm_context"], context)
@@ -243,7 +254,7 @@ def _block(params: Params, x: Float[Array, "B G T C"], context: Float[Array, "B 
         (part @ kernel + bias[None, None, None]).reshape(B * G, -1, HEADS, C // HEADS)
         for part, kernel, bias in zip((x, source, source), kernels, biases, strict=True)
     )
-    out = attention(q, k, v).reshape(B, G, T, C)
+    out = gathered_attention(q, k, v, frames.are_real(None, B * G, T), frames).reshape(B, G, T, C)
     x = x + apply(nn.Dense(C), params["attention"]["projection"], out)
     return x + apply(MLP(4 * C, C), params["mlp"], apply(LayerNorm(), params["norm2"], x))
 

@@ -25,6 +25,7 @@ from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.options import Options
 from vggtjax.pipeline.contact import PAGE_NAME, ContactPage
+from vggtjax.pipeline.devices import frames_mesh, whole_on
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pipeline.shards import parse_shard, running, starting
 from vggtjax.progress import Progress, StageSeconds, no_progress
@@ -63,6 +64,7 @@ def reconstruct_many(
     known: KnownGeometry | None = None,
     pad_frames: bool = False,
     shard: str | None = None,
+    devices: int = 1,
     progress: Progress | None = None,
     **changes: Any,
 ) -> Generator[ClipOutcome]:
@@ -81,6 +83,7 @@ def reconstruct_many(
         known: as for `reconstruct`, as far as all clips share it: intrinsics, a shared focal length, the height of the
             cameras, and what "source" names.
         pad_frames: as for `reconstruct`.
+        devices: as for `reconstruct`; the weights are copied once.
         framing: how frames are fitted; the keywords of `load_clip` serve, too.
         sampling: which frames are taken; the keywords of `load_clip` serve, too.
         saving: how results are written; the keywords of `Reconstruction.save` serve, too.
@@ -108,8 +111,10 @@ def reconstruct_many(
         known.check_many()
         check_readable(known)
     check_refinement(options.refine_cameras, known is not None and known.poses is not None)
+    mesh = frames_mesh(devices)
     run = _Batch(
         model=model,
+        placed=model if mesh is None else dataclasses.replace(model, params=whole_on(model.params, mesh)),
         options=options,
         fitter=framing.fitter(size=model.config.image_size, patch=model.config.patch_size),
         sampling=Sampling(**sampling) if isinstance(sampling, Mapping) else sampling or Sampling(),
@@ -117,6 +122,7 @@ def reconstruct_many(
         fusion=fusion,
         known=known or None,
         pad_frames=pad_frames,
+        devices=devices,
     )
     out, progress = Path(out), progress or no_progress
     with ExitStack() as whole:
@@ -139,6 +145,7 @@ class _Batch:
     """What all clips of a batch have in common."""
 
     model: Model
+    placed: Model  # the same, with its weights on every device
     options: Options
     fitter: Fitter
     sampling: Sampling
@@ -146,6 +153,7 @@ class _Batch:
     fusion: FusionParams | None
     known: KnownGeometry | None
     pad_frames: bool
+    devices: int
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -170,13 +178,14 @@ class _Batch:
     def reconstruct(self, clip: Clip, seconds: StageSeconds) -> Reconstruction:
         size = self.fitter.size
         return reconstruct(
-            self.model,
+            self.placed,
             clip,
             options=self.options,
             size=size,
             fusion=self.fusion,
             known=self.known,
             pad_frames=self.pad_frames,
+            devices=self.devices,
             on_stage=seconds.stage,
         )
 

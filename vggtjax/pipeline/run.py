@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.captures.frames import CaptureFrames
@@ -27,10 +28,12 @@ from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.passes import Assembly, Passes
+from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
+from vggtjax.pipeline.devices import by_frame_on, frames_mesh, on_host, placed, shared_length, whole_on
 from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, inline, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.refinement.refine import check_refinement, refine_cameras
@@ -49,6 +52,7 @@ def infer(
     *,
     options: Options = Options(),
     motion: MotionConfig | None = None,
+    mesh: Mesh | None = None,
     **changes: Any,
 ) -> tuple[Assembly, Passes]:
     """Run a method on a batch of clips as one compiled function.
@@ -59,6 +63,7 @@ def infer(
         config: the model's configuration.
         options: how the clips are reconstructed; masks are not refined.
         motion: the table of motion cues; the configuration's own if None.
+        mesh: devices along an axis "frames" that share the frames (`frames_mesh`); None for one device.
         changes: fields of `options` by name, such as `method="vggt4d"`.
 
     Returns:
@@ -67,13 +72,19 @@ def infer(
     config = config if motion is None else dataclasses.replace(config, motion=motion)
     # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.
     options = dataclasses.replace(options.changed(**changes).resolved(), refine_mask=False)
-    return _infer(params, images, config, options)
+    if mesh is None:
+        return _infer(params, images, config, options, images.shape[1], None)
+    frames = images.shape[1]
+    params, images = placed(params, images, mesh)
+    outputs = _infer(params, images, config, options, frames, mesh)
+    return outputs if images.shape[1] == frames else jax.tree.map(lambda x: x[:, :frames], outputs)
 
 
-@partial(jax.jit, static_argnames=("config", "options"))
-def _infer(params: Params, images: Array, config: VGGTConfig, options: Options) -> tuple[Assembly, Passes]:
-    frames, height, width = images.shape[1:4]
-    stages = Stages(config, options, frames, (height, width), run=inline)
+@partial(jax.jit, static_argnames=("config", "options", "frames", "mesh"))
+def _infer(
+    params: Params, images: Array, config: VGGTConfig, options: Options, frames: int, mesh: Mesh | None
+) -> tuple[Assembly, Passes]:
+    stages = Stages(config, options, frames, (images.shape[2], images.shape[3]), run=inline, mesh=mesh)
     passes, assembly, _ = run_stages(stages, params, ClipInputs(images))
     return assembly, passes
 
@@ -89,6 +100,7 @@ def reconstruct(
     fusion: FusionParams | None = None,
     known: KnownGeometry | None = None,
     pad_frames: bool = False,
+    devices: int = 1,
     keep_passes: bool = False,
     on_stage: OnStage | None = None,
     **changes: Any,
@@ -109,13 +121,15 @@ def reconstruct(
         known: intrinsics, poses or lengths that are known, and pixels without depth: the prediction is brought to them.
         pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs; the
             result is the same to rounding. Not for clips with tracks.
+        devices: share the frames among so many devices, each with a copy of the weights; the result is the same to
+            rounding. With several processes (`jax.distributed`) every one calls this and returns the whole result.
         keep_passes: keep both passes on the result, as `.passes`.
         on_stage: called with the name of each stage, returns a context in which the stage runs.
         changes: fields of `options` by name, such as `method="vggt4d"`.
 
     Raises:
-        InputError: an invalid option, masks of another size, a size that is not a multiple of the patch size, or known
-            geometry that does not fit the clip.
+        InputError: an invalid option, masks of another size, a size that is not a multiple of the patch size, known
+            geometry that does not fit the clip, or more devices than there are.
         CheckpointError: the model has parameters that are not finite, and so has its prediction.
         ClipError: the source of the clip cannot be read.
         DeviceMemoryError: the clip does not fit in the memory of the device.
@@ -123,6 +137,7 @@ def reconstruct(
     """
     options = options.changed(**changes).resolved()
     on_stage = on_stage or no_stage
+    mesh = frames_mesh(devices)
     check_fuses(fusion, options.method)
     if masks is not None:
         options.check_given_masks()
@@ -136,24 +151,26 @@ def reconstruct(
         given, mask_source = np.zeros(clip.images.shape[:3], bool), "none: all frames are equal"
     geometry = _given_geometry(known, clip) if known else None
     frames, height, width = clip.images.shape[:3]
-    stages = Stages(model.config, options, frames, (height, width))
-    padding = padded_frames(frames, model.config.motion.offsets) - frames if pad_frames and tracks is None else 0
+    length = padded_frames(frames, model.config.motion.offsets) if pad_frames and tracks is None else frames
+    stages = Stages(model.config, options, frames, (height, width), mesh=mesh, padded=length)
+    padding = shared_length(length, mesh) - frames
 
     def padded(x: np.ndarray) -> Array:
-        return jax.device_put(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None])
+        return by_frame_on(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None], mesh)
 
     inputs = ClipInputs(
         images=padded(clip.images),
-        frame_count=jax.device_put(np.array([frames], np.int32)) if padding else None,
+        frame_count=whole_on(np.array([frames], np.int32), mesh) if length > frames else None,
         dynamic_mask=None if given is None else padded(given),
         moves=given is None or bool(given.any()),
-        query_points={} if tracks is None else _points_by_frame(tracks),
+        query_points={} if tracks is None else whole_on(_points_by_frame(tracks), mesh),
     )
-    run = partial(run_stages, params=model.params, inputs=inputs, fusion=fusion, all_outputs=keep_passes)
+    params, rule = (model.params, fusion) if mesh is None else whole_on((model.params, fusion), mesh)
+    run = partial(run_stages, params=params, inputs=inputs, fusion=rule, all_outputs=keep_passes)
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
         run(dataclasses.replace(stages, run=Compile(on_stage)))
-        passes, assembly, by_frame = run(dataclasses.replace(stages, run=Execute(on_stage)))
-    passes = jax.tree.map(lambda x: np.asarray(x)[:, :frames], passes)
+        outputs = run(dataclasses.replace(stages, run=Execute(on_stage)))
+    passes, assembly, by_frame = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
     fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, frames))
     try:
         result = Reconstruction(
@@ -184,6 +201,7 @@ def compile_ahead(
     *,
     options: Options = Options(),
     pad_frames: bool = False,
+    devices: int = 1,
     keep_passes: bool = False,
     **changes: Any,
 ) -> dict[str, StageMemory]:
@@ -193,10 +211,12 @@ def compile_ahead(
     kept (as the command line does).
 
     Returns:
-        The memory of each stage beside its inputs, by XLA's own analysis: `.temporary` and `.output` bytes.
+        The memory of each stage on each device beside its inputs, by XLA's own analysis: `.temporary` and `.output`
+        bytes; and `.collectives`, the number of communications between devices by kind.
 
     Raises:
-        InputError: an invalid option, no frame, or sides that are not multiples of the model's patch size.
+        InputError: an invalid option, no frame, sides that are not multiples of the model's patch size, or more devices
+            than there are.
         DeviceMemoryError: the clip does not fit in the memory of the device.
     """
     patch = model.config.patch_size
@@ -205,16 +225,21 @@ def compile_ahead(
             f"{frames} frames of {width} x {height} pixels; expected at least one frame, with sides that are multiples "
             f"of the patch size {patch}"
         )
-    options = options.changed(**changes)
+    options, mesh = options.changed(**changes), frames_mesh(devices)
     length = padded_frames(frames, model.config.motion.offsets) if pad_frames else frames
+    total = shared_length(length, mesh)
+    by_frame, whole = (Frames(mesh).sharding(spec) for spec in (BY_FRAME, WHOLE))
     inputs = ClipInputs(
-        images=jax.ShapeDtypeStruct((1, length, height, width, 3), jnp.float32),  # type: ignore[arg-type]
-        frame_count=None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32),  # type: ignore[arg-type]
+        images=jax.ShapeDtypeStruct((1, total, height, width, 3), jnp.float32, sharding=by_frame),  # type: ignore
+        frame_count=None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32, sharding=whole),  # type: ignore
     )
+    params = model.params
+    if mesh is not None:
+        params = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole), params)
     compiler = Compile()
-    stages = Stages(model.config, options, frames, (height, width), run=compiler)
+    stages = Stages(model.config, options, frames, (height, width), run=compiler, mesh=mesh, padded=length)
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
-        run_stages(stages, model.params, inputs, all_outputs=keep_passes)
+        run_stages(stages, params, inputs, all_outputs=keep_passes)
     return compiler.memory
 
 

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.cameras import Cameras
@@ -19,6 +24,7 @@ from vggtjax.method.mask import mine_mask
 from vggtjax.method.passes import Assembly, Passes, assemble, first_pass, second_pass, track_from
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
 from vggtjax.network.precision import Compute
@@ -29,6 +35,9 @@ from vggtjax.options import Options
 from vggtjax.progress import OnStage, no_stage
 from vggtjax.storage.programs import Program, keep_type
 
+_COLLECTIVE = re.compile(
+    r" (all-gather|all-reduce|all-to-all|ragged-all-to-all|reduce-scatter|collective-\w+|send|recv)(?:-start)?\("
+)
 _DIGITS = 4  # significant binary digits of padded lengths: no clip gets longer by more than an eighth
 
 
@@ -44,54 +53,83 @@ def padded_frames(frames: int, offsets: tuple[int, ...]) -> int:
     return -(-frames // step) * step
 
 
-def _first(params, clips, query_points=None, *, compute_dtype, attention, **options):
-    compute = Compute(compute_dtype, attention=attention)
-    return first_pass(params, clips, query_points=query_points, compute=compute, **options)
+def _image_features(params, images, *, frames: Frames, **options):
+    return frames.on_devices(partial(encode, **options), WHOLE, BY_FRAME)(params, images)
 
 
-def _second(params, clips, dynamic_mask, first, *, suppress, mask_pairs, compute_dtype, attention, **options):
-    suppression = Suppression(suppress=suppress, mask_pairs=mask_pairs)
-    compute = Compute(compute_dtype, attention=attention)
-    return second_pass(params, clips, dynamic_mask, plain=first, suppression=suppression, compute=compute, **options)
+def _first(params, clips, query_points=None, *, compute_dtype, attention, frames: Frames, **options):
+    def run(params, clips, query_points):
+        compute = Compute(compute_dtype, attention=attention, frames=frames)
+        return first_pass(params, clips, query_points=query_points, compute=compute, **options)
+
+    return frames.on_devices(run, WHOLE, _CLIPS, WHOLE)(params, clips, query_points)
 
 
-def _track(params, clips, query_points, frame, *, config, compute_dtype, attention):
-    compute = Compute(compute_dtype, attention=attention)
-    return track_from(params, clips, query_points, frame, config, compute=compute)
+def _second(
+    params, clips, dynamic_mask, first, *, suppress, mask_pairs, compute_dtype, attention, frames: Frames, **options
+):
+    def run(params, clips, dynamic_mask, first, mask_pairs):
+        suppression = Suppression(suppress=suppress, mask_pairs=mask_pairs)
+        masking = {
+            "plain": first,
+            "suppression": suppression,
+            "compute": Compute(compute_dtype, attention=attention, frames=frames),
+        }
+        return second_pass(params, clips, dynamic_mask, **masking, **options)
+
+    located = frames.on_devices(run, WHOLE, _CLIPS, BY_FRAME, BY_FRAME, WHOLE)
+    return located(params, clips, dynamic_mask, first, mask_pairs)
+
+
+def _track(params, clips, query_points, frame, *, config, compute_dtype, attention, frames: Frames):
+    track = partial(track_from, config=config, compute=Compute(compute_dtype, attention=attention, frames=frames))
+    return frames.on_devices(track, WHOLE, _CLIPS, WHOLE, WHOLE)(params, clips, query_points, frame)
 
 
 def _mine(
-    saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"], *, frames: int, **options
+    saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"], *, frames: Frames, **options
 ) -> Bool[Array, "B F H W"]:
-    """Mine the mask of the first `frames` frames; padded frames get an empty mask."""
-    mask = mine_mask(saliency[:, :frames], patch_tokens[:, :frames], **options)
-    return jnp.pad(mask, ((0, 0), (0, saliency.shape[1] - frames), (0, 0), (0, 0)))
+    """Mine the mask of the first `frames.count` frames; padded frames get an empty mask."""
+    if frames.mesh is not None:
+        mine = partial(mine_mask, frames=frames, **options)
+        return frames.on_devices(mine, BY_FRAME, BY_FRAME)(saliency, patch_tokens)
+    mask = mine_mask(saliency[:, : frames.count], patch_tokens[:, : frames.count], **options)
+    return jnp.pad(mask, ((0, 0), (0, saliency.shape[1] - mask.shape[1]), (0, 0), (0, 0)))
 
 
 def _assemble(
-    passes: Passes, fusion: FusionParams | None, *, frames: int, method: str, align_scale: bool, patch_size: int
+    passes: Passes, fusion: FusionParams | None, *, frames: Frames, method: str, align_scale: bool, patch_size: int
 ) -> Assembly:
-    passes = jax.tree.map(lambda x: x[:, :frames], passes)
-    assembly = assemble(passes, method, align_scale=align_scale)
-    return assembly if fusion is None else apply_fusion(assembly, passes, fusion, patch_size, align_scale=align_scale)
+    """Assemble the first `frames.count` frames; on several devices the padded ones follow."""
+
+    def run(passes, fusion):
+        changes = {"align_scale": align_scale, "frames": frames}
+        assembly = assemble(passes, method, **changes)
+        return assembly if fusion is None else apply_fusion(assembly, passes, fusion, patch_size, **changes)
+
+    if frames.mesh is None:
+        passes = jax.tree.map(lambda x: x[:, : frames.count], passes)
+    return frames.on_devices(run, BY_FRAME, WHOLE)(passes, fusion)
 
 
-_encode = Program(encode, static=("config", "compute_dtype"))
-_first_pass = Program(_first, static=("config", "gram", "compute_dtype", "attention"))
+_CLIPS = ClipBatch(BY_FRAME, BY_FRAME, WHOLE)  # type: ignore[arg-type]
+_encode = Program(_image_features, static=("config", "compute_dtype", "frames"))
+_first_pass = Program(_first, static=("config", "gram", "compute_dtype", "attention", "frames"))
 _mine_mask = Program(_mine, static=("frames", "size", "clusters", "threshold", "smooth_frames"))
-_SECOND_STATIC = ("config", "suppress", "outputs", "compute_dtype", "attention")  # mask_pairs is traced
+_SECOND_STATIC = ("config", "suppress", "outputs", "compute_dtype", "attention", "frames")  # mask_pairs is traced
 _second_pass = Program(_second, static=_SECOND_STATIC)
-_track_from = Program(_track, static=("config", "compute_dtype", "attention"))
+_track_from = Program(_track, static=("config", "compute_dtype", "attention", "frames"))
 _assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
 for _kind in (ClipBatch, Predictions, Passes, Cameras, Assembly, Tracks, Quantised):
     keep_type(_kind)
 
 
 class StageMemory(NamedTuple):
-    """Memory of a compiled stage beside its inputs, by XLA's own analysis, in bytes."""
+    """Memory of a compiled stage on each device beside its inputs, by XLA's own analysis, in bytes."""
 
     temporary: int
     output: int
+    collectives: Mapping[str, int] = MappingProxyType({})  # communications between devices in the program, by kind
 
 
 class Execute:
@@ -112,6 +150,11 @@ def inline(stage: str, program: Program, *arguments: Any, **options: Any) -> Any
     return program.function(*arguments, **options)
 
 
+def count_collectives(program: str) -> dict[str, int]:
+    """Return the number of communications between devices in the text of a compiled program, by kind."""
+    return dict(Counter(_COLLECTIVE.findall(program)))
+
+
 class Compile:
     """Compiles each program for the shapes of its arguments; later calls with such arguments find it compiled.
 
@@ -126,9 +169,11 @@ class Compile:
         """Return the shapes of the program's outputs."""
         with self._on_stage(f"compile {stage}"):
             compiled, outputs = program.compile(*arguments, **options)
+        shared = options["frames"].mesh is not None
+        collectives = count_collectives(compiled.as_text() or "") if shared else {}
         memory = compiled.memory_analysis()
         if memory is not None:  # some platforms do not tell
-            self.memory[stage] = StageMemory(memory.temp_size_in_bytes, memory.output_size_in_bytes)
+            self.memory[stage] = StageMemory(memory.temp_size_in_bytes, memory.output_size_in_bytes, collectives)
         return outputs
 
 
@@ -144,10 +189,17 @@ class Stages:
     frames: int
     size: tuple[int, int]  # height and width in pixels
     run: Callable[..., Any] = field(default_factory=Execute)  # Execute, Compile or inline
+    mesh: Mesh | None = None  # of the devices that share the frames
+    padded: int | None = None  # frames with those of `ClipInputs.frame_count`, without those that make shares equal
 
     @property
     def _network(self) -> dict[str, Any]:
-        return {"config": self.config, "compute_dtype": self.options.compute_dtype}
+        frames = Frames(self.mesh, None if self.mesh is None else self.padded or self.frames)
+        return {"config": self.config, "compute_dtype": self.options.compute_dtype, "frames": frames}
+
+    @property
+    def _real(self) -> Frames:
+        return Frames(self.mesh, self.frames)
 
     @property
     def _passes(self) -> dict[str, Any]:
@@ -171,7 +223,7 @@ class Stages:
     ) -> Bool[Array, "B F H W"]:
         method = self.options.row
         options = {"clusters": method.clusters, "threshold": method.threshold}
-        options |= {"smooth_frames": self.options.smooth_frames, "frames": self.frames, "size": self.size}
+        options |= {"smooth_frames": self.options.smooth_frames, "frames": self._real, "size": self.size}
         return self.run("dynamic mask", _mine_mask, saliency, patch_tokens, **options)
 
     def second_pass(
@@ -192,11 +244,11 @@ class Stages:
     def assemble(self, passes: Passes, fusion: FusionParams | None = None) -> Assembly:
         """Return the method's depth, confidence and cameras of the real frames, fused by `fusion` if given."""
         options = {"method": self.options.method, "align_scale": self.options.align_scale}
-        options |= {"frames": self.frames, "patch_size": self.config.patch_size}
+        options |= {"frames": self._real, "patch_size": self.config.patch_size}
         return self.run("assemble", _assembled, passes, fusion, **options)
 
     def tracks(
-        self, params: Params, clips: ClipBatch, query_points: Float[Array, "B Q 2"], frame: Int[Array, ""]
+        self, params: Params, clips: ClipBatch, query_points: Float[Array, "B Q 2"], frame: Int[np.ndarray, ""]
     ) -> Tracks:
         """Return the tracks of points of a later frame."""
         return self.run("tracks", _track_from, params, clips, query_points, frame, **self._passes)
@@ -250,7 +302,8 @@ def run_stages(
     passes = Passes(first, second, saliency, mask)
     assembly = stages.assemble(passes, fusion)
     tracks = {
-        frame: stages.tracks(params, clips, frame_points, jnp.int32(frame)) for frame, frame_points in points.items()
+        frame: stages.tracks(params, clips, frame_points, np.asarray(frame, np.int32))
+        for frame, frame_points in points.items()
     }
     if 0 in inputs.query_points:
         tracks[0] = Tracks(first.tracks, first.track_visibility, first.track_confidence)  # type: ignore[arg-type]

@@ -2,7 +2,8 @@
 
 Tracing and lowering the network take as long as loading its compiled form. If compiled programs are kept in the user's
 cache (`enable_compilation_cache`), so are, on a CPU, lowered programs (jax.export). Their key is the sources of this
-package, the versions of jax, the platform, the static options, and the shapes of the arguments.
+package, the versions of jax, the platform, the static options, and the shapes of the arguments. Programs on several
+devices are not kept.
 """
 
 from __future__ import annotations
@@ -55,7 +56,10 @@ class Program:
         compiled = lowered.compile()
         if key is not None and ready is not self._jitted:
             self._ready[key] = compiled
-        return compiled, lowered.out_info
+        outputs = lowered.out_info
+        if _on_several_devices(arguments):  # the next program has to be compiled for arrays that are there
+            outputs = jax.tree.map(_placed, outputs, compiled.output_shardings)
+        return compiled, outputs
 
     def _key(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Return the key of a program on disk, None if it cannot be kept; and the traced options."""
@@ -63,7 +67,7 @@ class Program:
         if not _keeping() or jax.default_backend() != "cpu":
             return None, traced
         leaves, structure = jax.tree.flatten((arguments, traced))
-        if any(isinstance(leaf, Tracer) for leaf in leaves):
+        if any(isinstance(leaf, Tracer) for leaf in leaves) or _on_several_devices(leaves):
             return None, traced
         static = tuple(sorted((name, repr(value)) for name, value in options.items() if name in self._static))
         return (static, structure, tuple((jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)), traced
@@ -107,6 +111,15 @@ def keep_type(kind: type) -> type:
     """Decorate a NamedTuple that kept programs take or return: register how it is stored."""
     export.register_namedtuple_serialization(kind, serialized_name=f"{kind.__module__}.{kind.__qualname__}")
     return kind
+
+
+def _on_several_devices(arguments: Any) -> bool:
+    shardings = (getattr(leaf, "sharding", None) for leaf in jax.tree.leaves(arguments))
+    return any(sharding is not None and sharding.num_devices > 1 for sharding in shardings)
+
+
+def _placed(output: Any, sharding: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(output.shape, output.dtype, sharding=sharding)
 
 
 def kept_text(name: str, make: Callable[[], str]) -> str:

@@ -1,0 +1,140 @@
+"""One clip on several devices: the numbers of one device, the collectives, the memory of each device, two processes."""
+
+import os
+import re
+import socket
+import subprocess
+import sys
+from collections import defaultdict
+from itertools import pairwise
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.tiny import tiny_config
+from vggtjax import infer
+from vggtjax.commands import main as cli
+from vggtjax.errors import InputError
+from vggtjax.network.model import init_params
+from vggtjax.pipeline.devices import frames_mesh
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs" / "how-to" / "several-devices.md"
+WORKER = Path(__file__).with_name("devices_worker.py")
+DEVICES = (1, 2, 4, 8)
+NAMED = {  # in docs/how-to/several-devices.md
+    "image features": set(),
+    "first pass": {"all-gather", "collective-permute"},
+    "dynamic mask": {"all-gather", "all-reduce"},
+    "second pass": {"all-gather", "all-reduce"},
+    "assemble": {"all-reduce"},
+}
+CLOSE = 1e-5  # of the spread of an array
+
+Kept = dict[str, dict[int, dict[str, np.ndarray]]]
+
+
+def start(out: Path, *arguments: str) -> subprocess.Popen:
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    words = [sys.executable, str(WORKER), str(out), *arguments]
+    return subprocess.Popen(words, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True)
+
+
+def finished(process: subprocess.Popen, out: Path) -> Kept:
+    """Return what -> devices -> name -> array."""
+    _, said = process.communicate(timeout=900)
+    assert process.returncode == 0, said[-3000:]
+    kept: Kept = defaultdict(lambda: defaultdict(dict))
+    with np.load(out) as arrays:
+        for name, array in arrays.items():
+            what, devices, field = name.split("/", 2)
+            kept[what][int(devices)][field] = array
+    return kept
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory) -> Kept:
+    out = tmp_path_factory.mktemp("devices") / "one.npz"
+    return finished(start(out), out)
+
+
+def check_equal(expected: dict[str, np.ndarray], found: dict[str, np.ndarray]) -> None:
+    assert expected.keys() == found.keys()
+    for name, array in expected.items():
+        other = found[name]
+        assert (other.shape, other.dtype) == (array.shape, array.dtype), name
+        if array.dtype == bool:
+            assert 0.02 < array.mean() < 0.98, name
+            assert (other == array).all(), name
+        else:
+            assert np.isfinite(array).all(), name
+            assert np.abs(other - array).max() <= CLOSE * np.ptp(array), name
+
+
+@pytest.mark.parametrize("what", ["infer 16", "gradient 16", "reconstruct 13", "vggt4d 13"])
+def test_several_devices_give_the_numbers_of_one(kept, what):
+    assert len(kept[what]) > 1
+    for devices in set(kept[what]) - {1}:
+        check_equal(kept[what][1], kept[what][devices])
+
+
+def test_a_pass_has_only_the_collectives_that_the_docs_name(kept):
+    rows = dict(re.findall(r"^\| (\S.*?) \| .* \| (.*) \|$", DOCS.read_text(), flags=re.MULTILINE))
+    for stage, kinds in NAMED.items():
+        assert set(re.findall(r"`([\w-]+)`", rows[stage])) == kinds, stage
+        for devices in set(DEVICES) - {1}:
+            assert set(kept[f"collectives of {stage}"][devices]) <= {f"['{name}']" for name in kinds}, stage
+    assert kept["collectives of first pass"][8]
+
+
+def test_memory_of_a_device_falls_with_their_number(kept):
+    for stage in ("image features", "first pass", "second pass"):
+        needs = [int(kept["memory"][devices][f"['{stage}']"]) for devices in DEVICES]
+        assert all(more > less for more, less in pairwise(needs)), (stage, needs)
+
+
+def test_two_processes(kept, tmp_path):
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = str(free.getsockname()[1])
+    outs = [tmp_path / f"{rank}.npz" for rank in range(2)]
+    started = [start(out, str(rank), port) for rank, out in enumerate(outs)]
+    try:
+        both = [finished(process, out) for process, out in zip(started, outs, strict=True)]
+    finally:
+        for process in started:
+            process.kill()
+    for one in both:
+        check_equal(kept["reconstruct 13"][1], one["processes"][4])
+
+
+def test_more_devices_than_there_are(tmp_path, capsys):
+    count = jax.device_count() + 1
+    Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save(tmp_path / "0.png")
+    words = ["reconstruct", str(tmp_path), "--model", "demo", "--out", str(tmp_path / "out"), "--devices"]
+    for number, sentence in (
+        (
+            f"{count}",
+            f"--devices is {count} and jax sees {count - 1} here; take at most {count - 1}, or split the CPU by "
+            f"XLA_FLAGS=--xla_force_host_platform_device_count={count}",
+        ),
+        ("0", "devices is 0; expected a whole number of at least 1"),
+        ("2 --window 4", "--devices and --window exclude each other"),
+    ):
+        assert cli.main([*words, *number.split()]) == 2
+        assert sentence in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match=f"devices is {count} and jax sees {count - 1} here.*device_count={count}"):
+        frames_mesh(count)
+    with pytest.raises(InputError, match="devices is 0; expected a whole number of at least 1"):
+        frames_mesh(0)
+
+
+def test_a_mesh_without_an_axis_of_frames():
+    config, mesh = tiny_config(image_size=28), jax.make_mesh((1,), ("clips",))
+    with pytest.raises(InputError, match=r"mesh has the axes \('clips',\); expected one named 'frames'"):
+        infer(init_params(0, config), jnp.zeros((1, 2, 28, 28, 3)), config, mesh=mesh)

@@ -1,0 +1,151 @@
+"""The frames of the clips, wherever they are: all here, or in equal shares on the devices of a mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Bool, Int
+
+AXIS = "frames"  # of the mesh
+WHOLE = PartitionSpec()  # on every device
+BY_FRAME = PartitionSpec(None, AXIS)  # arrays [B, S, ...]
+
+_Tree = TypeVar("_Tree")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Where the frames of a batch of clips are; static under jit.
+
+    Without a mesh all frames are here, and every method below is the identity or the plain reduction. With a mesh the
+    methods run inside `on_devices`, where device i holds frames i S to (i + 1) S - 1 and S is its own number of frames.
+
+    Attributes:
+        mesh: devices along an axis named "frames"; None for frames that are all here.
+        count: frames of each clip on all devices together; the frames after them make the shares equal, and do not
+            change them. None: all. Read only with a mesh.
+    """
+
+    mesh: Mesh | None = None
+    count: int | None = None
+
+    @property
+    def devices(self) -> int:
+        """The number of devices along the axis of frames."""
+        return 1 if self.mesh is None else self.mesh.shape[AXIS]
+
+    def on_devices(self, function: Callable[..., _Tree], *specs: Any) -> Callable[..., _Tree]:
+        """Return a function of whole arrays [B, S, ...] that runs `function` on the share of each device.
+
+        `specs` say where the arguments are, WHOLE or BY_FRAME; the outputs are by frame.
+        """
+        if self.mesh is None:
+            return function
+        return jax.shard_map(function, mesh=self.mesh, in_specs=specs, out_specs=BY_FRAME)
+
+    def sharding(self, spec: PartitionSpec) -> NamedSharding | None:
+        """Return where an array with this spec is; None without a mesh."""
+        return None if self.mesh is None else NamedSharding(self.mesh, spec)
+
+    def first(self, S: int) -> int | Int[Array, ""]:
+        """Return the number of the first frame of the S frames here."""
+        return 0 if self.mesh is None else jax.lax.axis_index(AXIS) * S
+
+    def numbers(self, S: int) -> Int[np.ndarray, " S"] | Int[Array, " S"]:
+        """Return the numbers of the S frames here."""
+        return np.arange(S) if self.mesh is None else self.first(S) + jnp.arange(S)
+
+    def total(self, S: int) -> int:
+        """Return the number of frames on all devices, where S are here."""
+        return S * self.devices
+
+    def counted(self, S: int) -> int:
+        """Return the number of frames on all devices, where S are here, without those that make the shares equal."""
+        return self.total(S) if self.mesh is None or self.count is None else self.count
+
+    def are_real(self, frame_count: Int[Array, " B"] | None, B: int, S: int) -> Bool[Array, "B S"] | None:
+        """Return which of the S frames here are real: before `count`, and `frame_count` of their clip; None: all."""
+        if self.counted(S) < self.total(S):
+            counts = jnp.full(B, self.counted(S)) if frame_count is None else jnp.minimum(frame_count, self.counted(S))
+        elif frame_count is None:
+            return None
+        else:
+            counts = frame_count
+        return jnp.asarray(self.numbers(S))[None] < counts[:, None]
+
+    def gather(self, x: Array, axis: int = 1) -> Array:
+        """Return the frames of all devices, along `axis`."""
+        return x if self.mesh is None else jax.lax.all_gather(x, AXIS, axis=axis, tiled=True)
+
+    def share(self, x: Array, S: int, axis: int = 1) -> Array:
+        """Return the S frames here of an array with the frames of all devices along `axis`."""
+        if self.mesh is None:
+            return x
+        return jax.lax.dynamic_slice_in_dim(x, self.first(S), S, axis)
+
+    def rows(self, x: Array, index: Int[Array, " N"]) -> Array:
+        """Return rows of x along its first axis, by their numbers among the rows of all devices."""
+        if self.mesh is None:
+            return x[index]
+        here = index - self.first(len(x))
+        found = x[jnp.clip(here, 0, len(x) - 1)]
+        is_here = ((here >= 0) & (here < len(x))).reshape(-1, *(1,) * (x.ndim - 1))
+        return self.sum(jnp.where(is_here, found, 0))
+
+    def roll(self, x: Array, shift: Int[Array, ""]) -> Array:
+        """Return [B, S, ...] rolled by `shift` frames around the counted frames of each clip."""
+        if self.mesh is None:
+            return jnp.roll(x, shift, axis=1)
+        S = x.shape[1]
+        rolled = jnp.roll(self.gather(x)[:, : self.counted(S)], shift, axis=1)
+        padding = self.total(S) - rolled.shape[1]
+        return self.share(jnp.pad(rolled, ((0, 0), (0, padding), *((0, 0),) * (x.ndim - 2))), S)
+
+    def around(self, x: Array, reach: int, axis: int = 1) -> tuple[Array, int | Int[Array, ""]]:
+        """Return the frames up to `reach` before and after those here, and perhaps more; and the first one's number.
+
+        There are zeros where the number is below 0, or beyond the last frame.
+        """
+        if self.mesh is None:
+            return x, 0
+        S, devices = x.shape[axis], self.devices
+        shares = -(-reach // S)  # of neighbours, on either side
+        if 2 * shares + 1 >= devices:
+            return self.gather(x, axis), 0
+        parts = []
+        for shift in range(-shares, shares + 1):
+            pairs = [(i + shift, i) for i in range(devices) if 0 <= i + shift < devices]
+            parts.append(jax.lax.ppermute(x, AXIS, pairs) if shift else x)
+        return jnp.concatenate(parts, axis), self.first(S) - shares * S
+
+    def of_first(self, x: _Tree) -> _Tree:
+        """Return the arrays of the device with the first frame."""
+        if self.mesh is None:
+            return x
+        return self.sum(jax.tree.map(lambda leaf: jnp.where(jax.lax.axis_index(AXIS) == 0, leaf, 0), x))
+
+    def sum(self, x: _Tree) -> _Tree:
+        """Return the sum over devices."""
+        return x if self.mesh is None else jax.lax.psum(x, AXIS)
+
+    def max(self, x: Array) -> Array:
+        """Return the maximum over devices."""
+        return x if self.mesh is None else jax.lax.pmax(x, AXIS)
+
+    def min(self, x: Array) -> Array:
+        """Return the minimum over devices."""
+        return x if self.mesh is None else jax.lax.pmin(x, AXIS)
+
+    def any(self, x: Bool[Array, ""]) -> Bool[Array, ""]:
+        """Return whether x is true on any device."""
+        return x if self.mesh is None else jax.lax.pmax(x.astype(jnp.int32), AXIS) > 0
+
+    def varying(self, x: _Tree) -> _Tree:
+        """Return arrays that are equal on all devices with the type of arrays that differ, for the start of a loop."""
+        return x if self.mesh is None else jax.tree.map(lambda leaf: jax.lax.pcast(leaf, AXIS, to="varying"), x)
