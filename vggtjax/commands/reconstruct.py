@@ -127,7 +127,7 @@ def reconstruct(
     """
     if not source:
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
-    if devices > 1 and more.windows.window is not None:
+    if devices > 1 and more.windows.window:
         raise InputError("--devices and --window exclude each other: a window is run on one device")
     frames = source[0] if len(source) == 1 else list(source)
     report = Report()
@@ -150,12 +150,13 @@ def reconstruct(
         network, fitted = files.load(report, options, [options.method])
         fitter = framing.fitter(size=network.config.image_size, patch=network.config.patch_size)
         reading = Reading(opened, sampling, fitter)
-        if windows.window is None:
+        if devices > 1:  # which share the memory that a clip needs
+            count = None
+        elif windows.window is None:
             needs = {
                 "--tracks": known.tracks,
                 "known cameras or lengths": geometry,
                 "--refine-cameras": options.refine_cameras,
-                "--devices": devices > 1,
             }
             at_once = [name for name, given in needs.items() if given]
             windows, count = _chosen(report, reading, network, out, at_once)
