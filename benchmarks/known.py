@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -87,6 +87,7 @@ def known(
     model: str = "demo",
     clips: int = 64,
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4),
+    rows: tuple[str, ...] = (),
     folder: Path = Path("known-clips"),
     workers: int = 1,
 ) -> None:
@@ -98,6 +99,7 @@ def known(
         model: "demo", or weights as for vggtjax reconstruct.
         clips: number of clips of a seed.
         seeds: of the clips.
+        rows: of the table; all by default. The errors with nothing known always come first.
         folder: keeps clips and predictions; a later run with the same model takes them from there.
         workers: processes, each of which takes a seed at a time.
     """
@@ -105,18 +107,21 @@ def known(
         raise InputError(
             f"clips is {clips}, seeds {seeds} and workers {workers}; expected at least 2 clips, a seed and a worker"
         )
+    if unknown := [name for name in rows if name not in ROWS]:
+        raise InputError(f"rows has {unknown}; expected some of {list(ROWS)}")
+    chosen = [name for name in ROWS if name == NOTHING or name in rows or not rows]
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        found = list(pool.map(partial(_of_seed, model, clips, folder), seeds))
+        found = list(pool.map(partial(_of_seed, model, clips, folder, chosen), seeds))
     Console(width=200).print(_table(found), markup=False, highlight=False, soft_wrap=True)
 
 
-def _of_seed(model: str, clips: int, folder: Path, seed: int) -> dict[str, list[Errors | str]]:
+def _of_seed(model: str, clips: int, folder: Path, rows: Sequence[str], seed: int) -> dict[str, list[Errors | str]]:
     logging.getLogger("vggtjax").setLevel(logging.ERROR)  # the true poses fit this model's predictions poorly
-    found: dict[str, list[Errors | str]] = {name: [] for name in ROWS}
+    found: dict[str, list[Errors | str]] = {name: [] for name in rows}
     made = clips_of_seed(load_model(model), seed, clips, folder)
     for clip in track(made, f"seed {seed}", clips, console=Console(stderr=True)):
-        for name, given in ROWS.items():
-            found[name].append(_measured(clip, given(clip)))
+        for name in rows:
+            found[name].append(_measured(clip, ROWS[name](clip)))
     return found
 
 
@@ -156,7 +161,7 @@ def _table(seeds: list[dict[str, list[Errors | str]]]) -> str:
     predicted to be close to 0 has no bound.
     """
     lines = []
-    for name in ROWS:
+    for name in seeds[0]:
         cells = []
         for column in range(len(HEADINGS)):
             average = np.median if column == len(HEADINGS) - 1 else np.mean
