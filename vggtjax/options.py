@@ -123,8 +123,8 @@ class Options:
     ] = "float32"
     """type of the blocks' matrix products"""
     attention: InWords[Attention] = "exact"
-    """how frames attend to each other: exact; merged, an approximation that merges similar tokens: several times faster
-    for long clips, with other numbers (its errors are in the docs)"""
+    """how frames attend to each other: exact; merged, an approximation that merges similar tokens: faster for
+    long clips, with other numbers (its errors are in the docs)"""
 
     def __post_init__(self) -> None:
         find_method(self.method)
