@@ -2,36 +2,28 @@
 
 import logging
 import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.windows.walk import CONFIG, FRAMES, movers, walk, window_result
-from vggtjax.clips.preprocessing import Fitter
+from tests.windows.walk import CONFIG, FRAMES, SETTINGS, movers, plan_of, tools_of, walk, window_result
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.results.saving import Saving
 from vggtjax.storage.writing import locked_folder
-from vggtjax.windows.join import JoinRule
-from vggtjax.windows.plan import Windows
-from vggtjax.windows.run import LongRun, Tools, run_windows
+from vggtjax.windows.run import run_windows
 from vggtjax.windows.store import FOLDER
 
-FITTER = Fitter(size=CONFIG.width, patch=8)
 NOTHING = np.zeros((FRAMES, CONFIG.height, CONFIG.width), bool)
 
 
-def describe(images):
-    """Return small pictures as features: frames of one place look alike."""
-    return images[:, ::4, ::4].reshape(len(images), -1)
-
-
 def reconstructed(out, run, *, loops=False, masks=True, source=None) -> Reconstruction:
-    windows = Windows(16, 4, no_loops=not loops)
-    plan = LongRun(windows, fitter=FITTER, saving=Saving(only=("cameras", "depth")), rule=JoinRule(masks=masks))
     images = np.asarray(walk().images) if source is None else source
-    return run_windows(images, out, plan, Tools(run, describe), {"seed": 0})
+    return run_windows(images, out, plan_of(loops=loops, masks=masks), tools_of(run), SETTINGS)
 
 
 def path_error(result) -> float:
@@ -75,26 +67,25 @@ def test_windows_without_shared_static_pixels_are_joined_by_their_cameras(tmp_pa
 
 
 def test_a_killed_run_goes_on_and_ends_with_the_same_bytes(tmp_path):
-    class Killed(BaseException):
-        pass
-
     calls: list[str] = []
 
-    def run(clip, stop=None):
-        if len(calls) == stop:
-            raise Killed
+    def run(clip):
         calls.append(clip.frame_names[0])
         return window_result(clip, 0, movers(), 0.03)
 
     reconstructed(tmp_path / "whole", run, loops=True)
     every, calls = calls, []
     assert len(every) > 5  # five windows, and those of loops
-    for stop in (2, 5):  # among the windows, at the first loop
-        with pytest.raises(Killed):
-            reconstructed(tmp_path / "killed", lambda clip, stop=stop: run(clip, stop), loops=True)
+    np.savez(tmp_path / "walk.npz", **walk()._asdict())
+    for stage, done in (("windows", 2), ("write", 30)):  # between two windows; while files of frames are written
+        words = [sys.executable, "-m", "tests.windows.killed", tmp_path / "killed", tmp_path / "walk.npz", stage]
+        killed = subprocess.run([*map(str, words), str(done)], cwd=Path(__file__).parents[2], check=False)
+        assert killed.returncode == -signal.SIGKILL
         assert not (tmp_path / "killed" / "reconstruction.npz").exists()
+        stored = list((tmp_path / "killed").rglob("[0-9]*.npz"))
+        assert len(stored) == (2 if stage == "windows" else 5)
     reconstructed(tmp_path / "killed", run, loops=True)
-    assert calls == every  # nothing is computed twice
+    assert calls == []  # nothing is computed twice
     files = sorted(path.relative_to(tmp_path / "whole") for path in (tmp_path / "whole").rglob("*") if path.is_file())
     there = sorted(path.relative_to(tmp_path / "killed") for path in (tmp_path / "killed").rglob("*") if path.is_file())
     assert there == files  # and the folder of the windows is gone

@@ -8,12 +8,18 @@ from scipy.spatial.transform import Rotation
 
 from tests.generated import QUICK, textures
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.truth import Truth
 from vggtjax.geometry.similarity import Similarity, align
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.saving import Saving
 from vggtjax.scenes import SceneConfig, closed_walk, render, sample_scene
+from vggtjax.windows.join import JoinRule
+from vggtjax.windows.plan import Windows
+from vggtjax.windows.run import LongRun, Tools
 
 FRAMES = 60
+SETTINGS = {"seed": 0}  # that decide the windows
 CONFIG = SceneConfig(height=32, width=48, frames=FRAMES, dynamic=1.0, static_camera=0.0, noise=0.0)
 
 
@@ -66,3 +72,14 @@ def window_result(clip: Clip, seed: int, moving: np.ndarray, off: float = 0.0) -
         source_offset=clip.source_offset,
         valid_box=clip.valid_box,
     )
+
+
+def plan_of(*, loops: bool = False, masks: bool = True) -> LongRun:
+    """Return how the walk is cut and written."""
+    windows, fitter = Windows(16, 4, no_loops=not loops), Fitter(size=CONFIG.width, patch=8)
+    return LongRun(windows, fitter=fitter, saving=Saving(only=("cameras", "depth")), rule=JoinRule(masks=masks))
+
+
+def tools_of(run) -> Tools:
+    """Return tools that run a window as given, and take small pictures for features: frames of one place look alike."""
+    return Tools(run, lambda images: images[:, ::4, ::4].reshape(len(images), -1))
