@@ -17,6 +17,7 @@ from vggtjax.pretrained.embedded import demo_model
         (vggt_1b(), 32, (294, 518), 1_382_190_560),
         (vggt_1b(), 8, (392, 518), 658_206_752),
         (vggt_1b(), 8, (518, 518), 869_748_832),
+        (vggt_1b(), 32, (518, 518), 2_610_586_656),
     ],
 )
 def test_the_passes_are_predicted_within_a_third_of_the_counts_of_xla(config, frames, size, counted):

@@ -53,7 +53,10 @@ def test_movers_spoil_the_path_unless_the_masks_leave_them_out(tmp_path, share, 
     def run(clip):
         return window_result(clip, 0, moving, off)
 
-    assert path_error(reconstructed(tmp_path / "masks", run)) < 1e-5
+    masked = reconstructed(tmp_path / "masks", run)
+    assert path_error(masked) < 1e-5
+    assert np.array_equal(masked.dynamic_mask, moving)
+    assert np.array_equal(np.unique(masked.instances), [0, 1])  # one object, with one number in all windows
     assert path_error(reconstructed(tmp_path / "none", run, masks=False)) > worse
 
 

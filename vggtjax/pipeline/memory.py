@@ -17,7 +17,7 @@ from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
 from vggtjax.pipeline.free_memory import host_bytes
 
 _FLOAT = 4  # bytes
-_PROCESS, _PROCESS_OF_WEIGHTS = 0.4e9, 0.08  # Python, libraries, programs; freed memory that is kept grows with weights
+_PROCESS, _PROCESS_OF_WEIGHTS = 0.5e9, 0.08  # Python, libraries, programs; freed memory that is kept grows with weights
 _ROWS = 12.5  # copies of a frame's tokens, in and between the blocks
 _LOGITS = 4  # copies of the attention of short frames, whose heads are computed at once
 _MAPS = 0.5  # copies of the dense head's maps at full resolution
