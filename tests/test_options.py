@@ -49,9 +49,12 @@ def test_keywords_are_the_fields():
 def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     """A new option is one of them unless it is named there."""
     other = {"gram": "dot", "suppress": "drop", "mask_pairs": 2, "smooth_frames": 3, "compute_dtype": "bfloat16"}
+    other |= {"attention": "merged"}  # absent where it is exact
     fields = {field.name for field in dataclasses.fields(Options)}
     key = Options().passes_settings
-    assert set(key) == fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters", "threshold"}
+    named = fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters", "threshold"}
+    assert set(key) == named - {"attention"}
+    assert set(Options(attention="merged").passes_settings) == named
     assert all(Options(**{name: value}).passes_settings != key for name, value in other.items())
     assert Options(align_scale=True, refine_mask=True, refine_cameras=True).passes_settings == key
     same = {name for name in METHODS if Options(name).passes_settings == key}  # pyright: ignore[reportArgumentType]
