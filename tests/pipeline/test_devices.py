@@ -75,7 +75,7 @@ def check_equal(expected: dict[str, np.ndarray], found: dict[str, np.ndarray]) -
             assert np.abs(other - array).max() <= CLOSE * np.ptp(array), name
 
 
-@pytest.mark.parametrize("what", ["infer 16", "gradient 16", "reconstruct 13", "vggt4d 13"])
+@pytest.mark.parametrize("what", ["infer 16", "gradient 16", "reconstruct 13", "tracks 13"])
 def test_several_devices_give_the_numbers_of_one(kept, what):
     assert len(kept[what]) > 1
     for devices in set(kept[what]) - {1}:
