@@ -18,7 +18,6 @@ os.environ["XLA_FLAGS"] = " ".join(
 )
 
 import jax  # noqa: E402
-import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 if rank is not None:
@@ -27,12 +26,9 @@ if rank is not None:
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 from tests.tiny import tiny_config  # noqa: E402
-from vggtjax import Model, Queries, compile_ahead, forward, infer, load_clip, reconstruct  # noqa: E402
+from vggtjax import Model, compile_ahead, load_clip, reconstruct  # noqa: E402
 from vggtjax.config import MotionConfig  # noqa: E402
-from vggtjax.network import gathered_attention  # noqa: E402
-from vggtjax.network.frames import BY_FRAME, WHOLE, Frames  # noqa: E402
 from vggtjax.network.model import init_params  # noqa: E402
-from vggtjax.pipeline.devices import frames_mesh  # noqa: E402
 
 SIDE = 42
 arrays: dict[str, np.ndarray] = {}
@@ -68,21 +64,6 @@ def keep_result(what: str, devices: int, result) -> None:
     keep(what, devices, {name: getattr(result, name) for name in names})
 
 
-def gradient(model: Model, devices: int):
-    """Return the gradient, by the parameters, of a loss of all that a pass predicts of 16 frames."""
-    frames = Frames(frames_mesh(devices), 16)
-
-    def predicted(params, images):
-        made = forward(params, images, model.config, frames=frames)
-        return made.pose_encoding, made.depth, made.depth_confidence
-
-    def loss(params):
-        outputs = frames.on_devices(predicted, WHOLE, BY_FRAME)(params, jnp.asarray(images(16))[None])
-        return sum(jnp.mean(jnp.sin(3 * output)) for output in outputs)
-
-    return jax.jit(jax.grad(loss))(model.params)
-
-
 def main() -> None:
     model = make_model()
     clip = load_clip(images(13), size=SIDE)
@@ -97,14 +78,6 @@ def main() -> None:
             counts = {kind: np.array(count) for kind, count in need.collectives.items()}
             keep(f"collectives of {stage}", devices, counts)
         keep_result("reconstruct 13", devices, reconstruct(model, clip, devices=devices, align_scale=True))
-    gathered_attention.GATHERED_AT_ONCE = 1  # one head at a time
-    points = Queries(np.array([[4, 5], [14, 13], [20.5, 9]], np.float32), np.array([0, 0, 5]))
-    for devices in (1, 4):
-        keep("gradient 16", devices, gradient(model, devices))
-        other = {"mesh": frames_mesh(devices), "method": "vggt4d", "smooth_frames": 3}
-        keep("infer 16", devices, infer(model.params, jnp.asarray(images(16))[None], model.config, **other))
-        tracked = reconstruct(model, clip, method="vggt", tracks=points, devices=devices)
-        keep_result("tracks 13", devices, tracked)
 
 
 main()

@@ -129,6 +129,8 @@ def reconstruct(
         raise InputError("no input; name a folder of images, a pattern, images, or a video")
     if devices > 1 and more.windows.window:
         raise InputError("--devices and --window exclude each other: a window is run on one device")
+    if devices > 1 and known.tracks is not None:
+        raise InputError("--devices and --tracks exclude each other: points are followed on one device")
     frames = source[0] if len(source) == 1 else list(source)
     report = Report()
     with report.running():

@@ -138,6 +138,8 @@ def reconstruct(
     options = options.changed(**changes).resolved()
     on_stage = on_stage or no_stage
     mesh = frames_mesh(devices)
+    if mesh is not None and tracks is not None:
+        raise InputError(f"devices is {devices} and points are to be tracked, which takes one device; leave one out")
     check_fuses(fusion, options.method)
     if masks is not None:
         options.check_given_masks()
