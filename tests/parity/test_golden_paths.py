@@ -10,7 +10,7 @@ import pytest
 from tests.parity.test_golden_forward import Case, assert_close
 from vggtjax import forward
 from vggtjax.config import Suppress
-from vggtjax.network import attention, pieces, suppression
+from vggtjax.network import attention, gathered_attention, pieces
 
 BFLOAT16 = {"pose_enc": 0.06, "depth": 0.25, "depth_conf": 0.15}  # of each array's deviation; measured: half of it
 
@@ -28,7 +28,7 @@ def case(golden, seeded_params, config):
 
 @pytest.fixture(params=IMPLEMENTATIONS)
 def implementation(request, monkeypatch):
-    monkeypatch.setattr(suppression, "attention", IMPLEMENTATIONS[request.param])
+    monkeypatch.setattr(gathered_attention, "attention", IMPLEMENTATIONS[request.param])
     monkeypatch.setattr(attention, "QUERIES_AT_ONCE", 60)
     monkeypatch.setattr(attention, "LOGITS_AT_ONCE", 0)
     return request.param

@@ -1,7 +1,7 @@
 """What tests/pipeline/test_devices.py runs in a process with several devices: python devices_worker.py OUT [RANK PORT].
 
 Everything is computed on one device and on several, and written into OUT.npz under "what/devices/field". With a rank,
-this is one of two processes with half of the devices each.
+this is one of two processes with half of the devices each. The variable COUNTS has the numbers of devices.
 """
 
 import os
@@ -71,7 +71,7 @@ def main() -> None:
         result = reconstruct(model, clip, devices=jax.device_count(), align_scale=True)
         keep_result("processes", jax.device_count(), result)
         return
-    for devices in (1, 2, 4, 8):
+    for devices in map(int, os.environ.get("COUNTS", "1 2 4 8").split()):
         needs = compile_ahead(model, 13, SIDE, SIDE, devices=devices, align_scale=True)
         keep("memory", devices, {stage: np.array(need.temporary) for stage, need in needs.items()})
         for stage, need in needs.items():
