@@ -82,8 +82,8 @@ def _finite(name: str, tensor: np.ndarray) -> np.ndarray:
 def convert_state_dict(state_dict: Mapping[str, np.ndarray], config: VGGTConfig) -> dict[str, Any]:
     """Return the parameter tree (nested dicts of numpy arrays) of a PyTorch state dict; types are kept.
 
-    Raises CheckpointError, which lists every unknown, missing, duplicate and mis-shaped key, and types other than
-    float; or names the other network of the state dict.
+    Raises CheckpointError, which lists unknown, missing, duplicate and mis-shaped keys, and types other than float;
+    or names the other network of the state dict.
     """
     refuse_strangers("the state dict", state_dict)
     tensors = {name: np.asarray(value) for name, value in state_dict.items()}
@@ -113,8 +113,8 @@ def convert(
         progress: called with the number of steps done and the total: tensors, and hashed blocks of the source.
 
     Raises:
-        CheckpointError: the source cannot be read, does not fit the configuration (the message lists all problems), or
-            belongs to another network.
+        CheckpointError: the source cannot be read, does not fit the configuration (the message counts the problems and
+            lists the first ones), or belongs to another network.
         InputError: an unknown head, or the destination is the source.
         OutputError: the destination cannot be written.
         MissingExtraError: the source needs torch or huggingface_hub, which is not installed.
@@ -173,7 +173,7 @@ def plan_conversion(
     """Match every tensor with the rule table; return flat target name -> its sources.
 
     Only shapes and types of the tensors are read. Raises CheckpointError, which lists the `problems` of the reader and
-    every unknown, missing, duplicate and mis-shaped key.
+    unknown, missing, duplicate and mis-shaped keys, as many as a message has room for.
     """
     shapes = flat_shapes(config)
     problems = list(problems)

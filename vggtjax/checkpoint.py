@@ -121,6 +121,11 @@ def is_checkpoint(path: str | Path) -> bool:
     return is_tensor_file(path) and read_tensors(path).metadata.get("format") == FORMAT
 
 
+def checkpoint_config(path: str | Path) -> VGGTConfig:
+    """Return the configuration of a checkpoint of this library without its parameters; raises CheckpointError."""
+    return _read_metadata(Path(path), read_tensors(path).metadata)[0]
+
+
 def read_model(path: str | Path, *, dtype: LoadedDType | None = None, **fields: Any) -> Model:
     """Read a checkpoint of this library.
 
@@ -130,8 +135,8 @@ def read_model(path: str | Path, *, dtype: LoadedDType | None = None, **fields: 
             leaves the others as they are in the file: an approximation.
         fields: fields of `Model` in place of those in the file: name, note, untrained_heads.
 
-    Raises CheckpointError, which lists all problems, unless the file is a whole checkpoint of this library that fits
-    its own configuration.
+    Raises CheckpointError, which counts the problems and lists the first ones, unless the file is a whole checkpoint of
+    this library that fits its own configuration.
     """
     path = Path(path)
     facts = _file_facts(path)
@@ -170,8 +175,8 @@ def save_model(path: str | Path, params: Params, config: VGGTConfig, **labels: A
     """Write parameters, nested dicts of float32 or bfloat16 arrays, as a checkpoint of this library; return its path.
 
     An existing file is replaced. `labels` are `name`, `note` and `untrained_heads` of `write_checkpoint`. Raises
-    CheckpointError, which lists all problems, if the parameters do not fit the configuration, and OutputError if the
-    file cannot be written.
+    CheckpointError, which counts the problems and lists the first ones, if the parameters do not fit the configuration,
+    and OutputError if the file cannot be written.
     """
     flat: dict[str, Any] = flatten_dict(params, sep=".")
     if any(isinstance(leaf, Quantised) for leaf in flat.values()):
@@ -226,7 +231,7 @@ def numpy_dtype(dtype: DType) -> np.dtype:
 
 
 def check_parameters(subject: str, tensors: Mapping[str, Any], config: VGGTConfig) -> None:
-    """Raise CheckpointError with all problems of flat parameters (names, shapes, types) for a configuration."""
+    """Raise CheckpointError with the problems of flat parameters (names, shapes, types) for a configuration."""
     shapes = flat_shapes(config)
     problems = [f"missing parameter {name}" for name in shapes if name not in tensors]
     for name, tensor in tensors.items():

@@ -1,15 +1,29 @@
 """Exceptions of the public boundary: one clear sentence each; the command line turns them into exit code 2."""
 
 import operator
+import os
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 
-_MOST_PROBLEMS = 20  # in full, in one message
+MOST_LETTERS = 480  # of a message
+_LEAST_PROBLEMS = 200  # letters of a message that are left to the problems which it lists
 
 
 class VggtjaxError(Exception):
-    """Base of all exceptions that this library raises on purpose."""
+    """Base of all exceptions that this library raises on purpose.
+
+    As text it is one printable line of at most MOST_LETTERS letters, whatever a stranger's file put into it: the middle
+    of a longer message is left out, so that the advice at its end stays.
+    """
+
+    def __str__(self) -> str:
+        text = printable(super().__str__())
+        if len(text) <= MOST_LETTERS:
+            return text
+        end = MOST_LETTERS // 3
+        return f"{text[: MOST_LETTERS - end - 5]} ... {text[-end:]}"
 
 
 class InputError(VggtjaxError, ValueError):
@@ -34,6 +48,10 @@ class OutputError(VggtjaxError, OSError):
 
 class DeviceMemoryError(VggtjaxError, MemoryError):
     """A clip that does not fit in the memory of the device."""
+
+
+class ClusterError(VggtjaxError, RuntimeError):
+    """A cluster that is not there, is too small, has died, or runs other code."""
 
 
 class MissingExtraError(VggtjaxError, ImportError):
@@ -68,11 +86,26 @@ def check_choice(name: str, value: object, choices: Sequence[object]) -> None:
 
 @contextmanager
 def reading(path: object, error: type[InputError] = InputError) -> Iterator[None]:
-    """Turn an OSError of the body into `error`, which names `path` and the reason."""
+    """Turn an OSError of the body into `error`, which names `path` and the reason.
+
+    A pipe or a device is refused before the body: reading one may never end.
+    """
+    if isinstance(path, str | os.PathLike):
+        check_regular(path, error)
     try:
         yield
     except OSError as problem:
         raise error(f"cannot read {path}: {problem.strerror or problem}") from problem
+
+
+def check_regular(path: str | os.PathLike[str], error: type[InputError] = InputError) -> None:
+    """Raise `error` where there is something at `path` that is neither a file nor a folder, such as a named pipe."""
+    try:
+        mode = os.stat(path).st_mode  # noqa: PTH116 - words that are no path are not looked into
+    except (OSError, ValueError):
+        return  # the reader says what is wrong
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise error(f"{path} is a pipe, a socket or a device; expected a file: copy its content into one")
 
 
 @contextmanager
@@ -91,12 +124,27 @@ def device_memory_errors(advice: str, frames: int, height: int, width: int) -> I
 def one_line(text: str, most: int = 300) -> str:
     """Return text for one line of a terminal, a table or a page: printable, at most `most` letters."""
     line = " ".join(text[: 4 * most].split())
-    line = line if len(line) <= most else f"{line[: most - 3]}..."
-    return "".join(letter if letter.isprintable() else "?" for letter in line)
+    return printable(line if len(line) <= most else f"{line[: most - 3]}...")
+
+
+def printable(text: str) -> str:
+    """Return text on one line: a space for each blank letter such as a line's end, ? for others that do not print."""
+    return text if text.isprintable() else "".join(map(_printable_letter, text))
+
+
+def _printable_letter(letter: str) -> str:
+    return letter if letter.isprintable() else " " if letter.isspace() else "?"
 
 
 def problems_sentence(subject: str, problems: Sequence[str]) -> str:
-    """Return one sentence with the number of problems and the text of the first ones."""
-    shown = "; ".join(map(one_line, problems[:_MOST_PROBLEMS]))
-    more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
-    return f"{subject}: {len(problems)} {'problem' if len(problems) == 1 else 'problems'}: {shown}{more}"
+    """Return one sentence with the number of problems, and as many of them as a message has room for."""
+    room = max(_LEAST_PROBLEMS, MOST_LETTERS - len(subject) - len(": 1000 problems: ; and 1000 more"))
+    shown: list[str] = []
+    for problem in problems:
+        shown.append(one_line(problem, _LEAST_PROBLEMS))
+        room -= len(shown[-1]) + len("; ")
+        if room < 0 and len(shown) > 1:
+            shown.pop()
+            break
+    more = f"; and {len(problems) - len(shown)} more" if len(problems) > len(shown) else ""
+    return f"{subject}: {len(problems)} {'problem' if len(problems) == 1 else 'problems'}: {'; '.join(shown)}{more}"

@@ -1,6 +1,8 @@
 """Lists of clips: names, paths, and a sentence with the line for what is wrong."""
 
+import pyarrow as pa
 import pytest
+from pyarrow import parquet
 
 from vggtjax.clips.manifest import read_manifest
 from vggtjax.clips.sources import clips_by_name
@@ -18,10 +20,14 @@ def test_both_kinds_name_the_same_clips(tmp_path):
     table = written(tmp_path, "clips.csv", "name,source,split\nfirst,a/b.mp4,train\n,walk.v2,test\n,/there/yard.mp4,\n")
     lines = ['{"source": "a/b.mp4", "name": "first"}', "", '{"source": "walk.v2", "split": 3}']
     lines += ['{"source": "/there/yard.mp4"}', ""]
-    expected = {"first": tmp_path / "a/b.mp4", "walk.v2": tmp_path / "walk.v2", "yard": tmp_path / "/there/yard.mp4"}
+    paths = {"first": tmp_path / "a/b.mp4", "walk.v2": tmp_path / "walk.v2", "yard": tmp_path / "/there/yard.mp4"}
+    expected = {name: str(path) for name, path in paths.items()}
     assert read_manifest(table) == expected
     assert read_manifest(written(tmp_path, "clips.jsonl", "\n".join(lines))) == expected
-    assert clips_by_name([str(table)]) == {name: str(path) for name, path in expected.items()}
+    columns = {"source": ["a/b.mp4", "walk.v2", "/there/yard.mp4"], "name": ["first", None, None], "split": [1, 2, 3]}
+    parquet.write_table(pa.table(columns), tmp_path / "clips.parquet")
+    assert read_manifest(tmp_path / "clips.parquet") == expected
+    assert clips_by_name([str(table)]) == expected
     with pytest.raises(ClipError, match="two clips are named first"):
         clips_by_name([str(table), str(tmp_path / "clips.jsonl")])
 
@@ -40,6 +46,7 @@ def test_both_kinds_name_the_same_clips(tmp_path):
         ("a.jsonl", '["x.mp4"]\n', "line 1 .*expected"),
         ("a.jsonl", "{\n", "line 1 is not JSON"),
         ("a.jsonl", '{"source": "x\\u0000.mp4"}\n', "line 1 has the source"),
+        ("a.parquet", "PAR1 and nothing", "a.parquet is no parquet file: "),
     ],
 )
 def test_lists_that_are_none_are_one_sentence(tmp_path, name, text, sentence):
@@ -52,3 +59,35 @@ def test_bytes_that_are_no_text(tmp_path):
     path.write_bytes(b"source\n\xff.mp4\n")
     with pytest.raises(ClipError, match="is no CSV file"):
         read_manifest(path)
+
+
+@pytest.mark.parametrize(
+    ("columns", "sentence"),
+    [
+        ({"source": [1, 2]}, "has no column source of text"),
+        ({"path": ["a.mp4"]}, "has no column source of text"),
+        ({"source": ["a.mp4", None]}, "row 2 has the source ''"),
+        ({"source": ["a.mp4", "b/a.mp4"]}, "rows 1 and 2 both name a clip 'a'"),
+    ],
+)
+def test_parquet_that_is_no_list_of_clips(tmp_path, columns, sentence):
+    parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
+    with pytest.raises(ClipError, match=sentence):
+        read_manifest(tmp_path / "a.parquet")
+
+
+def test_a_list_may_name_urls_and_one_from_a_url_names_nothing_of_this_machine(tmp_path):
+    lines = "source,name\ns3://b/walks/yard.mp4,\nhttps://u:p@h/a%20b.mp4?key=secret,\nfile:///there/my%20cat.mp4,cat\n"
+    assert read_manifest(written(tmp_path, "a.csv", lines)) == {
+        "yard": "s3://b/walks/yard.mp4",
+        "a b": "https://u:p@h/a%20b.mp4?key=secret",
+        "cat": "/there/my cat.mp4",
+    }
+    url = "s3://bucket/lists/a.csv"
+    assert read_manifest(written(tmp_path, "b.csv", "source\nday/x.mp4\ngs://c/y.mp4\n"), url) == {
+        "x": "s3://bucket/lists/day/x.mp4",
+        "y": "gs://c/y.mp4",
+    }
+    for source in ("/etc/passwd", "../up.mp4", "a/../../b.mp4", "file:///etc/passwd", "\\\\host\\share"):
+        with pytest.raises(ClipError, match="a list from a URL names URLs, and paths below its own"):
+            read_manifest(written(tmp_path, "c.csv", f"source\n{source}\n"), url)

@@ -130,7 +130,7 @@ def test_given_masks_replace_the_mined_ones(params, config, tmp_path):
     still = reconstruct(model, clip, size=56, masks=np.zeros_like(masks), keep_passes=True)
     assert np.array_equal(still.passes.first.depth, still.passes.second.depth)
     assert np.allclose(still.depth, still.passes.first.depth[0], rtol=1e-5)
-    assert np.array_equal(made.passes.first.depth, still.passes.first.depth)
+    assert np.abs(made.passes.first.depth - still.passes.first.depth).max() < 1e-5  # of another program
     assert not np.allclose(made.camera_from_world, still.camera_from_world, atol=1e-4)
     with pytest.raises(InputError, match="expected bool"):
         reconstruct(model, clip, size=56, masks=masks[:2])

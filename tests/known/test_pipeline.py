@@ -5,16 +5,14 @@ import pytest
 from PIL import Image
 
 from tests.moving_ball import moving_ball
-from tests.tiny import tiny_config
-from vggtjax import KnownGeometry, Reconstruction, init_params, load_clip, reconstruct, reconstruct_many
-from vggtjax.checkpoint import Model
+from tests.tiny import tiny_model
+from vggtjax import KnownGeometry, Reconstruction, load_clip, reconstruct, reconstruct_many
 from vggtjax.errors import ClipError, InputError
 
 
 @pytest.fixture(scope="module")
 def model():
-    config = tiny_config()
-    return Model(config, init_params(0, config), "tiny")
+    return tiny_model()
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,8 @@ import pytest
 pytest.importorskip("pycolmap", reason="needs the extra colmap")
 
 from tests.corner import make_corner, paint
-from tests.tiny import tiny_config
-from vggtjax import KnownGeometry, init_params, load_clip, reconstruct
-from vggtjax.checkpoint import Model
+from tests.tiny import tiny_model
+from vggtjax import KnownGeometry, load_clip, reconstruct
 from vggtjax.errors import InputError
 from vggtjax.options import Options
 from vggtjax.pipeline.several import reconstruct_methods
@@ -17,8 +16,7 @@ from vggtjax.progress import StageSeconds
 
 @pytest.fixture(scope="module")
 def model():
-    config = tiny_config()
-    return Model(config, init_params(0, config), "tiny")
+    return tiny_model()
 
 
 @pytest.mark.filterwarnings("ignore:the field of view")

@@ -228,3 +228,33 @@ def test_damaged_files_are_refused_or_read(whole, cut, position, value):
     except ResultError:
         return
     assert sum(array.nbytes for array in read.values()) < 10_000
+
+
+def test_a_small_archive_of_large_arrays_is_refused(tmp_path, monkeypatch):
+    large = np.zeros((300, 2**20), np.uint8)
+    np.savez_compressed(tmp_path / "bomb.npz", depth=large)
+    assert (tmp_path / "bomb.npz").stat().st_size < 2**20
+    for read in (arrays.read_headers, arrays.read_arrays):
+        with pytest.raises(ResultError, match=r"says that its arrays take 314572928; expected at most 16 times"):
+            read(tmp_path / "bomb.npz")
+    np.savez(tmp_path / "honest.npz", depth=large)
+    assert arrays.read_headers(tmp_path / "honest.npz")["depth"].shape == large.shape
+
+
+def test_archives_are_held_against_the_memory_that_is_free(whole, monkeypatch):
+    monkeypatch.setattr(arrays, "_SPARE", 10)
+    monkeypatch.setattr(arrays, "free_bytes", lambda: 20)
+    with pytest.raises(ResultError, match=r"take \d+ bytes of memory and 20 are free"):
+        arrays.read_arrays(whole)
+    assert arrays.read_arrays(whole, ["missing"]) == {}  # what is not read takes nothing
+    assert "grid" in arrays.read_headers(whole)
+
+
+def test_a_stored_array_cannot_say_that_it_is_longer(tmp_path):
+    store(tmp_path / "a.npz", {"x.npy": npy(np.zeros(100))})
+    content = (tmp_path / "a.npz").read_bytes()
+    size = (100 * 8 + 128).to_bytes(4, "little")
+    at = content.rindex(size)  # in the zip's directory: the uncompressed size stands last
+    (tmp_path / "a.npz").write_bytes(content[:at] + (2**31).to_bytes(4, "little") + content[at + 4 :])
+    with pytest.raises(ResultError, match="made to fill the memory"):
+        arrays.read_headers(tmp_path / "a.npz")

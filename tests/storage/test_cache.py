@@ -5,9 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
-from vggtjax.storage.cache import _show_warning, cache_folder
+from vggtjax.storage.cache import _say_how_to_keep, _show_warning, cache_folder, say_how_to_keep
 
 PROGRAM = """
 import sys
@@ -79,3 +80,11 @@ def test_a_cache_that_cannot_be_used_is_warned_about_once(tmp_path, kind):
     _show_warning(tmp_path, said.append, shown, "another warning")
     assert said == [text, "another warning"]
     assert all(path.exists() for path in kept)
+
+
+def test_a_script_is_told_once_how_to_keep_what_it_compiles(caplog, monkeypatch):
+    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
+    _say_how_to_keep.cache_clear()  # another test may have been told
+    for seconds in (1.0, 30.0, 30.0):
+        say_how_to_keep(seconds)
+    assert [record.message.count("enable_compilation_cache()") for record in caplog.records] == [1]

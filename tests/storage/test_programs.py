@@ -65,8 +65,8 @@ def test_calls_use_compiled_programs(folder):
     (first, second, _), traced = counted()
     shape = jax.ShapeDtypeStruct((2, 3), jnp.float32)
     for program in (first, second):
-        compiled, made = program.compile(Pair(shape), None, power=2, factor=3.0)
-        assert compiled.memory_analysis() is not None
+        compiling, made = program.compile(Pair(shape), None, power=2, factor=3.0)
+        assert compiling.result().memory_analysis() is not None
         assert made[0].one.shape == (2, 3)
         assert np.array_equal(program(Pair(X), None, power=2, factor=3.0)[0].one, 3 * X**2)
     assert traced == [2]

@@ -64,6 +64,7 @@ def test_one_pose_is_a_table_too(tmp_path):
         (b"0 0 0 0 0 0 0 1\n0 0 0 0 0 0 1\n", "is not a table of 8 numbers a line"),
         (b"0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 nan\n", "holds nan; expected finite numbers"),
         (b"0 0 0 zero 0 0 0 1\n", "is not a table of 8 numbers"),
+        (b"0 0 0 " + b"0" * 2**16 + b"\n", "has a line of over 65536 letters; expected numbers"),
         (b"\xff\xfe\x00", "is not a table of 8 numbers"),
         (b"0 0 0 0 0 0 0 2\n", r"has a quaternion of length 2\.000 in pose 0; expected 1"),
     ],

@@ -78,7 +78,7 @@ class Capture:
             return tuple(stems)
         parts = [path.with_suffix("").parts for path in self.pictures]
         shared = 0
-        while len({part[: shared + 1] for part in parts}) == 1:
+        while shared < len(parts[0]) and len({part[: shared + 1] for part in parts}) == 1:
             shared += 1
         names = ["_".join(part[shared:]) for part in parts]
         unique = max(Counter(names).values()) == 1

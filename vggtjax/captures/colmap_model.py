@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
 from vggtjax.captures.cameras import PIXEL_CENTRE, intrinsics_matrix
 from vggtjax.captures.files import read_bytes, read_text
@@ -72,7 +72,7 @@ def read_views(folder: Path, suffix: Suffix = ".bin") -> dict[str, ColmapView]:
             raise InputError(f"{path} has {name!r} of camera {number}; cameras{suffix} has no such camera")
         if not np.isfinite(pose).all() or abs(np.linalg.norm(quaternion) - 1) > 0.01:
             raise InputError(f"{path} has an invalid pose of {name!r}; expected a quaternion of length 1")
-        rotation = Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
+        rotation = scipy.spatial.transform.Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
         views[name] = ColmapView(*cameras[number], np.column_stack([rotation, translation]))
     return views
 

@@ -9,7 +9,7 @@ from jaxtyping import Float32
 
 from vggtjax.captures.files import read_bytes
 from vggtjax.captures.pictures import PNG, opening
-from vggtjax.errors import InputError, check_extra, one_line
+from vggtjax.errors import InputError, check_extra, check_regular, one_line
 from vggtjax.storage.arrays import read_array
 
 SINTEL_TAG = b"PIEH"  # the float 202021.25, little-endian: the first bytes of .dpt and .cam
@@ -63,6 +63,7 @@ def read_exr(path: Path) -> Float32[np.ndarray, "h w"]:
     check_extra("depth in OpenEXR files", "exr", "OpenEXR")
     import OpenEXR
 
+    check_regular(path)
     try:
         header = OpenEXR.File(str(path), header_only=True).header()
         if len(header["channels"]) != 1:  # before they are decoded
@@ -72,8 +73,9 @@ def read_exr(path: Path) -> Float32[np.ndarray, "h w"]:
         width, height = (int(side) for side in highest.astype(np.int64) - lowest + 1)
         if not 0 < width * height <= _MOST_PIXELS or width < 1:
             raise InputError(f"{path} has {width} x {height} pixels; expected at most {_MOST_PIXELS}")
-        channels = OpenEXR.File(str(path), separate_channels=True).channels()
-    except (RuntimeError, KeyError, TypeError) as error:
+        (channel,) = OpenEXR.File(str(path), separate_channels=True).channels().values()
+        return np.asarray(channel.pixels, np.float32).reshape(height, width)
+    except InputError:
+        raise
+    except (RuntimeError, LookupError, TypeError, AttributeError, ValueError) as error:  # ValueError: names, no part
         raise InputError(f"{path} is not an OpenEXR file that can be read: {error}") from None
-    (channel,) = channels.values()
-    return np.asarray(channel.pixels, np.float32)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path, PureWindowsPath
 
 from vggtjax.clips.order import natural_key
-from vggtjax.errors import InputError, reading
+from vggtjax.errors import InputError, one_line, reading
 
 _MOST_BYTES = 2**28  # of a file
 
@@ -20,7 +20,7 @@ def inside(folder: Path, name: str, source: Path) -> Path:
     """Return the path of a name from the file `source`; raises InputError for a path outside `folder`."""
     path = PureWindowsPath(name)  # with slashes, backslashes and drives
     if not path.parts or path.anchor or ".." in path.parts or "\0" in name:
-        raise InputError(f"{source} names the file {name!r}; expected a path inside {folder}")
+        raise InputError(f"{source} names the file {one_line(name, 80)!r}; expected a path inside {folder}")
     return folder.joinpath(*path.parts)
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from vggtjax.clips.images import UNREADABLE, known_formats
-from vggtjax.errors import InputError
+from vggtjax.clips.images import UNREADABLE, check_pixels, known_formats
+from vggtjax.errors import InputError, check_regular
 
 PNG = ("PNG",)
 _ORIENTATION = 0x0112  # EXIF; from 5 on, width and height are swapped
@@ -21,8 +21,10 @@ _BROKEN = (*UNREADABLE, Image.DecompressionBombWarning)
 @contextmanager
 def opening(path: Path, formats: tuple[str, ...]) -> Iterator[Image.Image]:
     """Open a picture without turning it; raises InputError for any other file, also while it is decoded."""
+    check_regular(path)
     try:
         with Image.open(path, formats=formats) as image:
+            check_pixels(image, path, InputError)
             yield image
     except InputError:
         raise

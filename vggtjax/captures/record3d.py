@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float32, Float64
-from scipy.spatial.transform import Rotation
 
 from vggtjax.captures.cameras import PIXEL_CENTRE, checked_intrinsics, from_opengl, intrinsics_matrix
 from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, known
@@ -110,7 +110,7 @@ def _poses(rows: Float64[np.ndarray, "S 7"], source: Path) -> Float64[np.ndarray
     if (wrong := np.flatnonzero(abs(lengths - 1) > _UNIT)).size:
         raise InputError(f"{source} has a quaternion of length {lengths[wrong[0]]:.3f} in pose {wrong[0]}; expected 1")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, :4]).as_matrix()
+    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(rows[:, :4]).as_matrix()
     poses[:, :3, 3] = rows[:, 4:]
     return poses
 

@@ -13,14 +13,30 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from vggtjax.clips.arrays import eight_bit
 from vggtjax.clips.sampling import Frame, Sampling
-from vggtjax.errors import ClipError
+from vggtjax.errors import ClipError, InputError, check_regular
 
 # Formats of still pictures only: for others (EPS) Pillow starts another program.
 FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP", "PPM", "WEBP", "TGA", "JPEG2000", "AVIF", "HEIF")
 
+# A picture of one colour takes a byte for at most about so many pixels (of one bit), and so many are never doubted; a
+# shorter file makes Pillow take memory in vain. Formats that are not in the table shrink one colour to almost nothing.
+_MOST_PIXELS_A_BYTE, _ALWAYS_PIXELS = 10_000, 2**24
+_LITTLE_SHRUNK: dict[str, int] = dict.fromkeys(("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA"), 2**22)
+
 # What Pillow's decoders raise on broken files; its size limit is DecompressionBombError.
 UNREADABLE = (
-    *(OSError, SyntaxError, ValueError, TypeError, IndexError, KeyError, RuntimeError, EOFError, OverflowError),
+    *(
+        OSError,
+        SyntaxError,
+        ValueError,
+        TypeError,
+        IndexError,
+        KeyError,
+        RuntimeError,
+        EOFError,
+        OverflowError,
+        MemoryError,
+    ),
     *(struct.error, Image.DecompressionBombError),
 )
 
@@ -64,10 +80,13 @@ def read_image(path: Path) -> Image.Image:
     The orientation of its EXIF data is applied, transparency is composited over white, 16-bit values are scaled to
     8 bits and floating-point values must lie in [0, 1].
 
-    Raises ClipError for a file that is missing, no image, truncated, corrupt, or above Pillow's limit of pixels.
+    Raises ClipError for a file that is missing, no image, truncated, corrupt, above Pillow's limit of pixels, or too
+    short for the pixels that it says it has.
     """
+    check_regular(path, ClipError)
     try:
         with Image.open(path, formats=known_formats()) as image:
+            check_pixels(image, path)
             return to_rgb(ImageOps.exif_transpose(image), path.name)
     except ClipError:
         raise
@@ -78,6 +97,13 @@ def read_image(path: Path) -> Image.Image:
     except UNREADABLE as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise ClipError(f"cannot read image {path}: {reason}; leave it out or write it anew") from error
+
+
+def check_pixels(image: Image.Image, path: Path, error: type[InputError] = ClipError) -> None:
+    """Raise `error` for an opened picture that says it has more pixels than a file of its size can honestly hold."""
+    pixels, size = image.width * image.height, path.stat().st_size
+    if pixels > max(_LITTLE_SHRUNK.get(image.format or "", _ALWAYS_PIXELS), _MOST_PIXELS_A_BYTE * size):
+        raise error(f"{path} has {size} bytes and says it has {image.width} x {image.height} pixels; get it whole")
 
 
 def to_rgb(image: Image.Image, name: str) -> Image.Image:

@@ -1,17 +1,21 @@
-"""A list of clips in a file: CSV, or JSON values a line. Does not import jax."""
+"""Lists of clips in a file: CSV, JSON values a line, or parquet. Does not import jax."""
 
 from __future__ import annotations
 
-import csv
+from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
-from vggtjax.errors import ClipError, one_line, reading
+from vggtjax.clips.images import is_image_name
+from vggtjax.clips.video import is_video_name
+from vggtjax.errors import ClipError, check_extra, one_line, reading
+from vggtjax.storage.csv_file import read_csv
 from vggtjax.storage.json_values import parse_json
+from vggtjax.storage.remote import is_url, local_path, url_name
 
-SUFFIXES = (".csv", ".jsonl")
-_MOST_BYTES = 2**28  # about two million clips
+MOST_BYTES = 2**28  # of a list: about two million clips
 _MOST_LETTERS = 4096  # of a path
+_MOST_ROWS = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -20,66 +24,117 @@ class _Row:
     name: str | None = None
 
 
-def is_manifest(path: Path) -> bool:
-    """Return whether a path names a file with the suffix of a list of clips."""
-    return path.suffix.lower() in SUFFIXES and path.is_file()
+def is_manifest(name: str) -> bool:
+    """Return whether a name has the suffix of a list of clips."""
+    return PurePath(name).suffix.lower() in _READERS
 
 
-def read_manifest(path: Path) -> dict[str, Path]:
-    """Return the paths of clips by name, in the order of the file.
+def read_manifest(path: Path, url: str | None = None) -> dict[str, str]:
+    """Return the sources of clips, paths or URLs, by name, in the order of the file.
 
-    A CSV file has a column `source`, and `name` if wanted; a .jsonl file has an object with these keys a line. Other
-    columns are not read. Relative paths start at the file's folder; a clip without a name has that of its source.
+    A CSV or parquet file has a column `source`, and `name` if wanted; a .jsonl file has an object with these keys a
+    line. Other columns are not read. Relative paths start at the file's folder, or at that of `url`, where the file was
+    downloaded from; a clip without a name has that of its source.
 
-    Raises ClipError, with the line, for a file that is no such list, two clips of one name, and names that are not
-    plain ones.
+    Raises ClipError, with the line, for a file that is no such list, two clips of one name, names that are not plain
+    ones, and, in a list from a URL, paths of this machine.
     """
-    rows = _csv_rows(path) if path.suffix.lower() == ".csv" else _json_rows(path)
-    found: dict[str, tuple[int, Path]] = {}
-    for line, row in rows:
+    unit, read = ("row" if path.suffix.lower() == ".parquet" else "line"), _READERS[path.suffix.lower()]
+    found: dict[str, tuple[int, str]] = {}
+    for number, row in read(path):
+        place = f"{path} {unit} {number}"
         if not row.source or len(row.source) > _MOST_LETTERS or "\0" in row.source:
-            raise ClipError(f"{path} line {line} has the source {one_line(row.source, 60)!r}; expected a path")
-        source = path.parent / row.source
-        name = row.name or (source.name if source.is_dir() else source.stem)
+            raise ClipError(f"{place} has the source {one_line(row.source, 60)!r}; expected a path or a URL")
+        source = _source(row.source, path, url, place)
+        name = row.name or source_name(source)
         if name in ("", ".", "..") or name.startswith(".") or Path(name).name != name or not name.isprintable():
-            raise ClipError(
-                f"{path} line {line} names a clip {one_line(name, 60)!r}; expected a plain name: it becomes a folder"
-            )
+            raise ClipError(f"{place} names a clip {one_line(name, 60)!r}; expected a plain name: it becomes a folder")
         if name in found:
-            raise ClipError(f"{path} lines {found[name][0]} and {line} both name a clip {name!r}; rename one of them")
-        found[name] = (line, source)
+            raise ClipError(
+                f"{path} {unit}s {found[name][0]} and {number} both name a clip {name!r}; rename one of them"
+            )
+        found[name] = (number, source)
     if not found:
         raise ClipError(f"{path} lists no clips; expected a line for each, with its source")
     return {name: source for name, (_, source) in found.items()}
 
 
-def _csv_rows(path: Path) -> list[tuple[int, _Row]]:
-    try:
-        with reading(path, ClipError), path.open(encoding="utf-8-sig", newline="") as file:
-            _check_size(path)
-            reader = csv.DictReader(file)
-            if "source" not in (reader.fieldnames or ()):
-                raise ClipError(f"{path} has no column source; expected columns source and, if wanted, name")
-            return [(reader.line_num, _Row(row["source"] or "", row.get("name") or None)) for row in reader]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ClipError(f"{path} is no CSV file: {error}") from None
+def source_name(source: str) -> str:
+    """Return how a clip is called after its source: as the folder, or the file without the suffix."""
+    if is_url(source):
+        name = Path(url_name(source, ClipError))
+        return name.stem if is_video_name(name) or is_image_name(name) or name.suffix == ".r3d" else name.name
+    path = Path(source)
+    return path.name if path.is_dir() else path.stem
 
 
-def _json_rows(path: Path) -> list[tuple[int, _Row]]:
+def _source(source: str, path: Path, url: str | None, place: str) -> str:
+    """Return the path or URL that a row names."""
+    if is_url(source):
+        return source
+    if url is None:
+        return str(path.parent / local_path(source))
+    if "://" in source or source.startswith(("/", "\\")) or ".." in source.replace("\\", "/").split("/"):
+        raise ClipError(
+            f"{place} has the source {one_line(source, 60)!r}; a list from a URL names URLs, and paths below its own"
+        )
+    return f"{url.rpartition('/')[0]}/{source}"
+
+
+def _csv_rows(path: Path) -> Iterator[tuple[int, _Row]]:
+    table = read_csv(path, most_bytes=MOST_BYTES, error=ClipError)
+    if "source" not in table.columns:
+        raise ClipError(f"{path} has no column source; expected columns source and, if wanted, name")
+    for line, row in table.rows:
+        yield line, _Row(row["source"] or "", row.get("name") or None)
+
+
+def _json_rows(path: Path) -> Iterator[tuple[int, _Row]]:
     with reading(path, ClipError):
         _check_size(path)
         lines = path.read_bytes().splitlines()
-    found = []
     for number, line in enumerate(lines, start=1):
         if line.strip():
-            values = parse_json(line, dict[str, object], f"{path} line {number}", error=ClipError)
+            place = f"{path} line {number}"
+            values = parse_json(line, dict[str, object], place, error=ClipError)
             known = {key: value for key, value in values.items() if key in ("source", "name")}
             if not isinstance(known.get("source"), str) or not isinstance(known.get("name"), str | None):
-                raise ClipError(f"{path} line {number} has no source; expected source and, if wanted, name, as text")
-            found.append((number, _Row(**known)))  # type: ignore[arg-type]
-    return found
+                raise ClipError(f"{place} has no source; expected source and, if wanted, name, as text")
+            yield number, _Row(**known)  # type: ignore[arg-type]
+
+
+def _parquet_rows(path: Path) -> Iterator[tuple[int, _Row]]:
+    check_extra(f"{path}, a list of clips in parquet,", "cluster", "pyarrow")
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    with reading(path, ClipError):
+        _check_size(path)
+        try:
+            with parquet.ParquetFile(path) as file:
+                types = {field.name: field.type for field in file.schema_arrow}
+                names = [name for name in ("source", "name") if name in types]
+                is_text = all(
+                    pa.types.is_string(types[name]) or pa.types.is_large_string(types[name]) for name in names
+                )
+                if "source" not in names or not is_text:
+                    raise ClipError(
+                        f"{path} has no column source of text; expected source and, if wanted, name, as text"
+                    )
+                if file.metadata.num_rows > _MOST_ROWS:
+                    raise ClipError(f"{path} has {file.metadata.num_rows} rows; expected at most {_MOST_ROWS}")
+                number = 0
+                for rows in file.iter_batches(columns=names):
+                    for values in rows.to_pylist():
+                        number += 1
+                        yield number, _Row(values["source"] or "", values.get("name"))
+        except (pa.ArrowException, UnicodeDecodeError) as problem:
+            raise ClipError(f"{path} is no parquet file: {one_line(str(problem))}") from problem
 
 
 def _check_size(path: Path) -> None:
-    if (size := path.stat().st_size) > _MOST_BYTES:
-        raise ClipError(f"{path} has {size} bytes; expected at most {_MOST_BYTES}: cut it into several lists")
+    if (size := path.stat().st_size) > MOST_BYTES:
+        raise ClipError(f"{path} is {size} bytes; expected at most {MOST_BYTES}: cut it into several lists")
+
+
+_READERS = {".csv": _csv_rows, ".jsonl": _json_rows, ".parquet": _parquet_rows}

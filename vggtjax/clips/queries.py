@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import csv
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32, Float64, Int64
 
-from vggtjax.errors import InputError, reading
+from vggtjax.errors import InputError, one_line
+from vggtjax.storage.csv_file import read_csv
 
 if TYPE_CHECKING:
     from vggtjax.clips.clip import Clip
@@ -97,23 +99,36 @@ def _grid_side(text: str) -> int:
     return int(number)
 
 
+def check_queries(text: str, clip: Clip, frames: int) -> None:
+    """Raise InputError for points that `parse_queries` refuses, where `clip` is the beginning of one of so many frames.
+
+    Places in later frames are not checked.
+    """
+    if not text.startswith("grid:"):
+        deque(_places(Path(text), clip, frames), maxlen=0)
+
+
 def _read(path: Path, clip: Clip) -> Queries:
-    try:
-        with reading(path), path.open(encoding="utf-8-sig", newline="") as file:
-            if path.stat().st_size > _MOST_FILE_BYTES:
-                raise InputError(f"{path} is {path.stat().st_size} bytes; expected a CSV file with x, y and frame")
-            rows = list(csv.DictReader(file))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} is no CSV file: {error}") from None
-    points, frames = [], []
-    for line, row in enumerate(rows, start=2):
+    points, frames = zip(*_places(path, clip, len(clip)), strict=True)
+    return Queries(np.array(points, np.float32), np.array(frames, np.int64))
+
+
+def _places(path: Path, clip: Clip, frames: int) -> Iterator[tuple[Float64[np.ndarray, " 2"], int]]:
+    """Yield the points of a file in the frames of `clip`, and their frames; others are before frame `frames`."""
+    rows = read_csv(path, most_bytes=_MOST_FILE_BYTES).rows
+    if not rows:
+        raise InputError(f"{path} holds no points; expected a line x,y,frame and then one line per point")
+    for line, row in rows:
+        shown = one_line(str(row))
         try:
             frame = int(row.get("frame") or 0)
             place = np.array([float(row["x"]), float(row["y"])])
         except (KeyError, TypeError, ValueError):
-            raise InputError(f"{path} line {line} is {row}; expected columns x, y and, if wanted, frame") from None
-        if not 0 <= frame < len(clip) or not np.isfinite(place).all():
-            raise InputError(f"{path} line {line} is {row}; expected numbers, and a frame from 0 to {len(clip) - 1}")
+            raise InputError(f"{path} line {line} is {shown}; expected columns x, y and, if wanted, frame") from None
+        if not 0 <= frame < frames or not np.isfinite(place).all():
+            raise InputError(f"{path} line {line} is {shown}; expected numbers, and a frame from 0 to {frames - 1}")
+        if frame >= len(clip):
+            continue
         point = clip.from_source(frame, place)
         left, top, right, bottom = clip.valid_box[frame]
         if not (left <= point[0] <= right and top <= point[1] <= bottom):
@@ -123,8 +138,4 @@ def _read(path: Path, clip: Clip) -> Queries:
                 f"a picture of {width} x {height}; expected a place inside (mode 'crop' cuts tall pictures, 'pad' "
                 "does not: --preprocess pad)"
             )
-        points.append(point)
-        frames.append(frame)
-    if not points:
-        raise InputError(f"{path} holds no points; expected a line x,y,frame and then one line per point")
-    return Queries(np.array(points, np.float32), np.array(frames, np.int64))
+        yield point, frame

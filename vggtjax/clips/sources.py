@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -12,14 +13,15 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from vggtjax.captures.frames import CaptureFrames
-from vggtjax.captures.table import capture_kind, find_capture
+from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, find_capture
 from vggtjax.clips.arrays import ArrayFrames
 from vggtjax.clips.images import ImageFiles, is_image_name, to_rgb
-from vggtjax.clips.manifest import is_manifest, read_manifest
+from vggtjax.clips.manifest import MOST_BYTES, is_manifest, read_manifest, source_name
 from vggtjax.clips.order import natural_key
 from vggtjax.clips.sampling import Source
 from vggtjax.clips.video import VideoFile, is_video_name
 from vggtjax.errors import ClipError, InputError, reading
+from vggtjax.storage.remote import check_url, download, is_url, list_url, local_path, shown, url_name
 
 Name: TypeAlias = str | os.PathLike[str]
 ClipSource: TypeAlias = Name | Sequence[Name] | Sequence[Image.Image] | Sequence[np.ndarray] | np.ndarray
@@ -53,37 +55,71 @@ def open_source(source: ClipSource) -> Source:
 
 
 def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
-    """Return the paths of clips by name.
+    """Return the sources of clips, paths or URLs, by name.
 
-    `paths` are folders of images, videos, folders that hold such clips, or lists of clips (`read_manifest`). A clip is
-    named as its list says, after its folder, or after its video without the suffix. Raises ClipError for a path without
-    clips, or two clips of one name.
+    `paths` are folders of images, videos, folders that hold such clips, or lists of clips (`read_manifest`), each a
+    path or a URL. A clip is named as its list says, after its folder, or after its video without the suffix. Raises
+    ClipError for a path without clips, or two clips of one name.
     """
     found: dict[str, str] = {}
     for text in paths:
-        path = Path(text)
-        with reading(path, ClipError):
-            if not path.exists():
-                raise _missing(text)
-            if is_manifest(path):
-                listed = read_manifest(path)
-                if known := [name for name in listed if name in found]:
-                    raise ClipError(f"two clips are named {known[0]}: {found[known[0]]} and one of {path}; rename one")
-                found |= {name: str(source) for name, source in listed.items()}
-                continue
-            entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
-            whole = not path.is_dir() or any(is_image_name(entry) for entry in entries) or bool(capture_kind(path))
-            clips = [path] if whole else [entry for entry in entries if _is_clip(entry)]
-        if not clips:
-            raise ClipError(f"{path} is not a clip and holds no clips; expected folders of images, or videos")
-        for clip in clips:
-            name = clip.resolve().name if clip.is_dir() else clip.stem
+        listed = _at_url(text) if is_url(text) else _at_path(local_path(text))
+        for name, clip in listed.items():
             if name in found:
-                raise ClipError(f"two clips are named {name}: {found[name]} and {clip}; rename one of them")
-            found[name] = str(clip)
+                raise ClipError(f"two clips are named {name}: {shown(found[name])} and {shown(clip)}; rename one")
+            found[name] = clip
     if not found:
         raise ClipError("no clips; name folders of images, videos, or a folder of such")
     return found
+
+
+def _at_path(text: str) -> dict[str, str]:
+    """Return the clips at a path by name."""
+    path = Path(text)
+    with reading(path, ClipError):
+        if not path.exists():
+            raise _missing(text)
+        if is_manifest(text) and path.is_file():
+            return read_manifest(path)
+        entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
+        whole = not path.is_dir() or any(is_image_name(entry) for entry in entries) or bool(capture_kind(path))
+        clips = [path] if whole else [entry for entry in entries if _is_clip(entry)]
+        named = [(clip.resolve().name if clip.is_dir() else clip.stem, str(clip)) for clip in clips]
+    return _by_name(named, str(path))
+
+
+def _at_url(url: str) -> dict[str, str]:
+    """Return the clips at a URL by name. A list of clips is downloaded, other files are not."""
+    check_url(url, error=ClipError)
+    name = Path(url_name(url, ClipError))
+    if is_manifest(name.name):
+        with tempfile.TemporaryDirectory() as folder:
+            path = download(url, Path(folder), most_bytes=MOST_BYTES, error=ClipError)
+            try:
+                return read_manifest(path, url)
+            except ClipError as error:
+                raise ClipError(str(error).replace(str(path), shown(url))) from None
+    entries = [] if _is_clip_file(name) or is_image_name(name) else list_url(url, ClipError)
+    if not entries or any(is_image_name(Path(entry.name)) for entry in entries):
+        return {source_name(url): url} if entries or name.suffix else _by_name([], shown(url))
+    entries.sort(key=lambda entry: natural_key(Path(entry.name)))
+    clips = [e.url for e in entries if not e.name.startswith(".") and (e.is_folder or _is_clip_file(Path(e.name)))]
+    return _by_name([(source_name(clip), clip) for clip in clips], shown(url))
+
+
+def _by_name(clips: Sequence[tuple[str, str]], place: str) -> dict[str, str]:
+    if not clips:
+        raise ClipError(f"{place} is not a clip and holds no clips; expected folders of images, or videos")
+    found: dict[str, str] = {}
+    for name, clip in clips:
+        if name in found:
+            raise ClipError(f"two clips are named {name}: {shown(found[name])} and {shown(clip)}; rename one")
+        found[name] = clip
+    return found
+
+
+def _is_clip_file(name: Path) -> bool:
+    return is_video_name(name) or name.suffix.lower() == RECORD3D_SUFFIX
 
 
 def _is_clip(entry: Path) -> bool:
@@ -120,7 +156,7 @@ def _capture(path: Path) -> CaptureFrames | None:
 
 def _missing(name: str) -> ClipError:
     if "://" in name:
-        return ClipError(f"{name} is a URL; download the file first, and give its path")
+        return ClipError(f"{name} is a URL; download the file first, or give it to vggtjax batch")
     return ClipError(f"'{name}' does not exist; expected a folder, a pattern, or an image or video file")
 
 

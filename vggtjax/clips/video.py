@@ -14,12 +14,12 @@ from PIL import Image
 
 from vggtjax.clips.arrays import frame_name
 from vggtjax.clips.sampling import Frame, Sampling
-from vggtjax.errors import ClipError
+from vggtjax.errors import ClipError, check_regular
 
 if TYPE_CHECKING:
     from types import ModuleType
 
-    from av import VideoFrame, VideoStream
+    from av import VideoCodecContext, VideoFrame, VideoStream
     from av.container import InputContainer
     from av.stream import Stream
 
@@ -33,6 +33,7 @@ _SUFFIXES = (
 # Containers that hold their own video. FFmpeg also reads playlists and text, which can name other files.
 _CONTAINERS = "mov,matroska,avi,mpeg,mpegts,asf,flv,ogg,mxf,gif"
 _MOST_PIXELS = 2**27  # of one frame; 15360 x 8640 is below it
+_ALWAYS_PIXELS, _MOST_PIXELS_A_BYTE = 2**23, 10_000  # of a frame in any file, 3840 x 2160; and by the file's size
 _EXACT_CONTAINERS = frozenset(("mov", "matroska", "avi"))  # their stated length is reliable
 _MISSING_END = 0.5  # seconds by which a whole file may end before its stated length
 
@@ -123,6 +124,7 @@ def _display_matrix(frame: VideoFrame, path: Path) -> np.ndarray:
 
 def _opened(path: Path, av: ModuleType) -> InputContainer:
     """Return the opened file, of one of the `_CONTAINERS` only."""
+    check_regular(path, ClipError)
     options: dict[str, Any] = {"container_options": {"format_whitelist": _CONTAINERS}}
     if int(av.__version__.split(".")[0]) < 19:  # later ones never fail on titles in odd encodings
         options["metadata_errors"] = "replace"
@@ -159,6 +161,15 @@ def _video_stream(container: InputContainer, path: Path, odd: set[Fraction]) -> 
     stream = cast("VideoStream | None", container.streams.best("video"))
     if stream is None or stream.disposition & Disposition.attached_pic:  # the cover of a piece of music
         raise ClipError(f"{path} has no video stream; expected a whole video file")
+    decoder = cast("VideoCodecContext | None", stream.codec_context)
+    if decoder is None:
+        raise ClipError(f"video {path} has a codec that is not known; write it anew, such as by H.264")
+    size = path.stat().st_size
+    most = min(_MOST_PIXELS, max(_ALWAYS_PIXELS, _MOST_PIXELS_A_BYTE * size))
+    if decoder.width * decoder.height > most:
+        shown = f"frames of {decoder.width} x {decoder.height} pixels in {size} bytes"
+        raise ClipError(f"video {path} says it has {shown}; expected at most {most} pixels, in a whole file")
+    decoder.options = {"max_pixels": str(most)}  # also of sizes that the frames themselves say
     stream.thread_type = "AUTO"
     aspect = stream.sample_aspect_ratio
     if aspect not in (None, 0, 1) and aspect not in odd:

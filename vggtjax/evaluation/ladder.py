@@ -140,7 +140,7 @@ def ladder(
         images = jax.device_put(truth.images[padded].astype(np.float32, copy=False))
         patch_tokens = shared.image_features(model.params, images)
         batch = ClipBatch(images, patch_tokens)
-        first, saliency = shared.first_pass(model.params, batch)
+        first, saliency = shared.first_pass(model.params, batch, second_follows=bool(masked))
         mined = shared.dynamic_mask(saliency, patch_tokens)
         pixels = np.asarray(_upsample(saliency, size=tuple(size)))
         scenes = [_Scene(clip, Truth(*(a[clip] for a in truth)), pixels[i]) for i, clip in enumerate(clips)]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -18,6 +18,7 @@ from vggtjax.options import METHODS, Options
 from vggtjax.progress import OnStage
 from vggtjax.results.foreign import check_format
 from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.storage.file_digest import file_digest
 from vggtjax.storage.trajectories import Quaternion
 
 if TYPE_CHECKING:  # the folders of other programs are scored without jax
@@ -151,17 +152,14 @@ class FolderSource:
 
     def fingerprint(self, name: str, sequence: LabelledSequence) -> str:
         """Return a digest of the names, sizes and dates of the result's files; "" where there are none."""
-        folder, digest, count = self.folders[name] / sequence.name, hashlib.sha256(), 0
+        folder = self.folders[name] / sequence.name
         try:
-            for path in sorted(folder.rglob("*")) if folder.is_dir() else [folder]:
-                count += 1
-                if count > _MOST_FILES:
-                    raise InputError(f"{folder} holds more than {_MOST_FILES} files; expected one result")
-                stat = path.stat()
-                digest.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode("utf-8", "surrogateescape"))
+            paths = list(islice(folder.rglob("*"), _MOST_FILES + 1)) if folder.is_dir() else [folder]
+            if len(paths) > _MOST_FILES:
+                raise InputError(f"{folder} holds more than {_MOST_FILES} files; expected one result")
+            return file_digest(sorted(paths))
         except OSError:
             return ""
-        return digest.hexdigest()
 
     def results(
         self, names: Sequence[str], sequence: LabelledSequence, on_stage: OnStage

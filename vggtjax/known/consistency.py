@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Float64
-from scipy.ndimage import gaussian_filter, zoom
 
 from vggtjax.known.sweep import Views, sweep_costs
 from vggtjax.results.result import Result
@@ -85,7 +85,7 @@ def _fields(views: Views) -> tuple[Float[np.ndarray, "S H W"], float]:
     gains = middle - costs.min(axis=1) > _LEAST_GAIN
     fields = np.where(gains, _lowest(costs, _NARROW), 0)
     sigma = _SPREAD * max(middle.shape[1:]) / 2
-    fields = np.stack([gaussian_filter(field, sigma) for field in fields])
+    fields = np.stack([scipy.ndimage.gaussian_filter(field, sigma) for field in fields])
     after = np.where(gains, costs.min(axis=1), middle)
     return fields, _mean(after, views.usable)
 
@@ -95,7 +95,9 @@ def _regional(views: Views, logarithms: Float[np.ndarray, " F"]) -> Float[np.nda
     costs = sweep_costs(views, np.exp(logarithms), _OTHERS)
     sigma = _SPREAD * max(costs.shape[2:])
     for cost, usable in zip(costs, views.usable.astype(np.float32), strict=True):
-        cost[:] = gaussian_filter(cost * usable, (0, sigma, sigma)) / (gaussian_filter(usable, sigma) + 1e-6)
+        cost[:] = scipy.ndimage.gaussian_filter(cost * usable, (0, sigma, sigma)) / (
+            scipy.ndimage.gaussian_filter(usable, sigma) + 1e-6
+        )
     return costs + _PRIOR * (logarithms**2)[:, None, None]
 
 
@@ -140,5 +142,5 @@ def _pooled(result: Result, step: int) -> Views:
 
 def _enlarged(field: Float[np.ndarray, "h w"], step: int, size: tuple[int, int]) -> Float[np.ndarray, "H W"]:
     """Return a field at the pixels of the result, linear between the middles of the pooled ones."""
-    large = np.asarray(field if step == 1 else zoom(field, step, order=1, mode="nearest", grid_mode=True))
+    large = np.asarray(field if step == 1 else scipy.ndimage.zoom(field, step, order=1, mode="nearest", grid_mode=True))
     return np.pad(large, [(0, size[0] - large.shape[0]), (0, size[1] - large.shape[1])], mode="edge")

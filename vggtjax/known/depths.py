@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,8 +10,9 @@ from jaxtyping import Float64, Int64
 
 from vggtjax.captures.capture import Capture
 from vggtjax.clips.truth import Placed
-from vggtjax.errors import InputError, one_line, reading
+from vggtjax.errors import InputError, one_line
 from vggtjax.results.result import Result
+from vggtjax.storage.csv_file import read_csv
 
 _MOST_FILE_BYTES = 1 << 24
 _FRAME_DEPTHS = 10_000  # of a capture's map
@@ -33,16 +33,9 @@ def read_depths(path: str | Path, frames: Placed) -> DepthSamples:
     Raises InputError for an unreadable file, other columns, no rows, and points outside the frames that the model saw.
     """
     path = Path(path)
-    try:
-        with reading(path), path.open(encoding="utf-8-sig", newline="") as file:
-            if path.stat().st_size > _MOST_FILE_BYTES:
-                raise InputError(f"{path} is {path.stat().st_size} bytes; expected at most {_MOST_FILE_BYTES}")
-            lines = list(csv.DictReader(file))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path} is no CSV file: {error}") from None
     found = []
     count = len(frames.images)
-    for number, line in enumerate(lines, start=2):
+    for number, line in read_csv(path, most_bytes=_MOST_FILE_BYTES).rows:
         shown = one_line(str(line))
         try:
             frame, x, y, depth = int(line["frame"]), float(line["x"]), float(line["y"]), float(line["depth"])

@@ -6,10 +6,8 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float64
-from scipy.optimize import least_squares
-from scipy.sparse import csr_array
-from scipy.spatial.transform import Rotation
 
 from vggtjax.known.flow import Flow, moved_to, rays, seen_at
 
@@ -48,7 +46,7 @@ def fit_poses(
     def jacobian(x: Float64[np.ndarray, " P"]) -> Any:
         return problem.jacobian(x).toarray() if dense else problem.jacobian(x)
 
-    made = least_squares(
+    made = scipy.optimize.least_squares(
         problem.offsets,
         np.zeros(count),
         jacobian,  # pyright: ignore[reportArgumentType] - of the stubs
@@ -72,7 +70,7 @@ class _Problem:
     def poses(self, x: Float64[np.ndarray, " P"]) -> tuple[Float64[np.ndarray, "S 3 4"], Float64[np.ndarray, "S 3"]]:
         """Return camera-from-world poses, and the rotation vectors."""
         turns, shifts = np.concatenate([np.zeros((1, 6)), x.reshape(-1, 6)]).reshape(-1, 2, 3).swapaxes(0, 1)
-        rotation = Rotation.from_rotvec(turns).as_matrix() @ self._start[:, :, :3]
+        rotation = scipy.spatial.transform.Rotation.from_rotvec(turns).as_matrix() @ self._start[:, :, :3]
         translation = self._start[:, :, 3] + self._unit * shifts
         return np.concatenate([rotation, translation[:, :, None]], axis=2), turns
 
@@ -85,7 +83,7 @@ class _Problem:
         """Return by how many pixels the points miss their places."""
         return (seen_at(self._moved(self.poses(x)[0]), self._K[self._flow.target]) - self._flow.landed).ravel()
 
-    def jacobian(self, x: Float64[np.ndarray, " P"]) -> csr_array:
+    def jacobian(self, x: Float64[np.ndarray, " P"]) -> scipy.sparse.csr_array:
         """Return the derivatives of the offsets."""
         i, j = self._flow.source, self._flow.target
         poses, turns = self.poses(x)
@@ -108,7 +106,7 @@ class _Problem:
         columns = np.broadcast_to(columns[:, None], values.shape)
         rows = np.broadcast_to(np.arange(2 * len(i)).reshape(-1, 2, 1), values.shape)
         shape = (2 * len(i), 6 * len(poses))
-        return csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)[:, 6:]
+        return scipy.sparse.csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)[:, 6:]
 
 
 def _cross(vectors: Float64[np.ndarray, "N 3"]) -> Float64[np.ndarray, "N 3 3"]:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
 from vggtjax.cameras import camera_centres, world_from_camera
 from vggtjax.captures.cameras import checked_world_from_camera
@@ -99,7 +99,7 @@ def checked_known_poses(
             f"the poses of {name} are at about {np.round(centres.mean(axis=0)).tolist()}, too far from the origin for "
             "their motion; subtract this place from all of them"
         )
-    poses[:, :3, :3] = Rotation.from_matrix(poses[:, :3, :3]).as_matrix()
+    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3]).as_matrix()
     return poses
 
 
@@ -110,7 +110,7 @@ def agreement(camera_from_world: Float64[np.ndarray, "S 3 4"], known: Float64[np
     of frames, of the known over the predicted distance between their cameras. Raises InputError where the predicted
     cameras do not move.
     """
-    between = Rotation.from_matrix(known[:, :, :3].swapaxes(1, 2) @ camera_from_world[:, :, :3])
+    between = scipy.spatial.transform.Rotation.from_matrix(known[:, :, :3].swapaxes(1, 2) @ camera_from_world[:, :, :3])
     turn = between.mean()  # of the known world from the predicted one
     angles = np.degrees((turn.inv() * between).magnitude())
     centres, true_centres = camera_centres(camera_from_world), camera_centres(known)

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Int
 
+from vggtjax.network.sampling import bilinear
+
 _RADIUS = 2  # of the neighbourhood, in pixels
 _NOISE = 1e-4  # variance of grey values; neighbourhoods of less show nothing
 _UNSEEN = -0.2  # correlation where the other frame does not show the pixel, but would at the predicted depth
@@ -101,13 +103,8 @@ def _sampled(
     """Return an image between its pixels (bilinear), and whether the nearest pixel is usable."""
     H, W = image.shape
     column, row = jnp.clip(column, 0, W - 1), jnp.clip(row, 0, H - 1)
-    left, top = column.astype(int), row.astype(int)
-    right, bottom = jnp.minimum(left + 1, W - 1), jnp.minimum(top + 1, H - 1)
-    a, b, values = column - left, row - top, image.ravel()
-    upper = values[top * W + left] * (1 - a) + values[top * W + right] * a
-    lower = values[bottom * W + left] * (1 - a) + values[bottom * W + right] * a
-    nearest = jnp.rint(row).astype(int) * W + jnp.rint(column).astype(int)
-    return upper * (1 - b) + lower * b, usable.ravel()[nearest]
+    between = bilinear(image[..., None], jnp.stack([column, row], axis=-1))[..., 0]
+    return between, usable[jnp.rint(row).astype(int), jnp.rint(column).astype(int)]
 
 
 def _moments(image: Float[Array, "H W"]) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:

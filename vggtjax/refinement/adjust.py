@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float64, Int64
-from scipy.spatial.transform import Rotation
 
 from vggtjax.cameras import Cameras
 from vggtjax.refinement.tracks import Tracks
@@ -133,7 +133,7 @@ class _Model:
                 camera_id=int(self.camera_of[frame]) + 1,
                 image_id=frame + 1,
             )
-            turn = pycolmap.Rotation3d(Rotation.from_matrix(pose[:, :3]).as_matrix())
+            turn = pycolmap.Rotation3d(scipy.spatial.transform.Rotation.from_matrix(pose[:, :3]).as_matrix())
             self.model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(turn, pose[:, 3]))
             for place, point in enumerate(tracks.points[chosen].tolist()):
                 elements.setdefault(point, pycolmap.Track()).add_element(frame + 1, place)

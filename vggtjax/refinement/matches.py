@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from PIL import Image
-from scipy.ndimage import binary_dilation
 
 from vggtjax.errors import ClipError
 from vggtjax.results.result import Result
@@ -142,7 +142,7 @@ def _clear_nearest(cosines: Float32[np.ndarray, "N M"]) -> Int64[np.ndarray, " N
 def _static_pixels(result: Result) -> Bool[np.ndarray, "S H W"]:
     """Return valid pixels that are static, and not next to moving ones."""
     grown = max(1, result.depth.shape[2] // _GROWN)
-    moving = np.stack([binary_dilation(mask, iterations=grown) for mask in result.dynamic_mask])
+    moving = np.stack([scipy.ndimage.binary_dilation(mask, iterations=grown) for mask in result.dynamic_mask])
     return result.valid_pixels & np.logical_not(moving)
 
 

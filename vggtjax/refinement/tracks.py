@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float64, Int64
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from vggtjax.refinement.matches import Pair
 from vggtjax.results.result import Result
@@ -45,8 +44,8 @@ def join_matches(
     total = int(starts[-1])
     if not len(edges):
         return Tracks(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)))
-    graph = coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (total, total))
-    label = connected_components(graph, directed=False)[1].astype(np.int64)
+    graph = scipy.sparse.coo_array((np.ones(len(edges), bool), (edges[:, 0], edges[:, 1])), (total, total))
+    label = scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
     frame = np.repeat(np.arange(len(sizes)), sizes)
     _, group, count = np.unique(label * len(sizes) + frame, return_inverse=True, return_counts=True)
     alone = count[group] == 1

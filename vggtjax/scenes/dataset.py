@@ -22,7 +22,7 @@ import numpy as np
 from PIL import Image
 
 from vggtjax.cameras import world_from_camera
-from vggtjax.errors import InputError, OutputError, check_choice
+from vggtjax.errors import InputError, OutputError, check_choice, one_line
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.export import encode_depth, write_intrinsics
 from vggtjax.scenes.config import SceneConfig
@@ -128,7 +128,7 @@ def read_index(out: str | Path) -> dict[str, Any]:
     if index.get("format") != "vggtjax scenes":
         raise InputError(f"{path} is not the index of a set of scenes; choose another folder")
     if index.get("version") != _FORMAT_VERSION:
-        raise InputError(f"{path} has version {index.get('version')!r}; expected {_FORMAT_VERSION}")
+        raise InputError(f"{path} has version {one_line(repr(index.get('version')), 60)}; expected {_FORMAT_VERSION}")
     return index
 
 
@@ -155,8 +155,16 @@ def _check_folder(out: Path, index: dict[str, Any]) -> None:
     existing = read_index(out)
     other = [name for name in ("kind", "split", "seed", "config") if existing.get(name) != index[name]]
     if other:
-        values = ", ".join(f"{name} {existing.get(name)!r} instead of {index[name]!r}" for name in other)
+        values = ", ".join(_difference(name, existing.get(name), index[name]) for name in other)
         raise InputError(f"{out} holds scenes with {values}; choose another folder, or the same settings to resume")
+
+
+def _difference(name: str, there: Any, wanted: Any) -> str:
+    """Say how two values differ; of two dictionaries, in which of their values."""
+    if not (isinstance(there, dict) and isinstance(wanted, dict)):
+        return f"{name} {there!r} instead of {wanted!r}"
+    keys = [key for key in sorted({*there, *wanted}) if there.get(key) != wanted.get(key)]
+    return ", ".join(_difference(f"{key} of {name}", there.get(key), wanted.get(key)) for key in keys)
 
 
 def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str, Any]:

@@ -21,10 +21,12 @@ from typing import IO, NamedTuple
 
 import numpy as np
 
-from vggtjax.errors import ResultError
+from vggtjax.errors import ResultError, check_regular, one_line
+from vggtjax.storage.free_memory import free_bytes
 
 _DEFLATE_LEVEL = 1  # higher levels take several times as long and save a few percent
 SIZE_LIMIT = 64 * 2**30  # bytes of all arrays of one file
+_MOST_TIMES, _SPARE = 16, 2**28  # of a file's bytes its arrays may have, or so many bytes; depth barely shrinks
 _LENGTHS = {(1, 0): 2, (2, 0): 4}  # version of the format -> bytes of the length of a header
 _MOST_HEADER_BYTES = 2**14
 _MOST_AXES = 32
@@ -96,15 +98,16 @@ def spread_frames(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
 def read_headers(path: Path) -> dict[str, Header]:
     """Return name -> type and shape of the arrays in an .npz file, without reading the arrays.
 
-    Raises ResultError for a file that is not a whole .npz, holds Python objects, or exceeds SIZE_LIMIT. The message
-    says "it"; the caller names the file.
+    Raises ResultError for a file that is not a whole .npz, holds Python objects, exceeds SIZE_LIMIT, or declares more
+    bytes than an archive of its size can honestly hold. The message says "it"; the caller names the file.
     """
-    with _explaining("it", ".npz"), zipfile.ZipFile(path) as archive:
+    with _opened(path) as archive:
         return {name: _read_header(file, member.filename, member.file_size) for name, member, file in _members(archive)}
 
 
 def read_array(path: Path) -> np.ndarray:
     """Return the array of an .npy file; raises ResultError as `read_headers` does."""
+    check_regular(path, ResultError)
     with _explaining(path.name, ".npy"), path.open("rb") as file:
         size = path.stat().st_size
         if size > SIZE_LIMIT:
@@ -118,15 +121,24 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, n
     """Return all arrays of an .npz file, or those with these names; raises ResultError as `read_headers` does.
 
     Those that stand uncompressed and take 1 MB or more are mapped. They may be written to; the file stays as it is.
-    Check the headers of an untrusted file first: a small compressed file can hold large arrays.
+    ResultError too where the others take more memory than is free.
     """
     arrays = {}
-    with _explaining("it", ".npz"), zipfile.ZipFile(path) as archive:
+    with _opened(path) as archive:
+        needed = sum(
+            member.file_size
+            for member in archive.infolist()
+            if not _is_mappable(member) and (names is None or member.filename.removesuffix(".npy") in names)
+        )
+        if needed > _SPARE and (free := free_bytes()) is not None and needed > free:
+            raise ResultError(
+                f"its arrays take {needed} bytes of memory and {free:.0f} are free; free some, or take fewer"
+            )
         for name, member, file in _members(archive):
             if names is not None and name not in names:
                 continue
             header = _read_header(file, member.filename, member.file_size)
-            if member.compress_type == zipfile.ZIP_STORED and member.file_size >= _LEAST_MAPPED:
+            if _is_mappable(member):
                 arrays[name] = _mapped(path, member, file.tell(), header)
                 continue
             file.seek(0)
@@ -135,6 +147,10 @@ def read_arrays(path: Path, names: Collection[str] | None = None) -> dict[str, n
                 raise ResultError(f"{member.filename} holds text that is not Unicode")
             arrays[name] = array
     return arrays
+
+
+def _is_mappable(member: zipfile.ZipInfo) -> bool:
+    return member.compress_type == zipfile.ZIP_STORED and member.file_size >= _LEAST_MAPPED
 
 
 def _mapped(path: Path, member: zipfile.ZipInfo, offset: int, header: Header) -> np.ndarray:
@@ -152,6 +168,26 @@ def _mapped(path: Path, member: zipfile.ZipInfo, offset: int, header: Header) ->
 
 
 @contextmanager
+def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open an .npz file and hold its declared sizes against its own; errors of the body say "it"."""
+    with _explaining("it", ".npz"):
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ResultError("it is a pipe, a socket or a device; expected an .npz file")
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            size, total = path.stat().st_size, sum(member.file_size for member in members)
+            stored = [member for member in members if member.compress_type == zipfile.ZIP_STORED]
+            if total > SIZE_LIMIT:
+                raise ResultError(f"its arrays take {total} bytes; expected at most {SIZE_LIMIT}")
+            if total > max(_SPARE, _MOST_TIMES * size) or any(m.file_size != m.compress_size for m in stored):
+                raise ResultError(
+                    f"it has {size} bytes and says that its arrays take {total}; expected at most {_MOST_TIMES} times "
+                    "as many: it is damaged, or made to fill the memory"
+                )
+            yield archive
+
+
+@contextmanager
 def _explaining(subject: str, suffix: str) -> Iterator[None]:
     try:
         yield
@@ -165,23 +201,22 @@ def _explaining(subject: str, suffix: str) -> Iterator[None]:
 
 def _members(archive: zipfile.ZipFile) -> Iterator[tuple[str, zipfile.ZipInfo, IO[bytes]]]:
     members = archive.infolist()
-    total = sum(member.file_size for member in members)
-    if total > SIZE_LIMIT:
-        raise ResultError(f"its arrays take {total} bytes; expected at most {SIZE_LIMIT}")
     if len({member.filename for member in members}) < len(members):
         raise ResultError("it holds two arrays of the same name")
     for member in members:
         name = member.filename.removesuffix(".npy")
+        shown = one_line(member.filename, 80)
         if name == member.filename:
-            raise ResultError(f"it holds {member.filename!r}; expected arrays alone")
+            raise ResultError(f"it holds {shown!r}; expected arrays alone")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ResultError(f"array '{name}' has compression type {member.compress_type}; expected numpy's: 0 or 8")
+            raise ResultError(f"{shown} has compression type {member.compress_type}; expected numpy's: 0 or 8")
         with archive.open(member) as file:
             yield name, member, file
 
 
 def _read_header(file: IO[bytes], name: str, length: int) -> Header:
     """Return the header at the start of `length` bytes; the array must fill the remaining bytes."""
+    name = one_line(name, 80)
     version = np.lib.format.read_magic(file)
     if version not in _LENGTHS:
         raise ResultError(f"{name} has version {version} of the array format; expected (1, 0) or (2, 0)")

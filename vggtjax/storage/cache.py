@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
+import shutil
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+from vggtjax.storage.writing import write_errors
+
 COMPILED_BYTES = 2 * 2**30  # of kept compiled programs; the least recently used go first
+CONVERTED = "converted weights"
+_KINDS = {"compiled programs": "compiled", "traced programs": "lowered", "passes for fits": "passes"}
+_CONVERTED = re.compile(r"-[0-9a-f]{16}\.safetensors$")  # weights that were converted for `load_model`
 _DAMAGED = re.compile(r"Error (reading|writing) persistent compilation cache entry for '([^']+)'")
 _FOLDER = "jax_compilation_cache_dir"
 _SHORTEST = 0.05  # seconds; programs that compile faster are not kept
+_WORTH_KEEPING = 5.0  # seconds of compiling, after which it is said once how to keep it
+
+logger = logging.getLogger(__name__)
 
 
 def cache_folder() -> Path:
@@ -35,6 +45,40 @@ def compiled_folder() -> Path:
 def lowered_folder() -> Path:
     """Return the folder of traced programs, not yet compiled."""
     return cache_folder() / "lowered"
+
+
+def cache_parts() -> dict[str, list[Path]]:
+    """Return what this library keeps in its cache folder, by kind; files of others there are not named."""
+    folder = cache_folder()
+    parts = {kind: [folder / name] for kind, name in _KINDS.items()}
+    models = sorted(path for path in folder.glob("*.safetensors") if _CONVERTED.search(path.name))
+    return {kind: [path for path in paths if path.exists()] for kind, paths in (parts | {CONVERTED: models}).items()}
+
+
+def size_of(paths: Iterable[Path]) -> int:
+    """Return the bytes of files, and of the files in folders; those that another process removes count as 0."""
+    total = 0
+    for path in paths:
+        for file in path.rglob("*") if path.is_dir() else [path]:
+            with suppress(OSError):
+                total += file.lstat().st_size if file.is_file() else 0
+    return total
+
+
+def clear_cache() -> int:
+    """Remove what `cache_parts` names; return how many bytes that were.
+
+    Raises OutputError where it cannot be removed.
+    """
+    paths = [path for part in cache_parts().values() for path in part]
+    before = size_of(paths)
+    for path in paths:
+        with write_errors(path), suppress(FileNotFoundError):  # another process clears it, too
+            if path.is_symlink() or not path.is_dir():
+                path.unlink()
+            else:
+                shutil.rmtree(path)
+    return before
 
 
 def enable_compilation_cache() -> Path:
@@ -66,6 +110,20 @@ def enable_compilation_cache() -> Path:
     if getattr(warnings.showwarning, "func", None) is not _show_warning:
         warnings.showwarning = partial(_show_warning, Path(folder), warnings.showwarning, set())
     return Path(folder)
+
+
+def say_how_to_keep(seconds: float) -> None:
+    """Say once how later processes save these seconds of compiling, unless compiled programs are kept."""
+    if seconds >= _WORTH_KEEPING and sys.modules["jax"].config.values[_FOLDER] is None:
+        _say_how_to_keep()
+
+
+@cache  # once in a process
+def _say_how_to_keep() -> None:
+    logger.warning(
+        "what was compiled is lost with this process; call vggtjax.enable_compilation_cache() at the start of the "
+        "script, and later runs start sooner"
+    )
 
 
 def _show_warning(

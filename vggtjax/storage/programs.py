@@ -9,9 +9,11 @@ devices are not kept.
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,13 +23,17 @@ import jax.numpy as jnp
 from jax import export
 from jax.core import Tracer
 
-from vggtjax.errors import OutputError
+from vggtjax.errors import InputError, OutputError, check_regular
 from vggtjax.storage.cache import compiled_folder, lowered_folder
+from vggtjax.storage.versions import package_digest
 from vggtjax.storage.writing import writing
 
 KEPT_BYTES = 2**28  # of lowered programs and texts; the oldest are removed first
 _DIGEST = 32  # bytes of the sha256 at the start of a kept file
 _PACKAGE = Path(__file__).parents[1]
+# Of LLVM on a CPU. Its third level takes up to a fifth longer to compile the network, which runs no faster with it, as
+# its products are in libraries.
+_OPTIONS_ON_CPU = {"xla_backend_optimization_level": 1}
 
 
 class Program:
@@ -36,41 +42,63 @@ class Program:
     def __init__(self, function: Callable[..., Any], static: Sequence[str] = ()) -> None:
         self.__name__ = function.__name__
         self.function, self._static = function, tuple(static)
-        self._jitted = jax.jit(function, static_argnames=self._static)
         self._ready: dict[Any, Callable[..., Any]] = {}
+
+    @cached_property
+    def _jitted(self) -> Any:
+        return jax.jit(self.function, static_argnames=self._static, compiler_options=_compiler_options())
+
+    @cached_property
+    def _inside(self) -> Any:
+        """The function as a part of another program, which has the compiler options."""
+        return jax.jit(self.function, static_argnames=self._static)
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
         """Run the function."""
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((arguments, options))):
+            return self._inside(*arguments, **options)
         ready, options = self._find(arguments, options)
         return ready(*arguments, **options)
 
-    def compile(self, *arguments: Any, **options: Any) -> tuple[Any, Any]:
-        """Compile for arguments, or for their shapes and types; later calls with such arguments use the program.
+    def compile(self, *arguments: Any, **options: Any) -> tuple[Future[Any], Any]:
+        """Trace the function for arguments, or for their shapes and types, and compile it in another thread.
 
-        Returns the compiled program, and the shapes and types of its output.
+        Later calls with such arguments use the program; they wait for nothing, so wait for the future before.
+
+        Returns the future of the compiled program, and the shapes and types of its output.
         """
         key, _ = self._key(arguments, options)
         self._ready.pop(key, None)
         ready, options = self._find(arguments, options)
         lowered = ready.lower(*arguments, **options)
-        compiled = lowered.compile()
-        if key is not None and ready is not self._jitted:
-            self._ready[key] = compiled
+
+        def compile_lowered() -> Any:
+            compiled = lowered.compile()
+            if key is not None and ready is not self._jitted:
+                self._ready[key] = compiled
+            return compiled
+
+        compiling = _compilers().submit(compile_lowered)
         outputs = lowered.out_info
         if _on_several_devices(arguments):  # the next program has to be compiled for arrays that are there
-            outputs = jax.tree.map(_placed, outputs, compiled.output_shardings)
-        return compiled, outputs
+            outputs = jax.tree.map(_placed, outputs, compiling.result().output_shardings)
+        return compiling, outputs
+
+    def signature(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, ...]:
+        """Return what tells this program for these arguments, or for their shapes and types, from others."""
+        static = tuple(sorted((name, repr(value)) for name, value in options.items() if name in self._static))
+        traced = {name: value for name, value in options.items() if name not in self._static}
+        leaves, structure = jax.tree.flatten((arguments, traced))
+        return self, static, structure, tuple((jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)
 
     def _key(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Return the key of a program on disk, None if it cannot be kept; and the traced options."""
         traced = {name: value for name, value in options.items() if name not in self._static}
         if not _keeping() or jax.default_backend() != "cpu":
             return None, traced
-        leaves, structure = jax.tree.flatten((arguments, traced))
-        if any(isinstance(leaf, Tracer) for leaf in leaves) or _on_several_devices(leaves):
+        if _on_several_devices((arguments, traced)):
             return None, traced
-        static = tuple(sorted((name, repr(value)) for name, value in options.items() if name in self._static))
-        return (static, structure, tuple((jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)), traced
+        return self.signature(arguments, options)[1:], traced
 
     def _find(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
         """Return the function to call, and its options: the traced options, or all."""
@@ -91,7 +119,7 @@ class Program:
         precision = jax.config.values["jax_default_matmul_precision"]
         path = _kept_path("\n".join((source_digest(), name, *map(str, key), str(precision))))
         if (content := _read_kept(path)) is not None:
-            return jax.jit(export.deserialize(bytearray(content)).call)
+            return jax.jit(export.deserialize(bytearray(content)).call, compiler_options=_compiler_options())
         shapes, named = jax.tree.map(
             lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), (arguments, traced)
         )
@@ -104,7 +132,21 @@ class Program:
             _keep(path, content)
         except OutputError:  # the cache cannot be written
             return self._jitted
-        return jax.jit(exported.call)
+        return jax.jit(exported.call, compiler_options=_compiler_options())
+
+
+@cache
+def _compilers() -> ThreadPoolExecutor:
+    """Return the threads that compile: XLA holds no lock of Python, and much of its work is for one core."""
+    return ThreadPoolExecutor(os.cpu_count() or 1, "compile")
+
+
+def _compiler_options() -> dict[str, Any] | None:
+    """Return how XLA compiles on this platform, unless XLA_FLAGS say it."""
+    given = os.environ.get("XLA_FLAGS", "")
+    if jax.default_backend() != "cpu":
+        return None
+    return {name: value for name, value in _OPTIONS_ON_CPU.items() if name not in given}
 
 
 def keep_type(kind: type) -> type:
@@ -141,7 +183,8 @@ def _kept_path(text: str) -> Path:
 
 def _read_kept(path: Path) -> bytes | None:
     """Return the content that `_keep` wrote; None for a missing file, and for a damaged file, which is removed."""
-    with suppress(OSError):
+    with suppress(OSError, InputError):
+        check_regular(path)
         content = path.read_bytes()
         if content[:_DIGEST] == hashlib.sha256(content[_DIGEST:]).digest():
             return content[_DIGEST:]
@@ -169,8 +212,5 @@ def _keeping() -> bool:
 @cache
 def source_digest() -> str:
     """Return versions, platform, and a digest of all sources: what results depend on besides arguments."""
-    digest = hashlib.sha256()
-    for path in sorted(_PACKAGE.rglob("*.py")):
-        digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
     versions = [version(name) for name in ("jax", "jaxlib", "flax")]
-    return f"{' '.join(versions)} {jax.default_backend()} {digest.hexdigest()}"
+    return f"{' '.join(versions)} {jax.default_backend()} {package_digest(_PACKAGE)}"

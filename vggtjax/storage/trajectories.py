@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, TextIO, get_args
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Float64, Int
-from scipy.spatial.transform import Rotation
 
 from vggtjax.errors import InputError, ResultError, check_choice, reading
 
 Quaternion = Literal["xyzw", "wxyz"]
 
 _MOST_BYTES = 2**27  # of a text file; a million poses
+_LONGEST_LINE = 2**16  # letters
 _UNIT = 0.01  # by which a quaternion's length may differ from 1
 _WIDER = 1.01  # times the tolerance is the search range for partners: sums of times are rounded
 _MOST_CANDIDATES = 10_000_000  # pairs of timestamps within the tolerance; 160 MB of indices
@@ -35,7 +37,9 @@ def write_trajectory(
     and VGGT4D have no comments, as theirs.
     """
     poses = world_from_camera.astype(np.float64)
-    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True, scalar_first=quaternion == "wxyz")
+    turns = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3]).as_quat(
+        canonical=True, scalar_first=quaternion == "wxyz"
+    )
     rows = np.column_stack([times, poses[:, :3, 3], turns])
     header = commented(f"timestamp tx ty tz {_COLUMNS['xyzw']} (world-from-camera)", note)
     header = header if quaternion == "xyzw" else ""
@@ -69,7 +73,7 @@ def read_trajectory(
         line = int(np.argmax(abs(lengths - 1)))
         raise ResultError(f"{path} has a quaternion of length {lengths[line]:.3f} in pose {line}; expected 1")
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(turns).as_matrix()
+    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(turns).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]
     return rows[:, 0], poses
 
@@ -138,7 +142,9 @@ def read_numbers(path: str | Path, columns: int | tuple[int, ...]) -> Float[np.n
             raise ResultError(f"{path} has {path.stat().st_size} bytes; expected at most {_MOST_BYTES}")
         warnings.simplefilter("ignore")  # of an empty file, an error below
         try:
-            array = np.loadtxt((line.replace(",", " ") for line in file), ndmin=2)
+            array = np.loadtxt(_lines(file, path), ndmin=2)
+        except ResultError:
+            raise
         except ValueError as error:  # not text, not numbers, or lines of different length
             reason = str(error).split(";")[0].split("\n")[0][:100]
             raise ResultError(f"{path} is not a table of {expected} numbers a line ({reason})") from None
@@ -148,3 +154,11 @@ def read_numbers(path: str | Path, columns: int | tuple[int, ...]) -> Float[np.n
     if not np.isfinite(array).all():
         raise ResultError(f"{path} holds {array[~np.isfinite(array)][0]}; expected finite numbers")
     return array
+
+
+def _lines(file: TextIO, path: Path) -> Iterator[str]:
+    """Yield lines with spaces for commas; one long line would take many times its size."""
+    while line := file.readline(_LONGEST_LINE + 1):
+        if len(line) > _LONGEST_LINE:
+            raise ResultError(f"{path} has a line of over {_LONGEST_LINE} letters; expected numbers")
+        yield line.replace(",", " ")

@@ -142,6 +142,10 @@ def _staged(folder: Path) -> Iterator[Path]:
 
 @lru_cache(maxsize=256)  # once in a process: a scan of 20,000 files takes as long as writing 50
 def _remove_leftovers(folder: Path) -> None:
+    remove_leftovers(folder)
+
+
+def remove_leftovers(folder: Path) -> None:
     """Remove what killed writers left in a folder: their locks are free, or they have no lock and are old."""
     for path in [Path(entry) for entry in os.scandir(folder) if _LEFTOVER.fullmatch(entry.name)]:
         with suppress(OSError):  # files of another user, or of a writer that ends now

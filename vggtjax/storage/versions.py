@@ -1,0 +1,24 @@
+"""What code runs here: versions, and a digest of this package's sources. Does not import jax."""
+
+from __future__ import annotations
+
+import hashlib
+from importlib.metadata import version
+from pathlib import Path
+
+_PACKAGE = Path(__file__).parents[1]
+
+
+def package_digest(package: Path = _PACKAGE) -> str:
+    """Return a digest of all Python files in a folder."""
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def running_versions() -> str:
+    """Return in words which code runs in this process: equal words, equal results."""
+    from vggtjax import __version__
+
+    return f"vggtjax {__version__} (sources {package_digest()[:8]}) with jax {version('jax')}"
