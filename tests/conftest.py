@@ -1,6 +1,5 @@
 """What every test shares: strict jax settings, the tiny model of the golden files, real footage where it is present."""
 
-import json
 import os
 from pathlib import Path
 
@@ -8,11 +7,9 @@ import jax
 import pytest
 from hypothesis import settings
 
-from benchmarks.seeded import seeded_state_dict
-from converters import convert_state_dict
+from benchmarks.golden import GOLDEN, golden_config, golden_params
 from vggtjax import VGGTConfig
 
-GOLDEN = Path(__file__).parent / "golden"
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 _MAPPINGS = 2**14  # Linux allows 65530
 
@@ -53,18 +50,13 @@ def golden() -> Path:
 @pytest.fixture(scope="session")
 def config() -> VGGTConfig:
     """The tiny model: 24 pairs like VGGT-1B, so that every layer index is a real one."""
-    return VGGTConfig(**json.loads((GOLDEN / "config.json").read_text()))
+    return golden_config()
 
 
 @pytest.fixture(scope="session")
-def seeded_params(config):
+def seeded_params():
     """Return the tiny model's parameters for a seed."""
-    shapes = json.loads((GOLDEN / "shapes.json").read_text())
-
-    def make(seed: int):
-        return jax.tree.map(jax.numpy.asarray, convert_state_dict(seeded_state_dict(shapes, seed), config))
-
-    return make
+    return golden_params
 
 
 @pytest.fixture(scope="session")

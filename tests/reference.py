@@ -1,7 +1,8 @@
-"""The aggregator and the Gram maps again, slow and obvious: numpy in float64, Python loops, no scan, no cond."""
+"""The aggregator, the Gram maps and multi-Otsu again, slow and obvious: numpy, Python loops, no scan, no cond."""
 
 import numpy as np
 from scipy.special import erf
+from skimage.filters import threshold_multiotsu
 
 from vggtjax import VGGTConfig
 
@@ -120,3 +121,20 @@ def gram_map(rows, columns, layers, statistic, offsets, gram):
         result[r] = average.mean(1) if statistic == "mean" else average.std(1, ddof=1)
     low, high = result.min(1, keepdims=True), result.max(1, keepdims=True)
     return (result - low) / (high - low + 1e-6)
+
+
+def multi_otsu(values, bins=256):
+    """Return the highest threshold of Otsu's best partition into two to four classes, by scikit-image."""
+    best, best_score = float(values.max()), -np.inf
+    if best - values.min() < 1e-6:
+        return best
+    distinct = np.count_nonzero(np.histogram(values, bins)[0])
+    for classes in range(2, min(4, distinct) + 1):
+        thresholds = threshold_multiotsu(values, classes=classes, nbins=bins)
+        regions = np.digitize(values, bins=thresholds)
+        if len(np.unique(regions)) < classes:
+            continue
+        score = np.var([values[regions == i].mean() for i in range(classes)]) / classes**0.5
+        if score > best_score:
+            best, best_score = float(thresholds[-1]), score
+    return best

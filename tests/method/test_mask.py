@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.filters import threshold_otsu
 
+from tests.reference import multi_otsu
 from vggtjax.errors import InputError
 from vggtjax.method.mask import (
     dynamic_pixels,
@@ -20,6 +21,7 @@ from vggtjax.method.mask import (
 )
 
 _otsu = jax.jit(otsu_threshold)
+_multi_otsu = jax.jit(multi_otsu_threshold)
 
 
 @settings(max_examples=60)
@@ -53,6 +55,20 @@ def test_multi_otsu_of_constant_saliency_has_no_dynamic_pixels(saliency):
     assert not dynamic_pixels(jnp.asarray(saliency), (28, 28), threshold="multi-otsu").any()
 
 
+@settings(max_examples=40)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    centres=st.lists(st.floats(0, 1), min_size=1, max_size=5),
+    spread=st.sampled_from([0.0, 1e-3, 0.03, 0.2]),
+)
+def test_multi_otsu_agrees_with_scikit_image_within_a_bin(seed, centres, spread):
+    generator = np.random.default_rng(seed)
+    values = generator.choice(centres, size=(5, 20, 40)) + spread * generator.normal(size=(5, 20, 40))
+    values = values.astype(np.float32)
+    width = (values.max() - values.min()) / 256
+    assert abs(float(_multi_otsu(values)) - multi_otsu(values)) <= 1.01 * width + 1e-6
+
+
 def test_multi_otsu_cuts_every_clip_at_its_own_threshold():
     saliency = np.zeros((2, 2, 4, 4), np.float32)
     saliency[0, :, :2] = 1.0  # two values alone
@@ -62,7 +78,7 @@ def test_multi_otsu_cuts_every_clip_at_its_own_threshold():
     mask = np.asarray(run(jnp.asarray(saliency), (16, 16), threshold="multi-otsu"))
     pixels = np.asarray(upsample(jnp.asarray(saliency), (16, 16)))
     for one, values in zip(mask, pixels, strict=True):
-        assert np.array_equal(one, values > multi_otsu_threshold(values))
+        assert np.array_equal(one, values > multi_otsu(values))
         assert 0 < one.mean() < 0.7
 
 

@@ -1,7 +1,6 @@
 """The network against numbers of the public PyTorch code: plain, drop and zero passes; tokens, poses, depth, points."""
 
 import dataclasses
-import json
 from functools import partial
 
 import jax
@@ -9,47 +8,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.seeded import seeded_images
+from benchmarks.golden import FORWARD, OUTPUTS, TOLERANCE, GoldenPass, spread_error
 from vggtjax import decode_pose, encode, encode_pose, forward
 from vggtjax.network.aggregator import aggregate, identity
-
-TOLERANCE = 1e-4  # of each array's standard deviation; measured: 1e-6 (poses) to 3e-5 (points)
 
 _forward = jax.jit(forward, static_argnames=("config", "suppress", "outputs"))
 
 
 def assert_close(made, golden: np.ndarray) -> None:
-    error = np.abs(np.asarray(made).reshape(golden.shape) - golden).max() / golden.std()
-    assert error <= TOLERANCE
+    assert spread_error(made, golden) <= TOLERANCE
 
 
-class Case:
-    def __init__(self, path, seeded_params, config):
-        self.arrays = np.load(path)
-        meta = json.loads(str(self.arrays["meta"]))
-        self.params, self.config = seeded_params(meta["seed"]), config
-        self.size = (meta["height"], meta["width"])
-        images = [seeded_images(meta["frames"], *self.size, meta["seed"] + b) for b in range(meta["batch"])]
-        self.images = np.stack(images).transpose(0, 1, 3, 4, 2)
-        p = config.patch_size
-        h, w = self.size[0] // p, self.size[1] // p
-        self.tokens = self.arrays["masks"].reshape(meta["batch"], meta["frames"], h, p, w, p).any(axis=(3, 5))
-
-
-@pytest.fixture(scope="module", params=["single", "frames4", "batch2"])
-def case(request, golden, seeded_params, config):
-    return Case(golden / f"forward_{request.param}.npz", seeded_params, config)
+@pytest.fixture(scope="module", params=FORWARD)
+def case(request):
+    return GoldenPass(request.param)
 
 
 def test_plain_pass(case):
     made = _forward(case.params, case.images, case.config, outputs=("camera", "depth", "points"))
-    for name, golden in {
-        "pose_encoding": "pose_enc",
-        "depth": "depth",
-        "depth_confidence": "depth_conf",
-        "world_points": "world_points",
-        "world_points_confidence": "world_points_conf",
-    }.items():
+    for name, golden in OUTPUTS.items():
         assert_close(getattr(made, name), case.arrays[f"plain/{golden}"])
     extrinsic, intrinsic = decode_pose(made.pose_encoding, case.size)
     assert_close(extrinsic, case.arrays["plain/extrinsic"])
@@ -57,8 +34,8 @@ def test_plain_pass(case):
 
 
 @pytest.mark.parametrize("name", ["frames4", "batch2"])
-def test_tracks(golden, seeded_params, config, name):
-    case = Case(golden / f"forward_{name}.npz", seeded_params, config)
+def test_tracks(name):
+    case = GoldenPass(name)
     queries = case.arrays["queries"]
     made = _forward(case.params, case.images, case.config, outputs=("tracks",), query_points=queries)
     for value, key, tolerance in (
@@ -88,15 +65,15 @@ def test_pose_codec(case):
     assert np.allclose(fov[valid], golden[..., 7:][valid], atol=1e-5)
 
 
-def test_tokens(golden, seeded_params, config):
-    case = Case(golden / "forward_frames4.npz", seeded_params, config)
-    patch_tokens = jax.jit(partial(encode, config=config))(case.params, case.images)
+def test_tokens():
+    case = GoldenPass("frames4")
+    patch_tokens = jax.jit(partial(encode, config=case.config))(case.params, case.images)
     assert_close(patch_tokens, case.arrays["plain/patch_tokens"])
     layers = (4, 11, 17, 23)
     for taps in (layers, (0, *layers[1:])):  # layer 0 is not a tap of the model, but a tap can be anywhere
         run = partial(
             aggregate,
-            config=dataclasses.replace(config, taps=taps),
+            config=dataclasses.replace(case.config, taps=taps),
             grid=case.tokens.shape[2:],
             captures=[identity] * 4,
         )

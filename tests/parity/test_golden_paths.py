@@ -7,12 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.parity.test_golden_forward import Case, assert_close
+from benchmarks.golden import BFLOAT16, GoldenPass, spread_error
+from tests.parity.test_golden_forward import assert_close
 from vggtjax import forward
 from vggtjax.config import Suppress
 from vggtjax.network import attention, gathered_attention, pieces
-
-BFLOAT16 = {"pose_enc": 0.06, "depth": 0.25, "depth_conf": 0.15}  # of each array's deviation; measured: half of it
 
 IMPLEMENTATIONS = {
     "in chunks": attention._in_chunks,
@@ -22,8 +21,8 @@ IMPLEMENTATIONS = {
 
 
 @pytest.fixture(scope="module")
-def case(golden, seeded_params, config):
-    return Case(golden / "forward_frames4.npz", seeded_params, config)
+def case():
+    return GoldenPass("frames4")
 
 
 @pytest.fixture(params=IMPLEMENTATIONS)
@@ -79,6 +78,5 @@ def test_bfloat16_stays_within_its_bound(case):
             (made.depth, "depth"),
             (made.depth_confidence, "depth_conf"),
         ):
-            golden = case.arrays[f"{name}/{key}"]
-            error = np.abs(np.asarray(value).reshape(golden.shape) - golden).max() / golden.std()
+            error = spread_error(value, case.arrays[f"{name}/{key}"])
             assert error <= BFLOAT16[key], (name, key, error)

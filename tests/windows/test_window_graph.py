@@ -48,7 +48,7 @@ def test_exact_edges_give_exact_worlds(loop):
     assert worst(solve_graph(6, edges, [1.0] * 6), worlds) < 1e-8
 
 
-@pytest.mark.parametrize("count", [12, 30])  # with the dense and with the sparse derivative
+@pytest.mark.parametrize("count", [12, 30])
 def test_a_loop_takes_the_drift_back(count):
     generator = np.random.default_rng(1)
     worlds = ring(count)

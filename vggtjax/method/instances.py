@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float64, Int, UInt8
-from scipy import ndimage
-from scipy.optimize import linear_sum_assignment
 
 from vggtjax.errors import InputError
 from vggtjax.storage.arrays import zeros_beside
@@ -90,7 +89,7 @@ def find_instances(
 def _regions(mask: Bool[np.ndarray, "H W"], least: float) -> list[Int[np.ndarray, "N 2"]]:
     """Return the pixels (row, column) of each connected region that is large enough, the largest first."""
     labels = np.zeros(mask.shape, np.int32)
-    ndimage.label(mask, _NEIGHBOURS, output=labels)
+    scipy.ndimage.label(mask, _NEIGHBOURS, output=labels)
     places = np.argwhere(labels)
     owner = labels[places[:, 0], places[:, 1]]
     sizes = np.bincount(owner, minlength=int(labels.max()) + 1)[1:]
@@ -109,7 +108,7 @@ def _matched(known: list[_Object], regions: list[Int[np.ndarray, "N 2"]], frame:
     size = np.sqrt([[max(len(owner.pixels), len(region)) for region in regions] for owner in known])
     distance = np.linalg.norm(expected[:, None] - centres[None], axis=2) / size
     cost = np.minimum(distance, _REACH) ** 2  # a region beyond the reach costs as much as no match
-    for i, j in zip(*linear_sum_assignment(cost), strict=True):
+    for i, j in zip(*scipy.optimize.linear_sum_assignment(cost), strict=True):
         if distance[i, j] < _REACH:
             owners[j] = known[i]
     return owners

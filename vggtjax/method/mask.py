@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.method.clustering import kmeans
@@ -60,7 +59,7 @@ def dynamic_pixels(
     Args:
         saliency: of every patch, in [0, 1].
         size: height and width of the frames in pixels.
-        threshold: "otsu" (at or above, 4DVGGT-D) or "multi-otsu" (above, VGGT4D), which is computed on the host.
+        threshold: "otsu" (at or above, 4DVGGT-D) or "multi-otsu" (above, VGGT4D).
         frames: where the frames are; those that make shares equal have no dynamic pixels.
     """
     is_real = frames.are_real(None, *saliency.shape[:2])
@@ -70,9 +69,8 @@ def dynamic_pixels(
         varies = high - low >= CONSTANT
         if threshold == "otsu":
             return (pixels >= otsu_threshold(pixels, frames=frames)) & varies
-        scalar = jax.ShapeDtypeStruct((), jnp.float32)
         every = frames.gather(pixels, axis=0)[: frames.counted(len(pixels))]
-        return (pixels > jax.pure_callback(_multi_otsu, scalar, every, vmap_method="sequential")) & varies
+        return (pixels > multi_otsu_threshold(every)) & varies
 
     mask = jax.vmap(one_clip)(upsample(saliency, size))
     return mask if is_real is None else mask & is_real[:, :, None, None]
@@ -174,34 +172,67 @@ def _extremes(values: Float[Array, "S ..."], frames: Frames) -> tuple[Float[Arra
     return frames.min(low), frames.max(high)
 
 
-def multi_otsu_threshold(values: np.ndarray) -> float:
-    """Return the highest threshold of Otsu's best partition into two to four classes (VGGT4D), on the host.
+def multi_otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS) -> Float[Array, ""]:
+    """Return the highest threshold of Otsu's best partition into two to four classes (VGGT4D).
 
-    The number of classes K is that of the largest variance of the classes' means over sqrt(K), among numbers up to that
-    of distinct values. Of constant values, the value is returned.
+    Partitions are those of scikit-image's `threshold_multiotsu`. The number of classes K is that of the largest
+    variance of the classes' means over sqrt(K), among numbers up to that of bins with values. Of constant values the
+    value is returned; of values that are not all finite, NaN.
     """
-    from skimage.filters import threshold_multiotsu
+    low, high = values.min(), values.max()
+    width = (high - low) / bins
+    index = jnp.floor((values.ravel() - low) / jnp.where(width > 0, width, 1))
+    index = jnp.clip(jnp.where(jnp.isfinite(index), index, 0), 0, bins - 1).astype(jnp.int32)
+    counts = jnp.bincount(index, length=bins)
+    between = _between_classes(counts / values.size)
+    centres = low + width * (jnp.arange(bins) + 0.5)
+    best, best_score = high, jnp.asarray(-jnp.inf)
+    for classes in range(2, MOST_CLASSES + 1):
+        thresholds = centres[_partition(between, classes)]
+        region = (values[..., None] >= thresholds[(None,) * values.ndim]).sum(axis=-1)
+        sizes, sums = zip(*(_size_and_sum(values, region == i) for i in range(classes)), strict=True)
+        mean = jnp.stack(sums) / jnp.maximum(jnp.stack(sizes), 1)
+        score = jnp.where(jnp.stack(sizes).all(), mean.var() / classes**0.5, -jnp.inf)
+        wins = (jnp.count_nonzero(counts) >= classes) & (score > best_score)
+        best, best_score = jnp.where(wins, thresholds[-1], best), jnp.where(wins, score, best_score)
+    return jnp.where(jnp.isfinite(high - low), jnp.where(high - low < CONSTANT, high, best), jnp.nan)
 
-    values = np.asarray(values, np.float32)
-    best, best_score = float(values.max()), -np.inf
-    if best - values.min() < CONSTANT:
-        return best
-    distinct = np.count_nonzero(np.histogram(values, BINS)[0])
-    for classes in range(2, min(MOST_CLASSES, distinct) + 1):
-        thresholds = threshold_multiotsu(values, classes=classes, nbins=BINS)
-        regions = np.digitize(values, bins=thresholds)
-        if len(np.unique(regions)) < classes:
-            continue
-        score = np.var([values[regions == i].mean() for i in range(classes)]) / classes**0.5
-        if score > best_score:
-            best, best_score = float(thresholds[-1]), score
-    return best
+
+def _between_classes(shares: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """Return the part of the class of bins i to j in the variance between classes, 0 for classes without values.
+
+    As in scikit-image, bin 0 counts as bin 1 does, and adds nothing as a class of its own.
+    """
+    n = len(shares)
+    mass, moment = (jnp.pad(jnp.cumsum(x), (1, 0)) for x in (shares, jnp.maximum(jnp.arange(n), 1) * shares))
+    mass, moment = (x[None, 1:] - x[:n, None] for x in (mass, moment))
+    is_class = (mass > 0) & (jnp.arange(n)[:, None] <= jnp.arange(n)[None])
+    return jnp.where(is_class, moment**2 / jnp.where(is_class, mass, 1), 0).at[0, 0].set(0)
 
 
-def _multi_otsu(values: np.ndarray) -> np.ndarray:
-    values = np.asarray(values)
-    threshold = multi_otsu_threshold(values) if np.isfinite(values).all() else np.nan  # no value is above NaN
-    return np.asarray(threshold, np.float32)
+def _partition(between: Float[Array, "n n"], classes: int) -> Int[Array, " K-1"]:
+    """Return the last bins of all classes but the highest, of the best partition; of equally good ones the first.
+
+    The best partition of the bins from j on into k classes follows from those into k - 1 classes.
+    """
+    n = len(between)
+    value, ends = between[:, -1], []  # of the bins from j on as one class
+    for _ in range(classes - 1):
+        rest = jnp.append(value[1:], -jnp.inf)  # of the bins after t
+        total = jnp.where(jnp.arange(n)[:, None] <= jnp.arange(n)[None], between + rest[None], -jnp.inf)
+        ends.append(jnp.argmax(total, axis=1))
+        value = total.max(axis=1)
+    start, found = jnp.zeros((), jnp.int32), []
+    for end in reversed(ends):
+        found.append(end[start])
+        start = jnp.minimum(end[start] + 1, n - 1)
+    return jnp.stack(found)
+
+
+def _size_and_sum(values: Float[Array, "S ..."], member: Bool[Array, "S ..."]) -> tuple[Array, Array]:
+    """Return the number and the sum of the members: a sum of sums over frames, which keeps float32 exact enough."""
+    sums = jnp.where(member, values, 0).reshape(len(values), -1).sum(axis=1)
+    return member.sum(), jax.lax.optimization_barrier(sums).sum()
 
 
 def dynamic_tokens(

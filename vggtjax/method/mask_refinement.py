@@ -12,9 +12,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 from jaxtyping import Array, Bool, Float, Int
-from scipy import ndimage
-from scipy.spatial import KDTree
 
 from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
@@ -122,7 +121,7 @@ def statistical_outliers(
         outlier |= ~valid.ravel()
     known = flat[~outlier]
     if len(known):
-        distances, _ = KDTree(known, leafsize=32).query(known, k=min(NEIGHBOURS, len(known)), workers=-1)
+        distances, _ = scipy.spatial.KDTree(known, leafsize=32).query(known, k=min(NEIGHBOURS, len(known)), workers=-1)
         distance = distances.reshape(len(known), -1).mean(axis=1)
         outlier[~outlier] = distance > distance.mean() + OUTLIER_SIGMA * distance.std()
     return outlier.reshape(points.shape[:2])
@@ -241,5 +240,5 @@ def _packed(inside: Bool[np.ndarray, "S H W"], count: int) -> tuple[np.ndarray, 
 
 def _smoothed(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     """Close with OpenCV's 5 x 5 ellipse, then dilate with a full 3 x 3; pixels beyond the edge change neither."""
-    closed = ndimage.binary_erosion(ndimage.binary_dilation(mask, _CLOSING), _CLOSING, border_value=1)
-    return ndimage.binary_dilation(closed, np.ones((3, 3), bool))
+    closed = scipy.ndimage.binary_erosion(scipy.ndimage.binary_dilation(mask, _CLOSING), _CLOSING, border_value=1)
+    return scipy.ndimage.binary_dilation(closed, np.ones((3, 3), bool))

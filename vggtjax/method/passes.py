@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -77,10 +78,73 @@ def first_pass(
         config,
         outputs=outputs if query_points is None else (*outputs, "tracks"),
         query_points=query_points,
-        accumulator=cues,
+        accumulator=None if compute.frames.counted(clips.images.shape[1]) == 1 else cues,
         compute=compute,
     )
+    return _with_saliency(predictions, cues, clips, config, exponents)
+
+
+def either_pass(
+    params: Params,
+    clips: ClipBatch,
+    dynamic_mask: Bool[Array, "B S H W"],
+    is_first: Bool[Array, ""],
+    config: VGGTConfig,
+    *,
+    gram: Gram = "cosine",
+    suppression: Suppression = Suppression(),
+    outputs: tuple[str, ...] = ("camera", "depth"),
+    compute: Compute = Compute(),
+) -> tuple[Predictions, Float[Array, "B S h w"]]:
+    """Run the first pass or the second: one program serves both, and is compiled once.
+
+    Args:
+        params: the model's parameter tree.
+        clips: images, patch tokens and numbers of real frames.
+        dynamic_mask: dynamic pixels; none for the first pass.
+        is_first: whether this is the first pass, in which motion cues are added up. The saliency of the second pass is
+            meaningless.
+        config: the model's configuration.
+        gram: similarity of the motion cues.
+        suppression: how keys of dynamic tokens are suppressed, and in which pairs; 0 pairs for the first pass.
+        outputs: what to predict, as for `forward`.
+        compute: as for `predict`.
+    """
+    cues = GramCues(config.motion, config.depth, gram, compute.frames)
+    masking = dataclasses.replace(suppression, dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size))
+    options = {"outputs": outputs, "suppression": masking, "compute": compute}
+    predictions = predict(params, clips, config, accumulator=_Sometimes(cues, is_first), **options)
+    return _with_saliency(predictions, cues, clips, config)
+
+
+@dataclass(frozen=True)
+class _Sometimes:
+    """Motion cues that are added up in some calls of a program."""
+
+    cues: GramCues
+    is_read: Bool[Array, ""]
+
+    def layer_counts(self) -> Int[Array, "depth cues"]:
+        return self.is_read * jnp.asarray(self.cues.layer_counts())
+
+    def zeros(self, B: int, S: int, P: int) -> Any:
+        return self.cues.zeros(B, S, P)
+
+    def add(self, *arguments: Any) -> Any:
+        return self.cues.add(*arguments)
+
+
+def _with_saliency(
+    predictions: Predictions,
+    cues: GramCues,
+    clips: ClipBatch,
+    config: VGGTConfig,
+    exponents: Float[Array, " cues"] | None = None,
+) -> tuple[Predictions, Float[Array, "B S h w"]]:
+    """Return the predictions without sums of cues, and the saliency that these sums give; 0 without them."""
     B, S, h, w = (*clips.images.shape[:2], *patch_grid(clips.images, config))
+    if predictions.cue_sums is None:  # a single frame
+        return predictions, jnp.zeros((B, S, h, w))
     saliency = cues.saliency(predictions.cue_sums, exponents).reshape(B, S, h, w)
     return predictions._replace(cue_sums=None), saliency
 
@@ -117,11 +181,17 @@ def second_pass(
         masking = dataclasses.replace(suppression, dynamic_tokens=tokens)
         return predict(params, clips, config, suppression=masking, outputs=outputs, compute=compute)
 
-    fields = {"camera": ("pose_encoding",), "depth": ("depth", "depth_confidence")}
-    wanted = {name: getattr(plain, name, None) for output in outputs for name in fields.get(output, (output,))}
-    if plain is None or any(value is None for value in wanted.values()) or dynamic_mask.dtype != bool:
+    unchanged = None if plain is None else only(plain, outputs)
+    if unchanged is None or dynamic_mask.dtype != bool:
         return masked()
-    return jax.lax.cond(compute.frames.any(dynamic_mask.any()), masked, lambda: Predictions(**wanted))
+    return jax.lax.cond(compute.frames.any(dynamic_mask.any()), masked, lambda: unchanged)
+
+
+def only(predictions: Predictions, outputs: tuple[str, ...]) -> Predictions | None:
+    """Return the predictions of these outputs alone; None if there is one that was not predicted."""
+    fields = {"camera": ("pose_encoding",), "depth": ("depth", "depth_confidence")}
+    wanted = {name: getattr(predictions, name, None) for output in outputs for name in fields.get(output, (output,))}
+    return None if any(value is None for value in wanted.values()) else Predictions(**wanted)
 
 
 def track_from(

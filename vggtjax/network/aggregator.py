@@ -40,7 +40,7 @@ class Accumulator(Protocol):
     The sums are any tree of arrays; they are carried through the scan, so no pair's q and k are stored.
     """
 
-    def layer_counts(self) -> Int[np.ndarray, "depth ..."]:
+    def layer_counts(self) -> Int[np.ndarray, "depth ..."] | Int[Array, "depth ..."]:
         """Return how often every pair is read; `add` receives the pair's own entry."""
         ...
 

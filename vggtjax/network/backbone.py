@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.block import Block
-from vggtjax.network.layers import LayerNorm, Params, apply, declare
+from vggtjax.network.layers import Conv, LayerNorm, Params, apply, declare
 from vggtjax.network.precision import check_compute_dtype, full_precision, widened
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
@@ -91,9 +90,9 @@ def declare_backbone(config: VGGTConfig) -> Params:
     }
 
 
-def _patch_embedding(config: VGGTConfig, dtype: str = "float32") -> nn.Conv:
+def _patch_embedding(config: VGGTConfig, dtype: str = "float32") -> Conv:
     size = (config.patch_size, config.patch_size)
-    return nn.Conv(config.embed_dim, size, strides=size, padding="VALID", dtype=jnp.dtype(dtype))
+    return Conv(config.embed_dim, size, strides=size, padding="VALID", dtype=jnp.dtype(dtype))
 
 
 def _block(config: VGGTConfig, dtype: str = "float32") -> Block:

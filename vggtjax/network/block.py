@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.network.layers import MLP, DType, LayerNorm, Params, apply, declare
+from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, Params, apply, declare
 from vggtjax.network.pieces import in_pieces, replaced_in_pieces
 from vggtjax.network.quantised import dequantised
 from vggtjax.network.rope import Rope, apply_rope
@@ -54,7 +54,7 @@ class Block:
         def before(rows):
             x, place = rows
             y = apply(LayerNorm(self.epsilon, dtype=self.dtype), params["norm1"], x)
-            y = apply(nn.Dense(3 * C, dtype=self.dtype), params["attention"]["qkv"], y).reshape(-1, 3, *heads)
+            y = apply(Dense(3 * C, dtype=self.dtype), params["attention"]["qkv"], y).reshape(-1, 3, *heads)
             q, k, v = (y[:, i] for i in range(3))  # [R, N, D]
             if self.qk_norm:
                 q = apply(LayerNorm(dtype=self.dtype), params["attention"]["q_norm"], q)
@@ -65,7 +65,7 @@ class Block:
             return q, k, v
 
         def after(x, y):
-            y = apply(nn.Dense(C, dtype=self.dtype), params["attention"]["projection"], y)
+            y = apply(Dense(C, dtype=self.dtype), params["attention"]["projection"], y)
             x = add(x, "scale1", y)
             y = apply(LayerNorm(self.epsilon, dtype=self.dtype), params["norm2"], x)
             return add(x, "scale2", apply(MLP(4 * C, C, self.dtype), params["mlp"], y))
@@ -84,7 +84,7 @@ class Block:
         def declared(module: nn.Module, channels: int) -> Params:
             return declare(module, jnp.zeros((1, channels)))
 
-        attention = {"qkv": declared(nn.Dense(3 * C), C), "projection": declared(nn.Dense(C), C)}
+        attention = {"qkv": declared(Dense(3 * C), C), "projection": declared(Dense(C), C)}
         if self.qk_norm:
             norm = declared(LayerNorm(), C // self.num_heads)
             attention |= {"q_norm": norm, "k_norm": norm}

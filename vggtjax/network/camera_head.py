@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from vggtjax.config import VGGTConfig
 from vggtjax.network.block import Block
 from vggtjax.network.frames import Frames
-from vggtjax.network.layers import MLP, LayerNorm, Params, apply, declare
+from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, declare
 from vggtjax.network.pose import POSE_SIZE
 from vggtjax.network.precision import full_precision
 
@@ -50,8 +50,8 @@ def predict_pose(
 
     def iteration(estimates, _):
         pose, previous = estimates  # sum of all updates so far; input of this iteration
-        embedded = apply(nn.Dense(E), params["pose_embedding"], previous)
-        modulation = apply(nn.Dense(3 * E), params["modulation"], nn.silu(embedded))
+        embedded = apply(Dense(E), params["pose_embedding"], previous)
+        modulation = apply(Dense(3 * E), params["modulation"], nn.silu(embedded))
         shift, scale, gate = jnp.split(modulation, 3, axis=-1)
         x = tokens + gate * (normed * (1 + scale) + shift)
         x, _ = jax.lax.scan(lambda x, layer: (block(layer, x, is_real=is_real)[0], None), x, params["trunk"])
@@ -72,8 +72,8 @@ def declare_camera_head(config: VGGTConfig) -> Params:
     return {
         "token_norm": declare(LayerNorm(), x),
         "empty_pose": pose,
-        "pose_embedding": declare(nn.Dense(E), pose),
-        "modulation": declare(nn.Dense(3 * E), x),
+        "pose_embedding": declare(Dense(E), pose),
+        "modulation": declare(Dense(3 * E), x),
         "trunk": Block(config.camera_num_heads).declare_stacked(config.camera_depth, E),
         "trunk_norm": declare(LayerNorm(), x),
         "pose_branch": declare(_branch(config), x),

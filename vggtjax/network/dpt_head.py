@@ -12,7 +12,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.layers import LayerNorm, Params, apply, declare
+from vggtjax.network.layers import Conv, Dense, LayerNorm, Params, apply, declare
 from vggtjax.network.pieces import largest_divisor
 from vggtjax.network.precision import full_precision
 
@@ -27,7 +27,7 @@ class TapProjection(nn.Module):
 
     @nn.compact
     def __call__(self, tokens: Float[Array, "... E"]) -> Float[Array, "... F"]:
-        return nn.Dense(self.features, name="projection")(LayerNorm(name="norm")(tokens))
+        return Dense(self.features, name="projection")(LayerNorm(name="norm")(tokens))
 
 
 class DepthToSpace(nn.Module):
@@ -39,7 +39,7 @@ class DepthToSpace(nn.Module):
     def __call__(self, x: Float[Array, "F h w C"]) -> Float[Array, "F H W C"]:
         F, h, w, C = x.shape
         s = self.factor
-        kernel = self.param("kernel", nn.initializers.lecun_normal(0, -1, batch_axis=(1, 2)), (C, s, s, C))
+        kernel = self.param("kernel", nn.initializers.zeros, (C, s, s, C))
         bias = self.param("bias", nn.initializers.zeros, (C,))
         x = jnp.einsum("fhwc,cabo->fhawbo", x, kernel.astype(x.dtype)).reshape(F, h * s, w * s, C)
         return x + bias.astype(x.dtype)[None, None, None]
@@ -52,8 +52,8 @@ class ResidualUnit(nn.Module):
     def __call__(self, x: Float[Array, "F h w C"]) -> Float[Array, "F h w C"]:
         C = x.shape[-1]
         x = nn.relu(x)
-        y = nn.relu(nn.Conv(C, (3, 3), name="conv1")(x))
-        return x + nn.Conv(C, (3, 3), name="conv2")(y)
+        y = nn.relu(Conv(C, (3, 3), name="conv1")(x))
+        return x + Conv(C, (3, 3), name="conv2")(y)
 
 
 class Fusion(nn.Module):
@@ -66,7 +66,7 @@ class Fusion(nn.Module):
         if lateral is not None:
             x = x + ResidualUnit(name="residual1")(lateral)
         x = ResidualUnit(name="residual2")(x)
-        x = nn.Dense(x.shape[-1], name="projection")(x)  # 1 x 1: commutes with the resize, and is cheaper before it
+        x = Dense(x.shape[-1], name="projection")(x)  # 1 x 1: commutes with the resize, and is cheaper before it
         return resize_aligned(x, size)
 
 
@@ -86,16 +86,16 @@ class DPTFeatures(nn.Module):
             DepthToSpace(4, name="upsample0")(taps[0]),
             DepthToSpace(2, name="upsample1")(taps[1]),
             taps[2],
-            nn.Conv(taps[3].shape[-1], (3, 3), strides=(2, 2), padding=1, name="downsample3")(taps[3]),
+            Conv(taps[3].shape[-1], (3, 3), strides=(2, 2), padding=1, name="downsample3")(taps[3]),
         ]
         levels = [
-            nn.Conv(self.features, (3, 3), use_bias=False, name=f"level{i}")(level) for i, level in enumerate(levels)
+            Conv(self.features, (3, 3), use_bias=False, name=f"level{i}")(level) for i, level in enumerate(levels)
         ]
         x = levels[3]
         for i in (3, 2, 1, 0):
             size = levels[i - 1].shape[1:3] if i else (2 * x.shape[1], 2 * x.shape[2])
             x = Fusion(name=f"fusion{i}")(x, levels[i] if i < 3 else None, size)
-        return nn.Conv(self.out_features, (3, 3), name="output")(x)
+        return Conv(self.out_features, (3, 3), name="output")(x)
 
 
 class Regression(nn.Module):
@@ -105,8 +105,8 @@ class Regression(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "F H W C"]) -> Float[Array, "F H W O"]:
-        x = nn.relu(nn.Conv(HIDDEN, (3, 3), name="conv1")(x))
-        return nn.Dense(self.channels, name="conv2")(x)
+        x = nn.relu(Conv(HIDDEN, (3, 3), name="conv1")(x))
+        return Dense(self.channels, name="conv2")(x)
 
 
 CHANNELS = {"depth": 2, "points": 4}  # values and confidence logit of the heads that regress

@@ -12,6 +12,18 @@ Params = dict[str, Any]
 DType = Any
 
 
+class Dense(nn.Dense):
+    """A linear layer. `init_params` draws its kernel: flax would trace a generator at every declaration and call."""
+
+    kernel_init: Any = nn.initializers.zeros
+
+
+class Conv(nn.Conv):
+    """A convolution, whose kernel `init_params` draws."""
+
+    kernel_init: Any = nn.initializers.zeros
+
+
 class LayerNorm(nn.LayerNorm):
     """Layer norm as PyTorch computes it: two passes for the variance, epsilon 1e-5 by default."""
 
@@ -28,8 +40,8 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "... C"]) -> Float[Array, "... F"]:
-        x = nn.Dense(self.hidden, dtype=self.dtype, name="fc1")(x)
-        return nn.Dense(self.features, dtype=self.dtype, name="fc2")(nn.gelu(x, approximate=False))
+        x = Dense(self.hidden, dtype=self.dtype, name="fc1")(x)
+        return Dense(self.features, dtype=self.dtype, name="fc2")(nn.gelu(x, approximate=False))
 
 
 def apply(module: nn.Module, params: Params, *inputs: Any) -> Any:

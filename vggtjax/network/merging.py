@@ -1,4 +1,4 @@
-"""Token merging in global attention (FastVGGT, arXiv 2509.02560): an approximation, several times faster.
+"""Token merging in global attention (FastVGGT, arXiv 2509.02560): an approximation, the faster the more frames.
 
 Similar tokens form a group before attention and get the group's output after it. Queries, keys and values are merged
 after norm and rotation, so the motion cues read them unmerged.

@@ -23,7 +23,7 @@ from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
-from vggtjax.network.track_head import declare_track_head, predict_tracks, smallest_side
+from vggtjax.network.track_head import check_track_size, declare_track_head, predict_tracks
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
 HEADS = {"camera": "camera_head", **DENSE_HEADS, "tracks": "track_head"}
@@ -244,8 +244,4 @@ def _check_queries(clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str],
     shape = tuple(query_points.shape)
     if len(shape) != 3 or shape != (B, max(shape[1], 1), 2):
         raise InputError(f"query_points have shape {shape}; expected [{B}, Q, 2] with at least one point")
-    if min(H, W) < smallest_side(config):
-        raise InputError(
-            f"tracks need frames of at least {smallest_side(config)} pixels a side; these have {H} x {W}: "
-            f"the pyramid has {config.track_corr_levels} levels"
-        )
+    check_track_size(H, W, config)

@@ -11,10 +11,11 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
+from vggtjax.errors import InputError
 from vggtjax.network.dpt_head import DPTFeatures, add_positions, declare_features, frames_at_once, resize_aligned
 from vggtjax.network.frames import Frames
 from vggtjax.network.gathered_attention import gathered_attention
-from vggtjax.network.layers import MLP, LayerNorm, Params, apply, declare
+from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, declare
 from vggtjax.network.precision import full_precision
 from vggtjax.network.sampling import bilinear, neighbours
 
@@ -84,13 +85,13 @@ def predict_tracks(
         x = x.swapaxes(1, 2) + place + kind  # [B, Q, S, E]
         delta = _updates(params, x, config, frames).swapaxes(1, 2)  # [B, S, Q, 2 + F]
         update = apply(LayerNorm(), params["feature_norm"], delta[..., 2:])
-        update = nn.gelu(apply(nn.Dense(F), params["feature_update"], update), approximate=False)
+        update = nn.gelu(apply(Dense(F), params["feature_update"], update), approximate=False)
         positions = jnp.where(jnp.asarray(later)[None, :, None, None], positions + delta[..., :2], start)
         return (positions, features + update), None
 
     (positions, features), _ = jax.lax.scan(iteration, frames.varying((start, features)), length=ITERATIONS)
     visibility, confidence = (
-        jax.nn.sigmoid(apply(nn.Dense(1), params[name], features)[..., 0]) for name in ("visibility", "confidence")
+        jax.nn.sigmoid(apply(Dense(1), params[name], features)[..., 0]) for name in ("visibility", "confidence")
     )
     return Tracks(positions * STRIDE, visibility, confidence)
 
@@ -98,6 +99,15 @@ def predict_tracks(
 def smallest_side(config: VGGTConfig) -> int:
     """Return the smallest side of an image, in pixels, with at least one pixel on every level of the pyramid."""
     return STRIDE * 2 ** (config.track_corr_levels - 1)
+
+
+def check_track_size(height: int, width: int, config: VGGTConfig) -> None:
+    """Raise InputError for frames that are too small to be tracked in."""
+    if min(height, width) < smallest_side(config):
+        raise InputError(
+            f"tracks need frames of at least {smallest_side(config)} pixels a side; these have {height} x {width}: "
+            f"the pyramid has {config.track_corr_levels} levels"
+        )
 
 
 def _feature_maps(params: Params, taps: list[Array], config: VGGTConfig, grid: tuple[int, int]) -> Array:
@@ -214,7 +224,7 @@ def _updates(params: Params, x: Float[Array, "B Q S E"], config: VGGTConfig, fra
     attend to them.
     """
     C, Q = config.track_hidden, x.shape[1]
-    start = apply(nn.Dense(C), params["input_projection"], apply(LayerNorm(), params["input_norm"], x))
+    start = apply(Dense(C), params["input_projection"], apply(LayerNorm(), params["input_norm"], x))
     virtual = params["virtual_tracks"][None, :, None]
     virtual = jnp.broadcast_to(virtual, (x.shape[0], VIRTUAL_TRACKS, x.shape[2], C))
     names = ("time", "virtual_to_point", "virtual", "point_to_virtual")
@@ -232,7 +242,7 @@ def _updates(params: Params, x: Float[Array, "B Q S E"], config: VGGTConfig, fra
         layer, jnp.concatenate([start, virtual], axis=1), {name: params[f"{name}_blocks"] for name in names}
     )
     x = apply(LayerNorm(), params["output_norm"], tokens[:, :Q] + start)
-    return apply(nn.Dense(config.track_features + 2), params["flow_projection"], x)
+    return apply(Dense(config.track_features + 2), params["flow_projection"], x)
 
 
 def _block(
@@ -255,7 +265,7 @@ def _block(
         for part, kernel, bias in zip((x, source, source), kernels, biases, strict=True)
     )
     out = gathered_attention(q, k, v, frames.are_real(None, B * G, T), frames).reshape(B, G, T, C)
-    x = x + apply(nn.Dense(C), params["attention"]["projection"], out)
+    x = x + apply(Dense(C), params["attention"]["projection"], out)
     return x + apply(MLP(4 * C, C), params["mlp"], apply(LayerNorm(), params["norm2"], x))
 
 
@@ -270,7 +280,7 @@ def declare_track_head(config: VGGTConfig) -> Params:
 
     def blocks(context: bool) -> Params:
         block = {
-            "attention": {"qkv": declared(nn.Dense(3 * C), C), "projection": declared(nn.Dense(C), C)},
+            "attention": {"qkv": declared(Dense(3 * C), C), "projection": declared(Dense(C), C)},
             "mlp": declared(MLP(4 * C, C), C),
         }
         for name in ("norm1", "norm2") + ("norm_context",) * context:
@@ -282,16 +292,16 @@ def declare_track_head(config: VGGTConfig) -> Params:
         "virtual_tracks": jnp.zeros((VIRTUAL_TRACKS, C)),
         "correlation_mlp": declared(MLP(C, F), correlations),
         "input_norm": declared(LayerNorm(), E),
-        "input_projection": declared(nn.Dense(C), E),
+        "input_projection": declared(Dense(C), E),
         "time_blocks": blocks(context=False),
         "virtual_blocks": blocks(context=False),
         "point_to_virtual_blocks": blocks(context=True),
         "virtual_to_point_blocks": blocks(context=True),
         "output_norm": declared(LayerNorm(), C),
-        "flow_projection": declared(nn.Dense(F + 2), C),
+        "flow_projection": declared(Dense(F + 2), C),
         "feature_map_norm": declared(LayerNorm(), F),
         "feature_norm": declared(LayerNorm(), F),
-        "feature_update": declared(nn.Dense(F), F),
-        "visibility": declared(nn.Dense(1), F),
-        "confidence": declared(nn.Dense(1), F),
+        "feature_update": declared(Dense(F), F),
+        "visibility": declared(Dense(1), F),
+        "confidence": declared(Dense(1), F),
     }

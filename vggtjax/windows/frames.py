@@ -86,7 +86,32 @@ def clip_of(frames: Sequence[tuple[Result, int]], like: Clip) -> Clip:
     )
 
 
-_ARRAYS = ("images", "source_size", "source_scale", "source_offset", "valid_box")
+class SeenFrames:
+    """Where the frames of the windows lie in the source: what is known of a clip that is never in memory as a whole."""
+
+    def __init__(self) -> None:
+        self._clip: Clip | None = None
+        self._parts: dict[str, list[np.ndarray]] = {name: [] for name in _PLACES}
+
+    def add(self, clip: Clip, window: range) -> None:
+        """Note the frames of a window; windows come in order."""
+        known = sum(map(len, self._parts["valid_box"]))
+        for name, parts in self._parts.items():
+            parts.append(getattr(clip, name)[known - window.start :])
+        self._clip = clip
+
+    def clip(self) -> Clip:
+        """Return a clip of the frames that were seen, whose pictures are black."""
+        assert self._clip is not None
+        arrays = {name: np.concatenate(parts) for name, parts in self._parts.items()}
+        frames = len(arrays["valid_box"])
+        images = np.broadcast_to(np.float32(0), (frames, *self._clip.images.shape[1:]))
+        names = [str(frame) for frame in range(frames)]
+        return dataclasses.replace(self._clip, images=images, frame_names=names, timestamps=None, **arrays)
+
+
+_PLACES = ("source_size", "source_scale", "source_offset", "valid_box")
+_ARRAYS = ("images", *_PLACES)
 
 
 def _joined(first: Clip, second: Clip) -> Clip:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,13 +15,17 @@ from jaxtyping import Float32
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.images import ImageFiles
 from vggtjax.clips.masks import load_masks
 from vggtjax.clips.preprocessing import Fitter
+from vggtjax.clips.queries import Queries, check_queries, check_words, parse_queries
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
-from vggtjax.errors import InputError
+from vggtjax.errors import ClipError, InputError, reading
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
+from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.track_head import check_track_size
 from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pipeline.stages import Stages
@@ -29,11 +35,13 @@ from vggtjax.results.folder import check_folder
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import RunFacts, versions
 from vggtjax.results.saving import Saving
+from vggtjax.storage.file_digest import file_digest
 from vggtjax.storage.writing import locked_folder
-from vggtjax.windows.frames import count_frames, window_clips
+from vggtjax.windows.frames import SeenFrames, count_frames, window_clips
 from vggtjax.windows.join import JoinRule
 from vggtjax.windows.plan import Windows, plan_windows
 from vggtjax.windows.store import FOLDER, WindowStore, write_cut
+from vggtjax.windows.tracks import Follow, Images, Start, Tracked
 from vggtjax.windows.whole import Whole, store_window
 
 _JOINED = 12.0 + 12.0  # bytes of a pixel, beside the files of a result: blended arrays, windows
@@ -44,6 +52,8 @@ class Tools(NamedTuple):
 
     run: Callable[[Clip], Reconstruction]
     describe: Callable[[Float32[np.ndarray, "F H W 3"]], Float32[np.ndarray, "F C"]]  # features for finding loops
+    follow: Follow | None = None
+    check_track_size: Callable[[int, int], None] = lambda height, width: None  # raises InputError for small frames
 
 
 class LongRun(NamedTuple):
@@ -55,6 +65,7 @@ class LongRun(NamedTuple):
     fitter: Fitter = Fitter()
     saving: Saving = Saving()
     rule: JoinRule = JoinRule()
+    tracks: Queries | str | None = None  # points to follow: in pixels of the fitted frames, or words for parse_queries
     on_stage: OnStage = no_stage
 
 
@@ -97,6 +108,8 @@ def reconstruct_long(
     """
     options = options.changed(**changes).resolved()
     check_fuses(fusion, options.method)
+    if long_run is not None and isinstance(long_run.tracks, str):
+        check_words(long_run.tracks)
     if options.refine_cameras:
         raise InputError("refine_cameras is for clips that are run at once; leave it out, or take fewer frames")
     config = model.config
@@ -107,7 +120,7 @@ def reconstruct_long(
         "model": model.identity.to_json(),
         "options": options.to_json(),
         "fusion": fusion_digest(fusion),
-        "masks": str(masks),
+        "masks": masks_digest(masks),
         "versions": versions(),
     }
     return run_windows(
@@ -137,7 +150,17 @@ def tools_of(
         tokens = stages.image_features(model.params, jax.device_put(images[None]))
         return np.asarray(tokens[0], np.float32).mean(axis=1)
 
-    return Tools(run, describe)
+    def follow(images: Images, starts: Sequence[Start]) -> list[Tracked]:
+        stages = Stages(config, options, len(images), (images.shape[1], images.shape[2]))
+        frames = jax.device_put(images[None])
+        clips = ClipBatch(frames, stages.image_features(model.params, frames))
+        found = []
+        for frame, places in starts:
+            tracks = stages.tracks(model.params, clips, jax.device_put(places[None]), np.asarray(frame, np.int32))
+            found.append(Tracked(*(np.asarray(value)[0] for value in tracks)))
+        return found
+
+    return Tools(run, describe, follow, partial(check_track_size, config=config))
 
 
 def run_windows(source: ClipSource, out: Path, plan: LongRun, tools: Tools, settings: dict[str, Any]) -> Reconstruction:
@@ -151,7 +174,7 @@ def run_windows(source: ClipSource, out: Path, plan: LongRun, tools: Tools, sett
         settings: all else that decides the windows, as JSON values; stored windows of other settings are not used.
     """
     opened, windows, seconds = open_source(source), plan.windows, StageSeconds()
-    check_folder(out, plan.saving.names(tracks=False))
+    check_folder(out, plan.saving.names(tracks=plan.tracks is not None))
     frames = count_frames(opened, plan.sampling) if plan.frames is None else plan.frames
     if not windows.cuts(frames):
         raise InputError(f"the clip has {frames} frames and window is {windows.window}; expected a longer clip")
@@ -162,24 +185,36 @@ def run_windows(source: ClipSource, out: Path, plan: LongRun, tools: Tools, sett
         "fitter": dataclasses.asdict(plan.fitter),
         "windows": [frames, windows.window, windows.shared],
     }
+    clips = window_clips(opened, plan.sampling, plan.fitter, cut)
+    first = next(clips)  # what is wrong with it is found before anything is written
+    shape = (frames, *first.images.shape[1:3])
+    if plan.tracks is not None:
+        tools.check_track_size(*shape[1:])
+        if isinstance(plan.tracks, str):
+            check_queries(plan.tracks, first, frames)
+        else:
+            plan.tracks.check(*shape)
+    sizes = np.repeat(first.source_size[:1], frames, axis=0)
+    announce(out, forecast_bytes(shape, sizes, plan.saving) + _JOINED * np.prod(shape))
     with locked_folder(out / FOLDER, "the windows of a clip"):
         store = WindowStore(out, decides)
         write_cut(out, windows.window, windows.shared)
         whole = Whole(store, cut, tools.run, plan.rule, plan.on_stage)
+        clip, seen = first, SeenFrames()
         with seconds.stage("windows"), plan.on_stage("windows") as progress:
-            clip = None
-            for number, clip in enumerate(window_clips(opened, plan.sampling, plan.fitter, cut)):
-                if number == 0:
-                    pixels = frames * clip.images[0, ..., 0].size
-                    sizes = np.repeat(clip.source_size[:1], frames, axis=0)
-                    shape = (frames, *clip.images.shape[1:3])
-                    announce(out, forecast_bytes(shape, sizes, plan.saving) + _JOINED * pixels)
+            for number, clip in enumerate(chain([first], clips)):
+                seen.add(clip, cut[number])
                 store_window(number, clip, cut[number], store, tools.run, tools.describe)
                 if progress is not None:
                     progress(number + 1, len(cut))
-        assert clip is not None
+        tracks = {}
+        if plan.tracks is not None:
+            assert tools.follow is not None
+            queries = parse_queries(plan.tracks, seen.clip()) if isinstance(plan.tracks, str) else plan.tracks
+            with seconds.stage("follow points"), plan.on_stage("follow points") as progress:
+                tracks = whole.tracks(queries, tools.follow, progress)
         with seconds.stage("join and blend"):
-            result = whole.result(clip, loops=not windows.no_loops)
+            result = whole.result(clip, loops=not windows.no_loops, tracks=tracks)
         with plan.on_stage("write") as progress:
             pictures = None
             if plan.saving.resolution == "original":
@@ -189,3 +224,14 @@ def run_windows(source: ClipSource, out: Path, plan: LongRun, tools: Tools, sett
         del result
         store.remove()
     return Reconstruction.load(out)
+
+
+def masks_digest(masks: str | Path | bool | None) -> str:
+    """Return text that changes when the given masks do. Raises ClipError for masks that are not there."""
+    if masks is None or isinstance(masks, bool):
+        return str(masks)
+    source = open_source(str(masks))
+    if not isinstance(source, ImageFiles):
+        raise ClipError(f"{masks} is not a folder of pictures; masks need one picture per frame")
+    with reading(masks, ClipError):
+        return f"{masks} {file_digest(source.paths)}"

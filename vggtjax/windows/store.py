@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from vggtjax.errors import ResultError
+from vggtjax.errors import InputError, OutputError, ResultError
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.arrays import read_array
-from vggtjax.storage.writing import write_errors, writing
+from vggtjax.storage.json_values import read_json
+from vggtjax.storage.writing import locked_folder, write_errors, writing
 
 FOLDER = ".vggtjax-windows"
 _CUT = "cut.json"
@@ -40,10 +41,16 @@ def write_cut(out: Path, window: int, overlap: int) -> None:
 def unfinished_cut(out: Path) -> tuple[int, int] | None:
     """Return the frames of a window and the overlap of a run that was stopped; None without one."""
     try:
-        window, overlap = json.loads((out / FOLDER / _CUT).read_text())
-        return int(window), int(overlap)
-    except (OSError, ValueError, TypeError):
+        return read_json(out / FOLDER / _CUT, tuple[int, int], "the cut of a clip")
+    except InputError:
         return None
+
+
+def discard(out: Path) -> None:
+    """Remove what a stopped run in windows left in a result's folder, unless a run is writing it."""
+    if (out / FOLDER).is_dir():
+        with suppress(OutputError), locked_folder(out / FOLDER, "the windows of a clip"):
+            shutil.rmtree(out / FOLDER, ignore_errors=True)
 
 
 class WindowStore:

@@ -6,16 +6,18 @@ One or two windows are in memory at a time; the arrays of the whole clip are map
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
 
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.queries import Queries
 from vggtjax.geometry.similarity import Similarity
-from vggtjax.progress import OnStage, no_stage
+from vggtjax.progress import OnStage, Progress, no_progress, no_stage
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import ARRAYS
 from vggtjax.windows.blend import View, blend_frame
@@ -25,11 +27,14 @@ from vggtjax.windows.join import Join, JoinRule, join_windows, reach_of
 from vggtjax.windows.loops import Loop, described_frames, find_loops, frames_around
 from vggtjax.windows.plan import blend_weights, shared_frames
 from vggtjax.windows.store import WindowStore
+from vggtjax.windows.tracks import Follow, Tracked, follow_points
 
 _LOOPS = 0.5  # tried, at most, for each window
 _WORSE = 2.0  # times the usual residual of neighbours; a loop window that fits worse shows another place
 _WORST = 0.2  # residual of a loop, relative to depth
 _LEAST_RESIDUAL = 0.005  # smaller ones do not tell a better join
+
+NO_TRACKS: Mapping[str, np.ndarray] = MappingProxyType({})
 
 logger = logging.getLogger(__name__)
 
@@ -57,13 +62,28 @@ class Whole:
     joins: list[Join] = field(default_factory=list)
     loops: list[TriedLoop] = field(default_factory=list)
 
-    def result(self, like: Clip, *, loops: bool) -> Reconstruction:
+    def tracks(self, queries: Queries, follow: Follow, progress: Progress | None) -> dict[str, np.ndarray]:
+        """Follow points through the windows, and return the fields of the whole result; they are mapped files."""
+        frames, points = self.windows[-1].stop, len(queries.frames)
+        shapes: dict[str, tuple[int, ...]] = {"track_positions": (frames, points, 2)}
+        shapes |= dict.fromkeys(("track_visibility", "track_confidence", "weights"), (frames, points))
+        arrays = self.store.arrays({name: (np.dtype(np.float32), shape) for name, shape in shapes.items()})
+        weights = arrays.pop("weights")
+
+        def images_of(number: int) -> Float32[np.ndarray, "F H W 3"]:
+            return self.store.load(window_name(number)).images / np.float32(255)
+
+        into = Tracked(*(arrays[f"track_{name}"] for name in Tracked._fields))
+        follow_points(queries, self.windows, images_of, follow, into, weights, progress or no_progress)
+        return {**arrays, "track_frames": queries.frames}
+
+    def result(self, like: Clip, *, loops: bool, tracks: Mapping[str, np.ndarray] = NO_TRACKS) -> Reconstruction:
         """Return the whole clip; its large arrays are mapped files of the store."""
         edges, reaches = self._neighbours()
         if loops:
             edges += self._loop_edges(like)
         worlds = solve_graph(len(self.windows), edges, reaches)
-        return self._blended(worlds)
+        return self._blended(worlds, tracks)
 
     def facts(self) -> dict[str, Any]:
         """Return what is told of the windows in the settings of the result, as JSON values."""
@@ -153,7 +173,7 @@ class Whole:
         between_both = to_first.similarity.after(to_second.similarity.inverse())
         return _edge(loop.first, loop.second, between_both, worst, usual)
 
-    def _blended(self, worlds: Sequence[Similarity]) -> Reconstruction:
+    def _blended(self, worlds: Sequence[Similarity], tracks: Mapping[str, np.ndarray]) -> Reconstruction:
         """Return the result, written frame by frame into mapped files; windows are loaded when frames need them."""
         total = self.windows[-1].stop
         first = self.store.load(window_name(0))
@@ -181,7 +201,7 @@ class Whole:
                 names.append(source.frame_names[number])
                 if progress is not None:
                     progress(frame + 1, total)
-        fields: dict[str, Any] = {"saliency": None, "timestamps": None, **arrays}
+        fields: dict[str, Any] = {"saliency": None, "timestamps": None, **arrays, **tracks}
         settings = first.settings | {"windows": self.facts()}
         return Reconstruction(
             **fields, frame_names=tuple(names), method=first.method, model_name=first.model_name, settings=settings
