@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from vggtjax import init_params
+from vggtjax.checkpoint import Model
 from vggtjax.config import VGGTConfig
 
 
@@ -21,3 +23,9 @@ def tiny_config(**changes: Any) -> VGGTConfig:
         "dpt_channels": (8, 8, 8, 8),
     }
     return VGGTConfig(**(fields | changes))
+
+
+def tiny_model() -> Model:
+    """Return the tiny network with seeded parameters."""
+    config = tiny_config()
+    return Model(config, init_params(0, config), "tiny")

@@ -24,6 +24,7 @@ from .network.pose import decode_pose as decode_pose
 from .network.pose import encode_pose as encode_pose
 from .options import LADDER as LADDER
 from .options import METHODS as METHODS
+from .pipeline.artefact import write_artefact as write_artefact
 from .pipeline.batch import reconstruct_many as reconstruct_many
 from .pipeline.run import compile_ahead as compile_ahead
 from .pipeline.run import infer as infer

@@ -10,9 +10,17 @@ from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import open_source
 from vggtjax.commands import main as cli
-from vggtjax.commands.reconstruct import Reading, _chosen, _cut_frames
+from vggtjax.commands.clip_options import Known
+from vggtjax.commands.one_clip import OneClip
 from vggtjax.commands.report import Report
+from vggtjax.errors import DeviceMemoryError
+from vggtjax.known.options import KnownGeometry
+from vggtjax.options import Options
 from vggtjax.pipeline import memory
+from vggtjax.pipeline.batch import reconstruct_many
+from vggtjax.pipeline.stage_runners import Compile
+from vggtjax.results.saving import Saving
+from vggtjax.storage.free_memory import Room, in_gigabytes
 from vggtjax.windows.plan import Windows
 from vggtjax.windows.store import FOLDER, write_cut
 
@@ -32,7 +40,7 @@ def frames(tmp_path_factory):
         ("--window 8 --overlap 1", "overlap is 1; expected a whole number of at least 2"),
         ("--overlap 2", "overlap is 2, but there are no windows"),
         ("--window 0 --overlap 2", "overlap is 2, but there are no windows"),
-        ("--window 4 --tracks grid:3", "--tracks and --window exclude each other"),
+        ("--window 4 --tracks grid:0", "tracks is 'grid:0'; expected grid:N"),
         ("--window 4 --shared-focal", "known cameras or lengths and --window exclude each other"),
     ],
 )
@@ -45,44 +53,150 @@ def test_options_that_cannot_be(frames, tmp_path, capsys, options, sentence):
     assert not out.exists()
 
 
-def test_a_video_that_does_not_fit_in_memory_is_run_in_windows(tmp_path, capsys, monkeypatch):
-    """The free memory is made up: one byte less than what 10 frames need."""
-    video = write_video(tmp_path / "clip.mp4", range(0, 1200, 100), size=(64, 64))
-    model = load_model("demo")
-    free = memory.predicted_bytes(model, 10, 64, 64) - 1
-    monkeypatch.setattr(memory, "available_bytes", lambda _: free)
-    words = ["reconstruct", str(video), "--model", "demo", "--method", "vggt", "--only", "cameras", "--no-loops"]
-    assert cli.main([*words, "--out", str(tmp_path / "cut")]) == 0
+def test_points_outside_the_frames_end_a_windowed_run_before_the_work(frames, tmp_path, capsys):
+    points, out = tmp_path / "points.csv", tmp_path / "out"
+    points.write_text("x,y,frame\n10,20,7\n")
+    words = ["reconstruct", str(frames), "--model", "demo", "--window", "4", "--tracks", str(points)]
+    assert cli.main([*words, "--out", str(out)]) == 2
+    assert "expected numbers, and a frame from 0 to 6" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    assert not out.exists()
+
+
+def free_for(monkeypatch, count, clips=1):
+    """Make up the free memory: what so many frames need, and one byte; nothing is known for None."""
+    needed = 0 if count is None else memory.predicted_bytes(load_model("demo"), count, 64, 64, clips=clips) + 1
+    monkeypatch.setattr(memory, "available", lambda _: None if count is None else Room(needed, "of a test"))
+    return needed
+
+
+def fail_once(monkeypatch):
+    """Let the first program that is compiled find no memory."""
+    run, calls = Compile.__call__, []
+
+    def failing(self, stage, *arguments, **options):
+        calls.append(stage)
+        if len(calls) == 1:
+            raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 123 bytes")
+        return run(self, stage, *arguments, **options)
+
+    monkeypatch.setattr(Compile, "__call__", failing)
+    return calls
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    return write_video(tmp_path_factory.mktemp("video") / "clip.mp4", range(0, 1600, 100), size=(64, 64))
+
+
+_WORDS = ["--model", "demo", "--method", "vggt", "--only", "cameras", "--no-loops"]
+
+
+@pytest.fixture(scope="module")
+def in_windows(video, tmp_path_factory):
+    """The video in windows of 8 frames."""
+    out = tmp_path_factory.mktemp("result") / "cut"
+    assert cli.main(["reconstruct", str(video), *_WORDS, "--window", "8", "--out", str(out)]) == 0
+    return Reconstruction.load(out)
+
+
+def test_a_video_that_does_not_fit_in_memory_is_run_in_windows(video, in_windows, tmp_path, capsys, monkeypatch):
+    free = free_for(monkeypatch, 10)
+    assert cli.main(["reconstruct", str(video), *_WORDS, "--out", str(tmp_path / "cut")]) == 0
     said = " ".join(capsys.readouterr().err.split())
-    needed = memory.predicted_bytes(model, 12, 64, 64)
-    assert f"12 frames need about {needed / 1e9:.1f} GB, {free / 1e9:.1f} GB are free: running windows of 8" in said
-    assert "frames, overlap 2; --window 0 runs all together" in said
-    assert Reconstruction.load(tmp_path / "cut").settings["windows"]["count"] == 2
+    needed = memory.predicted_bytes(load_model("demo"), 16, 64, 64)
+    sizes = f"16 frames need about {in_gigabytes(needed)}, {in_gigabytes(free)} are free of a test"
+    assert f"{sizes}: running windows of 8 frames, overlap 2; --window 0 runs all together" in said
+    cut = Reconstruction.load(tmp_path / "cut")
+    assert cut.settings["windows"]["count"] == in_windows.settings["windows"]["count"] == 3
+    assert np.array_equal(cut.depth, in_windows.depth)
     names = sorted(path.name for path in (tmp_path / "cut").iterdir())
     assert names == ["intrinsics.txt", "reconstruction.npz", "trajectory.txt"]
 
 
-def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, monkeypatch):
-    model, report = load_model("demo"), Report()
-    reading = Reading(open_source(str(frames)), Sampling(), Fitter(size=64, patch=8))
+def test_a_run_without_memory_is_run_once_more_in_windows(video, in_windows, tmp_path, capsys, monkeypatch):
+    calls = fail_once(monkeypatch)
+    words = ["reconstruct", str(video), *_WORDS, "--window", "0", "--no-memory-check"]
+    assert cli.main([*words, "--out", str(tmp_path / "out")]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "16 frames of 64 x 64 pixels do not fit in the memory of the device" in said
+    assert "running once more, in windows of 8 frames" in said
+    assert len(calls) > 1
+    assert np.array_equal(Reconstruction.load(tmp_path / "out").depth, in_windows.depth)
 
-    def with_room(count, *at_once):
-        free = None if count is None else memory.predicted_bytes(model, count, 64, 64)
-        monkeypatch.setattr(memory, "available_bytes", lambda _: free)
-        return _chosen(report, reading, model, tmp_path, at_once)
+
+def test_clips_of_a_batch_that_do_not_fit_are_run_in_windows(video, in_windows, tmp_path, monkeypatch):
+    def outcome(out, **changes):
+        saving, options = Saving(only=("cameras",)), Options(method="vggt")
+        found = reconstruct_many(
+            load_model("demo"), {"a": video}, tmp_path / out, options=options, saving=saving, **changes
+        )
+        (only,) = found
+        if only.status == "done":
+            assert np.array_equal(Reconstruction.load(tmp_path / out / "a").depth.shape, in_windows.depth.shape)
+            assert not (tmp_path / out / "a" / FOLDER).exists()
+        return only
+
+    free_for(monkeypatch, 10, clips=3)
+    predicted = outcome("predicted")
+    assert (predicted.status, predicted.frames) == ("done", 16)
+    assert predicted.reason.endswith("running windows of 8 frames, overlap 2")
+    free_for(monkeypatch, 10, clips=3)
+    refused = outcome("refused", known=KnownGeometry(shared_focal=True))
+    assert refused.status == "done"  # 16 frames need little more than 10: within the error of the prediction
+    fail_once(monkeypatch)
+    retried = outcome("retried", unchecked=True)
+    assert "run once more, in windows of 8 frames" in retried.reason
+
+
+def test_a_clip_that_cannot_fit_is_refused_before_the_work(frames, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(memory, "ERROR", 0.0)
+    free_for(monkeypatch, 5)
+    words = ["reconstruct", str(frames), "--model", "demo", "--out", str(tmp_path / "out")]
+    assert cli.main([*words, "--window", "0"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "GB are free of a test; what fits: --max-frames 5, or --size 48, or weights of half the size" in said
+    assert said.endswith("(--no-memory-check runs it all the same)")
+    assert not (tmp_path / "out").exists()
+
+
+def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, monkeypatch):
+    model = load_model("demo")
+
+    def with_room(count, *, window=None, **options):
+        free_for(monkeypatch, count)
+        clip = OneClip(
+            report=Report(),
+            frames=str(frames),
+            source=open_source(str(frames)),
+            sampling=Sampling(),
+            fitter=Fitter(size=64, patch=8),
+            model=model,
+            fusion=None,
+            options=Options(**options),
+            devices=1,
+            known=Known(),
+            geometry=KnownGeometry(),
+            out=tmp_path,
+            saving=Saving(),
+        )
+        return clip.cut(Windows(window))
+
+    def said():
+        return " ".join(capsys.readouterr().err.split())
 
     assert with_room(7) == (Windows(), None)
     assert with_room(None) == (Windows(), None)
-    assert with_room(6, "--tracks") == (Windows(), None)
-    assert "but --tracks needs all frames at once: they are run together" in " ".join(capsys.readouterr().err.split())
+    assert with_room(6, refine_cameras=True) == (Windows(), None)
+    assert "but --refine-cameras needs all frames at once: they are run together" in said()
+    assert with_room(None, window=7) == (Windows(7), None)
+    assert "no more than a window of 7: all are run together" in said()
+    assert with_room(6, window=4) == (Windows(4), 7)
+    assert with_room(6) == (Windows(), None)  # seven frames are too few for windows of eight
+    assert "GB are free of a test: that may not be enough" in said()
+    monkeypatch.setattr(memory, "ERROR", 0.0)
+    with pytest.raises(DeviceMemoryError, match="what fits: --max-frames 3"):
+        with_room(3, window=4)
     assert memory.most_frames(model, 64, 64, memory.predicted_bytes(model, 100, 64, 64)) == 100
     (tmp_path / FOLDER).mkdir()
     write_cut(tmp_path, 4, 2)  # of a run that was stopped
     assert with_room(7) == (Windows(4, 2), 7)
-
-
-def test_a_clip_of_a_window_is_run_as_a_whole(frames, capsys):
-    opened = open_source(str(frames))
-    assert _cut_frames(Report(), opened, Sampling(), Windows(7)) is None
-    assert "no more than a window of 7: all are run together" in capsys.readouterr().err
-    assert _cut_frames(Report(), opened, Sampling(start=1), Windows(5)) == 6

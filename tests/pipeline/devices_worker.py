@@ -1,11 +1,13 @@
 """What tests/pipeline/test_devices.py runs in a process with several devices: python devices_worker.py OUT [RANK PORT].
 
 Everything is computed on one device and on several, and written into OUT.npz under "what/devices/field". With a rank,
-this is one of two processes with half of the devices each. The variable COUNTS has the numbers of devices.
+this is one of two processes with half of the devices each. The variables COUNTS and FRAMES have numbers of
+devices and of frames.
 """
 
 import os
 import sys
+from itertools import product
 
 DEVICES = 8
 PROCESSES = 2
@@ -17,7 +19,9 @@ os.environ["XLA_FLAGS"] = " ".join(
     ]
 )
 
+import flax.linen as nn  # noqa: E402
 import jax  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 
 if rank is not None:
@@ -26,9 +30,10 @@ if rank is not None:
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 from tests.tiny import tiny_config  # noqa: E402
-from vggtjax import Model, compile_ahead, load_clip, reconstruct  # noqa: E402
+from vggtjax import Model, compile_ahead, infer, load_clip, reconstruct  # noqa: E402
 from vggtjax.config import MotionConfig  # noqa: E402
 from vggtjax.network.model import init_params  # noqa: E402
+from vggtjax.pipeline.devices import frames_mesh  # noqa: E402
 
 SIDE = 42
 arrays: dict[str, np.ndarray] = {}
@@ -64,20 +69,43 @@ def keep_result(what: str, devices: int, result) -> None:
     keep(what, devices, {name: getattr(result, name) for name in names})
 
 
+def keep_gradient(model: Model, frames: int, devices: int) -> None:
+    """Keep what `infer` returns, and the gradient of a sum of all it assembles, by parameters and images."""
+
+    def weighted(params, x):
+        assembly, passes = infer(params, x, model.config, mesh=frames_mesh(devices))
+        leaves = [leaf for leaf in jax.tree.leaves(assembly) if leaf.dtype != bool]
+        weights = [np.random.default_rng(0).normal(size=leaf.shape).astype(np.float32) for leaf in leaves]
+        return sum(jnp.mean(w * leaf) for w, leaf in zip(weights, leaves, strict=True)), (assembly, passes)
+
+    (_, outputs), gradients = jax.value_and_grad(weighted, argnums=(0, 1), has_aux=True)(
+        model.params, jnp.asarray(images(frames))[None]
+    )
+    keep(f"infer {frames}", devices, outputs)
+    keep(f"gradient {frames}", devices, gradients)
+
+
 def main() -> None:
     model = make_model()
-    clip = load_clip(images(13), size=SIDE)
+    all_frames = [int(word) for word in os.environ.get("FRAMES", "13 16").split()]
+    counts = [int(word) for word in os.environ.get("COUNTS", "1 2 4 8").split()]
     if rank is not None:
+        clip = load_clip(images(all_frames[0]), size=SIDE)
         result = reconstruct(model, clip, devices=jax.device_count(), align_scale=True)
         keep_result("processes", jax.device_count(), result)
         return
-    for devices in map(int, os.environ.get("COUNTS", "1 2 4 8").split()):
-        needs = compile_ahead(model, 13, SIDE, SIDE, devices=devices, align_scale=True)
-        keep("memory", devices, {stage: np.array(need.temporary) for stage, need in needs.items()})
+    for frames, devices in product(all_frames, counts):
+        clip = load_clip(images(frames), size=SIDE)
+        needs = compile_ahead(model, frames, SIDE, SIDE, devices=devices, align_scale=True)
+        keep(f"memory {frames}", devices, {stage: np.array(need.temporary) for stage, need in needs.items()})
         for stage, need in needs.items():
-            counts = {kind: np.array(count) for kind, count in need.collectives.items()}
-            keep(f"collectives of {stage}", devices, counts)
-        keep_result("reconstruct 13", devices, reconstruct(model, clip, devices=devices, align_scale=True))
+            by_kind = {kind: np.array(count) for kind, count in need.collectives.items()}
+            keep(f"collectives of {stage} {frames}", devices, by_kind)
+        keep_result(f"reconstruct {frames}", devices, reconstruct(model, clip, devices=devices, align_scale=True))
+    # The slope of a ReLU jumps at 0, where rounding decides the side: gradients are compared through a smooth function.
+    nn.relu = nn.gelu
+    for frames, devices in product(all_frames, counts):
+        keep_gradient(model, frames, devices)
 
 
 main()

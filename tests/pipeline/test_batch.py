@@ -1,9 +1,9 @@
 """Many clips in one call: all of them, in spite of a broken one, and after an interruption."""
 
-import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from functools import partial
 
@@ -14,14 +14,15 @@ from PIL import Image
 
 from benchmarks import __main__ as benchmarks
 from tests.moving_ball import moving_ball
-from tests.tiny import tiny_config
-from vggtjax import Reconstruction, init_params
+from tests.servers import empty_memory, served
+from tests.tiny import tiny_model
+from vggtjax import Reconstruction
 from vggtjax.checkpoint import Model, save_model
 from vggtjax.clips.sources import clips_by_name
 from vggtjax.commands.batch import _Clock
 from vggtjax.errors import ClipError, InputError, OutputError
-from vggtjax.pipeline.batch import SETTINGS_NAME, reconstruct_many
-from vggtjax.pipeline.contact import PAGE_NAME
+from vggtjax.pipeline.batch import reconstruct_many
+from vggtjax.pipeline.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
@@ -29,8 +30,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
 
 @pytest.fixture(scope="module")
 def model():
-    config = tiny_config()
-    return Model(config, init_params(0, config), "tiny")
+    return tiny_model()
 
 
 def write_clip(folder, frames, rows):
@@ -245,6 +245,44 @@ def test_results_of_other_weights_are_not_kept(model, clips, tmp_path):
         next(reconstruct_many(retrained, sources, tmp_path, method="vggt"))
 
 
+def test_clips_from_urls_and_results_at_urls(model, clips, tmp_path, monkeypatch):
+    """A list on a web server names folders there and one in memory; the results are those of local files."""
+    run = partial(reconstruct_many, model, method="vggt", saving={"resolution": "original", "only": ["depth"]})
+    list(run(clips_by_name([str(clips)]), tmp_path / "local"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
+    with empty_memory() as memory, served(clips) as url:
+        memory.put(str(clips / "clip5"), "/videos/clip5", recursive=True)
+        lines = ["source", *(f"clip{number}/" for number in range(5)), "memory://videos/clip5", "gone.mp4"]
+        (clips / "all.csv").write_text("\n".join(lines))
+        sources = clips_by_name([f"{url}/all.csv"])
+        (clips / "all.csv").unlink()
+        assert list(sources) == [*(f"clip{number}" for number in range(6)), "gone"]
+        assert list(clips_by_name(["memory://videos", f"{url}/clip1/"])) == ["clip5", "clip1"]
+        outcomes = {outcome.name: outcome for outcome in run(sources, "memory://results")}
+        assert {name for name, outcome in outcomes.items() if outcome.status != "done"} == {"clip2", "gone"}
+        assert "1.png" in outcomes["clip2"].reason
+        assert "there is nothing at http://127.0.0.1" in outcomes["gone"].reason
+        assert not list((tmp_path / "temporary").iterdir())
+        memory.get("/results", str(tmp_path / "copy"), recursive=True)
+        files = {
+            path.relative_to(tmp_path / "local"): path.read_bytes()
+            for path in (tmp_path / "local").rglob("*")
+            if path.is_file() and path.name != PAGE_NAME
+        }
+        assert len(files) > 10
+        assert {p.relative_to(tmp_path / "copy"): p.read_bytes() for p in (tmp_path / "copy").rglob("*.*")} == files
+
+        memory.rm(f"/results/clip0/{ARCHIVE_NAME}")  # as an upload that was killed leaves it
+        again = {outcome.name: outcome.status for outcome in run(sources, "memory://results")}
+        assert {name for name, status in again.items() if status == "kept"} == {"clip1", "clip3", "clip4", "clip5"}
+        assert again["clip0"] == "done"
+        with pytest.raises(InputError, match=r"memory://results/batch.json has other settings"):
+            next(run(sources, "memory://results", pad_frames=True))
+    with pytest.raises(InputError, match=r"https://h/results can be read, not written"):
+        next(run({}, "https://h/results"))
+
+
 def test_two_batches_on_one_folder(model, clips, tmp_path):
     sources = {name: str(clips / name) for name in ("clip0", "clip1")}
     first = reconstruct_many(model, sources, tmp_path, method="vggt")
@@ -334,18 +372,6 @@ def test_what_is_no_clip(clips, tmp_path):
         clips_by_name([])
 
 
-def test_the_benchmark_compares_both_ways(model, tmp_path, capsys):
-    path = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
-    out = tmp_path / "batch.json"
-    arguments = ["--clips", "2", "--lengths", "2", "--method", "vggt", "--repeats", "1", "--out", str(out)]
-    assert benchmarks.main(["batch", "--model", str(path), *arguments]) == 0
-    shown = capsys.readouterr().out
-    assert "1 clips of 2 frames, and a corrupt one" in shown
-    measured = json.loads(out.read_text())
-    for state in ("cold", "warm"):
-        alone, batch = (measured["seconds"][state][side][0] for side in ("one by one", "batch"))
-        assert min(alone, batch) > 0
-        assert measured["ratios"][state] == pytest.approx(alone / batch)
-        assert f"{alone / batch:.3f}" in shown
+def test_the_benchmark_needs_clips(capsys):
     assert benchmarks.main(["batch", "--clips", "1"]) == 2
     assert "clips is 1; expected at least 2" in capsys.readouterr().err

@@ -8,7 +8,8 @@ import pytest
 from tests.chromium import browser, look
 from tests.results.test_report import Reader
 from tests.room import make_room
-from vggtjax.pipeline.contact import PAGE_NAME, ContactPage
+from vggtjax.pipeline.contact import ContactPage
+from vggtjax.pipeline.destination import PAGE_NAME
 from vggtjax.results.saving import Saving
 
 NAMES = ["dog", "<script>alert(1)<", "a#b?c%20 é"]

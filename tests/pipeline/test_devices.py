@@ -25,7 +25,8 @@ from vggtjax.pipeline.devices import frames_mesh
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs" / "how-to" / "several-devices.md"
 WORKER = Path(__file__).with_name("devices_worker.py")
-DEVICES = (1, 8)  # compiling for each takes 16 s; the worker alone runs 2 and 4 too
+DEVICES = (1, 8)  # compiling for each takes most of a minute; the worker alone runs 2 and 4 too,
+FRAMES = 13  # and 16, which 8 divides
 NAMED = {  # in docs/how-to/several-devices.md
     "image features": set(),
     "first pass": {"all-gather", "collective-permute"},
@@ -39,7 +40,8 @@ Kept = dict[str, dict[int, dict[str, np.ndarray]]]
 
 
 def start(out: Path, *arguments: str) -> subprocess.Popen:
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu", "COUNTS": " ".join(map(str, DEVICES))}
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    environment |= {"COUNTS": " ".join(map(str, DEVICES)), "FRAMES": str(FRAMES)}
     words = [sys.executable, str(WORKER), str(out), *arguments]
     return subprocess.Popen(words, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True)
 
@@ -75,9 +77,10 @@ def check_equal(expected: dict[str, np.ndarray], found: dict[str, np.ndarray]) -
             assert np.abs(other - array).max() <= CLOSE * np.ptp(array), name
 
 
-def test_several_devices_give_the_numbers_of_one(kept):
+@pytest.mark.parametrize("what", ["reconstruct", "infer", "gradient"])
+def test_several_devices_give_the_numbers_of_one(kept, what):
     for devices in set(DEVICES) - {1}:
-        check_equal(kept["reconstruct 13"][1], kept["reconstruct 13"][devices])
+        check_equal(kept[f"{what} {FRAMES}"][1], kept[f"{what} {FRAMES}"][devices])
 
 
 def test_a_pass_has_only_the_collectives_that_the_docs_name(kept):
@@ -85,13 +88,13 @@ def test_a_pass_has_only_the_collectives_that_the_docs_name(kept):
     for stage, kinds in NAMED.items():
         assert set(re.findall(r"`([\w-]+)`", rows[stage])) == kinds, stage
         for devices in set(DEVICES) - {1}:
-            assert set(kept[f"collectives of {stage}"][devices]) <= {f"['{name}']" for name in kinds}, stage
-    assert kept["collectives of first pass"][8]
+            assert set(kept[f"collectives of {stage} {FRAMES}"][devices]) <= {f"['{name}']" for name in kinds}, stage
+    assert kept[f"collectives of first pass {FRAMES}"][8]
 
 
 def test_memory_of_a_device_falls_with_their_number(kept):
     for stage in ("image features", "first pass", "second pass"):
-        needs = [int(kept["memory"][devices][f"['{stage}']"]) for devices in DEVICES]
+        needs = [int(kept[f"memory {FRAMES}"][devices][f"['{stage}']"]) for devices in DEVICES]
         assert all(more > less for more, less in pairwise(needs)), (stage, needs)
 
 
@@ -107,7 +110,7 @@ def test_two_processes(kept, tmp_path):
         for process in started:
             process.kill()
     for one in both:
-        check_equal(kept["reconstruct 13"][1], one["processes"][4])
+        check_equal(kept[f"reconstruct {FRAMES}"][1], one["processes"][4])
 
 
 def test_more_devices_than_there_are(tmp_path, capsys):

@@ -1,11 +1,16 @@
 """What is predicted of memory, beside XLA's own count, and what is read of the system."""
 
+import re
+import subprocess
+import sys
+
 import pytest
+from PIL import Image
 
 from vggtjax.config import vggt_1b
 from vggtjax.pipeline import memory
-from vggtjax.pipeline.free_memory import host_bytes
 from vggtjax.pretrained.embedded import demo_model
+from vggtjax.storage.free_memory import host_room, own_limits
 
 
 @pytest.mark.parametrize(
@@ -24,24 +29,94 @@ def test_the_passes_are_predicted_within_a_third_of_the_counts_of_xla(config, fr
     assert memory.pass_bytes(config, frames, *size) == pytest.approx(counted, rel=1 / 3)
 
 
+@pytest.mark.parametrize(
+    ("frames", "height", "width", "measured"),  # peaks in MB of processes, by python -m benchmarks peak-memory
+    [
+        (8, 64, 64, 661),
+        (32, 64, 64, 673),
+        (64, 64, 64, 723),
+        (32, 64, 64, 691),
+        (8, 128, 128, 672),
+        (16, 128, 128, 714),
+        (16, 128, 128, 745),
+        (32, 128, 128, 863),
+        (4, 256, 256, 764),
+        (4, 256, 256, 761),
+        (8, 256, 256, 859),
+        (12, 192, 256, 852),
+    ],
+)
+def test_the_peaks_of_processes_are_predicted_within_the_error_that_is_promised(frames, height, width, measured):
+    predicted = memory.predicted_bytes(demo_model(), frames, height, width)
+    assert predicted == pytest.approx(1e6 * measured, rel=memory.ERROR)
+
+
 def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
     def write(name, text):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
 
-    assert host_bytes(tmp_path) is None
+    def room():
+        found = host_room(tmp_path)
+        return None if found is None else (found.size / 1024, found.limit)
+
+    assert room() is None
     write("proc/meminfo", "MemTotal: 2000 kB\nMemAvailable: 1000 kB\n")
     write("proc/self/status", "Name: python\nVmRSS: 100 kB\n")
-    assert host_bytes(tmp_path) == 1100 * 1024
+    assert room() == (1100, "of the computer")
     write("proc/self/cgroup", "4:memory:/a/b\n0::/c/d\n")
     write("sys/fs/cgroup/memory/a/memory.limit_in_bytes", f"{900 * 1024}")
     write("sys/fs/cgroup/memory/a/memory.usage_in_bytes", f"{200 * 1024}")
     write("sys/fs/cgroup/memory/a/memory.stat", f"total_inactive_file {50 * 1024}\n")
     write("sys/fs/cgroup/memory/memory.limit_in_bytes", "9223372036854771712")
     write("sys/fs/cgroup/memory/memory.usage_in_bytes", "5")
-    assert host_bytes(tmp_path) == (100 + 750) * 1024
+    assert room() == (100 + 750, "of its container (cgroup)")
     write("sys/fs/cgroup/c/memory.max", f"{300 * 1024}")
     write("sys/fs/cgroup/c/memory.current", f"{100 * 1024}")
     write("sys/fs/cgroup/c/d/memory.max", "max")
-    assert host_bytes(tmp_path) == (100 + 200) * 1024
+    assert room() == (100 + 200, "of its container (cgroup)")
+    write("proc/self/status", "Name: python\nVmSize: 700000 kB\nVmData: 300 kB\nVmRSS: 100 kB\n")
+    title = "Limit                     Soft Limit           Hard Limit           Units\n"
+    data = f"Max data size             {2**40}        unlimited            bytes\n"
+    space = f"Max address space         {(700000 + 400150) * 1024}            unlimited            bytes\n"
+    write("proc/self/limits", title + data + space)
+    assert own_limits(tmp_path) == [
+        ("ulimit -d", 2**40, 300 * 1024),
+        ("ulimit -v", (700000 + 400150) * 1024, 700000 * 1024),
+    ]
+    stacks = 300_000_000 / 1024  # of threads that start later
+    assert room() == (100 + 200, "of its container (cgroup)")
+    write("sys/fs/cgroup/c/memory.max", "max")
+    write("sys/fs/cgroup/memory/a/memory.limit_in_bytes", "9223372036854771712")
+    write("proc/meminfo", "MemTotal: 2000000 kB\nMemAvailable: 1000000 kB\n")
+    assert room() == (pytest.approx(100 + 400150 - stacks), "within ulimit -v")
+
+
+def test_a_limit_too_low_for_the_libraries_is_met_by_a_sentence(tmp_path):
+    """Without the sentence a library that cannot start a thread ends the process."""
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_AS, (800_000_000,) * 2)"
+    code = f"{limit}; from vggtjax.commands.main import main; raise SystemExit(main(['info', 'demo']))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert re.fullmatch(r"vggtjax: ulimit -v leaves this process 0\.\d\d GB, .* ulimit -v unlimited\n", done.stderr)
+
+
+def test_a_limit_too_low_for_a_clip_is_met_by_a_sentence(tmp_path):
+    for number in range(8):
+        Image.new("RGB", (1024, 1024), (number, 0, 0)).save(tmp_path / f"{number}.png")
+    code = f"""
+import resource
+from vggtjax.commands.main import main
+from vggtjax import load_model
+load_model("demo")
+used = int(next(line for line in open("/proc/self/status") if line.startswith("VmSize")).split()[1]) * 1024
+resource.setrlimit(resource.RLIMIT_AS, (used + 1_050_000_000,) * 2)
+words = ["reconstruct", {str(tmp_path)!r}, "--model", "demo", "--size", "1024", "--out", {str(tmp_path / "out")!r}]
+raise SystemExit(main(words))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    sizes = r"vggtjax: 8 frames need about \d\.\d\d GB, \d\.\d\d GB are free within ulimit -v"
+    assert re.search(rf"{sizes}; what fits: .*--size \d+", done.stderr)
+    assert not (tmp_path / "out").exists()

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tests.moving_ball import moving_ball
-from tests.tiny import tiny_config
-from vggtjax import init_params, load_clip, reconstruct
-from vggtjax.checkpoint import Model
+from tests.tiny import tiny_model
+from vggtjax import load_clip, reconstruct
 from vggtjax.pipeline.several import reconstruct_methods
 
 METHODS = ("4dvggt-d", "vggt", "vggt4d")
@@ -16,8 +15,7 @@ METHODS = ("4dvggt-d", "vggt", "vggt4d")
 
 @pytest.fixture(scope="module")
 def model():
-    config = tiny_config()
-    return Model(config, init_params(0, config), "tiny")
+    return tiny_model()
 
 
 @pytest.fixture(scope="module")

@@ -11,9 +11,10 @@ from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.passes import first_pass, second_pass
 from vggtjax.network.clip_batch import ClipBatch
-from vggtjax.network.model import init_params
+from vggtjax.network.model import init_params, parameter_shapes
 from vggtjax.network.suppression import Suppression
-from vggtjax.pipeline.stages import padded_frames
+from vggtjax.options import Options
+from vggtjax.pipeline.stages import Stages, padded_frames
 
 SIDE, OFFSETS = 70, MotionConfig().offsets
 
@@ -117,10 +118,25 @@ def test_what_is_compiled_ahead_is_not_compiled_again(model):
     assert {"image features", "first pass", "second pass"} <= needs.keys()
     assert all(need.output > 0 for need in needs.values())
     assert compilations(lambda: reconstruct(model, clip)) == 0
+    assert needs["first pass"] == needs["second pass"]  # one program
     with pytest.raises(InputError, match="multiples of the patch size 14"):
         compile_ahead(model, 2, 20, 70)
     with pytest.raises(InputError, match="compute_dtype is 'float16'; expected one of"):
         compile_ahead(model, 2, SIDE, SIDE, compute_dtype="float16")
+
+
+def test_programs_are_compiled_before_the_weights_are_there(model):
+    shapes = Model(model.config, parameter_shapes(model.config), "no weights")
+    clip = load_clip(pictures(6), size=SIDE)
+    programs = ("image features", "both passes", "dynamic mask", "assemble")
+    assert 0 < compilations(lambda: compile_ahead(shapes, 6, SIDE, SIDE)) <= len(programs)
+    assert compilations(lambda: reconstruct(model, clip)) == 0
+
+
+def test_a_single_picture_compiles_what_one_pass_needs(model):
+    programs = ("image features", "first pass", "assemble")
+    assert 0 < compilations(lambda: compile_ahead(model, 1, SIDE, SIDE)) <= len(programs)
+    assert compilations(lambda: reconstruct(model, load_clip(pictures(1), size=SIDE))) == 0
 
 
 def test_clips_of_similar_length_share_a_compilation(model):
@@ -148,6 +164,8 @@ def test_a_mask_without_a_moving_pixel_needs_no_second_pass(model):
     assert (np.asarray(second(still, plain=marked).depth) == np.asarray(marked.depth)).all()
     assert apart(second(still).depth, plain.depth) < 1e-4
     assert apart(second(moving, plain=marked).depth, second(moving).depth) < 1e-4
+    stages = Stages(model.config, Options(), 4, (SIDE, SIDE))
+    assert compilations(lambda: stages.second_pass(model.params, clips, jnp.asarray(still), marked)) == 0
 
 
 def test_only_what_a_method_reads_of_the_second_pass_is_computed(model):

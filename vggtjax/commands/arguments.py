@@ -34,11 +34,11 @@ def _result_folder(out: Path) -> Path:
     return out
 
 
-def _batch_folder(out: Path) -> Path:
+def _batch_folder(out: str) -> str:
     """Return the folder.
 
     Args:
-        out: folder for the results, with one folder per clip, named after the clip
+        out: folder for the results, or a URL such as s3://bucket/results, with one folder per clip, named after it
     """
     return out
 
@@ -89,9 +89,18 @@ def _devices(devices: int = 1) -> int:
     return whole_number("devices", devices, 1)
 
 
+def _no_memory_check(no_memory_check: Switch = False) -> bool:
+    """Return the choice.
+
+    Args:
+        no_memory_check: run all frames together, without comparing the memory that they need with what is free
+    """
+    return no_memory_check
+
+
 # The name puts a flag into the group of that name.
 ResultFolder = Annotated[Path, tyro.conf.arg(constructor=_result_folder, name="output", prefix_name=False, help="")]
-BatchFolder = Annotated[Path, tyro.conf.arg(constructor=_batch_folder, name="output", prefix_name=False, help="")]
+BatchFolder = Annotated[str, tyro.conf.arg(constructor=_batch_folder, name="output", prefix_name=False, help="")]
 EvaluationFolder = Annotated[
     Path, tyro.conf.arg(constructor=_evaluation_folder, name="output", prefix_name=False, help="")
 ]
@@ -99,3 +108,4 @@ View = Annotated[bool, tyro.conf.arg(constructor=_view, name="output", prefix_na
 Shards = Annotated[str | None, tyro.conf.arg(constructor=_shard, name="output", prefix_name=False, help="")]
 Devices = Annotated[int, tyro.conf.arg(constructor=_devices, name="method", prefix_name=False, help="")]
 PadFrames = Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="method", prefix_name=False, help="")]
+Unchecked = Annotated[bool, tyro.conf.arg(constructor=_no_memory_check, name="long clip", prefix_name=False, help="")]

@@ -4,22 +4,38 @@ from __future__ import annotations
 
 import time
 from datetime import timedelta
-from typing import Annotated
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
-from vggtjax.commands.arguments import BatchFolder, Devices, Frames, Method, Output, PadFrames, Shards, Size, Sources
-from vggtjax.commands.models import ModelFiles
+from vggtjax.commands.arguments import (
+    BatchFolder,
+    Devices,
+    Frames,
+    Method,
+    Output,
+    PadFrames,
+    Shards,
+    Size,
+    Sources,
+    Unchecked,
+)
+from vggtjax.commands.models import ModelFiles, check_named, load_on_worker
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
 from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
+from vggtjax.pipeline.cluster_options import Cluster
 from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving
 
-_NOTHING_KNOWN = KnownGeometry()
+if TYPE_CHECKING:
+    from vggtjax.pipeline.recipe import ClipOutcome
+
+_NOTHING_KNOWN, _HERE = KnownGeometry(), Cluster()
 
 
 def batch(
@@ -33,16 +49,19 @@ def batch(
     devices: Devices = 1,
     pad_frames: PadFrames = False,
     known: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = _NOTHING_KNOWN,
+    unchecked: Unchecked = False,
     out: BatchFolder,
     saving: Output = Saving(),
     shard: Shards = None,
+    cluster: Annotated[Cluster, tyro.conf.arg(name="cluster", help="")] = _HERE,
 ) -> None:
     """Reconstruct many clips, each into a folder of its own; run the same command again to resume.
 
     A clip that fails is named and does not stop the others; the exit code is 2 only if every clip fails.
 
     Args:
-        sources: folders of images, videos, or captures of apps; a folder of such; or a list of them, .csv or .jsonl.
+        sources: folders of images, videos, or captures of apps; a folder of such; or a list of them, .csv, .jsonl or
+            .parquet; each a path or a URL.
         sampling: which frames of the source
         framing: how frames are fitted to the model
         files: the model
@@ -50,9 +69,11 @@ def batch(
         devices: how many devices share the frames
         pad_frames: whether clips are padded to one of a few lengths
         known: cameras and lengths that all clips share, or that "source" names
+        unchecked: whether the memory is left unchecked
         out: folder for the results
         saving: how the result is written
         shard: which part of the clips is done
+        cluster: where the clips are reconstructed
     """
     report = Report()
     with report.running():
@@ -67,41 +88,64 @@ def batch(
         part = named if shard is None else parse_shard(shard).share(named)
         if not part:
             raise InputError(f"shard {shard} of {len(named)} clips has none; expected at most {len(named)} shards")
+        if cluster.engine == "ray" and shard is not None:
+            raise InputError("--engine ray and --shard exclude each other: workers share the clips themselves")
         known.check_many()
         check_readable(known)
-        frames_mesh(devices)
-        network, fitted = files.load(report, options, [options.method])
-        from vggtjax.pipeline.batch import reconstruct_many
+        outcomes: list[ClipOutcome] = []
 
-        outcomes = []
-        with report.stage("frames") as show:
-            clock = _Clock(show)
-            for outcome in reconstruct_many(
-                network,
-                named,
-                out,
-                options=options,
-                framing=framing,
-                sampling=sampling,
-                saving=saving,
-                fusion=fitted,
-                known=known,
-                pad_frames=pad_frames,
-                shard=shard,
-                devices=devices,
-                progress=clock.progress,
-            ):
-                outcomes.append(outcome)
-                reason = f" ({outcome.reason})" if outcome.reason else ""
-                name = one_line(outcome.name)
-                report.note(f"{len(outcomes)}/{len(part)} {name}: {outcome.status}{reason}{clock.left()}")
+        def tell(outcome: ClipOutcome) -> None:
+            outcomes.append(outcome)
+            reason = f" ({outcome.reason})" if outcome.reason else ""
+            report.note(f"{len(outcomes)}/{len(part)} {one_line(outcome.name)}: {outcome.status}{reason}{clock.left()}")
+
+        if cluster.engine == "ray":
+            from vggtjax.pipeline.cluster import reconstruct_on_cluster
+            from vggtjax.pipeline.recipe import Recipe
+
+            check_named(files.model)
+            recipe = Recipe(options, framing, sampling, saving, known or None, pad_frames, devices, unchecked)
+            load = partial(load_on_worker, files, options)
+            with report.stage("clips") as show:
+                clock = _Clock(show)
+                run = reconstruct_on_cluster(
+                    load, named, out, cluster, recipe, progress=clock.progress, note=report.note
+                )
+                for outcome in run:
+                    tell(outcome)
+            warning = ""  # a worker has said it
+        else:
+            frames_mesh(devices)
+            network, fitted = files.load(report, options, [options.method])
+            from vggtjax.pipeline.batch import reconstruct_many
+
+            with report.stage("frames") as show:
+                clock = _Clock(show)
+                for outcome in reconstruct_many(
+                    network,
+                    named,
+                    out,
+                    options=options,
+                    framing=framing,
+                    sampling=sampling,
+                    saving=saving,
+                    fusion=fitted,
+                    known=known,
+                    pad_frames=pad_frames,
+                    shard=shard,
+                    devices=devices,
+                    unchecked=unchecked,
+                    progress=clock.progress,
+                ):
+                    tell(outcome)
+            warning = network.warning
     counts = {status: sum(outcome.status == status for outcome in outcomes) for status in ("done", "kept", "failed")}
     report.table({"clips": len(outcomes), **counts, "results": f"{out}/"})
     for outcome in outcomes:
         if outcome.status == "failed":
             report.line(f"{one_line(outcome.name)} failed: {outcome.reason}")
-    if network.note:
-        report.line(network.warning)
+    if warning:
+        report.line(warning)
     if counts["failed"] == len(outcomes):
         raise InputError("none of the clips could be reconstructed; the reasons are above")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import difflib
+import errno
 import functools
 import gc
 import io
@@ -23,11 +24,13 @@ from vggtjax.commands.batch import batch
 from vggtjax.commands.calibrate_cues import calibrate_cues
 from vggtjax.commands.convert import convert, import_result, info
 from vggtjax.commands.demo import demo
+from vggtjax.commands.doctor import doctor
 from vggtjax.commands.evaluate import evaluate
 from vggtjax.commands.export import export
+from vggtjax.commands.export_model import export_model
 from vggtjax.commands.fit_fusion import fit_fusion
 from vggtjax.commands.overview import overview
-from vggtjax.commands.process import keep_freed_memory
+from vggtjax.commands.process import check_limits, keep_freed_memory
 from vggtjax.commands.reconstruct import reconstruct
 from vggtjax.commands.render import render
 from vggtjax.commands.scenes import scenes
@@ -50,10 +53,13 @@ COMMANDS = {
     "evaluate": evaluate,
     "calibrate-cues": calibrate_cues,
     "fit-fusion": fit_fusion,
+    "export-model": export_model,
     "scenes": scenes,
     "app": app,
+    "doctor": doctor,
 }
 
+_OUT_OF_MEMORY = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size"
 _OLD_FLAGS = {"--mode": "--preprocess"}  # still understood
 
 
@@ -77,18 +83,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stderr.write(overview(COMMANDS))
             return 2
         else:
-            _parsed(arguments)()
+            command = _parsed(arguments)
+            check_limits()
+            command()
         sys.stdout.flush()  # a broken pipe is noticed here
         return 0
     except VggtjaxError as error:
         message, code = _with_flag(str(error), arguments), 2
     except MemoryError:  # of the host
-        message, code = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size", 2
+        message, code = _OUT_OF_MEMORY, 2
+    except RuntimeError as error:  # jax's own error is one
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        message, code = _OUT_OF_MEMORY, 2
     except BrokenPipeError:  # the reader of our output, such as head, has ended
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the last flush of the interpreter
         return 1
     except OSError as error:  # of a file that no other message covers
-        message, code = f"{error.filename or 'a file'}: {error.strerror or error}", 2
+        text = f"{error.filename or 'a file'}: {error.strerror or error}"
+        message, code = _OUT_OF_MEMORY if error.errno == errno.ENOMEM else text, 2
     except KeyboardInterrupt:
         message, code = "interrupted", 130
     sys.stderr.write(f"vggtjax: {message}\n")

@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vggtjax.commands.arguments import ModelName
+from vggtjax.commands.process import keep_freed_memory
+from vggtjax.commands.report import Report
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS, Options
+from vggtjax.storage.cache import enable_compilation_cache
 from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import read_json
 
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
-    from vggtjax.commands.report import Report
     from vggtjax.method.fusion_family import FusionParams
 
 _MOST_CONFIG_BYTES = 1 << 20
@@ -24,15 +26,21 @@ _MOST_CONFIG_BYTES = 1 << 20
 
 def load(report: Report, name: str | None, config: Path | None = None) -> Model:
     """Load a model as a stage of the report. Raises InputError without a name."""
+    name = check_named(name)
+    with report.stage("load model") as progress:
+        from vggtjax.pretrained.load import load_model
+
+        return load_model(name, config=read_config(config), progress=progress)
+
+
+def check_named(name: str | None) -> str:
+    """Return the name of a model. Raises InputError without one."""
     if name is None:
         raise InputError(
             "no model is named; give --model a converted .safetensors, a PyTorch checkpoint, a hub id such as "
             "facebook/VGGT-1B, or demo, the small demonstration model, which is not for real footage"
         )
-    with report.stage("load model") as progress:
-        from vggtjax.pretrained.load import load_model
-
-        return load_model(name, config=read_config(config), progress=progress)
+    return name
 
 
 @dataclass(frozen=True)
@@ -63,6 +71,13 @@ class ModelFiles:
         fusing = next(name for name in methods if METHODS[name].depth == "fused")
         warn_if_fitted_otherwise(self.fusion, model, options.changed(method=fusing))
         return model, params
+
+
+def load_on_worker(files: ModelFiles, options: Options) -> tuple[Model, FusionParams | None]:
+    """Load the model in a process of a cluster, which then keeps what it compiles, as a command does."""
+    keep_freed_memory()
+    enable_compilation_cache()
+    return files.load(Report(), options, [options.method])
 
 
 def read_config(path: Path | None) -> VGGTConfig | None:

@@ -23,10 +23,14 @@ _GROUPS = {
         "train": "train a model on generated scenes, or finetune one",
         "calibrate-cues": "choose a model's motion cues",
         "fit-fusion": "fit how the two passes are fused",
+        "export-model": "a model as a program that jax runs without vggtjax",
     },
     "Measure": {
         "evaluate": "score methods on a data set with ground truth",
         "scenes": "generate clips with exact ground truth",
+    },
+    "This computer": {
+        "doctor": "versions, devices, memory, the longest clips, extras, the cache",
     },
 }
 _OTHERS = "Others"

@@ -1,12 +1,17 @@
-"""Keeping the memory that one computation frees for the next one, on Linux."""
+"""The memory of the process: keeping what one computation frees, and limits that are too low. Linux only."""
 
 from __future__ import annotations
 
 import ctypes
+import os
 import sys
+
+from vggtjax.errors import InputError
+from vggtjax.storage.free_memory import in_gigabytes, own_limits
 
 _M_TRIM_THRESHOLD, _M_MMAP_MAX, _M_ARENA_MAX = -1, -4, -8  # names of glibc's malloc.h
 _MOST = 2**31 - 1
+_LIBRARIES, _OF_A_CORE = 1_000_000_000, 20_000_000  # bytes of address space; a core's threads have stacks
 
 
 def keep_freed_memory() -> bool:
@@ -26,3 +31,17 @@ def keep_freed_memory() -> bool:
     settings = ((_M_MMAP_MAX, 0), (_M_TRIM_THRESHOLD, _MOST), (_M_ARENA_MAX, 1))
     taken = [mallopt(name, value) == 1 for name, value in settings]  # every one is tried
     return all(taken)
+
+
+def check_limits() -> None:
+    """Raise InputError where a limit of this process (`ulimit -v`) does not even leave room for loading the libraries.
+
+    A library that cannot start a thread or map a file ends the process without a sentence.
+    """
+    needed = _LIBRARIES + _OF_A_CORE * (os.cpu_count() or 1)
+    for name, limit, used in own_limits():
+        if limit - used < needed:
+            raise InputError(
+                f"{name} leaves this process {in_gigabytes(limit - used)}, and its libraries take "
+                f"{in_gigabytes(needed)}; set a higher limit, or none: {name} unlimited"
+            )

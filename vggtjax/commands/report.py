@@ -63,7 +63,11 @@ class Report:
         label = f"{name} (once for clips of this shape)" if compiles else name
         task = self._progress.add_task(label, total=None)
         started = time.perf_counter()
-        yield lambda done, total: self._progress.update(task, completed=done, total=total)
+        try:
+            yield lambda done, total: self._progress.update(task, completed=done, total=total)
+        except BaseException:
+            self._progress.stop_task(task)  # its clock
+            raise
         seconds = time.perf_counter() - started
         self.seconds[name] = self.seconds.get(name, 0.0) + seconds
         total = next(t.total for t in self._progress.tasks if t.id == task) or 1

@@ -2,22 +2,25 @@
 
 It is the weights, the process, what the blocks hold of every frame, what the dense head holds of the frames that it
 computes at once, and pictures and results. The rates are fitted to XLA's own counts of both passes on a CPU
-(`python -m benchmarks memory`) and to measured peaks of processes.
+(`python -m benchmarks memory`) and to measured peaks of processes (`python -m benchmarks peak-memory`).
 """
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import jax
 
-from vggtjax.checkpoint import Model
 from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.attention import LOGITS_AT_ONCE
 from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
-from vggtjax.pipeline.free_memory import host_bytes
+from vggtjax.options import Options
+from vggtjax.storage.free_memory import Room, host_room
 
+ERROR = 0.15  # of a measured peak: predictions are as near
 _FLOAT = 4  # bytes
-_PROCESS, _PROCESS_OF_WEIGHTS = 0.5e9, 0.08  # Python, libraries, programs; freed memory that is kept grows with weights
+_PROCESS, _PROCESS_OF_WEIGHTS = 0.62e9, 0.08  # Python, libraries, the compiler; freed memory that is kept
 _ROWS = 12.5  # copies of a frame's tokens, in and between the blocks
 _LOGITS = 4  # copies of the attention of short frames, whose heads are computed at once
 _MAPS = 0.5  # copies of the dense head's maps at full resolution
@@ -25,18 +28,33 @@ _PIXEL = 40.0  # bytes of a pixel: pictures, and the results of both passes, on 
 _MOST_IMAGES = 2**34  # bytes of the images of a clip that is loaded as a whole
 
 
-def predicted_bytes(model: Model, frames: int, height: int, width: int) -> float:
-    """Return how much memory both passes take on all frames of a clip at once, with the model and the process.
+class Sized(Protocol):
+    """What is known of a model, loaded or not."""
 
-    On a GPU the process is not counted.
+    @property
+    def config(self) -> VGGTConfig: ...
+
+    @property
+    def parameter_bytes(self) -> int: ...
+
+
+def predicted_bytes(
+    model: Sized, frames: int, height: int, width: int, options: Options = Options(), *, clips: int = 1
+) -> float:
+    """Return how much memory a method takes on all frames of a clip at once, with the model and the process.
+
+    On a GPU the process is not counted. `clips` such clips are held at the same time: in a batch one is computed while
+    the next is read and the last is written.
     """
-    weights = weight_bytes(model)
+    weights = model.parameter_bytes
     process = _PROCESS + _PROCESS_OF_WEIGHTS * weights if on_cpu() else 0.0
-    return weights + process + pass_bytes(model.config, frames, height, width) + frames * _PIXEL * height * width
+    pictures = clips * frames * _PIXEL * height * width
+    return weights + process + pass_bytes(model.config, frames, height, width, options) + pictures
 
 
-def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int) -> float:
+def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int, options: Options = Options()) -> float:
     """Return what the passes hold beside weights, pictures and results: XLA's count, within a third."""
+    del options
     tokens = SPECIAL_TOKENS + height * width // config.patch_size**2
     rows = _ROWS * tokens * config.embed_dim
     logits = _LOGITS * config.num_heads * tokens**2 if tokens**2 <= LOGITS_AT_ONCE else 0
@@ -45,29 +63,27 @@ def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int) -> floa
     return _FLOAT * (frames * (rows + logits) + at_once * maps)
 
 
-def available_bytes(model: Model) -> float | None:
-    """Return how much of it there is, what the model and the process hold included; None where it is not known."""
+def available(model: Sized) -> Room | None:
+    """Return how much there is, what the model and the process hold included; None where it is not known."""
     if on_cpu():
-        return host_bytes()
+        return host_room()
     stats = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" not in stats:
         return None
-    return stats["bytes_limit"] - stats.get("bytes_in_use", 0) + weight_bytes(model)
+    free = stats["bytes_limit"] - stats.get("bytes_in_use", 0)
+    return Room(free + model.parameter_bytes, "of the device")
 
 
-def most_frames(model: Model, height: int, width: int, available: float) -> int:
-    """Return the most frames that are predicted to fit when they are run together; maybe 0."""
+def most_frames(
+    model: Sized, height: int, width: int, size: float, options: Options = Options(), *, clips: int = 1
+) -> int:
+    """Return the most frames that are predicted to fit in `size` bytes when they are run together; maybe 0."""
     low, high = 0, max(1, _MOST_IMAGES // (3 * _FLOAT * height * width)) + 1  # the first fits, the last does not
     while high - low > 1:
         middle = (low + high) // 2
-        fits = predicted_bytes(model, middle, height, width) <= available
+        fits = predicted_bytes(model, middle, height, width, options, clips=clips) <= size
         low, high = (middle, high) if fits else (low, middle)
     return low
-
-
-def weight_bytes(model: Model) -> int:
-    """Return the bytes of a model's parameters."""
-    return sum(leaf.nbytes for leaf in jax.tree.leaves(model.params))
 
 
 def on_cpu() -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,11 +35,13 @@ from vggtjax.network.model import Predictions
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
 from vggtjax.pipeline.devices import by_frame_on, frames_mesh, on_host, placed, shared_length, whole_on
-from vggtjax.pipeline.stages import ClipInputs, Compile, Execute, StageMemory, Stages, inline, padded_frames, run_stages
+from vggtjax.pipeline.stage_runners import Compile, Execute, StageMemory, inline
+from vggtjax.pipeline.stages import ClipInputs, Stages, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.refinement.refine import check_refinement, refine_cameras
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import versions
+from vggtjax.storage.cache import say_how_to_keep
 
 _LESS_MEMORY = (
     "fewer frames at once (window, max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
@@ -170,7 +173,12 @@ def reconstruct(
     params, rule = (model.params, fusion) if mesh is None else whole_on((model.params, fusion), mesh)
     run = partial(run_stages, params=params, inputs=inputs, fusion=rule, all_outputs=keep_passes)
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
-        run(dataclasses.replace(stages, run=Compile(on_stage)))
+        started = time.perf_counter()
+        with on_stage("compile programs") as progress:
+            compiler = Compile()
+            run(dataclasses.replace(stages, run=compiler))
+            compiler.wait(progress)
+        say_how_to_keep(time.perf_counter() - started)
         outputs = run(dataclasses.replace(stages, run=Execute(on_stage)))
     passes, assembly, by_frame = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
     fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, frames))
@@ -229,11 +237,13 @@ def compile_ahead(
         )
     options, mesh = options.changed(**changes), frames_mesh(devices)
     length = padded_frames(frames, model.config.motion.offsets) if pad_frames else frames
-    total = shared_length(length, mesh)
+    total, alone = shared_length(length, mesh), frames == 1  # in a single frame nothing moves
     by_frame, whole = (Frames(mesh).sharding(spec) for spec in (BY_FRAME, WHOLE))
     inputs = ClipInputs(
         images=jax.ShapeDtypeStruct((1, total, height, width, 3), jnp.float32, sharding=by_frame),  # type: ignore
         frame_count=None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32, sharding=whole),  # type: ignore
+        dynamic_mask=jax.ShapeDtypeStruct((1, total, height, width), bool, sharding=by_frame) if alone else None,  # type: ignore
+        moves=not alone,
     )
     params = model.params
     if mesh is not None:
@@ -242,7 +252,7 @@ def compile_ahead(
     stages = Stages(model.config, options, frames, (height, width), run=compiler, mesh=mesh, padded=length)
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
         run_stages(stages, params, inputs, all_outputs=keep_passes)
-    return compiler.memory
+        return compiler.wait()
 
 
 def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from vggtjax.storage.writing import locked_folder
 
 _MOST = 1_000_000
 _PREFIX = ".vggtjax-shard-"
-_SETTLING = 120.0  # seconds that a shard waits for others, which start at the same time
+SETTLING = 120.0  # seconds that a shard waits for others, which start at the same time
 T = TypeVar("T")
 
 
@@ -39,16 +39,6 @@ def parse_shard(text: str) -> Shard:
     if not 1 <= shard.number <= shard.of <= _MOST:
         raise InputError(f"shard is {one_line(text, 40)!r}; expected K/N with K from 1 to N, such as 3/16")
     return shard
-
-
-@contextmanager
-def starting(out: Path, shard: Shard | None) -> Iterator[None]:
-    """Hold the folder of a batch while a run starts; a shard waits for others, a whole batch for no one.
-
-    Raises OutputError where another run writes the whole batch, or where the folder cannot be written.
-    """
-    with locked_folder(out, "a batch", wait=0 if shard is None else _SETTLING):
-        yield
 
 
 @contextmanager

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -21,7 +19,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_inputs import apply_fusion
 from vggtjax.method.mask import mine_mask
-from vggtjax.method.passes import Assembly, Passes, assemble, first_pass, second_pass, track_from
+from vggtjax.method.passes import Assembly, Passes, assemble, either_pass, first_pass, only, second_pass, track_from
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
@@ -32,12 +30,9 @@ from vggtjax.network.quantised import Quantised
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
-from vggtjax.progress import OnStage, no_stage
+from vggtjax.pipeline.stage_runners import Execute, inline
 from vggtjax.storage.programs import Program, keep_type
 
-_COLLECTIVE = re.compile(
-    r" (all-gather|all-reduce|all-to-all|ragged-all-to-all|reduce-scatter|collective-\w+|send|recv)(?:-start)?\("
-)
 _DIGITS = 4  # significant binary digits of padded lengths: no clip gets longer by more than an eighth
 
 
@@ -81,6 +76,14 @@ def _second(
     return located(params, clips, dynamic_mask, first, mask_pairs)
 
 
+def _either(
+    params, clips, dynamic_mask, is_first, *, suppress, mask_pairs, compute_dtype, attention, frames: Frames, **options
+):
+    options |= {"suppression": Suppression(suppress=suppress, mask_pairs=mask_pairs)}
+    compute = Compute(compute_dtype, attention=attention, frames=frames)
+    return either_pass(params, clips, dynamic_mask, is_first, compute=compute, **options)
+
+
 def _track(params, clips, query_points, frame, *, config, compute_dtype, attention, frames: Frames):
     track = partial(track_from, config=config, compute=Compute(compute_dtype, attention=attention, frames=frames))
     return frames.on_devices(track, WHOLE, _CLIPS, WHOLE, WHOLE)(params, clips, query_points, frame)
@@ -112,69 +115,18 @@ def _assemble(
     return frames.on_devices(run, BY_FRAME, WHOLE)(passes, fusion)
 
 
+_FIRST_OUTPUTS = ("camera", "depth")  # of the first pass
 _CLIPS = ClipBatch(BY_FRAME, BY_FRAME, WHOLE)  # type: ignore[arg-type]
 _encode = Program(_image_features, static=("config", "compute_dtype", "frames"))
 _first_pass = Program(_first, static=("config", "gram", "compute_dtype", "attention", "frames"))
 _mine_mask = Program(_mine, static=("frames", "size", "clusters", "threshold", "smooth_frames"))
 _SECOND_STATIC = ("config", "suppress", "outputs", "compute_dtype", "attention", "frames")  # mask_pairs is traced
 _second_pass = Program(_second, static=_SECOND_STATIC)
+_either_pass = Program(_either, static=(*_SECOND_STATIC, "gram"))
 _track_from = Program(_track, static=("config", "compute_dtype", "attention", "frames"))
 _assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
 for _kind in (ClipBatch, Predictions, Passes, Cameras, Assembly, Tracks, Quantised):
     keep_type(_kind)
-
-
-class StageMemory(NamedTuple):
-    """Memory of a compiled stage on each device beside its inputs, by XLA's own analysis, in bytes."""
-
-    temporary: int
-    output: int
-    collectives: Mapping[str, int] = MappingProxyType({})  # communications between devices in the program, by kind
-
-
-class Execute:
-    """Runs each program as a stage of its own."""
-
-    def __init__(self, on_stage: OnStage | None = None) -> None:
-        self._on_stage = on_stage or no_stage
-
-    def __call__(self, stage: str, program: Program, *arguments: Any, **options: Any) -> Any:
-        """Return the outputs of the program, when they are computed."""
-        with self._on_stage(stage):
-            return jax.block_until_ready(program(*arguments, **options))
-
-
-def inline(stage: str, program: Program, *arguments: Any, **options: Any) -> Any:
-    """Compute the outputs of the program as a part of the caller's own program."""
-    del stage
-    return program.function(*arguments, **options)
-
-
-def count_collectives(program: str) -> dict[str, int]:
-    """Return the number of communications between devices in the text of a compiled program, by kind."""
-    return dict(Counter(_COLLECTIVE.findall(program)))
-
-
-class Compile:
-    """Compiles each program for the shapes of its arguments; later calls with such arguments find it compiled.
-
-    Each program is a stage of its own, such as "compile first pass".
-    """
-
-    def __init__(self, on_stage: OnStage | None = None) -> None:
-        self._on_stage = on_stage or no_stage
-        self.memory: dict[str, StageMemory] = {}
-
-    def __call__(self, stage: str, program: Program, *arguments: Any, **options: Any) -> Any:
-        """Return the shapes of the program's outputs."""
-        with self._on_stage(f"compile {stage}"):
-            compiled, outputs = program.compile(*arguments, **options)
-        shared = options["frames"].mesh is not None
-        collectives = count_collectives(compiled.as_text() or "") if shared else {}
-        memory = compiled.memory_analysis()
-        if memory is not None:  # some platforms do not tell
-            self.memory[stage] = StageMemory(memory.temp_size_in_bytes, memory.output_size_in_bytes, collectives)
-        return outputs
 
 
 @dataclass(frozen=True)
@@ -208,13 +160,34 @@ class Stages:
     def image_features(self, params: Params, images: Float[Array, "B F H W 3"]) -> Float[Array, "B F P C"]:
         return self.run("image features", _encode, params, images, **self._network)
 
+    @property
+    def _either(self) -> dict[str, Any]:
+        return self._passes | {"gram": self.options.row.gram, "suppress": self.options.row.suppress}
+
+    def _shared(self, outputs: tuple[str, ...]) -> bool:
+        """Return whether one program serves both passes, where the second pass has these outputs."""
+        return self.mesh is None and self.run is not inline and outputs == _FIRST_OUTPUTS
+
+    def _second_outputs(self, all_outputs: bool) -> tuple[str, ...]:
+        return _FIRST_OUTPUTS if all_outputs else self.options.row.second_outputs(self.options.align_scale)
+
     def first_pass(
         self,
         params: Params,
         clips: ClipBatch,
         query_points: Float[Array, "B Q 2"] | None = None,
+        *,
+        second_follows: bool = False,
+        all_outputs: bool = False,
     ) -> tuple[Predictions, Float[Array, "B F h w"]]:
-        """Return what the plain pass predicts, and the motion saliency."""
+        """Return what the plain pass predicts, and the motion saliency.
+
+        If `second_pass` follows with these `all_outputs`, both are one program wherever they can be.
+        """
+        if second_follows and query_points is None and self._shared(self._second_outputs(all_outputs)):
+            nothing = np.zeros(clips.images.shape[:4], bool)
+            none = {"mask_pairs": 0, "outputs": _FIRST_OUTPUTS}
+            return self.run("first pass", _either_pass, params, clips, nothing, np.True_, **self._either, **none)
         points = () if query_points is None else (query_points,)
         return self.run("first pass", _first_pass, params, clips, *points, gram=self.options.row.gram, **self._passes)
 
@@ -236,10 +209,16 @@ class Stages:
         all_outputs: bool = False,
     ) -> Predictions:
         """Return what the mask-aware pass predicts; depth only if the method needs it, or with `all_outputs`."""
-        method = self.options.row
-        outputs = ("camera", "depth") if all_outputs else method.second_outputs(self.options.align_scale)
-        options = {"suppress": method.suppress, "mask_pairs": self.options.mask_pairs, "outputs": outputs}
-        return self.run("second pass", _second_pass, params, clips, dynamic_mask, first, **self._passes, **options)
+        outputs = self._second_outputs(all_outputs)
+        options = {"mask_pairs": self.options.mask_pairs, "outputs": outputs}
+        if not self._shared(outputs):
+            options |= self._passes | {"suppress": self.options.row.suppress}
+            return self.run("second pass", _second_pass, params, clips, dynamic_mask, first, **options)
+        unchanged = only(first, outputs)
+        if unchanged is not None and isinstance(dynamic_mask, jax.Array) and not np.asarray(dynamic_mask).any():
+            return unchanged
+        arguments = (params, clips, dynamic_mask, np.False_)
+        return self.run("second pass", _either_pass, *arguments, **self._either, **options)[0]
 
     def assemble(self, passes: Passes, fusion: FusionParams | None = None) -> Assembly:
         """Return the method's depth, confidence and cameras of the real frames, fused by `fusion` if given."""
@@ -292,12 +271,14 @@ def run_stages(
     points = dict(inputs.query_points)
     patch_tokens = stages.image_features(params, inputs.images)
     clips = ClipBatch(inputs.images, patch_tokens, inputs.frame_count)
-    first, saliency = stages.first_pass(params, clips, points.pop(0, None))
+    runs_second = stages.options.row.needs_second_pass and inputs.moves
+    plans = {"second_follows": runs_second, "all_outputs": all_outputs}
+    first, saliency = stages.first_pass(params, clips, points.pop(0, None), **plans)
     mask = inputs.dynamic_mask
     if mask is None:
         mask = stages.dynamic_mask(saliency, patch_tokens)
     second = first if stages.options.row.needs_second_pass else None
-    if second is not None and inputs.moves:
+    if runs_second:
         second = stages.second_pass(params, clips, mask, first, all_outputs=all_outputs)
     passes = Passes(first, second, saliency, mask)
     assembly = stages.assemble(passes, fusion)

@@ -1,0 +1,189 @@
+"""Artefacts: run where this package cannot be imported, with equal numbers; what does not fit is one sentence."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.seeded import seeded_images
+from tests.tiny import tiny_model
+from vggtjax import infer, write_artefact
+from vggtjax.commands import main as cli
+from vggtjax.errors import InputError, OutputError
+from vggtjax.pipeline import serve
+
+SHAPE = (4, 28, 42)  # frames, height, width
+INSTALLED = ("jax", "jaxlib", "numpy", "ml_dtypes", "opt_einsum", "scipy")  # by `pip install jax`
+ALONE = """
+import runpy, sys
+folder, site, *arguments = sys.argv[1:]
+sys.path[:0] = [folder, site]
+sys.argv = [folder + "/serve.py", *arguments]
+try:
+    runpy.run_path(sys.argv[0], run_name="__main__")
+except SystemExit as end:
+    assert not end.code, end.code
+loaded = {name.split(".")[0] for name in sys.modules}
+assert "flatbuffers" in loaded and not loaded & {"vggtjax", "flax", "safetensors"}
+"""
+
+
+@pytest.fixture(scope="module")
+def model():
+    return tiny_model()
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, model):
+    frames, height, width = SHAPE
+    folder = tmp_path_factory.mktemp("artefact") / "tiny"
+    return write_artefact(model, folder, frames=frames, height=height, width=width, mask_pairs=2)
+
+
+@pytest.fixture
+def artefact(written, tmp_path) -> Path:
+    """Return a copy that a test may damage."""
+    return Path(shutil.copytree(written, tmp_path / "artefact"))
+
+
+def clip(seed: int) -> np.ndarray:
+    return (255 * seeded_images(*SHAPE, seed).transpose(0, 2, 3, 1)).astype(np.uint8)
+
+
+@pytest.fixture
+def site(tmp_path) -> Path:
+    """Return a folder of packages as in an environment that has jax alone."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    for name in INSTALLED:
+        for path in Path(jax.__file__).parents[1].glob(f"{name}*"):
+            if path.name in (name, f"{name}.libs") or path.match(f"{name}-*.dist-info"):
+                (folder / path.name).symlink_to(path)
+    return folder
+
+
+def test_jax_alone_gives_the_numbers_of_infer(written, site, tmp_path, model):
+    for seed in (0, 1):
+        np.save(tmp_path / f"clip{seed}.npy", clip(seed))
+    clips = [str(tmp_path / f"clip{seed}.npy") for seed in (0, 1)]
+    command = [sys.executable, "-I", "-S", "-c", ALONE, written, site, *clips, "--out", tmp_path / "results"]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for seed in (0, 1):
+        images = jax.numpy.asarray(clip(seed)[None].astype(np.float32) / np.float32(255))
+        assembly, passes = infer(model.params, images, model.config, mask_pairs=2)
+        expected = {
+            "depth": assembly.depth,
+            "depth_confidence": assembly.confidence,
+            "camera_from_world": assembly.camera_from_world,
+            "intrinsics": assembly.intrinsics,
+            "dynamic_mask": passes.dynamic_mask,
+            "saliency": passes.saliency,
+        }
+        with np.load(tmp_path / "results" / f"clip{seed}.npz") as results:
+            assert set(results) == set(expected)
+            for name, value in expected.items():
+                np.testing.assert_allclose(results[name], np.asarray(value)[0], rtol=1e-6, atol=1e-6, err_msg=name)
+    assert passes.dynamic_mask.any()
+
+
+def test_the_manifest_tells_what_is_in_it(written, model):
+    manifest = serve.read_manifest(written)
+    assert manifest["platforms"] == ["cpu", "cuda"]
+    assert manifest["inputs"]["images"]["shape"] == [*SHAPE, 3]
+    assert manifest["outputs"]["dynamic_mask"] | {"about": ""} == {"shape": [*SHAPE], "dtype": "bool", "about": ""}
+    assert manifest["model"] == model.identity.to_json()
+    assert manifest["options"]["mask_pairs"] == 2
+    weights = serve._read_weights(written / serve.WEIGHTS)
+    assert {name.split(".")[0] for name in weights} == {"backbone", "aggregator", "camera_head", "depth_head"}
+    kernel = model.params["aggregator"]["global_blocks"]["mlp"]["fc1"]["kernel"]
+    assert np.array_equal(weights["aggregator.global_blocks.mlp.fc1.kernel"], kernel)
+
+
+def changed(artefact: Path, **fields) -> None:
+    path = artefact / serve.MANIFEST
+    path.write_text(json.dumps(json.loads(path.read_text()) | fields))
+
+
+def flipped(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[-1] ^= 1
+    path.write_bytes(content)
+
+
+DAMAGES = {
+    "version 2 of the format": lambda folder: changed(folder, version=2),
+    "with calling convention 99; jax": lambda folder: changed(folder, calling_convention=99),
+    "is for tpu; jax runs on cpu here": lambda folder: changed(folder, platforms=["tpu"]),
+    "its format is not vggtjax-artefact": lambda folder: changed(folder, format="other"),
+    "fields are missing or have wrong types": lambda folder: changed(folder, files={}),
+    "is damaged (": lambda folder: (folder / serve.MANIFEST).write_text("{"),
+    "weights.safetensors is damaged: its sha256": lambda folder: flipped(folder / serve.WEIGHTS),
+    "program.bin is damaged: its sha256": lambda folder: flipped(folder / serve.PROGRAM),
+    "program.bin: No such file": lambda folder: (folder / serve.PROGRAM).unlink(),
+    "is not an artefact": shutil.rmtree,
+}
+
+
+@pytest.mark.parametrize("message", DAMAGES)
+def test_what_does_not_fit_is_one_sentence(artefact, tmp_path, capsys, message):
+    DAMAGES[message](artefact)
+    np.save(tmp_path / "clip.npy", clip(0))
+    assert serve.main([str(tmp_path / "clip.npy"), "--artefact", str(artefact), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.startswith("serve: ")
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("frames", "message"),
+    [
+        (clip(0)[:2], "the frames have shape [2, 28, 42, 3]; this artefact takes [4, 28, 42, 3]"),
+        (clip(0).astype(np.float32), "values that are not in [0, 1]"),
+        (np.full((*SHAPE, 3), np.nan, np.float32), "values that are not in [0, 1]"),
+        (clip(0).astype(np.int32), "the frames have type int32"),
+        (np.array([{}]), "cannot read"),  # pickled
+    ],
+)
+def test_frames_that_do_not_fit(written, tmp_path, capsys, frames, message):
+    np.save(tmp_path / "clip.npy", frames, allow_pickle=True)
+    assert serve.main([str(tmp_path / "clip.npy"), "--artefact", str(written), "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--size", "518"), "size is '518'; expected width and height"),
+        (("--frames", "0"), "expected a whole number of at least 1"),
+        (("--platforms", "gpu"), "platforms is 'gpu'; expected one of cpu, cuda, rocm, tpu"),
+        (("--platforms", "cpu,cpu"), "expected different ones"),
+        (("--method", "vggt4d"), "--no-refine-mask"),
+        (("--refine-cameras",), "bundle adjustment is not a part"),
+        (("--out", "."), "exists and is not replaced"),
+        (("--size", "63x64"), "expected multiples of the patch size"),
+    ],
+)
+def test_the_command_refuses(tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    given = {"--frames": "2", "--size": "64x64", "--out": "new"}
+    given |= {arguments[0]: arguments[1]} if len(arguments) == 2 else {}
+    flags = [text for pair in given.items() for text in pair] + list(arguments if len(arguments) == 1 else ())
+    assert cli.main(["export-model", "demo", *flags]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_model_that_cannot_be_exported(tmp_path, model):
+    with pytest.raises(InputError, match="multiples of the patch size 14"):
+        write_artefact(model, tmp_path / "new", frames=2, height=28, width=30)
+    (tmp_path / "old").mkdir()
+    with pytest.raises(OutputError, match="exists and is not replaced"):
+        write_artefact(model, tmp_path / "old", frames=2, height=28, width=28)

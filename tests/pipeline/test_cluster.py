@@ -1,0 +1,261 @@
+"""Clips on a cluster of Ray: each good one once, whatever becomes of a worker; a sentence for what is no cluster."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.moving_ball import moving_ball
+from tests.pipeline import dying_driver
+from tests.room import make_room
+from tests.tiny import tiny_model
+from vggtjax.checkpoint import save_model
+from vggtjax.commands.main import main
+from vggtjax.errors import ClusterError, InputError
+from vggtjax.options import Options
+from vggtjax.pipeline.cluster import _messages, reconstruct_on_cluster
+from vggtjax.pipeline.cluster_driver import Dispatcher, Note, Plan, _Slot, shared
+from vggtjax.pipeline.cluster_options import Cluster
+from vggtjax.pipeline.cluster_worker import Job, Place, Refused, Started, Worker
+from vggtjax.pipeline.destination import SETTINGS_NAME, LocalFolder
+from vggtjax.pipeline.recipe import ClipOutcome, Recipe
+from vggtjax.results.archive import ARCHIVE_NAME
+from vggtjax.storage.versions import running_versions
+
+pytest.importorskip("ray", reason="Ray is not installed: pip install 'vggtjax[cluster]'")
+RECIPE = Recipe(options=Options(method="vggt"))
+
+
+def test_a_killed_worker_costs_its_clips_alone_and_they_are_run_again(tmp_path):
+    """Nine clips, one of them corrupt, on two workers, of which one is killed once three clips are there."""
+    frames = (255 * moving_ball(2)).astype(np.uint8)
+    for number in range(9):
+        (tmp_path / f"clips/{number}").mkdir(parents=True)
+        for i, frame in enumerate(frames):
+            Image.fromarray(np.roll(frame[:70], number, axis=1)).save(tmp_path / f"clips/{number}/{i}.png")
+    (tmp_path / "clips/2/1.png").write_bytes(b"broken")
+    model = tiny_model()
+    save_model(tmp_path / "tiny.safetensors", model.params, model.config)
+    command = [sys.executable, "-m", "vggtjax", "batch", str(tmp_path / "clips"), "--method", "vggt", "--only", ""]
+    command += ["--model", str(tmp_path / "tiny.safetensors"), "--out"]
+    environment = os.environ | {"VGGTJAX_CACHE": str(tmp_path / "cache"), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    alone = subprocess.run([*command, str(tmp_path / "alone")], env=environment, capture_output=True, check=False)
+    assert alone.returncode == 0, alone.stderr
+
+    out = tmp_path / "out"
+    arguments = [*command, str(out), "--engine", "ray", "--address", "local", "--workers", "2"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    workers, done, said = [], 0, []
+    with subprocess.Popen(arguments, env=environment, **pipes) as running:
+        assert running.stderr is not None
+        for line in running.stderr:
+            said.append(line)
+            workers += map(int, re.findall(r"ready: .*, process (\d+)", line))
+            done += ": done" in line
+            if done == 3 and len(workers) == 2:
+                os.kill(workers[0], signal.SIGKILL)
+                done += 100
+        table = running.stdout.read()  # type: ignore[union-attr]
+    assert running.returncode == 0, said
+    assert any("has ended; in its work: " in line for line in said)
+    assert dict(line.split(maxsplit=1) for line in table.splitlines()[:4]) == {
+        "clips": "9",
+        "done": "8",
+        "kept": "0",
+        "failed": "1",
+    }
+    assert "2 failed: " in table
+    assert "1.png" in table
+    assert "ray" not in table.lower()
+    archives = {path.parent.name: path.read_bytes() for path in (tmp_path / "alone").glob(f"*/{ARCHIVE_NAME}")}
+    assert sorted(archives) == [str(number) for number in (0, 1, 3, 4, 5, 6, 7, 8)]
+    assert {path.parent.name: path.read_bytes() for path in out.glob(f"*/{ARCHIVE_NAME}")} == archives
+    assert (out / SETTINGS_NAME).read_bytes() == (tmp_path / "alone" / SETTINGS_NAME).read_bytes()
+    assert {path.name for path in out.iterdir()} == {path.name for path in (tmp_path / "alone").iterdir()}
+
+
+class Actors:
+    """Stands for Ray: remembers what was asked of which worker."""
+
+    def __init__(self, monkeypatch):
+        self.answers, self.killed = {}, []
+        ray = SimpleNamespace(get=self.get, kill=self.killed.append)
+        monkeypatch.setitem(sys.modules, "ray", ray)
+
+    def get(self, reference):
+        answer = self.answers[reference]
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+
+class Actor:
+    def __init__(self):
+        self.asked = []
+
+    def __getattr__(self, name):
+        return SimpleNamespace(remote=partial(self._ask, name))
+
+    def _ask(self, name, *arguments):
+        self.asked.append(name)
+        return (id(self), len(self.asked))
+
+
+@pytest.fixture
+def dispatcher(monkeypatch, tmp_path):
+    """Return a dispatcher of five clips with two workers that are ready, and what it has sent."""
+    actors, sent = Actors(monkeypatch), []
+    job = Job(load=dying_driver.no_model, recipe=RECIPE, out=LocalFolder(tmp_path), folder=".")
+    dispatcher = Dispatcher(Plan(job, {name: name for name in "abcde"}, workers=2), sent.append)
+    dispatcher._wanted, dispatcher._job = 2, job
+    dispatcher._class = SimpleNamespace(remote=Actor)
+    dispatcher._grow()
+    settings = {"size": 56}
+    for number, slot in enumerate(dispatcher._slots):
+        slot.place = Place("host", number, running_versions())
+        dispatcher._begin(slot, Started(settings, ""))
+    dispatcher._tasks.clear()
+    return SimpleNamespace(it=dispatcher, actors=actors, sent=sent)
+
+
+def end(dispatcher, slot, name, answer):
+    """Let a worker answer for a clip."""
+    reference = next(key for key, task in dispatcher.it._tasks.items() if task == (slot, name))
+    dispatcher.actors.answers[reference] = answer
+    dispatcher.it._finish(reference)
+
+
+def test_a_clip_that_ends_two_workers_fails_and_those_beside_it_do_not(dispatcher):
+    from ray.exceptions import RayActorError
+
+    it = dispatcher.it
+    it._assign()
+    first, second = it._slots
+    assert (first.clips, second.clips) == (["a", "c", "e"], ["b", "d"])
+    end(dispatcher, first, "c", RayActorError())
+    assert [slot for slot, _ in it._tasks.values()] == [second, second]
+    assert dispatcher.actors.killed == [first.actor]
+    assert dispatcher.sent[-1] == Note("a worker (host, process 0) has ended; in its work: a, c, e")
+    it._grow()
+    third = it._slots[1]
+    third.place, third.ready = second.place, True
+    it._assign()
+    assert third.clips == ["a"]  # alone, so that another end tells which clip it is
+    end(dispatcher, third, "a", ClipOutcome("a", "kept"))
+    assert dispatcher.sent[-1] == ClipOutcome("a", "done")  # the first worker had written it
+    it._assign()
+    assert third.clips == ["c"]
+    end(dispatcher, third, "c", RayActorError())
+    (outcome,) = [sent for sent in dispatcher.sent if getattr(sent, "status", "") == "failed"]
+    assert outcome.name == "c"
+    assert "two workers ended with it in their work" in outcome.reason
+    assert list(it._again) == ["e"]
+    assert second.clips == ["b", "d"]
+
+
+def test_workers_of_other_code_and_other_files_are_refused(dispatcher):
+    slot = _Slot(Actor())
+    dispatcher.actors.answers["x"] = Place("far", 7, "vggtjax 0.0.9 (sources 01234567) with jax 0.9")
+    dispatcher.it._tasks["x"] = (slot, None)
+    with pytest.raises(
+        ClusterError, match=r"\(far, process 7\) runs vggtjax 0.0.9 .*, this command vggtjax .* the same"
+    ):
+        dispatcher.it._finish("x")
+    slot.place = Place("far", 7, running_versions())
+    with pytest.raises(ClusterError, match="has another size than the one on host, process 0"):
+        dispatcher.it._begin(slot, Started({"size": 70}, ""))
+    with pytest.raises(ClusterError, match="cannot begin: no such model"):
+        dispatcher.it._begin(slot, Refused("no such model"))
+
+
+def test_workers_that_never_begin_end_the_batch(dispatcher):
+    for slot in dispatcher.it._slots:
+        slot.ready = False
+    problem = RuntimeError("a stack\nno memory")
+    for _ in range(2):
+        dispatcher.it._lose(dispatcher.it._slots[0], None, problem)
+        dispatcher.it._grow()
+    with pytest.raises(ClusterError, match="3 workers in a row ended before they began: no memory"):
+        dispatcher.it._lose(dispatcher.it._slots[0], None, problem)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "asked", "share"),
+    [
+        ([{"CPU": 8}], {}, (1, 8, 0)),
+        ([{"CPU": 8}, {"CPU": 4}], {}, (3, 4, 0)),
+        ([{"CPU": 8}], {"workers": 2}, (2, 4, 0)),
+        ([{"CPU": 2}], {"workers": 9}, (9, 1, 0)),
+        ([{"CPU": 8}, {"CPU": 8}], {"cpus": 3}, (4, 3, 0)),
+        ([{"CPU": 16, "GPU": 4}, {"CPU": 2}], {}, (4, 1, 1)),
+        ([{"CPU": 16, "GPU": 4}], {"gpus": 0.5}, (8, 1, 0.5)),
+        ([{"CPU": 16, "GPU": 4}], {"gpus": 0.0}, (1, 16, 0)),
+        ([{"CPU": 2}], {"gpus": 1.0, "workers": 4}, (4, 1, 1)),
+    ],
+)
+def test_the_share_of_a_worker(nodes, asked, share):
+    plan = Plan(Job(lambda: 1 / 0, RECIPE, LocalFolder("/"), "."), {}, **asked)  # type: ignore[arg-type]
+    assert shared(nodes, plan) == share
+
+
+def test_a_cluster_without_room(dispatcher):
+    for nodes, cpus, gpus in (([{"CPU": 2}], None, 1.0), ([{"CPU": 2}], 4, None), ([], None, None)):
+        with pytest.raises(ClusterError, match="no machine of the cluster has room for a worker, which takes "):
+            shared(nodes, Plan(dispatcher.it._job, {}, cpus=cpus, gpus=gpus))
+
+
+def test_a_worker_does_a_clip_once(tmp_path):
+    model = tiny_model()
+    Image.fromarray(np.zeros((70, 98, 3), np.uint8)).save(tmp_path / "a.png")
+    worker = Worker()
+    place = LocalFolder(tmp_path / "out")
+    assert worker.place() == Place(os.uname().nodename, os.getpid(), running_versions())
+    started = worker.start(Job(lambda: (model, None), RECIPE, place, str(tmp_path)))
+    assert isinstance(started, Started)
+    assert started.settings["method"] == "vggt"
+    worker._work.reconstruct_or_cut = lambda name, clip, seconds: make_room()  # type: ignore[union-attr]
+    assert worker.run("a", "a.png") == ClipOutcome("a", "done", frames=1)
+    assert worker.run("a", "a.png").status == "kept"
+    assert "'b.png' does not exist" in worker.run("b", "b.png").reason
+    worker._work.load = lambda source: 1 / 0  # type: ignore[union-attr]
+    assert "ZeroDivisionError" in worker.run("c", "a.png").reason
+    worker.close()
+    refused = Worker().start(Job(partial(_no_model, "no such model"), RECIPE, place, "/nowhere"))
+    assert refused == Refused("no such model")
+
+
+def _no_model(reason):
+    raise InputError(reason)
+
+
+def test_a_driver_that_dies_is_one_sentence(monkeypatch, tmp_path):
+    job = Job(dying_driver.no_model, RECIPE, LocalFolder(tmp_path), ".")
+    monkeypatch.setattr("vggtjax.pipeline.cluster.drive", dying_driver.die)
+    with pytest.raises(ClusterError, match=r"the cluster has died \(Ray's last words: GCS is gone\); finished clips"):
+        list(_messages(Plan(job, {})))
+
+
+def test_what_is_wrong_is_said_before_anything_starts(tmp_path, capsys, monkeypatch):
+    (tmp_path / "a").mkdir()
+    Image.fromarray(np.zeros((70, 98, 3), np.uint8)).save(tmp_path / "a/a.png")
+    common = ["batch", str(tmp_path / "a"), "--model", "demo", "--out"]
+    for arguments, sentence in (
+        ([str(tmp_path / "o"), "--workers", "2"], "--workers needs --engine ray"),
+        ([str(tmp_path / "o"), "--engine", "ray", "--shard", "1/1"], "--engine ray and --shard exclude each other"),
+        ([str(tmp_path / "o"), "--engine", "ray", "--workers", "0"], "--workers is 0; expected a whole number"),
+        ([str(tmp_path / "o"), "--engine", "ray", "--address", "ray://h:1"], "run the command on a machine of the cl"),
+        (["memory://o", "--engine", "ray"], "memory://o is in the memory of one process"),
+    ):
+        assert main([*common, *arguments]) == 2
+        assert sentence in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+    monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"--engine ray needs the extra 'cluster'"):
+        next(reconstruct_on_cluster(tiny_model, {}, tmp_path, Cluster("ray"), RECIPE))  # type: ignore[arg-type]

@@ -1,0 +1,140 @@
+"""Every program is lowered for NVIDIA GPUs and TPUs, which need not be there: nothing is compiled or run."""
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import export
+from jax._src.cudnn import fused_attention_stablehlo as cudnn
+
+from tests.tiny import tiny_config
+from vggtjax.method.fusion_family import PARTS, start
+from vggtjax.method.mask_refinement import cluster_losses, cluster_points
+from vggtjax.network import attention
+from vggtjax.network.aggregator import aggregate
+from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.dpt_head import predict_dense
+from vggtjax.network.model import parameter_shapes
+from vggtjax.network.precision import Compute
+from vggtjax.options import METHODS, Options
+from vggtjax.pipeline.stages import ClipInputs, Stages, run_stages
+from vggtjax.scenes.textures import load_textures
+from vggtjax.training.data import make_batch
+from vggtjax.training.recipe import Phase
+
+PLATFORMS = ("cuda", "tpu")
+SIZE, FRAMES = (56, 56), 4
+CONFIG = tiny_config(track_features=8, track_hidden=16, track_corr_levels=3, track_corr_radius=1)
+PARAMS = parameter_shapes(CONFIG)
+CUDNN = ("__cudnn$fmhaSoftmax", "__cudnn$fmhaSoftmaxBackward")
+CALLS = [export.DisabledSafetyCheck.custom_call(name) for name in CUDNN]
+
+
+def array(*shape, dtype: Any = jnp.float32) -> Any:
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def shapes(tree):
+    return jax.tree.map(lambda x: array(*jnp.shape(x), dtype=jnp.result_type(x)), tree)
+
+
+def lowered(function, *arguments, platforms=PLATFORMS, **options):
+    """Lower a function of arrays. A callback to the host cannot be lowered for two platforms."""
+    return export.export(jax.jit(function), platforms=platforms, disabled_checks=CALLS)(*arguments, **options)
+
+
+def text(*arguments, **options):
+    return str(lowered(*arguments, **options).mlir_module())
+
+
+class Lower:
+    """Lowers each program of the stages in place of running it, once for equal options and shapes."""
+
+    def __init__(self):
+        self.outputs = {}
+
+    def __call__(self, stage, program, *arguments, **options):
+        fixed = {name: value for name, value in options.items() if name in program._static}
+        traced = shapes({name: value for name, value in options.items() if name not in fixed})
+        leaves, structure = jax.tree.flatten(shapes(arguments))
+        key = (stage, str(fixed), tuple(leaves), structure)
+        if key not in self.outputs:
+            exported = lowered(partial(program.function, **fixed), *shapes(arguments), **traced)
+            self.outputs[key] = jax.tree.unflatten(exported.out_tree, exported.out_avals)
+        return self.outputs[key]
+
+
+@pytest.fixture(scope="module")
+def lower():
+    return Lower()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_stages_of_a_method(lower, method):
+    """`vggt4d` in bfloat16, the others in float32; one of them with tracks, one with a fitted rule of fusion."""
+    dtype = "bfloat16" if method == "vggt4d" else "float32"
+    points = {3: array(1, 2, 2)} if method == "vggt" else {}
+    fusion = shapes(start(tuple(PARTS))) if method == "4dvggt-d" else None
+    stages = Stages(CONFIG, Options(method=method, compute_dtype=dtype).resolved(), FRAMES, SIZE, run=lower)
+    clip = ClipInputs(array(1, FRAMES, *SIZE, 3), query_points=points)
+    run_stages(stages, PARAMS, clip, fusion=fusion, all_outputs=method != "vggt4d")
+    assert {"image features", "first pass", "dynamic mask", "assemble"} <= {stage for stage, *_ in lower.outputs}
+
+
+def test_merged_attention(lower):
+    stages = Stages(CONFIG, Options(attention="merged").resolved(), FRAMES, SIZE, run=lower)
+    grid = [side // CONFIG.patch_size for side in SIZE]
+    features = array(1, FRAMES, grid[0] * grid[1], CONFIG.embed_dim)
+    stages.first_pass(PARAMS, ClipBatch(array(1, FRAMES, *SIZE, 3), features))
+
+
+def test_mask_refinement():
+    pixels, points = (FRAMES, *SIZE), (FRAMES, 50)
+    lowered(cluster_points, shapes(jax.random.key(0)), array(*points, 3), array(*points, dtype=bool))
+    arrays = (array(*pixels, 3), array(*pixels), array(*pixels, dtype=bool), array(FRAMES, 3, 4), array(FRAMES, 3, 3))
+    lowered(cluster_losses, *arrays, array(*points, dtype=int), array(*points, dtype=bool), array(*points, dtype=int))
+
+
+def test_the_gradient_of_the_blocks():
+    """Attention has a backward pass of its own."""
+    h, w = (side // CONFIG.patch_size for side in SIZE)
+
+    def loss(params, tokens):
+        return aggregate(params, tokens, CONFIG, (h, w), captures=(), compute=Compute(remat=True))[0].sum()
+
+    lowered(jax.grad(loss), PARAMS, array(1, FRAMES, h * w, CONFIG.embed_dim))
+
+
+def test_the_gradient_of_a_dense_head():
+    """Resizing has a backward pass of its own."""
+    h, w = (side // CONFIG.patch_size for side in SIZE)
+
+    def loss(params, taps):
+        return predict_dense(params, taps, CONFIG, (h, w), "depth")[0].sum()
+
+    lowered(jax.grad(loss), PARAMS["depth_head"], [array(1, FRAMES, h * w, width) for width in CONFIG.dpt_channels])
+
+
+def test_batches_that_are_drawn_on_the_device():
+    run = partial(make_batch, phase=Phase(4, 1, (2,), *SIZE), frames=2)
+    lowered(run, *shapes((jax.random.key(0), load_textures("training"))))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_the_kernels_that_need_their_device(monkeypatch, masked, dtype):
+    """What `attention` takes where it finds the device: cuDNN's kernel and its gradient, and that for TPUs."""
+    heads = array(2, 140, 2, 64, dtype=dtype)
+    visible = array(2, 140, dtype=bool) if masked else None
+    assert "tpu_custom_call" in text(attention._on_tpu, heads, heads, heads, visible, platforms=["tpu"])
+    if dtype == "float32":  # which cuDNN does not take
+        return
+    monkeypatch.setattr(cudnn, "check_cudnn_version", lambda: 91200)  # as on a machine that has cuDNN
+    run = partial(attention._packed, implementation="cudnn")
+    assert CUDNN[0] in text(run, heads, heads, heads, visible, platforms=["cuda"])
+    gradient = jax.grad(lambda q, k, v: run(q, k, v, visible).astype(np.float32).sum(), argnums=(0, 1, 2))
+    if not masked:
+        assert CUDNN[1] in text(gradient, heads, heads, heads, platforms=["cuda"])

@@ -1,0 +1,139 @@
+"""The work on one clip of a batch: load, reconstruct, write."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from vggtjax.checkpoint import Model
+from vggtjax.clips.clip import Clip, read_clip
+from vggtjax.clips.preprocessing import Fitter
+from vggtjax.clips.sources import ClipSource, open_source
+from vggtjax.errors import one_line
+from vggtjax.known.intrinsics import known_values
+from vggtjax.method.fusion_family import FusionParams
+from vggtjax.method.fusion_file import fusion_digest
+from vggtjax.pipeline.destination import Destination
+from vggtjax.pipeline.devices import frames_mesh, whole_on
+from vggtjax.pipeline.recipe import ClipOutcome, Recipe
+from vggtjax.pipeline.run import reconstruct
+from vggtjax.progress import StageSeconds
+from vggtjax.results.disk import forecast_bytes
+from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.results.report import RunFacts
+from vggtjax.windows.choice import choose_windows, smaller_window
+from vggtjax.windows.plan import Windows
+from vggtjax.windows.run import LongRun, reconstruct_long
+
+
+class LongClip(NamedTuple):
+    """A clip that is run in windows, and why."""
+
+    windows: Windows
+    frames: int
+    reason: str
+
+
+class ClipWork:
+    """A model and a recipe, ready for one clip after another."""
+
+    def __init__(self, model: Model, fusion: FusionParams | None, recipe: Recipe, out: Destination) -> None:
+        mesh = frames_mesh(recipe.devices)
+        self._model, self._fusion, self._recipe, self._out = model, fusion, recipe, out
+        self._placed = model  # with its weights on every device
+        if mesh is not None:
+            self._placed = dataclasses.replace(model, params=whole_on(model.params, mesh))
+        self._fitter: Fitter = recipe.framing.fitter(size=model.config.image_size, patch=model.config.patch_size)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What decides the results, as JSON values."""
+        recipe = self._recipe
+        return {
+            "model": self._model.identity.to_json(),
+            "mode": self._fitter.mode,
+            "size": self._fitter.size,
+            **dataclasses.asdict(recipe.sampling),
+            "stride": recipe.sampling.step,
+            **recipe.options.resolved().to_json(),
+            **dataclasses.asdict(recipe.saving),
+            "only": None if recipe.saving.only is None else list(recipe.saving.only),
+            "fusion": fusion_digest(self._fusion),
+            **({} if recipe.known is None else {"known": known_values(recipe.known)}),
+            "pad_frames": recipe.pad_frames,
+        }
+
+    @property
+    def _cuts(self) -> bool:
+        """Whether a clip may be run in windows."""
+        return not (self._recipe.known or self._recipe.options.refine_cameras or self._recipe.devices > 1)
+
+    def long_clip(self, source: ClipSource, *, clips: int = 1) -> LongClip | None:
+        """Return windows for a clip that does not fit in memory beside `clips` - 1 others; None for one that does.
+
+        Raises DeviceMemoryError for a clip that cannot fit and cannot be cut.
+        """
+        opened, recipe = open_source(source), self._recipe
+        if not recipe.unchecked and recipe.devices == 1:
+            choice = choose_windows(self._model, opened, recipe.sampling, self._fitter, recipe.options, clips=clips)
+            if choice is not None and choice.is_cut and self._cuts:
+                return LongClip(choice.windows, choice.frames, choice.sentence)
+            if choice is not None and choice.is_hopeless:
+                raise choice.refusal(cuts=False)
+        return None
+
+    def load(self, source: ClipSource) -> Clip:
+        """Read a clip of this machine."""
+        return read_clip(open_source(source), self._recipe.sampling, self._fitter)
+
+    def run_long(self, name: str, source: ClipSource, clip: LongClip) -> ClipOutcome:
+        """Reconstruct a clip in windows, and write its result."""
+        recipe = self._recipe
+        plan = LongRun(clip.windows, clip.frames, recipe.sampling, self._fitter, recipe.saving)
+
+        def run(folder: Path) -> None:
+            how: dict[str, Any] = {"options": recipe.options, "long_run": plan, "fusion": self._fusion}
+            reconstruct_long(self._model, source, folder, clip.windows, **how)
+
+        self._out.write(name, run)
+        return ClipOutcome(name, "done", clip.reason, clip.frames)
+
+    def reconstruct(self, name: str, clip: Clip, seconds: StageSeconds) -> Reconstruction:
+        """Reconstruct a clip, if there is space for its result."""
+        saving = self._recipe.saving
+        self._out.check_space(name, forecast_bytes(clip.images.shape[:3], clip.source_size, saving))
+        return reconstruct(
+            self._placed,
+            clip,
+            options=self._recipe.options,
+            size=self._fitter.size,
+            fusion=self._fusion,
+            known=self._recipe.known,
+            pad_frames=self._recipe.pad_frames,
+            devices=self._recipe.devices,
+            on_stage=seconds.stage,
+        )
+
+    def reconstruct_or_cut(self, name: str, clip: Clip, seconds: StageSeconds) -> Reconstruction | LongClip:
+        """Reconstruct a clip; return smaller windows for one that finds no memory and may be cut."""
+        try:
+            return self.reconstruct(name, clip, seconds)
+        except MemoryError as error:  # of the host or of the device
+            windows = smaller_window(len(clip)) if self._cuts else None
+            if windows is None:
+                raise
+            reason = one_line(str(error)) or "out of memory"
+        return LongClip(windows, len(clip), f"{reason}; run once more, in windows of {windows.window} frames")
+
+    def write(self, name: str, clip: Clip, result: Reconstruction, seconds: Mapping[str, float]) -> ClipOutcome:
+        """Write the result of a clip."""
+        saving = self._recipe.saving
+
+        def save(folder: Path) -> None:
+            pictures = clip.pictures() if saving.resolution == "original" else None
+            result.save(folder, saving=saving, pictures=pictures, facts=RunFacts(seconds))
+
+        self._out.write(name, save)
+        return ClipOutcome(name, "done", frames=len(clip))
