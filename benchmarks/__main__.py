@@ -9,15 +9,21 @@ import tyro
 
 from benchmarks.approximations import approximations
 from benchmarks.batch import batch
+from benchmarks.cluster import cluster
 from benchmarks.demo_model import demo_model
 from benchmarks.devices import devices
 from benchmarks.embed import embed
+from benchmarks.first_run import first_run
+from benchmarks.fuzz import fuzz
+from benchmarks.gpu_day.command import gpu_day
 from benchmarks.gradient import gradient
+from benchmarks.kills import kills
 from benchmarks.known import known
 from benchmarks.leads import leads
 from benchmarks.long_clips import long_clips
 from benchmarks.make_checkpoint import main as make_checkpoint
 from benchmarks.masks import masks
+from benchmarks.peak_memory import peak_memory
 from benchmarks.point_clouds import point_clouds
 from benchmarks.refine_cameras import refine_cameras
 from benchmarks.refinement import refinement
@@ -34,17 +40,23 @@ from vggtjax.errors import VggtjaxError
 COMMANDS = {
     "approximations": approximations,
     "batch": batch,
+    "cluster": cluster,
     "demo-model": demo_model,
     "devices": devices,
     "embed": embed,
+    "first-run": first_run,
+    "gpu-day": gpu_day,
+    "fuzz": fuzz,
     "gpu-targets": gpu_targets,
     "gradient": gradient,
+    "kills": kills,
     "known": known,
     "leads": leads,
     "long-clips": long_clips,
     "make-checkpoint": make_checkpoint,
     "masks": masks,
     "memory": memory,
+    "peak-memory": peak_memory,
     "point-clouds": point_clouds,
     "refine-cameras": refine_cameras,
     "refinement": refinement,

@@ -1,6 +1,7 @@
-"""A process that reconstructs a long clip in windows and says how much memory it took.
+"""A process that reconstructs a long clip, in windows or all frames together, and says what memory and time it took.
 
-python -m benchmarks.long_clips_worker FOLDER MODEL FRAMES WINDOW OVERLAP; prints a line of JSON.
+python -m benchmarks.long_clips_worker FOLDER MODEL FRAMES WINDOW OVERLAP; prints a line of JSON. WINDOW 0 runs all
+frames together.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ from benchmarks.worker import PeakMemory
 
 
 def main(folder: str, model: str, frames: str, window: str, overlap: str) -> None:
-    """Reconstruct the first frames of a folder."""
+    """Reconstruct the first frames of a folder, and write the result."""
+    from vggtjax.clips.clip import load_clip
     from vggtjax.clips.preprocessing import Fitter
     from vggtjax.clips.sampling import Sampling
     from vggtjax.commands.process import keep_freed_memory
+    from vggtjax.pipeline.run import reconstruct
     from vggtjax.pretrained.load import load_model
     from vggtjax.windows.plan import Windows
     from vggtjax.windows.run import LongRun, reconstruct_long
@@ -26,12 +29,17 @@ def main(folder: str, model: str, frames: str, window: str, overlap: str) -> Non
     keep_freed_memory()
     loaded = load_model(model)
     fitter = Fitter(size=loaded.config.image_size, patch=loaded.config.patch_size)
-    windows = Windows(int(window), int(overlap))
-    plan = LongRun(windows, sampling=Sampling(max_frames=int(frames)), fitter=fitter)
-    began = time.perf_counter()
+    began, processor = time.perf_counter(), time.process_time()
     with PeakMemory() as peak, TemporaryDirectory() as out:
-        reconstruct_long(loaded, folder, Path(out), windows, long_run=plan)
-    answer = {"own": peak.own, "total": peak.total, "seconds": time.perf_counter() - began}
+        if int(window):
+            windows = Windows(int(window), int(overlap))
+            plan = LongRun(windows, sampling=Sampling(max_frames=int(frames)), fitter=fitter)
+            reconstruct_long(loaded, folder, Path(out), windows, long_run=plan)
+        else:
+            clip = load_clip(folder, size=fitter.size, patch=fitter.patch, max_frames=int(frames))
+            reconstruct(loaded, clip).save(out)
+    answer = {"own": peak.own, "total": peak.total}
+    answer |= {"seconds": time.perf_counter() - began, "processor": time.process_time() - processor}
     sys.stdout.write(json.dumps(answer) + "\n")
 
 

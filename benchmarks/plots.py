@@ -103,23 +103,25 @@ def _save(figure, path: Path) -> None:
         figure.savefig(temporary, dpi=120, format="png")
 
 
-def plot_paths(path: Path, cameras: dict[str, np.ndarray], truth: np.ndarray, title: str) -> None:
-    """Draw the paths of cameras from above, each fitted to the true one by a similarity, beside the true one."""
+def plot_paths(
+    path: Path, cameras: dict[str, np.ndarray], reference: np.ndarray, title: str, name: str = "true"
+) -> None:
+    """Draw the paths of cameras from above, each fitted to a reference of this name by a similarity."""
     from matplotlib.figure import Figure
 
     columns = 3
     rows = -(-len(cameras) // columns)
     figure = Figure(figsize=(4 * columns, 4 * rows), layout="constrained")
-    true = centres(truth)
+    wanted = centres(reference)
     every = figure.subplots(rows, columns, squeeze=False).ravel()
     for axes in every[len(cameras) :]:
         axes.set_axis_off()
-    for axes, (name, poses) in zip(every, cameras.items(), strict=False):
-        found = umeyama_sim3(centres(poses), true, allow_line=True).apply(centres(poses))
-        axes.plot(true[:, 0], true[:, 2], color="0.6", linewidth=3, label="true")
+    for axes, (way, poses) in zip(every, cameras.items(), strict=False):
+        found = umeyama_sim3(centres(poses), wanted, allow_line=True).apply(centres(poses))
+        axes.plot(wanted[:, 0], wanted[:, 2], color="0.6", linewidth=3, label=name)
         axes.plot(found[:, 0], found[:, 2], color="tab:blue", linewidth=1.2, label="found")
         axes.plot(*found[[0, -1]][:, [0, 2]].T, ".", color="tab:red", label="first, last")
-        axes.set_title(name, fontsize=9)
+        axes.set_title(way, fontsize=9)
         axes.set_aspect("equal")
     figure.axes[0].legend(fontsize=8)
     figure.suptitle(title)

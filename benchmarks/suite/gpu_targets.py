@@ -14,7 +14,7 @@ from benchmarks.suite.workloads import WORKLOADS
 from vggtjax.commands.process import keep_freed_memory
 from vggtjax.errors import InputError
 
-_FRAME = (392, 518)
+FRAME = (392, 518)
 _PROGRAMS = ("aggregator", "depth-head", "two-passes")
 # By number of frames, for an H200, the full model in bfloat16, and frames of 518 x 392.
 TARGETS = {
@@ -29,7 +29,7 @@ PUBLISHED = {
     "depth-head": dict.fromkeys((1, 8, 20, 50, 100, 200), 30.0),
     "memory": {1: 1.9, 8: 3.2, 20: 5.6, 50: 11.4, 100: 21.2, 200: 40.6},
 }
-_HEADINGS = {
+HEADINGS = {
     "aggregator": "aggregator (ms)",
     "depth-head": "depth head (ms a frame)",
     "two-passes": "two passes (s)",
@@ -73,7 +73,7 @@ def gpu_targets(
         task = progress.add_task("weights", total=len(frames) * len(_PROGRAMS))
         config, params = load(size, weights)
         if size == "full":
-            height, width = _FRAME[0] if height is None else height, _FRAME[1] if width is None else width
+            height, width = FRAME[0] if height is None else height, FRAME[1] if width is None else width
         shape = frame_size(size, config, height, width)
         for count in sorted(set(frames)):
             case = Case(size, config, params, count, *shape, dtype)
@@ -83,13 +83,13 @@ def gpu_targets(
                 (found[count][name],) = measured_rows(name, WORKLOADS[name], case, repeats)
                 progress.advance(task)
     here = machine()
-    comparable = size == "full" and shape == _FRAME and dtype == "bfloat16"
+    comparable = size == "full" and shape == FRAME and dtype == "bfloat16"
     wanted = TARGETS if comparable and "H200" in here["device"] else {}
     headings, rows = ["frames"], [[str(count)] for count in found]
-    for name, heading in _HEADINGS.items():
+    for name, heading in HEADINGS.items():
         headings += [heading, "target", "VGGT (cited)"]
         for cells, (count, programs) in zip(rows, found.items(), strict=True):
-            cells.append(_shown(name, count, programs))
+            cells.append(_shown(name, programs))
             cells += [number(table.get(name, {}).get(count)) for table in (wanted, PUBLISHED if comparable else {})]
     title = f"{size}, {shape[1]} x {shape[0]} pixels, {dtype}, medians of {repeats}"
     Sheet(title, tuple(headings), [tuple(cells) for cells in rows]).show(screen)
@@ -101,13 +101,18 @@ def gpu_targets(
         write_rows(out, measured, targets=wanted, published=PUBLISHED if comparable else {})
 
 
-def _shown(name: str, count: int, programs: dict[str, Row]) -> str:
-    """Return a figure in the unit of its heading, or the reason for its absence."""
-    results = [row.measured for row in programs.values()] if name == "memory" else [programs[name].measured]
-    if failures := [result.failure for result in results if result.failure]:
-        return failures[0]
+def figure(name: str, *rows: Row) -> float | None:
+    """Return a figure of measured rows in the unit of its heading; "memory" is the most of all rows. None: unknown."""
+    results = [row.measured for row in rows]
     if name == "memory":
         sizes = [result.xla_bytes if result.device_bytes is None else result.device_bytes for result in results]
-        return number(max((size / 1e9 for size in sizes if size is not None), default=None))
-    scale = {"aggregator": 1e3, "depth-head": 1e3 / count, "two-passes": 1.0}[name]
-    return number(scale * (results[0].median or 0))
+        return max((size / 1e9 for size in sizes if size is not None), default=None)
+    scale = {"aggregator": 1e3, "depth-head": 1e3 / (rows[0].frames or 1), "two-passes": 1.0}[name]
+    return None if results[0].median is None else scale * results[0].median
+
+
+def _shown(name: str, programs: dict[str, Row]) -> str:
+    """Return a figure as text, or the reason for its absence."""
+    rows = list(programs.values()) if name == "memory" else [programs[name]]
+    failures = [row.measured.failure for row in rows if row.measured.failure]
+    return failures[0] if failures else number(figure(name, *rows))

@@ -1,0 +1,156 @@
+"""Predicted and measured peak memory of whole processes: python -m benchmarks peak-memory."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from PIL import Image
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.seeded import seeded_images
+from vggtjax.checkpoint import Model
+from vggtjax.errors import InputError
+from vggtjax.options import Options
+from vggtjax.pipeline import memory
+from vggtjax.pretrained.load import load_model
+from vggtjax.storage.writing import writing
+
+WITHIN = 0.15  # of the measured peak
+_GIGA = 1e9
+
+
+class Setting(NamedTuple):
+    """One run: square or wide frames, the type of the products, the method."""
+
+    frames: int
+    height: int
+    width: int
+    dtype: Literal["float32", "bfloat16"]
+    method: str
+
+    @property
+    def words(self) -> list[str]:
+        """The options of the command."""
+        return ["--size", str(self.width), "--dtype", self.dtype, "--method", self.method]
+
+
+EMBEDDED = (
+    Setting(8, 64, 64, "float32", "4dvggt-d"),
+    Setting(32, 64, 64, "float32", "vggt4d"),
+    Setting(64, 64, 64, "float32", "vggt"),
+    Setting(32, 64, 64, "bfloat16", "4dvggt-d"),
+    Setting(8, 128, 128, "float32", "vggt"),
+    Setting(16, 128, 128, "float32", "4dvggt-d"),
+    Setting(16, 128, 128, "bfloat16", "vggt4d"),
+    Setting(32, 128, 128, "float32", "hard-replacement"),
+    Setting(4, 256, 256, "float32", "4dvggt-d"),
+    Setting(4, 256, 256, "bfloat16", "vggt"),
+    Setting(8, 256, 256, "float32", "vggt4d"),
+    Setting(12, 192, 256, "float32", "vggt"),
+)
+FULL = (
+    Setting(2, 294, 518, "float32", "4dvggt-d"),
+    Setting(4, 294, 518, "float32", "vggt"),
+    Setting(3, 252, 252, "float32", "vggt4d"),
+    Setting(2, 294, 518, "bfloat16", "4dvggt-d"),
+)
+
+
+class Row(NamedTuple):
+    """Bytes of a setting: predicted, and the peak of a process that compiles its programs."""
+
+    model: str
+    setting: Setting
+    predicted: float
+    measured: float
+    own: float  # without mapped files
+
+    @property
+    def ratio(self) -> float:
+        return self.predicted / self.measured
+
+
+def peak_memory(*, full: Path | None = None, embedded: bool = True, out: Path | None = None) -> None:
+    """Compare the predicted memory of `vggtjax reconstruct` with the peaks of processes, each of one setting.
+
+    Nothing is taken from the cache, so that every process traces and compiles its programs, as a first run does.
+
+    Args:
+        full: a checkpoint of VGGT-1B's size, such as `make-checkpoint` writes and `vggtjax convert` converts; its four
+            settings take 8 GB of memory.
+        embedded: measure the twelve settings of the embedded model.
+        out: JSON file for the rows.
+    """
+    work = [("demo", EMBEDDED)] if embedded else []
+    work += [] if full is None else [(str(full), FULL)]
+    if not work:
+        raise InputError("nothing is measured; give a checkpoint as full, or leave out --no-embedded")
+    rows, screen = [], Console()
+    for name, settings in work:
+        for row in measure(name, settings):
+            rows.append(row)
+            screen.print(
+                f"{_label(row)}: predicted {row.predicted / _GIGA:.2f}, measured {row.measured / _GIGA:.2f} GB"
+            )
+            if out is not None:
+                with writing(out) as temporary:
+                    temporary.write_text(json.dumps([row._asdict() for row in rows], indent=2) + "\n")
+    table = Table(title="peak memory of a process (GB)", box=None)
+    for heading in ("setting", "predicted", "measured", "ratio", "without mapped files"):
+        table.add_column(heading, justify="left" if heading == "setting" else "right")
+    for row in rows:
+        sizes = [f"{value / _GIGA:.2f}" for value in (row.predicted, row.measured)]
+        table.add_row(_label(row), *sizes, f"{row.ratio:.2f}", f"{row.own / _GIGA:.2f}")
+    screen.print(table)
+    off = [row for row in rows if abs(row.ratio - 1) > WITHIN]
+    screen.print(f"{len(rows) - len(off)} of {len(rows)} within {100 * WITHIN:.0f} %")
+
+
+def measure(name: str, settings: tuple[Setting, ...]) -> Iterator[Row]:
+    """Yield the row of each setting of a model."""
+    model = load_model(name)
+    for setting in settings:
+        with TemporaryDirectory() as folder:
+            yield _measured(model, name, setting, Path(folder))
+
+
+def _measured(model: Model, name: str, setting: Setting, folder: Path) -> Row:
+    frames = folder / "frames"
+    frames.mkdir()
+    shape = setting.frames, setting.height, setting.width
+    for number, image in enumerate(seeded_images(*shape).transpose(0, 2, 3, 1)):
+        Image.fromarray(np.round(255 * image).astype(np.uint8)).save(frames / f"{number:04}.png")
+    options = Options(method=setting.method, compute_dtype=setting.dtype)  # pyright: ignore[reportArgumentType]
+    predicted = memory.predicted_bytes(model, *shape, options)
+    words = ["reconstruct", str(frames), "--model", name, "--out", str(folder / "out"), "--window", "0"]
+    answer = run_worker([*words, *setting.words], folder / "cache")
+    return Row("embedded" if name == "demo" else "full", setting, predicted, answer["total"], answer["own"])
+
+
+def run_worker(words: list[str], cache: Path) -> dict[str, Any]:
+    """Run a command in a process with a cache of its own and return what it took. Raises InputError if it fails."""
+    command = [sys.executable, "-m", "benchmarks.peak_worker", *words]
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env={**os.environ, "VGGTJAX_CACHE": str(cache)}
+    )
+    last = done.stdout.strip().rpartition("\n")[2]
+    if done.returncode or not last.startswith("{"):
+        raise InputError(f"{' '.join(words)} ended with code {done.returncode}: {done.stderr[-500:]}")
+    answer = json.loads(last)
+    if answer["code"]:
+        raise InputError(f"{' '.join(words)} failed: {done.stderr[-500:]}")
+    return answer
+
+
+def _label(row: Row) -> str:
+    frames, height, width, dtype, method = row.setting
+    return f"{row.model}, {frames} x {width} x {height}, {dtype}, {method}"
