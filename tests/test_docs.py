@@ -129,6 +129,13 @@ def _leads_somewhere(page: Path, link: str) -> bool:
     return target.exists() or target.parent.name == "made" or (bool(notebook) and notebook.exists())
 
 
+def test_every_promise_names_a_test():
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", (ROOT / "docs" / "promises.md").read_text(encoding="utf-8"))
+    missing = [name for file, name in named if f"def {name}(" not in (ROOT / file).read_text(encoding="utf-8")]
+    assert len(named) > 20
+    assert missing == []
+
+
 @pytest.mark.parametrize("command", ["reconstruct", "view"])
 def test_the_reference_has_every_option(command):
     hook = runpy.run_path(str(ROOT / "docs" / "hooks" / "command_line.py"))
