@@ -41,6 +41,14 @@ def few_programs():
         jax.clear_caches()
 
 
+@pytest.fixture(autouse=True)
+def same_folder():
+    """Refuse a test that leaves the process in another folder, where the tests after it would run."""
+    before = Path.cwd()
+    yield
+    assert Path.cwd() == before
+
+
 @pytest.fixture(scope="session")
 def golden() -> Path:
     """Folder of numbers that the public PyTorch code computed for seeded weights."""

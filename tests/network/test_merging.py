@@ -47,9 +47,13 @@ def reference(q, k, v, suppressed, real, suppress):
     for centre in kept:
         members = [token for token in group if group[token] == centre and real[token] and not suppressed[token]]
         if members:
-            keys.append(k[members].mean(0)), values.append(v[members].mean(0)), counts.append(len(members))
+            keys.append(k[members].mean(0))
+            values.append(v[members].mean(0))
+            counts.append(len(members))
     for token in np.flatnonzero(suppressed & real) if suppress == "zero" else ():
-        keys.append(np.zeros_like(k[0])), values.append(v[token]), counts.append(1)
+        keys.append(np.zeros_like(k[0]))
+        values.append(v[token])
+        counts.append(1)
     out = np.zeros_like(q)
     for token in np.flatnonzero(real):
         members = [other for other in group if group[other] == group[token] and real[other]]

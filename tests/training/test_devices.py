@@ -3,10 +3,12 @@
 import dataclasses
 import subprocess
 import sys
+from pathlib import Path
 
 from tests.training_runs import RECIPE
 from vggtjax.training.devices import placement
 
+ROOT = Path(__file__).parents[2]
 CODE = """
 import jax, numpy as np
 from tests.training_runs import RECIPE
@@ -28,7 +30,7 @@ def test_the_most_devices_that_divide_every_batch():
     code = code.replace("where =", stages + "where =", 1)
     made = subprocess.run(
         [sys.executable, "-c", code],
-        env={"XLA_FLAGS": "--xla_force_host_platform_device_count=3", "PYTHONPATH": ".", "PATH": ""},
+        env={"XLA_FLAGS": "--xla_force_host_platform_device_count=3", "PYTHONPATH": str(ROOT), "PATH": ""},
         capture_output=True,
         text=True,
         check=False,
