@@ -49,12 +49,12 @@ def test_keywords_are_the_fields():
 def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     """A new option is one of them unless it is named there."""
     other = {"gram": "dot", "suppress": "drop", "mask_pairs": 2, "smooth_frames": 3, "compute_dtype": "bfloat16"}
-    other |= {"attention": "merged"}  # absent where it is exact
+    other |= {"attention": "merged"}  # absent where it is exact, as is the precision where it is the highest
     fields = {field.name for field in dataclasses.fields(Options)}
     key = Options().passes_settings
     named = fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters", "threshold"}
-    assert set(key) == named - {"attention"}
-    assert set(Options(attention="merged").passes_settings) == named
+    assert set(key) == named - {"attention", "precision"}
+    assert set(Options(attention="merged").passes_settings) == named - {"precision"}
     assert all(Options(**{name: value}).passes_settings != key for name, value in other.items())
     assert Options(align_scale=True, refine_mask=True, refine_cameras=True).passes_settings == key
     same = {name for name in METHODS if Options(name).passes_settings == key}  # pyright: ignore[reportArgumentType]
@@ -62,5 +62,26 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
 
 
 def test_the_method_fills_in_what_is_not_given():
-    assert Options("vggt4d").resolved() == Options("vggt4d", gram="dot", suppress="drop", refine_mask=True)
+    cpu = {"compute_dtype": "float32", "precision": "highest"}
+    made = Options("vggt4d").resolved()
+    assert made == Options("vggt4d", gram="dot", suppress="drop", refine_mask=True, **cpu)  # pyright: ignore
     assert Options("vggt4d", gram="cosine", refine_mask=False).resolved().gram == "cosine"
+
+
+@pytest.mark.parametrize(
+    ("given", "dtype", "precision"),
+    [
+        ({}, "bfloat16", "tf32"),
+        ({"precision": "highest"}, "float32", "highest"),
+        ({"compute_dtype": "float32"}, "float32", "tf32"),
+        ({"compute_dtype": "bfloat16", "precision": "highest"}, "bfloat16", "highest"),
+    ],
+)
+def test_the_platform_fills_in_how_exact_the_network_is(monkeypatch, given, dtype, precision):
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    made = Options(**given).resolved()
+    assert (made.compute_dtype, made.precision) == (dtype, precision)
+    assert made.resolved() == made
+    assert Options(**given).passes_settings["compute_dtype"] == dtype
+    on_cpu = Options(**given).resolved(on_accelerator=False)
+    assert (on_cpu.compute_dtype, on_cpu.precision) == (given.get("compute_dtype", "float32"), "highest")

@@ -18,6 +18,7 @@ Threshold = Literal["otsu", "multi-otsu"]
 _ShownDType = Literal["float32", "bfloat16"]  # on the command line
 Attention = Literal["exact", "merged"]
 ComputeDType = Literal["float32", "bfloat16", "float64"]
+Precision = Literal["highest", "tf32"]
 MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d"]
 
 
@@ -88,7 +89,11 @@ def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) ->
     return True if refine_mask else False if no_refine_mask else None
 
 
-_LATER = {"refine_cameras": False, "attention": "exact"}  # options that older results lack, and their defaults
+_LATER = {
+    "refine_cameras": False,
+    "attention": "exact",
+    "precision": "highest",
+}  # as in older results
 
 # The name puts both flags into the group of the method in the help.
 _RefineMask = Annotated[bool | None, tyro.conf.arg(constructor=_refine_mask, name="method", prefix_name=False)]
@@ -118,10 +123,13 @@ class Options:
     """adjust cameras and focal length to matches between the source's pictures, where nothing moves (bundle adjustment;
     needs the extra colmap)"""
     compute_dtype: Annotated[
-        ComputeDType,
-        tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint="(default: float32)"),  # pyright: ignore
-    ] = "float32"
-    """type of the blocks' matrix products"""
+        ComputeDType | None,
+        tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint=""),  # pyright: ignore
+    ] = None
+    """type of the blocks' matrix products; by default bfloat16 on a GPU or TPU, else float32"""
+    precision: InWords[Precision | None] = None
+    """of the convolutions of depth on a GPU or TPU: tf32, the default there, as PyTorch computes them; highest, float32
+    for them and, unless --dtype says otherwise, for the blocks; a CPU always computes in float32"""
     attention: InWords[Attention] = "exact"
     """how frames attend to each other: exact; merged, an approximation that merges similar tokens: faster for
     long clips, with other numbers (its errors are in the docs)"""
@@ -148,10 +156,17 @@ class Options:
             refine=method.refine if self.refine_mask is None else self.refine_mask,
         )
 
-    def resolved(self) -> Options:
-        """Return the options with the method's own values in place of None."""
-        row = self.row
-        return dataclasses.replace(self, gram=row.gram, suppress=row.suppress, refine_mask=row.refine)
+    def resolved(self, on_accelerator: bool | None = None) -> Options:
+        """Return the options with the values of the method and of the platform in place of None.
+
+        `on_accelerator` tells whether the network will be computed on a GPU or TPU; by default, whether jax has one.
+        """
+        row, dtype, precision = self.row, self.compute_dtype, self.precision
+        if dtype is None or precision != "highest":
+            narrow = precision != "highest" and (_has_accelerator() if on_accelerator is None else on_accelerator)
+            dtype, precision = dtype or ("bfloat16" if narrow else "float32"), "tf32" if narrow else "highest"
+        method = {"gram": row.gram, "suppress": row.suppress, "refine_mask": row.refine}
+        return dataclasses.replace(self, **method, compute_dtype=dtype, precision=precision)
 
     @property
     def passes_settings(self) -> dict[str, Any]:
@@ -169,3 +184,9 @@ class Options:
     def to_json(self) -> dict[str, Any]:
         """Return the options as JSON values, without those of `_LATER` at their default: as in results before them."""
         return {name: value for name, value in dataclasses.asdict(self).items() if (name, value) not in _LATER.items()}
+
+
+def _has_accelerator() -> bool:
+    import jax  # it takes a second, and a command line that is refused needs none
+
+    return jax.default_backend() != "cpu"

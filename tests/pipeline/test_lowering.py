@@ -1,5 +1,6 @@
 """Every program is lowered for NVIDIA GPUs and TPUs, which need not be there: nothing is compiled or run."""
 
+import re
 from functools import partial
 from typing import Any
 
@@ -17,7 +18,7 @@ from vggtjax.network import attention
 from vggtjax.network.aggregator import aggregate
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.dpt_head import predict_dense
-from vggtjax.network.model import parameter_shapes
+from vggtjax.network.model import forward, parameter_shapes
 from vggtjax.network.precision import Compute
 from vggtjax.options import METHODS, Options
 from vggtjax.pipeline.stages import ClipInputs, Stages, run_stages
@@ -82,6 +83,21 @@ def test_the_stages_of_a_method(lower, method):
     clip = ClipInputs(array(1, FRAMES, *SIZE, 3), query_points=points)
     run_stages(stages, PARAMS, clip, fusion=fusion, all_outputs=method != "vggt4d")
     assert {"image features", "first pass", "dynamic mask", "assemble"} <= {stage for stage, *_ in lower.outputs}
+
+
+@pytest.mark.parametrize(("precision", "head"), [("tf32", "HIGH"), ("highest", "HIGHEST")])
+def test_the_precision_of_products(precision, head):
+    """Those of a dense head have the given precision; all others are exact, as is the convolution of the patches."""
+    run = partial(forward, config=CONFIG, outputs=("camera", "depth"), precision=precision)
+    lines = text(run, PARAMS, array(1, 2, *SIZE, 3), platforms=["cuda"]).splitlines()
+    found = {}
+    for name in ("convolution", "dot_general"):
+        products = [line for line in lines if f"stablehlo.{name}" in line]
+        found[name] = [set(re.findall("HIGH(?:EST)?|DEFAULT", line)) for line in products]
+    patches, *of_the_head = found["convolution"]
+    assert patches == {"HIGHEST"}
+    assert of_the_head == [{head}] * 21
+    assert found["dot_general"].count({"HIGHEST"}) == len(found["dot_general"]) - (7 if head == "HIGH" else 0)
 
 
 def test_merged_attention(lower):

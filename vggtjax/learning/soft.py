@@ -89,7 +89,7 @@ def reconstruct_softly(
         remat: compute activations again on the way back, which takes less memory.
     """
     clips = ClipBatch(images, encode(params, images, config, compute_dtype=compute_dtype, remat=remat))
-    compute = Compute(compute_dtype, remat)
+    compute = Compute(compute_dtype, remat=remat)
     mining = {"gram": gram, "motion": motion, "exponents": masking.exponents}
     first, saliency = first_pass(params, clips, config, compute=compute, **mining)
     dynamic = soft_pixels(saliency, (images.shape[2], images.shape[3]), masking)

@@ -269,10 +269,10 @@ def run_passes(
     """
     mask_pairs: Any = changes.pop("mask_pairs", options.mask_pairs)  # not in the options: the number can be traced
     options = options.changed(**changes)
-    method, compute = options.row, Compute(options.compute_dtype, attention=options.attention)
+    method, compute = options.row, Compute.of(options)
     if second is None:
         second = method.second_outputs(options.align_scale) if method.needs_second_pass else ()
-    patch_tokens = encode(params, images, config, compute_dtype=options.compute_dtype)
+    patch_tokens = encode(params, images, config, compute_dtype=compute.compute_dtype)
     clips = ClipBatch(images, patch_tokens)
     first, saliency = first_pass(params, clips, config, gram=method.gram, motion=motion, compute=compute)
     mask = mine_mask(

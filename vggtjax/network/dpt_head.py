@@ -14,7 +14,6 @@ from jaxtyping import Array, Float
 from vggtjax.config import VGGTConfig
 from vggtjax.network.layers import Conv, Dense, LayerNorm, Params, apply, declare
 from vggtjax.network.pieces import largest_divisor
-from vggtjax.network.precision import full_precision
 
 HIDDEN = 32
 PIXELS_AT_ONCE = 4 * 518 * 518  # bounds the memory of the full-resolution maps
@@ -118,9 +117,13 @@ def project_tap(params: Params, tokens: Float[Array, "... E"], slot: int, config
     return apply(TapProjection(config.dpt_channels[slot]), weights, tokens)
 
 
-@full_precision
 def predict_dense(
-    params: Params, taps: list[Float[Array, "B S P F"]], config: VGGTConfig, grid: tuple[int, int], kind: str
+    params: Params,
+    taps: list[Float[Array, "B S P F"]],
+    config: VGGTConfig,
+    grid: tuple[int, int],
+    kind: str,
+    precision: str = "highest",
 ) -> tuple[Float[Array, "B S H W V"], Float[Array, "B S H W"]]:
     """Return a dense head's values and confidence (1 + exp(c), at least 1) at full resolution.
 
@@ -130,6 +133,7 @@ def predict_dense(
         config: the model's configuration.
         grid: rows and columns of patches.
         kind: "depth" (V = 1, exp(x)) or "points" (V = 3, sign(x) (exp|x| - 1)).
+        precision: as in `Compute`. It is that of all products here, which are convolutions in VGGT.
     """
     (h, w), p = grid, config.patch_size
     B, S = taps[0].shape[:2]
@@ -140,7 +144,8 @@ def predict_dense(
         x = add_positions(resize_aligned(features, (h * p, w * p)), aspect=w / h)
         return apply(Regression(CHANNELS[kind]), params["regression"], x)
 
-    out = frames_at_once(some_frames, taps, (h * p) * (w * p))
+    with jax.default_matmul_precision("tensorfloat32" if precision == "tf32" else "highest"):
+        out = frames_at_once(some_frames, taps, (h * p) * (w * p))
     out = out.reshape(B, S, h * p, w * p, CHANNELS[kind])
     values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
     if kind == "depth":

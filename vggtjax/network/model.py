@@ -52,6 +52,7 @@ class ForwardChanges(TypedDict, total=False):
     strength: Float[Array, " depth"] | None
     stop_camera_gradient: bool
     compute_dtype: str
+    precision: str
     remat: bool
     attention: str
     frames: Frames
@@ -87,8 +88,8 @@ def forward(
         cues: motion cues, or another accumulator, whose sums become `.cue_sums`.
         suppression: the keys to suppress; none for the plain pass.
         changes: fields of `Suppression` (`dynamic_tokens`, `suppress`, `mask_pairs`, `strength`) in place of those of
-            `suppression`, and fields of `Compute` (`compute_dtype`, `remat`, `stop_camera_gradient`,
-            `attention`, `frames`).
+            `suppression`, and fields of `Compute` (`compute_dtype`, `precision`, `remat`,
+            `stop_camera_gradient`, `attention`, `frames`).
 
     Raises:
         InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing.
@@ -157,11 +158,12 @@ def predict(
             stop_gradient=compute.stop_camera_gradient,
             frames=compute.frames,
         )
-    regress = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4)) if compute.remat else predict_dense
+    regress = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4, 5)) if compute.remat else predict_dense
     for name, field in (("depth", "depth"), ("points", "world_points")):
         if name in outputs:
             head = HEADS[name]
-            values, confidence = regress(params[head], [tap[head] for tap in taps], config, grid, name)
+            projected = [tap[head] for tap in taps]
+            values, confidence = regress(params[head], projected, config, grid, name, compute.precision)
             fields |= {field: values[..., 0] if name == "depth" else values, f"{field}_confidence": confidence}
     if query_points is not None:
         head = HEADS["tracks"]

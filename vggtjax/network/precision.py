@@ -1,4 +1,4 @@
-"""How the network is computed: the blocks' type, and float32 products at full precision on every accelerator."""
+"""How the network is computed: the blocks' type, and how exact float32 products are on accelerators."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from vggtjax.errors import InputError, check_choice
 from vggtjax.network.frames import Frames
-from vggtjax.options import Attention, ComputeDType
+from vggtjax.options import Attention, ComputeDType, Options, Precision
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -26,6 +26,8 @@ class Compute:
     Attributes:
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
             "float64" is for checks of gradients; it requires parameters and images in float64 and jax.enable_x64.
+        precision: of the convolutions of the dense heads on accelerators: "highest" for float32; "tf32" as PyTorch
+            computes them on an NVIDIA GPU (on a TPU, three passes in bfloat16). Other products are float32 always.
         remat: compute activations of blocks and dense heads again in the backward pass: less memory, more time.
         stop_camera_gradient: treat the previous estimate as a constant in every iteration of the camera head, as in
             VGGT's training.
@@ -35,6 +37,7 @@ class Compute:
     """
 
     compute_dtype: str = "float32"
+    precision: str = "highest"
     remat: bool = False
     stop_camera_gradient: bool = True
     attention: str | Callable = "exact"
@@ -42,8 +45,15 @@ class Compute:
 
     def __post_init__(self) -> None:
         check_compute_dtype(self.compute_dtype)
+        check_choice("precision", self.precision, get_args(Precision))
         if not callable(self.attention):
             check_choice("attention", self.attention, get_args(Attention))
+
+    @classmethod
+    def of(cls, options: Options, frames: Frames = Frames()) -> Compute:
+        """Return how the network is computed by options, with the platform's values in place of None."""
+        options = options.resolved()
+        return cls(str(options.compute_dtype), str(options.precision), attention=options.attention, frames=frames)
 
 
 def check_compute_dtype(name: str) -> None:

@@ -66,7 +66,8 @@ class Compile:
         if key not in self._compiling:
             self._compiling[key] = program.compile(*arguments, **options)
         compiling, outputs = self._compiling[key]
-        self._stages.append((stage, compiling, options["frames"].mesh is not None))
+        frames = options["compute"].frames if "compute" in options else options["frames"]
+        self._stages.append((stage, compiling, frames.mesh is not None))
         return outputs
 
     def wait(self, progress: Progress | None = None) -> dict[str, StageMemory]:

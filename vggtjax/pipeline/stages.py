@@ -52,41 +52,30 @@ def _image_features(params, images, *, frames: Frames, **options):
     return frames.on_devices(partial(encode, **options), WHOLE, BY_FRAME)(params, images)
 
 
-def _first(params, clips, query_points=None, *, compute_dtype, attention, frames: Frames, **options):
+def _first(params, clips, query_points=None, *, compute: Compute, **options):
     def run(params, clips, query_points):
-        compute = Compute(compute_dtype, attention=attention, frames=frames)
         return first_pass(params, clips, query_points=query_points, compute=compute, **options)
 
-    return frames.on_devices(run, WHOLE, _CLIPS, WHOLE)(params, clips, query_points)
+    return compute.frames.on_devices(run, WHOLE, _CLIPS, WHOLE)(params, clips, query_points)
 
 
-def _second(
-    params, clips, dynamic_mask, first, *, suppress, mask_pairs, compute_dtype, attention, frames: Frames, **options
-):
+def _second(params, clips, dynamic_mask, first, *, suppress, mask_pairs, compute: Compute, **options):
     def run(params, clips, dynamic_mask, first, mask_pairs):
-        suppression = Suppression(suppress=suppress, mask_pairs=mask_pairs)
-        masking = {
-            "plain": first,
-            "suppression": suppression,
-            "compute": Compute(compute_dtype, attention=attention, frames=frames),
-        }
-        return second_pass(params, clips, dynamic_mask, **masking, **options)
+        masking = {"suppression": Suppression(suppress=suppress, mask_pairs=mask_pairs), "compute": compute}
+        return second_pass(params, clips, dynamic_mask, plain=first, **masking, **options)
 
-    located = frames.on_devices(run, WHOLE, _CLIPS, BY_FRAME, BY_FRAME, WHOLE)
+    located = compute.frames.on_devices(run, WHOLE, _CLIPS, BY_FRAME, BY_FRAME, WHOLE)
     return located(params, clips, dynamic_mask, first, mask_pairs)
 
 
-def _either(
-    params, clips, dynamic_mask, is_first, *, suppress, mask_pairs, compute_dtype, attention, frames: Frames, **options
-):
-    options |= {"suppression": Suppression(suppress=suppress, mask_pairs=mask_pairs)}
-    compute = Compute(compute_dtype, attention=attention, frames=frames)
-    return either_pass(params, clips, dynamic_mask, is_first, compute=compute, **options)
+def _either(params, clips, dynamic_mask, is_first, *, suppress, mask_pairs, **options):
+    suppression = Suppression(suppress=suppress, mask_pairs=mask_pairs)
+    return either_pass(params, clips, dynamic_mask, is_first, suppression=suppression, **options)
 
 
-def _track(params, clips, query_points, frame, *, config, compute_dtype, attention, frames: Frames):
-    track = partial(track_from, config=config, compute=Compute(compute_dtype, attention=attention, frames=frames))
-    return frames.on_devices(track, WHOLE, _CLIPS, WHOLE, WHOLE)(params, clips, query_points, frame)
+def _track(params, clips, query_points, frame, *, config, compute: Compute):
+    track = partial(track_from, config=config, compute=compute)
+    return compute.frames.on_devices(track, WHOLE, _CLIPS, WHOLE, WHOLE)(params, clips, query_points, frame)
 
 
 def _mine(
@@ -118,12 +107,12 @@ def _assemble(
 _FIRST_OUTPUTS = ("camera", "depth")  # of the first pass
 _CLIPS = ClipBatch(BY_FRAME, BY_FRAME, WHOLE)  # type: ignore[arg-type]
 _encode = Program(_image_features, static=("config", "compute_dtype", "frames"))
-_first_pass = Program(_first, static=("config", "gram", "compute_dtype", "attention", "frames"))
+_first_pass = Program(_first, static=("config", "gram", "compute"))
 _mine_mask = Program(_mine, static=("frames", "size", "clusters", "threshold", "smooth_frames"))
-_SECOND_STATIC = ("config", "suppress", "outputs", "compute_dtype", "attention", "frames")  # mask_pairs is traced
+_SECOND_STATIC = ("config", "suppress", "outputs", "compute")  # mask_pairs is traced
 _second_pass = Program(_second, static=_SECOND_STATIC)
 _either_pass = Program(_either, static=(*_SECOND_STATIC, "gram"))
-_track_from = Program(_track, static=("config", "compute_dtype", "attention", "frames"))
+_track_from = Program(_track, static=("config", "compute"))
 _assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
 for _kind in (ClipBatch, Predictions, Passes, Cameras, Assembly, Tracks, Quantised):
     keep_type(_kind)
@@ -145,20 +134,18 @@ class Stages:
     padded: int | None = None  # frames with those of `ClipInputs.frame_count`, without those that make shares equal
 
     @property
-    def _network(self) -> dict[str, Any]:
+    def _passes(self) -> dict[str, Any]:
         frames = Frames(self.mesh, None if self.mesh is None else self.padded or self.frames)
-        return {"config": self.config, "compute_dtype": self.options.compute_dtype, "frames": frames}
+        return {"config": self.config, "compute": Compute.of(self.options, frames)}
 
     @property
     def _real(self) -> Frames:
         return Frames(self.mesh, self.frames)
 
-    @property
-    def _passes(self) -> dict[str, Any]:
-        return self._network | {"attention": self.options.attention}
-
     def image_features(self, params: Params, images: Float[Array, "B F H W 3"]) -> Float[Array, "B F P C"]:
-        return self.run("image features", _encode, params, images, **self._network)
+        compute: Compute = self._passes["compute"]
+        options = {"config": self.config, "compute_dtype": compute.compute_dtype, "frames": compute.frames}
+        return self.run("image features", _encode, params, images, **options)
 
     @property
     def _either(self) -> dict[str, Any]:
