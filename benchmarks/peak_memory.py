@@ -19,7 +19,6 @@ from rich.table import Table
 from benchmarks.seeded import seeded_images
 from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
-from vggtjax.options import Options
 from vggtjax.pipeline import memory
 from vggtjax.pretrained.load import load_model
 from vggtjax.storage.writing import writing
@@ -129,8 +128,7 @@ def _measured(model: Model, name: str, setting: Setting, folder: Path) -> Row:
     shape = setting.frames, setting.height, setting.width
     for number, image in enumerate(seeded_images(*shape).transpose(0, 2, 3, 1)):
         Image.fromarray(np.round(255 * image).astype(np.uint8)).save(frames / f"{number:04}.png")
-    options = Options(method=setting.method, compute_dtype=setting.dtype)  # pyright: ignore[reportArgumentType]
-    predicted = memory.predicted_bytes(model, *shape, options)
+    predicted = memory.predicted_bytes(model, *shape)
     words = ["reconstruct", str(frames), "--model", name, "--out", str(folder / "out"), "--window", "0"]
     answer = run_worker([*words, *setting.words], folder / "cache")
     return Row("embedded" if name == "demo" else "full", setting, predicted, answer["total"], answer["own"])

@@ -103,3 +103,11 @@ def test_heads_of_any_size():
     with jax.default_matmul_precision("highest"):
         made = attention.attention(x, x, x)
     assert np.abs(np.asarray(made) - _formula(x, x, x, np.ones((1, 300), bool))).max() < 1e-5
+
+
+@pytest.mark.parametrize(("cores", "times"), [(1, 1), (2, 1), (4, 2), (16, 8), (128, 8)])
+def test_chunks_grow_with_the_cores_but_not_without_bound(monkeypatch, cores, times):
+    monkeypatch.setattr("vggtjax.network.pieces.core_count", lambda: cores)
+    queries = jnp.zeros((12_800, 1))
+    assert attention._chunks(queries, keys=5000).shape == (16 // times, 800 * times, 1)
+    assert attention._chunks(queries, keys=10**6).shape == (16, 800, 1)

@@ -98,7 +98,6 @@ class OneClip:
                 self.source,
                 self.sampling,
                 self.fitter,
-                self.options,
                 window=None if count is None else windows.window,
             )
         if choice is None:

@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.network.pieces import largest_divisor
+from vggtjax.network.pieces import largest_divisor, times_for_cores
 from vggtjax.network.precision import widened
 
-QUERIES_AT_ONCE = 800
+QUERIES_AT_ONCE = 800  # on a CPU of two cores
+LOGITS_OF_A_CHUNK = 2**26  # on a CPU of more cores, at most, unless 800 queries have more
 LOGITS_AT_ONCE = 320**2  # on a CPU, at most so many logits of a head (queries times keys) for all heads at once
 LOGITS_ELSEWHERE = 2**28  # on other platforms, at most so many logits of all clips and heads in memory
 _TPU_BLOCK = 128  # tokens in a block of the kernel for TPUs: lengths are multiples of it
@@ -124,7 +125,8 @@ def _head_by_head(q, k, v, bias):
         clip, head = index // N, index % N
         queries, keys, values = (x[clip, :, head] for x in (out, k, v))
         own_bias = None if bias is None else bias[clip]
-        outputs = jax.lax.map(lambda chunk: _attended(chunk, keys, values, own_bias), _chunks(queries * D**-0.5))
+        chunks = _chunks(queries * D**-0.5, len(keys))
+        outputs = jax.lax.map(lambda chunk: _attended(chunk, keys, values, own_bias), chunks)
         return out.at[clip, :, head].set(outputs.reshape(-1, D)[:T]), None
 
     return jax.lax.scan(one_head, q, jnp.arange(B * N))[0]
@@ -149,7 +151,7 @@ def _head_by_head_backward(residuals, gradient):
             to_queries, *to_others, _ = _backward((chunk[0], k, v, bias, chunk[1]), chunk[2])
             return [total + part for total, part in zip(sums, to_others, strict=True)], to_queries
 
-        chunks = tuple(_chunks(x) for x in (q * D**-0.5, out, gradient))
+        chunks = tuple(_chunks(x, len(k)) for x in (q * D**-0.5, out, gradient))
         (to_k, to_v), to_q = jax.lax.scan(step, [jnp.zeros_like(k), jnp.zeros_like(v)], chunks)
         return to_q.reshape(-1, D)[:T] * D**-0.5, to_k, to_v
 
@@ -162,9 +164,10 @@ def _head_by_head_backward(residuals, gradient):
 _head_by_head.defvjp(_head_by_head_forward, _head_by_head_backward)
 
 
-def _chunks(x: Float[Array, "T D"]) -> Float[Array, "c R D"]:
+def _chunks(x: Float[Array, "T D"], keys: int) -> Float[Array, "c R D"]:
     """Cut the queries of a head, or arrays of equal length, into chunks; zeros pad the last chunk."""
-    chunks = math.ceil(len(x) / QUERIES_AT_ONCE)
+    at_once = max(QUERIES_AT_ONCE, min(times_for_cores() * QUERIES_AT_ONCE, LOGITS_OF_A_CHUNK // keys))
+    chunks = math.ceil(len(x) / at_once)
     return jnp.pad(x, ((0, -len(x) % chunks), (0, 0))).reshape(chunks, -1, x.shape[1])
 
 

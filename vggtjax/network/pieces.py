@@ -9,8 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-NUMBERS_ON_CPU = 1600 * 1024  # of a piece: an MLP's hidden rows (26 MB) stay in the cache, where products are fastest
+from vggtjax.storage.cores import core_count
+
+NUMBERS_ON_CPU = 1600 * 1024  # of a piece on two cores: an MLP's hidden rows (26 MB) stay in the cache
 ROWS_ELSEWHERE = 2**15
+_MOST_TIMES = 8  # as large as on two cores are the pieces of more, at most: it bounds their memory
 
 _Rows = TypeVar("_Rows")
 _Outputs = TypeVar("_Outputs")
@@ -61,6 +64,11 @@ def replaced_in_pieces(
     return _by_platform(at_most, (x, others))
 
 
+def times_for_cores() -> int:
+    """Return how many times as large as on two cores a piece is on a CPU, so that every core has as much of it."""
+    return min(max(core_count() // 2, 1), _MOST_TIMES)
+
+
 def largest_divisor(count: int, most: int) -> int:
     """Return the largest divisor of `count` up to `most`: equal pieces need no second compilation for a remainder."""
     return max(n for n in range(1, min(count, most) + 1) if count % n == 0)
@@ -83,7 +91,7 @@ def _by_platform(at_most, rows):
 
 
 def _rows_on_cpu(rows) -> int:
-    return max(NUMBERS_ON_CPU // jax.tree.leaves(rows)[0].shape[1], 1)
+    return max(times_for_cores() * NUMBERS_ON_CPU // jax.tree.leaves(rows)[0].shape[1], 1)
 
 
 def _count(rows) -> int:

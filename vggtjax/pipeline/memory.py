@@ -15,7 +15,6 @@ from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.attention import LOGITS_AT_ONCE
 from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
-from vggtjax.options import Options
 from vggtjax.storage.free_memory import Room, host_room
 
 ERROR = 0.15  # of a measured peak: predictions are as near
@@ -38,10 +37,8 @@ class Sized(Protocol):
     def parameter_bytes(self) -> int: ...
 
 
-def predicted_bytes(
-    model: Sized, frames: int, height: int, width: int, options: Options = Options(), *, clips: int = 1
-) -> float:
-    """Return how much memory a method takes on all frames of a clip at once, with the model and the process.
+def predicted_bytes(model: Sized, frames: int, height: int, width: int, *, clips: int = 1) -> float:
+    """Return how much memory any method takes on all frames of a clip at once, with the model and the process.
 
     On a GPU the process is not counted. `clips` such clips are held at the same time: in a batch one is computed while
     the next is read and the last is written.
@@ -49,12 +46,11 @@ def predicted_bytes(
     weights = model.parameter_bytes
     process = _PROCESS + _PROCESS_OF_WEIGHTS * weights if on_cpu() else 0.0
     pictures = clips * frames * _PIXEL * height * width
-    return weights + process + pass_bytes(model.config, frames, height, width, options) + pictures
+    return weights + process + pass_bytes(model.config, frames, height, width) + pictures
 
 
-def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int, options: Options = Options()) -> float:
+def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int) -> float:
     """Return what the passes hold beside weights, pictures and results: XLA's count, within a third."""
-    del options
     tokens = SPECIAL_TOKENS + height * width // config.patch_size**2
     rows = _ROWS * tokens * config.embed_dim
     logits = _LOGITS * config.num_heads * tokens**2 if tokens**2 <= LOGITS_AT_ONCE else 0
@@ -74,14 +70,12 @@ def available(model: Sized) -> Room | None:
     return Room(free + model.parameter_bytes, "of the device")
 
 
-def most_frames(
-    model: Sized, height: int, width: int, size: float, options: Options = Options(), *, clips: int = 1
-) -> int:
+def most_frames(model: Sized, height: int, width: int, size: float, *, clips: int = 1) -> int:
     """Return the most frames that are predicted to fit in `size` bytes when they are run together; maybe 0."""
     low, high = 0, max(1, _MOST_IMAGES // (3 * _FLOAT * height * width)) + 1  # the first fits, the last does not
     while high - low > 1:
         middle = (low + high) // 2
-        fits = predicted_bytes(model, middle, height, width, options, clips=clips) <= size
+        fits = predicted_bytes(model, middle, height, width, clips=clips) <= size
         low, high = (middle, high) if fits else (low, middle)
     return low
 

@@ -25,6 +25,7 @@ from jax.core import Tracer
 
 from vggtjax.errors import InputError, OutputError, check_regular
 from vggtjax.storage.cache import compiled_folder, lowered_folder
+from vggtjax.storage.cores import core_count
 from vggtjax.storage.versions import package_digest
 from vggtjax.storage.writing import writing
 
@@ -211,6 +212,6 @@ def _keeping() -> bool:
 
 @cache
 def source_digest() -> str:
-    """Return versions, platform, and a digest of all sources: what results depend on besides arguments."""
+    """Return versions, platform, cores, and a digest of all sources: what results depend on besides arguments."""
     versions = [version(name) for name in ("jax", "jaxlib", "flax")]
-    return f"{' '.join(versions)} {jax.default_backend()} {package_digest(_PACKAGE)}"
+    return f"{' '.join(versions)} {jax.default_backend()} {core_count()} {package_digest(_PACKAGE)}"

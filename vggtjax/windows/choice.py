@@ -10,7 +10,6 @@ from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import DeviceMemoryError
-from vggtjax.options import Options
 from vggtjax.pipeline import memory
 from vggtjax.storage.free_memory import in_gigabytes
 from vggtjax.windows.frames import count_frames
@@ -70,7 +69,6 @@ def choose_windows(
     source: Source,
     sampling: Sampling,
     fitter: Fitter,
-    options: Options = Options(),
     *,
     window: int | None = None,
     clips: int = 1,
@@ -80,7 +78,7 @@ def choose_windows(
     The frames of a video are decoded to be counted, but no more of them than fit.
 
     Args:
-        model, source, sampling, fitter, options: what is run.
+        model, source, sampling, fitter: what is run.
         window: frames that are run together, where windows are given; by default all of the clip.
         clips: held in memory at the same time.
     """
@@ -89,7 +87,7 @@ def choose_windows(
         return None
     frame = next(source.frames(sampling))
     width, height = fitter.fit(*frame.image.size, frame.name).frame_size
-    most = memory.most_frames(model, height, width, room.size, options, clips=clips)
+    most = memory.most_frames(model, height, width, room.size, clips=clips)
     frames = min(count_frames(source, sampling, most + 1), window or most + 1)
     if frames <= most:
         return None
@@ -98,8 +96,8 @@ def choose_windows(
     windows = Windows(next((length for length in _LENGTHS if length <= most), _LENGTHS[-1]))
     if windows.window is not None and windows.window > most:  # not even the shortest fits
         windows = Windows()
-    needed = memory.predicted_bytes(model, frames, height, width, options, clips=clips)
-    smaller = _smaller(model, (frames, height, width), fitter, options, room.size, most, clips)
+    needed = memory.predicted_bytes(model, frames, height, width, clips=clips)
+    smaller = _smaller(model, (frames, height, width), fitter, room.size, most, clips)
     return Choice(windows, frames, needed, room.size, room.limit, smaller)
 
 
@@ -116,19 +114,13 @@ def smaller_size(fitter: Fitter) -> Fitter | None:
 
 
 def _smaller(
-    model: Model,
-    shape: tuple[int, int, int],
-    fitter: Fitter,
-    options: Options,
-    free: float,
-    most: int,
-    clips: int,
+    model: Model, shape: tuple[int, int, int], fitter: Fitter, free: float, most: int, clips: int
 ) -> tuple[str, ...]:
     """Return what would fit, each as the option that does it."""
     frames, height, width = shape
 
     def fits(network: memory.Sized, height: int, width: int) -> bool:
-        return memory.predicted_bytes(network, frames, height, width, options, clips=clips) <= free
+        return memory.predicted_bytes(network, frames, height, width, clips=clips) <= free
 
     ways = [] if most < 1 else [f"--max-frames {most}"]
     for size in range(fitter.size - fitter.patch, fitter.patch, -fitter.patch):
