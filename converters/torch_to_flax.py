@@ -42,6 +42,7 @@ class Conversion(NamedTuple):
     bytes: int  # of the checkpoint
     dtype: str
     sha256: Mapping[str, str]  # of the source files, by name
+    revision: str = ""  # commit on the hub; empty for other sources
 
     def summary(self) -> dict[str, Any]:
         """Return the conversion's facts for display, as plain values."""
@@ -54,6 +55,7 @@ class Conversion(NamedTuple):
             "bytes": self.bytes,
             "dtype": self.dtype,
             "heads": list(self.config.heads),
+            **({"revision": self.revision} if self.revision else {}),
             **{f"sha256 of {name}": digest for name, digest in self.sha256.items()},
         }
 
@@ -104,7 +106,8 @@ def convert(
     """Convert weights of a PyTorch VGGT to a checkpoint of this library; memory holds one source tensor at a time.
 
     Args:
-        source: a .safetensors file, the index or folder of shards, a .pt or .pth file, or a hub id.
+        source: a .safetensors file, the index or folder of shards, a .pt or .pth file, or a hub id, which may end in
+            "@" and a commit of 40 hexadecimal letters.
         destination: the file to write; an existing file is replaced.
         dtype: of the parameters in the checkpoint.
         config: the model's configuration; None for VGGT-1B. Weights do not tell the numbers of attention heads.
@@ -154,7 +157,8 @@ def convert_weights(
     sha256 = {file.name: _digest(file, advance) for file in files}
     refuse_strangers(weights.name, sha256=sha256)
     specs = {path: Spec(target.shape, kind) for path, target in targets.items()}
-    path = write_checkpoint(destination, specs, parts, config, name=weights.name, origin=sha256)
+    labels = {"name": weights.name, "origin": sha256, "revision": weights.revision}
+    path = write_checkpoint(destination, specs, parts, config, **labels)
     return Conversion(
         path,
         config,
@@ -164,6 +168,7 @@ def convert_weights(
         bytes=path.stat().st_size,
         dtype=dtype,
         sha256=sha256,
+        revision=weights.revision,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -38,6 +39,7 @@ _MOST_METADATA_LETTERS = 2**16
 _MOST_NAME_LETTERS = 200
 
 Sha256 = Annotated[str, Meta(pattern="^[0-9a-f]{64}$")]
+_COMMIT = re.compile("[0-9a-f]{40}")
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Model:
     name: str = ""
     path: Path | None = None  # file of the parameters
     origin: Mapping[str, str] = field(default_factory=dict)  # names of the source files of a conversion -> sha256
+    revision: str = ""  # commit of the source files on the hub; empty if they are not from there
     untrained_heads: tuple[str, ...] = ()  # heads with random parameters
     note: str = ""  # for users of the model; part of the settings of its results
     _file: _FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets it
@@ -110,6 +113,7 @@ class Model:
             "bytes": self.parameter_bytes,
             "dtype": self.dtype,
             "heads": [f"{head} (untrained)" if head in self.untrained_heads else head for head in self.heads],
+            **({"revision": self.revision} if self.revision else {}),
             **{f"sha256 of {file}": digest for file, digest in self.origin.items()},
             "pairs": self.config.depth,
             **{size: getattr(self.config, size) for size in ("embed_dim", "num_heads", "image_size", "patch_size")},
@@ -196,11 +200,12 @@ def write_checkpoint(
     note: str = "",
     untrained_heads: Sequence[str] = (),
     origin: Mapping[str, str] | None = None,
+    revision: str = "",
 ) -> Path:
     """Write a checkpoint of this library piece by piece, as `write_tensors` does; return its path.
 
     Without `name` the model is named after the file. `note` and `untrained_heads` are those of `Model`; `origin` gives
-    the names and sha256 of the source files of a conversion.
+    the names and sha256 of the source files of a conversion, `revision` their commit on the hub.
     """
     path = Path(path)
     _check_labels(path, note, untrained_heads, config)
@@ -208,6 +213,7 @@ def write_checkpoint(
     metadata |= {"note": note} if note else {}
     metadata |= {"untrained": json.dumps(list(untrained_heads))} if untrained_heads else {}
     metadata |= {"origin": json.dumps(origin)} if origin else {}
+    metadata |= {"revision": revision} if revision else {}
     write_tensors(path, specs, pieces, metadata)
     return path
 
@@ -258,13 +264,19 @@ def _read_metadata(path: Path, metadata: Mapping[str, str]) -> tuple[VGGTConfig,
     origin = parse(metadata.get("origin", "{}"), dict[str, Sha256], f"the origin of {path}")
     if not all(name.isprintable() for name in origin):
         raise CheckpointError(f"the origin of {path} names files with unprintable letters; expected names and sha256")
+    revision = metadata.get("revision", "")
+    if revision and not _COMMIT.fullmatch(revision):
+        raise CheckpointError(
+            f"the revision of {path} is {revision[:50]!r}; expected a commit of 40 hexadecimal letters"
+        )
     name = metadata.get("name", "")
     is_valid = name.isprintable() and 0 < len(name) <= _MOST_NAME_LETTERS
     note = metadata.get("note", "")
     untrained = parse(metadata.get("untrained", "[]"), tuple[str, ...], f"the list of untrained heads of {path}")
     _check_labels(path, note, untrained, config)
     name = name if is_valid else path.stem
-    return config, {"name": name, "origin": origin, "note": note, "untrained_heads": untrained}
+    fields = {"name": name, "origin": origin, "revision": revision, "note": note, "untrained_heads": untrained}
+    return config, fields
 
 
 def _check_labels(path: Path, note: str, untrained_heads: Sequence[str], config: VGGTConfig) -> None:

@@ -2,9 +2,12 @@
 
 import hashlib
 import json
+import re
+import shutil
 import sys
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 
 import huggingface_hub
 import huggingface_hub.constants
@@ -20,34 +23,59 @@ from vggtjax import load_model
 from vggtjax.errors import CheckpointError, MissingExtraError
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
+LATER = "89abcdef0123456789abcdef0123456789abcdef"
 INDEX = "model.safetensors.index.json"
 
 
 class Hub(ThreadingHTTPServer):
-    """Repositories by id, each a folder, or an error code such as GatedRepo; remembers what was asked."""
+    """Repositories by id, each a folder, or an error code such as GatedRepo; remembers what was asked.
+
+    Every commit has the files of the folder. The bytes of the `tampered` names are not those that it declares.
+    """
 
     def __init__(self):
         super().__init__(("127.0.0.1", 0), Answer)
         self.repositories = {}
         self.asked = []
+        self.commit = COMMIT  # of the default branch
+        self.tampered = set()
+
+
+def declared(path):
+    """Return what the hub's API says of a file: sha256 for one in large storage, git's id for one in git."""
+    content = path.read_bytes()
+    git_id = hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+    facts = {"rfilename": path.name, "size": len(content), "blobId": git_id}
+    if path.suffix in (".safetensors", ".pt"):
+        facts["lfs"] = {"sha256": hashlib.sha256(content).hexdigest(), "size": len(content), "pointerSize": 134}
+    return facts
 
 
 class Answer(BaseHTTPRequestHandler):
     def do_GET(self):
         assert isinstance(self.server, Hub)
         self.server.asked.append((self.command, self.path))
-        owner_and_name = "/".join(self.path.removeprefix("/api/models/").strip("/").split("/")[:2])
-        repository = self.server.repositories.get(owner_and_name, "RepoNotFound")
+        path, _, query = self.path.partition("?")
+        parts = path.removeprefix("/api/models/").strip("/").split("/")  # owner, name, revision, COMMIT
+        repository = self.server.repositories.get("/".join(parts[:2]), "RepoNotFound")
+        commit = parts[3] if len(parts) > 3 else self.server.commit
         if isinstance(repository, str):
             self.answer({"GatedRepo": 403, "Down": 500}.get(repository, 401), b"", {"X-Error-Code": repository})
-        elif self.path.startswith("/api/models/"):
-            files = [{"rfilename": path.name} for path in sorted(repository.iterdir())]
-            content = {"id": owner_and_name, "sha": COMMIT, "siblings": files}
+        elif commit not in (COMMIT, LATER, "main"):
+            self.answer(404, b"", {"X-Error-Code": "RevisionNotFound"})
+        elif path.startswith("/api/models/"):
+            files = [declared(path) for path in sorted(repository.iterdir())]
+            files = files if query == "blobs=true" else [{"rfilename": file["rfilename"]} for file in files]
+            content = {"id": "/".join(parts[:2]), "sha": commit, "siblings": files}
             self.answer(200, json.dumps(content).encode(), {"Content-Type": "application/json"})
         else:
-            content = (repository / self.path.rsplit("/", 1)[1]).read_bytes()
-            digest = hashlib.sha256(content).hexdigest()
-            self.answer(200, content, {"ETag": f'"{digest}"', "X-Repo-Commit": COMMIT})
+            facts = declared(repository / parts[-1])
+            content = (repository / parts[-1]).read_bytes()
+            if parts[-1] in self.server.tampered:
+                content = content[:-1] + bytes([content[-1] ^ 1])
+            etag = facts["lfs"]["sha256"] if "lfs" in facts else facts["blobId"]
+            served = self.server.commit if commit == "main" else commit
+            self.answer(200, content, {"ETag": f'"{etag}"', "X-Repo-Commit": served})
 
     do_HEAD = do_GET  # noqa: N815
 
@@ -119,10 +147,12 @@ def test_single_file_is_downloaded_and_converted_once(hub, repository, shapes, e
     assert model.name == "maker/tiny"
     assert model.path is not None
     assert model.path.name.startswith("maker-tiny-")
+    assert model.revision == COMMIT
+    assert model.summary()["revision"] == COMMIT
     again = load_model("maker/tiny", config=config)
     assert again.path == model.path
     downloads = [path for method, path in hub.asked if method == "GET" and "/resolve/" in path]
-    assert downloads == ["/maker/tiny/resolve/main/model.safetensors"]
+    assert downloads == [f"/maker/tiny/resolve/{COMMIT}/model.safetensors"]
 
 
 def test_shards(hub, repository, shapes, expected, config, tmp_path):
@@ -144,6 +174,60 @@ def test_without_network_the_cache_serves(hub, repository, monkeypatch):
     assert locate("maker/tiny").path == path
     next(path.parent.glob("*-00002-of-*")).unlink()
     assert "cannot be downloaded" in refusal("maker/tiny")
+
+
+def test_what_another_program_left_in_the_cache_serves_without_network(hub, repository):
+    (repository / "model.safetensors").write_bytes(b"weights")
+    there = huggingface_hub.hf_hub_download("maker/tiny", "model.safetensors")
+    hub.repositories["maker/tiny"] = "Down"
+    assert locate("maker/tiny") == (Path(there), "maker/tiny", COMMIT)
+    message = refusal("maker/tiny/weights.pt")
+    assert "unreachable, and its cache of 'maker/tiny' holds no weights.pt, only model.safetensors" in message
+
+
+def test_a_branch_is_resolved_once_and_a_given_commit_is_used(hub, repository):
+    (repository / "model.safetensors").write_bytes(b"weights")
+    assert locate("maker/tiny").revision == COMMIT
+    hub.commit = LATER
+    (repository / "model.safetensors").write_bytes(b"weights of later")
+    asked = len(hub.asked)
+    assert locate("maker/tiny").path.read_bytes() == b"weights"
+    assert len(hub.asked) == asked  # the record and the cache know all
+    later = locate(f"maker/tiny/model.safetensors@{LATER}")
+    assert (later.path.read_bytes(), later.name, later.revision) == (
+        b"weights of later",
+        "maker/tiny/model.safetensors",
+        LATER,
+    )
+    assert locate("maker/tiny").revision == COMMIT
+    assert "revision 'main' of 'maker/tiny' is not a commit; expected its 40 hex" in refusal("maker/tiny@main")
+    assert f"'maker/tiny' has no commit {'0' * 40}" in refusal(f"maker/tiny@{'0' * 40}")
+
+
+@pytest.mark.parametrize("name", [INDEX, "model-00002-of-00002.safetensors"])
+def test_a_file_that_is_not_what_the_hub_declares_is_refused(hub, repository, name):
+    make_checkpoint(repository, {"a": [2], "b": [2]}, shards=2)
+    hub.tampered.add(name)
+    message = refusal("maker/tiny")
+    assert f"{name} of the hub's 'maker/tiny' has the digest" in message
+    assert "delete" in message
+    hub.tampered.clear()
+    Path(re.findall("delete (.*) and download", message)[0]).unlink()  # as it says
+    assert locate("maker/tiny").path.name == INDEX
+
+
+def test_a_later_download_with_another_digest_is_refused(hub, repository, tmp_path):
+    (repository / "model.safetensors").write_bytes(b"weights")
+    locate("maker/tiny")
+    shutil.rmtree(tmp_path / "hub")
+    (repository / "model.safetensors").write_bytes(b"weights that the maker replaced")  # and declares anew
+    recorded = hashlib.sha256(b"weights").hexdigest()
+    for _ in range(2):
+        assert f"not the recorded {recorded[:16]}...; do not use it" in refusal("maker/tiny")
+    record = tmp_path / "cache/hub/maker/tiny.json"
+    assert json.loads(record.read_text())["files"][COMMIT]["model.safetensors"]["digest"] == recorded
+    record.write_text("{")
+    assert f"{record} is not JSON that can be read" in refusal("maker/tiny")
 
 
 def test_out_of_reach(hub, monkeypatch):
@@ -173,7 +257,7 @@ def test_hub_is_an_extra(monkeypatch):
         locate("maker/tiny")
 
 
-def test_one_of_several_files(hub, repository, shapes, expected, config):
+def test_one_of_several_files(hub, repository, shapes, expected, config, monkeypatch):
     for name in ("a_e20.pt", "a_e30.pt"):
         make_checkpoint(repository / name, shapes, format="pt")
     assert "holds 2 files of weights (a_e20.pt, a_e30.pt)" in refusal("maker/tiny")
@@ -181,10 +265,9 @@ def test_one_of_several_files(hub, repository, shapes, expected, config):
     assert_equal(model, expected)
     assert model.name == "maker/tiny/a_e20.pt"
     assert "has no file a_e10.pt; its files of weights are a_e20.pt, a_e30.pt" in refusal("maker/tiny/a_e10.pt")
-    hub.repositories["maker/tiny"] = "Down"
+    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     assert locate("maker/tiny/a_e20.pt").path.name == "a_e20.pt"
-    message = refusal("maker/tiny/a_e30.pt")
-    assert "the hub is unreachable, and its cache of 'maker/tiny' holds no a_e30.pt, only a_e20.pt" in message
+    assert "'maker/tiny/a_e30.pt' is not in the hub's cache and cannot be" in refusal("maker/tiny/a_e30.pt")
 
 
 def test_a_mistyped_path_stays_here(hub, tmp_path, monkeypatch):

@@ -7,7 +7,7 @@ from typing import Literal
 
 import tyro
 
-from vggtjax.commands.models import load, read_config
+from vggtjax.commands.models import at_revision, load, read_config
 from vggtjax.commands.report import Report
 from vggtjax.results.saving import ForeignFormat, Saving
 from vggtjax.storage.flags import InWords
@@ -18,6 +18,7 @@ def convert(
     destination: tyro.conf.Positional[Path],
     /,
     *,
+    revision: InWords[str | None] = None,
     config: InWords[Path | None] = None,
     heads: InWords[str | None] = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
@@ -27,6 +28,7 @@ def convert(
     Args:
         source: a .safetensors file, a sharded one (its index or folder), a .pt or .pth file, or a hub id.
         destination: the .safetensors file to write.
+        revision: commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use.
         config: JSON file with the configuration; VGGT-1B by default.
         heads: heads to convert, such as camera,depth; all of camera,depth,points,tracks by default.
         dtype: of the written weights.
@@ -35,6 +37,7 @@ def convert(
     with report.running(), report.stage("convert") as progress:
         from converters import convert as run
 
+        source = at_revision(source, revision)
         names = None if heads is None else [name.strip() for name in heads.split(",")]
         conversion = run(source, destination, dtype=dtype, config=read_config(config), heads=names, progress=progress)
     report.table(conversion.summary())

@@ -51,7 +51,7 @@ def export_model(
         from vggtjax.pipeline.artefact import check_artefact, write_artefact
 
         check_artefact(out, frames, height, width, names, options)
-        network, fitted = ModelFiles(model, config, fusion).load(report, options, [options.method])
+        network, fitted = ModelFiles(model=model, config=config, fusion=fusion).load(report, options, [options.method])
         write_artefact(
             network,
             out,

@@ -43,6 +43,11 @@ def check_named(name: str | None) -> str:
     return name
 
 
+def at_revision(name: str, revision: str | None) -> str:
+    """Return the name of a model with the revision that an option gives."""
+    return name if revision is None else f"{name}@{revision}"
+
+
 @dataclass(frozen=True)
 class ModelFiles:
     """The files of a model and of a fitted rule of fusion."""
@@ -52,6 +57,8 @@ class ModelFiles:
     demonstration model, which is not for real footage"""
     config: InWords[Path | None] = None
     """JSON file with the configuration of a PyTorch checkpoint; needed unless it is VGGT-1B"""
+    revision: InWords[str | None] = None
+    """commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use"""
     fusion: InWords[Path | None] = None
     """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""
 
@@ -61,13 +68,14 @@ class ModelFiles:
         The rule is read first: InputError where it is invalid or none of the `methods` (in place of `options.method`)
         fuses. A warning is logged if the rule was fitted to another model or with other options.
         """
+        name = at_revision(check_named(self.model), self.revision)
         if self.fusion is None:
-            return load(report, self.model, self.config), None
+            return load(report, name, self.config), None
         from vggtjax.method.fusion_file import check_fuses, load_fusion, warn_if_fitted_otherwise
 
         params = load_fusion(self.fusion)
         check_fuses(params, *methods)
-        model = load(report, self.model, self.config)
+        model = load(report, name, self.config)
         fusing = next(name for name in methods if METHODS[name].depth == "fused")
         warn_if_fitted_otherwise(self.fusion, model, options.changed(method=fusing))
         return model, params

@@ -37,14 +37,16 @@ def load_model(
 
     Args:
         name_or_path: "demo" (the small model in the package), a checkpoint of this library, PyTorch weights
-            (.safetensors, index or folder of shards, .pt, .pth), or a hub id such as "facebook/VGGT-1B".
+            (.safetensors, index or folder of shards, .pt, .pth), or a hub id such as "facebook/VGGT-1B", at the commit
+            that was its newest on the first use, unless it ends in "@" and another of 40 hexadecimal letters.
         config: the configuration of PyTorch weights; None for VGGT-1B. A checkpoint of this library contains its own.
         dtype: of the parameters; None for the types in the checkpoint, and float32 for PyTorch weights. "int8" rounds
             the kernels of the blocks to 8 bits as they are read: an approximation (docs/research-notes).
         progress: called during a conversion with the number of steps done and the total.
 
     Raises:
-        CheckpointError: the weights are missing, cannot be read, or do not fit the configuration.
+        CheckpointError: the weights are missing, cannot be read, do not fit the configuration, or are not what the hub
+            declared.
         MissingExtraError: the weights need torch or huggingface_hub, which is not installed.
     """
     model = load_weights(name_or_path, config=config, dtype=dtype, progress=progress)
@@ -69,12 +71,13 @@ def load_weights(
     path = weights.path
     if not is_checkpoint(path):
         stored = "float32" if dtype in (None, "int8") else dtype
-        path = _converted(path, weights.name, config or vggt_1b(), stored, progress)
+        path = _converted(weights, config or vggt_1b(), stored, progress)
     return read_model(path, dtype=dtype, **embedded_labels(path))
 
 
-def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:
+def _converted(weights: Weights, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:
     """Return the conversion of PyTorch weights in the cache; convert them if it is missing or damaged."""
+    path = weights.path
     try:
         stats = [(file.resolve(), file.stat()) for file in weight_files(path)]
     except OSError as error:
@@ -82,9 +85,9 @@ def _converted(path: Path, name: str, config: VGGTConfig, dtype: DType, progress
         raise CheckpointError(f"cannot read {reason}") from error
     facts = [VERSION, dtype, config.to_json(), *(f"{file} {stat.st_size} {stat.st_mtime_ns}" for file, stat in stats)]
     key = hashlib.sha256("\n".join(facts).encode("utf-8", "surrogateescape")).hexdigest()[:16]
-    destination = cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', name)[:80]}-{key}.safetensors"
+    destination = cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', weights.name)[:80]}-{key}.safetensors"
     if not _is_whole(destination):
-        convert_weights(Weights(path, name), destination, dtype=dtype, config=config, progress=progress)
+        convert_weights(weights, destination, dtype=dtype, config=config, progress=progress)
         logger.info("converted %s to %s, once", path, destination)
     logger.info("loading %s", destination)
     return destination
