@@ -1,17 +1,23 @@
 # Everything in two commands on a machine with Python and git: `make demo` and `make test`.
 # The docs site, in site/: `make docs`; its pictures of the demo: `make pictures`.
+# The environment of the lock, every file by its hash: `make locked`, before the others. `make lock` makes the lock anew,
+# from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the same bytes anywhere.
 # While you work: `make check`, which is lint, types and the tests that run no network, in a few minutes.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
+SUPPLY := $(VENV)/supply
+COMPILE = $(SUPPLY)/bin/uv pip compile --no-config --quiet --upgrade --exclude-newer '7 days' --generate-hashes \
+  --universal --python-version 3.11 --index-url https://pypi.org/simple --no-emit-index-url \
+  --custom-compile-command 'make lock'
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 # Tests that compile networks take nearly all of the time.
 SLOW = parity network method pipeline training calibration learning commands benchmarks pretrained
 
-.PHONY: demo pictures docs test check fast lint format clean
+.PHONY: demo pictures docs test check fast lint format clean locked lock audit sbom dist
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
@@ -41,8 +47,30 @@ format: $(VENV)/.development
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
+locked: | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --require-hashes --requirement requirements/dev.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $(VENV)/.runtime $(VENV)/.docs $(VENV)/.development
+
+lock: $(SUPPLY)/.installed
+	$(COMPILE) --extra dev pyproject.toml --output-file requirements/dev.lock
+	$(COMPILE) --group supply --output-file requirements/supply.lock
+
+audit: $(SUPPLY)/.installed
+	$(SUPPLY)/bin/pip-audit --strict --disable-pip --require-hashes --progress-spinner off \
+	  --requirement requirements/dev.lock --requirement requirements/supply.lock
+
+sbom: $(SUPPLY)/.installed
+	$(SUPPLY)/bin/cyclonedx-py requirements requirements/dev.lock --pyproject pyproject.toml --output-reproducible \
+	  --output-file sbom.json
+	@echo "wrote sbom.json, in CycloneDX's format"
+
+dist: $(SUPPLY)/.installed
+	rm -rf build dist
+	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(SUPPLY)/bin/python -m build --no-isolation
+
 clean:
-	rm -rf $(VENV) build dist site demo-output *.egg-info
+	rm -rf $(VENV) build dist site demo-output sbom.json *.egg-info
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -61,3 +89,8 @@ $(VENV)/.docs: pyproject.toml | $(BIN)/python
 $(VENV)/.development: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	touch $@ $(VENV)/.runtime $(VENV)/.docs
+
+$(SUPPLY)/.installed: requirements/supply.lock
+	$(PYTHON) -m venv $(SUPPLY)
+	$(SUPPLY)/bin/python -m pip install --quiet --require-hashes --requirement requirements/supply.lock
+	touch $@
