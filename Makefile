@@ -1,7 +1,7 @@
 # Everything in two commands on a machine with Python and git: `make demo` and `make test`.
 # The docs site, in site/: `make docs`; its pictures of the demo: `make pictures`.
 # The environment of the lock, every file by its hash: `make locked`, before the others. `make lock` makes the lock anew,
-# from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the same bytes anywhere.
+# from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the same wheel anywhere.
 # While you work: `make check`, which is lint, types and the tests that run no network, in a few minutes.
 
 PYTHON ?= python3
