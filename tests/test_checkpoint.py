@@ -231,7 +231,7 @@ def test_file_is_checked_against_its_configuration(saved_once, tmp_path):
         ({"origin": '{"a": ' + "9" * 400 + "}"}, "a is a number of more than 64 bits"),
         ({"origin": '{"a": "b"}'}, "Expected `str` matching regex"),
         ({"origin": '{"\\u001b": "' + "0" * 64 + '"}'}, "unprintable letters"),
-        ({"revision": "main"}, "expected 40 hexadecimal letters"),
+        ({"revision": "main"}, "expected a commit of 40 hexadecimal letters"),
     ],
 )
 def test_metadata_is_not_trusted(saved_once, tmp_path, metadata, reason):
