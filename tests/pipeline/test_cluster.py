@@ -211,7 +211,8 @@ def test_a_cluster_without_room(dispatcher):
             shared(nodes, Plan(dispatcher.it._job, {}, cpus=cpus, gpus=gpus))
 
 
-def test_a_worker_does_a_clip_once(tmp_path):
+def test_a_worker_does_a_clip_once(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where the worker goes itself
     model = tiny_model()
     Image.fromarray(np.zeros((70, 98, 3), np.uint8)).save(tmp_path / "a.png")
     worker = Worker()
