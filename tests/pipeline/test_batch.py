@@ -91,13 +91,13 @@ def write_video(path, frames, rows):
 
 
 def test_the_command_goes_on_after_it_was_killed(model, tmp_path):
-    """Twenty clips of three shapes, two of them videos and one corrupt, killed once eight are done."""
+    """Twelve clips of three shapes, two of them videos and one corrupt, killed once four are done."""
     root, out, visible = tmp_path / "clips", tmp_path / "out", f"[!.]*/{ARCHIVE_NAME}"
     lengths = {}
-    for number in range(20):
+    for number in range(12):
         name, frames, rows = f"clip{number:02}", *((2, 70), (3, 70), (2, 140))[number % 3]
         lengths[name] = frames
-        if number in (5, 14):
+        if number in (5, 10):
             write_video(root / f"{name}.mp4", frames, rows)
         else:
             write_clip(root / name, frames, rows)
@@ -108,13 +108,13 @@ def test_the_command_goes_on_after_it_was_killed(model, tmp_path):
     environment = os.environ | {"VGGTJAX_CACHE": str(tmp_path / "cache"), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 
     with subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as running:
-        while len(list(out.glob(visible))) < 8 and running.poll() is None:
+        while len(list(out.glob(visible))) < 4 and running.poll() is None:
             time.sleep(0.01)
         running.kill()
         _, said = running.communicate()
     assert running.returncode < 0, said.decode()  # by the signal
     finished = {path.parent.name: path.stat().st_mtime_ns for path in out.glob(visible)}
-    assert 8 <= len(finished) < 19
+    assert 4 <= len(finished) < 11
     folders = {path.name for path in out.iterdir() if path.is_dir() and not path.name.startswith(".")}
     assert folders == set(finished)  # what can be seen is whole
     for name in finished:
@@ -135,7 +135,7 @@ def test_the_command_goes_on_after_it_was_killed(model, tmp_path):
         assert (out / name / "scene.glb").stat().st_size > 1000
     assert {name: results[name] for name in finished} == finished
     table = dict(line.split(maxsplit=1) for line in again.stdout.splitlines()[:4])
-    assert table == {"clips": "20", "done": f"{19 - len(finished)}", "kept": f"{len(finished)}", "failed": "1"}
+    assert table == {"clips": "12", "done": f"{11 - len(finished)}", "kept": f"{len(finished)}", "failed": "1"}
     assert "clip03 failed: " in again.stdout
     assert "1.png" in again.stdout.partition("clip03 failed: ")[2].splitlines()[0]
     for name in set(results) - set(finished):

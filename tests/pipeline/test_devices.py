@@ -25,8 +25,8 @@ from vggtjax.pipeline.devices import frames_mesh
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs" / "how-to" / "several-devices.md"
 WORKER = Path(__file__).with_name("devices_worker.py")
-DEVICES = (1, 8)  # compiling for each takes most of a minute; the worker alone runs 2 and 4 too,
-FRAMES = 13  # and 16, which 8 divides
+DEVICES = (1, 8)  # compiling for each takes most of a minute; the worker alone runs 2 and 4 too, 16 frames, which 8
+FRAMES = 13  # divides, and the gradient of both passes
 NAMED = {  # in docs/how-to/several-devices.md
     "image features": set(),
     "first pass": {"all-gather", "collective-permute"},
@@ -41,7 +41,7 @@ Kept = dict[str, dict[int, dict[str, np.ndarray]]]
 
 def start(out: Path, *arguments: str) -> subprocess.Popen:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
-    environment |= {"COUNTS": " ".join(map(str, DEVICES)), "FRAMES": str(FRAMES)}
+    environment |= {"COUNTS": " ".join(map(str, DEVICES)), "FRAMES": str(FRAMES), "METHOD": "vggt"}
     words = [sys.executable, str(WORKER), str(out), *arguments]
     return subprocess.Popen(words, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True)
 
