@@ -43,7 +43,7 @@ def test_simulated_errors_are_what_the_tree_claims():
 def recovered():
     """Return clips, and the fit to them that ought to find TRUE again."""
     clips = simulated(1)
-    config = FitConfig(FAMILY, "joint", steps=400, learning_rate=0.05, clips_at_once=48, patience=40)
+    config = FitConfig(FAMILY, "joint", steps=120, learning_rate=0.15, clips_at_once=48, patience=40)
     return clips, fit_fusion(clips, clips, config)
 
 
@@ -170,7 +170,7 @@ def test_a_soft_mask_is_recovered():
     seen = Observations(d1, zero, d2, zero, (margin >= 0).astype(jnp.float32), margin, jnp.zeros((*shape, 4)))
     true = identity() | {"offset": jnp.asarray(0.1), "temperature": jnp.asarray(0.05)}
     truth = fuse(true, seen).depth + 0.02 * jnp.asarray(generator.normal(size=shape), jnp.float32)
-    config = FitConfig(parse_family("scale+offset+temperature"), steps=400, learning_rate=0.1, patience=60)
+    config = FitConfig(parse_family("scale+offset+temperature"), steps=200, learning_rate=0.2, patience=60)
     fit = fit_fusion(FitClips(seen, truth), FitClips(seen, truth), config)
     assert float(fit.params["offset"]) == pytest.approx(0.1, abs=0.01)
     assert float(fit.params["temperature"]) == pytest.approx(0.05, rel=0.15)
