@@ -269,7 +269,7 @@ def _made(function: Callable[[Path], object], name: str = "set") -> Callable[[Pa
 
 
 def _posted(path: Path) -> None:
-    if path.is_file():  # a request is no file
+    if path.is_file() and not path.is_symlink():  # a request is no file
         cleaned(path.read_bytes(), {0: 5})
 
 

@@ -196,7 +196,7 @@ def _explaining(subject: str, suffix: str) -> Iterator[None]:
     except OSError as error:
         raise ResultError(f"{subject} cannot be read ({error.strerror or error})") from error
     except _BROKEN as error:
-        raise ResultError(f"{subject} is not a whole {suffix} file ({error})") from error
+        raise ResultError(f"{subject} is not a whole {suffix} file ({one_line(str(error), 200)})") from error
 
 
 def _members(archive: zipfile.ZipFile) -> Iterator[tuple[str, zipfile.ZipInfo, IO[bytes]]]:
