@@ -11,6 +11,7 @@ from benchmarks.approximations import approximations
 from benchmarks.batch import batch
 from benchmarks.cluster import cluster
 from benchmarks.demo_model import demo_model
+from benchmarks.determinism import determinism
 from benchmarks.devices import devices
 from benchmarks.embed import embed
 from benchmarks.first_run import first_run
@@ -42,6 +43,7 @@ COMMANDS = {
     "batch": batch,
     "cluster": cluster,
     "demo-model": demo_model,
+    "determinism": determinism,
     "devices": devices,
     "embed": embed,
     "first-run": first_run,
