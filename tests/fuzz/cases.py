@@ -10,7 +10,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
@@ -158,7 +158,8 @@ def _renamed(path: Path, random: Random) -> None:
         (*(name for name in NAMES if "/" not in name and "\0" not in name), " ", "-x", "$(x)", "x" * 250)
     )
     place = os.fsencode(path.parent) + b"/" + name.encode("utf-8", "surrogateescape")[:240] + os.fsencode(path.suffix)
-    os.rename(path, place)  # noqa: PTH104 - names of bytes
+    with suppress(OSError):  # ".." is there
+        os.rename(path, place)  # noqa: PTH104 - names of bytes
 
 
 def _copied(path: Path, random: Random) -> None:

@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from weakref import WeakValueDictionary
 
 from vggtjax.captures.files import inside
-from vggtjax.errors import InputError, reading
+from vggtjax.errors import InputError, one_line, reading
 
 _MOST_FILES = 200_000
 _SPARE_BYTES = 2**26  # that the files may have beyond twice the archive: pictures and depth do not shrink much more
@@ -71,20 +71,24 @@ def unpacked(path: Path, wanted: tuple[str, ...]) -> Unpacked:
     except InputError:
         raise
     except _BROKEN as error:
-        raise InputError(f"{path} is not a whole zip, as Record3D writes it ({error}); export it again") from None
+        raise InputError(
+            f"{path} is not a whole zip, as Record3D writes it ({one_line(str(error), 150)}); export it again"
+        ) from None
     _KNOWN[key] = made
     return made
 
 
 def _members(path: Path, archive: zipfile.ZipFile, size: int, wanted: tuple[str, ...]) -> list[zipfile.ZipInfo]:
-    members = [member for member in archive.infolist() if not member.is_dir()]
+    members = [member for member in archive.infolist() if not member.filename.endswith("/")]
     total, most = sum(member.file_size for member in members), 2 * size + _SPARE_BYTES
     if len(members) > _MOST_FILES or total > most:
         raise InputError(f"{path} has {len(members)} files of {total} bytes; expected at most {_MOST_FILES} of {most}")
     for member in members:
         inside(path, member.filename, path)
         if any(letter in member.filename for letter in _SEPARATORS):
-            raise InputError(f"{path} names the file {member.filename!r}; expected a path inside the archive")
+            raise InputError(
+                f"{path} names the file {one_line(member.filename, 80)!r}; expected a path inside the archive"
+            )
     tops = [PurePosixPath(member.filename).parts[0] for member in members]
     if missing := [name for name in wanted if name not in tops]:
         raise InputError(

@@ -106,6 +106,12 @@ def check_pixels(image: Image.Image, path: Path, error: type[InputError] = ClipE
         raise error(f"{path} has {size} bytes and says it has {image.width} x {image.height} pixels; get it whole")
 
 
+def has_transparency(image: Image.Image) -> bool:
+    """Return whether a picture can be transparent; one of a palette that is missing cannot, and Pillow fails there."""
+    is_bare = image.mode == "P" and image.palette is None and "transparency" not in image.info
+    return not is_bare and image.has_transparency_data
+
+
 def to_rgb(image: Image.Image, name: str) -> Image.Image:
     """Return an image of any mode as RGB, as `read_image` does; errors say `name`."""
     if image.mode == "I" or image.mode == "F" or image.mode.startswith("I;16"):
@@ -115,7 +121,7 @@ def to_rgb(image: Image.Image, name: str) -> Image.Image:
                 raise ClipError(f"frame {name} has values from {values.min()} to {values.max()}; expected 16 bits")
             values = values.astype(np.uint16)
         return Image.fromarray(eight_bit(values, name)).convert("RGB")
-    if image.has_transparency_data:
+    if has_transparency(image):
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
     return image.convert("RGB")

@@ -12,7 +12,7 @@ from jaxtyping import Bool
 from PIL import Image
 
 from vggtjax.clips.clip import Clip
-from vggtjax.clips.images import ImageFiles, known_formats, read_image
+from vggtjax.clips.images import ImageFiles, has_transparency, known_formats, read_image
 from vggtjax.clips.sources import open_source
 from vggtjax.clips.truth import at_clip_pixels
 from vggtjax.errors import ClipError, InputError
@@ -112,9 +112,10 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
     """
     shown = read_image(path)  # says what is wrong with a file that is no picture
     with Image.open(path, formats=known_formats()) as picture:
-        if picture.mode in _LABELS and picture.size == shown.size and not picture.has_transparency_data:
+        is_see_through = has_transparency(picture)
+        if picture.mode in _LABELS and picture.size == shown.size and not is_see_through:
             return np.asarray(picture) > 0
-        opaque = np.asarray(picture.convert("RGBA"))[..., 3] > _WHITE if picture.has_transparency_data else None
+        opaque = np.asarray(picture.convert("RGBA"))[..., 3] > _WHITE if is_see_through else None
     bright = np.asarray(shown).max(axis=-1)
     if opaque is not None and opaque.shape == bright.shape:
         bright = np.where(opaque, bright, 0)
