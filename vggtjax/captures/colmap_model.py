@@ -90,8 +90,8 @@ def _camera(path: Path, kind: str, width: int, height: int, values: Sequence[flo
 def _check_model(path: Path, kind: str) -> None:
     if kind not in _MODELS:
         raise InputError(
-            f"{path} has a camera of kind {one_line(kind, 40)}; expected one of {', '.join(_MODELS)}: undistort the pictures first "
-            "(colmap image_undistorter)"
+            f"{path} has a camera of kind {one_line(kind, 40)}; expected one of {', '.join(_MODELS)}: undistort the "
+            "pictures first (colmap image_undistorter)"
         )
 
 
