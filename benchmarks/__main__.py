@@ -24,6 +24,7 @@ from benchmarks.leads import leads
 from benchmarks.long_clips import long_clips
 from benchmarks.make_checkpoint import main as make_checkpoint
 from benchmarks.masks import masks
+from benchmarks.mutants import mutants
 from benchmarks.peak_memory import peak_memory
 from benchmarks.point_clouds import point_clouds
 from benchmarks.refine_cameras import refine_cameras
@@ -58,6 +59,7 @@ COMMANDS = {
     "make-checkpoint": make_checkpoint,
     "masks": masks,
     "memory": memory,
+    "mutants": mutants,
     "peak-memory": peak_memory,
     "point-clouds": point_clouds,
     "refine-cameras": refine_cameras,

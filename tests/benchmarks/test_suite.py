@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from benchmarks import __main__ as benchmarks
-from benchmarks.suite import gpu_targets, measure, memory, work, workloads
+from benchmarks.suite import ceilings, gpu_targets, measure, memory, work, workloads
 from benchmarks.suite.cases import TINY, Case
 from benchmarks.suite.ceilings import Ceilings, Rounds
 from benchmarks.suite.command import measured_rows
@@ -80,9 +80,9 @@ def test_the_compiler_counts_the_same_work(name, build):
 
 
 def test_floors_by_hand():
-    ceilings = {"linear": 10.0, "exp": 2.0, "weights": 1.0}
+    rates = {"linear": 10.0, "exp": 2.0, "weights": 1.0}
     computing, reading = {"linear": 30.0, "exp": 4.0, "weights": 4.0}, {"linear": 10.0, "weights": 3.0}
-    assert work.floor_by_kind([computing, reading], ceilings) == {"linear": 3.0, "exp": 2.0, "weights": 3.0}
+    assert work.floor_by_kind([computing, reading], rates) == {"linear": 3.0, "exp": 2.0, "weights": 3.0}
     assert work.flop([computing, reading]) == 40
 
 
@@ -108,13 +108,13 @@ def test_slopes_by_hand():
 
 def test_memory_of_the_process_is_seen():
     def run():
-        kept.append(b"x" * 50_000_000)
+        kept.append(b"x" * 200_000_000)  # so much that what others free meanwhile hardly counts
 
     kept: list[bytes] = []
     host, _ = measure.memory_of(run)
     if host is None:
         pytest.skip("this system does not tell")
-    assert 49e6 < host < 80e6
+    assert 190e6 < host < 230e6
     again, _ = measure.memory_of(lambda: None)
     assert again is not None
     assert again < 5e6  # what is there already does not count
@@ -158,6 +158,7 @@ def quickly():
     jax.config.update("jax_disable_most_optimizations", True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measure, "_SUSTAINED", 1e-3)
+        patch.setattr(ceilings, "_IN_A_ROW", 1)
         yield
     jax.config.update("jax_disable_most_optimizations", False)
 
