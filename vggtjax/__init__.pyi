@@ -26,8 +26,8 @@ from .options import LADDER as LADDER
 from .options import METHODS as METHODS
 from .pipeline.artefact import write_artefact as write_artefact
 from .pipeline.batch import reconstruct_many as reconstruct_many
+from .pipeline.infer import infer as infer
 from .pipeline.run import compile_ahead as compile_ahead
-from .pipeline.run import infer as infer
 from .pipeline.run import reconstruct as reconstruct
 from .pretrained.load import load_model as load_model
 from .results.frame import frame_of as frame_of

@@ -28,7 +28,7 @@ from vggtjax.network.dpt_head import predict_dense, project_tap
 from vggtjax.network.model import forward
 from vggtjax.network.precision import Compute
 from vggtjax.network.track_head import predict_tracks
-from vggtjax.pipeline.run import infer
+from vggtjax.pipeline.infer import infer
 from vggtjax.scenes import SceneConfig, load_textures
 from vggtjax.scenes.render import generate
 

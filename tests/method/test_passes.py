@@ -26,7 +26,6 @@ from vggtjax.errors import DeviceMemoryError, InputError
 from vggtjax.method.fusion import scale_between
 from vggtjax.method.mask import dynamic_pixels, dynamic_tokens, mine_mask
 from vggtjax.options import Options
-from vggtjax.pipeline import run
 from vggtjax.results.result import FieldOfViewWarning
 
 FRAMES, SIZE = 4, (140, 140)
@@ -181,7 +180,8 @@ def test_passes_take_options_or_their_fields(params, config, images):
 
 
 def test_equal_programs_are_compiled_once(params, config, images, monkeypatch):
-    monkeypatch.setattr(run, "_infer", lambda *arguments: arguments[3])  # its options are static under jit
+    static = "vggtjax.pipeline.infer._infer"  # its options are static under jit
+    monkeypatch.setattr(static, lambda *arguments: arguments[3])
     options = infer(params, images, config, method="vggt4d")
     assert infer(params, images, config, method="vggt4d", gram="dot", refine_mask=True) == options
     assert infer(params, images, config, method="vggt4d", align_scale=True) != options
@@ -191,7 +191,7 @@ def test_running_out_of_memory_is_one_sentence(params, config, images, monkeypat
     def exhausted(*_, **__):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
 
-    monkeypatch.setattr(run, "run_stages", exhausted)
+    monkeypatch.setattr("vggtjax.pipeline.run.run_stages", exhausted)
     with pytest.raises(DeviceMemoryError, match="4 frames of 140 x 140 pixels do not fit"):
         reconstruct(Model(config, params, "tiny"), load_clip(images[0], size=140))
 

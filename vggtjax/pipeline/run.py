@@ -1,4 +1,4 @@
-"""A clip and a model -> a Reconstruction: stage by stage, or the whole batch under a single jit."""
+"""A clip and a model -> a Reconstruction, stage by stage."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.captures.frames import CaptureFrames
@@ -20,7 +19,6 @@ from vggtjax.clips.clip import Clip, load_clip
 from vggtjax.clips.masks import load_masks, masks_at_clip_pixels
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.sources import ClipSource
-from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError, ResultError, device_memory_errors
 from vggtjax.known.apply import apply_known, scaled
 from vggtjax.known.given import Given, check_readable, read_known
@@ -28,14 +26,13 @@ from vggtjax.known.options import KnownGeometry
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.mask_refinement import refine_masks
-from vggtjax.method.passes import Assembly, Passes
+from vggtjax.method.passes import Assembly
 from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
-from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
-from vggtjax.pipeline.devices import by_frame_on, frames_mesh, on_host, placed, shared_length, whole_on
-from vggtjax.pipeline.stage_runners import Compile, Execute, StageMemory, inline
+from vggtjax.pipeline.devices import by_frame_on, frames_mesh, on_host, shared_length, whole_on
+from vggtjax.pipeline.stage_runners import Compile, Execute, StageMemory
 from vggtjax.pipeline.stages import ClipInputs, Stages, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.refinement.refine import check_refinement, refine_cameras
@@ -46,50 +43,6 @@ from vggtjax.storage.cache import say_how_to_keep
 _LESS_MEMORY = (
     "fewer frames at once (window, max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
 )
-
-
-def infer(
-    params: Params,
-    images: Float[Array, "B S H W 3"],
-    config: VGGTConfig,
-    *,
-    options: Options = Options(),
-    motion: MotionConfig | None = None,
-    mesh: Mesh | None = None,
-    **changes: Any,
-) -> tuple[Assembly, Passes]:
-    """Run a method on a batch of clips as one compiled function.
-
-    Args:
-        params: the model's parameter tree.
-        images: RGB in [0, 1]; H and W are multiples of the patch size.
-        config: the model's configuration.
-        options: how the clips are reconstructed; masks are not refined.
-        motion: the table of motion cues; the configuration's own if None.
-        mesh: devices along an axis "frames" that share the frames (`frames_mesh`); None for one device.
-        changes: fields of `options` by name, such as `method="vggt4d"`.
-
-    Returns:
-        The method's depth, confidence and cameras, and the passes they were made of.
-    """
-    config = config if motion is None else dataclasses.replace(config, motion=motion)
-    # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.
-    options = dataclasses.replace(options.changed(**changes).resolved(), refine_mask=False)
-    if mesh is None:
-        return _infer(params, images, config, options, images.shape[1], None)
-    frames = images.shape[1]
-    params, images = placed(params, images, mesh)
-    outputs = _infer(params, images, config, options, frames, mesh)
-    return outputs if images.shape[1] == frames else jax.tree.map(lambda x: x[:, :frames], outputs)
-
-
-@partial(jax.jit, static_argnames=("config", "options", "frames", "mesh"))
-def _infer(
-    params: Params, images: Array, config: VGGTConfig, options: Options, frames: int, mesh: Mesh | None
-) -> tuple[Assembly, Passes]:
-    stages = Stages(config, options, frames, (images.shape[2], images.shape[3]), run=inline, mesh=mesh)
-    passes, assembly, _ = run_stages(stages, params, ClipInputs(images))
-    return assembly, passes
 
 
 def reconstruct(
