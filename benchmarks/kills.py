@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 from benchmarks.make_checkpoint import make_checkpoint
@@ -68,7 +69,7 @@ CASES = {
         "--out {out}/fit",
         ("*",),
     ),
-    "train": Case("train {inputs}/recipe.json {out}/run --log-every 2 --checkpoint-seconds 0.1", ("*",)),
+    "train": Case("train --recipe {inputs}/recipe.json --out {out}/run --log-every 2 --checkpoint-seconds 0.1", ("*",)),
 }
 
 
@@ -159,7 +160,7 @@ def kill_command(name: str, folder: Path, *, kills: int, pairs: int, draws: rand
     moments: list[int | float] = [1 + number * changes // at_changes for number in range(at_changes)]
     moments += [draws.uniform(0.0, seconds) for _ in range(kills - at_changes)]
     killed = [0, 0]
-    for moment in moments:
+    for moment in track(moments, f"{name}: kills", transient=True):
         is_change = isinstance(moment, int)
         label = f"killed at change {moment}" if is_change else f"killed after {moment:.2f} s"
         code, said = run(out, change=moment) if is_change else run(out, seconds=moment)
@@ -176,7 +177,7 @@ def kill_command(name: str, folder: Path, *, kills: int, pairs: int, draws: rand
         else:
             check(f"{label}, then run again", files_below(out), ended=True)
         _clear(out)
-    for number in range(pairs):
+    for number in track(range(pairs), f"{name}: two at once", transient=True):
         out.mkdir(parents=True, exist_ok=True)
         started = [_start(words(out), work / f"log{side}", out) for side in (0, 1)]
         ends = [_finish(*process, work / f"log{side}") for side, process in enumerate(started)]
@@ -272,7 +273,9 @@ def _start(
 
     def run() -> int:
         from vggtjax.commands.main import main
+        from vggtjax.storage.cache import enable_compilation_cache
 
+        enable_compilation_cache()  # a command does it before jax is imported
         changes = _watch(watched, change)
         code = main(words)
         if count is not None:

@@ -1,13 +1,61 @@
-"""Sources of each frame, layers of other depths, and degenerate clips."""
+"""Maps against every Gram matrix, sources of each frame, layers of other depths, and degenerate clips."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 
+from tests import reference
 from vggtjax import MotionConfig
+from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues, normalise, sources
+from vggtjax.network.frames import BY_FRAME, Frames
 
 OFFSETS = MotionConfig().offsets
+DEPTH, SPECIAL, PATCHES = 6, 3, 5
+
+
+def added(cues, q, k, frame_count=None):
+    """Return the sums over all pairs of q and k [pairs, S, tokens, heads, channels]."""
+
+    def all_pairs(q, k):  # [1, S, pairs, ...]: the frames are where devices share them
+        def add(sums, layer):
+            return cues.add(sums, *layer, frame_count), None
+
+        layers = (jnp.asarray(cues.layer_counts()), *(jnp.moveaxis(x, 2, 0) for x in (q, k)))
+        return jax.lax.scan(add, cues.frames.varying(cues.zeros(1, q.shape[1], PATCHES)), layers)[0]
+
+    return jax.jit(cues.frames.on_devices(all_pairs, BY_FRAME, BY_FRAME))(*(x.swapaxes(0, 1)[None] for x in (q, k)))
+
+
+@pytest.mark.parametrize(
+    ("gram", "padding"), [("cosine", "none"), ("dot", "by count"), ("cosine", "on a device"), ("dot", "on a device")]
+)
+def test_maps_and_saliency_are_those_of_every_gram_matrix(gram, padding):
+    S, motion = 9, MotionConfig()
+    q, k = np.random.default_rng(0).normal(size=(2, DEPTH, S + 2, SPECIAL + PATCHES, 2, 4)).astype(np.float32)
+    mesh = Mesh(np.array(jax.devices()[:1]), ("frames",))
+    cues = GramCues(motion, DEPTH, gram, Frames(mesh, S) if padding == "on a device" else Frames())
+    given = S if padding == "none" else S + 2
+    count = jnp.array([S]) if padding == "by count" else None
+    sums = tuple(x[:, :S] for x in added(cues, q[:, :given], k[:, :given], count))
+    maps, product = cues.maps(sums), np.ones((S, PATCHES))
+    patches = {"q": q[:, :S, SPECIAL:], "k": k[:, :S, SPECIAL:]}
+    for cue in motion.cues:
+        pair = patches[cue.rows], patches[cue.columns]
+        expected = reference.gram_map(*pair, motion.layers(cue, DEPTH), cue.statistic, OFFSETS, gram)
+        assert np.allclose(maps[cue.name][0], expected, atol=1e-4), cue.name
+        product *= 1 - expected if cue.inverted else expected
+    low, high = product.min(1, keepdims=True), product.max(1, keepdims=True)
+    assert np.allclose(cues.saliency(sums)[0], (product - low) / (high - low + 1e-6), atol=1e-3)
+    squared = cues.saliency(sums, jnp.full(5, 2.0))[0]
+    assert np.allclose(squared, np.asarray(normalise(jnp.asarray(product[None] ** 2)))[0], atol=1e-3)
+
+
+def test_an_unknown_similarity_is_refused():
+    with pytest.raises(InputError, match="gram"):
+        GramCues(MotionConfig(), DEPTH, "sine")  # pyright: ignore[reportArgumentType]
 
 
 def test_sources_are_the_offsets_that_exist():

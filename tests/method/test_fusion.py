@@ -20,6 +20,9 @@ def test_fusion_by_hand():
     depth, confidence = fuse_depth(D1, C1, D2, C2, DYNAMIC)
     assert np.allclose(depth, [[[3.5, 2.0, 2.5]]], atol=1e-5)
     assert np.allclose(confidence, [[[4.0, 1.0, 4.0]]])
+    # Without any confidence the weight of the second pass is 0; with eps = 1 it is 3 / (1 + 3 + 1).
+    assert np.allclose(fuse_depth(D1, 0 * C1, D2, 0 * C2, DYNAMIC)[0], D1)
+    assert np.allclose(fuse_depth(D1, C1, D2, C2, DYNAMIC, eps=1.0)[0], [[[3.2, 2.0, 2.4]]])
 
 
 def test_hard_replacement_by_hand():

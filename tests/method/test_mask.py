@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jax.sharding import Mesh
 from skimage.filters import threshold_otsu
 
 from tests.reference import multi_otsu
 from vggtjax.errors import InputError
 from vggtjax.method.mask import (
+    cluster_means,
     dynamic_pixels,
     dynamic_tokens,
     mine_mask,
@@ -19,6 +21,7 @@ from vggtjax.method.mask import (
     smooth_over_time,
     upsample,
 )
+from vggtjax.network.frames import BY_FRAME, Frames
 
 _otsu = jax.jit(otsu_threshold)
 _multi_otsu = jax.jit(multi_otsu_threshold)
@@ -135,3 +138,30 @@ def test_a_flicker_is_smoothed_away():
     assert rough[0, 3, 4, 20]
     assert not smooth[0, 3, 4, 20]
     assert smooth[0, 3, 4, 4]
+
+
+def test_cluster_means_by_hand():
+    saliency = jnp.array([[[0.0, 2, 4, 9]], [[1, 5, 9, 9]]])
+    labels = jnp.array([[[0, 0, 1, 2]], [[0, 1, 2, 2]]])  # means 1, 4.5, 9; label 3 has no token
+    made = np.asarray(cluster_means(saliency, labels, 4))[:, 0]
+    assert np.allclose(made, [[0, 0, 3.5 / 8, 1], [0, 3.5 / 8, 1, 1]], atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{"clusters": 3, "smooth_frames": 3}, {"threshold": "multi-otsu"}])
+def test_frames_that_make_shares_equal_change_no_mask(options):
+    generator = np.random.default_rng(0)
+    saliency = generator.random((2, 7, 4, 4)).astype(np.float32)
+    saliency[:, :, :2, 1:3] += 1
+    saliency[:, 5:] = 40 * saliency[:, 5:] - 20  # of the two frames that are added
+    tokens = saliency.reshape(2, 7, 16, 1) + generator.normal(0, 0.01, (2, 7, 16, 3)).astype(np.float32)
+    frames = Frames(Mesh(np.array(jax.devices()[:1]), ("frames",)), 5)
+    alone = jax.jit(lambda saliency, tokens: mine_mask(saliency, tokens, (16, 16), **options))(
+        saliency[:, :5], tokens[:, :5]
+    )
+    mine = frames.on_devices(
+        lambda saliency, tokens: mine_mask(saliency, tokens, (16, 16), frames=frames, **options), BY_FRAME, BY_FRAME
+    )
+    shared = np.asarray(jax.jit(mine)(saliency, tokens))
+    assert np.array_equal(shared[:, :5], alone)
+    assert not shared[:, 5:].any()
+    assert 0.1 < shared[:, :5].mean() < 0.6

@@ -12,9 +12,19 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from filelock import FileLock
 
+import vggtjax.storage.writing
 from vggtjax.errors import OutputError
-from vggtjax.storage.writing import _remove_leftovers, check_free, locked_folder, staging, writing
+from vggtjax.storage.writing import (
+    _remove_leftovers,
+    check_free,
+    locked_folder,
+    says_format,
+    staging,
+    write_errors,
+    writing,
+)
 
 WRITER = """
 import sys, time
@@ -118,14 +128,45 @@ def test_only_our_old_leftovers_without_a_lock_are_removed(tmp_path):
     for path in (ours, *(tmp_path / name for name in names)):
         path.mkdir()
         os.utime(path, (time.time() - 3600, time.time() - 3600))
-    for hours, left in ((1, {ours.name, *names}), (48, set(names))):
-        os.utime(ours, (time.time() - hours * 3600, time.time() - hours * 3600))
+    for seconds, left in ((-15, {ours.name, *names}), (15, set(names))):  # beside a day
         for name in names:
             os.utime(tmp_path / name, (0, 0))
+        day_ago = time.time() - 24 * 3600
+        os.utime(ours, (day_ago - seconds, day_ago - seconds))
         _remove_leftovers.cache_clear()
         with staging(tmp_path):
             pass
         assert {path.name for path in tmp_path.iterdir()} == left
+
+
+def test_a_folder_that_is_gone_or_never_was_is_no_error(tmp_path):
+    with staging(tmp_path) as staged:
+        staged.rmdir()
+    (tmp_path / f"{staged.name}.lock").touch()  # of a writer that was killed before it made its folder
+    _remove_leftovers.cache_clear()
+    with staging(tmp_path):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_locks_are_refused_at_once_and_released_by_any_thread(tmp_path, monkeypatch):
+    waits = []
+
+    class Recorded(FileLock):
+        def __init__(self, path, timeout, **options):
+            waits.append(timeout)
+            super().__init__(path, timeout, **options)
+
+    monkeypatch.setattr(vggtjax.storage.writing, "FileLock", Recorded)
+    (tmp_path / ".vggtjax-partial-0123456789abcdef.lock").touch()
+    _remove_leftovers.cache_clear()
+    with ThreadPoolExecutor(1) as pool, staging(tmp_path):
+        locked = locked_folder(tmp_path, "a batch")
+        pool.submit(locked.__enter__).result()
+        locked.__exit__(None, None, None)
+        with locked_folder(tmp_path, "a batch"):
+            pass
+    assert waits == [0] * 5  # its own, both in the folder, and the batches
 
 
 def test_a_folder_is_scanned_once(tmp_path, monkeypatch):
@@ -159,6 +200,39 @@ def test_a_file_system_without_locks_is_written_without_one(tmp_path, monkeypatc
                 path.write_text("whole")
     assert [str(warning.message)[:28] for warning in warned] == ["the file system has no locks"]
     assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
+
+
+def test_a_check_finds_files_that_may_not_be_replaced_and_leaves_nothing(tmp_path):
+    new, full = tmp_path / "a/b", tmp_path / "full"
+    check_free(new, ("x",), replaced=False, what="result")
+    assert not list(tmp_path.iterdir())
+    full.mkdir()
+    for name in ("x", "y"):
+        (full / name).write_text("theirs")
+    with pytest.raises(OutputError) as raised:
+        check_free(full, ("free", "x", "y"), replaced=False, what="result")
+    assert str(raised.value).startswith(f"{full / 'x'} exists and is not part of an earlier result, so it is not")
+    check_free(full, ("x",), replaced=True, what="result")
+    check_free(full, ("z",), replaced=False, what="result")
+    assert {path.name for path in full.iterdir()} == {"x", "y"}
+
+
+@pytest.mark.parametrize(("text", "says"), [('{"format": "a"}', True), ('{"format": "b"}', False), ("[", False)])
+def test_a_file_says_its_format(tmp_path, text, says):
+    (tmp_path / "file.json").write_text(text)
+    assert says_format(tmp_path / "file.json", "a") == says
+    assert not says_format(tmp_path / "missing.json", "a")
+
+
+def test_an_error_names_the_path_and_the_reason(tmp_path):
+    (tmp_path / "file").write_text("x")
+    blocked = (FileExistsError(errno.EEXIST, "exists"), f"{tmp_path / 'file'} is a file")
+    for error, reason in (blocked, (OSError(errno.ENOSPC, "no space"), "no space"), (OSError("it broke"), "it broke")):
+        with pytest.raises(OutputError) as raised, write_errors(tmp_path / "file/a"):
+            raise error
+        assert str(raised.value).startswith(f"cannot write {tmp_path / 'file/a'}: {reason}; choose")
+    with pytest.raises(OutputError, match="exists"), write_errors(tmp_path / "folder"):
+        raise FileExistsError(errno.EEXIST, "exists")
 
 
 def test_a_folder_that_another_run_fills_during_its_check_stays(tmp_path, monkeypatch):

@@ -189,7 +189,7 @@ def _release(lock: FileLock | None) -> None:
     if lock is None:
         return
     try:
-        with suppress(OSError):  # Windows cannot remove an open file
-            Path(lock.lock_file).unlink(missing_ok=True)  # before the release: afterwards another process may hold it
+        with suppress(OSError):  # it is gone, or open on Windows
+            Path(lock.lock_file).unlink()  # before the release: afterwards another process may hold it
     finally:  # also where Ctrl-C comes meanwhile
         lock.release()
