@@ -118,6 +118,7 @@ def _score(name: str, folder: Path, seconds: float, share: int, console: Console
     config = folder / "config.toml"
     config.write_text(_CONFIG.format(path=path, seconds=seconds, command=pytest, excluded=excluded))
     environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(folder / "cache"), "PYTHONPATH": str(root)}
+    environment["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # most programs of these tests are small
 
     def run(*words: str) -> None:
         done = subprocess.run(words, cwd=root, env=environment, capture_output=True, text=True, check=False)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.ndimage import gaussian_filter1d
-from scipy.spatial.transform import Rotation, Slerp
 
 from vggtjax.cameras import Cameras, camera_centres, world_from_camera
 
@@ -47,7 +46,8 @@ def orbit(cameras: Cameras, intrinsics: Float[np.ndarray, "3 3"], depth: float, 
     start = world_from_camera(np.asarray(cameras.camera_from_world, np.float64)[[middle_camera(cameras)]])[0]
     turns = 2 * np.pi * np.arange(count) / count
     yaw, pitch = SWING * np.sin(turns), -_LIFT - NOD * np.sin(2 * turns + np.pi / 2)
-    swing = Rotation.from_euler("yx", np.stack([yaw, pitch], axis=-1), degrees=True).as_matrix()
+    angles = np.stack([yaw, pitch], axis=-1)
+    swing = scipy.spatial.transform.Rotation.from_euler("yx", angles, degrees=True).as_matrix()
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = start[:3, :3] @ swing
     pivot = start[:3, 3] + depth * start[:3, 2]
@@ -66,19 +66,20 @@ def follow(cameras: Cameras, intrinsics: Float[np.ndarray, "3 3"], depth: float,
     """
     real = world_from_camera(np.asarray(cameras.camera_from_world, np.float64))
     frames = len(real)
-    turned = Rotation.from_matrix(real[:, :3, :3])
+    turned = scipy.spatial.transform.Rotation.from_matrix(real[:, :3, :3])
     if frames == 1:
         rotations, centres = np.tile(real[:, :3, :3], (count, 1, 1)), np.tile(real[:, :3, 3], (count, 1))
     else:
         times = np.linspace(0, frames - 1, count)
         spread = max(_SMOOTH * frames, 0.5) * (count - 1) / (frames - 1)
         steps = np.arange(frames)
-        rotations = Slerp(steps, turned)(times).as_matrix()
+        rotations = scipy.spatial.transform.Slerp(steps, turned)(times).as_matrix()
         centres = np.stack([np.interp(times, steps, real[:, axis, 3]) for axis in range(3)], axis=-1)
         rotations, centres = (
-            gaussian_filter1d(value, spread, axis=0, mode="nearest") for value in (rotations, centres)
+            scipy.ndimage.gaussian_filter1d(value, spread, axis=0, mode="nearest") for value in (rotations, centres)
         )
-        rotations = Rotation.from_matrix(rotations).as_matrix()  # the nearest rotation of a mean of matrices
+        # The nearest rotation of a mean of matrices.
+        rotations = scipy.spatial.transform.Rotation.from_matrix(rotations).as_matrix()
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = rotations
     poses[:, :3, 3] = centres - _FOLLOW_BACK * depth * rotations[:, :, 2]

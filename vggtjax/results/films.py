@@ -7,8 +7,8 @@ from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
+import scipy
 from jaxtyping import Float32, Int32, UInt8
-from scipy.spatial import KDTree
 
 from vggtjax.cameras import Cameras, frustum_corners, project
 from vggtjax.errors import InputError, check_choice, whole_number
@@ -151,7 +151,7 @@ def _splats(result: Result, points: ShownPoints) -> Splats:
         pixel[start:end] = result.depth[frame].ravel()[own] / focal
         reach[start:end] = np.hypot(pixel[start:end], _steps(result.depth[frame]).ravel()[own])
     if len(points.positions) > _NEIGHBOURS:
-        distance = KDTree(points.positions).query(points.positions, _NEIGHBOURS + 1, workers=-1)[0]
+        distance = scipy.spatial.KDTree(points.positions).query(points.positions, _NEIGHBOURS + 1, workers=-1)[0]
         reach = np.maximum(reach, distance[:, -1])
     width = _OVERLAP * np.clip(reach, pixel, _SPARSEST * pixel)
     return Splats(points.positions, points.values(result.images), width.astype(np.float32))

@@ -5,10 +5,10 @@ from __future__ import annotations
 from colorsys import hsv_to_rgb
 
 import numpy as np
+import skimage
 from cmap import Colormap
 from jaxtyping import Bool, Float32, UInt8
 from PIL import Image, ImageDraw, ImageFont
-from skimage.segmentation import find_boundaries
 
 from vggtjax.results.result import Result
 from vggtjax.storage.arrays import spread_frames
@@ -90,7 +90,7 @@ def overlay(
     ids = moving.astype(np.uint8)
     tinted = 0.55 * image + 0.45 * INSTANCE_COLORS[ids]
     drawn = np.where(ids[..., None] > 0, tinted, 0.5 * image + 0.5 * grey).round().astype(np.uint8)
-    drawn[find_boundaries(ids, mode="thick")] = _OUTLINE
+    drawn[skimage.segmentation.find_boundaries(ids, mode="thick")] = _OUTLINE
     return drawn
 
 
