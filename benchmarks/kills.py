@@ -158,9 +158,15 @@ def kill_command(name: str, folder: Path, *, kills: int, pairs: int, draws: rand
 
     at_changes = min(kills - kills // 10, 10 * changes)
     moments: list[int | float] = [1 + number * changes // at_changes for number in range(at_changes)]
-    moments += [draws.uniform(0.0, seconds) for _ in range(kills - at_changes)]
     killed = [0, 0]
-    for moment in track(moments, f"{name}: kills", transient=True):
+
+    def all_moments() -> Iterator[int | float]:
+        yield from moments
+        for _ in range(2 * kills):  # some come after the end
+            if sum(killed) < kills:
+                yield draws.uniform(0.0, seconds)
+
+    for moment in track(all_moments(), f"{name}: kills", total=kills, transient=True):
         is_change = isinstance(moment, int)
         label = f"killed at change {moment}" if is_change else f"killed after {moment:.2f} s"
         code, said = run(out, change=moment) if is_change else run(out, seconds=moment)

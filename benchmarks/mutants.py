@@ -2,6 +2,7 @@
 
 cosmic-ray (https://cosmic-ray.readthedocs.io) makes the changes, one at a time, in a copy of the repository, and runs
 the tests of the module. Install it in any environment whose programs are on the PATH: `pipx install cosmic-ray`.
+mutants.toml names the changes that no test can notice, and why.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import tomllib
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -71,7 +73,13 @@ class Score(NamedTuple):
     module: str
     changes: int
     noticed: int
+    equivalent: int  # changes of mutants.toml
     survivors: list[str]  # each a line's number, the line before and after
+
+    @property
+    def percent(self) -> float:
+        """The noticed changes, of those that could be noticed."""
+        return 100 * self.noticed / max(self.changes - self.equivalent, 1)
 
 
 def mutants(
@@ -101,11 +109,11 @@ def mutants(
         if out is not None:
             write_json(out, {"scores": [score._asdict() for score in scores]})
     table = Table(title="changes that the tests of a module notice", title_justify="left")
-    for heading in ("module", "changes", "noticed", "score"):
+    for heading in ("module", "changes", "noticed", "equivalent", "score"):
         table.add_column(heading, justify="left" if heading == "module" else "right")
     for score in scores:
-        percent = f"{100 * score.noticed / max(score.changes, 1):.1f} %"
-        table.add_row(MODULES[score.module].path, str(score.changes), str(score.noticed), percent)
+        counts = map(str, (score.changes, score.noticed, score.equivalent))
+        table.add_row(MODULES[score.module].path, *counts, f"{score.percent:.1f} %")
     console.print(table)
 
 
@@ -159,8 +167,10 @@ def _score(name: str, folder: Path, seconds: float, share: int, console: Console
         raise InputError(
             f"cosmic-ray ended with code {running.returncode} after {len(rows)} of {total} changes of {name}"
         )
-    survivors = [_shown(line, diff) for _, line, outcome, diff in rows if outcome == "SURVIVED"]
-    return Score(name, len(rows), len(rows) - len(survivors), survivors)
+    survivors = [(line, _shown(diff)) for _, line, outcome, diff in rows if outcome == "SURVIVED"]
+    noticed, known = len(rows) - len(survivors), _equivalent(name)
+    unknown = [f"{line}: {change}" for line, change in survivors if change not in known]
+    return Score(name, len(rows), noticed, len(survivors) - len(unknown), unknown)
 
 
 def _copy(root: Path) -> None:
@@ -177,8 +187,14 @@ def _rows(session: str) -> Sequence[tuple[str, int, str, str]]:
         return connection.execute(_ROWS).fetchall()
 
 
-def _shown(line: int, diff: str) -> str:
+def _equivalent(name: str) -> set[str]:
+    """Return the changes of a module that no test can notice."""
+    groups = tomllib.loads((Path(__file__).with_suffix(".toml")).read_text()).get(name, [])
+    return {f"{group['line']} -> {to}" for group in groups for to in group["to"]}
+
+
+def _shown(diff: str) -> str:
     """Return the changed lines of a diff."""
     lines = diff.splitlines()
     changed = [text[1:].strip() for text in lines if text[:1] in "+-" and not text.startswith(("+++", "---"))]
-    return f"{line}: {' -> '.join(changed)}"
+    return " -> ".join(changed)

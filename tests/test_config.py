@@ -96,6 +96,7 @@ def test_the_command_line_starts_without_jax():
 
 def test_a_reconstruction_starts_without_the_parts_of_scipy_and_scikit_image():
     late = ("scipy.spatial", "scipy.ndimage", "scipy.linalg", "skimage.segmentation", "skimage.morphology")
-    code = f"import sys, vggtjax.commands.reconstruct, vggtjax.pipeline.run; print([name for name in {late} if name in sys.modules])"
+    code = "import sys, vggtjax.commands.reconstruct, vggtjax.pipeline.run; "
+    code += f"print([name for name in {late} if name in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert ran.stdout == "[]\n"
