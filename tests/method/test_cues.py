@@ -1,5 +1,7 @@
 """Maps against every Gram matrix, sources of each frame, layers of other depths, and degenerate clips."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from jax.sharding import Mesh
 from tests import reference
 from vggtjax import MotionConfig
 from vggtjax.errors import InputError
-from vggtjax.method.cues import GramCues, normalise, sources
+from vggtjax.method.cues import GramCues, _sample_std, _unit, normalise, sources
 from vggtjax.network.frames import BY_FRAME, Frames
 
 OFFSETS = MotionConfig().offsets
@@ -33,10 +35,13 @@ def added(cues, q, k, frame_count=None):
     ("gram", "padding"), [("cosine", "none"), ("dot", "by count"), ("cosine", "on a device"), ("dot", "on a device")]
 )
 def test_maps_and_saliency_are_those_of_every_gram_matrix(gram, padding):
-    S, motion = 9, MotionConfig()
+    S, layers = 9, ((0,), (1,), (2, 3), (3, 4, 5), (4, 5))
+    rows = zip(MotionConfig().cues, layers, strict=True)
+    motion = MotionConfig(tuple(dataclasses.replace(cue, layers=of_cue) for cue, of_cue in rows), reference_depth=DEPTH)
     q, k = np.random.default_rng(0).normal(size=(2, DEPTH, S + 2, SPECIAL + PATCHES, 2, 4)).astype(np.float32)
     mesh = Mesh(np.array(jax.devices()[:1]), ("frames",))
     cues = GramCues(motion, DEPTH, gram, Frames(mesh, S) if padding == "on a device" else Frames())
+    assert hash(cues) == hash(dataclasses.replace(cues))  # it can be a static argument
     given = S if padding == "none" else S + 2
     count = jnp.array([S]) if padding == "by count" else None
     sums = tuple(x[:, :S] for x in added(cues, q[:, :given], k[:, :given], count))
@@ -51,6 +56,12 @@ def test_maps_and_saliency_are_those_of_every_gram_matrix(gram, padding):
     assert np.allclose(cues.saliency(sums)[0], (product - low) / (high - low + 1e-6), atol=1e-3)
     squared = cues.saliency(sums, jnp.full(5, 2.0))[0]
     assert np.allclose(squared, np.asarray(normalise(jnp.asarray(product[None] ** 2)))[0], atol=1e-3)
+
+
+def test_deviations_and_directions_by_hand():
+    values = jnp.asarray([[[2.0, 3, 4, 7], [1, 1, 1, 1]]] * 3)
+    assert np.allclose(_sample_std(values), np.std(values, axis=-1, ddof=1))
+    assert np.allclose(_unit(jnp.asarray([[3.0, 4.0], [0.0, 0.0]])), [[0.6, 0.8], [0, 0]])
 
 
 def test_an_unknown_similarity_is_refused():

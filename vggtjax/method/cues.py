@@ -122,8 +122,6 @@ class GramCues:
         """
         maps = self.maps(sums)
         product = jnp.ones_like(next(iter(maps.values())))
-        if self.frames.counted(product.shape[1]) == 1:
-            return jnp.zeros_like(product)
         for i, cue in enumerate(self.motion.cues):
             factor = 1 - maps[cue.name] if cue.inverted else maps[cue.name]
             product = product * (factor if exponents is None else _power(factor, exponents[i]))
