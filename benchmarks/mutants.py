@@ -2,7 +2,7 @@
 
 cosmic-ray (https://cosmic-ray.readthedocs.io) makes the changes, one at a time, in a copy of the repository, and runs
 the tests of the module. Install it in any environment whose programs are on the PATH: `pipx install cosmic-ray`.
-mutants.toml names the changes that no test can notice, and why.
+mutants.toml names the changes that the module's own tests cannot notice, and why.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ def _rows(session: str) -> Sequence[tuple[str, int, str, str]]:
 
 
 def _equivalent(name: str) -> set[str]:
-    """Return the changes of a module that no test can notice."""
+    """Return the changes of a module that its own tests cannot notice."""
     groups = tomllib.loads((Path(__file__).with_suffix(".toml")).read_text()).get(name, [])
     return {f"{group['line']} -> {to}" for group in groups for to in group["to"]}
 
