@@ -58,6 +58,11 @@ def test_multi_otsu_of_constant_saliency_has_no_dynamic_pixels(saliency):
     assert not dynamic_pixels(jnp.asarray(saliency), (28, 28), threshold="multi-otsu").any()
 
 
+def test_multi_otsu_of_nearly_constant_values_is_the_largest():
+    values = jnp.asarray([0.5] * 3 + [0.5000005])
+    assert float(_multi_otsu(values)) == float(values[-1])
+
+
 @settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
@@ -147,7 +152,7 @@ def test_cluster_means_by_hand():
     assert np.allclose(made, [[0, 0, 3.5 / 8, 1], [0, 3.5 / 8, 1, 1]], atol=1e-6)
 
 
-@pytest.mark.parametrize("options", [{"clusters": 3, "smooth_frames": 3}, {"threshold": "multi-otsu"}])
+@pytest.mark.parametrize("options", [{}, {"clusters": 3, "smooth_frames": 3}, {"threshold": "multi-otsu"}])
 def test_frames_that_make_shares_equal_change_no_mask(options):
     generator = np.random.default_rng(0)
     saliency = generator.random((2, 7, 4, 4)).astype(np.float32)
