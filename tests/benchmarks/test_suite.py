@@ -163,23 +163,17 @@ def quickly():
     jax.config.update("jax_disable_most_optimizations", False)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory):
-    """A folder that keeps a run of everything for those that come after."""
-    return tmp_path_factory.mktemp("run")
-
-
-def test_every_workload_runs(run, capsys, monkeypatch):
+def test_every_workload_runs(tmp_path, capsys, monkeypatch):
     """But for those of other tests; compiling is timed with a smaller program."""
     elsewhere = {"start-up", "aggregator", "depth-head", "two-passes"}
     names = [name for name in WORKLOADS if name not in elsewhere]
     monkeypatch.setattr(workloads, "two_passes", workloads.cue_sums)
-    files = ["--out", str(run / "a.json"), "--markdown", str(run / "a.md"), "--plots", str(run)]
+    files = ["--out", str(tmp_path / "a.json"), "--markdown", str(tmp_path / "a.md"), "--plots", str(tmp_path)]
     arguments = ["--sizes", "tiny", "--frames", "2", "--repeats", "1", "--workloads", *names]
     code = benchmarks.main(["suite", *arguments, *files])
     shown = capsys.readouterr()
     assert code == 0, shown.err
-    stored = json.loads((run / "a.json").read_text())
+    stored = json.loads((tmp_path / "a.json").read_text())
     assert stored["machine"]["jax"] == jax.__version__
     assert all(min(rates) > 0 for rates in stored["ceilings"]["tiny"].values())
     rows = stored["rows"]
@@ -194,34 +188,36 @@ def test_every_workload_runs(run, capsys, monkeypatch):
             assert row["flop_per_second"] == pytest.approx(row["flop"] / row["median"])
             assert row["compile_seconds"] > 0
             assert row["output_bytes"] > 0
-    assert "| pass | 2 |" in (run / "a.md").read_text()
+    assert "| pass | 2 |" in (tmp_path / "a.md").read_text()
     for name in ("roofline", "scaling"):
-        with Image.open(run / f"{name}.png") as figure:
+        with Image.open(tmp_path / f"{name}.png") as figure:
             assert min(figure.size) > 300
 
 
-def test_a_stored_run_is_compared(run, capsys, monkeypatch):
+def test_a_stored_run_is_compared(tmp_path, capsys, monkeypatch):
     quick = WORKLOADS["cues"]._replace(measure=lambda case, rounds: {"": Measured(tuple(0.5 for _ in rounds))})
     monkeypatch.setitem(WORKLOADS, "cues", quick)
-    arguments = ["--sizes", "tiny", "--frames", "2", "4", "--repeats", "1", "--workloads", "cues"]
-    assert benchmarks.main(["suite", *arguments, "--against", str(run / "a.json"), "--out", str(run / "b.json")]) == 0
+    arguments = ["suite", "--sizes", "tiny", "--repeats", "1", "--workloads", "cues"]
+    assert benchmarks.main([*arguments, "--frames", "2", "--out", str(tmp_path / "a.json")]) == 0
+    against = ["--against", str(tmp_path / "a.json"), "--out", str(tmp_path / "b.json")]
+    assert benchmarks.main([*arguments, "--frames", "2", "4", *against]) == 0
     shown = capsys.readouterr().out
     assert "1 of 2 rows" in shown  # four frames are not in the stored run
-    now, then = (json.loads((run / name).read_text())["rows"] for name in ("b.json", "a.json"))
+    now, then = (json.loads((tmp_path / name).read_text())["rows"] for name in ("b.json", "a.json"))
     before = next(row["median"] for row in then if row["workload"] == "cues" and row["frames"] == 2)
     assert f"{now[0]['median'] / before:.3f}" in shown
 
 
-def test_starting_up(run, monkeypatch, capsys):
+def test_starting_up(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(
         workloads, "DEMO", ("-c", "import os, pathlib; pathlib.Path(os.environ['VGGTJAX_CACHE']).mkdir()")
     )
-    arguments = ["--workloads", "start-up", "--sizes", "tiny", "--repeats", "1", "--out", str(run / "start.json")]
+    arguments = ["--workloads", "start-up", "--sizes", "tiny", "--repeats", "1", "--out", str(tmp_path / "start.json")]
     assert benchmarks.main(["suite", *arguments]) == 2  # the second run finds the cache of the first
     assert "FileExistsError" in capsys.readouterr().err
     monkeypatch.setattr(workloads, "DEMO", ("-c", "import time; time.sleep(0.1)"))
     assert benchmarks.main(["suite", *arguments]) == 0, capsys.readouterr().err
-    seconds = {row["workload"]: row["median"] for row in json.loads((run / "start.json").read_text())["rows"]}
+    seconds = {row["workload"]: row["median"] for row in json.loads((tmp_path / "start.json").read_text())["rows"]}
     assert set(seconds) == {
         "start-up: import vggtjax, no jax",
         "start-up: vggtjax --help, no jax",

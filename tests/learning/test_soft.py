@@ -23,10 +23,11 @@ SHAPE = (1, 4, 16, 24, 3)
 @functools.cache
 def params():
     """Return weights under which blocks matter: LayerScale starts at 0.01 in training."""
-    tree = init_params(0, CONFIG)
-    for blocks in ("frame_blocks", "global_blocks"):
-        for name in ("scale1", "scale2"):
-            tree["aggregator"][blocks][name] = jnp.ones_like(tree["aggregator"][blocks][name])
+    with jax.ensure_compile_time_eval():  # the first call may be inside a program
+        tree = init_params(0, CONFIG)
+        for blocks in ("frame_blocks", "global_blocks"):
+            for name in ("scale1", "scale2"):
+                tree["aggregator"][blocks][name] = jnp.ones_like(tree["aggregator"][blocks][name])
     return tree
 
 

@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import re
+import shutil
 import subprocess
 import sys
 from typing import Any
@@ -189,11 +190,12 @@ def test_a_set_goes_on_where_it_stopped(written, tmp_path, monkeypatch):
     assert files(out) == files(written)  # as if it had never stopped
 
 
-def test_fewer_scenes_keep_those_that_are_there(written):
-    before = files(written)
-    assert write_scenes(written, CONFIG, count=1, seed=3) == [written / "scene_0000"]
-    after = files(written)
-    assert read_index(written)["scenes"] == ["scene_0000", "scene_0001"]
+def test_fewer_scenes_keep_those_that_are_there(written, tmp_path):
+    before, copy = files(written), tmp_path / "set"
+    shutil.copytree(written, copy)
+    assert write_scenes(copy, CONFIG, count=1, seed=3) == [copy / "scene_0000"]
+    after = files(copy)
+    assert read_index(copy)["scenes"] == ["scene_0000", "scene_0001"]
     assert {name: after[name] for name in before if name != "preview.png"} == {
         name: before[name] for name in before if name != "preview.png"
     }
