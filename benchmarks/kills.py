@@ -11,9 +11,8 @@ import hashlib
 import os
 import random
 import signal
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from fnmatch import fnmatch
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,6 +24,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.killed_process import finish, fork, start
 from benchmarks.make_checkpoint import make_checkpoint
 from benchmarks.seeded import seeded_images
 from vggtjax.config import VGGTConfig
@@ -32,9 +32,7 @@ from vggtjax.errors import InputError
 from vggtjax.storage.json_values import read_json
 
 _ROOT = Path(__file__).parents[1]
-_EVENTS = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link"}
 _SIZE, _FRAMES, _CLIPS = 56, 3, 4
-_LONGEST = 900.0  # seconds of one run
 TINY = VGGTConfig(
     image_size=_SIZE,
     embed_dim=16,
@@ -134,7 +132,7 @@ def kill_command(name: str, folder: Path, *, kills: int, pairs: int, draws: rand
 
     def run(out: Path, **how: Any) -> tuple[int, str]:
         out.mkdir(parents=True, exist_ok=True)
-        return _finish(*_start(words(out), work / "log", out, **how), work / "log")
+        return finish(*start(words(out), work / "log", out, **how), work / "log")
 
     out = work / "out"
     count_file, wholes, seconds = work / "count", [], 1.0
@@ -195,8 +193,8 @@ def kill_command(name: str, folder: Path, *, kills: int, pairs: int, draws: rand
         _clear(out)
     for number in track(range(pairs), f"{name}: two at once", transient=True):
         out.mkdir(parents=True, exist_ok=True)
-        started = [_start(words(out), work / f"log{side}", out) for side in (0, 1)]
-        ends = [_finish(*process, work / f"log{side}") for side, process in enumerate(started)]
+        started = [start(words(out), work / f"log{side}", out) for side in (0, 1)]
+        ends = [finish(*process, work / f"log{side}") for side, process in enumerate(started)]
         if all(code for code, _ in ends):
             problems.append(f"round {number} of two: neither ends: {ends[0][1]}; {ends[1][1]}")
         for code, said in ends:
@@ -234,10 +232,10 @@ def prepare(inputs: Path, commands: tuple[str, ...]) -> None:
 
     code, said = 0, ""
     if any("{inputs}/model.safetensors" in CASES[name].words or name == "export" for name in commands):
-        code, said = _finish(*_fork(write_model, inputs / "log"), inputs / "log")
+        code, said = finish(*fork(write_model, inputs / "log"), inputs / "log")
     if not code and "export" in commands:
         words = CASES["reconstruct"].words.replace("{out}", "{inputs}").format(inputs=inputs).split()
-        code, said = _finish(*_start(words, inputs / "log", inputs), inputs / "log")
+        code, said = finish(*start(words, inputs / "log", inputs), inputs / "log")
     if code:
         raise InputError(f"the inputs cannot be made: {said}")
 
@@ -274,94 +272,3 @@ def _clear(folder: Path) -> None:
     import shutil
 
     shutil.rmtree(folder, ignore_errors=True)
-
-
-def _start(
-    words: list[str],
-    log: Path,
-    watched: Path,
-    *,
-    count: Path | None = None,
-    change: int | None = None,
-    seconds: float | None = None,
-) -> tuple[int, float | None]:
-    """Start a command in a child; it kills itself at a change of a file, or notes the number of changes."""
-
-    def run() -> int:
-        from vggtjax.commands.main import main
-        from vggtjax.storage.cache import enable_compilation_cache
-
-        enable_compilation_cache()  # a command does it before jax is imported
-        changes = _watch(watched, change)
-        code = main(words)
-        if count is not None:
-            count.write_text(str(next(changes)))
-        return code
-
-    return _fork(run, log, seconds)
-
-
-def _watch(folder: Path, fatal: int | None) -> Iterator[int]:
-    """Count changes of files below a folder, and kill the process just before one; yields how many there were."""
-    inside, done = str(folder), [0]
-    sync = os.fsync
-
-    def changed() -> None:
-        done[0] += 1
-        if done[0] == fatal:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    def hook(event: str, arguments: tuple) -> None:
-        if event == "open":
-            path, _, flags = arguments
-            is_change = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR)
-        else:
-            path, is_change = arguments[0] if arguments else None, event in _EVENTS
-        if is_change and isinstance(path, str | os.PathLike) and os.fspath(path).startswith(inside):
-            changed()
-
-    def fsync(file: Any) -> None:
-        changed()
-        sync(file)
-
-    sys.addaudithook(hook)
-    os.fsync = fsync
-
-    def counts() -> Iterator[int]:
-        yield done[0]
-
-    return counts()
-
-
-def _fork(run: Callable[[], int], log: Path, seconds: float | None = None) -> tuple[int, float | None]:
-    """Run a function in a child whose output goes to a file; return its process, and when it is to be killed."""
-    import jax  # noqa: F401  imported before the fork, and with nothing started: no child imports it again
-
-    import vggtjax.pipeline.batch  # noqa: F401
-
-    log.parent.mkdir(parents=True, exist_ok=True)
-    process = os.fork()
-    if process:
-        return process, seconds
-    code = 70
-    try:
-        with log.open("wb") as file:
-            os.dup2(file.fileno(), 1)
-            os.dup2(file.fileno(), 2)
-            code = run()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-
-
-def _finish(process: int, seconds: float | None, log: Path) -> tuple[int, str]:
-    """Wait for a child, or kill it after so many seconds; return its exit code and the end of what it said."""
-    end = time.perf_counter() + (_LONGEST if seconds is None else seconds)
-    while True:
-        found, status = os.waitpid(process, os.WNOHANG)
-        if found:
-            return os.waitstatus_to_exitcode(status), log.read_text(errors="replace")[-300:]
-        if time.perf_counter() > end:
-            os.kill(process, signal.SIGKILL)
-        time.sleep(0.005)

@@ -16,9 +16,9 @@ ROOT = Path(__file__).parents[2]
 _WRITES = """
 import os, sys
 from pathlib import Path
-from benchmarks import kills
+from benchmarks import killed_process
 folder = Path(sys.argv[1])
-kills._watch(folder, 3)
+killed_process.watch(folder, 3)
 (folder.parent / "elsewhere").write_text("not counted")
 (folder / "a").write_text("first")
 (folder / "a").replace(folder / "b")
