@@ -37,6 +37,28 @@ def test_what_is_finished_is_not_done_again(tmp_path, three):
     assert after[0].metrics == records[0].metrics
 
 
+def test_a_killed_run_leaves_nothing_that_stops_the_next_one(tmp_path, monkeypatch):
+    store, other = Records(tmp_path / "out"), Records(tmp_path / "out")
+
+    def killed(path):
+        assert not store.folder.exists()  # no folder without a mark, at any moment
+        other.begin()  # another run, at the same moment
+        path.write_text("half")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("vggtjax.evaluation.records._mark", lambda path: (patch.undo(), killed(path)))
+        store.begin()
+    assert [path.name for path in store.folder.iterdir()] == ["evaluation.json"]
+    assert "half" not in (store.folder / "evaluation.json").read_text()
+
+    names = ("a/.vggtjax-partial-0123456789abcdef", "a/.vggtjax-partial-0123456789abcdef.lock", "a/vggt.json")
+    (store.folder / names[0]).mkdir(parents=True)
+    for name in names[1:]:
+        (store.folder / name).touch()
+    store.begin()
+    assert [path.name for path in (store.folder / "a").iterdir()] == ["vggt.json"]
+
+
 def test_what_has_changed_is_done_again(tmp_path, three):
     room, (sequence, *_) = three
     store = Records(tmp_path / "out")

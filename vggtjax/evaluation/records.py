@@ -13,10 +13,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vggtjax.errors import InputError, ResultError, one_line
+from vggtjax.errors import InputError, OutputError, ResultError, one_line
 from vggtjax.storage.arrays import read_arrays, write_arrays
 from vggtjax.storage.json_values import Natural, read_json
-from vggtjax.storage.writing import writing
+from vggtjax.storage.writing import remove_leftovers, writing
 
 FOLDER = "sequences"
 BOTH_OVER_ONE = "both passes over one"
@@ -50,9 +50,21 @@ class Records:
         return (self.folder / _MARK).is_file()
 
     def begin(self) -> None:
-        """Make the folder, with a file that marks it as a folder of records."""
-        with writing(self.folder / _MARK) as path:
-            path.write_text('{"format": "records of vggtjax evaluate"}\n', encoding="utf-8")
+        """Make the folder, with a file that marks it as a folder of records; remove what killed runs left in it."""
+        try:
+            if not self.folder.exists():
+                with writing(self.folder) as folder:  # a run that is killed here leaves no folder without a mark
+                    folder.mkdir()
+                    _mark(folder / _MARK)
+            elif not self.exists():
+                with writing(self.folder / _MARK) as path:
+                    _mark(path)
+        except OutputError:
+            if not self.exists():  # else another run has made it meanwhile
+                raise
+        for folder in (self.folder, *self.folder.iterdir()):  # a kept record is not written again, nor is its folder
+            if folder.is_dir() and not folder.is_symlink():
+                remove_leftovers(folder)
 
     def kept(self, name: str, method: str, settings: Mapping[str, Any]) -> Record | None:
         """Return the record of an earlier successful run with equal settings; None if there is no such record."""
@@ -83,6 +95,10 @@ class Records:
 
     def _path(self, name: str, method: str, suffix: str) -> Path:
         return self.folder / safe_name(name) / f"{safe_name(method)}.{suffix}"
+
+
+def _mark(path: Path) -> None:
+    path.write_text('{"format": "records of vggtjax evaluate"}\n', encoding="utf-8")
 
 
 def shown_name(name: str) -> str:
