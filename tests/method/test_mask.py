@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.sharding import Mesh
-from skimage.filters import threshold_otsu
+from skimage.filters import threshold_multiotsu, threshold_otsu
 
 from tests.reference import multi_otsu
 from vggtjax.errors import InputError
 from vggtjax.method.mask import (
+    _between_classes,
+    _partition,
     cluster_means,
     dynamic_pixels,
     dynamic_tokens,
@@ -77,6 +79,20 @@ def test_multi_otsu_agrees_with_scikit_image_within_a_bin(seed, centres, spread)
     assert abs(float(_multi_otsu(values)) - multi_otsu(values)) <= 1.01 * width + 1e-6
 
 
+@pytest.mark.parametrize("classes", [2, 3, 4])
+def test_partitions_of_small_histograms_are_those_of_scikit_image(classes):
+    generator = np.random.default_rng(classes)
+    partition = jax.jit(lambda shares: _partition(_between_classes(shares), classes))
+    for counts in generator.integers(1, 1000, size=(100, 7)):
+        expected = threshold_multiotsu(classes=classes, hist=(counts, np.arange(7)))
+        assert np.asarray(partition(counts / counts.sum())).tolist() == expected.tolist()
+
+
+def test_multi_otsu_with_a_class_of_one_value():
+    values = jnp.asarray([0.0] * 4 + [0.5] * 4 + [1.0])
+    assert float(_multi_otsu(values)) == pytest.approx(128.5 / 256)  # three classes: the bin of 0.5 is the last below
+
+
 def test_multi_otsu_cuts_every_clip_at_its_own_threshold():
     saliency = np.zeros((2, 2, 4, 4), np.float32)
     saliency[0, :, :2] = 1.0  # two values alone
@@ -109,6 +125,12 @@ def test_dynamic_pixels_are_at_or_above_the_threshold_of_their_own_clip():
         assert 0 < mask[clip].mean() < 0.5
 
 
+def test_a_pixel_at_the_threshold_is_dynamic_by_otsu_alone():
+    saliency = jnp.asarray([0, 0, 0, 1 / 512, 1, 1]).reshape(1, 1, 2, 3)  # the centre of the first of 256 bins
+    assert dynamic_pixels(saliency, (2, 3)).ravel().tolist() == [False] * 3 + [True] * 3
+    assert dynamic_pixels(saliency, (2, 3), threshold="multi-otsu").ravel().tolist() == [False] * 4 + [True] * 2
+
+
 def test_upsampling_has_half_pixel_centres():
     made = np.asarray(upsample(jnp.asarray([[[[0.0, 1.0]]]]), (1, 4)))
     assert np.allclose(made, [[[[0, 0.25, 0.75, 1]]]])
@@ -124,6 +146,7 @@ def test_smoothing_over_time_by_hand():
     saliency = jnp.array([0.0, 3, 0, 0, 9])[None, :, None, None]
     smoothed = smooth_over_time(saliency, 3)
     np.testing.assert_allclose(smoothed[0, :, 0, 0], [1.5, 1, 1, 3, 4.5], rtol=1e-6)
+    np.testing.assert_allclose(smooth_over_time(saliency, 5)[0, :, 0, 0], [1, 0.75, 2.4, 3, 3], rtol=1e-6)
     assert smooth_over_time(saliency, 1) is saliency
     np.testing.assert_allclose(smooth_over_time(saliency, 99)[0, :, 0, 0], [2.4] * 5, rtol=1e-6)
 
