@@ -1,7 +1,8 @@
 # Everything in two commands on a machine with Python and git: `make demo` and `make test`.
 # The docs site, in site/: `make docs`; its pictures of the demo: `make pictures`.
 # The environment of the lock, every file by its hash: `make locked`, before the others. `make lock` makes the lock anew,
-# from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the same wheel anywhere.
+# from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the last commit,
+# without what is not committed: the same wheel anywhere.
 # While you work: `make check`, which is lint, types and the tests that run no network, in a few minutes.
 
 PYTHON ?= python3
@@ -67,7 +68,11 @@ sbom: $(SUPPLY)/.installed
 
 dist: $(SUPPLY)/.installed
 	rm -rf build dist
-	SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) $(SUPPLY)/bin/python -m build --no-isolation
+	mkdir -p build/source
+	git -c tar.umask=022 archive HEAD | (umask 022 && tar -xf - -C build/source)
+	umask 022 && SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct) \
+	  $(SUPPLY)/bin/python -m build --no-isolation --outdir dist build/source
+	rm -rf build
 
 clean:
 	rm -rf $(VENV) build dist site demo-output sbom.json *.egg-info

@@ -15,31 +15,52 @@ ROOT = Path(__file__).parents[1]
 _MOST_BYTES = 30e6  # of the wheel; the embedded model is nearly all of it
 
 
-def sources(folder: Path) -> Path:
-    """Copy what a wheel is built from: setuptools leaves a build folder, whose stale files would enter later wheels."""
+def repository(folder: Path, umask: int) -> Path:
+    """Commit what a wheel is built from, as it is now, in a repository of its own under a umask."""
     folder.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, folder)
+    for name in ("pyproject.toml", "README.md", "LICENSE", "Makefile"):
+        shutil.copyfile(ROOT / name, folder / name)
     for name in ("vggtjax", "converters", "tests"):
-        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+        skipped = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, folder / name, ignore=skipped, copy_function=shutil.copyfile)
+    day = {f"GIT_{who}_DATE": "2026-01-01T00:00:00Z" for who in ("AUTHOR", "COMMITTER")}
+    author = (
+        "-c",
+        "user.name=test",
+        "-c",
+        "user.email=test@localhost",
+        "-c",
+        "commit.gpgsign=false",
+        "-c",
+        "core.compression=0",
+    )
+    for command in (["init", "--quiet"], ["add", "--all"], ["commit", "--quiet", "--message", "All"]):
+        subprocess.run(["git", *author, *command], cwd=folder, check=True, umask=umask, env=os.environ | day)
+    for path in folder.rglob("*"):
+        path.chmod((0o777 if path.is_dir() else 0o666) & ~umask)
     return folder
 
 
-def build_wheel(source: Path, out: Path) -> Path:
-    command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(out), str(source)]
-    dated = os.environ | {"SOURCE_DATE_EPOCH": "1700000000"}
-    made = subprocess.run(command, capture_output=True, text=True, check=False, env=dated)
+def build_wheel(source: Path, umask: int) -> Path:
+    """Return the wheel of `make dist`, with this environment's Python in place of the pinned tools."""
+    tools = source / ".venv" / "tools"
+    (tools / "bin").mkdir(parents=True)
+    (tools / "bin" / "python").write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@" --wheel\n')
+    (tools / "bin" / "python").chmod(0o755)
+    command = ["make", "dist", f"SUPPLY={tools}", f"--old-file={tools}/.installed"]
+    made = subprocess.run(command, cwd=source, capture_output=True, text=True, check=False, umask=umask)
     assert made.returncode == 0, made.stdout[-2000:] + made.stderr[-2000:]
-    (wheel,) = out.glob("*.whl")
+    (wheel,) = (source / "dist").glob("*.whl")
     return wheel
 
 
 def test_the_wheel_works_outside_the_repository_and_rebuilds_bit_by_bit(tmp_path):
-    wheel = build_wheel(sources(tmp_path / "source"), tmp_path)
-    again = sources(tmp_path / "again")
+    wheel = build_wheel(repository(tmp_path / "source", 0o022), 0o022)
+    again = repository(tmp_path / "again", 0o077)
+    (again / "vggtjax" / "stale.py").write_text("not committed")
     for path in again.rglob("*"):
         os.utime(path, (1e9, 1e9))
-    assert build_wheel(again, tmp_path / "rebuilt").read_bytes() == wheel.read_bytes()
+    assert build_wheel(again, 0o077).read_bytes() == wheel.read_bytes()
     assert wheel.stat().st_size < _MOST_BYTES
     with zipfile.ZipFile(wheel) as archive:
         names = archive.namelist()

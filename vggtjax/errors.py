@@ -14,16 +14,11 @@ _LEAST_PROBLEMS = 200  # letters of a message that are left to the problems whic
 class VggtjaxError(Exception):
     """Base of all exceptions that this library raises on purpose.
 
-    As text it is one printable line of at most MOST_LETTERS letters, whatever a stranger's file put into it: the middle
-    of a longer message is left out, so that the advice at its end stays.
+    As text it is a `message_line`, whatever a stranger's file put into it.
     """
 
     def __str__(self) -> str:
-        text = printable(super().__str__())
-        if len(text) <= MOST_LETTERS:
-            return text
-        end = MOST_LETTERS // 3
-        return f"{text[: MOST_LETTERS - end - 5]} ... {text[-end:]}"
+        return message_line(super().__str__())
 
 
 class InputError(VggtjaxError, ValueError):
@@ -125,6 +120,18 @@ def one_line(text: str, most: int = 300) -> str:
     """Return text for one line of a terminal, a table or a page: printable, at most `most` letters."""
     line = " ".join(text[: 4 * most].split())
     return printable(line if len(line) <= most else f"{line[: most - 3]}...")
+
+
+def message_line(text: str) -> str:
+    """Return the text of a message on one printable line of at most MOST_LETTERS letters.
+
+    The middle of a longer message is left out, so that the advice at its end stays.
+    """
+    line = printable(text)
+    if len(line) <= MOST_LETTERS:
+        return line
+    end = MOST_LETTERS // 3
+    return f"{line[: MOST_LETTERS - end - 5]} ... {line[-end:]}"
 
 
 def printable(text: str) -> str:

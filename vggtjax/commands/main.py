@@ -36,7 +36,7 @@ from vggtjax.commands.render import render
 from vggtjax.commands.scenes import scenes
 from vggtjax.commands.train import train
 from vggtjax.commands.view import view
-from vggtjax.errors import InputError, VggtjaxError, one_line
+from vggtjax.errors import InputError, VggtjaxError, message_line, one_line, printable
 from vggtjax.storage.cache import enable_compilation_cache
 
 COMMANDS = {
@@ -63,11 +63,23 @@ _OUT_OF_MEMORY = "out of memory; take fewer frames (--max-frames, --stride) or a
 _OLD_FLAGS = {"--mode": "--preprocess"}  # still understood
 
 
+class _OneLine(logging.Formatter):
+    """A message on one printable line, whatever names of files are in it; a traceback on printable lines below it."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        lines = [f"vggtjax: {message_line(record.getMessage())}"]
+        if record.exc_info:
+            lines += map(printable, self.formatException(record.exc_info).split("\n"))
+        return "\n".join(lines)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, 1 if nobody reads the output, 2 for errors, 130 if interrupted."""
     keep_freed_memory()
     atexit.register(gc.freeze)  # at the end there is nothing to collect, and a last collection takes half a second
-    logging.basicConfig(format="vggtjax: %(message)s", level=logging.INFO)
+    handler = logging.StreamHandler()
+    handler.setFormatter(_OneLine())
+    logging.basicConfig(handlers=[handler], level=logging.INFO)
     for chatty in ("jax", "absl", "orbax", "matplotlib", "httpx", "httpx2", "huggingface_hub", "websockets", "numexpr"):
         logging.getLogger(chatty).setLevel(logging.ERROR)
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
@@ -104,7 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message, code = _OUT_OF_MEMORY if error.errno == errno.ENOMEM else text, 2
     except KeyboardInterrupt:
         message, code = "interrupted", 130
-    sys.stderr.write(f"vggtjax: {message}\n")
+    sys.stderr.write(f"vggtjax: {message_line(message)}\n")
     return code
 
 
@@ -156,6 +168,6 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
             if isinstance(error, VggtjaxError):
                 raise error from None
             error = error.__context__
-        sys.stderr.write(complaint.getvalue())
+        sys.stderr.write("\n".join(map(printable, complaint.getvalue().split("\n"))))
         sys.stdout.flush()  # of a help page
         raise

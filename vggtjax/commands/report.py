@@ -16,7 +16,7 @@ from rich.progress import Progress as Bars
 from rich.table import Table
 from rich.text import Text
 
-from vggtjax.errors import one_line
+from vggtjax.errors import one_line, printable
 from vggtjax.progress import Progress
 
 if TYPE_CHECKING:
@@ -128,11 +128,11 @@ class Report:
 
     def note(self, text: str) -> None:
         """Print one line among the stages, on standard error."""
-        self._console.print(Text(text), soft_wrap=True)
+        self._console.print(Text(printable(text)), soft_wrap=True)
 
     def line(self, text: str) -> None:
-        """Print one line."""
-        self._out.print(Text(text), soft_wrap=True)
+        """Print one line on standard output."""
+        self._out.print(Text(printable(text)), soft_wrap=True)
 
 
 class _Count(MofNCompleteColumn):

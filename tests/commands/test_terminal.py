@@ -1,0 +1,52 @@
+"""What a command prints: names of files forge no line of the terminal and send it no control characters."""
+
+import errno
+import logging
+import pickle
+import warnings
+
+import pytest
+
+from vggtjax.commands import main as cli
+from vggtjax.commands.report import Report
+
+
+def test_names_of_files_forge_no_lines(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "evil\x1b]0;title\x07\nvggtjax: all is well.pt"
+    path.write_bytes(pickle.dumps("damaged", protocol=2))
+    shown = f"{tmp_path}/evil?]0;title? vggtjax: all is well.pt"
+
+    def printed(*arguments: str) -> tuple[str, list[str]]:
+        with monkeypatch.context() as patch:
+            patch.setattr(logging.root, "handlers", [])  # as in a process of its own
+            assert cli.main(arguments) == 2
+        out, err = capsys.readouterr()
+        assert all(letter == "\n" or letter.isprintable() for letter in out + err)
+        return out, err.splitlines()
+
+    _, (warned, failed) = printed("info", str(path))
+    assert warned == f"vggtjax: {shown} has the format of torch before 1.6: the whole file is read into memory"
+    assert failed.startswith(f"vggtjax: {shown} ")
+
+    def command() -> None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            warnings.warn(f"{path} is odd", stacklevel=1)
+        logging.getLogger("vggtjax").error("%s", "x" * 5000, exc_info=ValueError(str(path)))
+        Report().note(f"{path} is noted")
+        Report().line(f"{path} is printed")
+        raise FileNotFoundError(errno.ENOENT, "no such file", str(path))
+
+    monkeypatch.setitem(cli.COMMANDS, "scenes", command)
+    out, (odd, long, *traceback, noted, failed) = printed("scenes")
+    assert odd == f"vggtjax: {shown} is odd"
+    assert len(long) < 500
+    assert traceback[0].startswith("ValueError: ")
+    assert noted == f"{shown} is noted"
+    assert failed == f"vggtjax: {shown}: no such file"
+    assert out == f"{shown} is printed\n"
+
+    with pytest.raises(SystemExit, match="2"):
+        cli.main(["info", f"--{path.name}"])
+    out, err = capsys.readouterr()
+    assert all(letter == "\n" or letter.isprintable() for letter in out + err)
