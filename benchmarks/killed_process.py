@@ -1,8 +1,9 @@
-"""A command in a child of its own that is killed at a change of a file, or at a moment."""
+"""A command in a child of its own that is killed at a change of a file, within a write, or at a moment."""
 
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import sys
 import time
@@ -11,7 +12,18 @@ from pathlib import Path
 from typing import Any
 
 _LONGEST = 900.0  # seconds of one run
-_EVENTS = {"os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "os.link"}
+# events of Python -> positions of its paths, and of the open folders that relative paths start from
+_PATHS = {
+    "open": ((0, None),),
+    "os.rename": ((0, 2), (1, 3)),
+    "os.remove": ((0, 1),),
+    "os.mkdir": ((0, 2),),
+    "os.rmdir": ((0, 1),),
+    "os.truncate": ((0, None),),
+    "os.link": ((1, 3),),
+    "os.symlink": ((1, 2),),
+}
+KILLED = (-signal.SIGKILL, -signal.SIGXFSZ)  # exit codes
 
 
 def start(
@@ -22,8 +34,12 @@ def start(
     count: Path | None = None,
     change: int | None = None,
     seconds: float | None = None,
+    size: int | None = None,
 ) -> tuple[int, float | None]:
-    """Start a command in a child; it kills itself at a change of a file, or notes the number of changes."""
+    """Start a command in a child; it kills itself at a change of a file, or notes the number of changes.
+
+    With `size`, the system kills it within the write that makes a file larger than so many bytes, in whatever language.
+    """
 
     def run() -> int:
         from vggtjax.commands.main import main
@@ -31,6 +47,10 @@ def start(
 
         enable_compilation_cache()  # a command does it before jax is imported
         changes = watch(watched, change)
+        if size is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # Python ignores it
+            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
         code = main(words)
         if count is not None:
             count.write_text(str(next(changes)))
@@ -50,12 +70,9 @@ def watch(folder: Path, fatal: int | None) -> Iterator[int]:
             os.kill(os.getpid(), signal.SIGKILL)
 
     def hook(event: str, arguments: tuple) -> None:
-        if event == "open":
-            path, _, flags = arguments
-            is_change = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR)
-        else:
-            path, is_change = arguments[0] if arguments else None, event in _EVENTS
-        if is_change and isinstance(path, str | os.PathLike) and os.fspath(path).startswith(inside):
+        if event == "open" and not (isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR)):
+            return
+        if any(_is_inside(inside, arguments, *at) for at in _PATHS.get(event, ())):
             changed()
 
     def fsync(file: Any) -> None:
@@ -69,6 +86,15 @@ def watch(folder: Path, fatal: int | None) -> Iterator[int]:
         yield done[0]
 
     return counts()
+
+
+def _is_inside(folder: str, arguments: tuple, path: int, open_folder: int | None) -> bool:
+    """Return whether an event's path lies below a folder; it may start from an open folder, as in `shutil.rmtree`."""
+    if not isinstance(arguments[path], str | bytes | os.PathLike):
+        return False  # an open file's number
+    number = -1 if open_folder is None or len(arguments) <= open_folder else arguments[open_folder]
+    start = Path.cwd() if number == -1 else Path(f"/proc/self/fd/{number}").readlink()
+    return (start / os.fsdecode(arguments[path])).is_relative_to(folder)
 
 
 def fork(run: Callable[[], int], log: Path, seconds: float | None = None) -> tuple[int, float | None]:

@@ -2,15 +2,14 @@
 
 A process that has imported everything, and started nothing, forks one child for each run. A child kills itself with
 SIGKILL just before its n-th change of a file below the work's folder (a file opened for writing, a rename, a removal, a
-folder made or removed, an fsync), or is killed at a random moment. Then the same command runs again.
+folder made or removed, an fsync), is killed by the system within the write that makes a file larger than a drawn number
+of bytes, or is killed at a random moment. Then the same command runs again.
 """
 
 from __future__ import annotations
 
-import hashlib
 import os
 import random
-import signal
 import time
 from collections.abc import Iterator
 from fnmatch import fnmatch
@@ -24,7 +23,8 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from benchmarks.killed_process import finish, fork, start
+from benchmarks.file_contents import BROKEN, content
+from benchmarks.killed_process import KILLED, finish, fork, start
 from benchmarks.make_checkpoint import make_checkpoint
 from benchmarks.seeded import seeded_images
 from vggtjax.config import VGGTConfig
@@ -49,11 +49,11 @@ TINY = VGGTConfig(
 
 
 class Case(NamedTuple):
-    """A command: its words, with {inputs} and {out}, files that grow while it runs, and files that a clock names."""
+    """A command: its words, with {inputs} and {out}, files that are replaced while it runs, and that a clock names."""
 
     words: str
-    growing: tuple[str, ...] = ()
-    timed: tuple[str, ...] = ()  # such as checkpoints: any of them may be there, but no unfinished one
+    growing: tuple[str, ...] = ()  # whole at each moment, with other content than at the end
+    timed: tuple[str, ...] = ()  # such as checkpoints: any of them may be there, but no unfinished one after the end
 
 
 _MODEL = "--model {inputs}/model.safetensors"
@@ -62,32 +62,36 @@ CASES = {
     "reconstruct": Case(f"reconstruct {{inputs}}/clips/a {_MODEL} --out {{out}}/result"),
     "batch": Case(f"batch {{inputs}}/clips {_MODEL} --only cameras,depth --out {{out}}", ("index.html",)),
     "export": Case("export {inputs}/result --out {out}/model --to colmap-text"),
-    "evaluate": Case(f"evaluate plain {{inputs}}/data {_MODEL} --methods vggt,4dvggt-d --out {{out}}/scores", ("*",)),
+    "evaluate": Case(f"evaluate plain {{inputs}}/data {_MODEL} --methods vggt,4dvggt-d --out {{out}}/scores"),
     "fit-fusion": Case(
         f"fit-fusion --data plain={{inputs}}/data {_MODEL} --family scale paper --seeds 1 --steps 20 --pixels 300 "
         "--out {out}/fit",
-        ("*",),
+        ("fit/states/*.npz",),
     ),
     "train": Case(
         "train --recipe {inputs}/recipe.json --out {out}/run --log-every 2 --checkpoint-seconds 0.1",
-        ("*",),
+        ("run/metrics.csv", "run/metrics.png", "run/model.safetensors"),
         ("run/checkpoints/*",),
     ),
 }
 
 
+_HEADINGS = ("command", "changes of files", "killed at changes", "in writes", "at random", "two at once", "problems")
+
+
 class Tally(NamedTuple):
-    """What came of a command: kills at changes and at random moments, and what was wrong."""
+    """What came of a command: kills of each kind, and what was wrong."""
 
     command: str
     changes: int  # of files in an undisturbed run
     at_changes: int
+    in_writes: int
     at_random: int
     pairs: int
     problems: list[str]
 
 
-Files = dict[str, str]  # names below the folder, with those of folders -> digest, empty for folders
+Files = dict[str, str]  # names below the folder, with those of folders -> `content`
 
 
 def kills(*, command: tuple[str, ...] = tuple(CASES), kills: int = 50, pairs: int = 20, seed: int = 0) -> None:
@@ -95,9 +99,9 @@ def kills(*, command: tuple[str, ...] = tuple(CASES), kills: int = 50, pairs: in
 
     Args:
         command: what is killed; all by default.
-        kills: of each command, nine tenths of them spread over its changes of files, the others at random moments.
+        kills: of each command: four fifths spread over its changes of files, the others in writes or at random moments.
         pairs: rounds of two runs of a command at the same time in one folder.
-        seed: of the random moments.
+        seed: of the random moments and sizes.
     """
     for name in command:
         if name not in CASES:
@@ -112,12 +116,20 @@ def kills(*, command: tuple[str, ...] = tuple(CASES), kills: int = 50, pairs: in
             tallies.append(tally)
             for problem in tally.problems:
                 screen.print(f"{name}: {problem}", markup=False)
-            screen.print(f"{name}: {tally.at_changes + tally.at_random} kills, {len(tally.problems)} problems")
+            screen.print(f"{name}: {sum(tally[2:5])} kills, {len(tally.problems)} problems")
     table = Table(title="runs that were killed and run again", box=None)
-    for heading in ("command", "changes of files", "kills at changes", "at random moments", "two at once", "problems"):
+    for heading in (
+        "command",
+        "changes of files",
+        "kills at changes",
+        "within writes",
+        "at random moments",
+        "two at once",
+        "problems",
+    ):
         table.add_column(heading, justify="left" if heading == "command" else "right")
     for tally in tallies:
-        table.add_row(tally.command, *map(str, tally[1:5]), str(len(tally.problems)))
+        table.add_row(tally.command, *map(str, tally[1:6]), str(len(tally.problems)))
     screen.print(table)
     if any(tally.problems for tally in tallies):
         raise InputError("some outputs were not whole, or runs did not go on; the problems are above")
@@ -125,84 +137,104 @@ def kills(*, command: tuple[str, ...] = tuple(CASES), kills: int = 50, pairs: in
 
 def kill_command(name: str, folder: Path, *, kills: int, pairs: int, draws: random.Random) -> Tally:
     """Kill a command so many times, each time with an empty folder, and run two at once."""
-    case, work, problems = CASES[name], folder / "work" / name, []
-
-    def words(out: Path) -> list[str]:
-        return [word.format(inputs=folder / "inputs", out=out) for word in case.words.split()]
-
-    def run(out: Path, **how: Any) -> tuple[int, str]:
-        out.mkdir(parents=True, exist_ok=True)
-        return finish(*start(words(out), work / "log", out, **how), work / "log")
-
+    case, work = CASES[name], folder / "work" / name
+    words = [word.format(inputs=folder / "inputs", out=work / "out") for word in case.words.split()]
     out = work / "out"
-    count_file, wholes, seconds = work / "count", [], 1.0
+
+    def run(**how: Any) -> tuple[int, str]:
+        out.mkdir(parents=True, exist_ok=True)
+        return finish(*start(words, work / "log", out, **how), work / "log")
+
+    wholes, sizes, seconds = [], [2], 1.0
     for _ in range(3):  # the first fills the caches
         began = time.perf_counter()
-        code, said = run(out, count=count_file)
+        code, said = run(count=work / "count")
         seconds = time.perf_counter() - began
         if code:
             raise InputError(f"{name} ends with code {code} without a kill: {said}")
         wholes.append(files_below(out))
+        sizes = [path.stat().st_size for path in sorted(out.rglob("*")) if path.is_file() and path.stat().st_size > 1]
         _clear(out)
-    whole, changes = wholes[-1], int(count_file.read_text())
-    varying = {path for path in whole if whole[path] != wholes[-2].get(path)}  # such as pages with times
+    changes = int((work / "count").read_text())
+    checks = _Checks(case, wholes[-1], [])
+    checks.check("two whole runs", wholes[-2], ended=True)
 
-    def timed(path: str) -> bool:
-        return any(fnmatch(path, pattern) for pattern in case.timed)
+    at_changes = min(kills - 2 * max(kills // 10, 1), 10 * changes)
+    in_writes = (kills - at_changes) // 2
+    killed = {"change": 0, "size": 0, "seconds": 0}
 
-    def check(label: str, files: Files, *, ended: bool) -> None:
-        for path, digest in files.items():
-            if timed(path) and "tmp" not in path:
-                continue
-            if path not in whole:
-                if ended:
-                    problems.append(f"{label}: {path} is left behind")
-                continue
-            grows = not ended and any(fnmatch(path, pattern) for pattern in case.growing)
-            if digest != whole[path] and path not in varying and not grows:
-                problems.append(f"{label}: {path} differs from a whole run's")
-        if ended:
-            problems.extend(f"{label}: {path} is missing" for path in whole.keys() - files.keys() if not timed(path))
+    def all_moments() -> Iterator[tuple[str, float]]:
+        for number in range(at_changes):
+            yield "change", 1 + number * changes // at_changes
+        for _ in range(4 * kills):  # no file may have so many bytes when it is written
+            if killed["size"] < in_writes:
+                yield "size", draws.randrange(1, draws.choice(sizes))
+        for _ in range(4 * kills):  # some come after the end
+            if sum(killed.values()) < kills:
+                yield "seconds", draws.uniform(0.0, seconds)
 
-    at_changes = min(kills - kills // 10, 10 * changes)
-    moments: list[int | float] = [1 + number * changes // at_changes for number in range(at_changes)]
-    killed = [0, 0]
-
-    def all_moments() -> Iterator[int | float]:
-        yield from moments
-        for _ in range(2 * kills):  # some come after the end
-            if sum(killed) < kills:
-                yield draws.uniform(0.0, seconds)
-
-    for moment in track(all_moments(), f"{name}: kills", total=kills, transient=True):
-        is_change = isinstance(moment, int)
-        label = f"killed at change {moment}" if is_change else f"killed after {moment:.2f} s"
-        code, said = run(out, change=moment) if is_change else run(out, seconds=moment)
-        if code == -signal.SIGKILL:
-            killed[0 if is_change else 1] += 1
+    for kind, value in track(all_moments(), f"{name}: kills", total=kills, transient=True):
+        label = f"killed at {kind} {value:.6g}"
+        code, said = run(**{kind: value})
+        if code in KILLED:
+            killed[kind] += 1
         elif code:
-            problems.append(f"{label}: code {code}: {said}")
-        check(label, files_below(out), ended=False)
+            checks.problems.append(f"{label}: code {code}: {said}")
+        checks.check(label, files_below(out), ended=False)
         if name == "export" and (out / "model").exists():
             _clear(out)  # it never replaces what is there
-        code, said = run(out)
+        code, said = run()
         if code:
-            problems.append(f"{label}: the next run ends with code {code}: {said}")
+            checks.problems.append(f"{label}: the next run ends with code {code}: {said}")
         else:
-            check(f"{label}, then run again", files_below(out), ended=True)
+            checks.check(f"{label}, then run again", files_below(out), ended=True)
         _clear(out)
     for number in track(range(pairs), f"{name}: two at once", transient=True):
         out.mkdir(parents=True, exist_ok=True)
-        started = [start(words(out), work / f"log{side}", out) for side in (0, 1)]
-        ends = [finish(*process, work / f"log{side}") for side, process in enumerate(started)]
+        logs = [work / f"log{side}" for side in (0, 1)]
+        started = [start(words, log, out) for log in logs]
+        checks.check_pair(f"round {number} of two", [finish(*one, log) for one, log in zip(started, logs, strict=True)])
+        checks.check(f"round {number} of two", files_below(out), ended=True)
+        _clear(out)
+    return Tally(name, changes, killed["change"], killed["size"], killed["seconds"], pairs, checks.problems)
+
+
+class _Checks(NamedTuple):
+    """What is wrong with the files of runs, beside those of a whole run."""
+
+    case: Case
+    whole: Files
+    problems: list[str]
+
+    def check(self, label: str, files: Files, *, ended: bool) -> None:
+        """Note files that are half-written, or differ; after the end, those that are left behind or missing, too."""
+        for path, found in files.items():
+            if self._is_timed(path) and "tmp" not in path:
+                continue
+            if path not in self.whole:
+                if ended:
+                    self.problems.append(f"{label}: {path} is left behind")
+            elif found == BROKEN:
+                self.problems.append(f"{label}: {path} is half-written")
+            elif found != self.whole[path] and (ended or not _fits(path, self.case.growing)):
+                self.problems.append(f"{label}: {path} differs from a whole run's")
+        missing = self.whole.keys() - files.keys() if ended else ()
+        self.problems.extend(f"{label}: {path} is missing" for path in missing if not self._is_timed(path))
+
+    def check_pair(self, label: str, ends: list[tuple[int, str]]) -> None:
+        """Note two runs that both failed, and one that failed without a sentence."""
         if all(code for code, _ in ends):
-            problems.append(f"round {number} of two: neither ends: {ends[0][1]}; {ends[1][1]}")
+            self.problems.append(f"{label}: neither ends: {ends[0][1]}; {ends[1][1]}")
         for code, said in ends:
             if code not in (0, 2) or "Traceback" in said:
-                problems.append(f"round {number} of two: code {code}: {said}")
-        check(f"round {number} of two", files_below(out), ended=True)
-        _clear(out)
-    return Tally(name, changes, killed[0], killed[1], pairs, problems)
+                self.problems.append(f"{label}: code {code}: {said}")
+
+    def _is_timed(self, path: str) -> bool:
+        return _fits(path, self.case.timed)
+
+
+def _fits(path: str, patterns: tuple[str, ...]) -> bool:
+    return any(fnmatch(path, pattern) for pattern in patterns)
 
 
 def prepare(inputs: Path, commands: tuple[str, ...]) -> None:
@@ -260,12 +292,8 @@ def _write_data(root: Path) -> None:
 
 
 def files_below(folder: Path) -> Files:
-    """Return the files and folders below a folder, hidden ones too, with digests of the files."""
-    paths = sorted(folder.rglob("*"))
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""
-        for path in paths
-    }
+    """Return the files and folders below a folder, hidden ones too, with digests of what is in the files."""
+    return {str(path.relative_to(folder)): content(path) for path in sorted(folder.rglob("*"))}
 
 
 def _clear(folder: Path) -> None:

@@ -5,9 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
+from safetensors.numpy import save_file
 
 from benchmarks import kills as harness
+from benchmarks.file_contents import BROKEN
 from vggtjax.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -24,6 +28,41 @@ killed_process.watch(folder, 3)
 (folder / "a").replace(folder / "b")
 (folder / "c").write_text("third")
 """
+
+
+_REMOVES = """
+import shutil, sys
+from pathlib import Path
+from benchmarks import killed_process
+folder = Path(sys.argv[1])
+changes = killed_process.watch(folder, None)
+shutil.rmtree(folder / "a")
+assert next(changes) == 3
+"""
+
+
+def test_files_of_a_removed_folder_count(tmp_path):
+    (tmp_path / "a").mkdir()
+    for name in "xy":
+        (tmp_path / "a" / name).touch()
+    subprocess.run([sys.executable, "-c", _REMOVES, str(tmp_path)], check=True, cwd=ROOT)
+
+
+def test_half_written_files_are_told_apart_and_times_are_not_compared(tmp_path):
+    np.savez(tmp_path / "a.npz", x=np.ones(100))
+    save_file({"x": np.ones(100, np.float32)}, tmp_path / "a.safetensors")
+    Image.fromarray(np.eye(30, dtype=np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "a.json").write_text('{"x": 1, "seconds": {"all": 2.5}}')
+    (tmp_path / "a.html").write_text("<p>1.5 s</p></html>")
+    (tmp_path / "a.csv").write_text("step,seconds\n1,0.5\n2,0.9\n")
+    before = harness.files_below(tmp_path)
+    assert BROKEN not in before.values()
+    for name, old, new in (("a.json", "2.5", "99"), ("a.html", "1.5", "2.5"), ("a.csv", "0.9", "7")):
+        (tmp_path / name).write_text((tmp_path / name).read_text().replace(old, new))
+    assert harness.files_below(tmp_path) == before
+    for path in tmp_path.iterdir():
+        path.write_bytes(path.read_bytes()[:-5])
+    assert set(harness.files_below(tmp_path).values()) == {BROKEN}
 
 
 def test_a_process_kills_itself_just_before_a_change_of_a_file(tmp_path):
