@@ -91,3 +91,17 @@ def test_a_list_may_name_urls_and_one_from_a_url_names_nothing_of_this_machine(t
     for source in ("/etc/passwd", "../up.mp4", "a/../../b.mp4", "file:///etc/passwd", "\\\\host\\share"):
         with pytest.raises(ClipError, match="a list from a URL names URLs, and paths below its own"):
             read_manifest(written(tmp_path, "c.csv", f"source\n{source}\n"), url)
+
+
+def test_lists_that_would_fill_the_memory(tmp_path):
+    column = pa.table({"source": ["x" * 40_000] * 500})
+    parquet.write_table(column, tmp_path / "once.parquet", compression="zstd")  # in a dictionary, in 500 bytes
+    parquet.write_table(column, tmp_path / "each.parquet", compression="zstd", use_dictionary=False)
+    written(tmp_path, "a.jsonl", '{"source": "a", "x": [' + "0," * 40_000 + "0]}")
+    for name, sentence in (
+        ("once.parquet", "a text of more than 16384 bytes"),
+        ("each.parquet", "says that its text takes 200"),
+        ("a.jsonl", "line 1 has more than 65536 bytes"),
+    ):
+        with pytest.raises(ClipError, match=sentence):
+            read_manifest(tmp_path / name)

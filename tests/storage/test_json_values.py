@@ -139,3 +139,9 @@ def test_any_value_is_taken_or_refused(values):
     except InputError:
         return
     assert all(isinstance(phase, Phase) for phase in plan.phases)
+
+
+def test_more_values_than_can_be_looked_at_are_refused():
+    with pytest.raises(InputError, match="list holds more than 100 values"):
+        parse_json("[" + "0," * 100 + "0]", list[int], "list", most_bytes=1600)
+    assert len(parse_json("[" + "0," * 98 + "0]", list[int], "list", most_bytes=1600)) == 99

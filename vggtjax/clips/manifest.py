@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePath
+from typing import Any
 
 from vggtjax.clips.images import is_image_name
 from vggtjax.clips.video import is_video_name
@@ -15,6 +17,9 @@ from vggtjax.storage.remote import is_url, local_path, url_name
 
 MOST_BYTES = 2**28  # of a list: about two million clips
 _MOST_LETTERS = 4096  # of a path
+_MOST_LINE = 2**16  # bytes of a line of JSON
+_MOST_TIMES, _SPARE = 64, 2**20  # of a parquet file's bytes its text may have, and so many bytes more
+_BATCH = 16  # rows of a parquet file that are read at once: one text may stand for many
 _MOST_ROWS = 5_000_000
 
 
@@ -47,11 +52,18 @@ def read_manifest(path: Path, url: str | None = None) -> dict[str, str]:
             raise ClipError(f"{place} has the source {one_line(row.source, 60)!r}; expected a path or a URL")
         source = _source(row.source, path, url, place)
         name = row.name or source_name(source)
-        if name in ("", ".", "..") or name.startswith(".") or Path(name).name != name or not name.isprintable():
+        if (
+            name in ("", ".", "..")
+            or len(name) > 255
+            or name.startswith(".")
+            or Path(name).name != name
+            or not name.isprintable()
+        ):
             raise ClipError(f"{place} names a clip {one_line(name, 60)!r}; expected a plain name: it becomes a folder")
         if name in found:
             raise ClipError(
-                f"{path} {unit}s {found[name][0]} and {number} both name a clip {name!r}; rename one of them"
+                f"{path} {unit}s {found[name][0]} and {number} both name a clip {one_line(name, 60)!r}; "
+                "rename one of them"
             )
         found[name] = (number, source)
     if not found:
@@ -65,7 +77,7 @@ def source_name(source: str) -> str:
         name = Path(url_name(source, ClipError))
         return name.stem if is_video_name(name) or is_image_name(name) or name.suffix == ".r3d" else name.name
     path = Path(source)
-    return path.name if path.is_dir() else path.stem
+    return path.name if os.path.isdir(path) else path.stem  # noqa: PTH112 - a path may be too long to ask for
 
 
 def _source(source: str, path: Path, url: str | None, place: str) -> str:
@@ -96,7 +108,7 @@ def _json_rows(path: Path) -> Iterator[tuple[int, _Row]]:
     for number, line in enumerate(lines, start=1):
         if line.strip():
             place = f"{path} line {number}"
-            values = parse_json(line, dict[str, object], place, error=ClipError)
+            values = parse_json(line, dict[str, object], place, most_bytes=_MOST_LINE, error=ClipError)
             known = {key: value for key, value in values.items() if key in ("source", "name")}
             if not isinstance(known.get("source"), str) or not isinstance(known.get("name"), str | None):
                 raise ClipError(f"{place} has no source; expected source and, if wanted, name, as text")
@@ -106,30 +118,47 @@ def _json_rows(path: Path) -> Iterator[tuple[int, _Row]]:
 def _parquet_rows(path: Path) -> Iterator[tuple[int, _Row]]:
     check_extra(f"{path}, a list of clips in parquet,", "cluster", "pyarrow")
     import pyarrow as pa
-    from pyarrow import parquet
+    from pyarrow import compute, parquet
 
     with reading(path, ClipError):
         _check_size(path)
         try:
+            types = {field.name: field.type for field in parquet.read_schema(path)}
+            names = [name for name in ("source", "name") if name in types]
             with parquet.ParquetFile(path) as file:
-                types = {field.name: field.type for field in file.schema_arrow}
-                names = [name for name in ("source", "name") if name in types]
-                is_text = all(
-                    pa.types.is_string(types[name]) or pa.types.is_large_string(types[name]) for name in names
-                )
+                is_text = all(str(types[name]) in ("string", "large_string") for name in names)
                 if "source" not in names or not is_text:
                     raise ClipError(
                         f"{path} has no column source of text; expected source and, if wanted, name, as text"
                     )
                 if file.metadata.num_rows > _MOST_ROWS:
                     raise ClipError(f"{path} has {file.metadata.num_rows} rows; expected at most {_MOST_ROWS}")
+                _check_text_bytes(path, file.metadata, names)
                 number = 0
-                for rows in file.iter_batches(columns=names):
+                for rows in file.iter_batches(_BATCH, columns=names):
+                    for column in rows.columns:
+                        if (compute.max(compute.binary_length(column)).as_py() or 0) > 4 * _MOST_LETTERS:
+                            raise ClipError(
+                                f"{path} has a text of more than {4 * _MOST_LETTERS} bytes; expected paths and names"
+                            )
                     for values in rows.to_pylist():
                         number += 1
                         yield number, _Row(values["source"] or "", values.get("name"))
         except (pa.ArrowException, UnicodeDecodeError) as problem:
             raise ClipError(f"{path} is no parquet file: {one_line(str(problem))}") from problem
+
+
+def _check_text_bytes(path: Path, metadata: Any, names: Collection[str]) -> None:
+    """Raise ClipError where columns of a parquet file declare more bytes than a file of its size can honestly hold."""
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    columns = [group.column(number) for group in groups for number in range(group.num_columns)]
+    total = sum(column.total_uncompressed_size for column in columns if column.path_in_schema in names)
+    size = path.stat().st_size
+    if not 0 <= total <= min(MOST_BYTES, _MOST_TIMES * size + _SPARE):
+        raise ClipError(
+            f"{path} has {size} bytes and says that its text takes {total}; expected at most {_MOST_TIMES} times as "
+            "many: it is damaged, or made to fill the memory"
+        )
 
 
 def _check_size(path: Path) -> None:

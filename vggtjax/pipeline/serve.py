@@ -15,10 +15,11 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import os
+import reprlib
 import sys
 import tempfile
-import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -31,10 +32,19 @@ MANIFEST, PROGRAM, WEIGHTS = "manifest.json", "program.bin", "weights.safetensor
 
 _DTYPES = {"F32": "float32", "BF16": "bfloat16", "F16": "float16", "I8": "int8"}  # of safetensors
 _CHUNK = 1 << 24  # bytes that are hashed at once
+_MOST_BYTES = 1 << 24  # of the manifest, and of the header of the weights
+_MOST_LETTERS = 480  # of a message
+_MOST_WORD = 200  # letters of a text in the manifest that is used
+_MALFORMED = (ArithmeticError, AttributeError, LookupError, MemoryError, RecursionError, TypeError, ValueError)
 
 
 class ArtefactError(Exception):
-    """What does not fit, in one sentence."""
+    """What does not fit, in one sentence: a printable line of at most _MOST_LETTERS letters."""
+
+    def __str__(self) -> str:
+        text = "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in super().__str__())
+        end = _MOST_LETTERS // 3
+        return text if len(text) <= _MOST_LETTERS else f"{text[: _MOST_LETTERS - end - 5]} ... {text[-end:]}"
 
 
 def load(folder: str | Path) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
@@ -65,10 +75,9 @@ def load(folder: str | Path) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
         exported = export.deserialize(bytearray((folder / PROGRAM).read_bytes()))
         program = jax.jit(exported.call)
     except Exception as error:  # the file is whole, so this jax does not know what is in it
-        reason = str(error).strip().split("\n")[0]
         raise ArtefactError(
-            f"jax {jax.__version__} cannot read the program of {folder}, which {writer} wrote ({reason}): install that "
-            "version"
+            f"jax {jax.__version__} cannot read the program of {folder}, which {writer} wrote ({_reason(error)}): "
+            "install that version"
         ) from error
     weights = jax.device_put(_read_weights(folder / WEIGHTS))
     expected = manifest["inputs"]["images"]
@@ -77,10 +86,9 @@ def load(folder: str | Path) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
         images = _as_images(frames, expected["shape"])
         try:
             outputs = program(weights, images)
-        except ValueError as error:  # of jax, before it runs: such as a program for CUDA on a GPU of AMD
-            reason = str(error).strip().split("\n")[0]
-            raise ArtefactError(f"the program of {folder} cannot run here: {reason}") from error
-        return {name: np.asarray(outputs[name]) for name in manifest["outputs"]}
+            return {name: np.asarray(outputs[name]) for name in manifest["outputs"]}
+        except (ValueError, TypeError, LookupError) as error:  # of jax, before it runs: such as for a GPU of AMD
+            raise ArtefactError(f"the program of {folder} cannot run here: {_reason(error)}") from error
 
     return run
 
@@ -88,32 +96,53 @@ def load(folder: str | Path) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of an artefact of this version. Raises ArtefactError."""
     path = folder / MANIFEST
+    _check_regular(path)
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            text = file.read(_MOST_BYTES + 1)
+        if len(text) > _MOST_BYTES:
+            raise ArtefactError(f"{path} has more than {_MOST_BYTES} bytes; copy the artefact again")
+        manifest = json.loads(text)
     except OSError as error:
         raise ArtefactError(f"{folder} is not an artefact: {path}: {error.strerror}") from error
-    except ValueError as error:
-        raise ArtefactError(f"{path} is damaged ({error}); copy the artefact again") from error
+    except (ValueError, RecursionError) as error:
+        raise ArtefactError(f"{path} is damaged ({_reason(error)}); copy the artefact again") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ArtefactError(f"{path} is not the manifest of an artefact: its format is not {FORMAT}")
     if manifest.get("version") != VERSION:
         raise ArtefactError(
-            f"{folder} has version {manifest.get('version')!r} of the format; this script reads {VERSION}: use the "
-            "serve.py that lies in the artefact, or export the model again"
+            f"{folder} has version {reprlib.repr(manifest.get('version'))} of the format; this script reads {VERSION}: "
+            "use the serve.py that lies in the artefact, or export the model again"
         )
     try:
         facts = [manifest["jax"], *(manifest["files"][name]["sha256"] for name in (PROGRAM, WEIGHTS))]
         facts += [*manifest["platforms"], *manifest["outputs"]]
-        numbers = [manifest["calling_convention"], *manifest["inputs"]["images"]["shape"]]
-        whole = all(isinstance(x, str) for x in facts) and all(isinstance(x, int) for x in numbers)
-    except (KeyError, TypeError, IndexError):
+        shape = manifest["inputs"]["images"]["shape"]
+        whole = all(isinstance(x, str) and len(x) <= _MOST_WORD for x in facts)
+        whole &= all(name.isidentifier() for name in manifest["outputs"])  # they become names in an archive
+        whole &= not {"file", "allow_pickle"} & set(manifest["outputs"])  # numpy.savez has parameters of these names
+        whole &= all(type(x) is int and 0 < x < 2**31 for x in (manifest["calling_convention"], *shape))
+        whole &= len(shape) == 4 and shape[3] == 3
+    except _MALFORMED:
         whole = False
     if not whole:
         raise ArtefactError(f"{path} is damaged: fields are missing or have wrong types; copy the artefact again")
     return manifest
 
 
+def _check_regular(path: Path) -> None:
+    """Refuse a pipe or a device before it is opened: reading one may never end."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise ArtefactError(f"{path} is a pipe, a socket or a device; expected a file: copy its content into one")
+
+
+def _reason(error: Exception) -> str:
+    """Return the first line of what an exception says, shortened."""
+    return (str(error).strip() or type(error).__name__).split("\n")[0][:_MOST_WORD]
+
+
 def _check_file(path: Path, facts: dict[str, Any]) -> None:
+    _check_regular(path)
     digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
@@ -129,16 +158,28 @@ def _read_weights(path: Path) -> dict[str, np.ndarray]:
     """Map the tensors of a safetensors file, whose digest is known to be right."""
     import ml_dtypes  # which jax installs
 
-    with path.open("rb") as file:
-        length = int.from_bytes(file.read(8), "little")
-        header = json.loads(file.read(length))
-    header.pop("__metadata__", None)
-    content = np.memmap(path, np.uint8, mode="r", offset=8 + length)
-    weights = {}
-    for name, tensor in header.items():
-        (start, end), code = tensor["data_offsets"], _DTYPES[tensor["dtype"]]
-        dtype = np.dtype(getattr(ml_dtypes, code, code))
-        weights[name] = content[start:end].view(dtype).reshape(tensor["shape"])
+    size = path.stat().st_size
+    try:
+        with path.open("rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+            if length > min(_MOST_BYTES, size - 8):
+                raise ValueError(f"a header of {length} bytes")
+            header = json.loads(file.read(length))
+        header.pop("__metadata__", None)
+        content = np.memmap(path, np.uint8, mode="r", offset=8 + length)
+        weights, total = {}, 0
+        for name, tensor in header.items():
+            (start, end), code = tensor["data_offsets"], _DTYPES[tensor["dtype"]]
+            dtype = np.dtype(getattr(ml_dtypes, code, code))
+            if math.prod(tensor["shape"]) * dtype.itemsize != end - start or not 0 <= start <= end <= len(content):
+                raise ValueError(f"the tensor {reprlib.repr(name)} has other offsets than its shape needs")
+            weights[name] = content[start:end].view(dtype).reshape(tensor["shape"])
+            total += end - start
+        if total > len(content):  # on a device they would take as much
+            raise ValueError("its tensors overlap")
+    except _MALFORMED as error:
+        words = f"{type(error).__name__}: {_reason(error)}"
+        raise ArtefactError(f"{path} is not a whole file of weights ({words}); export the model again") from error
     return weights
 
 
@@ -156,11 +197,14 @@ def _as_images(frames: np.ndarray, shape: Sequence[int]) -> np.ndarray:
 
 
 def _read_frames(path: Path) -> np.ndarray:
+    """Map the frames of a file: their shape is checked before they take memory."""
+    _check_regular(path)
     try:
-        frames = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ArtefactError(f"cannot read {path}: {error}") from error
+        frames = np.load(path, mmap_mode="r", allow_pickle=False)
+    except Exception as error:  # of numpy, zipfile or Python's parser, for whatever a damaged header says
+        raise ArtefactError(f"cannot read {path}: {_reason(error)}") from error
     if not isinstance(frames, np.ndarray):
+        frames.close()
         raise ArtefactError(f"{path} holds several arrays; expected one array of frames, as numpy.save writes it")
     return frames
 

@@ -26,7 +26,7 @@ from vggtjax.storage.free_memory import free_bytes
 
 _DEFLATE_LEVEL = 1  # higher levels take several times as long and save a few percent
 SIZE_LIMIT = 64 * 2**30  # bytes of all arrays of one file
-_MOST_TIMES, _SPARE = 16, 2**28  # of a file's bytes its arrays may have, or so many bytes; depth barely shrinks
+_MOST_TIMES, _SPARE = 16, 2**26  # of a file's bytes its arrays may have, or so many bytes: masks may be all zero
 _LENGTHS = {(1, 0): 2, (2, 0): 4}  # version of the format -> bytes of the length of a header
 _MOST_HEADER_BYTES = 2**14
 _MOST_AXES = 32

@@ -24,6 +24,7 @@ from vggtjax.errors import InputError, one_line, reading
 
 MOST_BYTES = 2**24  # of a file or text, by default
 MOST_LEVELS = 64  # of nesting
+_BYTES_A_VALUE = 16  # so many values a text may hold: as many as its most bytes by this; each is looked at
 _MOST_INT = 2**63
 
 Natural = Annotated[int, Meta(ge=0)]
@@ -63,7 +64,7 @@ def parse_json(
 
     The annotations of `kind` give types and ranges. Raises `error`, whose subject is `what` (such as "recipe a.json"),
     for text that is too long or not JSON, more than MOST_LEVELS levels, unknown or missing keys, infinite numbers or
-    numbers of more than 64 bits, wrong types, and values out of range.
+    numbers of more than 64 bits, wrong types, values out of range, and more values than `most_bytes` / 16.
     """
     if len(text) > most_bytes:
         raise error(f"{what} has more than {most_bytes} bytes")
@@ -72,6 +73,7 @@ def parse_json(
     except (ValueError, RecursionError) as problem:
         raise error(f"{what} is not JSON that can be read: {problem}") from None
     try:
+        _check_count(value, most_bytes // _BYTES_A_VALUE)
         return _converted(value, kind)
     except _MisfitError as misfit:
         place, words = misfit.args
@@ -119,6 +121,18 @@ def _converted(value: Any, kind: Any) -> Any:
         raise _MisfitError(place, f"is {_short(value)}; expected {_expected(info)}") from None
 
 
+def _check_count(value: Any, most: int) -> None:
+    """Raise _MisfitError for a document of more than `most` values, before they are looked at one by one."""
+    count, todo = 1, [value]
+    while todo:
+        container = todo.pop()
+        items = container.values() if isinstance(container, dict) else container if isinstance(container, list) else ()
+        count += len(items)
+        if count > most:
+            raise _MisfitError("", f"holds more than {most} values; expected fewer: cut it into several files")
+        todo += [item for item in items if isinstance(item, dict | list)]
+
+
 def _check(value: Any, info: kinds.Type, keys: tuple[Any, ...] = ()) -> None:
     """Raise _MisfitError for infinite and huge numbers, unknown fields of a dataclass, and too many levels."""
     words = ""
@@ -135,7 +149,8 @@ def _check(value: Any, info: kinds.Type, keys: tuple[Any, ...] = ()) -> None:
     if words:
         raise _MisfitError("".join(map(_step, keys)), words)
     for key, child, child_info in _children(value, info):
-        _check(child, child_info, (*keys, key))
+        if type(child) is not str:
+            _check(child, child_info, (*keys, key))
 
 
 def _option(info: kinds.Type, value: Any) -> kinds.Type:

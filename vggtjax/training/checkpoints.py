@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import orbax.checkpoint as orbax
 
-from vggtjax.errors import CheckpointError, one_line
+from vggtjax.errors import CheckpointError, check_regular, one_line
 from vggtjax.storage.writing import write_errors
 from vggtjax.training.recipe import Recipe
 from vggtjax.training.state import TrainingState
@@ -19,6 +19,8 @@ from vggtjax.training.state import TrainingState
 KEPT = 2  # newest checkpoints; older ones are removed
 
 _STATE, _RUN = "state", "run"
+# Exceptions of orbax, tensorstore and Python's parser for damaged files; jax's own errors are other RuntimeErrors.
+_BROKEN = (OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, AssertionError, RecursionError)
 
 
 class Restored(NamedTuple):
@@ -30,11 +32,14 @@ class Restored(NamedTuple):
 
 
 def latest(folder: str | Path) -> int | None:
-    """Return the step of the newest complete checkpoint in `folder`; None without a checkpoint."""
+    """Return the step of the newest complete checkpoint in `folder`; None without a checkpoint.
+
+    Raises CheckpointError for a folder whose files cannot be read.
+    """
     folder = Path(folder)
     if not folder.is_dir():
         return None
-    with _opened(folder) as manager:
+    with _explaining(folder), _opened(folder) as manager:
         return manager.latest_step()
 
 
@@ -70,6 +75,8 @@ def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe) -> Restor
     with _opened(folder) as manager, _explaining(place):
         run = manager.restore(step, args=orbax.args.Composite(**{_RUN: orbax.args.JsonRestore()}))[_RUN]
         written = Recipe.from_json(json.dumps(run["recipe"]))
+        if not isinstance(run["notes"], dict):
+            raise CheckpointError(f"{place} has notes that are not an object; expected names and values")
         for name, old, new in (
             ("model", written.model, recipe.model),
             ("trainable", written.trainable, recipe.trainable),
@@ -83,10 +90,12 @@ def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe) -> Restor
                 )
         _check_shapes(place, manager.item_metadata(step)[_STATE], shapes)
         items = manager.restore(step, args=orbax.args.Composite(**{_STATE: orbax.args.StandardRestore(target)}))
-    return Restored(items[_STATE], written, dict(run["notes"]))
+    return Restored(items[_STATE], written, run["notes"])
 
 
 def _opened(folder: Path, *, create: bool = False) -> orbax.CheckpointManager:
+    for path in folder.rglob("*"):  # orbax would open a pipe, and wait
+        check_regular(path, CheckpointError)
     options = orbax.CheckpointManagerOptions(max_to_keep=KEPT, create=create, enable_async_checkpointing=False)
     handlers = {_STATE: orbax.StandardCheckpointHandler(), _RUN: orbax.JsonCheckpointHandler()}
     return orbax.CheckpointManager(folder.resolve(), options=options, item_handlers=handlers)
@@ -98,7 +107,7 @@ def _explaining(place: Path) -> Iterator[None]:
         yield
     except CheckpointError:
         raise
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except _BROKEN as error:
         raise CheckpointError(f"{place} cannot be read as a checkpoint of a run: {one_line(str(error))}") from error
 
 
