@@ -4,21 +4,32 @@
 # from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the last commit,
 # without what is not committed: the same wheel anywhere.
 # While you work: `make check`, which is lint, types and the tests that run no network, in a few minutes.
+# `make coverage` counts the lines and branches that the tests run, and `make shuffled` runs them in a random order.
 
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 WORKERS ?= 2
+TESTS ?= tests
+SEED ?= default
 SUPPLY := $(VENV)/supply
 COMPILE = $(SUPPLY)/bin/uv pip compile --no-config --quiet --upgrade --exclude-newer '7 days' --generate-hashes \
   --universal --python-version 3.11 --index-url https://pypi.org/simple --no-emit-index-url \
   --custom-compile-command 'make lock'
 PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+COUNTED = --cov --cov-append --cov-report= --cov-fail-under=0
+RANDOM = -p randomly --randomly-seed=$(SEED) --randomly-dont-reset-seed
+
+# All tests, with the options (1), or those of TESTS. What is compared with the public code is compiled well.
+define tests
+$(if $(filter tests,$(TESTS)),$(PYTEST) $(1) tests/parity)
+$(PYTEST) $(1) $(TESTS) --ignore tests/parity --hasty
+endef
 
 # Tests that compile networks take nearly all of the time.
 SLOW = parity network method pipeline training calibration learning commands benchmarks pretrained
 
-.PHONY: demo pictures docs test check fast lint format clean locked lock audit sbom dist
+.PHONY: demo pictures docs test check fast coverage shuffled lint format clean locked lock audit sbom dist
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
@@ -31,13 +42,20 @@ docs: $(VENV)/.docs
 	@echo "open site/index.html"
 
 test: lint
-	$(PYTEST) tests/parity
-	$(PYTEST) tests --ignore tests/parity --hasty
+	$(call tests)
 
 check: lint fast
 
 fast: $(VENV)/.development
 	$(PYTEST) tests --hasty $(SLOW:%=--ignore tests/%)
+
+coverage: $(VENV)/.coverage
+	$(BIN)/coverage erase
+	$(call tests,$(COUNTED))
+	$(BIN)/coverage report --skip-covered
+
+shuffled: $(VENV)/.coverage
+	$(call tests,$(RANDOM))
 
 lint: $(VENV)/.development
 	$(BIN)/ruff check
@@ -56,10 +74,12 @@ locked: | $(BIN)/python
 lock: $(SUPPLY)/.installed
 	$(COMPILE) --extra dev pyproject.toml --output-file requirements/dev.lock
 	$(COMPILE) --group supply --output-file requirements/supply.lock
+	$(COMPILE) --group coverage --no-deps --output-file requirements/coverage.lock
 
 audit: $(SUPPLY)/.installed
 	$(SUPPLY)/bin/pip-audit --strict --disable-pip --require-hashes --progress-spinner off \
-	  --requirement requirements/dev.lock --requirement requirements/supply.lock
+	  --requirement requirements/dev.lock --requirement requirements/supply.lock \
+	  --requirement requirements/coverage.lock
 
 sbom: $(SUPPLY)/.installed
 	$(SUPPLY)/bin/cyclonedx-py requirements requirements/dev.lock --pyproject pyproject.toml --output-reproducible \
@@ -94,6 +114,10 @@ $(VENV)/.docs: pyproject.toml | $(BIN)/python
 $(VENV)/.development: pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
 	touch $@ $(VENV)/.runtime $(VENV)/.docs
+
+$(VENV)/.coverage: requirements/coverage.lock | $(VENV)/.development
+	$(BIN)/python -m pip install --quiet --no-deps --require-hashes --requirement requirements/coverage.lock
+	touch $@
 
 $(SUPPLY)/.installed: requirements/supply.lock
 	$(PYTHON) -m venv $(SUPPLY)

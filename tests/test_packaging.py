@@ -101,7 +101,8 @@ def test_the_locks_fit_the_project_and_have_hashes():
     own = next(one for one in needed if one.name == project["name"])
     needed += [Requirement(text) for extra in own.extras for text in extras[extra]]
     needed.remove(own)
-    locks = {"dev": needed, "supply": [Requirement(text) for text in content["dependency-groups"]["supply"]]}
+    groups = content["dependency-groups"]
+    locks = {"dev": needed} | {name: [Requirement(text) for text in texts] for name, texts in groups.items()}
     for name, requirements in locks.items():
         text = (ROOT / f"requirements/{name}.lock").read_text("utf-8").replace("\\\n", "")
         entries = [line for line in text.splitlines() if line and not line.lstrip().startswith("#")]
