@@ -4,13 +4,18 @@ import json
 import tomllib
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 
+from vggtjax.commands import doctor
 from vggtjax.commands import main as cli
 from vggtjax.commands.doctor import EXTRAS
+from vggtjax.config import vggt_1b
 from vggtjax.pipeline import memory
 from vggtjax.pretrained.embedded import demo_model
 from vggtjax.storage.cache import CONVERTED, cache_parts, clear_cache
+from vggtjax.windows.choice import Planned
 
 _NOT_OF_THE_LIBRARY = {"docs", "dev"}
 
@@ -38,6 +43,55 @@ def test_facts_as_json(cache, capsys):
         free = min(room["bytes"] for room in found["memory"]["room"])
         frames = memory.most_frames(demo_model(), 32, 64, free)
         assert clip["frames"] == pytest.approx(frames, rel=0.3)  # the process has changed since
+
+
+class _Gpu:
+    """What jax tells of a GPU; nothing of its memory without a limit."""
+
+    platform, device_kind = "gpu", "a GPU of a test"
+
+    def __init__(self, limit=None, used=0):
+        self._stats = None if limit is None else {"bytes_limit": limit, "bytes_in_use": used}
+
+    def memory_stats(self):
+        return self._stats
+
+
+def use_gpu(monkeypatch, *memory_of_gpu):
+    monkeypatch.setattr(memory, "on_cpu", lambda: False)
+    monkeypatch.setattr(jax, "local_devices", lambda: [_Gpu(*memory_of_gpu)])
+
+
+def test_the_longest_clip_of_a_gpu_leaves_room_for_the_weights(monkeypatch):
+    """No model is loaded, so its weights have to fit beside the clip in what is free."""
+    models = {dtype: Planned(vggt_1b(), size * 1_257_000_000) for dtype, size in (("float32", 4), ("bfloat16", 2))}
+    monkeypatch.setattr(doctor, "_known_models", models.items)
+
+    def longest(*memory_of_gpu):
+        use_gpu(monkeypatch, *memory_of_gpu)
+        return {clip["model"]: clip for clip in doctor._longest_clips()}
+
+    for limit, used in ((4e9, 5e8), (12e9, 1e9)):
+        for dtype, clip in longest(limit, used).items():
+            sizes = [
+                memory.predicted_bytes(models[dtype], clip["frames"] + more, clip["height"], clip["width"])
+                for more in (0, 1)
+            ]
+            assert (sizes[0] if clip["frames"] else 0) <= limit - used < sizes[1]
+    small, unknown = longest(4e9, 5e8), longest()
+    assert small["float32"]["frames"] == 0 < small["bfloat16"]["frames"]
+    assert doctor._longest(small["float32"]) == "no clip of 518 x 294 pixels fits"
+    assert doctor._longest({**small["bfloat16"], "frames": 1}) == "1 frame of 518 x 294 pixels"
+    assert doctor._longest(unknown["float32"]) == "unknown: this system does not tell its memory"
+
+
+def test_the_weights_of_a_loaded_model_are_counted_once(monkeypatch):
+    use_gpu(monkeypatch, 4e9, 1e9)
+    params = {"on the device": jax.numpy.ones(1000, np.float32), "on the host": np.ones(1000)}
+    for held, size in ((params, 3e9 + 4000), (None, 3e9)):
+        room = memory.available(held)
+        assert room is not None
+        assert room.size == size
 
 
 def test_the_page_clears_the_cache_of_this_library_alone(cache, capsys):

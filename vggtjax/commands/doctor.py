@@ -104,10 +104,10 @@ def _longest_clips() -> Iterator[dict[str, Any]]:
     from vggtjax.clips.preprocessing import Fitter
     from vggtjax.pipeline import memory
 
+    room = memory.available()  # no model is loaded
     for name, model in _known_models():
         config = model.config
         width, height = Fitter(size=config.image_size, patch=config.patch_size).fit(*_WIDE, "").frame_size
-        room = memory.available(model)
         yield {
             "model": name,
             "weights": model.parameter_bytes,
@@ -146,9 +146,7 @@ def _print(report: Report, found: dict[str, Any]) -> None:
             for number, device in enumerate(found["devices"])
         },
         "Memory": _memory(found["memory"]),
-        "Longest clip that is run at once": {
-            clip["model"]: _frames(clip) + f" of {clip['width']} x {clip['height']} pixels" for clip in found["clips"]
-        }
+        "Longest clip that is run at once": {clip["model"]: _longest(clip) for clip in found["clips"]}
         | {"longer clips": "are run in windows, and joined"},
         "Extras": {
             extra["name"]: f"{'missing  ' if extra['missing'] else 'installed'}  {extra['for']}"
@@ -184,9 +182,11 @@ def _of_device(device: dict[str, Any]) -> str:
     return "" if limit is None else f", {in_gigabytes(device['bytes_in_use'])} of {in_gigabytes(limit)} in use"
 
 
-def _frames(clip: dict[str, Any]) -> str:
-    frames = clip["frames"]
-    return "unknown: frames" if frames is None else "no frame" if not frames else f"{frames} frames"
+def _longest(clip: dict[str, Any]) -> str:
+    frames, size = clip["frames"], f"of {clip['width']} x {clip['height']} pixels"
+    if frames is None:
+        return "unknown: this system does not tell its memory"
+    return f"{frames} frame{'s' if frames > 1 else ''} {size}" if frames else f"no clip {size} fits"
 
 
 def _version(package: str) -> str | None:

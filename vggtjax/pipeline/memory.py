@@ -7,7 +7,7 @@ computes at once, and pictures and results. The rates are fitted to XLA's own co
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import jax
 
@@ -59,15 +59,20 @@ def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int) -> floa
     return _FLOAT * (frames * (rows + logits) + at_once * maps)
 
 
-def available(model: Sized) -> Room | None:
-    """Return how much there is, what the model and the process hold included; None where it is not known."""
+def available(params: Any = None) -> Room | None:
+    """Return how much there is for a model and its passes; None where it is not known.
+
+    On a CPU what the process holds is included; on a GPU, of what is in use, `params` alone: arrays of a loaded model,
+    of which those on the host take nothing. None stands for a model that is not loaded.
+    """
     if on_cpu():
         return host_room()
     stats = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" not in stats:
         return None
     free = stats["bytes_limit"] - stats.get("bytes_in_use", 0)
-    return Room(free + model.parameter_bytes, "of the device")
+    held = sum(leaf.nbytes for leaf in jax.tree.leaves(params) if isinstance(leaf, jax.Array))
+    return Room(free + held, "of the device")
 
 
 def most_frames(model: Sized, height: int, width: int, size: float, *, clips: int = 1) -> int:

@@ -82,7 +82,7 @@ def choose_windows(
         window: frames that are run together, where windows are given; by default all of the clip.
         clips: held in memory at the same time.
     """
-    room = memory.available(model)
+    room = memory.available(model.params)
     if room is None:
         return None
     frame = next(source.frames(sampling))
