@@ -2,7 +2,7 @@
 
 cosmic-ray (https://cosmic-ray.readthedocs.io) makes the changes, one at a time, in a copy of the repository, and runs
 the tests of the module. Install it in any environment whose programs are on the PATH: `pipx install cosmic-ray`.
-mutants.toml names the changes that the module's own tests cannot notice, and why.
+mutants.toml explains changes that the module's own tests do not notice, such as a factor that cancels.
 """
 
 from __future__ import annotations
@@ -73,13 +73,12 @@ class Score(NamedTuple):
     module: str
     changes: int
     noticed: int
-    equivalent: int  # changes of mutants.toml
-    survivors: list[str]  # each a line's number, the line before and after
+    explained: int  # changes of mutants.toml that no test noticed
+    survivors: list[str]  # the others: each a line's number, the line before and after
 
-    @property
-    def percent(self) -> float:
-        """The noticed changes, of those that could be noticed."""
-        return 100 * self.noticed / max(self.changes - self.equivalent, 1)
+    def percent(self, *, explained: bool) -> str:
+        """Return the share of noticed changes, or of noticed and explained ones."""
+        return f"{100 * (self.noticed + explained * self.explained) / max(self.changes, 1):.1f} %"
 
 
 def mutants(
@@ -109,11 +108,12 @@ def mutants(
         if out is not None:
             write_json(out, {"scores": [score._asdict() for score in scores]})
     table = Table(title="changes that the tests of a module notice", title_justify="left")
-    for heading in ("module", "changes", "noticed", "equivalent", "score"):
+    for heading in ("module", "changes", "noticed", "share", "explained", "with explained"):
         table.add_column(heading, justify="left" if heading == "module" else "right")
     for score in scores:
-        counts = map(str, (score.changes, score.noticed, score.equivalent))
-        table.add_row(MODULES[score.module].path, *counts, f"{score.percent:.1f} %")
+        noticed, both = score.percent(explained=False), score.percent(explained=True)
+        row = score.changes, score.noticed, noticed, score.explained, both
+        table.add_row(MODULES[score.module].path, *map(str, row))
     console.print(table)
 
 
@@ -168,7 +168,7 @@ def _score(name: str, folder: Path, seconds: float, share: int, console: Console
             f"cosmic-ray ended with code {running.returncode} after {len(rows)} of {total} changes of {name}"
         )
     survivors = [(line, _shown(diff)) for _, line, outcome, diff in rows if outcome == "SURVIVED"]
-    noticed, known = len(rows) - len(survivors), _equivalent(name)
+    noticed, known = len(rows) - len(survivors), _explained(name)
     unknown = [f"{line}: {change}" for line, change in survivors if change not in known]
     return Score(name, len(rows), noticed, len(survivors) - len(unknown), unknown)
 
@@ -187,8 +187,8 @@ def _rows(session: str) -> Sequence[tuple[str, int, str, str]]:
         return connection.execute(_ROWS).fetchall()
 
 
-def _equivalent(name: str) -> set[str]:
-    """Return the changes of a module that its own tests cannot notice."""
+def _explained(name: str) -> set[str]:
+    """Return the changes of a module that its own tests do not notice, for a reason."""
     groups = tomllib.loads((Path(__file__).with_suffix(".toml")).read_text()).get(name, [])
     return {f"{group['line']} -> {to}" for group in groups for to in group["to"]}
 

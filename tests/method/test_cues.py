@@ -61,6 +61,7 @@ def test_maps_and_saliency_are_those_of_every_gram_matrix(gram, padding):
 def test_deviations_and_directions_by_hand():
     values = jnp.asarray([[[2.0, 3, 4, 7], [1, 1, 1, 1]]] * 3)
     assert np.allclose(_sample_std(values), np.std(values, axis=-1, ddof=1))
+    assert np.isfinite(jax.grad(lambda x: _sample_std(x).sum())(jnp.ones((2, 3)))).all()
     assert np.allclose(_unit(jnp.asarray([[3.0, 4.0], [0.0, 0.0]])), [[0.6, 0.8], [0, 0]])
 
 
