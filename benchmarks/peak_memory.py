@@ -55,6 +55,10 @@ EMBEDDED = (
     Setting(4, 256, 256, "bfloat16", "vggt"),
     Setting(8, 256, 256, "float32", "vggt4d"),
     Setting(12, 192, 256, "float32", "vggt"),
+    Setting(32, 256, 256, "float32", "4dvggt-d"),
+    Setting(24, 192, 256, "float32", "vggt4d"),
+    Setting(64, 128, 128, "float32", "4dvggt-d"),
+    Setting(8, 512, 512, "float32", "4dvggt-d"),
 )
 FULL = (
     Setting(2, 294, 518, "float32", "4dvggt-d"),
@@ -86,7 +90,7 @@ def peak_memory(*, full: Path | None = None, embedded: bool = True, out: Path | 
     Args:
         full: a checkpoint of VGGT-1B's size, such as `make-checkpoint` writes and `vggtjax convert` converts; its four
             settings take 8 GB of memory.
-        embedded: measure the twelve settings of the embedded model.
+        embedded: measure the sixteen settings of the embedded model.
         out: JSON file for the rows.
     """
     work = [("demo", EMBEDDED)] if embedded else []
@@ -128,7 +132,7 @@ def _measured(model: Model, name: str, setting: Setting, folder: Path) -> Row:
     shape = setting.frames, setting.height, setting.width
     for number, image in enumerate(seeded_images(*shape).transpose(0, 2, 3, 1)):
         Image.fromarray(np.round(255 * image).astype(np.uint8)).save(frames / f"{number:04}.png")
-    predicted = memory.predicted_bytes(model, *shape)
+    predicted = memory.predicted_bytes(model, *shape, method=setting.method)
     words = ["reconstruct", str(frames), "--model", name, "--out", str(folder / "out"), "--window", "0"]
     answer = run_worker([*words, *setting.words], folder / "cache")
     return Row("embedded" if name == "demo" else "full", setting, predicted, answer["total"], answer["own"])

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -11,6 +12,11 @@ from vggtjax.config import vggt_1b
 from vggtjax.pipeline import memory
 from vggtjax.pretrained.embedded import demo_model
 from vggtjax.storage.free_memory import host_room, own_limits
+from vggtjax.windows.choice import Planned
+
+_ROOT = Path(__file__).parents[2]
+_FULL = Planned(vggt_1b(), 5_026_145_968)  # of float32
+_HALF = Planned(vggt_1b(), 5_026_145_968 // 2)
 
 
 @pytest.mark.parametrize(
@@ -30,25 +36,66 @@ def test_the_passes_are_predicted_within_a_third_of_the_counts_of_xla(config, fr
 
 
 @pytest.mark.parametrize(
-    ("frames", "height", "width", "measured"),  # peaks in MB of processes, by python -m benchmarks peak-memory
+    ("frames", "height", "width", "method", "measured"),  # peaks in MB of processes, by benchmarks peak-memory
     [
-        (8, 64, 64, 661),
-        (32, 64, 64, 673),
-        (64, 64, 64, 723),
-        (32, 64, 64, 691),
-        (8, 128, 128, 672),
-        (16, 128, 128, 714),
-        (16, 128, 128, 745),
-        (32, 128, 128, 863),
-        (4, 256, 256, 764),
-        (4, 256, 256, 761),
-        (8, 256, 256, 859),
-        (12, 192, 256, 852),
+        (8, 64, 64, "4dvggt-d", 596),
+        (32, 64, 64, "vggt4d", 814),
+        (64, 64, 64, "vggt", 640),
+        (32, 64, 64, "4dvggt-d", 606),
+        (8, 128, 128, "vggt", 577),
+        (16, 128, 128, "4dvggt-d", 674),
+        (16, 128, 128, "vggt4d", 848),
+        (32, 128, 128, "hard-replacement", 740),
+        (4, 256, 256, "4dvggt-d", 680),
+        (4, 256, 256, "vggt", 632),
+        (8, 256, 256, "vggt4d", 787),
+        (12, 192, 256, "vggt", 758),
+        (32, 256, 256, "4dvggt-d", 1109),
+        (24, 192, 256, "vggt4d", 1001),
+        (64, 128, 128, "4dvggt-d", 1013),
+        (8, 512, 512, "4dvggt-d", 1212),
     ],
 )
-def test_the_peaks_of_processes_are_predicted_within_the_error_that_is_promised(frames, height, width, measured):
-    predicted = memory.predicted_bytes(demo_model(), frames, height, width)
+def test_the_peaks_of_processes_are_predicted_within_the_error_that_is_promised(
+    frames, height, width, method, measured
+):
+    predicted = memory.predicted_bytes(demo_model(), frames, height, width, method=method)
     assert predicted == pytest.approx(1e6 * measured, rel=memory.ERROR)
+
+
+@pytest.mark.parametrize(
+    ("frames", "height", "width", "method", "measured"),  # by --full CHECKPOINT, with weights of 5.03 GB
+    [
+        (2, 294, 518, "4dvggt-d", 5460),
+        (4, 294, 518, "vggt", 5590),
+        (3, 252, 252, "vggt4d", 5600),
+        (2, 294, 518, "4dvggt-d", 5470),
+    ],
+)
+def test_so_are_those_of_processes_with_a_model_of_full_size(frames, height, width, method, measured):
+    predicted = memory.predicted_bytes(_FULL, frames, height, width, method=method)
+    assert predicted == pytest.approx(1e6 * measured, rel=memory.ERROR)
+
+
+@pytest.mark.parametrize(
+    ("page", "pattern", "model"),  # each match: frames of 518 x 294, and GB with the digits that are given
+    [
+        ("docs/my-video.md", r"^\| (\d+) \| [^|]*\| ([\d.]+) GB \|", _FULL),
+        ("docs/troubleshooting.md", r"(\d+) frames: ([\d.]+) GB", _FULL),
+        ("docs/troubleshooting.md", r"(\d+) frames(?: of 518 x 294)?\s+need (?:about )?([\d.]+) GB", _FULL),
+        ("docs/how-to/long-clips.md", r"^\| (\d+)(?: \([^|]*\))? \| ([\d.]+) GB \|", _FULL),
+        ("docs/how-to/long-clips.md", r"(600) frames need about ([\d.]+) GB", _FULL),
+        ("docs/questions.md", r"do (\d+) frames need\? \| about ([\d.]+) GB", _FULL),
+        ("docs/questions.md", r"do (\d+) frames need\?.*?([\d.]+) with bfloat16 weights", _HALF),
+        ("README.md", r"take (\d+) frames for[^.]*?\s([\d.]+) GB of memory", _FULL),
+    ],
+)
+def test_the_pages_say_what_the_program_predicts(page, pattern, model):
+    found = re.findall(pattern, (_ROOT / page).read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert found
+    for frames, said in found:
+        predicted = memory.predicted_bytes(model, int(frames), 294, 518) / 1e9
+        assert f"{predicted:.{len(said.partition('.')[2])}f}" == said, (page, frames)
 
 
 def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):

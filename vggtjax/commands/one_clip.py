@@ -99,6 +99,7 @@ class OneClip:
                 self.sampling,
                 self.fitter,
                 window=None if count is None else windows.window,
+                method=self.options.method,
             )
         if choice is None:
             return windows, count

@@ -31,7 +31,7 @@ LEAST_SHARE = 0.05  # of a group's projections that must be comparable
 MOST_LOSS = 0.1
 OCCLUSION = 0.01  # depth by which a point may lie behind the depth of its target pixel
 TOO_FEW = 1e10  # loss of a group with too few comparable projections
-SAMPLES_AT_ONCE = 1 << 21  # projected points, a bound on memory
+SAMPLES_AT_ONCE = 1 << 18  # projected points, a bound on memory
 _BUCKET = 2048  # points are padded to a multiple, so that masks of similar size share a compilation
 _CLOSING = np.array([[0, 0, 1, 0, 0], [1] * 5, [1] * 5, [1] * 5, [0, 0, 1, 0, 0]], bool)  # OpenCV's 5 x 5 ellipse
 

@@ -77,7 +77,8 @@ class ClipWork:
         """
         opened, recipe = open_source(source), self._recipe
         if not recipe.unchecked and recipe.devices == 1:
-            choice = choose_windows(self._model, opened, recipe.sampling, self._fitter, clips=clips)
+            method = recipe.options.method
+            choice = choose_windows(self._model, opened, recipe.sampling, self._fitter, method=method, clips=clips)
             if choice is not None and choice.is_cut and self._cuts:
                 return LongClip(choice.windows, choice.frames, choice.sentence)
             if choice is not None and choice.is_hopeless:

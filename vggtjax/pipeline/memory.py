@@ -1,8 +1,9 @@
 """The memory that a clip needs when all of its frames are run together, predicted before it is loaded.
 
-It is the weights, the process, what the blocks hold of every frame, what the dense head holds of the frames that it
-computes at once, and pictures and results. The rates are fitted to XLA's own counts of both passes on a CPU
-(`python -m benchmarks memory`) and to measured peaks of processes (`python -m benchmarks peak-memory`).
+It is the weights, the process, and the larger of two: what the compiler takes of programs that are compiled side by
+side, and what the passes hold: the blocks of every frame, the dense head of the frames that it computes at once, and
+pictures and results. The rates are fitted to XLA's own counts of both passes on a CPU (`python -m benchmarks memory`)
+and to measured peaks of processes that compile their programs (`python -m benchmarks peak-memory`).
 """
 
 from __future__ import annotations
@@ -15,15 +16,17 @@ from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.attention import LOGITS_AT_ONCE
 from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
+from vggtjax.options import Method, find_method
 from vggtjax.storage.free_memory import Room, host_room
 
 ERROR = 0.15  # of a measured peak: predictions are as near
 _FLOAT = 4  # bytes
-_PROCESS, _PROCESS_OF_WEIGHTS = 0.62e9, 0.08  # Python, libraries, the compiler; freed memory that is kept
+_PROCESS = 0.54e9  # Python, libraries, the compiler of one pass
+_COMPILING = 0.26e9  # more than that, where the second pass has a program of its own
 _ROWS = 12.5  # copies of a frame's tokens, in and between the blocks
-_LOGITS = 4  # copies of the attention of short frames, whose heads are computed at once
+_LOGITS = 1  # copies of the attention of short frames, whose heads are computed at once
 _MAPS = 0.5  # copies of the dense head's maps at full resolution
-_PIXEL = 40.0  # bytes of a pixel: pictures, and the results of both passes, on the host and on the device
+_PIXEL = 150.0  # bytes of a pixel: pictures, the results of both passes, and what is made of them before it is written
 _MOST_IMAGES = 2**34  # bytes of the images of a clip that is loaded as a whole
 
 
@@ -37,16 +40,19 @@ class Sized(Protocol):
     def parameter_bytes(self) -> int: ...
 
 
-def predicted_bytes(model: Sized, frames: int, height: int, width: int, *, clips: int = 1) -> float:
-    """Return how much memory any method takes on all frames of a clip at once, with the model and the process.
+def predicted_bytes(
+    model: Sized, frames: int, height: int, width: int, *, method: str = "4dvggt-d", clips: int = 1
+) -> float:
+    """Return how much memory a method takes on all frames of a clip at once, with the model and the process.
 
     On a GPU the process is not counted. `clips` such clips are held at the same time: in a batch one is computed while
     the next is read and the last is written.
     """
-    weights = model.parameter_bytes
-    process = _PROCESS + _PROCESS_OF_WEIGHTS * weights if on_cpu() else 0.0
     pictures = clips * frames * _PIXEL * height * width
-    return weights + process + pass_bytes(model.config, frames, height, width) + pictures
+    run = pass_bytes(model.config, frames, height, width) + pictures
+    if on_cpu():
+        run = _PROCESS + max(run, _COMPILING if _second_is_another(find_method(method)) else 0)
+    return model.parameter_bytes + run
 
 
 def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int) -> float:
@@ -75,14 +81,19 @@ def available(params: Any = None) -> Room | None:
     return Room(free + held, "of the device")
 
 
-def most_frames(model: Sized, height: int, width: int, size: float, *, clips: int = 1) -> int:
+def most_frames(model: Sized, height: int, width: int, size: float, *, method: str = "4dvggt-d", clips: int = 1) -> int:
     """Return the most frames that are predicted to fit in `size` bytes when they are run together; maybe 0."""
     low, high = 0, max(1, _MOST_IMAGES // (3 * _FLOAT * height * width)) + 1  # the first fits, the last does not
     while high - low > 1:
         middle = (low + high) // 2
-        fits = predicted_bytes(model, middle, height, width, clips=clips) <= size
+        fits = predicted_bytes(model, middle, height, width, method=method, clips=clips) <= size
         low, high = (middle, high) if fits else (low, middle)
     return low
+
+
+def _second_is_another(method: Method) -> bool:
+    """Whether the second pass is another program than the first, as it gives no depth."""
+    return method.needs_second_pass and "depth" not in method.second_outputs()
 
 
 def on_cpu() -> bool:

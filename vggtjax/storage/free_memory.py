@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -129,3 +132,13 @@ def _kilobytes(path: Path, name: str) -> int | None:
         return int(lines[name].split()[0]) * _KILO
     except (OSError, LookupError, ValueError):
         return None
+
+
+def return_freed_memory() -> None:
+    """Return to the system what the process has freed and the C library keeps, of each thread; glibc alone does so.
+
+    A compiler frees hundreds of megabytes that no other thread would use again.
+    """
+    if sys.platform == "linux":
+        with suppress(AttributeError):  # musl has no malloc_trim
+            ctypes.CDLL(None).malloc_trim(0)

@@ -26,6 +26,7 @@ from jax.core import Tracer
 from vggtjax.errors import InputError, OutputError, check_regular
 from vggtjax.storage.cache import compiled_folder, lowered_folder
 from vggtjax.storage.cores import core_count
+from vggtjax.storage.free_memory import return_freed_memory
 from vggtjax.storage.versions import package_digest
 from vggtjax.storage.writing import writing
 
@@ -75,6 +76,7 @@ class Program:
 
         def compile_lowered() -> Any:
             compiled = lowered.compile()
+            return_freed_memory()
             if key is not None and ready is not self._jitted:
                 self._ready[key] = compiled
             return compiled

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 from vggtjax.checkpoint import Model
@@ -71,6 +73,7 @@ def choose_windows(
     fitter: Fitter,
     *,
     window: int | None = None,
+    method: str = "4dvggt-d",
     clips: int = 1,
 ) -> Choice | None:
     """Return windows for a clip that does not fit in memory; None for one that does, or where memory is not known.
@@ -80,6 +83,7 @@ def choose_windows(
     Args:
         model, source, sampling, fitter: what is run.
         window: frames that are run together, where windows are given; by default all of the clip.
+        method: by its name.
         clips: held in memory at the same time.
     """
     room = memory.available(model.params)
@@ -87,7 +91,7 @@ def choose_windows(
         return None
     frame = next(source.frames(sampling))
     width, height = fitter.fit(*frame.image.size, frame.name).frame_size
-    most = memory.most_frames(model, height, width, room.size, clips=clips)
+    most = memory.most_frames(model, height, width, room.size, method=method, clips=clips)
     frames = min(count_frames(source, sampling, most + 1), window or most + 1)
     if frames <= most:
         return None
@@ -96,8 +100,9 @@ def choose_windows(
     windows = Windows(next((length for length in _LENGTHS if length <= most), _LENGTHS[-1]))
     if windows.window is not None and windows.window > most:  # not even the shortest fits
         windows = Windows()
-    needed = memory.predicted_bytes(model, frames, height, width, clips=clips)
-    smaller = _smaller(model, (frames, height, width), fitter, room.size, most, clips)
+    need = partial(memory.predicted_bytes, method=method, clips=clips)
+    needed = need(model, frames, height, width)
+    smaller = _smaller(model, (frames, height, width), fitter, room.size, most, need)
     return Choice(windows, frames, needed, room.size, room.limit, smaller)
 
 
@@ -114,13 +119,13 @@ def smaller_size(fitter: Fitter) -> Fitter | None:
 
 
 def _smaller(
-    model: Model, shape: tuple[int, int, int], fitter: Fitter, free: float, most: int, clips: int
+    model: Model, shape: tuple[int, int, int], fitter: Fitter, free: float, most: int, need: Callable[..., float]
 ) -> tuple[str, ...]:
     """Return what would fit, each as the option that does it."""
     frames, height, width = shape
 
     def fits(network: memory.Sized, height: int, width: int) -> bool:
-        return memory.predicted_bytes(network, frames, height, width, clips=clips) <= free
+        return need(network, frames, height, width) <= free
 
     ways = [] if most < 1 else [f"--max-frames {most}"]
     for size in range(fitter.size - fitter.patch, fitter.patch, -fitter.patch):
