@@ -1,10 +1,13 @@
-"""How far results are apart, by hand; bad input."""
+"""How far results are apart, by hand and in every way of running; what the docs say of it; bad input."""
+
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks import __main__ as benchmarks
-from benchmarks.determinism import apart
+from benchmarks.determinism import MOST, WAYS, apart, differences
 
 
 def test_how_far_results_are_apart_by_hand():
@@ -34,3 +37,25 @@ def test_how_far_results_are_apart_by_hand():
 def test_bad_input(capsys, words, sentence):
     assert benchmarks.main(["determinism", *words.split()]) == 2
     assert sentence in capsys.readouterr().err
+
+
+def test_no_way_of_running_is_further_apart_than_is_promised():
+    rows = differences(17, "demo", tuple(WAYS))
+    assert {way: row for way, row in rows.items() if not row.within(MOST[way])} == {}
+
+
+def test_the_page_says_what_is_allowed():
+    page = (Path(__file__).parents[2] / "docs" / "promises.md").read_text(encoding="utf-8")
+    allowed = page.partition("and allows, in the same quantities")[2].partition("\n\n\n")[0]
+    rows = {
+        "the same": "again",
+        "on one core": "one core",
+        "every other way": "padded",
+        "blocks in bfloat16": "bfloat16",
+    }
+    for begins, way in rows.items():
+        cells = next(line for line in allowed.splitlines() if line.startswith(f"| {begins}")).split("|")[3:-1]
+        said = [float(number) for number in re.findall(r"[\d.]+(?:e-\d+)?", " ".join(cells))]
+        most = MOST[way]
+        assert said == [*([most.depth, most.mean_depth] if most.depth else [0]), *most[3:6], 100 * most.mask], way
+    assert set(MOST.values()) == {MOST[way] for way in rows.values()}
