@@ -79,7 +79,7 @@ class Apart(NamedTuple):
 _EQUAL = Apart(equal=True, depth=0, mean_depth=0, confidence=0, rotation=0, centre=0, mask=0)
 _ROUNDED = Apart(equal=False, depth=1e-5, mean_depth=1e-6, confidence=2e-5, rotation=1e-4, centre=5e-6, mask=1e-4)
 _COARSE = Apart(equal=False, depth=2, mean_depth=0.01, confidence=4, rotation=5, centre=0.1, mask=0.01)
-MOST = dict.fromkeys(WAYS, _ROUNDED) | {"again": _EQUAL, "one core": _EQUAL, "bfloat16": _COARSE}  # that tests allow
+MOST = dict.fromkeys(WAYS, _ROUNDED) | {"again": _EQUAL, "bfloat16": _COARSE}  # that tests allow
 
 
 def determinism(*, frames: int = 17, model: str = "demo", ways: tuple[str, ...] = tuple(WAYS)) -> None:

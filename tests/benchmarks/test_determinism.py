@@ -49,7 +49,6 @@ def test_the_page_says_what_is_allowed():
     allowed = page.partition("and allows, in the same quantities")[2].partition("\n\n\n")[0]
     rows = {
         "the same": "again",
-        "on one core": "one core",
         "every other way": "padded",
         "blocks in bfloat16": "bfloat16",
     }
