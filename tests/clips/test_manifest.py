@@ -99,7 +99,7 @@ def test_lists_that_would_fill_the_memory(tmp_path):
     parquet.write_table(column, tmp_path / "each.parquet", compression="zstd", use_dictionary=False)
     written(tmp_path, "a.jsonl", '{"source": "a", "x": [' + "0," * 40_000 + "0]}")
     for name, sentence in (
-        ("once.parquet", "has 16 rows of 640"),
+        ("once.parquet", "has a text of 40000 bytes"),
         ("each.parquet", "says that its text takes 200"),
         ("a.jsonl", "line 1 has more than 65536 bytes"),
     ):

@@ -31,6 +31,7 @@ class Reader(NamedTuple):
     make: Callable[[Path], Path]  # returns what is read: a file or folder inside the given, empty folder
     read: Callable[[Path], object]
     slack: int = 48 * 2**20  # bytes that a case may take beyond twice what the valid sample takes
+    refusals: type[Exception] = VggtjaxError  # what the reader raises for a file that it refuses, in a sentence
 
 
 class Outcome(NamedTuple):
@@ -69,7 +70,7 @@ class Sample:
             shutil.copytree(seed, self._scratch, symlinks=True, dirs_exist_ok=True)
         elif seed is not None:
             change(self._scratch, Random(f"{self.reader.name} {seed}"))
-        outcome = read(self.reader.read, self._scratch / self._read)
+        outcome = read(self.reader.read, self._scratch / self._read, self.reader.refusals)
         if seed is not None and outcome.kind != "found" and outcome.bytes > _TIMES * self.bytes + self.reader.slack:
             words = f"took {outcome.bytes >> 20} MiB, the valid sample {self.bytes >> 20}; {outcome.words}"
             return outcome._replace(kind="found", words=words)
@@ -94,7 +95,7 @@ def scratch_folder() -> Iterator[Path]:
         yield Path(folder)
 
 
-def read(function: Callable[[Path], object], path: Path) -> Outcome:
+def read(function: Callable[[Path], object], path: Path, refusals: type[Exception] = VggtjaxError) -> Outcome:
     """Call a reader; every outcome but success and one good sentence is found."""
     before = _peak(reset=True)
     start = time.monotonic()
@@ -103,7 +104,7 @@ def read(function: Callable[[Path], object], path: Path) -> Outcome:
             warnings.simplefilter("ignore")
             function(path)
         kind, words = "accepted", ""
-    except VggtjaxError as error:
+    except refusals as error:
         kind, words = _judged(error)
     except HangError:
         kind, words = "found", f"hangs: {_place()}"
@@ -177,7 +178,7 @@ _TREE: tuple[Callable[[Path, Random], Any], ...] = (
 )
 
 
-def _judged(error: VggtjaxError) -> tuple[str, str]:
+def _judged(error: Exception) -> tuple[str, str]:
     words, raw = str(error), str(error.args[0]) if error.args else ""
     if not words or not words.isprintable() or len(words) >= MOST_LETTERS:
         return "found", f"{type(error).__name__} with a message of {len(words)} letters: {words[:300]!r}"

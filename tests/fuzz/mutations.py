@@ -61,7 +61,7 @@ _RAW = (  # JSON text
 )
 _INTEGERS = (0, 1, -1, 2, 255, 2**15, 2**16 - 1, 2**24, 2**31 - 1, -(2**31), 2**32 - 1, 2**53, 2**62, 2**63 - 1)
 _FLOATS = (float("nan"), float("inf"), -float("inf"), 0.0, -1.0, 1e-300, 1e300, 3.5)
-_BOMB_BYTES = 2**28 + 2**25  # of zeros: one megabyte when they are compressed
+_BOMB_BYTES = (2**26 - 2**22, 2**28 + 2**25)  # of zeros: what an archive may declare, and what is refused
 
 
 def mutated(content: bytes, random: Random) -> bytes:
@@ -269,21 +269,21 @@ def _npy(content: bytes, random: Random) -> bytes:
     return npy(descr, array.flags.fnc, shape, values)
 
 
-@lru_cache(maxsize=1)
-def _bomb() -> tuple[bytes, int, int]:
+@lru_cache(maxsize=len(_BOMB_BYTES))
+def _bomb(size: int) -> tuple[bytes, int, int]:
     """Return an .npy file of zeros in deflated form, its checksum and its length, without holding the zeros."""
-    start, block = npy("|u1", False, (_BOMB_BYTES,), b""), bytes(2**22)
+    start, block = npy("|u1", False, (size,), b""), bytes(2**22)
     packer, check = zlib.compressobj(1, zlib.DEFLATED, -15), zlib.crc32(start)
     packed = [packer.compress(start)]
-    for _ in range(_BOMB_BYTES // len(block)):
+    for _ in range(size // len(block)):
         packed.append(packer.compress(block))
         check = zlib.crc32(block, check)
-    return b"".join([*packed, packer.flush()]), check, len(start) + _BOMB_BYTES
+    return b"".join([*packed, packer.flush()]), check, len(start) + size
 
 
-def _bombed(name: str) -> bytes:
-    """Return a zip with the bomb under a name."""
-    packed, check, length = _bomb()
+def _bombed(name: str, size: int) -> bytes:
+    """Return a zip with a bomb under a name."""
+    packed, check, length = _bomb(size)
     word = name.encode()
     fields = struct.pack("<HHHHHIIIHH", 20, 0, zipfile.ZIP_DEFLATED, 0, 33, check, len(packed), length, len(word), 0)
     local = b"PK\x03\x04" + fields + word + packed
@@ -295,7 +295,7 @@ def _bombed(name: str) -> bytes:
 def _zip(content: bytes, random: Random) -> bytes:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if sum(info.file_size for info in archive.infolist()) > _BOMB_BYTES // 4:  # a bomb already
+            if sum(info.file_size for info in archive.infolist()) > _BOMB_BYTES[0] // 4:  # a bomb already
                 return random.choice(_BYTES)(content, random)
             members = [(info.filename, archive.read(info), info.compress_type) for info in archive.infolist()]
             if not members:
@@ -323,7 +323,7 @@ def _zip(content: bytes, random: Random) -> bytes:
     elif change == 15:
         members[at] = (name, random.choice((b"", data * 3, bytes(2**22))), zipfile.ZIP_DEFLATED)
     elif change == 16 and name.endswith(".npy") and random.random() < 0.2:
-        return _bombed(name)
+        return _bombed(name, random.choice(_BOMB_BYTES))
     elif change == 17:
         return _lying_directory(content, random)
     elif change == 18:

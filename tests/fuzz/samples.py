@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Any
 
 import av
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 from PIL import Image
 
 from tests.captures import folders
@@ -133,6 +136,16 @@ def text_file(name: str, content: str | bytes):
     return lambda folder: write(folder / name, content)
 
 
+def made(function: Callable[[Path], object], name: str = "set") -> Callable[[Path], Path]:
+    """Return the maker of a folder that a function fills."""
+
+    def make(folder: Path) -> Path:
+        function(folder / name)
+        return folder / name
+
+    return make
+
+
 def json_file(name: str, value: Any):
     return text_file(name, json.dumps(value))
 
@@ -156,6 +169,9 @@ def manifest(name: str):
         for clip_name in ("a", "b"):
             write(folder / clip_name / "0.png", png(pixels()))
         rows = [{"source": "a", "name": "first"}, {"source": "b", "name": "second"}]
+        if name.endswith(".parquet"):
+            pq.write_table(pa.Table.from_pylist(rows), folder / name)
+            return folder / name
         if name.endswith(".csv"):
             text = "source,name\n" + "\n".join(f"{row['source']},{row['name']}" for row in rows)
         else:

@@ -22,7 +22,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import jax
 import numpy as np
@@ -42,9 +42,14 @@ class ArtefactError(Exception):
     """What does not fit, in one sentence: a printable line of at most _MOST_LETTERS letters."""
 
     def __str__(self) -> str:
-        text = "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in super().__str__())
+        text = _printable(super().__str__())
         end = _MOST_LETTERS // 3
         return text if len(text) <= _MOST_LETTERS else f"{text[: _MOST_LETTERS - end - 5]} ... {text[-end:]}"
+
+
+def _printable(text: str) -> str:
+    """Return text on one line, for a terminal: names of files may hold control characters."""
+    return "".join(c if c.isprintable() else " " if c.isspace() else "?" for c in text)
 
 
 def load(folder: str | Path) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
@@ -222,9 +227,14 @@ def _write_result(path: Path, arrays: dict[str, np.ndarray]) -> None:
         raise
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        super().error(_printable(message))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, or 2 for what does not fit."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = _Parser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("clips", nargs="+", type=Path, help="files of numpy.save: frames [S, H, W, 3]")
     parser.add_argument("--out", type=Path, required=True, help="folder for a file NAME.npz per clip")
     parser.add_argument("--artefact", type=Path, default=Path(__file__).parent, help="its folder; this script's own")
@@ -236,7 +246,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run = load(given.artefact)
         for clip, name in zip(given.clips, names, strict=True):
             _write_result(given.out / f"{name}.npz", run(_read_frames(clip)))
-            sys.stdout.write(f"{given.out / name}.npz\n")
+            sys.stdout.write(f"{_printable(str(given.out / name))}.npz\n")
     except ArtefactError as error:
         message = str(error)
     except OSError as error:
@@ -247,7 +257,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         message = "the clip does not fit in the memory of the device; export the model for fewer frames"
     else:
         return 0
-    sys.stderr.write(f"serve: {message}\n")
+    sys.stderr.write(f"serve: {_printable(message)}\n")
     return 2
 
 

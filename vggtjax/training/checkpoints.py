@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -101,14 +102,27 @@ def _opened(folder: Path, *, create: bool = False) -> orbax.CheckpointManager:
     return orbax.CheckpointManager(folder.resolve(), options=options, item_handlers=handlers)
 
 
+class _FinishingLoop(asyncio.SelectorEventLoop):
+    """A loop that ends its reads before it closes: where one fails, orbax leaves the others, which print tracebacks."""
+
+    def close(self) -> None:
+        if reads := asyncio.all_tasks(self):
+            self.run_until_complete(asyncio.gather(*reads, return_exceptions=True))
+        super().close()
+
+
 @contextmanager
 def _explaining(place: Path) -> Iterator[None]:
+    """Turn exceptions for damaged files into CheckpointError, with no word on the terminal."""
+    new_event_loop, asyncio.new_event_loop = asyncio.new_event_loop, _FinishingLoop  # which orbax calls
     try:
         yield
     except CheckpointError:
         raise
     except _BROKEN as error:
         raise CheckpointError(f"{place} cannot be read as a checkpoint of a run: {one_line(str(error))}") from error
+    finally:
+        asyncio.new_event_loop = new_event_loop
 
 
 def _check_shapes(place: Path, metadata: Any, shapes: TrainingState) -> None:

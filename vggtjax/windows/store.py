@@ -78,9 +78,21 @@ class WindowStore:
         """Return the stored result of a window. Raises ResultError where there is none."""
         return Reconstruction.load(self._folder / f"{name}.npz")
 
-    def features(self, name: str) -> Float32[np.ndarray, "F C"]:
-        """Return the stored features of a window."""
-        return read_array(self._folder / f"{name}.npy")
+    def features(self, names: Sequence[str], frames: int) -> list[Float32[np.ndarray, "F C"]]:
+        """Return the stored features of windows, of as many frames each.
+
+        Raises ResultError for files that are not finite features of one length.
+        """
+        try:
+            features = [read_array(self._folder / f"{name}.npy") for name in names]
+            shape = (frames, *features[0].shape[1:2])
+            if not all(
+                part.shape == shape and part.dtype == np.float32 and np.isfinite(part).all() for part in features
+            ):
+                raise ResultError("the features of the windows do not fit together")
+        except ResultError as error:
+            raise ResultError(f"{error}; delete {self._root}, and the windows are run again") from error
+        return features
 
     def save(self, name: str, result: Reconstruction, features: Float32[np.ndarray, "F C"] | None = None) -> None:
         """Store a window; the archive comes last and whole, so that a window is there or not."""

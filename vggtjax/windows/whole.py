@@ -134,7 +134,8 @@ class Whole:
 
     def _loop_edges(self, like: Clip) -> list[Edge]:
         """Return edges between windows that show one place again, each verified by a window of its own."""
-        features = [self.store.features(window_name(number)) for number in range(len(self.windows))]
+        names = [window_name(number) for number in range(len(self.windows))]
+        features = self.store.features(names, len(described_frames(self.windows[0])))
         found = find_loops(features, self.windows, max(1, round(_LOOPS * len(self.windows))))
         edges = []
         with self.on_stage("close loops") as progress:

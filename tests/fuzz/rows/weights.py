@@ -1,0 +1,200 @@
+"""Rows of weights, and of what goes with them: configurations, recipes, checkpoints of a run, artefacts, the hub."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from contextlib import suppress
+from functools import cache, partial
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from tests.dataset_files import write
+from tests.fuzz import samples
+from tests.fuzz.cases import Reader
+from tests.tiny import tiny_config
+from vggtjax.config import VGGTConfig
+from vggtjax.pipeline import serve
+from vggtjax.storage.json_values import read_json
+from vggtjax.storage.tensor_file import Spec, write_tensors
+from vggtjax.training.recipe import read_recipe
+
+_RECIPE = Path(__file__).parents[3] / "docs/recipes/smoke.json"
+
+
+def _weights(path: Path) -> None:
+    from converters.files import read_state_dict
+
+    for tensor in read_state_dict(path).tensors.values():
+        np.array(tensor)
+
+
+def _tensors(path: Path) -> Path:
+    specs = {"a.weight": Spec((4, 6), np.dtype(np.float32)), "b.bias": Spec((3,), np.dtype(np.float16))}
+    write_tensors(path, specs, lambda name: [np.ones(specs[name].shape)], {"format": "pt"})
+    return path
+
+
+def _shards(folder: Path) -> Path:
+    for number in (1, 2):
+        spec = {f"tensor{number}": Spec((4,), np.dtype(np.float32))}
+        write_tensors(folder / f"model-{number}-of-2.safetensors", spec, lambda _: [np.ones(4)])
+    names = {f"tensor{number}": f"model-{number}-of-2.safetensors" for number in (1, 2)}
+    content = {"metadata": {"total_size": 32}, "weight_map": names}
+    return write(folder / "model.safetensors.index.json", json.dumps(content))
+
+
+def _torch_file(folder: Path, **options: Any) -> Path:
+    import torch
+
+    state = {"a.weight": torch.ones(4, 6), "b.bias": torch.ones(3, dtype=torch.bfloat16)}
+    torch.save({"model": state, "step": 3}, folder / "model.pt", **options)
+    return folder / "model.pt"
+
+
+def _checkpoint(folder: Path) -> Path:
+    from vggtjax.checkpoint import flat_shapes, write_checkpoint
+
+    config = tiny_config(depth=4, track_features=8, track_hidden=16)
+    specs = {name: Spec(shape, np.dtype(np.float32)) for name, shape in flat_shapes(config).items()}
+    zeros = {name: np.zeros(spec.shape, np.float32) for name, spec in specs.items()}
+    labels: dict[str, Any] = {"name": "tiny", "note": "a note", "untrained_heads": ("tracks",)}
+    labels["origin"] = {"model.pt": "0" * 64}
+    return write_checkpoint(folder / "tiny.safetensors", specs, lambda name: [zeros[name]], config, **labels)
+
+
+def _read_checkpoint(path: Path) -> None:
+    from vggtjax.checkpoint import read_model
+
+    read_model(path)
+
+
+def _fusion(folder: Path) -> Path:
+    from vggtjax.method.fusion_family import start
+    from vggtjax.method.fusion_file import save_fusion
+
+    save_fusion(folder / "rule.safetensors", start(()), {"model": "demo", "mask_pairs": 5})
+    return folder / "rule.safetensors"
+
+
+def _read_fusion(path: Path) -> None:
+    from vggtjax.method.fusion_file import load_fusion
+
+    load_fusion(path)
+
+
+@cache
+def _state() -> Any:
+    """Return the state of a run whose model has one array."""
+    import jax.numpy as jnp
+
+    from vggtjax.training.state import TrainingState
+
+    kernel = {"kernel": jnp.ones((4, 3))}
+    probes = {"mean": {"bias": jnp.zeros(3)}}
+    moments = (jnp.int32(3), {"mu": kernel})
+    return TrainingState(jnp.int32(3), {"model": kernel, "probes": probes}, kernel, moments, jnp.int32(0))
+
+
+def _training_checkpoint(folder: Path) -> Path:
+    from vggtjax.training.checkpoints import save
+
+    save(folder / "checkpoints", _state(), read_recipe(_RECIPE), {"seconds": 0.5})
+    return folder / "checkpoints"
+
+
+def _read_training_checkpoint(path: Path) -> None:
+    import jax
+
+    from vggtjax.training.checkpoints import restore
+
+    restore(path, jax.eval_shape(_state), read_recipe(_RECIPE))
+
+
+def _artefact(folder: Path) -> Path:
+    """Write what `write_artefact` writes, with a small program, and a clip for it."""
+    import jax
+    from jax import export
+
+    place, shape = folder / "artefact", (2, 4, 6, 3)
+    weights = {"scale": np.ones((1, 1, 1, 3), np.float32), "shift": np.zeros((1, 1, 1, 3), np.float16)}
+    specs = {name: Spec(value.shape, value.dtype) for name, value in weights.items()}
+    place.mkdir()
+    write_tensors(place / serve.WEIGHTS, specs, lambda name: [weights[name]])
+    program = jax.jit(lambda w, images: {"depth": (images * w["scale"] + w["shift"]).sum(-1)})
+    exported = export.export(program, platforms=("cpu",))(weights, jax.ShapeDtypeStruct(shape, np.float32))
+    (place / serve.PROGRAM).write_bytes(exported.serialize())
+    manifest = {
+        "format": serve.FORMAT,
+        "version": serve.VERSION,
+        "jax": jax.__version__,
+        "calling_convention": exported.calling_convention_version,
+        "platforms": list(exported.platforms),
+        "model": {"name": "tiny"},
+        "inputs": {"images": {"shape": list(shape), "dtype": "float32", "about": "RGB in [0, 1]"}},
+        "outputs": {"depth": {"shape": list(shape[:3]), "dtype": "float32", "about": "up to scale"}},
+        "files": {name: {"sha256": _digest(place / name)} for name in (serve.PROGRAM, serve.WEIGHTS)},
+    }
+    write(place / serve.MANIFEST, json.dumps(manifest))
+    np.save(folder / "clip.npy", np.zeros(shape, np.uint8))
+    return folder
+
+
+def _read_artefact(folder: Path) -> None:
+    """Load an artefact and run it; who changes its weights writes their new digest into the manifest."""
+    place = folder / "artefact"
+    manifest = place / serve.MANIFEST
+    if (place / serve.WEIGHTS).is_file() and manifest.is_file() and not manifest.is_symlink():
+        entry = re.compile(f'("{serve.WEIGHTS}": {{"sha256": ")[0-9a-f]{{64}}'.encode())
+        with suppress(OSError):
+            digest = _digest(place / serve.WEIGHTS).encode()
+            manifest.write_bytes(entry.sub(rb"\g<1>" + digest, manifest.read_bytes()))
+    serve.load(place)(serve._read_frames(folder / "clip.npy"))
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+_HUB_ID = "facebook/VGGT-1B"
+
+
+def _hub_record(folder: Path) -> Path:
+    from converters.hub_record import HubFile, HubRecord, record_path, write_record
+
+    commit = "0123456789" * 4
+    files = {"model.safetensors": HubFile("a" * 64, "b" * 64), "model.safetensors.index.json": HubFile("c" * 40)}
+    with patch.dict(os.environ, VGGTJAX_CACHE=str(folder)):
+        write_record(_HUB_ID, HubRecord().with_files(commit, files, resolved=True))
+        return record_path(_HUB_ID)
+
+
+def _read_hub_record(path: Path) -> None:
+    from converters.hub_record import read_record
+
+    with patch.dict(os.environ, VGGTJAX_CACHE=str(path.parents[2])):
+        read_record(_HUB_ID)
+
+
+ROWS = (
+    Reader("safetensors", lambda folder: _tensors(folder / "model.safetensors"), _weights),
+    Reader("shards with an index", _shards, _weights),
+    Reader("torch file", _torch_file, _weights),
+    Reader("torch file before 1.6", partial(_torch_file, _use_new_zipfile_serialization=False), _weights),
+    Reader("checkpoint", _checkpoint, _read_checkpoint),
+    Reader(
+        "config",
+        samples.text_file("config.json", tiny_config().to_json()),
+        lambda path: read_json(path, VGGTConfig, "configuration"),
+    ),
+    Reader("recipe", lambda folder: write(folder / "recipe.json", _RECIPE.read_bytes()), read_recipe),
+    Reader("fusion file", _fusion, _read_fusion),
+    Reader("training checkpoint", _training_checkpoint, _read_training_checkpoint),
+    Reader("artefact", _artefact, _read_artefact, refusals=serve.ArtefactError),
+    Reader("hub record", _hub_record, _read_hub_record),
+)
