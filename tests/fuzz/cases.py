@@ -15,7 +15,8 @@ from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
 
-from tests.fuzz.mutations import NAMES, mutated
+from tests.fuzz.changes.text import NAMES
+from tests.fuzz.mutations import mutated
 from vggtjax.errors import VggtjaxError
 
 MOST_SECONDS = 10.0
