@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import jax
@@ -156,6 +157,27 @@ def test_frames_that_do_not_fit(written, tmp_path, capsys, frames, message):
     np.save(tmp_path / "clip.npy", frames, allow_pickle=True)
     assert serve.main([str(tmp_path / "clip.npy"), "--artefact", str(written), "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_names_of_files_send_the_terminal_no_control_characters(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(serve, "load", lambda _: lambda frames: {"depth": frames})
+    path = tmp_path / "evil\x1b]0;title\x07\nserve: all is well.npy"
+    np.save(path, np.zeros(3))
+    shown = "evil?]0;title? serve: all is well"
+
+    def printed(*arguments: object) -> tuple[str, str]:
+        with suppress(SystemExit):
+            serve.main([str(argument) for argument in arguments])
+        said = capsys.readouterr()
+        assert all(letter == "\n" or letter.isprintable() for letter in said.out + said.err)
+        return said
+
+    assert printed(path, "--out", tmp_path / "out") == (f"{tmp_path}/out/{shown}.npz\n", "")
+    assert printed(tmp_path / f"no {path.name}", "--out", tmp_path)[1].startswith(
+        f"serve: cannot read {tmp_path}/no {shown}"
+    )
+    assert printed(path, "--out", path) == ("", f"serve: cannot write {tmp_path}/{shown}.npy: File exists\n")
+    assert shown in printed(path, "--out", tmp_path, f"--{path.name}")[1]
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,19 @@
+import asyncio
 import dataclasses
 import json
+import os
+import shutil
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from orbax.checkpoint._src.asyncio_utils import run_sync
 
 from tests.training_runs import SHORT, init_probes
 from vggtjax.errors import CheckpointError, OutputError
-from vggtjax.training.checkpoints import KEPT, latest, restore, save
+from vggtjax.training.checkpoints import KEPT, _explaining, latest, restore, save
 from vggtjax.training.recipe import OptimiserConfig
 from vggtjax.training.state import initial_state, state_shapes
 
@@ -96,17 +101,46 @@ def test_other_shapes(saved, shapes):
 
 
 def test_damaged_checkpoints(tmp_path, state, shapes):
-    save(tmp_path, state, SHORT)
-    run = tmp_path / "3" / "run" / "metadata"
-    text = run.read_text()
-    for content in ("{", "{}", json.dumps({"recipe": {"name": "x"}, "notes": {}}), "[1]"):
-        run.write_text(content)
-        with pytest.raises(CheckpointError, match="cannot be"):
-            restore(tmp_path, shapes, SHORT)
-    run.write_text(text)
-    (tmp_path / "3" / "state" / "_METADATA").write_bytes(b"\x80\x04K\x01.")  # a pickle
-    with pytest.raises(CheckpointError, match="cannot be read"):
-        restore(tmp_path, shapes, SHORT)
+    save(tmp_path / "whole", state, SHORT)
+    run = json.loads((tmp_path / "whole/3/run/metadata").read_text())
+    for number, (name, content) in enumerate(
+        (
+            ("run/metadata", b"{"),
+            ("run/metadata", b"{}"),
+            ("run/metadata", b"[1]"),
+            ("run/metadata", json.dumps(run | {"recipe": {"name": "x"}}).encode()),
+            ("state/_METADATA", b"[]"),
+            ("state/_METADATA", b"\x80\x04K\x01."),  # a pickle
+            ("_CHECKPOINT_METADATA", b"[1]"),
+            ("state/manifest.ocdbt", b"\x00" * 99),
+        )
+    ):
+        folder = Path(shutil.copytree(tmp_path / "whole", tmp_path / f"damaged{number}"))
+        (folder / "3" / name).write_bytes(content)
+        with pytest.raises(CheckpointError, match=r"cannot be read as a checkpoint|is a checkpoint of|holds the state"):
+            restore(folder, shapes, SHORT)
+    (tmp_path / "whole/3/state/_METADATA").unlink()
+    os.mkfifo(tmp_path / "whole/3/state/_METADATA")
+    with pytest.raises(CheckpointError, match="is a pipe"):
+        restore(tmp_path / "whole", shapes, SHORT)
+
+
+def test_where_a_read_fails_the_others_end_before_orbax_closes_their_loop(tmp_path):
+    ended = []
+
+    async def slow():
+        await asyncio.sleep(0.05)
+        ended.append(True)
+
+    async def broken():
+        raise ValueError("damaged")
+
+    async def both():
+        await asyncio.gather(slow(), broken())
+
+    with pytest.raises(CheckpointError, match="damaged"), _explaining(tmp_path):
+        run_sync(both())
+    assert ended
 
 
 def test_folder_that_cannot_be_written(tmp_path, state):
