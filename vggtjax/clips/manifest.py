@@ -140,7 +140,7 @@ def _parquet_rows(path: Path) -> Iterator[tuple[int, _Row]]:
                     for source, name in zip(texts["source"], texts.get("name", [None] * len(rows)), strict=True):
                         number += 1
                         yield number, _Row(source or "", name)
-        except (pa.ArrowException, UnicodeDecodeError) as problem:
+        except (pa.ArrowException, KeyError, UnicodeDecodeError) as problem:
             raise ClipError(f"{path} is no parquet file: {one_line(str(problem))}") from problem
 
 
