@@ -3,13 +3,13 @@ import dataclasses
 import json
 import os
 import shutil
+from contextlib import closing
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from orbax.checkpoint._src.asyncio_utils import run_sync
 
 from tests.training_runs import SHORT, init_probes
 from vggtjax.errors import CheckpointError, OutputError
@@ -139,7 +139,8 @@ def test_where_a_read_fails_the_others_end_before_orbax_closes_their_loop(tmp_pa
         await asyncio.gather(slow(), broken())
 
     with pytest.raises(CheckpointError, match="damaged"), _explaining(tmp_path):
-        run_sync(both())
+        with closing(asyncio.new_event_loop()) as loop:
+            loop.run_until_complete(both())
     assert ended
 
 
