@@ -138,9 +138,9 @@ def test_where_a_read_fails_the_others_end_before_orbax_closes_their_loop(tmp_pa
     async def both():
         await asyncio.gather(slow(), broken())
 
-    with pytest.raises(CheckpointError, match="damaged"), _explaining(tmp_path):
-        with closing(asyncio.new_event_loop()) as loop:
-            loop.run_until_complete(both())
+    refused = pytest.raises(CheckpointError, match="damaged")
+    with refused, _explaining(tmp_path), closing(asyncio.new_event_loop()) as loop:
+        loop.run_until_complete(both())
     assert ended
 
 
