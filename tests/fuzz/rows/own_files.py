@@ -135,13 +135,13 @@ def _posted(path: Path) -> None:
 
 _POSTED = {"data": [[{"path": f"/tmp/{'0' * 64}/a.mp4"}], "demo", "vggt", 2, 0], "fn_index": 0, "session_hash": "x"}
 
-_ARCHIVE = 2**26 + 2**23  # slack: an archive of any size may declare 64 MiB
+_ARCHIVE = 2**26 + 2**23  # slack where an .npz is read: one of any size may declare 64 MiB
 
 ROWS = (
     Reader("npz", samples.npz, _npz, _ARCHIVE),
     Reader("npy", samples.text_file("array.npy", npy(np.ones((8, 6), np.float32))), arrays.read_array),
     Reader("result", samples.archive, _archive, _ARCHIVE),
-    Reader("record", _record, _read_record),
+    Reader("record", _record, _read_record, _ARCHIVE),
     Reader(
         "metrics",
         samples.text_file("metrics.csv", "step,stage,seconds,samples,loss\n1,0,0.5,4,2.5\n2,0,1.0,8,2.25\n"),
@@ -151,6 +151,6 @@ ROWS = (
     Reader("cached program", _program, _read_program),
     Reader("index of scenes", _scenes, _read_scenes),
     Reader("cut of windows", _cut, unfinished_cut),
-    Reader("stored windows", _windows, _read_windows),
+    Reader("stored windows", _windows, _read_windows, _ARCHIVE),
     Reader("request of the app's page", samples.json_file("posted.json", _POSTED), _posted),
 )
