@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -82,8 +83,10 @@ def test_a_cache_that_cannot_be_used_is_warned_about_once(tmp_path, kind):
     assert all(path.exists() for path in kept)
 
 
-def test_a_script_is_told_once_how_to_keep_what_it_compiles(caplog, monkeypatch):
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", None)
+def test_a_script_is_told_once_how_to_keep_what_it_compiles(caplog, request):
+    name = "jax_compilation_cache_dir"
+    request.addfinalizer(partial(jax.config.update, name, jax.config.values[name]))
+    jax.config.update(name, None)
     _say_how_to_keep.cache_clear()  # another test may have been told
     for seconds in (1.0, 30.0, 30.0):
         say_how_to_keep(seconds)
