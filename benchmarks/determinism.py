@@ -124,10 +124,11 @@ def _run(ways: list[str], frames: int, model: str, folder: Path) -> dict[str, di
     if counts := [int(way.split()[0]) for way in ways if way.endswith("devices")]:
         count = f"--xla_force_host_platform_device_count={max(counts)}"
         environment["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {count}"
+        environment["PJRT_NPROC"] = str(2 * max(counts))  # threads: devices that wait for each other hold one each
     words = [sys.executable, "-c", _SCRIPT, str(frames), model, str(folder), *ways]
     done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise InputError(f"the ways {', '.join(ways)} failed: {' '.join(done.stderr.split())[-300:]}")
+        raise InputError(f"the ways {', '.join(ways)} failed: {' '.join(done.stderr.split())[:600]}")
     kept = {}
     for way in ways:
         with np.load(folder / f"{way}.npz") as arrays:

@@ -100,7 +100,7 @@ class _Worker:
             stdout=subprocess.PIPE,
             text=True,
             cwd=folder,
-            env=os.environ | {"PYTHONPATH": str(folder), "XLA_FLAGS": flags},
+            env=os.environ | {"PJRT_NPROC": str(2 * devices), "PYTHONPATH": str(folder), "XLA_FLAGS": flags},
         )
         self.ask(steps=1)
 

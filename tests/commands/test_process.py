@@ -1,5 +1,6 @@
-"""The setting of the C library that commands make."""
+"""The settings of its process that a command makes."""
 
+import os
 import subprocess
 import sys
 
@@ -25,6 +26,26 @@ def test_memory_that_was_freed_is_used_again():
     made = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr
     assert int(made.stdout) < 200
+
+
+def test_devices_of_a_split_cpu_have_threads_to_wait_and_to_compute(monkeypatch):
+    from vggtjax.commands.process import give_devices_threads
+
+    flag = "--xla_force_host_platform_device_count"
+    for flags, given, threads in (
+        (f"--a=1 {flag}=99", None, str(max(198, os.cpu_count() or 1))),
+        (f"{flag}=99", "3", "3"),
+        (f"{flag}=1", None, None),
+        ("", None, None),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setenv("XLA_FLAGS", flags)
+            patch.delenv("PJRT_NPROC", raising=False)
+            if given:
+                patch.setenv("PJRT_NPROC", given)
+            give_devices_threads()
+            assert os.environ.get("PJRT_NPROC") == threads
+            os.environ.pop("PJRT_NPROC", None)
 
 
 def test_other_systems_are_left_alone(monkeypatch):

@@ -19,6 +19,8 @@ os.environ["XLA_FLAGS"] = " ".join(
     ]
 )
 
+os.environ["PJRT_NPROC"] = str(2 * DEVICES)  # of threads: devices that wait for each other hold one each
+
 import flax.linen as nn  # noqa: E402
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402

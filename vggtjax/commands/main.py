@@ -30,7 +30,7 @@ from vggtjax.commands.export import export
 from vggtjax.commands.export_model import export_model
 from vggtjax.commands.fit_fusion import fit_fusion
 from vggtjax.commands.overview import overview
-from vggtjax.commands.process import check_limits, keep_freed_memory
+from vggtjax.commands.process import check_limits, give_devices_threads, keep_freed_memory
 from vggtjax.commands.reconstruct import reconstruct
 from vggtjax.commands.render import render
 from vggtjax.commands.scenes import scenes
@@ -76,6 +76,7 @@ class _OneLine(logging.Formatter):
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, 1 if nobody reads the output, 2 for errors, 130 if interrupted."""
     keep_freed_memory()
+    give_devices_threads()
     atexit.register(gc.freeze)  # at the end there is nothing to collect, and a last collection takes half a second
     handler = logging.StreamHandler()
     handler.setFormatter(_OneLine())

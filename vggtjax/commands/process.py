@@ -1,9 +1,10 @@
-"""The memory of the process: keeping what one computation frees, and limits that are too low. Linux only."""
+"""Settings of a command's process: memory that is kept, threads of a split CPU, limits that are too low."""
 
 from __future__ import annotations
 
 import ctypes
 import os
+import re
 import sys
 
 from vggtjax.errors import InputError
@@ -31,6 +32,19 @@ def keep_freed_memory() -> bool:
     settings = ((_M_MMAP_MAX, 0), (_M_TRIM_THRESHOLD, _MOST), (_M_ARENA_MAX, 1))
     taken = [mallopt(name, value) == 1 for name, value in settings]  # every one is tried
     return all(taken)
+
+
+def give_devices_threads() -> None:
+    """Have XLA start two threads for each device of a CPU that XLA_FLAGS splits, unless PJRT_NPROC says how many.
+
+    By default there are as many threads as devices, if these are more than the cores. Devices that wait for each other
+    then hold all threads, nobody computes what they wait for, and XLA ends the process after 40 seconds.
+
+    Call it before jax starts: XLA reads the variable once.
+    """
+    counts = re.findall(r"--xla_force_host_platform_device_count=(\d{1,4})\b", os.environ.get("XLA_FLAGS", ""))
+    if counts and int(counts[-1]) > 1:
+        os.environ.setdefault("PJRT_NPROC", str(max(2 * int(counts[-1]), os.cpu_count() or 1)))
 
 
 def check_limits() -> None:
