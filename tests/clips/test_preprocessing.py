@@ -100,5 +100,10 @@ def test_a_side_of_no_patches(mode):
 
 
 def test_a_picture_too_long_to_cut():
-    with pytest.raises(ClipError, match="frame tower is 1 x 10000"):
+    with pytest.raises(ClipError, match=r"frame tower is 1 x 10000.*a less extreme shape"):
         Fitter("crop").fit(1, 10000, "tower")
+
+
+def test_a_size_that_no_picture_can_have():
+    with pytest.raises(ClipError, match=r"which becomes 100002 x 100002 .*; choose a smaller size"):
+        Fitter("crop", 100002).fit(64, 64, "a")

@@ -35,7 +35,7 @@ def test_every_group_but_the_cameras_adds_to_it(group):
 def test_too_little_space_is_said_before_anything_is_written(tmp_path, monkeypatch):
     monkeypatch.setattr(disk, "_free", lambda _: 1000)
     with pytest.raises(
-        OutputError, match=r"takes about 0.0 GB and the disk of .* has 0.0 GB left; free some, .*--only"
+        OutputError, match=r"takes about [0-9.]+ kB and the disk of .* has 1.0 kB left; free some, .*--only"
     ):
         make_room(1).save(tmp_path / "new")
     assert not (tmp_path / "new").exists()

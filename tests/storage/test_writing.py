@@ -233,6 +233,13 @@ def test_an_error_names_the_path_and_the_reason(tmp_path):
         assert str(raised.value).startswith(f"cannot write {tmp_path / 'file/a'}: {reason}; choose")
     with pytest.raises(OutputError, match="exists"), write_errors(tmp_path / "folder"):
         raise FileExistsError(errno.EEXIST, "exists")
+    (tmp_path / "link").symlink_to(tmp_path / "missing")
+    for path, reason in (
+        (tmp_path / "link", "is a link to .*missing, which does not exist"),
+        ("/dev/null", "not a folder"),
+    ):
+        with pytest.raises(OutputError, match=reason), write_errors(Path(path)):
+            raise FileExistsError(errno.EEXIST, "exists")
 
 
 def test_a_folder_that_another_run_fills_during_its_check_stays(tmp_path, monkeypatch):

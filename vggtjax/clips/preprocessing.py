@@ -77,9 +77,10 @@ class Fitter:
             resized_height = self.size
             resized_width = round(width * (self.size / height) / self.patch) * self.patch
         if not resized_width or not resized_height or resized_width * resized_height > _MOST_PIXELS:
+            remedy = "cut it to a less extreme shape" if self.size**2 <= _MOST_PIXELS else "choose a smaller size"
             raise ClipError(
                 f"frame {name} is {width} x {height}, which becomes {resized_width} x {resized_height} at size "
-                f"{self.size} and patch {self.patch}; cut it to a less extreme shape"
+                f"{self.size} and patch {self.patch}; {remedy}"
             )
         frame_size = (resized_width, min(resized_height, self.size))
         fit = Fit(

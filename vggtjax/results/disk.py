@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int
+from rich.filesize import decimal
 
 from vggtjax.errors import OutputError
 from vggtjax.results.previews import enlarged
 from vggtjax.results.saving import Group, Saving
 
 LARGE = 1e9  # bytes; larger results are announced
-_GIGA = 1e9
 _ARCHIVE = 10.0  # bytes of a pixel at the model's size, compressed: pictures, depth, confidence
 _POINT = 16  # bytes of a point
 _MOST_SCENE = 25e6  # bytes: a scene has a limit of points
@@ -60,7 +60,7 @@ def check_space(folder: str | Path, needed: float) -> None:
     free = _free(Path(folder))
     if free is not None and needed > free:
         raise OutputError(
-            f"the result takes about {needed / _GIGA:.1f} GB and the disk of {folder} has {free / _GIGA:.1f} GB left; "
+            f"the result takes about {decimal(round(needed))} and the disk of {folder} has {decimal(free)} left; "
             "free some, choose another folder, or write less: --only depth,cameras, --resolution model"
         )
 
@@ -70,8 +70,8 @@ def announce(folder: str | Path, needed: float) -> None:
     check_space(folder, needed)
     if needed > LARGE:
         free = _free(Path(folder))
-        left = "" if free is None else f"; the disk has {free / _GIGA:.1f} GB left"
-        logger.info("the result in %s will take about %.1f GB%s", folder, needed / _GIGA, left)
+        left = "" if free is None else f"; the disk has {decimal(free)} left"
+        logger.info("the result in %s will take about %s%s", folder, decimal(round(needed)), left)
 
 
 def _free(folder: Path) -> int | None:

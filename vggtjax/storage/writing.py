@@ -115,9 +115,16 @@ def write_errors(path: Path) -> Iterator[None]:
         raise
     except OSError as error:
         is_blocked = isinstance(error, FileExistsError | NotADirectoryError)
-        file = next((part for part in (path, *path.parents) if part.is_file()), None) if is_blocked else None
-        reason = f"{file} is a file" if file else error.strerror or error
+        parts = (path, *path.parents) if is_blocked else ()
+        blocking = next((part for part in parts if os.path.lexists(part) and not part.is_dir()), None)
+        reason = f"{blocking} is {_kind(blocking)}" if blocking else error.strerror or error
         raise OutputError(f"cannot write {path}: {reason}; choose a folder that is writable and has space") from error
+
+
+def _kind(path: Path) -> str:
+    if path.is_symlink() and not path.exists():
+        return f"a link to {path.readlink()}, which does not exist"
+    return "a file" if path.is_file() else "not a folder"
 
 
 @contextmanager
