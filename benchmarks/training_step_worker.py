@@ -15,7 +15,7 @@ from typing import Any
 
 import jax
 
-from vggtjax.commands.process import keep_freed_memory
+from vggtjax.commands import process
 from vggtjax.scenes.textures import load_textures
 from vggtjax.training.data import make_batch
 from vggtjax.training.devices import placement
@@ -26,7 +26,7 @@ from vggtjax.training.state import apply_gradient, initial_state, loss_and_gradi
 
 def main() -> None:
     """Answer every line of standard input."""
-    keep_freed_memory()
+    settle_memory()
     recipe = read_recipe(Path(sys.argv[1]))
     phase = recipe.stages[0]
     where = placement(recipe)
@@ -62,6 +62,15 @@ def main() -> None:
             times["gradient"] += done - drawn
             times["update"] += time.perf_counter() - done
         answer({name: value / task["steps"] for name, value in times.items()})
+
+
+def settle_memory() -> None:
+    """Set the process up as the checkout's own `vggtjax train` does."""
+    if hasattr(process, "run_in_calling_thread"):
+        process.keep_freed_memory(training=True)
+        process.run_in_calling_thread()
+    else:
+        process.keep_freed_memory()
 
 
 def answer(values: dict[str, Any]) -> None:

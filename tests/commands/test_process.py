@@ -28,6 +28,30 @@ def test_memory_that_was_freed_is_used_again():
     assert int(made.stdout) < 200
 
 
+TRAINING = """
+import resource
+import jax
+from vggtjax.commands.process import keep_freed_memory, run_in_calling_thread
+assert keep_freed_memory(training=True)
+run_in_calling_thread()
+work = jax.jit(lambda x: jax.lax.sort(x[None] + x[:, None], dimension=0).sum())  # 128 MiB of working memory
+x = jax.numpy.arange(5800.0)
+for turn in range(4):
+    work(x).block_until_ready()
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    if turn == 1:
+        first = faults
+print(faults - first)
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a setting of glibc")
+def test_so_is_that_of_a_training_step():
+    made = subprocess.run([sys.executable, "-c", TRAINING], capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr
+    assert int(made.stdout) < 2000
+
+
 def test_devices_of_a_split_cpu_have_threads_to_wait_and_to_compute(monkeypatch):
     from vggtjax.commands.process import give_devices_threads
 

@@ -75,7 +75,8 @@ class _OneLine(logging.Formatter):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; return the exit code: 0, 1 if nobody reads the output, 2 for errors, 130 if interrupted."""
-    keep_freed_memory()
+    arguments = sys.argv[1:] if arguments is None else arguments
+    keep_freed_memory(training=list(arguments[:1]) == ["train"])
     give_devices_threads()
     atexit.register(gc.freeze)  # at the end there is nothing to collect, and a last collection takes half a second
     handler = logging.StreamHandler()
@@ -86,7 +87,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
     if "jax" not in sys.modules:  # else a program calls this function, which decides for itself
         enable_compilation_cache()  # after showwarning is set, which it replaces for some warnings
-    arguments = sys.argv[1:] if arguments is None else arguments
     try:
         if list(arguments) in (["--version"], ["-V"]):
             sys.stdout.write(f"vggtjax {__version__}\n")

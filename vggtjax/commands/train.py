@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vggtjax.commands.process import run_in_calling_thread
 from vggtjax.commands.report import Report
 from vggtjax.errors import check_extra
 from vggtjax.storage.flags import InWords
@@ -42,6 +43,7 @@ def train(
     report = Report()
     with report.running():
         with report.stage("prepare"):
+            run_in_calling_thread()
             from vggtjax.training.loop import train as run
             from vggtjax.training.recipe import read_recipe
 

@@ -12,7 +12,7 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.layers import Conv, Dense, LayerNorm, Params, apply, declare
+from vggtjax.network.layers import Conv, Conv3x3, Dense, LayerNorm, Params, apply, declare
 from vggtjax.network.pieces import largest_divisor
 
 HIDDEN = 32
@@ -51,8 +51,8 @@ class ResidualUnit(nn.Module):
     def __call__(self, x: Float[Array, "F h w C"]) -> Float[Array, "F h w C"]:
         C = x.shape[-1]
         x = nn.relu(x)
-        y = nn.relu(Conv(C, (3, 3), name="conv1")(x))
-        return x + Conv(C, (3, 3), name="conv2")(y)
+        y = nn.relu(Conv3x3(C, name="conv1")(x))
+        return x + Conv3x3(C, name="conv2")(y)
 
 
 class Fusion(nn.Module):
@@ -87,14 +87,12 @@ class DPTFeatures(nn.Module):
             taps[2],
             Conv(taps[3].shape[-1], (3, 3), strides=(2, 2), padding=1, name="downsample3")(taps[3]),
         ]
-        levels = [
-            Conv(self.features, (3, 3), use_bias=False, name=f"level{i}")(level) for i, level in enumerate(levels)
-        ]
+        levels = [Conv3x3(self.features, use_bias=False, name=f"level{i}")(level) for i, level in enumerate(levels)]
         x = levels[3]
         for i in (3, 2, 1, 0):
             size = levels[i - 1].shape[1:3] if i else (2 * x.shape[1], 2 * x.shape[2])
             x = Fusion(name=f"fusion{i}")(x, levels[i] if i < 3 else None, size)
-        return Conv(self.out_features, (3, 3), name="output")(x)
+        return Conv3x3(self.out_features, name="output")(x)
 
 
 class Regression(nn.Module):
@@ -104,7 +102,7 @@ class Regression(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "F H W C"]) -> Float[Array, "F H W O"]:
-        x = nn.relu(Conv(HIDDEN, (3, 3), name="conv1")(x))
+        x = nn.relu(Conv3x3(HIDDEN, name="conv1")(x))
         return Dense(self.channels, name="conv2")(x)
 
 

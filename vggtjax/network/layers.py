@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
+
+from vggtjax.network.convolution import same_convolution
 
 Params = dict[str, Any]
 DType = Any
@@ -22,6 +26,13 @@ class Conv(nn.Conv):
     """A convolution, whose kernel `init_params` draws."""
 
     kernel_init: Any = nn.initializers.zeros
+
+
+class Conv3x3(Conv):
+    """A 3 x 3 convolution of stride 1 that keeps the size of the image."""
+
+    kernel_size: Any = (3, 3)
+    conv_general_dilated: Any = same_convolution
 
 
 class LayerNorm(nn.LayerNorm):
@@ -41,7 +52,25 @@ class MLP(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "... C"]) -> Float[Array, "... F"]:
         x = Dense(self.hidden, dtype=self.dtype, name="fc1")(x)
-        return Dense(self.features, dtype=self.dtype, name="fc2")(nn.gelu(x, approximate=False))
+        return Dense(self.features, dtype=self.dtype, name="fc2")(gelu(x))
+
+
+@jax.custom_vjp
+def gelu(x: Array) -> Array:
+    """Return x times the normal distribution function of x; the gradient computes both again from x."""
+    return x * _normal_cdf(x)
+
+
+def _gelu_backward(x, gradient):
+    density = jnp.exp(-0.5 * x * x) * (2 * math.pi) ** -0.5
+    return (gradient * (_normal_cdf(x) + x * density),)
+
+
+def _normal_cdf(x: Array) -> Array:
+    return 0.5 * (1 + jax.lax.erf(x * 0.5**0.5))
+
+
+gelu.defvjp(lambda x: (gelu(x), x), _gelu_backward)
 
 
 def apply(module: nn.Module, params: Params, *inputs: Any) -> Any:

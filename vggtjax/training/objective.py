@@ -183,9 +183,10 @@ def _angle(a: Float[Array, "B S 3 3"], b: Float[Array, "B S 3 3"]) -> Float[Arra
 
 
 def _depth_error(depth: Float[Array, "B S H W"], truth: Float[Array, "B S H W"]) -> Float[Array, ""]:
-    """Return the mean absolute relative error after alignment of every clip's medians."""
+    """Return the mean absolute relative error after alignment of every clip's medians (of each second pixel)."""
     depth = jnp.clip(depth, 1e-6, 1e6)  # an untrained head can give any depth
-    ratio = (jnp.log(truth) - jnp.log(depth)).reshape(depth.shape[0], -1)
+    few = np.s_[:, :, ::2, ::2]  # sorting all pixels would take a hundredth of a step
+    ratio = (jnp.log(truth[few]) - jnp.log(depth[few])).reshape(depth.shape[0], -1)
     scale = jnp.exp(jnp.median(ratio, axis=-1))[:, None, None, None]
     return (jnp.abs(scale * depth - truth) / truth).mean()
 
