@@ -22,13 +22,14 @@ _WORKER = Path(__file__).with_name("training_step_worker.py")
 _PARTS = ("render", "gradient", "update")
 
 Answer = dict[str, Any]
+_Side = tuple[str, int]  # the package, and the number of devices
 
 
 def training_step(
     *,
     recipe: Path = _ROOT / "docs" / "embedded" / "5-four-frames.json",
     before: Path | None = None,
-    devices: int = 2,
+    devices: tuple[int, ...] = (1, 2),
     steps: int = 2,
     rounds: int = 5,
     out: Path | None = None,
@@ -37,17 +38,17 @@ def training_step(
 
     The first phase of the recipe counts. The products of forward and backward pass are counted from the shapes: three
     times those of the forward pass. With `before`, both checkouts take turns, and their losses on the same clips are
-    compared first.
+    compared first. Each of them sets its process up as its own `vggtjax train` does.
 
     Args:
         recipe: JSON file with the recipe.
         before: folder of another checkout, whose package `vggtjax` is measured too.
-        devices: XLA devices that a CPU is divided into; the clips are spread over them.
+        devices: numbers of XLA devices that a CPU is divided into; the clips are spread over them.
         steps: steps of a round.
         rounds: timed rounds, after a warm-up.
         out: JSON file for the figures of every round.
     """
-    if min(devices, steps, rounds) < 1:
+    if min(*devices, steps, rounds) < 1:
         raise InputError(f"devices, steps and rounds are {devices}, {steps} and {rounds}; expected at least 1")
     if before is not None and not (before / "vggtjax" / "training").is_dir():
         raise InputError(f"{before} has no vggtjax/training; expected a checkout of this package")
@@ -56,33 +57,37 @@ def training_step(
     grid = phase.height // chosen.model.patch_size, phase.width // chosen.model.patch_size
     frames = phase.frames[0]
     flop = 3 * phase.batch * _forward_flop(chosen, frames, grid)
-    sides = {"now": _ROOT} | ({} if before is None else {"before": before.resolve()})
+    folders = {"now": _ROOT} | ({} if before is None else {"before": before.resolve()})
+    sides = {(name, count): folder for count in devices for name, folder in folders.items()}
     screen, ceiling = console(), Rounds(rounds, Ceilings(chosen.model, grid, "float32"))
     with screen.status("compile"):
-        workers = {name: _Worker(folder, recipe.resolve(), devices) for name, folder in sides.items()}
+        workers = {side: _Worker(folder, recipe.resolve(), side[1]) for side, folder in sides.items()}
     try:
-        losses = {name: worker.ask(losses=True)["losses"] for name, worker in workers.items()}
-        runs: dict[str, list[Answer]] = {name: [] for name in sides}
+        losses = {side: worker.ask(losses=True)["losses"] for side, worker in workers.items()}
+        runs: dict[_Side, list[Answer]] = {side: [] for side in sides}
         with screen.status("measure"):
             for turn in ceiling:
-                for name in sides if turn % 2 else reversed(sides):
-                    runs[name].append(workers[name].ask(steps=steps))
+                for side in sides if turn % 2 else reversed(sides):
+                    runs[side].append(workers[side].ask(steps=steps))
     finally:
         for worker in workers.values():
             worker.close()
     rates = [rate["linear"] for rate in ceiling.rates]
-    rows = [_row(name, runs[name], phase.batch * frames, flop, rates) for name in sides]
-    headings = ("package", *_PARTS, "step (s)", "frames/s", "GFLOP/s", "of the ceiling", "render share")
+    rows = [_row(side, runs[side], phase.batch * frames, flop, rates) for side in sides]
+    headings = ("package", "devices", *_PARTS, "step (s)", "frames/s", "GFLOP/s", "of the ceiling", "render share")
     title = f"{phase.batch} clips of {frames} frames, {phase.width} x {phase.height}, {flop / 1e9:.0f} GFLOP a step"
     Sheet(title, headings, rows).show(screen)
-    report = {"recipe": chosen.name, "flop": flop, "ceilings": rates, "runs": runs, "losses": losses}
+    figures = [{"package": name, "devices": count, "runs": runs[name, count]} for name, count in sides]
+    report = {"recipe": chosen.name, "flop": flop, "ceilings": rates, "sides": figures}
     if before is not None:
-        ratios = [_seconds(old) / _seconds(new) for old, new in zip(runs["before"], runs["now"], strict=True)]
-        apart = max(
-            abs(losses["now"][key] - losses["before"][key]) / abs(losses["before"][key]) for key in losses["now"]
-        )
-        screen.print(f"{np.median(ratios):.2f} times the frames a second; losses differ by at most {apart:.1e}")
-        report |= {"ratios": ratios, "losses_apart": apart}
+        apart = max(_apart(losses["now", count], losses["before", count]) for count in devices)
+        screen.print(f"losses differ by at most {apart:.1e}")
+        report["losses_apart"] = apart
+        for count in devices:
+            pairs = zip(runs["before", count], runs["now", devices[0]], strict=True)
+            ratio = float(np.median([_seconds(old) / _seconds(new) for old, new in pairs]))
+            screen.print(f"{ratio:.2f} times the frames a second of before on {count} of them, now on {devices[0]}")
+            report[f"ratio_to_{count}"] = ratio
     here = machine()
     screen.print(describe(here), highlight=False)
     if out is not None:
@@ -131,14 +136,20 @@ def _seconds(run: Answer) -> float:
     return sum(run[part] for part in _PARTS)
 
 
-def _row(name: str, runs: list[Answer], frames: int, flop: float, ceilings: list[float]) -> tuple[str, ...]:
+def _apart(losses: dict[str, float], others: dict[str, float]) -> float:
+    """Return the largest difference of two losses, relative to the second."""
+    return max(abs(losses[name] - other) / abs(other) for name, other in others.items())
+
+
+def _row(side: _Side, runs: list[Answer], frames: int, flop: float, ceilings: list[float]) -> tuple[str, ...]:
     parts = [float(np.median([run[part] for run in runs])) for part in _PARTS]
     seconds = [_seconds(run) for run in runs]
     rate = flop / float(np.median([run["gradient"] for run in runs]))
     share = float(np.median([flop / run["gradient"] / ceiling for run, ceiling in zip(runs, ceilings, strict=True)]))
     median = float(np.median(seconds))
     return (
-        name,
+        side[0],
+        str(side[1]),
         *map(number, parts),
         number(median),
         number(frames / median),
