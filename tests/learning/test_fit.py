@@ -131,7 +131,7 @@ def test_an_interrupted_fit_goes_on_exactly(tmp_path):
     arrays = read_arrays(path)  # of the ended fit, whose step is 60
     *_, step = [name for name, array in arrays.items() if array.shape == () and array == 60]  # others: the optimiser's
     for wrong in (2**31 - 1, -10, 61):
-        write_arrays(path, arrays | {step: np.int32(wrong)})
+        write_arrays(path, arrays | {step: np.array(wrong, np.int32)})
         assert np.array_equal(fit_fusion(clips, held_out, config, checkpoint=path).losses, whole.losses)
 
 

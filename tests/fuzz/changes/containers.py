@@ -126,7 +126,7 @@ def _crc_table() -> list[int]:
 _CRC = _crc_table()
 
 
-def _checksum(data: bytes, start: int) -> int:
+def _checksum(data: bytes | bytearray, start: int) -> int:
     """Return the CRC-32 whose first bit is the highest: of Ogg from 0 on, of MPEG from 2^32 - 1 on."""
     for byte in data:
         start = (start << 8 & 0xFFFFFFFF) ^ _CRC[start >> 24 ^ byte]
