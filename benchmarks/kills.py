@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import os
 import random
+import re
+import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from fnmatch import fnmatch
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -33,6 +36,7 @@ from vggtjax.storage.json_values import read_json
 
 _ROOT = Path(__file__).parents[1]
 _SIZE, _FRAMES, _CLIPS = 56, 3, 4
+_PARTIAL = re.compile(r"partial|incomplete|tmp")  # names of files that are not whole
 TINY = VGGTConfig(
     image_size=_SIZE,
     embed_dim=16,
@@ -49,9 +53,10 @@ TINY = VGGTConfig(
 
 
 class Case(NamedTuple):
-    """A command: its words, with {inputs} and {out}, files that are replaced while it runs, and that a clock names."""
+    """A command: its words, with {inputs} and {out}, and files of a kind of their own."""
 
     words: str
+    at_once: tuple[str, ...] = ()  # folders that have all their files as soon as they are there, and are not replaced
     growing: tuple[str, ...] = ()  # whole at each moment, with other content than at the end
     timed: tuple[str, ...] = ()  # such as checkpoints: any of them may be there, but no unfinished one after the end
 
@@ -60,23 +65,23 @@ _MODEL = "--model {inputs}/model.safetensors"
 CASES = {
     "convert": Case("convert {inputs}/source.safetensors {out}/model.safetensors --config {inputs}/config.json"),
     "reconstruct": Case(f"reconstruct {{inputs}}/clips/a {_MODEL} --out {{out}}/result"),
-    "batch": Case(f"batch {{inputs}}/clips {_MODEL} --only cameras,depth --out {{out}}", ("index.html",)),
-    "export": Case("export {inputs}/result --out {out}/model --to colmap-text"),
+    "batch": Case(f"batch {{inputs}}/clips {_MODEL} --only cameras,depth --out {{out}}", growing=("index.html",)),
+    "export": Case("export {inputs}/result --out {out}/model --to colmap-text", at_once=("model",)),
     "evaluate": Case(f"evaluate plain {{inputs}}/data {_MODEL} --methods vggt,4dvggt-d --out {{out}}/scores"),
     "fit-fusion": Case(
         f"fit-fusion --data plain={{inputs}}/data {_MODEL} --family scale paper --seeds 1 --steps 20 --pixels 300 "
         "--out {out}/fit",
-        ("fit/states/*.npz",),
+        growing=("fit/states/*.npz",),
     ),
     "train": Case(
         "train --recipe {inputs}/recipe.json --out {out}/run --log-every 2 --checkpoint-seconds 0.1",
-        ("run/metrics.csv", "run/metrics.png", "run/model.safetensors"),
-        ("run/checkpoints/*",),
+        growing=("run/metrics.csv", "run/metrics.png", "run/model.safetensors"),
+        timed=("run/checkpoints/*",),
     ),
 }
 
 
-_HEADINGS = ("command", "changes of files", "killed at changes", "in writes", "at random", "two at once", "problems")
+_HEADINGS = ("command", "changes of files", "kills at changes", "in writes", "at random", "two at once", "problems")
 
 
 class Tally(NamedTuple):
@@ -107,10 +112,8 @@ def kills(*, command: tuple[str, ...] = tuple(CASES), kills: int = 50, pairs: in
         if name not in CASES:
             raise InputError(f"command is {name!r}; expected one of {', '.join(CASES)}")
     screen, tallies = Console(), []
-    with TemporaryDirectory() as folder:
-        inputs = Path(folder) / "inputs"
-        os.environ["VGGTJAX_CACHE"] = str(Path(folder) / "cache")
-        prepare(inputs, command)
+    with TemporaryDirectory() as folder, _places(Path(folder)):
+        prepare(Path(folder) / "inputs", command)
         for name in command:
             tally = kill_command(name, Path(folder), kills=kills, pairs=pairs, draws=random.Random(seed))
             tallies.append(tally)
@@ -118,15 +121,7 @@ def kills(*, command: tuple[str, ...] = tuple(CASES), kills: int = 50, pairs: in
                 screen.print(f"{name}: {problem}", markup=False)
             screen.print(f"{name}: {sum(tally[2:5])} kills, {len(tally.problems)} problems")
     table = Table(title="runs that were killed and run again", box=None)
-    for heading in (
-        "command",
-        "changes of files",
-        "kills at changes",
-        "within writes",
-        "at random moments",
-        "two at once",
-        "problems",
-    ):
+    for heading in _HEADINGS:
         table.add_column(heading, justify="left" if heading == "command" else "right")
     for tally in tallies:
         table.add_row(tally.command, *map(str, tally[1:6]), str(len(tally.problems)))
@@ -157,6 +152,7 @@ def kill_command(name: str, folder: Path, *, kills: int, pairs: int, draws: rand
         _clear(out)
     changes = int((work / "count").read_text())
     checks = _Checks(case, wholes[-1], [])
+    checks.check_places("whole runs", folder)
     checks.check("two whole runs", wholes[-2], ended=True)
 
     at_changes = min(kills - 2 * max(kills // 10, 1), 10 * changes)
@@ -181,13 +177,14 @@ def kill_command(name: str, folder: Path, *, kills: int, pairs: int, draws: rand
         elif code:
             checks.problems.append(f"{label}: code {code}: {said}")
         checks.check(label, files_below(out), ended=False)
-        if name == "export" and (out / "model").exists():
-            _clear(out)  # it never replaces what is there
+        for below in case.at_once:
+            _clear(out / below)  # the next run replaces nothing; what is beside it stays
         code, said = run()
         if code:
             checks.problems.append(f"{label}: the next run ends with code {code}: {said}")
         else:
             checks.check(f"{label}, then run again", files_below(out), ended=True)
+        checks.check_places(f"{label}, then run again", folder)
         _clear(out)
     for number in track(range(pairs), f"{name}: two at once", transient=True):
         out.mkdir(parents=True, exist_ok=True)
@@ -195,6 +192,7 @@ def kill_command(name: str, folder: Path, *, kills: int, pairs: int, draws: rand
         started = [start(words, log, out) for log in logs]
         checks.check_pair(f"round {number} of two", [finish(*one, log) for one, log in zip(started, logs, strict=True)])
         checks.check(f"round {number} of two", files_below(out), ended=True)
+        checks.check_places(f"round {number} of two", folder)
         _clear(out)
     return Tally(name, changes, killed["change"], killed["size"], killed["seconds"], pairs, checks.problems)
 
@@ -207,19 +205,23 @@ class _Checks(NamedTuple):
     problems: list[str]
 
     def check(self, label: str, files: Files, *, ended: bool) -> None:
-        """Note files that are half-written, or differ; after the end, those that are left behind or missing, too."""
+        """Note files that are half-written, differ, or are left behind or missing where all ought to be there.
+
+        All ought to be there after the end, and in a folder that has all its files at once.
+        """
+        there = tuple(f"{folder}/" for folder in self.case.at_once if folder in files)
         for path, found in files.items():
             if self._is_timed(path) and "tmp" not in path:
                 continue
             if path not in self.whole:
-                if ended:
+                if ended or path.startswith(there):
                     self.problems.append(f"{label}: {path} is left behind")
             elif found == BROKEN:
                 self.problems.append(f"{label}: {path} is half-written")
             elif found != self.whole[path] and (ended or not _fits(path, self.case.growing)):
                 self.problems.append(f"{label}: {path} differs from a whole run's")
-        missing = self.whole.keys() - files.keys() if ended else ()
-        self.problems.extend(f"{label}: {path} is missing" for path in missing if not self._is_timed(path))
+        missing = [path for path in self.whole.keys() - files.keys() if ended or path.startswith(there)]
+        self.problems.extend(f"{label}: {path} is missing" for path in sorted(missing) if not self._is_timed(path))
 
     def check_pair(self, label: str, ends: list[tuple[int, str]]) -> None:
         """Note two runs that both failed, and one that failed without a sentence."""
@@ -229,8 +231,32 @@ class _Checks(NamedTuple):
             if code not in (0, 2) or "Traceback" in said:
                 self.problems.append(f"{label}: code {code}: {said}")
 
+    def check_places(self, label: str, folder: Path) -> None:
+        """Note what is left for ever, in the temporary folder and, under partial names, in the cache; remove it."""
+        left = sorted((folder / "tmp").iterdir())
+        left += [path for path in sorted((folder / "cache").rglob("*")) if _PARTIAL.search(path.name)]
+        for path in left:
+            self.problems.append(f"{label}: {path.relative_to(folder)} is left behind")
+            if path.is_dir():
+                _clear(path)
+            else:
+                path.unlink(missing_ok=True)
+
     def _is_timed(self, path: str) -> bool:
         return _fits(path, self.case.timed)
+
+
+@contextmanager
+def _places(folder: Path) -> Iterator[None]:
+    """Let commands have their temporary files and their cache in a folder."""
+    earlier = tempfile.tempdir
+    (folder / "tmp").mkdir()
+    tempfile.tempdir = str(folder / "tmp")  # of the children that this process forks; TMPDIR of those that they start
+    os.environ |= {"TMPDIR": tempfile.tempdir, "VGGTJAX_CACHE": str(folder / "cache")}
+    try:
+        yield
+    finally:
+        tempfile.tempdir = earlier
 
 
 def _fits(path: str, patterns: tuple[str, ...]) -> bool:

@@ -65,6 +65,27 @@ def test_half_written_files_are_told_apart_and_times_are_not_compared(tmp_path):
     assert set(harness.files_below(tmp_path).values()) == {BROKEN}
 
 
+def test_what_a_killed_run_may_not_leave_is_noted(tmp_path):
+    checks = harness._Checks(harness.CASES["export"], {"model": "", "model/a.txt": "1", "model/b.txt": "2"}, [])
+    checks.check("absent", {".partial": ""}, ended=False)
+    checks.check("whole", checks.whole, ended=False)
+    assert checks.problems == []
+    checks.check("half", {"model": "", "model/a.txt": "1", "model/c.txt": "3"}, ended=False)
+    (tmp_path / "tmp/xyz").mkdir(parents=True)
+    (tmp_path / "cache/compiled").mkdir(parents=True)
+    for name in (".vggtjax-partial-0", "kept"):
+        (tmp_path / "cache/compiled" / name).touch()
+    for _ in range(2):  # each once
+        checks.check_places("then run again", tmp_path)
+    assert checks.problems == [
+        "half: model/c.txt is left behind",
+        "half: model/b.txt is missing",
+        "then run again: tmp/xyz is left behind",
+        "then run again: cache/compiled/.vggtjax-partial-0 is left behind",
+    ]
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["kept"]
+
+
 def test_a_process_kills_itself_just_before_a_change_of_a_file(tmp_path):
     folder = tmp_path / "watched"
     folder.mkdir()

@@ -13,6 +13,8 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from tests.dataset_files import cameras_bin, images_bin
+
 FRAMES, WIDTH, HEIGHT = 4, 96, 72
 
 
@@ -177,6 +179,23 @@ def colmap_text(folder: Path, truth: Truth, model: str = "sparse/0") -> Path:
     (folder / model).mkdir(parents=True)
     (folder / model / "cameras.txt").write_text("\n".join(cameras) + "\n")
     (folder / model / "images.txt").write_text("\n".join(images) + "\n")
+    return folder
+
+
+def colmap_binary(folder: Path, truth: Truth) -> Path:
+    """The same model as COLMAP writes it by default, without points."""
+    colmap_text(folder, truth)
+    cameras, images = [], []
+    for frame in range(FRAMES):
+        K, pose = truth.intrinsics[frame], truth.world_from_camera[frame]
+        cameras.append((frame + 1, 1, WIDTH, HEIGHT, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
+        rotation = pose[:3, :3].T
+        quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+        images.append((40 - frame, quaternion, -rotation @ pose[:3, 3], frame + 1, f"view_{8 + frame}.png"))
+    for name, content in (("cameras", cameras_bin(cameras)), ("images", images_bin(images))):
+        (folder / f"sparse/0/{name}.txt").unlink()
+        (folder / f"sparse/0/{name}.bin").write_bytes(content)
+    (folder / "sparse/0/points3D.bin").write_bytes(bytes(8))
     return folder
 
 

@@ -31,31 +31,31 @@ def running(reader: Reader, first: int, count: int, keep: Path | None) -> Iterat
     """
     fork = multiprocessing.get_context("fork")  # imports take longer than hundreds of cases
     receiver, sender = fork.Pipe(duplex=False)
-    process = fork.Process(target=_run, args=(reader, first, count, keep, sender), daemon=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of jax, which has started nothing here
-        process.start()
-    sender.close()
-    try:
-        yield receiver
-    finally:
-        process.kill()
-        process.join()
-        receiver.close()
+    with scratch_folder() as folder:  # here: a process that is killed removes nothing
+        process = fork.Process(target=_run, args=(reader, first, count, keep, sender, folder), daemon=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of jax, which has started nothing here
+            process.start()
+        sender.close()
+        try:
+            yield receiver
+        finally:
+            process.kill()
+            process.join()
+            receiver.close()
 
 
-def _run(reader: Reader, first: int, count: int, keep: Path | None, sender: Connection) -> None:
+def _run(reader: Reader, first: int, count: int, keep: Path | None, sender: Connection, folder: Path) -> None:
     logging.disable(logging.CRITICAL)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.stdout, sys.stderr):  # libraries in C print what they think of a file
         os.dup2(nowhere, stream.fileno())
-    with scratch_folder() as folder:
-        sample = Sample(reader, folder)
-        size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (size + _MOST_BYTES, size + _MOST_BYTES))
-        for seed in range(first, first + count):
-            sender.send((seed, None))
-            outcome = sample.run(seed)
-            if outcome.kind == "found" and keep is not None:
-                sample.keep(seed, keep / str(seed))
-            sender.send((seed, outcome))
+    sample = Sample(reader, folder)
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (size + _MOST_BYTES, size + _MOST_BYTES))
+    for seed in range(first, first + count):
+        sender.send((seed, None))
+        outcome = sample.run(seed)
+        if outcome.kind == "found" and keep is not None:
+            sample.keep(seed, keep / str(seed))
+        sender.send((seed, outcome))

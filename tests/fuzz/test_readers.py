@@ -17,7 +17,7 @@ CASES = 50
 PATIENCE = 60.0  # seconds of a case; a busy machine is no fault of the reader
 CORPUS = Path(__file__).parent / "corpus"
 # Readers of our own caches and kept results: what is damaged is made anew, without a word.
-SILENT = {"record", "kept passes", "cached program", "cut of windows"}
+SILENT = {"record", "kept passes", "cached program", "cut of windows", "state of a fit", "evaluation"}
 
 
 @pytest.fixture

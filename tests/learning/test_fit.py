@@ -16,6 +16,7 @@ from vggtjax.errors import InputError
 from vggtjax.learning.fit import FitClips, FitConfig, fit_fusion
 from vggtjax.learning.objectives import View, joint_negative_log_likelihood
 from vggtjax.method.fusion_family import PRESETS, Observations, fuse, identity, log_precisions, parse_family
+from vggtjax.storage.arrays import read_arrays, write_arrays
 
 TRUE = identity() | {
     "scale": jnp.asarray([2.5, 1.5]),
@@ -127,6 +128,11 @@ def test_an_interrupted_fit_goes_on_exactly(tmp_path):
     assert len(other.losses) == 3  # the state of another fit is not gone on from
     path.write_bytes(path.read_bytes()[:100])  # a file that is not whole is not gone on from
     assert np.array_equal(fit_fusion(clips, held_out, config, checkpoint=path).losses, whole.losses)
+    arrays = read_arrays(path)  # of the ended fit, whose step is 60
+    *_, step = [name for name, array in arrays.items() if array.shape == () and array == 60]  # others: the optimiser's
+    for wrong in (2**31 - 1, -10, 61):
+        write_arrays(path, arrays | {step: np.array(wrong, np.int32)})
+        assert np.array_equal(fit_fusion(clips, held_out, config, checkpoint=path).losses, whole.losses)
 
 
 def test_a_fit_ends_where_held_out_clips_gain_nothing():

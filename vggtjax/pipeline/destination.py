@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, one_line
 from vggtjax.pipeline.shards import SETTLING, Shard, running
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.results.disk import announce
@@ -22,6 +22,7 @@ from vggtjax.storage.writing import check_free, locked_folder, remove_leftovers,
 SETTINGS_NAME, PAGE_NAME = "batch.json", "index.html"
 _AT_ONCE = 16  # questions to a server
 _MOST_SETTINGS_BYTES = 2**20
+_MOST_NAMED = 8  # settings in a message
 
 
 class Destination(Protocol):
@@ -84,7 +85,11 @@ class LocalFolder:
     def begin(self, settings: dict[str, Any]) -> None:
         path = self.path / SETTINGS_NAME
         if path.is_file():
-            _check_settings(str(path), read_json(path, dict[str, Any], "settings of a batch"), settings)
+            _check_settings(
+                str(path),
+                read_json(path, dict[str, Any], "settings of a batch", most_bytes=_MOST_SETTINGS_BYTES),
+                settings,
+            )
             return
         with writing(path) as temporary:
             temporary.write_bytes(_settings_text(settings))
@@ -123,7 +128,9 @@ class RemoteFolder:
         if earlier is None:
             write_url(url, _settings_text(settings))
             return
-        _check_settings(shown(url), parse_json(earlier, dict[str, Any], shown(url)), settings)
+        _check_settings(
+            shown(url), parse_json(earlier, dict[str, Any], shown(url), most_bytes=_MOST_SETTINGS_BYTES), settings
+        )
 
     def has(self, name: str) -> bool:
         return exists(f"{self.url}/{name}/{ARCHIVE_NAME}")
@@ -152,7 +159,14 @@ def _settings_text(settings: dict[str, Any]) -> bytes:
 def _check_settings(place: str, earlier: dict[str, Any], settings: dict[str, Any]) -> None:
     names = [name for name in settings | earlier if earlier.get(name) != settings.get(name)]
     if names:
-        others = "; ".join(f"{name} {earlier.get(name)!r}, now {settings.get(name)!r}" for name in names)
+        others = "; ".join(
+            f"{one_line(name, 40)} {_short(earlier.get(name))}, now {_short(settings.get(name))}"
+            for name in names[:_MOST_NAMED]
+        )
         raise InputError(
             f"{place} has other settings than this run ({others}); choose another folder, or move the file away"
         )
+
+
+def _short(value: Any) -> str:
+    return one_line(repr(value), 80)

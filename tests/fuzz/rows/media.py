@@ -44,13 +44,15 @@ _PICTURES = {  # suffix -> slack: the last ones can hold 16 million pixels in a 
     **dict.fromkeys((".tif", ".webp", ".jp2", ".avif"), 2**28),
 }
 
+_VIDEO = 384 * 2**20  # slack: a damaged packet may say 8 million pixels, of which a decoder holds several frames
+
 ROWS = (
     *(
         Reader(f"picture {suffix}", samples.picture_file(f"picture{suffix}"), read_image, slack)
         for suffix, slack in _PICTURES.items()
     ),
     *(
-        Reader(f"video {suffix}", samples.video_file(suffix, codec), read_frames, 2**28)
+        Reader(f"video {suffix}", samples.video_file(suffix, codec), read_frames, _VIDEO)
         for suffix, codec in _CODECS.items()
     ),
     Reader("folder of pictures", samples.made(lambda folder: (folder.mkdir(), _pictures(folder))), read_frames),

@@ -54,6 +54,7 @@ ROWS = (
     Reader("capture Polycam", samples.capture(folders.polycam), _capture),
     Reader("capture nerfstudio", samples.capture(folders.nerfstudio), _capture),
     Reader("capture COLMAP", samples.capture(folders.colmap_text), _capture),
+    Reader("capture COLMAP, binary", samples.capture(folders.colmap_binary), _capture),
     Reader("capture TUM", samples.capture(folders.tum), _capture),
     # data sets
     Reader("data set plain", samples.plain, partial(_sequences, "plain")),
