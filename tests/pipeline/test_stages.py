@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tiny import tiny_config
-from vggtjax import Model, compile_ahead, encode, forward, load_clip, reconstruct
+from vggtjax import Model, compile_ahead, encode, forward, infer, load_clip, reconstruct
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.passes import first_pass, second_pass
@@ -186,6 +186,16 @@ def test_equal_frames_show_nothing_that_moves(model):
     assert result.settings["masks"] == "none: all frames are equal"
     still[2, :2, :2] = 1 - still[2, :2, :2].round()  # four pixels change, as a small mover's do
     assert reconstruct(model, load_clip(still, size=SIDE, patch=14), size=SIDE).settings["masks"] == "mined"
+
+
+def test_one_program_knows_the_clips_of_a_batch_that_are_still(model):
+    still = np.repeat(pictures(1), 3, axis=0)
+    batch = jnp.asarray(np.stack([still, pictures(3)]))
+    _, passes = infer(model.params, batch, model.config)
+    _, other = infer(model.params, batch[1:], model.config)
+    assert passes.dynamic_mask[1].any()
+    assert not passes.dynamic_mask[0].any()
+    assert (passes.dynamic_mask[1] == other.dynamic_mask[0]).mean() > 0.999
 
 
 def test_a_parameter_that_is_not_finite_is_named(model):
