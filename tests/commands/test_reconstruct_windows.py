@@ -62,10 +62,10 @@ def test_points_outside_the_frames_end_a_windowed_run_before_the_work(frames, tm
     assert not out.exists()
 
 
-def free_for(monkeypatch, count, clips=1):
+def free_for(monkeypatch, count, clips=1, *, hard=False):
     """Make up the free memory: what so many frames need, and one byte; nothing is known for None."""
     needed = 0 if count is None else memory.predicted_bytes(load_model("demo"), count, 64, 64, clips=clips) + 1
-    monkeypatch.setattr(memory, "available", lambda _: None if count is None else Room(needed, "of a test"))
+    monkeypatch.setattr(memory, "available", lambda _: None if count is None else Room(needed, "of a test", hard))
     return needed
 
 
@@ -156,6 +156,15 @@ def test_a_clip_that_cannot_fit_is_refused_before_the_work(frames, tmp_path, cap
     said = " ".join(capsys.readouterr().err.split())
     assert "GB are free of a test; what fits: --max-frames 5, or --size 48, or weights of half the size" in said
     assert said.endswith("(--no-memory-check runs it all the same)")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_hard_limit_leaves_no_room_for_an_error_of_the_prediction(frames, tmp_path, capsys, monkeypatch):
+    """Seven frames need less than 15 % more than six, which is tried in memory that is free (the next test)."""
+    words = ["reconstruct", str(frames), "--model", "demo", "--out", str(tmp_path / "out"), "--window", "0"]
+    free_for(monkeypatch, 6, hard=True)
+    assert cli.main(words) == 2
+    assert "GB are free of a test; what fits: --max-frames 6" in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
 
 

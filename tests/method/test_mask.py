@@ -55,6 +55,18 @@ def test_constant_saliency_has_no_dynamic_pixels(value):
     assert not dynamic_pixels(jnp.full((1, 3, 2, 2), value), (28, 28)).any()
 
 
+@pytest.mark.parametrize("threshold", ["otsu", "multi-otsu"])
+def test_a_frame_that_is_not_finite_leaves_the_masks_of_the_others(threshold):
+    saliency = np.zeros((1, 3, 4, 4), np.float32)
+    saliency[0, :2, 1:3, 1:3] = 1
+    tokens = jnp.zeros((1, 3, 16, 2))
+    whole = mine_mask(jnp.asarray(saliency), tokens, (28, 28), threshold=threshold)
+    saliency[0, 2], saliency[0, 2, 0, 0] = np.nan, np.inf
+    broken = mine_mask(jnp.asarray(saliency), tokens, (28, 28), threshold=threshold)
+    assert whole[0, :2].any(axis=(1, 2)).all()
+    assert (broken == whole).all()
+
+
 @pytest.mark.parametrize("saliency", [np.full((1, 3, 2, 2), 0.4), np.zeros((1, 1, 4, 4))])
 def test_multi_otsu_of_constant_saliency_has_no_dynamic_pixels(saliency):
     assert not dynamic_pixels(jnp.asarray(saliency), (28, 28), threshold="multi-otsu").any()

@@ -106,23 +106,23 @@ def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
 
     def room():
         found = host_room(tmp_path)
-        return None if found is None else (found.size / 1024, found.limit)
+        return None if found is None else (found.size / 1024, found.limit, found.is_hard)
 
     assert room() is None
     write("proc/meminfo", "MemTotal: 2000 kB\nMemAvailable: 1000 kB\n")
     write("proc/self/status", "Name: python\nVmRSS: 100 kB\n")
-    assert room() == (1100, "of the computer")
+    assert room() == (1100, "of the computer", False)
     write("proc/self/cgroup", "4:memory:/a/b\n0::/c/d\n")
     write("sys/fs/cgroup/memory/a/memory.limit_in_bytes", f"{900 * 1024}")
     write("sys/fs/cgroup/memory/a/memory.usage_in_bytes", f"{200 * 1024}")
     write("sys/fs/cgroup/memory/a/memory.stat", f"total_inactive_file {50 * 1024}\n")
     write("sys/fs/cgroup/memory/memory.limit_in_bytes", "9223372036854771712")
     write("sys/fs/cgroup/memory/memory.usage_in_bytes", "5")
-    assert room() == (100 + 750, "of its container (cgroup)")
+    assert room() == (100 + 750, "of its container (cgroup)", True)
     write("sys/fs/cgroup/c/memory.max", f"{300 * 1024}")
     write("sys/fs/cgroup/c/memory.current", f"{100 * 1024}")
     write("sys/fs/cgroup/c/d/memory.max", "max")
-    assert room() == (100 + 200, "of its container (cgroup)")
+    assert room() == (100 + 200, "of its container (cgroup)", True)
     write("proc/self/status", "Name: python\nVmSize: 700000 kB\nVmData: 300 kB\nVmRSS: 100 kB\n")
     title = "Limit                     Soft Limit           Hard Limit           Units\n"
     data = f"Max data size             {2**40}        unlimited            bytes\n"
@@ -133,11 +133,11 @@ def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
         ("ulimit -v", (700000 + 400150) * 1024, 700000 * 1024),
     ]
     stacks = 300_000_000 / 1024  # of threads that start later
-    assert room() == (100 + 200, "of its container (cgroup)")
+    assert room() == (100 + 200, "of its container (cgroup)", True)
     write("sys/fs/cgroup/c/memory.max", "max")
     write("sys/fs/cgroup/memory/a/memory.limit_in_bytes", "9223372036854771712")
     write("proc/meminfo", "MemTotal: 2000000 kB\nMemAvailable: 1000000 kB\n")
-    assert room() == (pytest.approx(100 + 400150 - stacks), "within ulimit -v")
+    assert room() == (pytest.approx(100 + 400150 - stacks), "within ulimit -v", True)
 
 
 def test_a_limit_too_low_for_the_libraries_is_met_by_a_sentence(tmp_path):

@@ -1,12 +1,14 @@
 """Stages ahead of time, clips that are padded, passes that need not be run, and frames that are not real."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.tiny import tiny_config
-from vggtjax import Model, compile_ahead, encode, forward, load_clip, reconstruct
+from vggtjax import Model, compile_ahead, encode, forward, infer, load_clip, reconstruct
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.passes import first_pass, second_pass
@@ -14,7 +16,9 @@ from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.model import init_params, parameter_shapes
 from vggtjax.network.suppression import Suppression
 from vggtjax.options import Options
+from vggtjax.pipeline.run import assembled_fields
 from vggtjax.pipeline.stages import Stages, padded_frames
+from vggtjax.results.not_finite import NotFiniteWarning, warn_of_not_finite
 
 SIDE, OFFSETS = 70, MotionConfig().offsets
 
@@ -186,6 +190,42 @@ def test_equal_frames_show_nothing_that_moves(model):
     assert result.settings["masks"] == "none: all frames are equal"
     still[2, :2, :2] = 1 - still[2, :2, :2].round()  # four pixels change, as a small mover's do
     assert reconstruct(model, load_clip(still, size=SIDE, patch=14), size=SIDE).settings["masks"] == "mined"
+
+
+def test_one_program_knows_the_clips_of_a_batch_that_are_still(model):
+    still = np.repeat(pictures(1), 3, axis=0)
+    batch = jnp.asarray(np.stack([still, pictures(3)]))
+    _, passes = infer(model.params, batch, model.config)
+    _, other = infer(model.params, batch[1:], model.config)
+    assert passes.dynamic_mask[1].any()
+    assert not passes.dynamic_mask[0].any()
+    assert (passes.dynamic_mask[1] == other.dynamic_mask[0]).mean() > 0.999
+
+
+def test_values_that_are_not_finite_are_told_once(model, monkeypatch):
+    """Of 3 frames of 70 x 70 pixels, 98 pixels of one have no depth and 49 of two no confidence."""
+
+    def spoilt(*args):
+        fields = assembled_fields(*args)
+        fields["depth"][1, :7, :14] = np.nan
+        fields["depth_confidence"][1:, :7, :7] = np.inf
+        return fields
+
+    clip = load_clip(pictures(3), size=SIDE, patch=14)
+    reconstruct(model, clip)  # without a warning, which would be an error
+    monkeypatch.setattr("vggtjax.pipeline.run.assembled_fields", spoilt)
+    with pytest.warns(NotFiniteWarning) as told:
+        result = reconstruct(model, clip)
+    assert [str(one.message) for one in told] == [
+        "the clip: not finite are depth at 0.67% of the pixels, in 1 of 3 frames (which become no points), and "
+        "depth_confidence at 0.67% of the pixels, in 2 of 3 frames (which become no points); look at these frames, or "
+        "compute in float32 (precision 'highest')"
+    ]
+    assert result.valid_pixels.sum() == 3 * SIDE**2 - 98 - 49  # of the first, half have no depth either
+    saliency = np.array(result.saliency)
+    saliency[2] = np.nan
+    with pytest.warns(NotFiniteWarning, match=r"saliency at 33.33% of the patches, in 1 of 3 frames \(which count as"):
+        warn_of_not_finite(dataclasses.replace(result, saliency=saliency))
 
 
 def test_a_parameter_that_is_not_finite_is_named(model):

@@ -16,13 +16,13 @@ from vggtjax.captures.frames import CaptureFrames
 from vggtjax.clips.preprocessing import Fit, Fitter, Mode
 from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.clips.sources import ClipSource, open_source
+from vggtjax.clips.still import same_picture
 from vggtjax.errors import ClipError, InputError
 from vggtjax.progress import Progress, no_progress
 
 logger = logging.getLogger(__name__)
 
 _MOST_WORKERS = 4
-_ROUNDING = 2 / 255  # of a pixel
 _LARGE_CUT = 0.1  # share of a picture's pixels; larger cuts are warned about
 _MOST_BYTES = 2**34  # of the images of one clip; over 5000 frames of 518 x 518
 
@@ -53,8 +53,8 @@ class Clip:
 
     @property
     def is_still(self) -> bool:
-        """Whether all frames are one picture, to the rounding of a video: nothing can be seen to move."""
-        return all(np.abs(image - self.images[0]).max() <= _ROUNDING for image in self.images[1:])
+        """Whether all frames are one picture, up to the noise of a video's codec: nothing can be seen to move."""
+        return all(same_picture(image, self.images[0]) for image in self.images[1:])
 
     def to_source(self, frame: int, points: Float[np.ndarray, "... 2"]) -> Float64[np.ndarray, "... 2"]:
         """Return the source coordinates (x, y) of points given in clip coordinates of `frame`."""

@@ -91,7 +91,7 @@ def mine_mask(
     No gradient passes: a mask is a decision.
 
     Args:
-        saliency: of every patch, in [0, 1].
+        saliency: of every patch, in [0, 1]; a patch whose saliency is not finite counts as still.
         patch_tokens: the backbone's features.
         size: height and width of the mask.
         clusters: number of clusters of `smooth_by_clusters`; 0 for none.
@@ -101,6 +101,7 @@ def mine_mask(
         frames: where the frames are; those that make shares equal change nothing and have no dynamic pixels.
     """
     saliency, patch_tokens = jax.lax.stop_gradient((saliency, patch_tokens))
+    saliency = jnp.where(jnp.isfinite(saliency), saliency, 0)  # else one value would empty the masks of all frames
     if clusters:
         saliency = smooth_by_clusters(saliency, patch_tokens, clusters, frames)
     saliency = smooth_over_time(saliency, smooth_frames, frames)

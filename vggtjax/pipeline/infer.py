@@ -41,7 +41,8 @@ def infer(
         changes: fields of `options` by name, such as `method="vggt4d"`.
 
     Returns:
-        The method's depth, confidence and cameras, and the passes they were made of.
+        The method's depth, confidence and cameras, and the passes they were made of. The mask of a clip whose frames
+        are all one picture is empty.
     """
     config = config if motion is None else dataclasses.replace(config, motion=motion)
     # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.

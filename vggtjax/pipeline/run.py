@@ -36,6 +36,7 @@ from vggtjax.pipeline.stage_runners import Compile, Execute, StageMemory
 from vggtjax.pipeline.stages import ClipInputs, Stages, padded_frames, run_stages
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.refinement.refine import check_refinement, refine_cameras
+from vggtjax.results.not_finite import warn_of_not_finite
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import versions
 from vggtjax.storage.cache import say_how_to_keep
@@ -82,6 +83,8 @@ def reconstruct(
         keep_passes: keep both passes on the result, as `.passes`.
         on_stage: called with the name of each stage, returns a context in which the stage runs.
         changes: fields of `options` by name, such as `method="vggt4d"`.
+
+    A NotFiniteWarning tells how much of depth, confidence and saliency is NaN or infinite.
 
     Raises:
         InputError: an invalid option, masks of another size, a size that is not a multiple of the patch size, known
@@ -149,6 +152,7 @@ def reconstruct(
     except ResultError:
         check_finite(model)  # they may be the reason
         raise
+    warn_of_not_finite(result)
     result, unit = _with_geometry(result, clip, options, geometry, on_stage)
     if options.refine_mask:
         with on_stage("refine mask") as progress:

@@ -15,6 +15,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.cameras import Cameras
+from vggtjax.clips.still import same_picture
 from vggtjax.config import VGGTConfig
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_inputs import apply_fusion
@@ -102,6 +103,11 @@ def _assemble(
     if frames.mesh is None:
         passes = jax.tree.map(lambda x: x[:, : frames.count], passes)
     return frames.on_devices(run, BY_FRAME, WHOLE)(passes, fusion)
+
+
+def _still(images: Float[Array, "B S H W 3"]) -> Bool[Array, " B"]:
+    """Return the clips whose frames are all one picture."""
+    return same_picture(images[:, 1:], images[:, :1]).all(axis=1)
 
 
 _FIRST_OUTPUTS = ("camera", "depth")  # of the first pass
@@ -264,6 +270,8 @@ def run_stages(
     mask = inputs.dynamic_mask
     if mask is None:
         mask = stages.dynamic_mask(saliency, patch_tokens)
+        if stages.run is inline:  # else whoever calls this has looked at the frames
+            mask = mask & ~_still(inputs.images[:, : stages.frames])[:, None, None, None]
     second = first if stages.options.row.needs_second_pass else None
     if runs_second:
         second = stages.second_pass(params, clips, mask, first, all_outputs=all_outputs)

@@ -28,6 +28,7 @@ class Room(NamedTuple):
 
     size: float
     limit: str
+    is_hard: bool = False  # a process that gets larger is ended, or gets no memory: no other process can make room
 
 
 def host_room(root: Path = Path("/")) -> Room | None:
@@ -47,12 +48,12 @@ def total_bytes(root: Path = Path("/")) -> int | None:
 def rooms(root: Path = Path("/")) -> list[Room]:
     """Return how large this process can get by each of the limits that there are."""
     held = _kilobytes(root / "proc/self/status", "VmRSS") or 0
-    return [Room(held + size, limit) for size, limit in _left(root)]
+    return [room._replace(size=held + room.size) for room in _left(root)]
 
 
 def free_bytes(root: Path = Path("/")) -> float | None:
     """Return what is free for this process beside what it holds; None where the system does not tell."""
-    return min((size for size, _ in _left(root)), default=None)
+    return min((room.size for room in _left(root)), default=None)
 
 
 def _left(root: Path) -> list[Room]:
@@ -61,8 +62,8 @@ def _left(root: Path) -> list[Room]:
     if available is None:
         return []
     left = [Room(available, "of the computer")]
-    left += [Room(size, "of its container (cgroup)") for size in _group_rooms(root)]
-    left += [Room(max(0, limit - used - _LATER), f"within {name}") for name, limit, used in own_limits(root)]
+    left += [Room(size, "of its container (cgroup)", True) for size in _group_rooms(root)]
+    left += [Room(max(0, limit - used - _LATER), f"within {name}", True) for name, limit, used in own_limits(root)]
     return left
 
 

@@ -36,6 +36,7 @@ class Choice(NamedTuple):
     free: float  # bytes
     limit: str  # what limits them
     smaller: tuple[str, ...]  # what would fit without windows
+    is_hard: bool = False  # whether the limit is one of the process or its container, and not what is free just now
 
     @property
     def sizes(self) -> str:
@@ -56,8 +57,11 @@ class Choice(NamedTuple):
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether the clip would not fit even where the prediction is too high by its error."""
-        return self.needed * (1 - memory.ERROR) > self.free
+        """Whether the clip is predicted not to fit: without a hard limit, even if too much is predicted, by its error.
+
+        What is free of a computer can grow while the clip is read; a process that meets a hard limit is ended.
+        """
+        return self.needed * (1 if self.is_hard else 1 - memory.ERROR) > self.free
 
     def refusal(self, *, cuts: bool = True) -> DeviceMemoryError:
         """Return the error that says what would fit; `cuts` tells whether the clip can be cut into windows."""
@@ -103,7 +107,7 @@ def choose_windows(
     need = partial(memory.predicted_bytes, method=method, clips=clips)
     needed = need(model, frames, height, width)
     smaller = _smaller(model, (frames, height, width), fitter, room.size, most, need)
-    return Choice(windows, frames, needed, room.size, room.limit, smaller)
+    return Choice(windows, frames, needed, room.size, room.limit, smaller, room.is_hard)
 
 
 def smaller_window(frames: int) -> Windows | None:
