@@ -10,6 +10,7 @@ from vggtjax.method.clustering import kmeans
 from vggtjax.network.backbone import encode
 from vggtjax.pretrained.embedded import demo_clip, demo_model
 
+SEEDS = range(12)  # one run's inertia varies by 1.2 %
 _kmeans = jax.jit(kmeans, static_argnames=("clusters", "restarts"))
 
 
@@ -31,9 +32,9 @@ def features(kind: str) -> np.ndarray:
 @pytest.mark.parametrize(("kind", "clusters"), [("backbone", 64), ("features", 64), ("cloud", 30), ("blobs", 12)])
 def test_inertia_is_scikit_learns(kind, clusters):
     points = features(kind)
-    fitted = [KMeans(clusters, random_state=seed).fit(points) for seed in range(3)]
+    fitted = [KMeans(clusters, random_state=seed).fit(points) for seed in SEEDS]
     theirs = np.mean([-model.score(points) for model in fitted])  # the score is minus the inertia
-    ours = np.mean([float(_kmeans(jax.random.key(seed), points, clusters=clusters).inertia) for seed in range(3)])
+    ours = np.mean([float(_kmeans(jax.random.key(seed), points, clusters=clusters).inertia) for seed in SEEDS])
     assert ours <= 1.01 * theirs
 
 
