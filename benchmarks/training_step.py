@@ -48,7 +48,7 @@ def training_step(
         rounds: timed rounds, after a warm-up.
         out: JSON file for the figures of every round.
     """
-    if min(*devices, steps, rounds) < 1:
+    if not devices or min(*devices, steps, rounds) < 1:
         raise InputError(f"devices, steps and rounds are {devices}, {steps} and {rounds}; expected at least 1")
     if before is not None and not (before / "vggtjax" / "training").is_dir():
         raise InputError(f"{before} has no vggtjax/training; expected a checkout of this package")

@@ -35,7 +35,12 @@ def test_two_checkouts_take_turns(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("option", "message"), [({"rounds": 0}, r"rounds are \(1, 2\), 2 and 0"), ({"before": Path("/")}, "no vggtjax")]
+    ("option", "message"),
+    [
+        ({"rounds": 0}, r"rounds are \(1, 2\), 2 and 0"),
+        ({"devices": ()}, r"rounds are \(\), 2 and 5"),
+        ({"before": Path("/")}, "no vggtjax"),
+    ],
 )
 def test_bad_input(option, message):
     with pytest.raises(InputError, match=message):

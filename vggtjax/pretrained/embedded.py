@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import filecmp
 import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,8 +16,7 @@ MODEL = Path(__file__).with_name("model.safetensors")
 CLIP = MODEL.with_name("clip.npz")
 NOTE = "small demonstration model, trained on generated scenes; not for real footage"
 UNTRAINED_HEADS = ("points", "tracks")
-_LABELS: dict[str, Any] = {"note": NOTE, "untrained_heads": UNTRAINED_HEADS}  # this file's metadata lacks them
-SCENE_SEED = 100  # of held-out dynamic scenes; the clip is the first of them; no evaluation uses this seed
+SCENE_SEED = 100  # of held-out dynamic scenes; the clip is one of them; no evaluation uses this seed
 _NEAREST = np.float32(1e-3)  # metres
 _STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
 
@@ -31,12 +28,7 @@ def demo_model(dtype: LoadedDType = "float32") -> Model:
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
-    return read_model(MODEL, dtype=dtype, **_LABELS)
-
-
-def embedded_labels(path: Path) -> dict[str, Any]:
-    """Return note and untrained heads for the embedded model's file or a copy of it; nothing for other files."""
-    return _LABELS if MODEL.is_file() and filecmp.cmp(path, MODEL, shallow=False) else {}
+    return read_model(MODEL, dtype=dtype)
 
 
 def demo_clip(path: Path = CLIP) -> Truth:

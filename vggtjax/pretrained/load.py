@@ -15,7 +15,7 @@ from converters.torch_to_flax import convert_weights
 from vggtjax.checkpoint import VERSION, DType, LoadedDType, Model, is_checkpoint, read_model
 from vggtjax.config import VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, check_choice
-from vggtjax.pretrained.embedded import demo_model, embedded_labels
+from vggtjax.pretrained.embedded import demo_model
 from vggtjax.progress import Progress
 from vggtjax.storage.cache import cache_folder
 
@@ -72,7 +72,7 @@ def load_weights(
     if not is_checkpoint(path):
         stored = "float32" if dtype in (None, "int8") else dtype
         path = _converted(weights, config or vggt_1b(), stored, progress)
-    return read_model(path, dtype=dtype, **embedded_labels(path))
+    return read_model(path, dtype=dtype)
 
 
 def _converted(weights: Weights, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:
