@@ -14,8 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.attention import ATTENDED
-from vggtjax.network.block import Block
+from vggtjax.network.block import Block, storing_little
 from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.merging import merged_attention
@@ -31,11 +30,6 @@ GLOBAL_ATTENTION: Mapping[str, Callable[[int, tuple[int, int], int], Attend]] = 
     "exact": lambda S, grid, special_tokens: suppressed_attention,
     "merged": merged_attention,
 }
-
-# What the gradient keeps of a pair: outputs of linear layers and of attention; all else is cheap to compute again.
-STORED = jax.checkpoint_policies.save_from_both_policies(
-    jax.checkpoint_policies.dots_with_no_batch_dims_saveable, jax.checkpoint_policies.save_only_these_names(ATTENDED)
-)
 
 Capture = Callable[[Float[Array, "B S T E"]], Any]
 
@@ -144,7 +138,7 @@ def aggregate(
     tokens = _tokens(params, widened(patch_tokens), frames)
     camera = frames.varying(jnp.zeros((B, S, 2 * C), tokens.dtype))
     taps = frames.varying(tuple(_empty(capture, (B, S, T, 2 * C), tokens.dtype) for capture in captures))
-    step = jax.checkpoint(pair, prevent_cse=False, policy=None if compute.remat else STORED)
+    step = storing_little(pair, remat=compute.remat)
     (_, camera, taps, sums), _ = jax.lax.scan(step, (tokens, camera, taps, sums), layers)
     return camera, taps, sums
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.block import Block
+from vggtjax.network.block import Block, storing_little
 from vggtjax.network.layers import Conv, LayerNorm, Params, apply, declare
 from vggtjax.network.precision import check_compute_dtype, full_precision, widened
 
@@ -60,7 +60,7 @@ def encode(
     def step(x, layer):
         return block(layer, x)[0], None
 
-    x, _ = jax.lax.scan(jax.checkpoint(step, prevent_cse=False) if remat else step, x, params["blocks"])
+    x, _ = jax.lax.scan(storing_little(step, remat=remat), x, params["blocks"])
     x = apply(LayerNorm(_EPSILON), params["norm"], x)
     return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -9,11 +10,25 @@ import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
+from vggtjax.network.attention import ATTENDED
 from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, Params, apply, declare
 from vggtjax.network.pieces import in_pieces, replaced_in_pieces
 from vggtjax.network.quantised import dequantised
 from vggtjax.network.rope import Rope, apply_rope
 from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
+
+_STORED = jax.checkpoint_policies.save_from_both_policies(
+    jax.checkpoint_policies.dots_with_no_batch_dims_saveable, jax.checkpoint_policies.save_only_these_names(ATTENDED)
+)
+
+
+def storing_little(step: Callable, *, remat: bool) -> Callable:
+    """Return the step of a scan over blocks with little stored for its gradient.
+
+    It keeps the outputs of linear layers and of attention, as all else is cheap to compute again, or with `remat` the
+    step's input alone.
+    """
+    return jax.checkpoint(step, prevent_cse=False, policy=None if remat else _STORED)
 
 
 @dataclass(frozen=True)
