@@ -11,6 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 from PIL import Image
 from rich.console import Console
@@ -35,11 +36,13 @@ class Setting(NamedTuple):
     width: int
     dtype: Literal["float32", "bfloat16"]
     method: str
+    devices: int = 1  # into which the CPU is split
 
     @property
     def words(self) -> list[str]:
         """The options of the command."""
-        return ["--size", str(self.width), "--dtype", self.dtype, "--method", self.method]
+        how = ["--devices", str(self.devices)] if self.devices > 1 else ["--window", "0"]
+        return ["--size", str(self.width), "--dtype", self.dtype, "--method", self.method, *how]
 
 
 EMBEDDED = (
@@ -59,6 +62,17 @@ EMBEDDED = (
     Setting(24, 192, 256, "float32", "vggt4d"),
     Setting(64, 128, 128, "float32", "4dvggt-d"),
     Setting(8, 512, 512, "float32", "4dvggt-d"),
+)
+SPLIT = (
+    Setting(16, 64, 64, "float32", "4dvggt-d", 2),
+    Setting(32, 128, 128, "float32", "4dvggt-d", 2),
+    Setting(24, 192, 256, "float32", "vggt4d", 2),
+    Setting(32, 256, 256, "float32", "4dvggt-d", 2),
+    Setting(24, 192, 256, "float32", "vggt", 4),
+    Setting(64, 128, 128, "float32", "4dvggt-d", 4),
+    Setting(32, 256, 256, "float32", "4dvggt-d", 4),
+    Setting(32, 128, 128, "float32", "4dvggt-d", 8),
+    Setting(32, 256, 256, "float32", "4dvggt-d", 8),
 )
 FULL = (
     Setting(2, 294, 518, "float32", "4dvggt-d"),
@@ -82,7 +96,9 @@ class Row(NamedTuple):
         return self.predicted / self.measured
 
 
-def peak_memory(*, full: Path | None = None, embedded: bool = True, out: Path | None = None) -> None:
+def peak_memory(
+    *, full: Path | None = None, embedded: bool = True, split: bool = False, out: Path | None = None
+) -> None:
     """Compare the predicted memory of `vggtjax reconstruct` with the peaks of processes, each of one setting.
 
     Nothing is taken from the cache, so that every process traces and compiles its programs, as a first run does.
@@ -91,12 +107,15 @@ def peak_memory(*, full: Path | None = None, embedded: bool = True, out: Path | 
         full: a checkpoint of VGGT-1B's size, such as `make-checkpoint` writes and `vggtjax convert` converts; its four
             settings take 8 GB of memory.
         embedded: measure the sixteen settings of the embedded model.
+        split: measure nine settings of the embedded model on a CPU that is split into devices.
         out: JSON file for the rows.
     """
     work = [("demo", EMBEDDED)] if embedded else []
+    work += [("demo", SPLIT)] if split else []
     work += [] if full is None else [(str(full), FULL)]
     if not work:
         raise InputError("nothing is measured; give a checkpoint as full, or leave out --no-embedded")
+    jax.config.update("jax_num_cpu_devices", max(setting.devices for _, settings in work for setting in settings))
     rows, screen = [], Console()
     for name, settings in work:
         for row in measure(name, settings):
@@ -132,18 +151,19 @@ def _measured(model: Model, name: str, setting: Setting, folder: Path) -> Row:
     shape = setting.frames, setting.height, setting.width
     for number, image in enumerate(seeded_images(*shape).transpose(0, 2, 3, 1)):
         Image.fromarray(np.round(255 * image).astype(np.uint8)).save(frames / f"{number:04}.png")
-    predicted = memory.predicted_bytes(model, *shape, method=setting.method)
-    words = ["reconstruct", str(frames), "--model", name, "--out", str(folder / "out"), "--window", "0"]
-    answer = run_worker([*words, *setting.words], folder / "cache")
+    predicted = memory.predicted_bytes(model, *shape, method=setting.method, devices=setting.devices)
+    words = ["reconstruct", str(frames), "--model", name, "--out", str(folder / "out")]
+    answer = run_worker([*words, *setting.words], folder / "cache", setting.devices)
     return Row("embedded" if name == "demo" else "full", setting, predicted, answer["total"], answer["own"])
 
 
-def run_worker(words: list[str], cache: Path) -> dict[str, Any]:
+def run_worker(words: list[str], cache: Path, devices: int = 1) -> dict[str, Any]:
     """Run a command in a process with a cache of its own and return what it took. Raises InputError if it fails."""
     command = [sys.executable, "-m", "benchmarks.peak_worker", *words]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, "VGGTJAX_CACHE": str(cache)}
-    )
+    environment = os.environ | {"VGGTJAX_CACHE": str(cache)}
+    if devices > 1:
+        environment["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     last = done.stdout.strip().rpartition("\n")[2]
     if done.returncode or not last.startswith("{"):
         raise InputError(f"{' '.join(words)} ended with code {done.returncode}: {done.stderr[-500:]}")
@@ -154,5 +174,6 @@ def run_worker(words: list[str], cache: Path) -> dict[str, Any]:
 
 
 def _label(row: Row) -> str:
-    frames, height, width, dtype, method = row.setting
-    return f"{row.model}, {frames} x {width} x {height}, {dtype}, {method}"
+    frames, height, width, dtype, method, devices = row.setting
+    shared = f", {devices} devices" if devices > 1 else ""
+    return f"{row.model}, {frames} x {width} x {height}, {dtype}, {method}{shared}"

@@ -171,7 +171,7 @@ def test_a_hard_limit_leaves_no_room_for_an_error_of_the_prediction(frames, tmp_
 def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, monkeypatch):
     model = load_model("demo")
 
-    def with_room(count, *, window=None, **options):
+    def with_room(count, *, window=None, devices=1, **options):
         free_for(monkeypatch, count)
         clip = OneClip(
             report=Report(),
@@ -182,7 +182,7 @@ def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, mon
             model=model,
             fusion=None,
             options=Options(**options),
-            devices=1,
+            devices=devices,
             known=Known(),
             geometry=KnownGeometry(),
             out=tmp_path,
@@ -205,6 +205,9 @@ def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, mon
     monkeypatch.setattr(memory, "ERROR", 0.0)
     with pytest.raises(DeviceMemoryError, match="what fits: --max-frames 3"):
         with_room(3, window=4)
+    assert with_room(6, devices=2) == (Windows(), None)  # each has four of the seven frames
+    with pytest.raises(DeviceMemoryError, match=r"what fits: --max-frames \d"):
+        with_room(2, devices=2)
     assert memory.most_frames(model, 64, 64, memory.predicted_bytes(model, 100, 64, 64)) == 100
     (tmp_path / FOLDER).mkdir()
     write_cut(tmp_path, 4, 2)  # of a run that was stopped

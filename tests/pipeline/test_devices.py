@@ -98,6 +98,20 @@ def test_memory_of_a_device_falls_with_their_number(kept):
         assert all(more > less for more, less in pairwise(needs)), (stage, needs)
 
 
+def test_cues_of_many_frames_do_not_mix_up_their_communications(tmp_path):
+    """Devices that start communications of two cues in another order end the process, or wait for each other."""
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for number, picture in enumerate(np.random.default_rng(0).integers(0, 255, (32, 128, 128, 3), np.uint8)):
+        Image.fromarray(picture).save(frames / f"{number:02}.png")
+    words = ["reconstruct", str(frames), "--model", "demo", "--method", "vggt", "--size", "128", "--only", "cameras"]
+    words += ["--devices", "8", "--out", str(tmp_path / "out")]
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=8", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-m", "vggtjax", *words]
+    done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[:3000]
+
+
 def test_two_processes(kept, tmp_path):
     with socket.socket() as free:
         free.bind(("localhost", 0))

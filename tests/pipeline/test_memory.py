@@ -35,6 +35,11 @@ def test_the_passes_are_predicted_within_a_third_of_the_counts_of_xla(config, fr
     assert memory.pass_bytes(config, frames, *size) == pytest.approx(counted, rel=1 / 3)
 
 
+@pytest.mark.parametrize(("devices", "counted"), [(2, 1055e6), (4, 753e6), (8, 526e6)])  # by benchmarks devices
+def test_so_are_those_of_each_device_that_shares_the_frames(devices, counted):
+    assert memory.pass_bytes(vggt_1b(), 32, 294, 518, devices=devices) == pytest.approx(counted, rel=1 / 3)
+
+
 @pytest.mark.parametrize(
     ("frames", "height", "width", "method", "measured"),  # peaks in MB of processes, by benchmarks peak-memory
     [

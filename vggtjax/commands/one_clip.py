@@ -90,7 +90,7 @@ class OneClip:
             self.report.note(f"{self.out} {text}")
         if windows.window:
             count = self._counted(windows)
-        if unchecked or self.devices > 1:  # several devices share the memory that a clip needs
+        if unchecked:
             return windows, count
         with self.report.stage("check memory"):
             choice = choose_windows(
@@ -100,6 +100,7 @@ class OneClip:
                 self.fitter,
                 window=None if count is None else windows.window,
                 method=self.options.method,
+                devices=self.devices,
             )
         if choice is None:
             return windows, count

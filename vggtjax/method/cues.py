@@ -102,10 +102,13 @@ class GramCues:
 
             return branch
 
-        return tuple(
-            jax.lax.cond(counts[i] > 0, added(cue), lambda total, count, q, k: total, total, counts[i], q, k)
-            for i, (cue, total) in enumerate(zip(self.motion.cues, sums, strict=True))
-        )
+        totals = []
+        for i, (cue, total) in enumerate(zip(self.motion.cues, sums, strict=True)):
+            is_read = counts[i] > 0
+            if totals:
+                is_read = self.frames.after(is_read, totals[-1])
+            totals.append(jax.lax.cond(is_read, added(cue), lambda total, count, q, k: total, total, counts[i], q, k))
+        return tuple(totals)
 
     def maps(self, sums: Sums) -> dict[str, Float[Array, "B S P"]]:
         """Return every cue's map by name, min-max normalised per frame."""

@@ -116,7 +116,7 @@ def aggregate(
         x, q, k = global_block(global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens)
         if accumulator is not None:
             q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
-            sums = accumulator.add(sums, counts, q, k, frame_count)
+            sums = accumulator.add(sums, frames.after(counts, x), q, k, frame_count)
         taps = tuple(
             jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
             for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))

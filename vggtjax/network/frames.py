@@ -146,6 +146,16 @@ class Frames:
         """Return whether x is true on any device."""
         return x if self.mesh is None else jax.lax.pmax(x.astype(jnp.int32), AXIS) > 0
 
+    def after(self, flags: Array, x: Array) -> Array:
+        """Return flags of conditionals, unchanged, which are not known before x is computed.
+
+        XLA's runtime for CPUs tells communications of two conditionals apart only if one waits for the other.
+        """
+        if self.mesh is None:
+            return flags
+        bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(x).ravel()[0].astype(jnp.float32), jnp.uint32)
+        return jnp.where((bits | 1) != 0, flags, jnp.zeros_like(flags))  # always, but the compiler cannot know
+
     def varying(self, x: _Tree) -> _Tree:
         """Return arrays that are equal on all devices with the type of arrays that differ, for the start of a loop."""
         return x if self.mesh is None else jax.tree.map(lambda leaf: jax.lax.pcast(leaf, AXIS, to="varying"), x)

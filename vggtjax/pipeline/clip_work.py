@@ -76,9 +76,9 @@ class ClipWork:
         Raises DeviceMemoryError for a clip that cannot fit and cannot be cut.
         """
         opened, recipe = open_source(source), self._recipe
-        if not recipe.unchecked and recipe.devices == 1:
-            method = recipe.options.method
-            choice = choose_windows(self._model, opened, recipe.sampling, self._fitter, method=method, clips=clips)
+        if not recipe.unchecked:
+            how: dict[str, Any] = {"method": recipe.options.method, "clips": clips, "devices": recipe.devices}
+            choice = choose_windows(self._model, opened, recipe.sampling, self._fitter, **how)
             if choice is not None and choice.is_cut and self._cuts:
                 return LongClip(choice.windows, choice.frames, choice.sentence)
             if choice is not None and choice.is_hopeless:

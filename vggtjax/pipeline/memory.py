@@ -2,8 +2,9 @@
 
 It is the weights, the process, and the larger of two: what the compiler takes of programs that are compiled side by
 side, and what the passes hold: the blocks of every frame, the dense head of the frames that it computes at once, and
-pictures and results. The rates are fitted to XLA's own counts of both passes on a CPU (`python -m benchmarks memory`)
-and to measured peaks of processes that compile their programs (`python -m benchmarks peak-memory`).
+pictures and results. Devices that share the frames hold keys and values of all of them, too. The rates are fitted to
+XLA's own counts of both passes on a CPU (`python -m benchmarks memory`) and to measured peaks of processes that compile
+their programs (`python -m benchmarks peak-memory`).
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ import jax
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS
-from vggtjax.network.attention import LOGITS_AT_ONCE
+from vggtjax.network.attention import LOGITS_AT_ONCE, QUERIES_AT_ONCE
 from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
+from vggtjax.network.gathered_attention import GATHERED_AT_ONCE
 from vggtjax.options import Method, find_method
 from vggtjax.storage.free_memory import Room, host_room
 
@@ -41,28 +43,43 @@ class Sized(Protocol):
 
 
 def predicted_bytes(
-    model: Sized, frames: int, height: int, width: int, *, method: str = "4dvggt-d", clips: int = 1
+    model: Sized,
+    frames: int,
+    height: int,
+    width: int,
+    *,
+    method: str = "4dvggt-d",
+    clips: int = 1,
+    devices: int = 1,
 ) -> float:
     """Return how much memory a method takes on all frames of a clip at once, with the model and the process.
 
-    On a GPU the process is not counted. `clips` such clips are held at the same time: in a batch one is computed while
-    the next is read and the last is written.
+    On a GPU that is the memory of one device, and the process is not counted; on a CPU the devices of this process
+    share its memory. `clips` such clips are held at the same time: in a batch one is computed while the next is read
+    and the last is written. The frames are shared by `devices`, each with a copy of the weights.
     """
-    pictures = clips * frames * _PIXEL * height * width
-    run = pass_bytes(model.config, frames, height, width) + pictures
+    here = min(devices, jax.local_device_count()) if on_cpu() else 1  # devices that take of one memory
+    pictures = clips * min(here * -(-frames // devices), frames) * _PIXEL * height * width
+    run = here * pass_bytes(model.config, frames, height, width, devices=devices) + pictures
     if on_cpu():
         run = _PROCESS + max(run, _COMPILING if _second_is_another(find_method(method)) else 0)
-    return model.parameter_bytes + run
+    return here * model.parameter_bytes + run
 
 
-def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int) -> float:
-    """Return what the passes hold beside weights, pictures and results: XLA's count, within a third."""
+def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int, *, devices: int = 1) -> float:
+    """Return what the passes hold on each device beside weights, pictures and results: XLA's count, within a third."""
+    share = -(-frames // devices)
     tokens = SPECIAL_TOKENS + height * width // config.patch_size**2
     rows = _ROWS * tokens * config.embed_dim
     logits = _LOGITS * config.num_heads * tokens**2 if tokens**2 <= LOGITS_AT_ONCE else 0
-    at_once = min(frames, max(PIXELS_AT_ONCE // (height * width), 1))  # frames of the dense head, at most
+    at_once = min(share, max(PIXELS_AT_ONCE // (height * width), 1))  # frames of the dense head, at most
     maps = _MAPS * max(config.dpt_features // 2, HIDDEN) * height * width
-    return _FLOAT * (frames * (rows + logits) + at_once * maps)
+    largest = at_once * maps
+    if devices > 1:  # gathered keys and values, and on a CPU the logits of a chunk of queries to all of these keys
+        keys = share * devices * tokens
+        chunk = min(QUERIES_AT_ONCE, share * tokens) * keys if on_cpu() else 0
+        largest = max(largest, 2 * min(keys * config.embed_dim, GATHERED_AT_ONCE) + chunk)
+    return _FLOAT * (share * (rows + logits) + largest)
 
 
 def available(params: Any = None) -> Room | None:
@@ -81,12 +98,15 @@ def available(params: Any = None) -> Room | None:
     return Room(free + held, "of the device")
 
 
-def most_frames(model: Sized, height: int, width: int, size: float, *, method: str = "4dvggt-d", clips: int = 1) -> int:
-    """Return the most frames that are predicted to fit in `size` bytes when they are run together; maybe 0."""
+def most_frames(model: Sized, height: int, width: int, size: float, **how: Any) -> int:
+    """Return the most frames that are predicted to fit in `size` bytes when they are run together; maybe 0.
+
+    `how` are the options of `predicted_bytes`.
+    """
     low, high = 0, max(1, _MOST_IMAGES // (3 * _FLOAT * height * width)) + 1  # the first fits, the last does not
     while high - low > 1:
         middle = (low + high) // 2
-        fits = predicted_bytes(model, middle, height, width, method=method, clips=clips) <= size
+        fits = predicted_bytes(model, middle, height, width, **how) <= size
         low, high = (middle, high) if fits else (low, middle)
     return low
 

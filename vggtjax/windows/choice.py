@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.preprocessing import Fitter
@@ -79,6 +79,7 @@ def choose_windows(
     window: int | None = None,
     method: str = "4dvggt-d",
     clips: int = 1,
+    devices: int = 1,
 ) -> Choice | None:
     """Return windows for a clip that does not fit in memory; None for one that does, or where memory is not known.
 
@@ -89,13 +90,15 @@ def choose_windows(
         window: frames that are run together, where windows are given; by default all of the clip.
         method: by its name.
         clips: held in memory at the same time.
+        devices: that share the frames.
     """
+    how: dict[str, Any] = {"method": method, "clips": clips, "devices": devices}
     room = memory.available(model.params)
     if room is None:
         return None
     frame = next(source.frames(sampling))
     width, height = fitter.fit(*frame.image.size, frame.name).frame_size
-    most = memory.most_frames(model, height, width, room.size, method=method, clips=clips)
+    most = memory.most_frames(model, height, width, room.size, **how)
     frames = min(count_frames(source, sampling, most + 1), window or most + 1)
     if frames <= most:
         return None
@@ -104,7 +107,7 @@ def choose_windows(
     windows = Windows(next((length for length in _LENGTHS if length <= most), _LENGTHS[-1]))
     if windows.window is not None and windows.window > most:  # not even the shortest fits
         windows = Windows()
-    need = partial(memory.predicted_bytes, method=method, clips=clips)
+    need = partial(memory.predicted_bytes, **how)
     needed = need(model, frames, height, width)
     smaller = _smaller(model, (frames, height, width), fitter, room.size, most, need)
     return Choice(windows, frames, needed, room.size, room.limit, smaller, room.is_hard)
