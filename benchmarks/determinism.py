@@ -69,6 +69,7 @@ class Apart(NamedTuple):
     confidence: float  # likewise
     rotation: float  # of the worst frame, in degrees
     centre: float  # of the worst frame, as a share of the extent of all centres
+    focal: float  # focal lengths, as a share
     mask: float  # share of the pixels
 
     def within(self, most: Apart) -> bool:
@@ -76,9 +77,11 @@ class Apart(NamedTuple):
         return all(mine <= limit for mine, limit in zip(self[1:], most[1:], strict=True)) and self.equal >= most.equal
 
 
-_EQUAL = Apart(equal=True, depth=0, mean_depth=0, confidence=0, rotation=0, centre=0, mask=0)
-_ROUNDED = Apart(equal=False, depth=1e-5, mean_depth=1e-6, confidence=2e-5, rotation=1e-4, centre=5e-6, mask=1e-4)
-_COARSE = Apart(equal=False, depth=2, mean_depth=0.01, confidence=4, rotation=5, centre=0.1, mask=0.01)
+_EQUAL = Apart(equal=True, depth=0, mean_depth=0, confidence=0, rotation=0, centre=0, focal=0, mask=0)
+_ROUNDED = Apart(
+    equal=False, depth=1e-5, mean_depth=1e-6, confidence=2e-5, rotation=1e-4, centre=5e-6, focal=2e-6, mask=1e-4
+)
+_COARSE = Apart(equal=False, depth=2, mean_depth=0.01, confidence=4, rotation=5, centre=0.1, focal=0.02, mask=0.01)
 MOST = dict.fromkeys(WAYS, _ROUNDED) | {"again": _EQUAL, "bfloat16": _COARSE}  # that tests allow
 
 
@@ -99,11 +102,11 @@ def determinism(*, frames: int = 17, model: str = "demo", ways: tuple[str, ...] 
     rows = differences(frames, model, ways)
     console = Console()
     table = Table(title=f"{frames} frames: largest differences from the plain way", title_justify="left")
-    for heading in ("way", "bytes", "depth", "its mean", "confidence", "rotation", "centres", "mask"):
+    for heading in ("way", "bytes", "depth", "its mean", "confidence", "rotation", "centres", "focal", "mask"):
         table.add_column(heading, justify="left" if heading in ("way", "bytes") else "right")
     for way, row in rows.items():
         depth = (f"{row.depth:.1e}", f"{row.mean_depth:.1e}", f"{row.confidence:.1e}")
-        numbers = (*depth, f"{row.rotation:.1e}°", f"{row.centre:.1e}")
+        numbers = (*depth, f"{row.rotation:.1e}°", f"{row.centre:.1e}", f"{row.focal:.1e}")
         table.add_row(WAYS[way], "equal" if row.equal else "differ", *numbers, f"{100 * row.mask:.3f} %")
     console.print(table)
 
@@ -145,6 +148,7 @@ def apart(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Apart:
     ]
     extent = np.linalg.norm(np.ptp(centres[0], axis=0))
     depth, confidence = (np.abs(other[name] / one[name] - 1) for name in ("depth", "depth_confidence"))
+    focal = np.abs(other["intrinsics"][:, [0, 1], [0, 1]] / one["intrinsics"][:, [0, 1], [0, 1]] - 1)
     return Apart(
         equal=all(one[name].tobytes() == other[name].tobytes() for name in one),
         depth=float(depth.max()),
@@ -152,5 +156,6 @@ def apart(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> Apart:
         confidence=float(confidence.max()),
         rotation=float(np.degrees(np.arcsin(np.minimum(sines, 1))).max()),
         centre=float(np.linalg.norm(centres[1] - centres[0], axis=1).max() / extent),
+        focal=float(focal.max()),
         mask=float((one["dynamic_mask"] != other["dynamic_mask"]).mean()),
     )

@@ -17,9 +17,10 @@ def test_how_far_results_are_apart_by_hand():
         "depth": np.array([[2.0, 4.0]]),
         "depth_confidence": np.array([[1.0, 2.0]]),
         "camera_from_world": poses,
+        "intrinsics": np.array([[[4.0, 0, 1], [0, 2, 1], [0, 0, 1]]]),
         "dynamic_mask": np.array([[True, False]]),
     }
-    assert apart(one, one) == (True, 0, 0, 0, 0, 0, 0)
+    assert apart(one, one) == (True, 0, 0, 0, 0, 0, 0, 0)
     turned = poses.copy()
     turn = np.radians(2)
     turned[0, :, :3] = [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
@@ -28,9 +29,10 @@ def test_how_far_results_are_apart_by_hand():
         "depth": np.array([[2.2, 4.0]]),
         "depth_confidence": np.array([[1.0, 3.0]]),
         "camera_from_world": turned,
+        "intrinsics": np.array([[[4.0, 0, 1], [0, 2.5, 1], [0, 0, 1]]]),
         "dynamic_mask": np.array([[True, True]]),
     }
-    assert apart(one, other) == (False, *map(pytest.approx, (0.1, 0.05, 0.5, 2, 0.1, 0.5)))
+    assert apart(one, other) == (False, *map(pytest.approx, (0.1, 0.05, 0.5, 2, 0.1, 0.25, 0.5)))
 
 
 @pytest.mark.parametrize(("words", "sentence"), [("--ways twice", "ways has 'twice'"), ("--frames 1", "frames is 1")])
@@ -56,5 +58,5 @@ def test_the_page_says_what_is_allowed():
         cells = next(line for line in allowed.splitlines() if line.startswith(f"| {begins}")).split("|")[3:-1]
         said = [float(number) for number in re.findall(r"[\d.]+(?:e-\d+)?", " ".join(cells))]
         most = MOST[way]
-        assert said == [*([most.depth, most.mean_depth] if most.depth else [0]), *most[3:6], 100 * most.mask], way
+        assert said == [*([most.depth, most.mean_depth] if most.depth else [0]), *most[3:7], 100 * most.mask], way
     assert set(MOST.values()) == {MOST[way] for way in rows.values()}

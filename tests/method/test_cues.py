@@ -1,6 +1,11 @@
 """Maps against every Gram matrix, sources of each frame, layers of other depths, and degenerate clips."""
 
 import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -56,6 +61,16 @@ def test_maps_and_saliency_are_those_of_every_gram_matrix(gram, padding):
     assert np.allclose(cues.saliency(sums)[0], (product - low) / (high - low + 1e-6), atol=1e-3)
     squared = cues.saliency(sums, jnp.full(5, 2.0))[0]
     assert np.allclose(squared, np.asarray(normalise(jnp.asarray(product[None] ** 2)))[0], atol=1e-3)
+
+
+def test_eight_devices_have_the_sums_of_one():
+    script, root = Path(__file__).with_name("cues_on_devices.py"), Path(__file__).parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    for frames, off in json.loads(done.stdout).items():
+        assert len(off) == 3, frames
+        assert max(off) < 1e-6, frames
 
 
 def test_clips_of_different_lengths_in_one_batch_have_the_sums_of_each_alone():
