@@ -48,7 +48,9 @@ def run_in_calling_thread() -> None:
 
 
 def give_devices_threads() -> None:
-    """Have XLA start two threads for each device of a CPU that XLA_FLAGS splits, unless PJRT_NPROC says how many.
+    """Have XLA start two threads for each device of a CPU that is split, unless PJRT_NPROC says how many.
+
+    XLA_FLAGS or JAX_NUM_CPU_DEVICES split it.
 
     By default there are as many threads as devices, if these are more than the cores. Devices that wait for each other
     then hold all threads, nobody computes what they wait for, and XLA ends the process after 40 seconds.
@@ -56,6 +58,7 @@ def give_devices_threads() -> None:
     Call it before jax starts: XLA reads the variable once.
     """
     counts = re.findall(r"--xla_force_host_platform_device_count=(\d{1,4})\b", os.environ.get("XLA_FLAGS", ""))
+    counts += re.findall(r"^\d{1,4}$", os.environ.get("JAX_NUM_CPU_DEVICES", ""))
     if counts and int(counts[-1]) > 1:
         os.environ.setdefault("PJRT_NPROC", str(max(2 * int(counts[-1]), os.cpu_count() or 1)))
 
