@@ -149,9 +149,10 @@ class Frames:
     def after(self, flags: Array, x: Array) -> Array:
         """Return flags of conditionals, unchanged, which are not known before x is computed.
 
-        XLA's runtime for CPUs tells communications of two conditionals apart only if one waits for the other.
+        XLA's runtime for CPUs tells communications of two conditionals apart only if one waits for the other. On other
+        platforms the flags are returned as they are: to wait for a flag takes time there.
         """
-        if self.mesh is None:
+        if self.mesh is None or self.mesh.devices.flat[0].platform != "cpu":
             return flags
         bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(x).ravel()[0].astype(jnp.float32), jnp.uint32)
         return jnp.where((bits | 1) != 0, flags, jnp.zeros_like(flags))  # always, but the compiler cannot know
