@@ -25,7 +25,7 @@ MOTION = MotionConfig(
         Cue("deviation", rows="q", columns="q", layers=(1,), statistic="std"),
         Cue("deviations", rows="k", columns="q", layers=(0, 1), statistic="std"),
     ),
-    offsets=(-3, -1, 2),
+    offsets=(-4, -1, 2),
 )
 
 
@@ -43,7 +43,7 @@ def sums(frames: Frames, q, k):
 
 
 off = {}
-for count in (5, 13, 24):  # all frames on every device; gathered, with padding; only those of near devices
+for count in (5, 13, 24):  # one, two and three frames a device: of all devices, or of near ones; 5 and 13 are padded
     mesh = frames_mesh(8)
     shape = 1, shared_length(count, mesh), SPECIAL + PATCHES, HEADS, CHANNELS
     q, k = np.random.default_rng(count).normal(size=(2, *shape)).astype(np.float32)

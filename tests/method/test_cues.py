@@ -66,7 +66,8 @@ def test_maps_and_saliency_are_those_of_every_gram_matrix(gram, padding):
 def test_eight_devices_have_the_sums_of_one():
     script, root = Path(__file__).with_name("cues_on_devices.py"), Path(__file__).parents[2]
     environment = os.environ | {"PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}
-    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False)
+    words = [sys.executable, str(script)]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]
     for frames, off in json.loads(done.stdout).items():
         assert len(off) == 3, frames

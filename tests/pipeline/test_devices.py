@@ -99,7 +99,7 @@ def test_memory_of_a_device_falls_with_their_number(kept):
 
 
 def test_cues_of_many_frames_do_not_mix_up_their_communications(tmp_path):
-    """Devices that start communications of two cues in another order end the process, or wait for each other."""
+    """Without an order, devices enter communications of two cues at once, and XLA ends the process."""
     frames = tmp_path / "frames"
     frames.mkdir()
     for number, picture in enumerate(np.random.default_rng(0).integers(0, 255, (32, 128, 128, 3), np.uint8)):

@@ -69,6 +69,26 @@ def test_the_peaks_of_processes_are_predicted_within_the_error_that_is_promised(
 
 
 @pytest.mark.parametrize(
+    ("frames", "height", "width", "method", "devices", "measured"),  # by --split
+    [
+        (16, 64, 64, "4dvggt-d", 2, 596),
+        (32, 128, 128, "4dvggt-d", 2, 755),
+        (24, 192, 256, "vggt4d", 2, 1201),
+        (32, 256, 256, "4dvggt-d", 2, 1342),
+        (24, 192, 256, "vggt", 4, 1136),
+        (64, 128, 128, "4dvggt-d", 4, 1253),
+        (32, 256, 256, "4dvggt-d", 4, 1771),
+        (32, 128, 128, "4dvggt-d", 8, 1116),
+        (32, 256, 256, "4dvggt-d", 8, 2339),
+    ],
+)
+def test_so_are_those_of_processes_with_several_devices(monkeypatch, frames, height, width, method, devices, measured):
+    monkeypatch.setattr("jax.local_device_count", lambda: devices)
+    predicted = memory.predicted_bytes(demo_model(), frames, height, width, method=method, devices=devices)
+    assert predicted == pytest.approx(1e6 * measured, rel=memory.ERROR)
+
+
+@pytest.mark.parametrize(
     ("frames", "height", "width", "method", "measured"),  # by --full CHECKPOINT, with weights of 5.03 GB
     [
         (2, 294, 518, "4dvggt-d", 5460),

@@ -155,7 +155,7 @@ class Frames:
         if self.mesh is None or self.mesh.devices.flat[0].platform != "cpu":
             return flags
         bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(x).ravel()[0].astype(jnp.float32), jnp.uint32)
-        return jnp.where((bits | 1) != 0, flags, jnp.zeros_like(flags))  # always, but the compiler cannot know
+        return jnp.where((bits | 1) != 0, flags, jnp.zeros_like(flags))  # always true, which XLA does not find out
 
     def varying(self, x: _Tree) -> _Tree:
         """Return arrays that are equal on all devices with the type of arrays that differ, for the start of a loop."""

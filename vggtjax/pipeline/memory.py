@@ -58,8 +58,9 @@ def predicted_bytes(
     share its memory. `clips` such clips are held at the same time: in a batch one is computed while the next is read
     and the last is written. The frames are shared by `devices`, each with a copy of the weights.
     """
-    here = min(devices, jax.local_device_count()) if on_cpu() else 1  # devices that take of one memory
-    pictures = clips * min(here * -(-frames // devices), frames) * _PIXEL * height * width
+    here = min(devices, jax.local_device_count()) if on_cpu() else 1  # devices that share one memory
+    held = frames if on_cpu() else -(-frames // devices)  # every process loads the whole clip and returns all of it
+    pictures = clips * held * _PIXEL * height * width
     run = here * pass_bytes(model.config, frames, height, width, devices=devices) + pictures
     if on_cpu():
         run = _PROCESS + max(run, _COMPILING if _second_is_another(find_method(method)) else 0)
