@@ -276,6 +276,22 @@ def test_a_folder_that_another_check_removes_is_made_again(tmp_path, monkeypatch
         pass
 
 
+def test_a_folder_that_is_removed_while_it_is_made_is_made_again(tmp_path, monkeypatch):
+    folder, is_dir, removed = tmp_path / "out", Path.is_dir, []
+    folder.mkdir()
+
+    def late(path):
+        if path == folder and not removed:
+            removed.append(path)
+            folder.rmdir()
+        return is_dir(path)
+
+    monkeypatch.setattr(Path, "is_dir", late)
+    with staging(folder):
+        assert removed == [folder]
+    assert is_dir(folder)
+
+
 def test_a_locked_folder_has_one_writer(tmp_path):
     folder = tmp_path / "out"
     sentence = f"another run is writing the batch into {folder}; wait for it or choose another folder"

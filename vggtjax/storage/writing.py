@@ -169,10 +169,15 @@ def _acquire_in(folder: Path, name: str, wait: float = 0) -> FileLock | None:
 
     Another process may make the same folder for a check, and remove it before our file is there: then try again.
     """
+    error = None
     for _ in range(_TRIES):
-        folder.mkdir(parents=True, exist_ok=True)
-        with suppress(FileNotFoundError):
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
             return _acquire(folder / name, wait)
+        except (FileNotFoundError, FileExistsError) as failed:  # mkdir finds the folder, then finds it removed
+            error = failed
+    if isinstance(error, FileExistsError):  # something else is in its place
+        raise error
     raise OutputError(f"cannot write {folder}: another program removes it again and again; choose another folder")
 
 
