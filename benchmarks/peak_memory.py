@@ -115,7 +115,8 @@ def peak_memory(
     work += [] if full is None else [(str(full), FULL)]
     if not work:
         raise InputError("nothing is measured; give a checkpoint as full, or leave out --no-embedded")
-    jax.config.update("jax_num_cpu_devices", max(setting.devices for _, settings in work for setting in settings))
+    if split:  # to predict what such a process takes
+        jax.config.update("jax_num_cpu_devices", max(setting.devices for setting in SPLIT))
     rows, screen = [], Console()
     for name, settings in work:
         for row in measure(name, settings):
@@ -162,7 +163,8 @@ def run_worker(words: list[str], cache: Path, devices: int = 1) -> dict[str, Any
     command = [sys.executable, "-m", "benchmarks.peak_worker", *words]
     environment = os.environ | {"VGGTJAX_CACHE": str(cache)}
     if devices > 1:
-        environment["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={devices}"
+        count = f"--xla_force_host_platform_device_count={devices}"
+        environment["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {count}"
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     last = done.stdout.strip().rpartition("\n")[2]
     if done.returncode or not last.startswith("{"):

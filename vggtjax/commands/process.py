@@ -48,12 +48,11 @@ def run_in_calling_thread() -> None:
 
 
 def give_devices_threads() -> None:
-    """Have XLA start two threads for each device of a CPU that is split, unless PJRT_NPROC says how many.
+    """Have XLA start two threads for each device of a split CPU, unless PJRT_NPROC says how many.
 
-    XLA_FLAGS or JAX_NUM_CPU_DEVICES split it.
-
-    By default there are as many threads as devices, if these are more than the cores. Devices that wait for each other
-    then hold all threads, nobody computes what they wait for, and XLA ends the process after 40 seconds.
+    XLA_FLAGS or JAX_NUM_CPU_DEVICES splits it. By default there are as many threads as devices, if these are more than
+    the cores. Devices that wait for each other then hold all threads, nobody computes what they wait for, and XLA ends
+    the process after 40 seconds.
 
     Call it before jax starts: XLA reads the variable once.
     """

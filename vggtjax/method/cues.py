@@ -88,7 +88,6 @@ class GramCues:
                     gram = jnp.einsum("pnd,jnd->pj", vectors(row), source) / heads
                     return gram if self._keeps_gram(cue) else _sample_std(gram)
 
-                near, first_near = columns, 0
                 if cue.statistic == "std":
                     near, first_near = self.frames.around(columns, reach, axis=0)
                     return _over_frames(deviation, (rows, index - first_near, weights))

@@ -9,7 +9,7 @@ their programs (`python -m benchmarks peak-memory`).
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, TypedDict, Unpack
 
 import jax
 
@@ -40,6 +40,14 @@ class Sized(Protocol):
 
     @property
     def parameter_bytes(self) -> int: ...
+
+
+class Together(TypedDict, total=False):
+    """How the frames of a clip are run together: the method, clips held at the same time, devices that share them."""
+
+    method: str
+    clips: int
+    devices: int
 
 
 def predicted_bytes(
@@ -99,7 +107,7 @@ def available(params: Any = None) -> Room | None:
     return Room(free + held, "of the device")
 
 
-def most_frames(model: Sized, height: int, width: int, size: float, **how: Any) -> int:
+def most_frames(model: Sized, height: int, width: int, size: float, **how: Unpack[Together]) -> int:
     """Return the most frames that are predicted to fit in `size` bytes when they are run together; maybe 0.
 
     `how` are the options of `predicted_bytes`.

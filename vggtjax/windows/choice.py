@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.preprocessing import Fitter
@@ -92,7 +92,7 @@ def choose_windows(
         clips: held in memory at the same time.
         devices: that share the frames.
     """
-    how: dict[str, Any] = {"method": method, "clips": clips, "devices": devices}
+    how: memory.Together = {"method": method, "clips": clips, "devices": devices}
     room = memory.available(model.params)
     if room is None:
         return None
