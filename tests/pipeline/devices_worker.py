@@ -72,7 +72,7 @@ def keep_result(what: str, devices: int, result) -> None:
 
 
 def keep_gradient(model: Model, frames: int, devices: int) -> None:
-    """Keep what `infer` returns, and the gradient of a sum of all it assembles, by parameters and images.
+    """Keep what `infer` returns, and the gradient of a sum of all of it, saliency too, by parameters and images.
 
     METHOD names the method; that of one pass compiles in a third of the time.
     """
@@ -80,7 +80,7 @@ def keep_gradient(model: Model, frames: int, devices: int) -> None:
     def weighted(params, x):
         method = os.environ.get("METHOD", "4dvggt-d")
         assembly, passes = infer(params, x, model.config, mesh=frames_mesh(devices), method=method)
-        leaves = [leaf for leaf in jax.tree.leaves(assembly) if leaf.dtype != bool]
+        leaves = [leaf for leaf in jax.tree.leaves((assembly, passes)) if leaf.dtype != bool]
         weights = [np.random.default_rng(0).normal(size=leaf.shape).astype(np.float32) for leaf in leaves]
         return sum(jnp.mean(w * leaf) for w, leaf in zip(weights, leaves, strict=True)), (assembly, passes)
 

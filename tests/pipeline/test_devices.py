@@ -1,5 +1,6 @@
 """One clip on several devices: the numbers of one device, the collectives, the memory of each device, two processes."""
 
+import json
 import os
 import re
 import socket
@@ -110,6 +111,19 @@ def test_cues_of_many_frames_do_not_mix_up_their_communications(tmp_path):
     command = [sys.executable, "-m", "vggtjax", *words]
     done = subprocess.run(command, env=os.environ | flags, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr[:3000]
+
+
+def test_communications_of_a_program_wait_for_each_other():
+    """Of loops and conditionals that do not, XLA's runtime for CPUs mixes up the communications, now and then."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, str(WORKER.with_name("communications.py"))]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=600)
+    assert done.returncode == 0, done.stderr[-3000:]
+    found = json.loads(done.stdout)
+    assert len(found["two sums"][0]) == 1
+    pairs, communicating = found["gradient"]
+    assert communicating > 10
+    assert not pairs
 
 
 def test_two_processes(kept, tmp_path):

@@ -35,8 +35,22 @@ def test_the_passes_are_predicted_within_a_third_of_the_counts_of_xla(config, fr
     assert memory.pass_bytes(config, frames, *size) == pytest.approx(counted, rel=1 / 3)
 
 
+@pytest.fixture
+def two_cores(monkeypatch):
+    monkeypatch.setattr("vggtjax.network.attention.times_for_cores", lambda: 1)
+
+
+def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
+    needs = []
+    for times in (1, 4):
+        monkeypatch.setattr("vggtjax.network.attention.times_for_cores", lambda times=times: times)
+        needs.append(memory.pass_bytes(vggt_1b(), 32, 294, 518, devices=8))
+    keys = 32 * (5 + 21 * 37)
+    assert needs[1] - needs[0] == pytest.approx(4 * keys * (2**26 // keys - 800))
+
+
 @pytest.mark.parametrize(("devices", "counted"), [(2, 1055e6), (4, 753e6), (8, 526e6)])  # by benchmarks devices
-def test_so_are_those_of_each_device_that_shares_the_frames(devices, counted):
+def test_so_are_those_of_each_device_that_shares_the_frames(two_cores, devices, counted):
     assert memory.pass_bytes(vggt_1b(), 32, 294, 518, devices=devices) == pytest.approx(counted, rel=1 / 3)
 
 
@@ -82,7 +96,9 @@ def test_the_peaks_of_processes_are_predicted_within_the_error_that_is_promised(
         (32, 256, 256, "4dvggt-d", 8, 2339),
     ],
 )
-def test_so_are_those_of_processes_with_several_devices(monkeypatch, frames, height, width, method, devices, measured):
+def test_so_are_those_of_processes_with_several_devices(
+    monkeypatch, two_cores, frames, height, width, method, devices, measured
+):
     monkeypatch.setattr("jax.local_device_count", lambda: devices)
     predicted = memory.predicted_bytes(demo_model(), frames, height, width, method=method, devices=devices)
     assert predicted == pytest.approx(1e6 * measured, rel=memory.ERROR)

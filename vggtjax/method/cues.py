@@ -106,7 +106,9 @@ class GramCues:
             is_read = counts[i] > 0
             if totals:
                 is_read = self.frames.after(is_read, totals[-1])
-            totals.append(jax.lax.cond(is_read, added(cue), lambda total, count, q, k: total, total, counts[i], q, k))
+            total = jax.lax.cond(is_read, added(cue), lambda total, count, q, k: total, total, counts[i], q, k)
+            total, (q, k) = self.frames.in_order(total, (q, k))
+            totals.append(total)
         return tuple(totals)
 
     def maps(self, sums: Sums) -> dict[str, Float[Array, "B S P"]]:

@@ -120,6 +120,7 @@ def smooth_by_clusters(
     """
     is_real = frames.are_real(None, 1, saliency.shape[1])
     is_real = None if is_real is None else is_real[0]
+    patch_tokens = frames.after(patch_tokens, saliency)  # clusters do not start beside attention
 
     def one_clip(clip: tuple[Array, Array]) -> Float[Array, "S h w"]:
         values, features = clip

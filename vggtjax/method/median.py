@@ -26,8 +26,8 @@ def median_over_frames(values: Float[Array, "B S ..."], frames: Frames = Frames(
     ordered = _ordered(jax.lax.stop_gradient(flat).astype(jnp.float32))
     order = jnp.where(valid, ordered, jnp.uint32(2**_BITS - 1))
     count = frames.sum(valid.sum(axis=1))
-    middle = [_value_of_rank(flat, order, valid, rank, frames) for rank in ((count - 1) // 2, count // 2)]
-    return jnp.where(count > 0, (middle[0] + middle[1]) * 0.5, jnp.nan)
+    middle = _values_of_ranks(flat, order, valid, jnp.stack([(count - 1) // 2, count // 2]), frames)
+    return jnp.where(count > 0, middle.mean(axis=0), jnp.nan)
 
 
 def _ordered(values: Float[Array, "B N"]) -> UInt32[Array, "B N"]:
@@ -37,14 +37,14 @@ def _ordered(values: Float[Array, "B N"]) -> UInt32[Array, "B N"]:
     return jnp.where(bits >= sign, ~bits, bits | sign)
 
 
-def _value_of_rank(flat: Array, order: Array, valid: Array, rank: Int[Array, " B"], frames: Frames) -> Array:
-    """Return the value that `rank` values of its clip precede in order."""
+def _values_of_ranks(flat: Array, order: Array, valid: Array, ranks: Int[Array, "R B"], frames: Frames) -> Array:
+    """Return the values [R, B] that so many values of their clips precede in order."""
 
     def bit(i, found):
         candidate = found | (jnp.uint32(1) << (_BITS - 1 - i).astype(jnp.uint32))
-        smaller = frames.sum((order < candidate[:, None]).sum(axis=1))
-        return jnp.where(smaller <= rank, candidate, found)
+        smaller = frames.sum((order[None] < candidate[..., None]).sum(axis=-1))
+        return jnp.where(smaller <= ranks, candidate, found)
 
-    found = jax.lax.fori_loop(0, _BITS, bit, jnp.zeros(len(flat), jnp.uint32))
-    equal = valid & (order == found[:, None])
-    return frames.sum(jnp.where(equal, flat, 0).sum(axis=1)) / jnp.maximum(frames.sum(equal.sum(axis=1)), 1)
+    found = jax.lax.fori_loop(0, _BITS, bit, jnp.zeros(ranks.shape, jnp.uint32))
+    equal = valid[None] & (order[None] == found[..., None])
+    return frames.sum(jnp.where(equal, flat[None], 0).sum(axis=-1)) / jnp.maximum(frames.sum(equal.sum(axis=-1)), 1)

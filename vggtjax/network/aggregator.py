@@ -116,7 +116,8 @@ def aggregate(
         x, q, k = global_block(global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens)
         if accumulator is not None:
             q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
-            # What cues fetch from other devices waits for what attention fetches.
+            # What cues fetch from other devices waits for what attention fetches; their gradients the other way round.
+            x, (q, k) = frames.in_order(x, (q, k))
             sums = accumulator.add(sums, frames.after(counts, x), q, k, frame_count)
         taps = tuple(
             jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)

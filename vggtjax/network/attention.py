@@ -166,10 +166,14 @@ def _head_by_head_backward(residuals, gradient):
 _head_by_head.defvjp(_head_by_head_forward, _head_by_head_backward)
 
 
+def queries_at_once(keys: int) -> int:
+    """Return how many queries of a head are attended at once on a CPU, at most, where they see so many keys."""
+    return max(QUERIES_AT_ONCE, min(times_for_cores() * QUERIES_AT_ONCE, LOGITS_OF_A_CHUNK // keys))
+
+
 def _chunks(x: Float[Array, "T D"], keys: int) -> Float[Array, "c R D"]:
     """Cut the queries of a head, or arrays of equal length, into chunks; zeros pad the last chunk."""
-    at_once = max(QUERIES_AT_ONCE, min(times_for_cores() * QUERIES_AT_ONCE, LOGITS_OF_A_CHUNK // keys))
-    chunks = math.ceil(len(x) / at_once)
+    chunks = math.ceil(len(x) / queries_at_once(keys))
     return jnp.pad(x, ((0, -len(x) % chunks), (0, 0))).reshape(chunks, -1, x.shape[1])
 
 

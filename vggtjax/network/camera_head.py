@@ -59,8 +59,7 @@ def predict_pose(
         pose = pose + apply(_branch(config), params["pose_branch"], x)
         return (pose, jax.lax.stop_gradient(pose) if stop_gradient else pose), None
 
-    start = frames.varying((jnp.zeros_like(empty), empty))
-    (pose, _), _ = jax.lax.scan(iteration, start, length=ITERATIONS)
+    (pose, _), _ = jax.lax.scan(iteration, (jnp.zeros_like(empty), empty), length=ITERATIONS)
     pose = frames.share(pose, S)
     return jnp.concatenate([pose[..., :7], nn.relu(pose[..., 7:])], axis=-1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -43,11 +44,17 @@ class Frames:
     def on_devices(self, function: Callable[..., _Tree], *specs: Any) -> Callable[..., _Tree]:
         """Return a function of whole arrays [B, S, ...] that runs `function` on the share of each device.
 
-        `specs` say where the arguments are, WHOLE or BY_FRAME; the outputs are by frame.
+        `specs` say where the arguments are, WHOLE or BY_FRAME; the outputs are by frame. The gradients of a whole
+        argument are summed over the devices at the end, not in every loop and conditional that reads it.
         """
         if self.mesh is None:
             return function
-        return jax.shard_map(function, mesh=self.mesh, in_specs=specs, out_specs=BY_FRAME)
+
+        def share(*arguments: Any) -> _Tree:
+            pairs = zip(specs, arguments, strict=True)
+            return function(*(self.varying(x) if spec == WHOLE else x for spec, x in pairs))
+
+        return jax.shard_map(share, mesh=self.mesh, in_specs=specs, out_specs=BY_FRAME)
 
     def sharding(self, spec: PartitionSpec) -> NamedSharding | None:
         """Return where an array with this spec is; None without a mesh."""
@@ -146,17 +153,46 @@ class Frames:
         """Return whether x is true on any device."""
         return x if self.mesh is None else jax.lax.pmax(x.astype(jnp.int32), AXIS) > 0
 
-    def after(self, flags: Array, x: Array) -> Array:
-        """Return flags of conditionals, unchanged, which are not known before x is computed.
+    def after(self, x: Array, earlier: Any) -> Array:
+        """Return x unchanged, such as the flag of a conditional, which is not known before `earlier` is computed.
 
-        XLA's runtime for CPUs tells communications of two conditionals apart only if one waits for the other. On other
-        platforms the flags are returned as they are: to wait for a flag takes time there.
+        XLA's runtime for CPUs tells communications of two conditionals or loops apart only if one waits for the other.
+        On other platforms x is returned as it is: to wait takes time there.
         """
-        if self.mesh is None or self.mesh.devices.flat[0].platform != "cpu":
-            return flags
-        bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(x).ravel()[0].astype(jnp.float32), jnp.uint32)
-        return jnp.where((bits | 1) != 0, flags, jnp.zeros_like(flags))  # always true, which XLA does not find out
+        if not self._needs_order:
+            return x
+        firsts = [leaf.ravel()[0].astype(jnp.float32) for leaf in jax.tree.leaves(jax.lax.stop_gradient(earlier))]
+        bits = jax.lax.bitcast_convert_type(jnp.stack(firsts), jnp.uint32).max()
+        return jnp.where((bits | 1) != 0, x, jnp.zeros_like(x))  # always true, which XLA does not find out
+
+    def in_order(self, x: Array, later: _Tree) -> tuple[Array, _Tree]:
+        """Return x and what is computed from `later` after it, both unchanged, and keep their gradients in order.
+
+        The gradient by x is not known before the gradients by `later` are computed: see `after`.
+        """
+        return _in_order(self, x, later) if self._needs_order else (x, later)
+
+    @property
+    def _needs_order(self) -> bool:
+        return self.mesh is not None and self.mesh.devices.flat[0].platform == "cpu"
 
     def varying(self, x: _Tree) -> _Tree:
         """Return arrays that are equal on all devices with the type of arrays that differ, for the start of a loop."""
         return x if self.mesh is None else jax.tree.map(lambda leaf: jax.lax.pcast(leaf, AXIS, to="varying"), x)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _in_order(frames: Frames, x: Array, later: Any) -> tuple[Array, Any]:
+    return x, later
+
+
+def _in_order_forward(frames: Frames, x: Array, later: Any) -> tuple[tuple[Array, Any], None]:
+    return (x, later), None
+
+
+def _in_order_backward(frames: Frames, _: None, gradients: tuple[Array, Any]) -> tuple[Array, Any]:
+    x, later = gradients
+    return frames.after(x, later), later
+
+
+_in_order.defvjp(_in_order_forward, _in_order_backward)

@@ -89,7 +89,7 @@ def predict_tracks(
         positions = jnp.where(jnp.asarray(later)[None, :, None, None], positions + delta[..., :2], start)
         return (positions, features + update), None
 
-    (positions, features), _ = jax.lax.scan(iteration, frames.varying((start, features)), length=ITERATIONS)
+    (positions, features), _ = jax.lax.scan(iteration, (start, frames.varying(features)), length=ITERATIONS)
     visibility, confidence = (
         jax.nn.sigmoid(apply(Dense(1), params[name], features)[..., 0]) for name in ("visibility", "confidence")
     )

@@ -15,7 +15,7 @@ import jax
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS
-from vggtjax.network.attention import LOGITS_AT_ONCE, QUERIES_AT_ONCE
+from vggtjax.network.attention import LOGITS_AT_ONCE, queries_at_once
 from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
 from vggtjax.network.gathered_attention import GATHERED_AT_ONCE
 from vggtjax.options import Method, find_method
@@ -86,7 +86,7 @@ def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int, *, devi
     largest = at_once * maps
     if devices > 1:  # gathered keys and values, and on a CPU the logits of a chunk of queries to all of these keys
         keys = share * devices * tokens
-        chunk = min(QUERIES_AT_ONCE, share * tokens) * keys if on_cpu() else 0
+        chunk = min(queries_at_once(keys), share * tokens) * keys if on_cpu() else 0
         largest = max(largest, 2 * min(keys * config.embed_dim, GATHERED_AT_ONCE) + chunk)
     return _FLOAT * (share * (rows + logits) + largest)
 
