@@ -69,6 +69,15 @@ def test_last_two_are_kept(tmp_path, state):
     assert latest(tmp_path) == 9
 
 
+def test_the_next_save_removes_what_an_interrupted_one_left(tmp_path, saved, state):
+    save(tmp_path, state, SHORT)
+    shutil.copytree(saved / "3", tmp_path / "9.orbax-checkpoint-tmp")
+    assert latest(tmp_path) == 3
+    assert (tmp_path / "9.orbax-checkpoint-tmp").exists()  # who reads removes nothing
+    save(tmp_path, state._replace(step=jnp.int32(10)), SHORT)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["10", "3"]
+
+
 @pytest.mark.parametrize("name", ["none", "empty"])
 def test_folders_without_a_checkpoint(tmp_path, shapes, name):
     folder = tmp_path / name

@@ -97,7 +97,9 @@ def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe) -> Restor
 def _opened(folder: Path, *, create: bool = False) -> orbax.CheckpointManager:
     for path in folder.rglob("*"):  # orbax would open a pipe, and wait
         check_regular(path, CheckpointError)
-    options = orbax.CheckpointManagerOptions(max_to_keep=KEPT, create=create, enable_async_checkpointing=False)
+    options = orbax.CheckpointManagerOptions(
+        max_to_keep=KEPT, create=create, cleanup_tmp_directories=create, enable_async_checkpointing=False
+    )
     handlers = {_STATE: orbax.StandardCheckpointHandler(), _RUN: orbax.JsonCheckpointHandler()}
     return orbax.CheckpointManager(folder.resolve(), options=options, item_handlers=handlers)
 
