@@ -1,5 +1,11 @@
 """Otsu against scikit-image, upsampling, token masks."""
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,9 +106,16 @@ def test_partitions_of_small_histograms_are_those_of_scikit_image(classes):
         assert np.asarray(partition(counts / counts.sum())).tolist() == expected.tolist()
 
 
+def test_parts_of_classes_in_the_variance_by_hand():
+    found = _between_classes(jnp.asarray([0.5, 0, 0.5]))  # bin 0 counts as bin 1, and is nothing alone; bin 1 is empty
+    assert found.tolist() == [[0, 0.5, 2.25], [0, 0, 2], [0, 0, 2]]
+
+
 def test_multi_otsu_with_a_class_of_one_value():
     values = jnp.asarray([0.0] * 4 + [0.5] * 4 + [1.0])
     assert float(_multi_otsu(values)) == pytest.approx(128.5 / 256)  # three classes: the bin of 0.5 is the last below
+    assert float(multi_otsu_threshold(values, bins=4)) == pytest.approx(2.5 / 4)
+    assert float(_multi_otsu(values[:8])) == pytest.approx(0.5 * 1.5 / 256)  # two classes: bin 0 goes with bin 1
 
 
 def test_multi_otsu_cuts_every_clip_at_its_own_threshold():
@@ -138,9 +151,11 @@ def test_dynamic_pixels_are_at_or_above_the_threshold_of_their_own_clip():
 
 
 def test_a_pixel_at_the_threshold_is_dynamic_by_otsu_alone():
-    saliency = jnp.asarray([0, 0, 0, 1 / 512, 1, 1]).reshape(1, 1, 2, 3)  # the centre of the first of 256 bins
-    assert dynamic_pixels(saliency, (2, 3)).ravel().tolist() == [False] * 3 + [True] * 3
-    assert dynamic_pixels(saliency, (2, 3), threshold="multi-otsu").ravel().tolist() == [False] * 4 + [True] * 2
+    for threshold, value, is_dynamic in (("otsu", 0.5 / 256, True), ("multi-otsu", 64.5 / 256, False)):
+        saliency = jnp.asarray([0, 0, 0, value, 1, 1]).reshape(1, 1, 2, 3)  # the centre of one of 256 bins
+        mask = dynamic_pixels(saliency, (2, 3), threshold=threshold)
+        assert mask.ravel().tolist() == [False] * 3 + [is_dynamic] + [True] * 2
+        assert not dynamic_pixels(saliency.at[..., 1, 0].add(-1e-3), (2, 3), threshold=threshold)[0, 0, 1, 0]
 
 
 def test_upsampling_has_half_pixel_centres():
@@ -181,10 +196,10 @@ def test_a_flicker_is_smoothed_away():
 
 
 def test_cluster_means_by_hand():
-    saliency = jnp.array([[[0.0, 2, 4, 9]], [[1, 5, 9, 9]]])
-    labels = jnp.array([[[0, 0, 1, 2]], [[0, 1, 2, 2]]])  # means 1, 4.5, 9; label 3 has no token
-    made = np.asarray(cluster_means(saliency, labels, 4))[:, 0]
-    assert np.allclose(made, [[0, 0, 3.5 / 8, 1], [0, 3.5 / 8, 1, 1]], atol=1e-6)
+    saliency = jnp.array([[[0.0, 2, 4, 9, 3]], [[1, 5, 9, 9, 1]]])
+    labels = jnp.array([[[0, 0, 1, 2, 3]], [[0, 1, 2, 2, 0]]])  # means 1, 4.5, 9, 3; label 4 has no token
+    made = np.asarray(cluster_means(saliency, labels, 5))[:, 0]
+    assert np.allclose(made, [[0, 0, 3.5 / 8, 1, 2 / 8], [0, 3.5 / 8, 1, 1, 0]], atol=1e-6)
 
 
 @pytest.mark.parametrize("options", [{}, {"clusters": 3, "smooth_frames": 3}, {"threshold": "multi-otsu"}])
@@ -205,3 +220,14 @@ def test_frames_that_make_shares_equal_change_no_mask(options):
     assert np.array_equal(shared[:, :5], alone)
     assert not shared[:, 5:].any()
     assert 0.1 < shared[:, :5].mean() < 0.6
+
+
+def test_eight_devices_mine_the_masks_of_one():
+    script, root = Path(__file__).with_name("mask_on_devices.py"), Path(__file__).parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}
+    words = [sys.executable, str(script)]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    for method, (share, is_equal) in json.loads(done.stdout).items():
+        assert 0.05 < share < 0.5, method
+        assert is_equal, method

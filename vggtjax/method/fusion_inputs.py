@@ -115,8 +115,8 @@ def _margin(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"], fram
     smallest. Saliency and mask disagree where the mask was supplied by the user or smoothed. An empty mask has no edge.
     """
     still = ~dynamic
-    if (is_real := frames.are_real(None, 1, len(saliency))) is not None:
-        still = still & is_real[0][:, None, None]
+    if (is_counted := frames.are_counted(len(saliency))) is not None:
+        still = still & is_counted[:, None, None]
     low = frames.max(jnp.where(still, saliency, -jnp.inf).max())
     high = frames.min(jnp.where(dynamic, saliency, jnp.inf).min())
     low, high = jnp.where(jnp.isfinite(low), low, high - 1), jnp.where(jnp.isfinite(high), high, low + 1)

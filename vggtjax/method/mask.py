@@ -27,15 +27,15 @@ def otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS, frames: Fram
     The histogram has `bins` bins from the smallest to the largest value, as scikit-image's `threshold_otsu`. Of equal
     centres the lowest is returned; of constant values, the value. With `frames` the values are of all devices.
     """
-    is_real = frames.are_real(None, 1, len(values))
+    is_counted = frames.are_counted(len(values))
     low, high = _extremes(values, frames)
     count = values.size // len(values) * frames.counted(len(values))
     width = (high - low) / bins
     index = jnp.floor((values.ravel() - low) / jnp.where(width > 0, width, 1)).astype(jnp.int32)
     index = jnp.clip(index, 0, bins - 1)
-    if is_real is not None:  # others fall into a bin of their own
-        index = jnp.where(jnp.repeat(is_real[0], values.size // len(values)), index, bins)
-    counts = frames.sum(jnp.bincount(index, length=bins + (is_real is not None))[:bins]) / count
+    if is_counted is not None:  # others fall into a bin of their own
+        index = jnp.where(jnp.repeat(is_counted, values.size // len(values)), index, bins)
+    counts = frames.sum(jnp.bincount(index, length=bins + 1)[:bins]) / count
     centres = low + width * (jnp.arange(bins) + 0.5)
     offsets = jnp.arange(bins) + 0.5  # means in units of bins, which keeps every sum of order one
     below, above = jnp.cumsum(counts), jnp.cumsum(counts[::-1])[::-1]
@@ -62,7 +62,7 @@ def dynamic_pixels(
         threshold: "otsu" (at or above, 4DVGGT-D) or "multi-otsu" (above, VGGT4D).
         frames: where the frames are; those that make shares equal have no dynamic pixels.
     """
-    is_real = frames.are_real(None, *saliency.shape[:2])
+    is_counted = frames.are_counted(saliency.shape[1])
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
         low, high = _extremes(pixels, frames)
@@ -73,7 +73,7 @@ def dynamic_pixels(
         return (pixels > multi_otsu_threshold(every)) & varies
 
     mask = jax.vmap(one_clip)(upsample(saliency, size))
-    return mask if is_real is None else mask & is_real[:, :, None, None]
+    return mask if is_counted is None else mask & is_counted[None, :, None, None]
 
 
 def mine_mask(
@@ -118,13 +118,12 @@ def smooth_by_clusters(
 
     The backbone's features of all frames of a clip are clustered together.
     """
-    is_real = frames.are_real(None, 1, saliency.shape[1])
-    is_real = None if is_real is None else is_real[0]
+    is_counted = frames.are_counted(saliency.shape[1])
     patch_tokens = frames.after(patch_tokens, saliency)  # clusters do not start beside attention
 
     def one_clip(clip: tuple[Array, Array]) -> Float[Array, "S h w"]:
         values, features = clip
-        weights = None if is_real is None else jnp.repeat(is_real, features.shape[1])
+        weights = None if is_counted is None else jnp.repeat(is_counted, features.shape[1])
         points = features.reshape(-1, features.shape[-1])
         labels = kmeans(jax.random.key(0), points, clusters, weights, frames=frames).labels
         return cluster_means(values, labels.reshape(values.shape), clusters, frames)
@@ -156,8 +155,8 @@ def cluster_means(
 ) -> Float[Array, "S h w"]:
     """Return every token's mean over its cluster, min-max normalised per frame."""
     flat = labels.ravel()
-    if (is_real := frames.are_real(None, 1, len(saliency))) is not None:  # others are in no cluster
-        flat = jnp.where(jnp.repeat(is_real[0], saliency[0].size), flat, clusters)
+    if (is_counted := frames.are_counted(len(saliency))) is not None:  # others are in no cluster
+        flat = jnp.where(jnp.repeat(is_counted, flat.size // len(saliency)), flat, clusters)
     zeros = frames.varying(jnp.zeros(clusters))
     total = frames.sum(zeros.at[flat].add(saliency.ravel()))
     count = frames.sum(zeros.at[flat].add(1))
@@ -166,11 +165,12 @@ def cluster_means(
 
 
 def _extremes(values: Float[Array, "S ..."], frames: Frames) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the smallest and the largest value of all real frames."""
-    if (is_real := frames.are_real(None, 1, len(values))) is None:
+    """Return the smallest and the largest value of all counted frames."""
+    is_counted = frames.are_counted(len(values))
+    if is_counted is None:
         return frames.min(values.min()), frames.max(values.max())
-    is_real = is_real.reshape(-1, *(1,) * (values.ndim - 1))
-    low, high = jnp.where(is_real, values, jnp.inf).min(), jnp.where(is_real, values, -jnp.inf).max()
+    is_counted = is_counted.reshape(-1, *(1,) * (values.ndim - 1))
+    low, high = jnp.where(is_counted, values, jnp.inf).min(), jnp.where(is_counted, values, -jnp.inf).max()
     return frames.min(low), frames.max(high)
 
 

@@ -20,8 +20,8 @@ def median_over_frames(values: Float[Array, "B S ..."], frames: Frames = Frames(
     flat = values.reshape(len(values), -1)
     if frames.mesh is None:
         return jnp.nanmedian(flat, axis=-1)
-    if (is_real := frames.are_real(None, *values.shape[:2])) is not None:
-        flat = jnp.where(jnp.repeat(is_real, flat.shape[1] // values.shape[1], axis=1), flat, jnp.nan)
+    if (is_counted := frames.are_counted(values.shape[1])) is not None:
+        flat = jnp.where(jnp.repeat(is_counted, flat.shape[1] // values.shape[1])[None], flat, jnp.nan)
     valid = ~jnp.isnan(flat)
     ordered = _ordered(jax.lax.stop_gradient(flat).astype(jnp.float32))
     order = jnp.where(valid, ordered, jnp.uint32(2**_BITS - 1))

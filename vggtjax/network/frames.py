@@ -86,6 +86,11 @@ class Frames:
             counts = frame_count
         return jnp.asarray(self.numbers(S))[None] < counts[:, None]
 
+    def are_counted(self, S: int) -> Bool[Array, " S"] | None:
+        """Return which of the S frames here are before `count`; None: all."""
+        real = self.are_real(None, 1, S)
+        return None if real is None else real[0]
+
     def gather(self, x: Array, axis: int = 1) -> Array:
         """Return the frames of all devices, along `axis`."""
         return x if self.mesh is None else jax.lax.all_gather(x, AXIS, axis=axis, tiled=True)
