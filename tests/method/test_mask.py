@@ -150,12 +150,12 @@ def test_dynamic_pixels_are_at_or_above_the_threshold_of_their_own_clip():
         assert 0 < mask[clip].mean() < 0.5
 
 
-def test_a_pixel_at_the_threshold_is_dynamic_by_otsu_alone():
-    for threshold, value, is_dynamic in (("otsu", 0.5 / 256, True), ("multi-otsu", 64.5 / 256, False)):
-        saliency = jnp.asarray([0, 0, 0, value, 1, 1]).reshape(1, 1, 2, 3)  # the centre of one of 256 bins
-        mask = dynamic_pixels(saliency, (2, 3), threshold=threshold)
-        assert mask.ravel().tolist() == [False] * 3 + [is_dynamic] + [True] * 2
-        assert not dynamic_pixels(saliency.at[..., 1, 0].add(-1e-3), (2, 3), threshold=threshold)[0, 0, 1, 0]
+@pytest.mark.parametrize(("threshold", "bin", "is_dynamic"), [("otsu", 0, True), ("multi-otsu", 64, False)])
+def test_a_pixel_at_the_threshold_is_dynamic_by_otsu_alone(threshold, bin, is_dynamic):
+    saliency = jnp.asarray([0, 0, 0, (bin + 0.5) / 256, 1, 1]).reshape(1, 1, 2, 3)  # the centre of the bin
+    mask = dynamic_pixels(saliency, (2, 3), threshold=threshold)
+    assert mask.ravel().tolist() == [False] * 3 + [is_dynamic] + [True] * 2
+    assert not dynamic_pixels(saliency.at[..., 1, 0].add(-1e-3), (2, 3), threshold=threshold)[0, 0, 1, 0]
 
 
 def test_upsampling_has_half_pixel_centres():
