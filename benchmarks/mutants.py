@@ -61,7 +61,7 @@ name = "local"
 exclude-operators = [{excluded}]
 """
 _ROWS = """
-SELECT spec.operator_name, spec.start_pos_row, result.test_outcome, result.diff
+SELECT spec.start_pos_row, result.test_outcome, result.diff, result.output = 'timeout'
 FROM mutation_specs AS spec JOIN work_results AS result ON spec.job_id = result.job_id
 WHERE result.worker_outcome != 'SKIPPED' ORDER BY spec.start_pos_row
 """
@@ -73,6 +73,7 @@ class Score(NamedTuple):
     module: str
     changes: int
     noticed: int
+    late: int  # noticed because the tests took too long, as they also do on a busy machine
     explained: int  # changes of mutants.toml that no test noticed
     survivors: list[str]  # the others: each a line's number, the line before and after
 
@@ -108,11 +109,11 @@ def mutants(
         if out is not None:
             write_json(out, {"scores": [score._asdict() for score in scores]})
     table = Table(title="changes that the tests of a module notice", title_justify="left")
-    for heading in ("module", "changes", "noticed", "share", "explained", "with explained"):
+    for heading in ("module", "changes", "noticed", "share", "by time", "explained", "with explained"):
         table.add_column(heading, justify="left" if heading == "module" else "right")
     for score in scores:
         noticed, both = score.percent(explained=False), score.percent(explained=True)
-        row = score.changes, score.noticed, noticed, score.explained, both
+        row = score.changes, score.noticed, noticed, score.late, score.explained, both
         table.add_row(MODULES[score.module].path, *map(str, row))
     console.print(table)
 
@@ -167,10 +168,11 @@ def _score(name: str, folder: Path, seconds: float, share: int, console: Console
         raise InputError(
             f"cosmic-ray ended with code {running.returncode} after {len(rows)} of {total} changes of {name}"
         )
-    survivors = [(line, _shown(diff)) for _, line, outcome, diff in rows if outcome == "SURVIVED"]
+    survivors = [(line, _shown(diff)) for line, outcome, diff, _ in rows if outcome == "SURVIVED"]
     noticed, known = len(rows) - len(survivors), _explained(name)
+    late = sum(is_late for *_, is_late in rows)
     unknown = [f"{line}: {change}" for line, change in survivors if change not in known]
-    return Score(name, len(rows), noticed, len(survivors) - len(unknown), unknown)
+    return Score(name, len(rows), noticed, late, len(survivors) - len(unknown), unknown)
 
 
 def _copy(root: Path) -> None:
@@ -182,7 +184,7 @@ def _copy(root: Path) -> None:
             shutil.copy(source, root / name)
 
 
-def _rows(session: str) -> Sequence[tuple[str, int, str, str]]:
+def _rows(session: str) -> Sequence[tuple[int, str, str, int]]:
     with closing(sqlite3.connect(session, timeout=60)) as connection:
         return connection.execute(_ROWS).fetchall()
 
