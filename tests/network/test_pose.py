@@ -47,6 +47,14 @@ def test_intrinsics_by_hand():
     assert np.allclose(intrinsics, [[100, 0, 100], [0, 50, 50], [0, 0, 1]], atol=1e-4)
 
 
+def test_every_camera_of_a_batch_is_that_alone():
+    poses = jnp.asarray(np.random.default_rng(0).uniform(0.2, 1, (2, 9)), jnp.float32)
+    many = _decode(poses)
+    for i, pose in enumerate(poses):
+        for array, one in zip((*many, _encode(*many)), (*_decode(pose), _encode(*_decode(pose))), strict=True):
+            assert np.allclose(array[i], one, atol=1e-5)
+
+
 def test_odd_fields_of_view_are_not_clamped():
     pose = jnp.asarray([[0, 0, 0, 0, 0, 0, 1, 0, 4.0]], jnp.float32)
     _, intrinsics = decode_pose(pose, (100, 200))

@@ -18,10 +18,12 @@ import jax.numpy as jnp
 from tests.tiny import tiny_config
 from vggtjax import infer
 from vggtjax.config import MotionConfig
+from vggtjax.method.fusion_family import start
 from vggtjax.network import gathered_attention
 from vggtjax.network.frames import BY_FRAME, Frames
 from vggtjax.network.model import init_params
 from vggtjax.pipeline.devices import frames_mesh
+from vggtjax.pipeline.stages import _assemble
 
 COMPUTATION = re.compile(r"(?:ENTRY )?%?([\w.-]+) \(.*\) -> .* \{")
 INSTRUCTION = re.compile(r" +(?:ROOT )?%([\w.-]+) = .*? ([\w-]+)\((.*)")
@@ -29,9 +31,10 @@ COLLECTIVE = re.compile(r"(all-reduce|all-gather|all-to-all|collective-permute|r
 
 
 def unordered(text: str) -> tuple[list[tuple[str, str]], int]:
-    """Return the pairs of instructions of a compiled program that communicate inside and do not wait for each other.
+    """Return pairs of a loop, conditional or call that communicates, and a later communication that may run beside it.
 
-    Also return the number of computations that communicate.
+    The later one communicates inside, too, or is a communication. Also return the number of computations that
+    communicate.
     """
     computations: dict[str, dict[str, tuple[str, list[str]]]] = {}
     current = {}
@@ -47,10 +50,11 @@ def unordered(text: str) -> tuple[list[tuple[str, str]], int]:
         communicate[name] = False
         for result, (kind, names) in instructions.items():
             before[result] = {earlier for other in names if other in before for earlier in (other, *before[other])}
-            if any(communicate.get(other, False) for other in names):
+            is_inside = any(communicate.get(other, False) for other in names)
+            if is_inside or COLLECTIVE.fullmatch(kind):
                 pairs += [(other, result) for other in inside if other not in before[result]]
-                inside.append(result)
-            communicate[name] |= bool(inside) or COLLECTIVE.fullmatch(kind) is not None
+                inside += [result] if is_inside else []
+                communicate[name] = True
     return pairs, sum(communicate.values())
 
 
@@ -75,10 +79,20 @@ def gradient(params, images):
 
 
 gathered_attention.GATHERED_AT_ONCE = 1  # in a loop over heads, as in long clips
+def assembly(passes):
+    """Return the result of both passes, whose depths are aligned and fused by a fitted rule: two medians."""
+    changes = {"method": "4dvggt-d", "align_scale": True, "patch_size": config.patch_size}
+    return _assemble(passes, start(("gate",)), frames=Frames(frames_mesh(8), FRAMES), **changes)
+
+
+FRAMES = 13
 config = tiny_config(image_size=28, motion=MotionConfig(cues=MotionConfig().cues[:3]))
+params, images = init_params(0, config), jnp.zeros((1, FRAMES, 28, 28, 3))
+_, passes = jax.eval_shape(lambda x: infer(params, x, config), jnp.zeros((1, 16, 28, 28, 3)))  # padded for 8 devices
 programs = {
     "two sums": (two_sums, jnp.ones((1, 8))),
-    "gradient": (gradient, init_params(0, config), jnp.zeros((1, 13, 28, 28, 3))),
+    "assembly": (assembly, passes),
+    "gradient": (gradient, params, images),
 }
 found = {}
 for name, (function, *inputs) in programs.items():

@@ -113,17 +113,18 @@ def test_cues_of_many_frames_do_not_mix_up_their_communications(tmp_path):
     assert done.returncode == 0, done.stderr[:3000]
 
 
-def test_communications_of_a_program_wait_for_each_other():
-    """Of loops and conditionals that do not, XLA's runtime for CPUs mixes up the communications, now and then."""
+def test_communications_of_a_program_run_one_after_another():
+    """XLA's runtime for CPUs can mix up those of two loops or conditionals that run at the same time."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, str(WORKER.with_name("communications.py"))]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=600)
     assert done.returncode == 0, done.stderr[-3000:]
     found = json.loads(done.stdout)
     assert len(found["two sums"][0]) == 1
-    pairs, communicating = found["gradient"]
-    assert communicating > 10
-    assert not pairs
+    for program, least in (("assembly", 3), ("gradient", 20)):
+        pairs, communicating = found[program]
+        assert communicating >= least, program
+        assert not pairs, program
 
 
 def test_two_processes(kept, tmp_path):

@@ -5,10 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax.numpy as jnp
 import pytest
 from PIL import Image
 
 from vggtjax.config import vggt_1b
+from vggtjax.network.attention import _chunks
 from vggtjax.pipeline import memory
 from vggtjax.pretrained.embedded import demo_model
 from vggtjax.storage.free_memory import host_room, own_limits
@@ -41,12 +43,14 @@ def two_cores(monkeypatch):
 
 
 def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
-    needs = []
+    queries, keys = 4 * (5 + 21 * 37), 32 * (5 + 21 * 37)  # of one of eight devices
+    needs, rows = [], []
     for times in (1, 4):
         monkeypatch.setattr("vggtjax.network.attention.times_for_cores", lambda times=times: times)
+        rows.append(_chunks(jnp.zeros((queries, 1)), keys).shape[1])
         needs.append(memory.pass_bytes(vggt_1b(), 32, 294, 518, devices=8))
-    keys = 32 * (5 + 21 * 37)
-    assert needs[1] - needs[0] == pytest.approx(4 * keys * (2**26 // keys - 800))
+    assert rows == [782, 1564]
+    assert needs[1] - needs[0] == pytest.approx(4 * keys * (rows[1] - rows[0]))
 
 
 @pytest.mark.parametrize(("devices", "counted"), [(2, 1055e6), (4, 753e6), (8, 526e6)])  # by benchmarks devices

@@ -234,8 +234,10 @@ def test_an_error_names_the_path_and_the_reason(tmp_path):
     with pytest.raises(OutputError, match="exists"), write_errors(tmp_path / "folder"):
         raise FileExistsError(errno.EEXIST, "exists")
     (tmp_path / "link").symlink_to(tmp_path / "missing")
+    (tmp_path / "to-file").symlink_to(tmp_path / "file")
     for path, reason in (
         (tmp_path / "link", "is a link to .*missing, which does not exist"),
+        (tmp_path / "to-file", "to-file is a file"),
         ("/dev/null", "not a folder"),
     ):
         with pytest.raises(OutputError, match=reason), write_errors(Path(path)):
@@ -277,19 +279,25 @@ def test_a_folder_that_another_check_removes_is_made_again(tmp_path, monkeypatch
 
 
 def test_a_folder_that_is_removed_while_it_is_made_is_made_again(tmp_path, monkeypatch):
-    folder, is_dir, removed = tmp_path / "out", Path.is_dir, []
-    folder.mkdir()
+    folder, mkdir, removed = tmp_path / "out", os.mkdir, []
 
-    def late(path):
-        if path == folder and not removed:
+    def late(path, *arguments):
+        if Path(path) == folder and len(removed) < often:
             removed.append(path)
-            folder.rmdir()
-        return is_dir(path)
+            raise FileExistsError(errno.EEXIST, "exists")  # it did: another process has removed it by now
+        return mkdir(path, *arguments)
 
-    monkeypatch.setattr(Path, "is_dir", late)
+    monkeypatch.setattr(os, "mkdir", late)
+    often = 2
     with staging(folder):
-        assert removed == [folder]
-    assert is_dir(folder)
+        assert len(removed) == 2
+    folder.rmdir()
+    often = 1000
+    with pytest.raises(OutputError, match="another program removes it again and again"), staging(folder):
+        pass
+    folder.write_text("a file")
+    with pytest.raises(OutputError, match="out is a file"), staging(folder):
+        pass
 
 
 def test_a_locked_folder_has_one_writer(tmp_path):

@@ -62,7 +62,8 @@ def observe(
     dynamic = passes.dynamic_mask.astype(depth1.dtype)
     saliency = upsample(passes.saliency, (depth1.shape[2], depth1.shape[3]))
     hard = jax.lax.stop_gradient(dynamic) >= 0.5
-    median = median_over_frames(depth1, frames)[:, None, None, None]
+    waiting = depth1 if scale is None else frames.after(depth1, scale)  # another median
+    median = median_over_frames(waiting, frames)[:, None, None, None]
     log_depth = jnp.log(jnp.maximum(depth1, _SMALLEST)) - jnp.log(jnp.maximum(median, _SMALLEST))
     features = [saliency, log_depth, jax.vmap(jax.vmap(lambda frame: edge_proximity(frame, patch_size)))(hard), dynamic]
     return Observations(

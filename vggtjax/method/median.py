@@ -38,7 +38,7 @@ def _ordered(values: Float[Array, "B N"]) -> UInt32[Array, "B N"]:
 
 
 def _values_of_ranks(flat: Array, order: Array, valid: Array, ranks: Int[Array, "R B"], frames: Frames) -> Array:
-    """Return the values [R, B] that so many values of their clips precede in order."""
+    """Return the value [R, B] of each rank: as many values of its clip are smaller."""
 
     def bit(i, found):
         candidate = found | (jnp.uint32(1) << (_BITS - 1 - i).astype(jnp.uint32))

@@ -116,9 +116,8 @@ def aggregate(
         x, q, k = global_block(global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens)
         if accumulator is not None:
             q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
-            # What cues fetch from other devices waits for what attention fetches; their gradients the other way round.
-            x, (q, k) = frames.in_order(x, (q, k))
-            sums = accumulator.add(sums, frames.after(counts, x), q, k, frame_count)
+            x, (q, k) = frames.in_order(x, (q, k))  # in the gradient, cues communicate before attention does
+            sums = accumulator.add(sums, frames.after(counts, x), q, k, frame_count)  # and here, after it
         taps = tuple(
             jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
             for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))

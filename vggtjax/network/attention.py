@@ -166,14 +166,15 @@ def _head_by_head_backward(residuals, gradient):
 _head_by_head.defvjp(_head_by_head_forward, _head_by_head_backward)
 
 
-def queries_at_once(keys: int) -> int:
-    """Return how many queries of a head are attended at once on a CPU, at most, where they see so many keys."""
-    return max(QUERIES_AT_ONCE, min(times_for_cores() * QUERIES_AT_ONCE, LOGITS_OF_A_CHUNK // keys))
+def chunk_count(queries: int, keys: int) -> int:
+    """Return in how many chunks of equal size the queries of a head are attended on a CPU."""
+    at_once = max(QUERIES_AT_ONCE, min(times_for_cores() * QUERIES_AT_ONCE, LOGITS_OF_A_CHUNK // keys))
+    return math.ceil(queries / at_once)
 
 
 def _chunks(x: Float[Array, "T D"], keys: int) -> Float[Array, "c R D"]:
     """Cut the queries of a head, or arrays of equal length, into chunks; zeros pad the last chunk."""
-    chunks = math.ceil(len(x) / queries_at_once(keys))
+    chunks = chunk_count(len(x), keys)
     return jnp.pad(x, ((0, -len(x) % chunks), (0, 0))).reshape(chunks, -1, x.shape[1])
 
 

@@ -44,8 +44,8 @@ class Frames:
     def on_devices(self, function: Callable[..., _Tree], *specs: Any) -> Callable[..., _Tree]:
         """Return a function of whole arrays [B, S, ...] that runs `function` on the share of each device.
 
-        `specs` say where the arguments are, WHOLE or BY_FRAME; the outputs are by frame. The gradients of a whole
-        argument are summed over the devices at the end, not in every loop and conditional that reads it.
+        `specs` say where the arguments are, WHOLE or BY_FRAME; the outputs are by frame. The gradient by an argument
+        that is WHOLE is summed over the devices at the end, not in every loop and conditional that reads it.
         """
         if self.mesh is None:
             return function
@@ -159,22 +159,21 @@ class Frames:
         return x if self.mesh is None else jax.lax.pmax(x.astype(jnp.int32), AXIS) > 0
 
     def after(self, x: Array, earlier: Any) -> Array:
-        """Return x unchanged, such as the flag of a conditional, which is not known before `earlier` is computed.
+        """Return x. On a CPU it is not known before `earlier`, arrays that are computed from frames, is.
 
-        XLA's runtime for CPUs tells communications of two conditionals or loops apart only if one waits for the other.
-        On other platforms x is returned as it is: to wait takes time there.
+        x is the flag of a conditional, or what a loop starts from. XLA's runtime for CPUs can mix up communications of
+        two conditionals or loops that run at the same time. Other platforms keep them apart, and waiting takes time.
         """
         if not self._needs_order:
             return x
-        firsts = [leaf.ravel()[0].astype(jnp.float32) for leaf in jax.tree.leaves(jax.lax.stop_gradient(earlier))]
-        bits = jax.lax.bitcast_convert_type(jnp.stack(firsts), jnp.uint32).max()
-        return jnp.where((bits | 1) != 0, x, jnp.zeros_like(x))  # always true, which XLA does not find out
+        # The last number is a patch's: those of camera tokens are constants in the gradients of cues.
+        lasts = [leaf.ravel()[-1].astype(jnp.float32) for leaf in jax.tree.leaves(jax.lax.stop_gradient(earlier))]
+        bits = jax.lax.bitcast_convert_type(jnp.stack(lasts), jnp.uint32).max()
+        # XLA removes an optimisation barrier before it runs the program, and does not find out that this is true.
+        return jnp.where((bits | 1) != 0, x, jnp.zeros_like(x))
 
     def in_order(self, x: Array, later: _Tree) -> tuple[Array, _Tree]:
-        """Return x and what is computed from `later` after it, both unchanged, and keep their gradients in order.
-
-        The gradient by x is not known before the gradients by `later` are computed: see `after`.
-        """
+        """Return x and `later`. On a CPU the gradient by x is not known before the gradients by `later` are."""
         return _in_order(self, x, later) if self._needs_order else (x, later)
 
     @property
@@ -196,8 +195,8 @@ def _in_order_forward(frames: Frames, x: Array, later: Any) -> tuple[tuple[Array
 
 
 def _in_order_backward(frames: Frames, _: None, gradients: tuple[Array, Any]) -> tuple[Array, Any]:
-    x, later = gradients
-    return frames.after(x, later), later
+    by_x, by_later = gradients
+    return frames.after(by_x, by_later), by_later
 
 
 _in_order.defvjp(_in_order_forward, _in_order_backward)

@@ -17,7 +17,7 @@ from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.pipeline.destination import Destination
 from vggtjax.pipeline.devices import frames_mesh, whole_on
-from vggtjax.pipeline.memory import Together
+from vggtjax.pipeline.memory import Load
 from vggtjax.pipeline.recipe import ClipOutcome, Recipe
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.progress import StageSeconds
@@ -78,7 +78,7 @@ class ClipWork:
         """
         opened, recipe = open_source(source), self._recipe
         if not recipe.unchecked:
-            how: Together = {"method": recipe.options.method, "clips": clips, "devices": recipe.devices}
+            how: Load = {"method": recipe.options.method, "clips": clips, "devices": recipe.devices}
             choice = choose_windows(self._model, opened, recipe.sampling, self._fitter, **how)
             if choice is not None and choice.is_cut and self._cuts:
                 return LongClip(choice.windows, choice.frames, choice.sentence)

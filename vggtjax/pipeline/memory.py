@@ -15,7 +15,7 @@ import jax
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS
-from vggtjax.network.attention import LOGITS_AT_ONCE, queries_at_once
+from vggtjax.network.attention import LOGITS_AT_ONCE, chunk_count
 from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
 from vggtjax.network.gathered_attention import GATHERED_AT_ONCE
 from vggtjax.options import Method, find_method
@@ -42,8 +42,8 @@ class Sized(Protocol):
     def parameter_bytes(self) -> int: ...
 
 
-class Together(TypedDict, total=False):
-    """How the frames of a clip are run together: the method, clips held at the same time, devices that share them."""
+class Load(TypedDict, total=False):
+    """What is in memory beside a clip's frames: passes of the method, more clips at the same time, more devices."""
 
     method: str
     clips: int
@@ -86,7 +86,7 @@ def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int, *, devi
     largest = at_once * maps
     if devices > 1:  # gathered keys and values, and on a CPU the logits of a chunk of queries to all of these keys
         keys = share * devices * tokens
-        chunk = min(queries_at_once(keys), share * tokens) * keys if on_cpu() else 0
+        chunk = share * tokens / chunk_count(share * tokens, keys) * keys if on_cpu() else 0
         largest = max(largest, 2 * min(keys * config.embed_dim, GATHERED_AT_ONCE) + chunk)
     return _FLOAT * (share * (rows + logits) + largest)
 
@@ -107,7 +107,7 @@ def available(params: Any = None) -> Room | None:
     return Room(free + held, "of the device")
 
 
-def most_frames(model: Sized, height: int, width: int, size: float, **how: Unpack[Together]) -> int:
+def most_frames(model: Sized, height: int, width: int, size: float, **how: Unpack[Load]) -> int:
     """Return the most frames that are predicted to fit in `size` bytes when they are run together; maybe 0.
 
     `how` are the options of `predicted_bytes`.

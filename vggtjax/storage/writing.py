@@ -114,11 +114,14 @@ def write_errors(path: Path) -> Iterator[None]:
     except OutputError:
         raise
     except OSError as error:
-        is_blocked = isinstance(error, FileExistsError | NotADirectoryError)
-        parts = (path, *path.parents) if is_blocked else ()
-        blocking = next((part for part in parts if os.path.lexists(part) and not part.is_dir()), None)
+        blocking = _blocking(path) if isinstance(error, FileExistsError | NotADirectoryError) else None
         reason = f"{blocking} is {_kind(blocking)}" if blocking else error.strerror or error
         raise OutputError(f"cannot write {path}: {reason}; choose a folder that is writable and has space") from error
+
+
+def _blocking(path: Path) -> Path | None:
+    """Return the path, or a parent of it, that exists and is no folder."""
+    return next((part for part in (path, *path.parents) if os.path.lexists(part) and not part.is_dir()), None)
 
 
 def _kind(path: Path) -> str:
@@ -169,15 +172,15 @@ def _acquire_in(folder: Path, name: str, wait: float = 0) -> FileLock | None:
 
     Another process may make the same folder for a check, and remove it before our file is there: then try again.
     """
-    error = None
     for _ in range(_TRIES):
         try:
             folder.mkdir(parents=True, exist_ok=True)
             return _acquire(folder / name, wait)
-        except (FileNotFoundError, FileExistsError) as failed:  # mkdir finds the folder, then finds it removed
-            error = failed
-    if isinstance(error, FileExistsError):  # something else is in its place
-        raise error
+        except FileNotFoundError:
+            continue
+        except FileExistsError:  # also where mkdir finds the folder, and then finds it removed
+            if _blocking(folder) is not None:
+                raise
     raise OutputError(f"cannot write {folder}: another program removes it again and again; choose another folder")
 
 

@@ -92,7 +92,7 @@ def choose_windows(
         clips: held in memory at the same time.
         devices: that share the frames.
     """
-    how: memory.Together = {"method": method, "clips": clips, "devices": devices}
+    how: memory.Load = {"method": method, "clips": clips, "devices": devices}
     room = memory.available(model.params)
     if room is None:
         return None
