@@ -79,6 +79,8 @@ def gradient(params, images):
 
 
 gathered_attention.GATHERED_AT_ONCE = 1  # in a loop over heads, as in long clips
+
+
 def assembly(passes):
     """Return the result of both passes, whose depths are aligned and fused by a fitted rule: two medians."""
     changes = {"method": "4dvggt-d", "align_scale": True, "patch_size": config.patch_size}

@@ -14,6 +14,7 @@ from vggtjax.options import Threshold, odd_frames
 BINS = 256
 MOST_CLASSES = 4  # of multi-Otsu
 CONSTANT = 1e-6  # nothing moves in a clip whose saliency has a smaller range
+_SMALLEST_WIDTH = jnp.finfo(jnp.float32).tiny  # of a bin of constant values
 
 
 def upsample(saliency: Float[Array, "B S h w"], size: tuple[int, int]) -> Float[Array, "B S H W"]:
@@ -29,20 +30,17 @@ def otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS, frames: Fram
     """
     is_counted = frames.are_counted(len(values))
     low, high = _extremes(values, frames)
-    count = values.size // len(values) * frames.counted(len(values))
-    width = (high - low) / bins
-    index = jnp.floor((values.ravel() - low) / jnp.where(width > 0, width, 1)).astype(jnp.int32)
-    index = jnp.clip(index, 0, bins - 1)
+    index, centres = _binned(values, low, high, bins)
     if is_counted is not None:  # others fall into a bin of their own
         index = jnp.where(jnp.repeat(is_counted, values.size // len(values)), index, bins)
-    counts = frames.sum(jnp.bincount(index, length=bins + 1)[:bins]) / count
-    centres = low + width * (jnp.arange(bins) + 0.5)
+    counts = frames.sum(jnp.bincount(index, length=bins + 1)[:bins])
+    counts = counts / counts.sum()
     offsets = jnp.arange(bins) + 0.5  # means in units of bins, which keeps every sum of order one
     below, above = jnp.cumsum(counts), jnp.cumsum(counts[::-1])[::-1]
     mean_below = jnp.cumsum(counts * offsets) / jnp.maximum(below, 1e-12)
     mean_above = jnp.cumsum((counts * offsets)[::-1])[::-1] / jnp.maximum(above, 1e-12)
     between = below[:-1] * above[1:] * (mean_below[:-1] - mean_above[1:]) ** 2
-    return jnp.where(width > 0, centres[jnp.argmax(between)], low)
+    return jnp.where(high > low, centres[jnp.argmax(between)], low)
 
 
 def dynamic_pixels(
@@ -174,6 +172,18 @@ def _extremes(values: Float[Array, "S ..."], frames: Frames) -> tuple[Float[Arra
     return frames.min(low), frames.max(high)
 
 
+def _binned(
+    values: Float[Array, "S ..."], low: Float[Array, ""], high: Float[Array, ""], bins: int
+) -> tuple[Int[Array, " n"], Float[Array, " bins"]]:
+    """Return the bin of every value among equal ones from low to high, and the centres of all bins.
+
+    Constant values, and those of a range that is not finite, are in bin 0; values below low in a bin below 0.
+    """
+    width = (high - low) / bins
+    index = jnp.nan_to_num((values.ravel() - low) / jnp.maximum(width, _SMALLEST_WIDTH))
+    return jnp.minimum(jnp.floor(index), bins - 1).astype(jnp.int32), low + width * (jnp.arange(bins) + 0.5)
+
+
 def multi_otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS) -> Float[Array, ""]:
     """Return the highest threshold of Otsu's best partition into two to four classes (VGGT4D).
 
@@ -182,12 +192,9 @@ def multi_otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS) -> Flo
     value is returned; of values that are not all finite, NaN.
     """
     low, high = values.min(), values.max()
-    width = (high - low) / bins
-    index = jnp.floor((values.ravel() - low) / jnp.where(width > 0, width, 1))
-    index = jnp.clip(jnp.where(jnp.isfinite(index), index, 0), 0, bins - 1).astype(jnp.int32)
+    index, centres = _binned(values, low, high, bins)
     counts = jnp.bincount(index, length=bins)
     between = _between_classes(counts / values.size)
-    centres = low + width * (jnp.arange(bins) + 0.5)
     best, best_score = high, jnp.asarray(-jnp.inf)
     for classes in range(2, MOST_CLASSES + 1):
         thresholds = centres[_partition(between, classes)]
