@@ -76,6 +76,7 @@ class Score(NamedTuple):
     late: int  # noticed because the tests took too long, as they also do on a busy machine
     explained: int  # changes of mutants.toml that no test noticed
     survivors: list[str]  # the others: each a line's number, the line before and after
+    stale: list[str]  # explained changes that tests notice, or that were not made
 
     def percent(self, *, explained: bool) -> str:
         """Return the share of noticed changes, or of noticed and explained ones."""
@@ -106,6 +107,8 @@ def mutants(
             scores.append(_score(name, Path(folder), seconds, share, console))
         for line in scores[-1].survivors:
             console.print(f"{MODULES[name].path}:{line}", markup=False, soft_wrap=True)
+        for change in scores[-1].stale if share == 1 else ():
+            console.print(f"explained without need: {change}", markup=False, soft_wrap=True)
         if out is not None:
             write_json(out, {"scores": [score._asdict() for score in scores]})
     table = Table(title="changes that the tests of a module notice", title_justify="left")
@@ -172,7 +175,8 @@ def _score(name: str, folder: Path, seconds: float, share: int, console: Console
     noticed, known = len(rows) - len(survivors), _explained(name)
     late = sum(is_late for *_, is_late in rows)
     unknown = [f"{line}: {change}" for line, change in survivors if change not in known]
-    return Score(name, len(rows), noticed, late, len(survivors) - len(unknown), unknown)
+    stale = sorted(known - {change for _, change in survivors})
+    return Score(name, len(rows), noticed, late, len(survivors) - len(unknown), unknown, stale)
 
 
 def _copy(root: Path) -> None:
