@@ -23,6 +23,7 @@ COUNT, SIZE = 13, (6, 8)  # frames, which eight devices pad to 16
 METHODS = {
     "4dvggt-d": {"smooth_frames": 5},
     "vggt4d": {"clusters": 3, "threshold": "multi-otsu"},
+    "vggt4d without clusters": {"threshold": "multi-otsu"},  # which hide the range of the frames that are added
 }
 
 mesh = frames_mesh(8)
