@@ -175,6 +175,7 @@ def test_smoothing_over_time_by_hand():
     np.testing.assert_allclose(smoothed[0, :, 0, 0], [1.5, 1, 1, 3, 4.5], rtol=1e-6)
     np.testing.assert_allclose(smooth_over_time(saliency, 5)[0, :, 0, 0], [1, 0.75, 2.4, 3, 3], rtol=1e-6)
     assert smooth_over_time(saliency, 1) is saliency
+    np.testing.assert_allclose(smooth_over_time(saliency[:, 4:], 3)[0, :, 0, 0], [9], rtol=1e-6)  # of one frame
     np.testing.assert_allclose(smooth_over_time(saliency, 99)[0, :, 0, 0], [2.4] * 5, rtol=1e-6)
 
 
