@@ -4,10 +4,6 @@ It prints JSON: for each number of frames, how far each sum on eight devices is 
 """
 
 import json
-import os
-
-os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=8 --xla_backend_optimization_level=0"
-os.environ["PJRT_NPROC"] = "16"  # of threads: devices that wait for each other hold one each
 
 import jax
 import jax.numpy as jnp

@@ -4,11 +4,6 @@ It prints JSON: for each method, the share of dynamic pixels, and whether the ma
 """
 
 import json
-import os
-
-os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=8 --xla_backend_optimization_level=0"
-os.environ["PJRT_NPROC"] = "16"  # of threads: devices that wait for each other hold one each
-
 from functools import partial
 
 import jax

@@ -1,10 +1,6 @@
 """Maps against every Gram matrix, sources of each frame, layers of other depths, and degenerate clips."""
 
 import dataclasses
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
@@ -14,6 +10,7 @@ import pytest
 from jax.sharding import Mesh
 
 from tests import reference
+from tests.eight_devices import printed_by
 from vggtjax import MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues, _sample_std, _unit, normalise, sources
@@ -64,12 +61,7 @@ def test_maps_and_saliency_are_those_of_every_gram_matrix(gram, padding):
 
 
 def test_eight_devices_have_the_sums_of_one():
-    script, root = Path(__file__).with_name("cues_on_devices.py"), Path(__file__).parents[2]
-    environment = os.environ | {"PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}
-    words = [sys.executable, str(script)]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr[-3000:]
-    for frames, off in json.loads(done.stdout).items():
+    for frames, off in printed_by(Path(__file__).with_name("cues_on_devices.py")).items():
         assert len(off) == 3, frames
         assert max(off) < 1e-6, frames
 

@@ -1,9 +1,5 @@
 """Otsu against scikit-image, upsampling, token masks."""
 
-import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
@@ -15,6 +11,7 @@ from hypothesis import strategies as st
 from jax.sharding import Mesh
 from skimage.filters import threshold_multiotsu, threshold_otsu
 
+from tests.eight_devices import printed_by
 from tests.reference import multi_otsu
 from vggtjax.errors import InputError
 from vggtjax.method.mask import (
@@ -224,12 +221,7 @@ def test_frames_that_make_shares_equal_change_no_mask(options):
 
 
 def test_eight_devices_mine_the_masks_of_one():
-    script, root = Path(__file__).with_name("mask_on_devices.py"), Path(__file__).parents[2]
-    environment = os.environ | {"PYTHONPATH": str(root), "JAX_PLATFORMS": "cpu"}
-    words = [sys.executable, str(script)]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == 0, done.stderr[-3000:]
-    found = json.loads(done.stdout)
+    found = printed_by(Path(__file__).with_name("mask_on_devices.py"))
     assert len(found) == 3
     for method, (share, is_equal) in found.items():
         assert 0.05 < share < 0.5, method

@@ -1,16 +1,10 @@
 """What tests/pipeline/test_devices.py runs in a process with eight devices: the order of communications in programs.
 
-It prints JSON: for each program, the pairs of loops, conditionals and calls that communicate and do not wait for each
-other; and the number of computations that communicate.
+It prints JSON: what `unordered` returns for each program.
 """
 
-from __future__ import annotations
-
 import json
-import os
 import re
-
-os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=8 --xla_backend_optimization_level=0"
 
 import jax
 import jax.numpy as jnp
@@ -78,9 +72,6 @@ def gradient(params, images):
     return jax.grad(total, argnums=(0, 1))(params, images)
 
 
-gathered_attention.GATHERED_AT_ONCE = 1  # in a loop over heads, as in long clips
-
-
 def assembly(passes):
     """Return the result of both passes, whose depths are aligned and fused by a fitted rule: two medians."""
     changes = {"method": "4dvggt-d", "align_scale": True, "patch_size": config.patch_size}
@@ -88,6 +79,7 @@ def assembly(passes):
 
 
 FRAMES = 13
+gathered_attention.GATHERED_AT_ONCE = 1  # in a loop over heads, as in long clips
 config = tiny_config(image_size=28, motion=MotionConfig(cues=MotionConfig().cues[:3]))
 params, images = init_params(0, config), jnp.zeros((1, FRAMES, 28, 28, 3))
 _, passes = jax.eval_shape(lambda x: infer(params, x, config), jnp.zeros((1, 16, 28, 28, 3)))  # padded for 8 devices

@@ -1,6 +1,5 @@
 """One clip on several devices: the numbers of one device, the collectives, the memory of each device, two processes."""
 
-import json
 import os
 import re
 import socket
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.eight_devices import printed_by
 from tests.tiny import tiny_config
 from vggtjax import infer
 from vggtjax.commands import main as cli
@@ -115,11 +115,7 @@ def test_cues_of_many_frames_do_not_mix_up_their_communications(tmp_path):
 
 def test_communications_of_a_program_run_one_after_another():
     """XLA's runtime for CPUs can mix up those of two loops or conditionals that run at the same time."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
-    command = [sys.executable, str(WORKER.with_name("communications.py"))]
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False, timeout=600)
-    assert done.returncode == 0, done.stderr[-3000:]
-    found = json.loads(done.stdout)
+    found = printed_by(WORKER.with_name("communications.py"))
     assert len(found["two sums"][0]) == 1
     for program, least in (("assembly", 3), ("gradient", 20)):
         pairs, communicating = found[program]
