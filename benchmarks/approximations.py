@@ -18,7 +18,6 @@ from rich.table import Table
 from benchmarks.block_sparse import sparse_attention
 from vggtjax.cameras import unproject
 from vggtjax.checkpoint import Model
-from vggtjax.commands.process import keep_freed_memory
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.depth import median_scale
@@ -35,6 +34,7 @@ from vggtjax.network.rope import rope_table
 from vggtjax.network.suppression import suppressed_attention
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
+from vggtjax.storage.kept_memory import keep_freed_memory
 
 _SPARSE = {"queries": 32, "keys": 16}  # patches of a block in a frame of 64 patches: as large a share as 128 of 777
 WAYS: dict[str, str | Callable] = {

@@ -21,7 +21,6 @@ from rich.table import Table
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.sources import clips_by_name
-from vggtjax.commands.process import keep_freed_memory
 from vggtjax.errors import ClipError, InputError
 from vggtjax.options import MethodName
 from vggtjax.pipeline.batch import reconstruct_many
@@ -29,6 +28,7 @@ from vggtjax.pipeline.run import reconstruct
 from vggtjax.pretrained.load import load_model
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.scenes import SceneConfig, generate, load_textures
+from vggtjax.storage.kept_memory import keep_freed_memory
 from vggtjax.storage.writing import writing
 
 _SHAPES = ((1.0, 1.0), (1.0, 0.75), (0.6, 1.0))  # width and height of the pictures, in the largest side

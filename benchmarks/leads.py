@@ -17,12 +17,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from vggtjax.commands.process import keep_freed_memory
 from vggtjax.errors import InputError
 from vggtjax.network.attention import QUERIES_AT_ONCE, _attended, _in_chunks
 from vggtjax.network.dpt_head import resize_aligned
 from vggtjax.network.layers import MLP, apply, declare
 from vggtjax.network.pieces import in_pieces
+from vggtjax.storage.kept_memory import keep_freed_memory
 
 C, N, D = 1024, 16, 64
 

@@ -20,9 +20,9 @@ def main(folder: str, model: str, frames: str, window: str, overlap: str) -> Non
     from vggtjax.clips.clip import load_clip
     from vggtjax.clips.preprocessing import Fitter
     from vggtjax.clips.sampling import Sampling
-    from vggtjax.commands.process import keep_freed_memory
     from vggtjax.pipeline.run import reconstruct
     from vggtjax.pretrained.load import load_model
+    from vggtjax.storage.kept_memory import keep_freed_memory
     from vggtjax.windows.plan import Windows
     from vggtjax.windows.run import LongRun, reconstruct_long
 

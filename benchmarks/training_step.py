@@ -7,8 +7,9 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from benchmarks.suite import work
@@ -22,7 +23,14 @@ _WORKER = Path(__file__).with_name("training_step_worker.py")
 _PARTS = ("render", "gradient", "update")
 
 Answer = dict[str, Any]
-_Side = tuple[str, int]  # the package, and the number of devices
+
+
+class _Side(NamedTuple):
+    """One of the compared processes: the package, the XLA devices of its CPU, the workers that it trains with."""
+
+    package: str
+    devices: int
+    workers: int
 
 
 def training_step(
@@ -30,6 +38,7 @@ def training_step(
     recipe: Path = _ROOT / "docs" / "embedded" / "5-four-frames.json",
     before: Path | None = None,
     devices: tuple[int, ...] = (1, 2),
+    workers: int = 2,
     steps: int = 2,
     rounds: int = 5,
     out: Path | None = None,
@@ -44,49 +53,75 @@ def training_step(
         recipe: JSON file with the recipe.
         before: folder of another checkout, whose package `vggtjax` is measured too.
         devices: numbers of XLA devices that a CPU is divided into; the clips are spread over them.
+        workers: of one more side, whose clips are spread over so many processes; 1 for no such side.
         steps: steps of a round.
         rounds: timed rounds, after a warm-up.
         out: JSON file for the figures of every round.
     """
-    if not devices or min(*devices, steps, rounds) < 1:
-        raise InputError(f"devices, steps and rounds are {devices}, {steps} and {rounds}; expected at least 1")
+    if not devices or min(*devices, workers, steps, rounds) < 1:
+        given = f"{devices}, {workers}, {steps} and {rounds}"
+        raise InputError(f"devices, workers, steps and rounds are {given}; expected at least 1")
+    if workers > 1 and jax.default_backend() != "cpu":
+        raise InputError(f"workers is {workers}, and jax computes on a {jax.default_backend()}; give --workers 1")
     if before is not None and not (before / "vggtjax" / "training").is_dir():
         raise InputError(f"{before} has no vggtjax/training; expected a checkout of this package")
     chosen = read_recipe(recipe)
     phase = chosen.stages[0]
+    if phase.batch % workers:
+        raise InputError(f"workers is {workers}; expected a divisor of the batch of {phase.batch} clips")
     grid = phase.height // chosen.model.patch_size, phase.width // chosen.model.patch_size
     frames = phase.frames[0]
     flop = 3 * phase.batch * _forward_flop(chosen, frames, grid)
     folders = {"now": _ROOT} | ({} if before is None else {"before": before.resolve()})
-    sides = {(name, count): folder for count in devices for name, folder in folders.items()}
+    sides = {_Side(name, count, 1): folder for count in devices for name, folder in folders.items()}
+    if workers > 1:
+        sides[_Side("now", 1, workers)] = _ROOT
+    best = _Side("now", 1, workers) if workers > 1 else _Side("now", devices[0], 1)
     screen, ceiling = console(), Rounds(rounds, Ceilings(chosen.model, grid, "float32"))
-    with screen.status("compile"):
-        workers = {side: _Worker(folder, recipe.resolve(), side[1]) for side, folder in sides.items()}
+    processes: dict[_Side, _Worker] = {}
     try:
-        losses = {side: worker.ask(losses=True)["losses"] for side, worker in workers.items()}
+        with screen.status("compile"):
+            for side, folder in sides.items():
+                processes[side] = _Worker(folder, recipe.resolve(), side)
+                processes[side].ask(steps=1)
+        losses = {side: process.ask(losses=True)["losses"] for side, process in processes.items()}
         runs: dict[_Side, list[Answer]] = {side: [] for side in sides}
         with screen.status("measure"):
             for turn in ceiling:
                 for side in sides if turn % 2 else reversed(sides):
-                    runs[side].append(workers[side].ask(steps=steps))
+                    runs[side].append(processes[side].ask(steps=steps))
     finally:
-        for worker in workers.values():
-            worker.close()
+        for process in processes.values():
+            process.close()
     rates = [rate["linear"] for rate in ceiling.rates]
     rows = [_row(side, runs[side], phase.batch * frames, flop, rates) for side in sides]
-    headings = ("package", "devices", *_PARTS, "step (s)", "frames/s", "GFLOP/s", "of the ceiling", "render share")
+    headings = (
+        "package",
+        "devices",
+        "workers",
+        *_PARTS,
+        "step (s)",
+        "frames/s",
+        "GFLOP/s",
+        "of the ceiling",
+        "render share",
+    )
     title = f"{phase.batch} clips of {frames} frames, {phase.width} x {phase.height}, {flop / 1e9:.0f} GFLOP a step"
     Sheet(title, headings, rows).show(screen)
-    figures = [{"package": name, "devices": count, "runs": runs[name, count]} for name, count in sides]
+    figures = [{**side._asdict(), "losses": losses[side], "runs": runs[side]} for side in sides]
     report = {"recipe": chosen.name, "flop": flop, "ceilings": rates, "sides": figures}
     if before is not None:
-        apart = max(_apart(losses["now", count], losses["before", count]) for count in devices)
+        old = {count: _Side("before", count, 1) for count in devices}
+        apart = max(_apart(found, losses[old[devices[0]]]) for found in losses.values())
         screen.print(f"losses differ by at most {apart:.1e}")
-        report["losses_apart"] = apart
+        report |= {"losses_apart": apart, "best": best._asdict()}
         for count in devices:
-            pairs = zip(runs["before", count], runs["now", devices[0]], strict=True)
-            ratio = float(np.median([_seconds(old) / _seconds(new) for old, new in pairs]))
-            screen.print(f"{ratio:.2f} times the frames a second of before on {count} of them, now on {devices[0]}")
+            pairs = zip(runs[old[count]], runs[best], strict=True)
+            ratio = float(np.median([_seconds(a) / _seconds(b) for a, b in pairs]))
+            screen.print(
+                f"{ratio:.2f} times the frames a second of before: then devices {count}, "
+                f"now devices {best.devices}, workers {best.workers}"
+            )
             report[f"ratio_to_{count}"] = ratio
     here = machine()
     screen.print(describe(here), highlight=False)
@@ -97,17 +132,17 @@ def training_step(
 class _Worker:
     """A process that takes training steps with the package of one checkout."""
 
-    def __init__(self, folder: Path, recipe: Path, devices: int) -> None:
+    def __init__(self, folder: Path, recipe: Path, side: _Side) -> None:
+        devices = side.devices
         flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
         self._process: Any = subprocess.Popen(
-            [sys.executable, str(_WORKER), str(recipe)],
+            [sys.executable, str(_WORKER), str(recipe), str(side.workers)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
             cwd=folder,
             env=os.environ | {"PJRT_NPROC": str(2 * devices), "PYTHONPATH": str(folder), "XLA_FLAGS": flags},
         )
-        self.ask(steps=1)
 
     def ask(self, **task: Any) -> Answer:
         self._process.stdin.write(json.dumps(task) + "\n")
@@ -148,8 +183,9 @@ def _row(side: _Side, runs: list[Answer], frames: int, flop: float, ceilings: li
     share = float(np.median([flop / run["gradient"] / ceiling for run, ceiling in zip(runs, ceilings, strict=True)]))
     median = float(np.median(seconds))
     return (
-        side[0],
-        str(side[1]),
+        side.package,
+        str(side.devices),
+        str(side.workers),
         *map(number, parts),
         number(median),
         number(frames / median),

@@ -1,8 +1,8 @@
 """One side of the comparison of training steps: a process with the package of one checkout.
 
-Run as a script with the checkout on PYTHONPATH and the recipe's path as argument; then a line of JSON on standard input
-for every answer: {"steps": N} for the mean seconds of render, gradient and update; {"losses": true} for the losses of
-the first clips.
+Run as a script with the checkout on PYTHONPATH; the arguments are the recipe and the number of workers. Then a line
+of JSON on standard input for every answer: {"steps": N} for the mean seconds of render, gradient and update; {"losses":
+true} for the losses of the first clips.
 """
 
 from __future__ import annotations
@@ -10,17 +10,19 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Callable
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from vggtjax.commands import process
 from vggtjax.scenes.textures import load_textures
 from vggtjax.training.data import make_batch
 from vggtjax.training.devices import placement
 from vggtjax.training.objective import init_probes, objective
-from vggtjax.training.recipe import read_recipe
+from vggtjax.training.recipe import Recipe, read_recipe
 from vggtjax.training.state import apply_gradient, initial_state, loss_and_gradient
 
 
@@ -38,6 +40,8 @@ def main() -> None:
     textures = jax.device_put(load_textures("training"), where.whole)
     render = jax.jit(make_batch, static_argnums=(2, 3), out_shardings=where.by_clip)
     gradient_of = jax.jit(loss_and_gradient, static_argnums=(2, 3))
+    if (count := int(sys.argv[2])) > 1:
+        gradient_of = shared(recipe, state.trained, count)
     update = jax.jit(apply_gradient, static_argnums=3, donate_argnums=0)
 
     def draw(number: int):
@@ -66,11 +70,25 @@ def main() -> None:
 
 def settle_memory() -> None:
     """Set the process up as the checkout's own `vggtjax train` does."""
-    if hasattr(process, "run_in_calling_thread"):
-        process.keep_freed_memory(training=True)
-        process.run_in_calling_thread()
-    else:
-        process.keep_freed_memory()
+    for name in ("vggtjax.storage.kept_memory", "vggtjax.commands.process"):  # the second in older checkouts
+        with suppress(ImportError):
+            process: Any = import_module(name)
+            if hasattr(process, "run_in_calling_thread"):
+                process.keep_freed_memory(training=True)
+                process.run_in_calling_thread()
+                return
+            if hasattr(process, "keep_freed_memory"):
+                process.keep_freed_memory()
+                return
+
+
+def shared(recipe: Recipe, trained: Any, count: int) -> Callable[..., Any]:
+    """Return the function for loss and gradient whose clips `count` processes share."""
+    from vggtjax.training.objective import with_counts  # older checkouts have neither
+    from vggtjax.training.workers import Workers
+
+    workers, prepare = Workers(recipe, objective, trained, count), jax.jit(with_counts, static_argnums=1)
+    return lambda trained, batch, *_: workers.loss_and_gradient(trained, prepare(batch, recipe.model))
 
 
 def answer(values: dict[str, Any]) -> None:

@@ -28,7 +28,7 @@ Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S
 
 def ours(weights: Path) -> Run:
     """Return this library's passes: a plain one, or a whole method."""
-    from vggtjax.commands.process import keep_freed_memory
+    from vggtjax.storage.kept_memory import keep_freed_memory
 
     keep_freed_memory()
     import jax

@@ -12,8 +12,8 @@ from benchmarks.suite.ceilings import Ceilings, Rounds
 from benchmarks.suite.measure import compiling_anew, without_memory
 from benchmarks.suite.report import Row
 from benchmarks.suite.workloads import WORKLOADS, Workload
-from vggtjax.commands.process import keep_freed_memory
 from vggtjax.errors import InputError, check_extra
+from vggtjax.storage.kept_memory import keep_freed_memory
 from vggtjax.storage.writing import writing
 
 

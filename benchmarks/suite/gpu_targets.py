@@ -11,8 +11,8 @@ from benchmarks.suite.command import measured_rows
 from benchmarks.suite.measure import compiling_anew
 from benchmarks.suite.report import Row, Sheet, console, describe, machine, number, write_rows
 from benchmarks.suite.workloads import WORKLOADS
-from vggtjax.commands.process import keep_freed_memory
 from vggtjax.errors import InputError
+from vggtjax.storage.kept_memory import keep_freed_memory
 
 FRAME = (392, 518)
 _PROGRAMS = ("aggregator", "depth-head", "two-passes")

@@ -73,12 +73,15 @@ def test_bad_input(recipe, tmp_path, monkeypatch):
         ({"seconds": 0.0}, "seconds is 0.0"),
         ({"seconds": float("nan")}, "seconds is nan"),
         ({"log_every": 0}, "log_every is 0"),
+        ({"workers": 0}, "workers is 0"),
         ({"checkpoint_seconds": -1.0}, "checkpoint_seconds is -1.0"),
     ):
         with pytest.raises(InputError, match=says):
             RunOptions(**values)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="steps is 0"):
         command.train(recipe, tmp_path / "out", steps=0)
+    with pytest.raises(InputError, match="workers is 5; expected a divisor"):
+        command.train(recipe, tmp_path / "out", options=RunOptions(workers=5))
     with pytest.raises(InputError, match="cannot read"):
         command.train(tmp_path / "none.json", tmp_path / "out")
     with pytest.raises(CheckpointError):

@@ -14,7 +14,7 @@ from vggtjax.network.model import init_params
 from vggtjax.network.pose import decode_pose
 from vggtjax.scenes import SyntheticClip
 from vggtjax.training.matching import MatchLoss, match_loss
-from vggtjax.training.truth import OCCLUDED, Matches, matches, targets
+from vggtjax.training.truth import OCCLUDED, Matches, match_counts, matches, targets
 
 PATCH = 4
 COUNT = {STATIC: 3, DYNAMIC: 6}  # as the tests of the renderer, which may have drawn them already
@@ -226,6 +226,11 @@ def slow_match_loss(matches, q, k):
     return -np.mean(to_first) - np.mean(to_each), np.mean(right)
 
 
+def clip_counts(found):
+    """The counts of all clips together, as the objective sums them."""
+    return jax.tree.map(jnp.sum, match_counts(found))
+
+
 def log_softmax(x):
     return x - x.max() - np.log(np.exp(x - x.max()).sum())
 
@@ -236,7 +241,7 @@ def test_match_loss_against_a_slow_one(heads):
     B, S, P, D = 2, 3, 4, 8
     q, k = (jnp.asarray(generator.normal(0, 2, (B, S, P, heads, D)), jnp.float32) for _ in range(2))
     found = random_matches(generator, B, S, P)
-    loss, accuracy = match_loss(found, q, k)
+    loss, accuracy = match_loss(found, clip_counts(found), q, k)
     expected = slow_match_loss(found, q, k)
     assert (float(loss), float(accuracy)) == pytest.approx(expected, rel=1e-5)
     assert 0 < expected[1] < 1
@@ -253,11 +258,12 @@ def test_perfect_attention_has_no_loss_and_nothing_seen_none_at_all():
     to_first, to_each = said(0), sum(said(s) for s in range(3))
     sharp = 4000.0
     q = sharp * jnp.stack([to_first, to_each], axis=3)
-    loss, accuracy = match_loss(found, q, jnp.concatenate([names, names], axis=3))
+    keys = jnp.concatenate([names, names], axis=3)
+    loss, accuracy = match_loss(found, clip_counts(found), q, keys)
     assert float(loss) == pytest.approx(0, abs=1e-5)
     assert float(accuracy) == 1
     unseen = found._replace(visible=jnp.zeros_like(found.visible))
-    assert [float(x) for x in match_loss(unseen, q, jnp.concatenate([names, names], axis=3))] == [0, 0]
+    assert [float(x) for x in match_loss(unseen, clip_counts(unseen), q, keys)] == [0, 0]
 
 
 class Watched:
@@ -287,13 +293,13 @@ def test_match_loss_inside_the_aggregator_is_that_of_its_queries_and_keys():
     generator = np.random.default_rng(0)
     tokens = jnp.asarray(generator.normal(0, 1, (B, S, 4, CONFIG.embed_dim)), jnp.float32)
     found = random_matches(generator, B, S, 4)
-    loss = MatchLoss(found, layers, CONFIG.depth)
+    loss = MatchLoss(found, clip_counts(found), layers, CONFIG.depth)
     np.testing.assert_array_equal(loss.layer_counts(), [0, 1, 0, 1])
     captures = [lambda tokens: tokens[:, :, 0, :1]] * len(CONFIG.taps)
     cues: Any = Watched(loss, layers)
     sums = aggregate(init_params(0, CONFIG), tokens, CONFIG, grid, captures=captures, accumulator=cues)[2]
     accumulated, q, k = sums
-    by_hand = [[float(x) for x in match_loss(found, q[layer], k[layer])] for layer in range(2)]
+    by_hand = [[float(x) for x in match_loss(found, clip_counts(found), q[layer], k[layer])] for layer in range(2)]
     assert abs(by_hand[0][0] - by_hand[1][0]) > 1e-4  # the layers differ
     expected = np.mean(by_hand, axis=0)
     assert (float(accumulated.loss), float(accumulated.accuracy)) == pytest.approx(expected, rel=1e-5)

@@ -30,7 +30,7 @@ from vggtjax.commands.export import export
 from vggtjax.commands.export_model import export_model
 from vggtjax.commands.fit_fusion import fit_fusion
 from vggtjax.commands.overview import overview
-from vggtjax.commands.process import check_limits, give_devices_threads, keep_freed_memory
+from vggtjax.commands.process import check_limits, give_devices_threads
 from vggtjax.commands.reconstruct import reconstruct
 from vggtjax.commands.render import render
 from vggtjax.commands.scenes import scenes
@@ -38,6 +38,7 @@ from vggtjax.commands.train import train
 from vggtjax.commands.view import view
 from vggtjax.errors import InputError, VggtjaxError, message_line, one_line, printable
 from vggtjax.storage.cache import enable_compilation_cache
+from vggtjax.storage.kept_memory import keep_freed_memory
 
 COMMANDS = {
     "reconstruct": reconstruct,

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vggtjax.commands.arguments import ModelName
-from vggtjax.commands.process import keep_freed_memory
 from vggtjax.commands.report import Report
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
@@ -16,6 +15,7 @@ from vggtjax.options import METHODS, Options
 from vggtjax.storage.cache import enable_compilation_cache
 from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import read_json
+from vggtjax.storage.kept_memory import keep_freed_memory
 
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model

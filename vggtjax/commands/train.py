@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vggtjax.commands.process import run_in_calling_thread
 from vggtjax.commands.report import Report
 from vggtjax.errors import check_extra
 from vggtjax.storage.flags import InWords
+from vggtjax.storage.kept_memory import run_in_calling_thread
 from vggtjax.training.options import RunOptions
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def train(
         init: a model to start from: "demo", a .safetensors, a PyTorch checkpoint, or a hub id; random parameters by
             default. The recipe's image size and cues replace those of the model.
         steps: total number of steps; phases, warm-up and decay keep their shares. The recipe's own by default.
-        options: how the run logs, saves and ends.
+        options: how the run logs, saves, ends, and uses the cores of a CPU.
     """
     check_extra("training", "train", "optax", "orbax", "matplotlib")
     report = Report()

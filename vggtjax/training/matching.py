@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from vggtjax.training.truth import Matches
+from vggtjax.training.truth import MatchCounts, Matches
 
 
 class MatchSums(NamedTuple):
@@ -26,8 +26,8 @@ class MatchLoss:
     all frames; the second half to its match in each other frame, among that frame's patches.
     """
 
-    def __init__(self, matches: Matches, layers: tuple[int, ...], depth: int) -> None:
-        self._matches, self._layers, self._depth = matches, layers, depth
+    def __init__(self, matches: Matches, counts: MatchCounts, layers: tuple[int, ...], depth: int) -> None:
+        self._matches, self._counts, self._layers, self._depth = matches, counts, layers, depth
 
     def layer_counts(self) -> Int[np.ndarray, " L"]:
         """Return 1 for supervised layers, else 0."""
@@ -53,16 +53,19 @@ class MatchLoss:
 
         @jax.checkpoint  # otherwise the scan stores the logits of every layer
         def layer(sums: MatchSums, q: Array, k: Array) -> MatchSums:
-            loss, accuracy = match_loss(self._matches, q[:, :, -P:], k[:, :, -P:])
+            loss, accuracy = match_loss(self._matches, self._counts, q[:, :, -P:], k[:, :, -P:])
             return MatchSums(sums.loss + loss / len(self._layers), sums.accuracy + accuracy / len(self._layers))
 
         return jax.lax.cond(supervised > 0, layer, lambda sums, q, k: sums, sums, q, k)
 
 
 def match_loss(
-    matches: Matches, q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
+    matches: Matches, counts: MatchCounts, q: Float[Array, "B S P N D"], k: Float[Array, "B S P N D"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the cross-entropy of attention against true matches, and the share of correctly matched patches."""
+    """Return the cross-entropy of attention against true matches, and the share of correctly matched patches.
+
+    Both are means over `counts` of matches.
+    """
     B, S, P, N, D = q.shape
     half = N // 2
     logits = jnp.einsum("brpnd,bsjnd->bnrpsj", q, k) / D**0.5
@@ -70,15 +73,16 @@ def match_loss(
     to_first = matches.patch[:, :, 0]  # [B, R, P]; frame 0 comes first, so the index is that of the key
     weight = matches.visible[:, :, 0].at[:, 0].set(False)
     picked = jnp.take_along_axis(first, to_first[:, None, :, :, None], axis=-1)[..., 0].mean(axis=1)  # [B, R, P]
-    loss = -_mean(picked, weight)
+    loss = -_mean(picked, weight, counts.from_others)
 
     each = jax.nn.log_softmax(logits[:, half:].mean(axis=1), axis=-1)  # [B, R, P, S, P]
     index = matches.patch.swapaxes(2, 3)  # [B, R, P, S]
     other = matches.visible.swapaxes(2, 3) & ~jnp.eye(S, dtype=bool)[None, :, None, :]
     picked = jnp.take_along_axis(each, index[..., None], axis=-1)[..., 0]
     correct = jnp.argmax(each, axis=-1) == index
-    return loss - _mean(picked, other), _mean(correct.astype(jnp.float32), other)
+    accuracy = _mean(correct.astype(jnp.float32), other, counts.between)
+    return loss - _mean(picked, other, counts.between), accuracy
 
 
-def _mean(values: Array, weight: Array) -> Float[Array, ""]:
-    return (values * weight).sum() / jnp.maximum(weight.sum(), 1)
+def _mean(values: Array, weight: Array, count: Array) -> Float[Array, ""]:
+    return (values * weight).sum() / jnp.where(count > 0, count, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import jax
@@ -21,7 +22,7 @@ from vggtjax.network.precision import Compute, full_precision
 from vggtjax.storage.json_values import Natural, NotNegative, check_fields
 from vggtjax.training.batch import Batch
 from vggtjax.training.matching import MatchLoss
-from vggtjax.training.truth import Matches, Targets, matches, targets
+from vggtjax.training.truth import MatchCounts, Matches, Targets, match_counts, matches, targets
 
 PATCH_PROBE = 6  # position in the first frame (2), logarithm of depth (1), point in the first camera's frame (3)
 CAMERA_PROBE = 7 + 10  # translation (3), quaternion (4), moments of the flow from the first frame
@@ -86,8 +87,9 @@ def objective(
     grid = patch_grid(images, config)
     truth = targets(clips)
     paired = matches(clips, config.patch_size)
+    counts = _counts(batch, paired)
     dense = [name for name, weight in (("depth", weights.depth), ("points", weights.points)) if weight]
-    matching = MatchLoss(paired, weights.match_layers, config.depth) if weights.match else None
+    matching = MatchLoss(paired, counts, weights.match_layers, config.depth) if weights.match else None
 
     def capture(slot: int):
         @jax.checkpoint  # otherwise the scan stores this in every layer
@@ -127,7 +129,7 @@ def objective(
         terms["match"] = weights.match * sums.loss
         metrics["match_accuracy"] = sums.accuracy
     if weights.probe or weights.moments:
-        probe_terms = _probe_terms(taps, truth, paired, config.patch_size)
+        probe_terms = _probe_terms(taps, truth, paired, counts, config.patch_size)
         metrics |= {f"probe_{name}": value for name, value in probe_terms.items()}
         moments = probe_terms.pop("moments")
         if weights.moments:
@@ -136,6 +138,21 @@ def objective(
             terms["probe"] = weights.probe * sum(probe_terms.values(), start=jnp.zeros(()))
     loss = sum(terms.values(), start=jnp.zeros(()))
     return loss, {"loss": loss} | {f"loss_{name}": value for name, value in terms.items()} | metrics
+
+
+def with_counts(batch: Batch, config: VGGTConfig) -> Batch:
+    """Return the batch with the means of its clips' counts of matches, for shares of it.
+
+    The loss of the batch is then the mean of the losses of equal shares.
+    """
+    counts = match_counts(matches(batch.clips, config.patch_size))
+    return dataclasses.replace(batch, counts=jax.tree.map(lambda x: jnp.full_like(x, x.mean()), counts))
+
+
+def _counts(batch: Batch, paired: Matches) -> MatchCounts:
+    """Return how many matches the means are over; a share counts its part of the whole batch's."""
+    each = match_counts(paired) if batch.counts is None else batch.counts
+    return jax.tree.map(jnp.sum, each)
 
 
 def dense_loss(
@@ -197,7 +214,7 @@ def _probe(params: Params, slot: int, tokens: Float[Array, "... E"]) -> Float[Ar
     return jnp.einsum("...e,ef->...f", normed, params["kernel"][slot]) + bias
 
 
-def _probe_terms(taps, truth: Targets, paired: Matches, patch_size: int) -> dict[str, Array]:
+def _probe_terms(taps, truth: Targets, paired: Matches, counts: MatchCounts, patch_size: int) -> dict[str, Array]:
     B, S = truth.depth.shape[:2]
     middle = slice(patch_size // 2, None, patch_size)
     depth = jnp.log(truth.depth[:, :, middle, middle]).reshape(B, S, -1)
@@ -210,7 +227,7 @@ def _probe_terms(taps, truth: Targets, paired: Matches, patch_size: int) -> dict
     for tap in taps:
         patch, camera = tap["patch_probe"], tap["camera_probe"]
         error = jnp.abs(patch[..., :2] - position) * visible
-        terms["position"] += error.sum() / jnp.maximum(2 * visible.sum(), 1)
+        terms["position"] += error.sum() / jnp.where(counts.first > 0, 2 * counts.first, 1)
         terms["depth"] += jnp.abs(patch[..., 2] - depth).mean()
         terms["points"] += jnp.abs(patch[..., 3:] - points).mean()
         error = jnp.abs(camera[..., :7] - truth.pose_encoding[..., :7])

@@ -33,6 +33,14 @@ class Matches(NamedTuple):
     visible: Bool[Array, "B R S P"]
 
 
+class MatchCounts(NamedTuple):
+    """How many visible matches the means of the objective are over."""
+
+    first: Float[Array, ...]  # in the first frame, of all frames' patches
+    from_others: Float[Array, ...]  # in the first frame, of the other frames' patches
+    between: Float[Array, ...]  # in each other frame
+
+
 @full_precision
 def targets(clip: SyntheticClip) -> Targets:
     """Return the truth that the heads regress, normalised as in VGGT: first camera, mean point distance 1."""
@@ -75,3 +83,10 @@ def matches(clip: SyntheticClip, patch_size: int) -> Matches:
     visible = inside & (jnp.abs(depth - z) < OCCLUDED * z)
     position = jnp.stack([2 * x / W - 1, 2 * y / H - 1], axis=-1)
     return Matches(jnp.clip(position, -2, 2), (row // patch_size) * w + column // patch_size, visible)
+
+
+def match_counts(matches: Matches) -> MatchCounts:
+    """Return the counts of every clip, [B]."""
+    first, own = matches.visible[:, :, 0], jnp.eye(matches.visible.shape[1], dtype=bool)[None, :, :, None]
+    each = first, first.at[:, 0].set(False), matches.visible & ~own
+    return MatchCounts(*(x.reshape(len(x), -1).sum(axis=1, dtype=jnp.float32) for x in each))
