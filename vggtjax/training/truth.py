@@ -34,7 +34,7 @@ class Matches(NamedTuple):
 
 
 class MatchCounts(NamedTuple):
-    """How many visible matches the means of the objective are over."""
+    """Numbers of visible matches, over which terms of the objective are means."""
 
     first: Float[Array, ...]  # in the first frame, of all frames' patches
     from_others: Float[Array, ...]  # in the first frame, of the other frames' patches
