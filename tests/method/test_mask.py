@@ -125,7 +125,7 @@ def test_multi_otsu_with_a_class_of_one_value():
 
 def test_multi_otsu_with_a_class_that_ends_empty():
     """The middle value lies above the centre of its bin, and so in the highest of three classes: two are taken."""
-    values = np.float32([0.0] * 4 + [0.503] * 4 + [1.0])
+    values = np.array([0.0] * 4 + [0.503] * 4 + [1.0], np.float32)
     assert float(_multi_otsu(values)) == pytest.approx(multi_otsu(values))
     assert float(_multi_otsu(values)) < 0.4
 
