@@ -9,16 +9,17 @@ from vggtjax import Reconstruction
 from vggtjax.results.films import film_frames, write_film
 
 PICTURES = Path(__file__).parent
-WIDTH = 1280  # of the sheet
+WIDTH = 1280  # of the sheets
 
 
 def main(folder: Path) -> None:
-    """Write turntable.gif and sheet.png of the demo's result."""
+    """Write turntable.gif, sheet.png and truth.png of the demo's result."""
     result = Reconstruction.load(folder)
     write_film(PICTURES / "turntable.gif", film_frames(result, seconds=5, fps=10, size=(480, 270)), 10)
-    with Image.open(folder / "preview" / "sheet.png") as sheet:
-        sheet.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
-        sheet.save(PICTURES / "sheet.png", optimize=True)
+    for name in ("sheet.png", "truth.png"):
+        with Image.open(folder / "preview" / name) as picture:
+            picture.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
+            picture.save(PICTURES / name, optimize=True)
 
 
 if __name__ == "__main__":
