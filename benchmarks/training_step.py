@@ -9,7 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from benchmarks.suite import work
@@ -17,6 +16,7 @@ from benchmarks.suite.ceilings import Ceilings, Rounds
 from benchmarks.suite.report import Sheet, console, describe, machine, number, write_json
 from vggtjax.errors import InputError
 from vggtjax.training.recipe import Recipe, read_recipe
+from vggtjax.training.workers import check_workers
 
 _ROOT = Path(__file__).resolve().parents[1]
 _WORKER = Path(__file__).with_name("training_step_worker.py")
@@ -61,14 +61,11 @@ def training_step(
     if not devices or min(*devices, workers, steps, rounds) < 1:
         given = f"{devices}, {workers}, {steps} and {rounds}"
         raise InputError(f"devices, workers, steps and rounds are {given}; expected at least 1")
-    if workers > 1 and jax.default_backend() != "cpu":
-        raise InputError(f"workers is {workers}, and jax computes on a {jax.default_backend()}; give --workers 1")
     if before is not None and not (before / "vggtjax" / "training").is_dir():
         raise InputError(f"{before} has no vggtjax/training; expected a checkout of this package")
     chosen = read_recipe(recipe)
+    check_workers(chosen, workers)
     phase = chosen.stages[0]
-    if phase.batch % workers:
-        raise InputError(f"workers is {workers}; expected a divisor of the batch of {phase.batch} clips")
     grid = phase.height // chosen.model.patch_size, phase.width // chosen.model.patch_size
     frames = phase.frames[0]
     flop = 3 * phase.batch * _forward_flop(chosen, frames, grid)
@@ -95,17 +92,7 @@ def training_step(
             process.close()
     rates = [rate["linear"] for rate in ceiling.rates]
     rows = [_row(side, runs[side], phase.batch * frames, flop, rates) for side in sides]
-    headings = (
-        "package",
-        "devices",
-        "workers",
-        *_PARTS,
-        "step (s)",
-        "frames/s",
-        "GFLOP/s",
-        "of the ceiling",
-        "render share",
-    )
+    headings = (*_Side._fields, *_PARTS, "step (s)", "frames/s", "GFLOP/s", "of the ceiling", "render share")
     title = f"{phase.batch} clips of {frames} frames, {phase.width} x {phase.height}, {flop / 1e9:.0f} GFLOP a step"
     Sheet(title, headings, rows).show(screen)
     figures = [{**side._asdict(), "losses": losses[side], "runs": runs[side]} for side in sides]
@@ -183,9 +170,7 @@ def _row(side: _Side, runs: list[Answer], frames: int, flop: float, ceilings: li
     share = float(np.median([flop / run["gradient"] / ceiling for run, ceiling in zip(runs, ceilings, strict=True)]))
     median = float(np.median(seconds))
     return (
-        side.package,
-        str(side.devices),
-        str(side.workers),
+        *map(str, side),
         *map(number, parts),
         number(median),
         number(frames / median),

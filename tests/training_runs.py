@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from tests.tiny import tiny_config
 from vggtjax.config import VGGTConfig
 from vggtjax.training.loop import Task
+from vggtjax.training.metrics import read_metrics
 from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
 from vggtjax.training.state import Metrics, TrainingState, apply_gradient, loss_and_gradient
 
@@ -61,6 +62,11 @@ def train_step(state: TrainingState, batch, recipe: Recipe, objective) -> tuple[
     """Do one step of training."""
     metrics, gradient = loss_and_gradient(state.trained, batch, recipe, objective)
     return apply_gradient(state, gradient, metrics, recipe)
+
+
+def measured(path):
+    """Rows of metrics without what a clock says."""
+    return [{k: v for k, v in row.items() if k not in ("seconds", "render_share")} for row in read_metrics(path)]
 
 
 TASK = Task(jnp.float32(1), make_batch, init_probes, objective, for_workers)

@@ -45,7 +45,7 @@ def test_two_checkouts_take_turns(tmp_path):
         ({"rounds": 0}, r"rounds are \(1, 2\), 2, 2 and 0"),
         ({"devices": ()}, r"rounds are \(\), 2, 2 and 5"),
         ({"workers": 0}, "0, 2 and 5; expected at least 1"),
-        ({"workers": 3}, "workers is 3; expected a divisor of the batch of 8 clips"),
+        ({"workers": 3}, "workers is 3; expected a divisor of the batch of every phase; one is 8 clips"),
         ({"before": Path("/")}, "no vggtjax"),
     ],
 )

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_runs import PROBES, SHORT, TASK
+from tests.training_runs import PROBES, SHORT, TASK, measured
 from vggtjax.checkpoint import read_model
 from vggtjax.errors import CheckpointError, InputError, OutputError, VggtjaxError
 from vggtjax.network.model import init_params
@@ -20,11 +20,6 @@ from vggtjax.training.run import MOST_SKIPPED
 from vggtjax.training.state import exported
 
 NOW = 1e-9  # seconds: a run that ends after one step
-
-
-def measured(path):
-    """Rows of metrics without what a clock says."""
-    return [{k: v for k, v in row.items() if k not in ("seconds", "render_share")} for row in read_metrics(path)]
 
 
 def same(a, b) -> bool:

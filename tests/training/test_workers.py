@@ -12,14 +12,13 @@ import numpy as np
 import pytest
 
 from tests.generated import QUICK
-from tests.training_runs import CONFIG, SHORT, TASK
+from tests.training_runs import CONFIG, SHORT, TASK, measured
 from vggtjax.errors import InputError, VggtjaxError
 from vggtjax.network.model import init_params
 from vggtjax.scenes import load_textures
 from vggtjax.training.checkpoints import latest
 from vggtjax.training.data import make_batch
 from vggtjax.training.loop import train
-from vggtjax.training.metrics import read_metrics
 from vggtjax.training.objective import LossWeights, init_probes, objective, with_counts
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase
@@ -33,8 +32,7 @@ def quick(function, static=()):
 
 
 def values(path):
-    """Rows of metrics without what a clock says, as an array."""
-    rows = [{k: v for k, v in row.items() if k not in ("seconds", "render_share")} for row in read_metrics(path)]
+    rows = measured(path)
     return np.array([[row[name] for name in sorted(rows[0])] for row in rows])
 
 

@@ -71,13 +71,12 @@ def match_loss(
     logits = jnp.einsum("brpnd,bsjnd->bnrpsj", q, k) / D**0.5
     first = jax.nn.log_softmax(logits[:, :half].reshape(B, half, S, P, S * P), axis=-1)
     to_first = matches.patch[:, :, 0]  # [B, R, P]; frame 0 comes first, so the index is that of the key
-    weight = matches.visible[:, :, 0].at[:, 0].set(False)
     picked = jnp.take_along_axis(first, to_first[:, None, :, :, None], axis=-1)[..., 0].mean(axis=1)  # [B, R, P]
-    loss = -_mean(picked, weight, counts.from_others)
+    loss = -_mean(picked, matches.from_others, counts.from_others)
 
     each = jax.nn.log_softmax(logits[:, half:].mean(axis=1), axis=-1)  # [B, R, P, S, P]
     index = matches.patch.swapaxes(2, 3)  # [B, R, P, S]
-    other = matches.visible.swapaxes(2, 3) & ~jnp.eye(S, dtype=bool)[None, :, None, :]
+    other = matches.between.swapaxes(2, 3)
     picked = jnp.take_along_axis(each, index[..., None], axis=-1)[..., 0]
     correct = jnp.argmax(each, axis=-1) == index
     accuracy = _mean(correct.astype(jnp.float32), other, counts.between)

@@ -32,6 +32,16 @@ class Matches(NamedTuple):
     patch: Int[Array, "B R S P"]
     visible: Bool[Array, "B R S P"]
 
+    @property
+    def from_others(self) -> Bool[Array, "B R P"]:
+        """The patches of all frames but the first that are visible in the first."""
+        return self.visible[:, :, 0].at[:, 0].set(False)
+
+    @property
+    def between(self) -> Bool[Array, "B R S P"]:
+        """The patches that are visible in another frame than their own."""
+        return self.visible & ~jnp.eye(self.visible.shape[1], dtype=bool)[None, :, :, None]
+
 
 class MatchCounts(NamedTuple):
     """Numbers of visible matches, over which terms of the objective are means."""
@@ -87,6 +97,5 @@ def matches(clip: SyntheticClip, patch_size: int) -> Matches:
 
 def match_counts(matches: Matches) -> MatchCounts:
     """Return the counts of every clip, [B]."""
-    first, own = matches.visible[:, :, 0], jnp.eye(matches.visible.shape[1], dtype=bool)[None, :, :, None]
-    each = first, first.at[:, 0].set(False), matches.visible & ~own
+    each = matches.visible[:, :, 0], matches.from_others, matches.between
     return MatchCounts(*(x.reshape(len(x), -1).sum(axis=1, dtype=jnp.float32) for x in each))

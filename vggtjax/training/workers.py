@@ -31,11 +31,8 @@ from vggtjax.training.recipe import Recipe
 from vggtjax.training.state import Metrics, Objective, loss_and_gradient
 
 _GOODBYE = 2.0  # seconds for all workers to end by themselves
-_SETTINGS = (
-    "jax_enable_x64",
-    "jax_default_matmul_precision",
-    "jax_compilation_cache_dir",
-)  # of jax, that workers share
+# Of jax, which workers share with the process that starts them.
+_SETTINGS = ("jax_enable_x64", "jax_default_matmul_precision", "jax_compilation_cache_dir")
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
 
 
@@ -47,13 +44,12 @@ class Workers:
     """
 
     def __init__(self, recipe: Recipe, objective: Objective, trained: Params, count: int) -> None:
-        """Start `count` processes.
+        """Start `count` processes, a number that `check_workers` has accepted.
 
         Raises:
-            InputError: the objective is not defined at the top of a module, or see `check_workers`.
+            InputError: the objective is not defined at the top of a module.
             VggtjaxError: a process cannot be started.
         """
-        check_workers(recipe, count)
         self._recipe = recipe
         moving, frozen = split(trained, recipe)
         shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, np.float32), moving)
