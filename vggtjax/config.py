@@ -40,7 +40,11 @@ class Cue:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """The cues, and the frames that each cue is averaged over, as offsets from the reference frame."""
+    """The cues, and the frames that each cue is averaged over, as offsets from the reference frame.
+
+    `floor` is added to every map, inverted or not, before the product: 0 in the papers. Every frame has a patch where a
+    map is 0, and so the product, whatever the other maps say: among few patches that counts.
+    """
 
     cues: Annotated[tuple[Cue, ...], Meta(min_length=1)] = (
         Cue("shallow_kk_mean", "k", "k", (0,), "mean", inverted=True),
@@ -51,6 +55,7 @@ class MotionConfig:
     )
     offsets: Annotated[tuple[int, ...], Meta(min_length=1)] = (-6, -4, -2, 2, 4, 6)
     reference_depth: Count = 24
+    floor: Annotated[float, Meta(ge=0, le=1)] = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self, "motion")

@@ -70,7 +70,7 @@ def swept(model, clips):
 
 @pytest.fixture(scope="module")
 def choice(swept):
-    return choose(swept, min_gain=0)
+    return choose(swept, min_gain=0, floor=0.1)
 
 
 def make_sweep(seed, truth, depth=3):
@@ -295,6 +295,7 @@ def test_a_model_without_numbers(model, clips):
         ({"gram": "euclidean"}, "euclidean"),
         ({"max_terms": 0}, "max_terms is 0"),
         ({"min_gain": -0.1}, "min_gain is -0.1"),
+        ({"floor": 1.5}, "floor is 1.5"),
     ],
 )
 def test_a_choice_that_cannot_be(swept, arguments, sentence):
@@ -316,11 +317,12 @@ def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
     wanted = []
     monkeypatch.setattr(command, "generated_clips", lambda *a: wanted.append(a) or zip(*clips, strict=True))
     source = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
-    calibrate_cues(str(source), tmp_path / "out", scenes=CLIPS, frames=FRAMES, max_terms=2, seed=5)
+    calibrate_cues(str(source), tmp_path / "out", scenes=CLIPS, frames=FRAMES, max_terms=2, floor=0.2, seed=5)
     assert wanted == [(CLIPS, FRAMES, SIZE, 5)]
     loaded = load_model(tmp_path / "out" / MODEL)
     assert 1 <= len(loaded.config.motion.cues) <= 2
     assert loaded.config.motion.reference_depth == 4
+    assert loaded.config.motion.floor == 0.2
     printed = capsys.readouterr()
     assert loaded.config.motion.cues[0].name in printed.out
     assert "default table" in printed.out
@@ -332,7 +334,12 @@ def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
-    [({"scenes": 1}, "scenes is 1"), ({"max_terms": 0}, "max_terms is 0"), ({"seed": -1}, "seed is -1")],
+    [
+        ({"scenes": 1}, "scenes is 1"),
+        ({"max_terms": 0}, "max_terms is 0"),
+        ({"floor": -0.1}, "floor is -0.1"),
+        ({"seed": -1}, "seed is -1"),
+    ],
 )
 def test_arguments_are_checked_before_the_model_is_loaded(tmp_path, arguments, sentence):
     with pytest.raises(InputError, match=sentence):

@@ -12,6 +12,7 @@ from jax.sharding import Mesh
 from tests import reference
 from tests.eight_devices import printed_by
 from vggtjax import MotionConfig
+from vggtjax.config import Cue
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues, _sample_std, _unit, normalise, sources
 from vggtjax.network.frames import BY_FRAME, Frames
@@ -58,6 +59,22 @@ def test_maps_and_saliency_are_those_of_every_gram_matrix(gram, padding):
     assert np.allclose(cues.saliency(sums)[0], (product - low) / (high - low + 1e-6), atol=1e-3)
     squared = cues.saliency(sums, jnp.full(5, 2.0))[0]
     assert np.allclose(squared, np.asarray(normalise(jnp.asarray(product[None] ** 2)))[0], atol=1e-3)
+
+
+def test_a_floor_keeps_patches_that_one_map_rules_out():
+    """By hand: maps (0, 1/2, 1) and 1 - (1, 1/2, 0), each with a floor of 1/4."""
+    kept = MotionConfig(
+        (Cue("a", "q", "q", (0,), "mean"), Cue("b", "q", "q", (0,), "mean", inverted=True)),
+        reference_depth=1,
+        floor=0.25,
+    )
+    sums = tuple(jnp.array([[values]], jnp.float32) for values in ((0, 1, 2), (4, 8, 0)))
+    maps = np.array([[0, 0.5, 1], [0.5, 0, 1]])
+    for floor in (0.25, 0.0):
+        product = np.prod(maps + floor, axis=0)
+        expected = (product - product.min()) / (product.max() - product.min())
+        found = GramCues(dataclasses.replace(kept, floor=floor), 1).saliency(sums)[0, 0]
+        assert np.allclose(found, expected, atol=1e-5)
 
 
 def test_eight_devices_have_the_sums_of_one():

@@ -53,6 +53,7 @@ def choose(
     gram: Gram = "cosine",
     max_terms: int = MAX_TERMS,
     min_gain: float = MIN_GAIN,
+    floor: float = 0.0,
     progress: Progress | None = None,
 ) -> Choice:
     """Choose cues whose product separates moving from static tokens.
@@ -68,6 +69,7 @@ def choose(
         gram: similarity of the table.
         max_terms: largest number of cues.
         min_gain: smallest gain in area on the held-out half for another cue.
+        floor: of the table, in [0, 1]: see `MotionConfig`.
         progress: called with the number of tried candidates and the largest possible number.
 
     Raises:
@@ -77,6 +79,8 @@ def choose(
     max_terms = whole_number("max_terms", max_terms, 1)
     if not 0 <= min_gain <= 1:
         raise InputError(f"min_gain is {min_gain}; expected a number in [0, 1]")
+    if not 0 <= floor <= 1:
+        raise InputError(f"floor is {floor}; expected a number in [0, 1]")
     calibration, held_out = halves(sweep)
     _check_truth("calibration", calibration)
     _check_truth("held-out", held_out)
@@ -86,23 +90,25 @@ def choose(
     while len(steps) < max_terms and refused is None:
         chosen = [step.cue for step in steps]
         best_cue, best = None, steps[-1].rating.calibration if steps else -1.0
-        saliency = _product(calibration, gram, chosen)
+        saliency = _product(calibration, gram, chosen, floor)
         for tried, cue in enumerate(pool, 1):
             for inverted in (False, True):
                 candidate = dataclasses.replace(cue, inverted=inverted)
-                value = _product_auc(saliency * _term(calibration, gram, candidate), calibration.truth)
+                value = _product_auc(saliency * _term(calibration, gram, candidate, floor), calibration.truth)
                 if value > best and cue.name not in [other.name for other in chosen]:
                     best_cue, best = candidate, value
             (progress or no_progress)(len(steps) * len(pool) + tried, max_terms * len(pool))
         if best_cue is None:
             break
-        rating = Rating(best, _product_auc(_product(held_out, gram, [*chosen, best_cue]), held_out.truth))
+        confirmed = _product_auc(_product(held_out, gram, [*chosen, best_cue], floor), held_out.truth)
+        rating = Rating(best, confirmed)
         gain = rating.held_out - steps[-1].rating.held_out if steps else 1.0
         if gain > 0 and gain >= min_gain:
             steps.append(Step(best_cue, rating))
         else:
             refused = Step(best_cue, rating)
-    motion = dataclasses.replace(sweep.table, cues=tuple(step.cue for step in steps), reference_depth=sweep.depth)
+    cues = tuple(step.cue for step in steps)
+    motion = dataclasses.replace(sweep.table, cues=cues, reference_depth=sweep.depth, floor=floor)
     table = Rating(*(token_auc(half.table_saliency[GRAMS.index(gram)], half.truth) for half in (calibration, held_out)))
     return Choice(motion, gram, tuple(steps), refused, table)
 
@@ -143,14 +149,14 @@ def _check_truth(name: str, half: Sweep) -> None:
             )
 
 
-def _term(sweep: Sweep, gram: Gram, cue: Cue) -> Float32[np.ndarray, "N S P"]:
+def _term(sweep: Sweep, gram: Gram, cue: Cue, floor: float) -> Float32[np.ndarray, "N S P"]:
     plain = sweep.map(gram, cue)
-    return 1 - plain if cue.inverted else plain
+    return np.float32(floor) + (1 - plain if cue.inverted else plain)
 
 
-def _product(sweep: Sweep, gram: Gram, cues: Sequence[Cue]) -> Float32[np.ndarray, "N S P"]:
+def _product(sweep: Sweep, gram: Gram, cues: Sequence[Cue], floor: float) -> Float32[np.ndarray, "N S P"]:
     """Return the product of maps, not normalised."""
-    terms = (_term(sweep, gram, cue) for cue in cues)
+    terms = (_term(sweep, gram, cue, floor) for cue in cues)
     return reduce(np.multiply, terms, np.ones(sweep.truth.shape, np.float32))
 
 

@@ -142,7 +142,7 @@ def sweep(
         DeviceMemoryError: a clip does not fit in the device's memory.
     """
     default = MotionConfig()
-    table = dataclasses.replace(config.motion, cues=default.cues, reference_depth=default.reference_depth)
+    table = dataclasses.replace(default, offsets=config.motion.offsets)
     cues = SweepCues(table, config.depth)
     maps, saliencies, truths, first_shape = [], [], [], None
     for done, (images, mask) in enumerate(clips, 1):

@@ -27,6 +27,7 @@ def calibrate_cues(
     size: InWords[int | None] = None,
     gram: Gram = "cosine",
     max_terms: int = 5,
+    floor: float = 0.0,
     seed: int = 0,
 ) -> None:
     """Choose a model's motion cues on generated scenes, and save the model with them.
@@ -39,11 +40,15 @@ def calibrate_cues(
         size: side of the images in pixels; the model's own by default.
         gram: similarity of the cues.
         max_terms: largest number of cues.
+        floor: added to every map before the product, from 0 (as in the papers) to 1; 0.1 lets more cues join in where a
+            picture has only dozens of patches.
         seed: another seed draws other scenes.
     """
     if scenes < 2:
         raise InputError(f"scenes is {scenes}; expected at least 2, one to choose the cues and one to confirm them")
     whole_number("max_terms", max_terms, 1)
+    if not 0 <= floor <= 1:
+        raise InputError(f"floor is {floor}; expected a number in [0, 1]")
     if not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed}; expected a number in [0, 2**31)")
     report = Report()
@@ -63,7 +68,7 @@ def calibrate_cues(
             clips = generated_clips(scenes, frames, side, seed)
             swept = sweep(loaded.params, clips, loaded.config, progress=progress, total=scenes)
         with report.stage("choose") as progress:
-            choice = choose(swept, gram=gram, max_terms=max_terms, progress=progress)
+            choice = choose(swept, gram=gram, max_terms=max_terms, floor=floor, progress=progress)
         source = {"scenes": scenes, "frames": frames, "size": side, "textures": "training"}
         source |= {"key": f"fold_in(fold_in(key({seed}), {_KEYS}), scene)"}
         with report.stage("write"):

@@ -122,12 +122,13 @@ class GramCues:
     def saliency(self, sums: Sums, exponents: Float[Array, " cues"] | None = None) -> Float[Array, "B S P"]:
         """Return the product of the cues' maps, inverted where the table says so, min-max normalised per frame.
 
-        The saliency of a single frame is 0. Every map, inverted or not, is raised to its exponent (1 in the papers).
+        The saliency of a single frame is 0. Every map, inverted or not, is raised by the table's floor (0 in the
+        papers), then to the power of its exponent (1 in the papers).
         """
         maps = self.maps(sums)
         product = jnp.ones_like(next(iter(maps.values())))
         for i, cue in enumerate(self.motion.cues):
-            factor = 1 - maps[cue.name] if cue.inverted else maps[cue.name]
+            factor = self.motion.floor + (1 - maps[cue.name] if cue.inverted else maps[cue.name])
             product = product * (factor if exponents is None else _power(factor, exponents[i]))
         return normalise(product)
 
