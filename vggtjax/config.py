@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from vggtjax.errors import InputError
-from vggtjax.storage.json_values import Count, Natural, check_fields, parse_json
+from vggtjax.storage.json_values import Count, Natural, Share, check_fields, parse_json
 
 _LARGEST = 1_000_000  # size of one part of a network
 Size = Annotated[int, Meta(ge=1, le=_LARGEST)]
@@ -42,8 +42,9 @@ class Cue:
 class MotionConfig:
     """The cues, and the frames that each cue is averaged over, as offsets from the reference frame.
 
-    `floor` is added to every map, inverted or not, before the product: 0 in the papers. Every frame has a patch where a
-    map is 0, and so the product, whatever the other maps say: among few patches that counts.
+    `floor` is added to every map, inverted or not, before the product: 0 in the papers. Each map is 0 at some patch of
+    every frame. Without a floor the product is 0 there, whatever the other maps say, which matters where a frame has
+    few patches.
     """
 
     cues: Annotated[tuple[Cue, ...], Meta(min_length=1)] = (
@@ -55,7 +56,7 @@ class MotionConfig:
     )
     offsets: Annotated[tuple[int, ...], Meta(min_length=1)] = (-6, -4, -2, 2, 4, 6)
     reference_depth: Count = 24
-    floor: Annotated[float, Meta(ge=0, le=1)] = 0.0
+    floor: Share = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self, "motion")
@@ -137,8 +138,11 @@ class VGGTConfig:
         return self.image_size // self.patch_size
 
     def to_json(self) -> str:
-        """Return the configuration as a JSON object; `from_json` reads it back."""
-        return json.dumps(dataclasses.asdict(self), separators=(",", ":"))
+        """Return the configuration as a JSON object; `from_json` reads it back. A floor of 0 is left out, as it was."""
+        values = dataclasses.asdict(self)
+        if self.motion.floor == 0:
+            del values["motion"]["floor"]
+        return json.dumps(values, separators=(",", ":"))
 
     @classmethod
     def from_json(cls, text: str) -> VGGTConfig:

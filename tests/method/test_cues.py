@@ -61,20 +61,21 @@ def test_maps_and_saliency_are_those_of_every_gram_matrix(gram, padding):
     assert np.allclose(squared, np.asarray(normalise(jnp.asarray(product[None] ** 2)))[0], atol=1e-3)
 
 
-def test_a_floor_keeps_patches_that_one_map_rules_out():
-    """By hand: maps (0, 1/2, 1) and 1 - (1, 1/2, 0), each with a floor of 1/4."""
-    kept = MotionConfig(
-        (Cue("a", "q", "q", (0,), "mean"), Cue("b", "q", "q", (0,), "mean", inverted=True)),
-        reference_depth=1,
-        floor=0.25,
-    )
-    sums = tuple(jnp.array([[values]], jnp.float32) for values in ((0, 1, 2), (4, 8, 0)))
-    maps = np.array([[0, 0.5, 1], [0.5, 0, 1]])
-    for floor in (0.25, 0.0):
-        product = np.prod(maps + floor, axis=0)
-        expected = (product - product.min()) / (product.max() - product.min())
-        found = GramCues(dataclasses.replace(kept, floor=floor), 1).saliency(sums)[0, 0]
-        assert np.allclose(found, expected, atol=1e-5)
+@pytest.mark.parametrize(
+    ("floor", "exponents", "expected"),
+    [
+        (0.0, None, (0, 0, 1)),
+        (0.25, None, (1 / 6, 0, 1)),  # of 5/16, 3/16 and 15/16
+        (0.25, (2.0, 2.0), (16 / 216, 0, 1)),  # of their squares
+    ],
+)
+def test_a_floor_keeps_a_patch_that_one_map_rules_out(floor, exponents, expected):
+    """By hand: maps (0, 1/2, 1) and 1 - (0, 1, 1/2)."""
+    cues = Cue("a", "q", "q", (0,), "mean"), Cue("b", "q", "q", (0,), "mean", inverted=True)
+    sums = tuple(jnp.array([[values]], jnp.float32) for values in ((0, 1, 2), (0, 8, 4)))
+    made = GramCues(MotionConfig(cues, reference_depth=1, floor=floor), 1)
+    saliency = made.saliency(sums, None if exponents is None else jnp.array(exponents))
+    assert np.allclose(saliency[0, 0], expected, atol=1e-5)
 
 
 def test_eight_devices_have_the_sums_of_one():

@@ -69,7 +69,7 @@ def choose(
         gram: similarity of the table.
         max_terms: largest number of cues.
         min_gain: smallest gain in area on the held-out half for another cue.
-        floor: of the table, in [0, 1]: see `MotionConfig`.
+        floor: added to every map, in [0, 1]: see `MotionConfig`.
         progress: called with the number of tried candidates and the largest possible number.
 
     Raises:
@@ -81,6 +81,7 @@ def choose(
         raise InputError(f"min_gain is {min_gain}; expected a number in [0, 1]")
     if not 0 <= floor <= 1:
         raise InputError(f"floor is {floor}; expected a number in [0, 1]")
+    floor = float(floor)
     calibration, held_out = halves(sweep)
     _check_truth("calibration", calibration)
     _check_truth("held-out", held_out)

@@ -61,7 +61,8 @@ def draw_sweep(auc: Float64[np.ndarray, "G C L"], choice: Choice, *, title: str 
         draw.rectangle((x - 2, y - 2, right, y + _CELL[1]), outline=_OUTLINE, width=3)
         draw.rectangle((x - 2, y - 2, x + 10, y + 12), _OUTLINE)
         draw.text((x + 4, y + 5), str(number), _DARK, tiny, "mm")
-    heading = f"Chosen for {choice.gram} similarity; AUC of the product of each cue and those above it"
+    floor = f", floor {choice.motion.floor:g}" if choice.motion.floor else ""
+    heading = f"Chosen for {choice.gram} similarity{floor}; AUC of the product of each cue and those above it"
     rows: list[tuple[str, ...]] = [(heading, "calibration", "held-out half")]
     for number, (cue, rating) in enumerate(choice.steps, 1):
         name = f"{number}  {cue.name}{'  (1 - m)' if cue.inverted else ''}"

@@ -38,7 +38,7 @@ class Sweep(NamedTuple):
 
     maps: Float32[np.ndarray, "G C L N S P"]  # not normalised, so that neighbouring pairs can be averaged
     truth: Int8[np.ndarray, "N S P"]  # STATIC, DYNAMIC or UNCLEAR
-    table: MotionConfig  # for comparison with the chosen table: the default cues, the model's own offsets
+    table: MotionConfig  # for comparison with the chosen one: the default cues and floor, the model's own offsets
     table_saliency: Float32[np.ndarray, "G N S P"]
 
     @property

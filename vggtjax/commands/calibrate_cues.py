@@ -40,8 +40,7 @@ def calibrate_cues(
         size: side of the images in pixels; the model's own by default.
         gram: similarity of the cues.
         max_terms: largest number of cues.
-        floor: added to every map before the product, from 0 (as in the papers) to 1; 0.1 lets more cues join in where a
-            picture has only dozens of patches.
+        floor: added to every map before the product, from 0 (as in the papers) to 1; the model's own does not count.
         seed: another seed draws other scenes.
     """
     if scenes < 2:

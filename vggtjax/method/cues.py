@@ -122,8 +122,8 @@ class GramCues:
     def saliency(self, sums: Sums, exponents: Float[Array, " cues"] | None = None) -> Float[Array, "B S P"]:
         """Return the product of the cues' maps, inverted where the table says so, min-max normalised per frame.
 
-        The saliency of a single frame is 0. Every map, inverted or not, is raised by the table's floor (0 in the
-        papers), then to the power of its exponent (1 in the papers).
+        The saliency of a single frame is 0. To every map, inverted or not, the table's floor is added (0 in the
+        papers); the sum is raised to the map's exponent (1 in the papers).
         """
         maps = self.maps(sums)
         product = jnp.ones_like(next(iter(maps.values())))
@@ -181,7 +181,7 @@ def _unit(x: Float[Array, "... D"]) -> Float[Array, "... D"]:
 
 
 def _power(x: Float[Array, "B S P"], exponent: Float[Array, ""]) -> Float[Array, "B S P"]:
-    """Return x ** exponent for x in [0, 1]; close to 0, where the slope is unbounded, x."""
+    """Return x ** exponent for x in [0, 2]; close to 0, where the slope is unbounded, x."""
     return jnp.where(x > _EPSILON, jnp.maximum(x, _EPSILON) ** exponent, x)
 
 

@@ -228,7 +228,7 @@ def motion_saliency(
     gram: Gram = "cosine",
     motion: MotionConfig | None = None,
 ) -> Float[Array, "B S h w"]:
-    """Return the motion saliency of each patch, in [0, 1]: the product of the five Gram maps.
+    """Return the motion saliency of each patch, in [0, 1]: the product of the table's Gram maps.
 
     Args:
         params: the model's parameter tree.
