@@ -147,7 +147,7 @@ def passes(clip: Clip) -> Figure:
 
 
 def cues(clip: Clip) -> Figure:
-    """The five maps, as they enter the product, and the saliency that comes of them."""
+    """The maps, as they enter the product before the floor is added, and the saliency that comes of them."""
     from matplotlib import pyplot
 
     result, frames = clip.result, (2, 7, 12)
