@@ -1,9 +1,9 @@
 """Effects of the second pass on the cameras: python -m benchmarks second-pass.
 
 Every dynamic scene has a frozen twin: the same room, camera and textures, with its movers standing still. Plain passes
-over both measure the cost of motion. The second pass measures the total effect of suppression on the moving scene, its
-effect without motion on the frozen scene. Another scene's mask measures the effect of losing arbitrary keys; compared
-with the frozen scene's own mask it tells whether the movers' keys are worth more.
+over both measure the cost of motion. The second pass measures the total effect of suppression on the moving scene, and
+its effect without motion on the frozen scene. Another scene's mask measures the effect of losing arbitrary keys;
+compared with the frozen scene's own mask it tells whether the movers' keys are worth more.
 """
 
 from __future__ import annotations
