@@ -99,8 +99,7 @@ def _table(errors: dict[tuple[str, str, int], np.ndarray], suppress: str) -> Tab
     for heading in ("rotation", "against plain", "centres", "against plain"):
         table.add_column(heading, justify="right")
     for (scene, mask, pairs), values in errors.items():
-        change = values - errors[scene, "none", 0]
-        mean, spread = change.mean(axis=0), change.std(axis=0, ddof=1) / len(change) ** 0.5
+        mean, spread = _difference(values, errors[scene, "none", 0])
         changes = [f"{a:+.{n}f} ± {b:.{n}f}" if pairs else "" for a, b, n in zip(mean, spread, (2, 4), strict=True)]
         rotation, centre = values.mean(axis=0)
         table.add_row(scene, mask, str(pairs or "-"), f"{rotation:.2f}°", changes[0], f"{centre:.4f}", changes[1])
@@ -114,7 +113,12 @@ def _table(errors: dict[tuple[str, str, int], np.ndarray], suppress: str) -> Tab
 
 
 def _apart(errors: np.ndarray, others: np.ndarray) -> str:
-    """Return by how much errors [scenes, 2] are larger than others, as text."""
-    difference = errors - others
-    mean, spread = difference.mean(axis=0), difference.std(axis=0, ddof=1) / len(difference) ** 0.5
+    """Return by how much errors are larger than others, as text."""
+    mean, spread = _difference(errors, others)
     return f"rotation {mean[0]:+.2f} ± {spread[0]:.2f} degrees, centres {mean[1]:+.4f} ± {spread[1]:.4f}"
+
+
+def _difference(errors: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return by how much errors [scenes, 2] are larger than others: the mean over scenes, and its standard error."""
+    difference = errors - others
+    return difference.mean(axis=0), difference.std(axis=0, ddof=1) / len(difference) ** 0.5

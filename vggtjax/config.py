@@ -138,9 +138,9 @@ class VGGTConfig:
         return self.image_size // self.patch_size
 
     def to_json(self) -> str:
-        """Return the configuration as a JSON object; `from_json` reads it back. A floor of 0 is left out, as it was."""
+        """Return the configuration as a JSON object; `from_json` reads it back. A floor of 0 is left out."""
         values = dataclasses.asdict(self)
-        if self.motion.floor == 0:
+        if self.motion.floor == 0:  # as in files before it: digests and cached conversions stay the same
             del values["motion"]["floor"]
         return json.dumps(values, separators=(",", ":"))
 

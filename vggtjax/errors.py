@@ -73,6 +73,13 @@ def whole_number(name: str, value: object, lowest: int) -> int:
     return number
 
 
+def share(name: str, value: float) -> float:
+    """Return `value` as a float in [0, 1], else raise InputError naming the argument."""
+    if not 0 <= value <= 1:
+        raise InputError(f"{name} is {value}; expected a number in [0, 1]")
+    return float(value)
+
+
 def check_choice(name: str, value: object, choices: Sequence[object]) -> None:
     """Raise InputError, naming the argument, for a value that is not one of the choices."""
     if value not in choices:

@@ -220,9 +220,7 @@ def test_ratings_are_those_of_the_method(model, clips, swept, choice):
         values = saliency[start::2].reshape(2, FRAMES, -1)
         assert token_auc(values, halves(swept)[start].truth) == pytest.approx(rating, abs=2e-3)
     assert len(choice.steps) > 1  # of a single cue the floor changes no order
-    assert swept.table == MotionConfig(
-        offsets=model.config.motion.offsets
-    )  # the model's own floor is not the default's
+    assert swept.table == MotionConfig(offsets=model.config.motion.offsets)  # without the model's own floor
     assert choice.motion.offsets == model.config.motion.offsets
 
 

@@ -10,8 +10,8 @@ from vggtjax.storage.kept_memory import keep_freed_memory
 COUNT = """
 import ctypes
 import resource
-ctypes.CDLL(None).prctl(41, 1, 0, 0, 0)  # no huge pages (PR_SET_THP_DISABLE): a fault counts 4 KiB
 import statistics
+ctypes.CDLL(None).prctl(41, 1, 0, 0, 0)  # no huge pages (PR_SET_THP_DISABLE): a fault counts 4 KiB
 def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
 turns = []

@@ -14,7 +14,7 @@ from jaxtyping import Float32, Int8
 
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Sweep, token_auc
 from vggtjax.config import Cue, Gram, MotionConfig
-from vggtjax.errors import InputError, check_choice, whole_number
+from vggtjax.errors import InputError, check_choice, share, whole_number
 from vggtjax.method.cues import normalise
 from vggtjax.progress import Progress, no_progress
 
@@ -77,11 +77,7 @@ def choose(
     """
     check_choice("gram", gram, GRAMS)
     max_terms = whole_number("max_terms", max_terms, 1)
-    if not 0 <= min_gain <= 1:
-        raise InputError(f"min_gain is {min_gain}; expected a number in [0, 1]")
-    if not 0 <= floor <= 1:
-        raise InputError(f"floor is {floor}; expected a number in [0, 1]")
-    floor = float(floor)
+    min_gain, floor = share("min_gain", min_gain), share("floor", floor)
     calibration, held_out = halves(sweep)
     _check_truth("calibration", calibration)
     _check_truth("held-out", held_out)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from vggtjax.commands.report import Report
 from vggtjax.config import Gram
-from vggtjax.errors import InputError, whole_number
+from vggtjax.errors import InputError, share, whole_number
 from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
@@ -46,8 +46,7 @@ def calibrate_cues(
     if scenes < 2:
         raise InputError(f"scenes is {scenes}; expected at least 2, one to choose the cues and one to confirm them")
     whole_number("max_terms", max_terms, 1)
-    if not 0 <= floor <= 1:
-        raise InputError(f"floor is {floor}; expected a number in [0, 1]")
+    floor = share("floor", floor)
     if not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed}; expected a number in [0, 2**31)")
     report = Report()
