@@ -59,7 +59,7 @@ class Settings:
     dynamic: int
     seeds: int
     frames: int
-    mask_pairs: int
+    mask_pairs: int | None  # the number that the model recommends if None
     sweep: tuple[int, ...]
     sweep_seeds: int
     training_scenes: int
@@ -84,7 +84,7 @@ def demo_model(
     dynamic: int = 64,
     seeds: int = 5,
     frames: int = 12,
-    mask_pairs: int = 5,
+    mask_pairs: int | None = None,
     sweep: tuple[int, ...] = (1, 3, 5, 8, 12, 24),
     sweep_seeds: int = 1,
     training_scenes: int = 256,
@@ -101,7 +101,7 @@ def demo_model(
         dynamic: number of held-out dynamic scenes of each seed.
         seeds: number of draws of dynamic scenes, for the spread.
         frames: frames of a scene, and of a window of a filmed clip.
-        mask_pairs: pairs in which keys are suppressed.
+        mask_pairs: pairs in which keys are suppressed; the number that the model recommends by default.
         sweep: further numbers of pairs to try.
         sweep_seeds: number of draws of dynamic scenes for the sweep.
         training_scenes: number of training scenes behind the blind guesses.
@@ -116,7 +116,10 @@ def demo_model(
     loaded = load_model(model)
     bench = _Bench(loaded, settings)
     with bench.running():
-        results: dict[str, Any] = {"model": loaded.summary(), "settings": dataclasses.asdict(settings)}
+        results: dict[str, Any] = {
+            "model": loaded.summary(),
+            "settings": dataclasses.asdict(settings) | {"mask_pairs": bench.pairs},
+        }
         results["static"] = bench.static_scenes() if static else None
         results["hololens"] = bench.filmed([clips / "hololens"], "hololens")
         folders = sorted(clips.joinpath("composite").glob("*"))
@@ -124,7 +127,7 @@ def demo_model(
         results["composite ladder"] = bench.filmed_ladder(folders)
         results["dynamic"] = bench.dynamic_scenes() if dynamic else None
     text = report_text(loaded, results)
-    write_report(out, results, text, mask_pairs)
+    write_report(out, results, text, bench.pairs)
     console = Console()
     console.print(text, markup=False, highlight=False, soft_wrap=True)
     console.print(
@@ -137,6 +140,7 @@ class _Bench:
 
     def __init__(self, model: Model, settings: Settings) -> None:
         self.model, self.settings = model, settings
+        self.pairs = model.config.motion.mask_pairs if settings.mask_pairs is None else settings.mask_pairs
         columns = (TextColumn("{task.description:<28}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         self.console = Console(stderr=True)
         self.progress = Bars(*columns, console=self.console, disable=not self.console.is_terminal)
@@ -185,10 +189,10 @@ class _Bench:
     def laddered(self, name: str, truths: Iterable[Truth]) -> Laddered:
         settings, rows = self.settings, []
         for seed, truth in enumerate(truths):
-            pairs = {settings.mask_pairs, *(settings.sweep if seed < settings.sweep_seeds else ())}
+            pairs = {self.pairs, *(settings.sweep if seed < settings.sweep_seeds else ())}
             network = self._network(f"ladder, {name} {seed}")
             rows.append(ladder(self.model, truth, mask_pairs=sorted(pairs), suppress=SUPPRESS, **network))
-        main = [[row for row in found if row.mask_pairs in (None, settings.mask_pairs)] for found in rows]
+        main = [[row for row in found if row.mask_pairs in (None, self.pairs)] for found in rows]
         swept = rows[: settings.sweep_seeds] if settings.sweep else []
         return Laddered(rows, summarise(main), summarise(swept), saliency_auc(rows))
 

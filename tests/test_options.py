@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 import tyro
 
+from vggtjax import MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS, Options
+
+MOTION = MotionConfig()
 
 
 @pytest.mark.parametrize(
@@ -51,21 +54,29 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     other = {"gram": "dot", "suppress": "drop", "mask_pairs": 2, "smooth_frames": 3, "compute_dtype": "bfloat16"}
     other |= {"attention": "merged"}  # absent where it is exact, as is the precision where it is the highest
     fields = {field.name for field in dataclasses.fields(Options)}
-    key = Options().passes_settings
+    key = Options().passes_settings(MOTION)
     named = fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters", "threshold"}
     assert set(key) == named - {"attention", "precision"}
-    assert set(Options(attention="merged").passes_settings) == named - {"precision"}
-    assert all(Options(**{name: value}).passes_settings != key for name, value in other.items())
-    assert Options(align_scale=True, refine_mask=True, refine_cameras=True).passes_settings == key
-    same = {name for name in METHODS if Options(name).passes_settings == key}  # pyright: ignore[reportArgumentType]
+    assert set(Options(attention="merged").passes_settings(MOTION)) == named - {"precision"}
+    assert all(Options(**{name: value}).passes_settings(MOTION) != key for name, value in other.items())
+    assert Options(align_scale=True, refine_mask=True, refine_cameras=True).passes_settings(MOTION) == key
+    same = {name for name in METHODS if Options(name).passes_settings(MOTION) == key}  # pyright: ignore[reportArgumentType]
     assert same == set(METHODS) - {"vggt4d"}
 
 
 def test_the_method_fills_in_what_is_not_given():
     cpu = {"compute_dtype": "float32", "precision": "highest"}
-    made = Options("vggt4d").resolved()
-    assert made == Options("vggt4d", gram="dot", suppress="drop", refine_mask=True, **cpu)  # pyright: ignore
-    assert Options("vggt4d", gram="cosine", refine_mask=False).resolved().gram == "cosine"
+    made = Options("vggt4d").resolved(MOTION)
+    wanted = Options("vggt4d", gram="dot", suppress="drop", mask_pairs=5, refine_mask=True, **cpu)  # pyright: ignore
+    assert made == wanted
+    assert Options("vggt4d", gram="cosine", refine_mask=False).resolved(MOTION).gram == "cosine"
+
+
+def test_the_model_recommends_the_number_of_pairs():
+    motion = MotionConfig(mask_pairs=2)
+    assert Options().resolved(motion).mask_pairs == 2
+    assert Options(mask_pairs=0).resolved(motion).mask_pairs == 0
+    assert Options().passes_settings(motion) == Options(mask_pairs=2).passes_settings(MOTION)
 
 
 @pytest.mark.parametrize(
@@ -79,9 +90,9 @@ def test_the_method_fills_in_what_is_not_given():
 )
 def test_the_platform_fills_in_how_exact_the_network_is(monkeypatch, given, dtype, precision):
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
-    made = Options(**given).resolved()
+    made = Options(**given).resolved(MOTION)
     assert (made.compute_dtype, made.precision) == (dtype, precision)
-    assert made.resolved() == made
-    assert Options(**given).passes_settings["compute_dtype"] == dtype
-    on_cpu = Options(**given).resolved(on_accelerator=False)
+    assert made.resolved(MOTION) == made
+    assert Options(**given).passes_settings(MOTION)["compute_dtype"] == dtype
+    on_cpu = Options(**given).resolved(MOTION, on_accelerator=False)
     assert (on_cpu.compute_dtype, on_cpu.precision) == (given.get("compute_dtype", "float32"), "highest")

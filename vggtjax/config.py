@@ -45,6 +45,9 @@ class MotionConfig:
     `floor` is added to every map, inverted or not, before the product: 0 in the papers. Each map is 0 at some patch of
     every frame. Without a floor the product is 0 there, whatever the other maps say, which matters where a frame has
     few patches.
+
+    `mask_pairs` is the number of pairs, from the first, in which the second pass suppresses the keys of dynamic tokens
+    (L_mask) where the options leave it open. The default is that of the papers for VGGT-1B.
     """
 
     cues: Annotated[tuple[Cue, ...], Meta(min_length=1)] = (
@@ -57,6 +60,7 @@ class MotionConfig:
     offsets: Annotated[tuple[int, ...], Meta(min_length=1)] = (-6, -4, -2, 2, 4, 6)
     reference_depth: Count = 24
     floor: Share = 0.0
+    mask_pairs: Natural = 5
 
     def __post_init__(self) -> None:
         check_fields(self, "motion")
@@ -77,6 +81,9 @@ class MotionConfig:
             return cue.layers
         scale = (depth - 1) / max(self.reference_depth - 1, 1)
         return tuple(round(layer * scale) for layer in cue.layers)
+
+
+_PAPERS = MotionConfig()
 
 
 @dataclass(frozen=True)
@@ -138,10 +145,15 @@ class VGGTConfig:
         return self.image_size // self.patch_size
 
     def to_json(self) -> str:
-        """Return the configuration as a JSON object; `from_json` reads it back. A floor of 0 is left out."""
+        """Return the configuration as a JSON object; `from_json` reads it back.
+
+        A floor of 0 and the papers' number of pairs are left out, as in files before them: digests and cached
+        conversions stay the same.
+        """
         values = dataclasses.asdict(self)
-        if self.motion.floor == 0:  # as in files before it: digests and cached conversions stay the same
-            del values["motion"]["floor"]
+        for name in ("floor", "mask_pairs"):
+            if values["motion"][name] == getattr(_PAPERS, name):
+                del values["motion"][name]
         return json.dumps(values, separators=(",", ":"))
 
     @classmethod

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from vggtjax.config import Gram, Suppress
+from vggtjax.config import Gram, MotionConfig, Suppress
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields
@@ -111,8 +111,9 @@ class Options:
     """similarity of the motion cues; by default dot for vggt4d, else cosine"""
     suppress: InWords[Suppress | None] = None
     """how the second pass ignores keys of dynamic tokens; by default drop for vggt4d, else zero"""
-    mask_pairs: int = 5
-    """in how many pairs of blocks, from the first on, keys of dynamic tokens are ignored (L_mask of the paper)"""
+    mask_pairs: InWords[int | None] = None
+    """in how many pairs of blocks, from the first on, keys of dynamic tokens are ignored (L_mask of the paper); by
+    default the number that the model recommends, 5 for VGGT-1B"""
     align_scale: Switch = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1
@@ -136,7 +137,8 @@ class Options:
 
     def __post_init__(self) -> None:
         find_method(self.method)
-        object.__setattr__(self, "mask_pairs", whole_number("mask_pairs", self.mask_pairs, 0))
+        if self.mask_pairs is not None:
+            object.__setattr__(self, "mask_pairs", whole_number("mask_pairs", self.mask_pairs, 0))
         object.__setattr__(self, "smooth_frames", odd_frames(self.smooth_frames))
         check_fields(self)
 
@@ -156,22 +158,30 @@ class Options:
             refine=method.refine if self.refine_mask is None else self.refine_mask,
         )
 
-    def resolved(self, on_accelerator: bool | None = None) -> Options:
-        """Return the options with the values of the method and of the platform in place of None.
+    def resolved(self, motion: MotionConfig, on_accelerator: bool | None = None) -> Options:
+        """Return the options with the values of the method, the model and the platform in place of None.
+
+        `motion` is the model's. `on_accelerator` is as for `computed`.
+        """
+        row = self.row
+        pairs = motion.mask_pairs if self.mask_pairs is None else self.mask_pairs
+        values = {"gram": row.gram, "suppress": row.suppress, "refine_mask": row.refine, "mask_pairs": pairs}
+        return dataclasses.replace(self.computed(on_accelerator), **values)
+
+    def computed(self, on_accelerator: bool | None = None) -> Options:
+        """Return the options with the platform's types in place of None.
 
         `on_accelerator` tells whether the network will be computed on a GPU or TPU; by default, whether jax has one.
         """
-        row, dtype, precision = self.row, self.compute_dtype, self.precision
+        dtype, precision = self.compute_dtype, self.precision
         if dtype is None or precision != "highest":
             narrow = precision != "highest" and (_has_accelerator() if on_accelerator is None else on_accelerator)
             dtype, precision = dtype or ("bfloat16" if narrow else "float32"), "tf32" if narrow else "highest"
-        method = {"gram": row.gram, "suppress": row.suppress, "refine_mask": row.refine}
-        return dataclasses.replace(self, **method, compute_dtype=dtype, precision=precision)
+        return dataclasses.replace(self, compute_dtype=dtype, precision=precision)
 
-    @property
-    def passes_settings(self) -> dict[str, Any]:
-        """What the two passes depend on, as JSON values: methods with equal values share one run of the passes."""
-        settings = self.resolved().to_json() | {"clusters": self.row.clusters, "threshold": self.row.threshold}
+    def passes_settings(self, motion: MotionConfig) -> dict[str, Any]:
+        """What the two passes of a model depend on, as JSON values; methods with equal values share one run of them."""
+        settings = self.resolved(motion).to_json() | {"clusters": self.row.clusters, "threshold": self.row.threshold}
         return {name: value for name, value in settings.items() if name not in _READ_AFTER_THE_PASSES}
 
     def changed(self, **changes: Any) -> Options:

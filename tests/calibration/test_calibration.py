@@ -4,6 +4,7 @@ import dataclasses
 import json
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -37,6 +38,13 @@ from vggtjax.errors import InputError, OutputError
 from vggtjax.method.cues import GramCues
 
 FRAMES, SIZE, CLIPS = 4, 56, 4
+
+
+class Moving(NamedTuple):
+    """What is read of a generated clip."""
+
+    images: np.ndarray
+    dynamic_mask: np.ndarray
 
 
 @pytest.fixture(scope="module")
@@ -316,7 +324,7 @@ def test_nothing_to_tell_apart(swept, value, kind):
 
 def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
     wanted = []
-    monkeypatch.setattr(command, "generated_clips", lambda *a: wanted.append(a) or zip(*clips, strict=True))
+    monkeypatch.setattr(command, "generated_clips", lambda *a: wanted.append(a) or map(Moving, *clips))
     source = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
     calibrate_cues(str(source), tmp_path / "out", scenes=CLIPS, frames=FRAMES, max_terms=2, floor=0.2, seed=5)
     assert wanted == [(CLIPS, FRAMES, SIZE, 5)]
@@ -350,7 +358,7 @@ def test_arguments_are_checked_before_the_model_is_loaded(tmp_path, arguments, s
 def test_scenes_of_a_seed():
     first, second = generated_clips(2, 2, 28, seed=3)
     again, _ = generated_clips(2, 2, 28, seed=3)
-    assert first[0].shape == (2, 28, 28, 3)
-    assert first[1].shape == (2, 28, 28)
-    assert (first[0] == again[0]).all()
-    assert not (first[0] == second[0]).all()
+    assert first.images.shape == (2, 28, 28, 3)
+    assert first.dynamic_mask.shape == (2, 28, 28)
+    assert (first.images == again.images).all()
+    assert not (first.images == second.images).all()

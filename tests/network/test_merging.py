@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.tiny import tiny_config
+from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
 from vggtjax.method.passes import run_passes
@@ -155,4 +156,5 @@ def test_an_unknown_attention_is_refused(model):
 def test_results_of_exact_attention_have_the_settings_that_they_had():
     assert "attention" not in Options().to_json()
     assert Options(attention="merged").to_json()["attention"] == "merged"
-    assert Options(attention="merged").passes_settings != Options().passes_settings
+    motion = MotionConfig()
+    assert Options(attention="merged").passes_settings(motion) != Options().passes_settings(motion)

@@ -79,7 +79,7 @@ def test_the_stages_of_a_method(lower, method):
     dtype = "bfloat16" if method == "vggt4d" else "float32"
     points = {3: array(1, 2, 2)} if method == "vggt" else {}
     fusion = shapes(start(tuple(PARTS))) if method == "4dvggt-d" else None
-    stages = Stages(CONFIG, Options(method=method, compute_dtype=dtype).resolved(), FRAMES, SIZE, run=lower)
+    stages = Stages(CONFIG, Options(method=method, compute_dtype=dtype), FRAMES, SIZE, run=lower)
     clip = ClipInputs(array(1, FRAMES, *SIZE, 3), query_points=points)
     run_stages(stages, PARAMS, clip, fusion=fusion, all_outputs=method != "vggt4d")
     assert {"image features", "first pass", "dynamic mask", "assemble"} <= {stage for stage, *_ in lower.outputs}
@@ -101,7 +101,7 @@ def test_the_precision_of_products(precision, head):
 
 
 def test_merged_attention(lower):
-    stages = Stages(CONFIG, Options(attention="merged").resolved(), FRAMES, SIZE, run=lower)
+    stages = Stages(CONFIG, Options(attention="merged"), FRAMES, SIZE, run=lower)
     grid = [side // CONFIG.patch_size for side in SIZE]
     features = array(1, FRAMES, grid[0] * grid[1], CONFIG.embed_dim)
     stages.first_pass(PARAMS, ClipBatch(array(1, FRAMES, *SIZE, 3), features))

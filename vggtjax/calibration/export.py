@@ -21,6 +21,7 @@ from PIL import Image
 
 from vggtjax.calibration.choice import Choice, Rating, Step, halves
 from vggtjax.calibration.heatmap import draw_sweep
+from vggtjax.calibration.pairs import PairsChoice
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, UNCLEAR, Sweep
 from vggtjax.checkpoint import Model, save_model
 from vggtjax.storage.writing import check_free, says_format, staging
@@ -30,19 +31,34 @@ VERSION = 1
 NUMBERS, MODEL, PICTURE = "calibration.json", "model.safetensors", "sweep.png"
 
 
+def calibrated(model: Model, choice: Choice, pairs: PairsChoice | None = None) -> Model:
+    """Return the model with the chosen cues, and the number of pairs if one was chosen."""
+    motion = choice.motion if pairs is None else dataclasses.replace(choice.motion, mask_pairs=pairs.best)
+    return dataclasses.replace(model, config=dataclasses.replace(model.config, motion=motion))
+
+
 def save_calibration(
-    folder: str | Path, model: Model, sweep: Sweep, choice: Choice, *, source: Mapping[str, Any] | None = None
+    folder: str | Path,
+    model: Model,
+    sweep: Sweep,
+    choice: Choice,
+    *,
+    pairs: PairsChoice | None = None,
+    source: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the calibrated model, the numbers and the picture; return the model's path.
 
-    The folder is made if missing; an earlier calibration in it is replaced. `source` are JSON values about the clips.
+    The folder is made if missing; an earlier calibration in it is replaced. `pairs` is what `choose_pairs` returned;
+    without it the model keeps its number. `source` are JSON values about the clips.
     Raises OutputError if the folder cannot be written, or holds files with these names of another origin.
     """
     folder = Path(folder)
     check_folder(folder)
     auc = sweep.auc()
-    config = dataclasses.replace(model.config, motion=choice.motion)
+    config = calibrated(model, choice, pairs).config
     numbers = calibration_numbers(model, sweep, choice, auc) | {"source": dict(source or {})}
+    if pairs is not None:
+        numbers["mask_pairs"] = _pairs(pairs)
     with staging(folder) as staged:
         names = {"name": model.name or None, "note": model.note}
         save_model(staged / MODEL, model.params, config, **names, untrained_heads=model.untrained_heads)
@@ -88,6 +104,11 @@ def calibration_numbers(
             for c, kind in enumerate(KINDS)
         ],
     }
+
+
+def _pairs(pairs: PairsChoice) -> dict[str, Any]:
+    errors = [{"pairs": number, **error._asdict()} for number, error in pairs.errors.items()]
+    return {"recommended": pairs.best, "scenes": pairs.scenes, "errors": errors}
 
 
 def _step(step: Step) -> dict[str, Any]:

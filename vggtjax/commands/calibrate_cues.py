@@ -12,8 +12,7 @@ from vggtjax.errors import InputError, share, whole_number
 from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
-    import numpy as np
-    from jaxtyping import Bool, Float32
+    from vggtjax.scenes import SyntheticClip
 
 _KEYS = 0x63756573  # folded into the seed's key, so that no other use of a seed draws these scenes
 
@@ -28,9 +27,12 @@ def calibrate_cues(
     gram: Gram = "cosine",
     max_terms: int = 5,
     floor: float = 0.0,
+    mask_pairs: tuple[int, ...] = (),
     seed: int = 0,
 ) -> None:
     """Choose a model's motion cues on generated scenes, and save the model with them.
+
+    With --mask-pairs, also choose in how many pairs of blocks its second pass ignores keys.
 
     Args:
         model: a converted .safetensors, a PyTorch checkpoint, or a hub id such as facebook/VGGT-1B.
@@ -41,6 +43,8 @@ def calibrate_cues(
         gram: similarity of the cues.
         max_terms: largest number of cues.
         floor: added to every map before the product, from 0 (as in the papers) to 1; the model's own does not count.
+        mask_pairs: numbers of pairs to try on the same scenes, with mined masks. The one with the lowest camera errors
+            becomes what the model recommends, in place of its own number.
         seed: another seed draws other scenes.
     """
     if scenes < 2:
@@ -51,8 +55,11 @@ def calibrate_cues(
         raise InputError(f"seed is {seed}; expected a number in [0, 2**31)")
     report = Report()
     with report.running():
+        import numpy as np
+
         from vggtjax.calibration.choice import choose
-        from vggtjax.calibration.export import check_folder, save_calibration
+        from vggtjax.calibration.export import calibrated, check_folder, save_calibration
+        from vggtjax.calibration.pairs import check_pairs, choose_pairs
         from vggtjax.calibration.sweep import sweep
         from vggtjax.pretrained.load import load_model
 
@@ -62,15 +69,23 @@ def calibrate_cues(
         side = loaded.config.image_size if size is None else size
         if side < 1 or side % loaded.config.patch_size:
             raise InputError(f"size is {side}; expected a multiple of the patch size {loaded.config.patch_size}")
+        numbers = check_pairs(mask_pairs, loaded.config.depth) if mask_pairs else ()
         with report.stage("sweep") as progress:
-            clips = generated_clips(scenes, frames, side, seed)
+            drawn = generated_clips(scenes, frames, side, seed)
+            clips = ((np.asarray(clip.images), np.asarray(clip.dynamic_mask)) for clip in drawn)
             swept = sweep(loaded.params, clips, loaded.config, progress=progress, total=scenes)
         with report.stage("choose") as progress:
             choice = choose(swept, gram=gram, max_terms=max_terms, floor=floor, progress=progress)
+        pairs = None
+        if numbers:
+            with report.stage("try pairs") as progress:
+                clips = generated_clips(scenes, frames, side, seed)
+                with_cues = calibrated(loaded, choice)
+                pairs = choose_pairs(with_cues, clips, numbers, gram=gram, progress=progress, total=scenes)
         source = {"scenes": scenes, "frames": frames, "size": side, "textures": "training"}
         source |= {"key": f"fold_in(fold_in(key({seed}), {_KEYS}), scene)"}
         with report.stage("write"):
-            path = save_calibration(out, loaded, swept, choice, source=source)
+            path = save_calibration(out, loaded, swept, choice, pairs=pairs, source=source)
     rows = {
         step.cue.name + (" (1 - m)" if step.cue.inverted else ""): f"{calibration:.3f}   {held_out:.3f}"
         for step in choice.steps
@@ -80,14 +95,21 @@ def calibrate_cues(
     report.table(rows | {"default table": "{:.3f}   {:.3f}".format(*choice.table), "model": path})
     if choice.steps[-1].rating.held_out < choice.table.held_out:
         report.line("On the held-out half the default table is better than the chosen table; try more scenes.")
+    if pairs is not None:
+        report.line(f"Second pass by number of pairs, 0 for the first pass, on {pairs.scenes} scenes (mined masks):")
+        report.table(
+            {
+                f"{number} pairs": f"rotation {errors.rotation:.2f} degrees, centres {errors.centres:.4f} median depths"
+                for number, errors in pairs.errors.items()
+            }
+            | {"recommended": str(pairs.best)}
+        )
     if loaded.note:
         report.line(loaded.warning)
 
 
-def generated_clips(
-    scenes: int, frames: int, size: int, seed: int
-) -> Iterator[tuple[Float32[np.ndarray, "S H W 3"], Bool[np.ndarray, "S H W"]]]:
-    """Yield images and dynamic pixels of generated scenes with training textures, one scene at a time."""
+def generated_clips(scenes: int, frames: int, size: int, seed: int) -> Iterator[SyntheticClip]:
+    """Yield generated scenes with training textures, one at a time, as numpy arrays."""
     import jax
 
     from vggtjax.scenes import SceneConfig, generate, load_textures
@@ -97,5 +119,4 @@ def generated_clips(
     key = jax.random.fold_in(jax.random.key(seed), _KEYS)
     make = jax.jit(generate, static_argnames="config")
     for scene in range(scenes):
-        clip = make(jax.random.fold_in(key, scene), textures, config)
-        yield jax.device_get((clip.images, clip.dynamic_mask))
+        yield jax.device_get(make(jax.random.fold_in(key, scene), textures, config))

@@ -86,7 +86,7 @@ def ladder(
     *,
     methods: Sequence[str] = LADDER,
     masks: Sequence[MaskSource] = ("mined", "true"),
-    mask_pairs: Sequence[int] = (5,),
+    mask_pairs: Sequence[int] | None = None,
     suppress: Sequence[Suppress] = ("zero",),
     gram: Gram = "cosine",
     compute_dtype: ComputeDType = "float32",
@@ -101,7 +101,7 @@ def ladder(
         methods: names of `LADDER`. A method without a second pass has one row per clip, any other method one row for
             each combination of the three arguments that follow.
         masks: "mined" from the first pass, or the "true" masks, an upper bound for any mining.
-        mask_pairs: numbers of pairs in which the keys of dynamic tokens are suppressed.
+        mask_pairs: numbers of pairs in which the keys of dynamic tokens are suppressed; the model's own if None.
         suppress: ways to suppress them, in place of the methods' own.
         gram, compute_dtype: as in `Options`.
         batch_size: number of clips that go through the network together.
@@ -123,7 +123,8 @@ def ladder(
         raise InputError(f"batch_size is {batch_size}; expected at least 1")
     masked = tuple(name for name in methods if find_method(name).needs_second_pass)
     plain = tuple(name for name in methods if name not in masked)
-    settings = [_Setting(*values) for values in product(masks, mask_pairs, suppress)]
+    pairs = (model.config.motion.mask_pairs,) if mask_pairs is None else mask_pairs
+    settings = [_Setting(*values) for values in product(masks, pairs, suppress)]
     frames, *size = truth.images.shape[1:4]
     options = Options(gram=gram, compute_dtype=compute_dtype)
     shared = Stages(model.config, options, frames, (size[0], size[1]))

@@ -76,7 +76,8 @@ class ModelSource:
         check_fuses(self.fusion, *self.names)
         config = self.model.config
         self._fitter = self.framing.fitter(size=config.image_size, patch=config.patch_size)
-        self.groups = [[each.method for each in group] for group in groups_of_methods(self.names, self.options)]
+        groups = groups_of_methods(self.names, self.options, config.motion)
+        self.groups = [[each.method for each in group] for group in groups]
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -84,6 +85,7 @@ class ModelSource:
         settings = {"model": self.model.identity.to_json(), "mode": self._fitter.mode, "size": self._fitter.size}
         settings |= {"model_note": self.model.note} if self.model.note else {}
         settings |= {name: value for name, value in self.options.to_json().items() if name != "method"}
+        settings["mask_pairs"] = self.options.resolved(self.model.config.motion).mask_pairs
         if self.fusion is not None:
             from vggtjax.method.fusion_file import fusion_digest
 

@@ -218,7 +218,7 @@ def _all_passes(
     size = model.config.image_size if size is None else size
     options = options if isinstance(options, Options) else Options(**(options or {}))
     options = options.changed(method=METHOD, align_scale=False, refine_mask=False)
-    common = {"model": model.identity.sha256, "size": size, "options": options.passes_settings}
+    common = {"model": model.identity.sha256, "size": size, "options": options.passes_settings(model.config.motion)}
 
     def passes(clip: _LabelledClip) -> ClipPasses:
         frames = load_clip(clip.pictures(), size=size, patch=model.config.patch_size)

@@ -44,9 +44,13 @@ class SoftReconstruction(NamedTuple):
 
 
 def soft_masking(
-    config: VGGTConfig, *, temperature: float = 0.0, mask_pairs: int = 5, motion: MotionConfig | None = None
+    config: VGGTConfig, *, temperature: float = 0.0, mask_pairs: int | None = None, motion: MotionConfig | None = None
 ) -> SoftMasking:
-    """Return the paper's values: Otsu's threshold, suppression in the first pairs, the plain product of cues."""
+    """Return the paper's values: Otsu's threshold, suppression in the first pairs, the plain product of cues.
+
+    `mask_pairs` is the number of pairs; the configuration's own if None.
+    """
+    mask_pairs = config.motion.mask_pairs if mask_pairs is None else mask_pairs
     return SoftMasking(
         jnp.zeros(()),
         jnp.asarray(temperature, float),

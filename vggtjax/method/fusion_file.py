@@ -75,7 +75,12 @@ def check_fuses(fusion: FusionParams | None, *methods: str) -> None:
 def origin_of_fit(model: Model, options: Options) -> dict[str, Any]:
     """Return what a fit depends on that `warn_if_fitted_otherwise` compares, as JSON values."""
     digests = {"model_sha256": model.identity.sha256, "weights_sha256": _weights_digest(model)}
-    return {"model": model.name, **digests, **options.passes_settings, "align_scale": options.align_scale}
+    return {
+        "model": model.name,
+        **digests,
+        **options.passes_settings(model.config.motion),
+        "align_scale": options.align_scale,
+    }
 
 
 def warn_if_fitted_otherwise(path: Path, model: Model, options: Options) -> None:
@@ -85,7 +90,7 @@ def warn_if_fitted_otherwise(path: Path, model: Model, options: Options) -> None
     has neither, models are compared by name; a path is not compared.
     """
     _, about = _read(path)
-    settings: dict[str, Any] = options.passes_settings | {"align_scale": options.align_scale}
+    settings: dict[str, Any] = options.passes_settings(model.config.motion) | {"align_scale": options.align_scale}
     digest, fitted = about.get("model_sha256"), str(about.get("model"))
     if isinstance(digest, str):
         digests = (digest, about.get("weights_sha256"))

@@ -52,7 +52,7 @@ class Compute:
     @classmethod
     def of(cls, options: Options, frames: Frames = Frames()) -> Compute:
         """Return how the network is computed by options, with the platform's values in place of None."""
-        options = options.resolved()
+        options = options.computed()
         return cls(str(options.compute_dtype), str(options.precision), attention=options.attention, frames=frames)
 
 

@@ -111,7 +111,7 @@ def write_artefact(
         OutputError: the folder exists or cannot be written.
     """
     out, on_stage = Path(out), on_stage or no_stage
-    options = options.changed(**changes).resolved(on_accelerator="cpu" not in platforms)
+    options = options.changed(**changes).resolved(model.config.motion, on_accelerator="cpu" not in platforms)
     check_artefact(out, frames, height, width, platforms, options)
     check_fuses(fusion, options.method)
     patch = model.config.patch_size

@@ -58,7 +58,7 @@ class ClipWork:
             "size": self._fitter.size,
             **dataclasses.asdict(recipe.sampling),
             "stride": recipe.sampling.step,
-            **recipe.options.resolved().to_json(),
+            **recipe.options.resolved(self._model.config.motion).to_json(),
             **dataclasses.asdict(recipe.saving),
             "only": None if recipe.saving.only is None else list(recipe.saving.only),
             "fusion": fusion_digest(self._fusion),

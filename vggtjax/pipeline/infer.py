@@ -46,7 +46,7 @@ def infer(
     """
     config = config if motion is None else dataclasses.replace(config, motion=motion)
     # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.
-    options = dataclasses.replace(options.changed(**changes).resolved(), refine_mask=False)
+    options = dataclasses.replace(options.changed(**changes).resolved(config.motion), refine_mask=False)
     if mesh is None:
         return _infer(params, images, config, options, images.shape[1], None)
     frames = images.shape[1]

@@ -94,7 +94,7 @@ def reconstruct(
         DeviceMemoryError: the clip does not fit in the memory of the device.
         MissingExtraError: cameras are to be refined, and pycolmap is not installed.
     """
-    options = options.changed(**changes).resolved()
+    options = options.changed(**changes).resolved(model.config.motion)
     on_stage = on_stage or no_stage
     mesh = frames_mesh(devices)
     if mesh is not None and tracks is not None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
+from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
@@ -49,7 +50,7 @@ def reconstruct_methods(
     if options.refine_cameras:
         raise InputError("refine_cameras is for one method; reconstruct with each method by itself")
     results: dict[str, Reconstruction] = {}
-    for group in groups_of_methods(methods, options):
+    for group in groups_of_methods(methods, options, model.config.motion):
         shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(refine_mask=False)
         result = reconstruct(model, clip, options=shared, size=size, keep_passes=True, on_stage=on_stage)
         for each in group:
@@ -57,12 +58,12 @@ def reconstruct_methods(
     return {name: results[name] for name in methods}
 
 
-def groups_of_methods(methods: Sequence[str], options: Options) -> list[list[Options]]:
+def groups_of_methods(methods: Sequence[str], options: Options, motion: MotionConfig) -> list[list[Options]]:
     """Return the options of each method, in groups with equal passes."""
     groups: dict[tuple, list[Options]] = {}
     for name in methods:
         each = options.changed(method=name)
-        groups.setdefault(tuple(each.passes_settings.items()), []).append(each)
+        groups.setdefault(tuple(each.passes_settings(motion).items()), []).append(each)
     return list(groups.values())
 
 

@@ -128,7 +128,8 @@ for _kind in (ClipBatch, Predictions, Passes, Cameras, Assembly, Tracks, Quantis
 class Stages:
     """The stages for clips of one shape, which may be padded beyond `frames`.
 
-    Each stage reads only the options that it needs: changing an option recompiles only the stages that read it.
+    Each stage reads only the options that it needs: changing an option recompiles only the stages that read it. The
+    values of the method, the model and the platform take the place of options that are None.
     """
 
     config: VGGTConfig
@@ -138,6 +139,9 @@ class Stages:
     run: Callable[..., Any] = field(default_factory=Execute)  # Execute, Compile or inline
     mesh: Mesh | None = None  # of the devices that share the frames
     padded: int | None = None  # frames with those of `ClipInputs.frame_count`, without those that make shares equal
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "options", self.options.resolved(self.config.motion))
 
     @property
     def _passes(self) -> dict[str, Any]:

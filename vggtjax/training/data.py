@@ -31,7 +31,7 @@ def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> Bat
         order = jax.random.permutation(shuffle_key, frames)
         order = jnp.where(jax.random.uniform(coin_key) < IN_ORDER, jnp.arange(frames), order)
         clip = jax.tree.map(lambda leaf: leaf[order], clip)
-        clip = clip._replace(images=_recolour(colour_key, clip.images))
+        clip = clip._replace(images=_recolour(colour_key, clip.images, phase.gamma))
         if not phase.suppressed:
             return clip, None
         region_key, coin_key = jax.random.split(jax.random.fold_in(key, _SUPPRESSION))
@@ -45,11 +45,14 @@ def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> Bat
     return Batch(clips, regions, jnp.broadcast_to(pairs, (phase.batch,)), phase.suppress)
 
 
-def _recolour(key: Array, images: Array) -> Array:
-    """Return images with another gain per channel and gamma, or grey; the same for all frames of a clip."""
+def _recolour(key: Array, images: Array, width: float) -> Array:
+    """Return images with another gain per channel and gamma, or grey; the same for all frames of a clip.
+
+    The logarithm of gamma is uniform in [-width / 2, width / 2].
+    """
     draw = jax.random.uniform(key, (5,))
     grey = images.mean(axis=-1, keepdims=True)
     images = jnp.where(draw[0] < GREY, grey, images)
-    gamma = jnp.exp(0.5 * (draw[1] - 0.5))
+    gamma = jnp.exp(width * (draw[1] - 0.5))
     gain = jnp.exp(0.3 * (draw[2:] - 0.5))
     return jnp.clip(jnp.maximum(images, 1e-4) ** gamma * gain[None, None, None], 0, 1)

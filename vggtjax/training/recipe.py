@@ -30,6 +30,7 @@ from vggtjax.training.objective import LossWeights
 _MOST_FILE_BYTES = 1 << 20
 Decay = Annotated[float, Meta(ge=0, lt=1)]
 Seed = Annotated[int, Meta(ge=0, lt=2**31)]
+Gamma = Annotated[float, Meta(ge=0, le=4)]
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class Phase:
     motion: tuple[float, float] = (0.1, 1.0)  # range of the camera's share of its largest path
     suppressed: Share = 0.0  # share of clips in which the keys of random regions are suppressed, whatever moves
     suppress: Suppress = "zero"  # how; in the first pairs of blocks, their number drawn for each step
+    gamma: Gamma = 0.5  # width of the range around 0 from which the logarithm of a clip's gamma is drawn
 
     def __post_init__(self) -> None:
         check_fields(self, "phase")

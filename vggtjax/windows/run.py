@@ -106,7 +106,7 @@ def reconstruct_long(
         OutputError: the folder cannot be written, or another run is writing it.
         DeviceMemoryError: a window does not fit in the memory of the device.
     """
-    options = options.changed(**changes).resolved()
+    options = options.changed(**changes).resolved(model.config.motion)
     check_fuses(fusion, options.method)
     if long_run is not None and isinstance(long_run.tracks, str):
         check_words(long_run.tracks)
@@ -137,7 +137,7 @@ def tools_of(
     masks: str | Path | bool | None = None,
 ) -> Tools:
     """Return what runs a window by `reconstruct`, and describes frames by the means of their patch tokens."""
-    config, options = model.config, options.resolved()
+    config, options = model.config, options.resolved(model.config.motion)
 
     def run(clip: Clip) -> Reconstruction:
         moving = None

@@ -1,0 +1,82 @@
+"""The number of pairs in which keys are suppressed: chosen by errors of cameras, kept in the model, used by default."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.tiny import tiny_config
+from vggtjax import Model, MotionConfig, init_params, load_model, reconstruct
+from vggtjax.calibration.pairs import CameraErrors, PairsChoice, check_pairs, choose_pairs
+from vggtjax.checkpoint import save_model
+from vggtjax.commands.calibrate_cues import calibrate_cues, generated_clips
+from vggtjax.config import VGGTConfig
+from vggtjax.errors import InputError
+from vggtjax.evaluation.ladder import ladder
+
+FRAMES, SIZE, SCENES = 4, 28, 3
+
+
+@pytest.fixture(scope="module")
+def model():
+    config = tiny_config(motion=MotionConfig(offsets=(-1, 1)))
+    return Model(config, init_params(0, config), "tiny")
+
+
+def _errors(row):
+    return [np.nan if value is None else value for value in (row.rotation_error, row.centre_error_ratio)]
+
+
+def test_the_smallest_sum_of_shares_of_the_first_pass():
+    first, better, worse = CameraErrors(4.0, 0.02), CameraErrors(3.0, 0.022), CameraErrors(2.9, 0.03)
+    assert PairsChoice(8, {0: first, 1: worse, 3: better}).best == 3  # 0.75 + 1.1 against 0.725 + 1.5
+    assert PairsChoice(8, {0: first, 5: worse, 8: worse}).best == 5  # the smaller of equal ones, and never 0
+
+
+def test_errors_are_those_of_the_second_pass(model):
+    clips = list(generated_clips(SCENES, FRAMES, SIZE, seed=1))
+    found = choose_pairs(model, clips, [2, 1])
+    assert list(found.errors) == [0, 1, 2]
+    for pairs in (1, 2):
+        settings = {"methods": ["vggt", "4dvggt-d"], "masks": ["mined"], "mask_pairs": [pairs]}
+        rows = [[_errors(row) for row in ladder(model, clip, **settings)] for clip in clips]
+        scored = [each for each in rows if np.isfinite(each).all()]
+        assert found.scenes == len(scored) > 0
+        np.testing.assert_allclose([found.errors[0], found.errors[pairs]], np.mean(scored, axis=0), rtol=1e-4)
+
+
+@pytest.mark.parametrize(("pairs", "found"), [([], r"\[\]"), ([3, 0], "is 0"), ([5], r"\[5\]; .* from 1 to 4")])
+def test_numbers_that_a_model_does_not_have(model, pairs, found):
+    with pytest.raises(InputError, match=found):
+        check_pairs(pairs, model.config.depth)
+
+
+def test_a_model_recommends_its_number(model, tmp_path):
+    config = tiny_config(motion=MotionConfig(offsets=(-1, 1), mask_pairs=1))
+    assert "mask_pairs" not in json.loads(model.config.to_json())["motion"]
+    assert VGGTConfig.from_json(config.to_json()) == config
+    path = save_model(tmp_path / "one.safetensors", model.params, config)
+    clip = np.asarray(next(generated_clips(1, FRAMES, SIZE, seed=0)).images)
+    masks = np.zeros(clip.shape[:3], bool)
+    masks[:, :14] = True
+    made, one, five = (
+        reconstruct(load_model(path), clip, mask_pairs=pairs, masks=masks, size=SIZE) for pairs in (None, 1, 5)
+    )
+    assert made.settings["mask_pairs"] == one.settings["mask_pairs"] == 1
+    assert np.array_equal(made.camera_from_world, one.camera_from_world)
+    assert not np.array_equal(made.camera_from_world, five.camera_from_world)
+
+
+def test_the_command(model, tmp_path, capsys):
+    path = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
+    out = tmp_path / "out"
+    calibrate_cues(str(path), out, scenes=SCENES, frames=FRAMES, size=SIZE, max_terms=1, mask_pairs=(1, 2))
+    told = json.loads((out / "calibration.json").read_text())["mask_pairs"]
+    assert [row["pairs"] for row in told["errors"]] == [0, 1, 2]
+    motion = load_model(out / "model.safetensors").config.motion
+    assert motion.mask_pairs == told["recommended"]
+    assert len(motion.cues) == 1
+    assert "recommended" in capsys.readouterr().out
+    with pytest.raises(InputError, match="mask_pairs is"):
+        calibrate_cues(str(path), tmp_path / "other", mask_pairs=(9,))
+    assert not (tmp_path / "other").exists()

@@ -1,0 +1,90 @@
+"""In how many pairs of blocks the second pass should suppress keys: tried on scenes, with the masks that users get."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from vggtjax.checkpoint import Model
+from vggtjax.config import Gram
+from vggtjax.errors import InputError, whole_number
+from vggtjax.evaluation.ladder import ClipTruth, LadderRow, ladder
+from vggtjax.progress import Progress, no_progress
+
+
+class CameraErrors(NamedTuple):
+    """Means over scenes."""
+
+    rotation: float  # degrees
+    centres: float  # median depths
+
+
+class PairsChoice(NamedTuple):
+    """Errors of the cameras by the number of pairs; 0 is the first pass."""
+
+    scenes: int  # whose cameras could be scored
+    errors: dict[int, CameraErrors]
+
+    @property
+    def best(self) -> int:
+        """The number of at least 1 whose errors, over those of the first pass, have the smallest sum."""
+        first = self.errors[0]
+
+        def loss(pairs: int) -> float:
+            return sum(error / max(plain, 1e-12) for error, plain in zip(self.errors[pairs], first, strict=True))
+
+        return min((pairs for pairs in self.errors if pairs), key=lambda pairs: (loss(pairs), pairs))
+
+
+def check_pairs(pairs: Sequence[int], depth: int) -> tuple[int, ...]:
+    """Return the different numbers in order. Raises InputError for none, and for those outside [1, `depth`]."""
+    numbers = tuple(sorted({whole_number("mask_pairs", number, 1) for number in pairs}))
+    if not numbers or numbers[-1] > depth:
+        raise InputError(f"mask_pairs is {list(pairs)}; expected numbers from 1 to {depth}, the pairs of the model")
+    return numbers
+
+
+def choose_pairs(
+    model: Model,
+    clips: Iterable[ClipTruth],
+    pairs: Sequence[int],
+    *,
+    gram: Gram = "cosine",
+    progress: Progress | None = None,
+    total: int | None = None,
+) -> PairsChoice:
+    """Measure the cameras of the second pass, with mined masks, for some numbers of pairs.
+
+    Args:
+        model: the network, with the cues that its masks are mined by.
+        clips: dynamic clips with exact truth, one at a time.
+        pairs: numbers of pairs from 1 to the model's depth.
+        gram: similarity of the cues.
+        progress: called with the number of clips done and `total`.
+
+    Raises:
+        InputError: an invalid number, or no clip whose cameras can be scored.
+    """
+    numbers = check_pairs(pairs, model.config.depth)
+    scenes = []
+    for done, clip in enumerate(clips, 1):
+        methods = ("vggt", "pose-decoupling")
+        rows = ladder(model, clip, methods=methods, masks=["mined"], mask_pairs=numbers, gram=gram, batch_size=1)
+        errors = {row.mask_pairs or 0: _errors(row) for row in rows}
+        scenes.append(np.array([errors[number] for number in (0, *numbers)]))
+        (progress or no_progress)(done, total)
+    scored = [scene for scene in scenes if np.isfinite(scene).all()]
+    if not scored:
+        raise InputError(f"none of {len(scenes)} clips has cameras that can be scored; use clips with moving cameras")
+    means = np.mean(scored, axis=0)
+    return PairsChoice(
+        len(scored), {n: CameraErrors(*map(float, row)) for n, row in zip((0, *numbers), means, strict=True)}
+    )
+
+
+def _errors(row: LadderRow) -> CameraErrors:
+    """Return the errors of a row; NaN where there is none."""
+    rotation, centres = row.rotation_error, row.centre_error_ratio
+    return CameraErrors(np.nan if rotation is None else rotation, np.nan if centres is None else centres)
