@@ -62,7 +62,7 @@ axes.legend(frameon=False, ncols=4)
 # Give the second pass the true mask instead of the mined one. `run_passes` mines its own; `reconstruct` takes masks.
 
 # %%
-given = vggtjax.reconstruct(model, truth.images, size=64, masks=truth.dynamic_mask)
+given = vggtjax.reconstruct(model, truth.images, masks=truth.dynamic_mask)
 print("4dvggt-d with the mined mask:", round(scores["4dvggt-d"][0], 3))
 print("4dvggt-d with the true mask: ", round(abs_rel(given.depth, regions["all"]), 3))
 
