@@ -28,10 +28,10 @@ MOST_CLIP_BYTES = 1 << 20
 def embed(model: str, /, *, frames: int = 16, scenes: int = 45, image_size: int | None = None) -> None:
     """Write the model, in bfloat16, and a held-out dynamic clip into the package.
 
-    The clip is a typical one of `scenes`. Scenes are ranked by the rotation error and by the centres' error of the first
-    pass, and the middle third by the sum of ranks is kept. These are ranked by how the second pass, with mined masks,
-    changes the two errors, and the one with the median sum of ranks is taken. So the demo shows neither the best nor
-    the worst of the model and of the method.
+    The clip is a typical one of `scenes`. Scenes are ranked by the rotation error and by the centres' error of the
+    first pass, and the middle third by the sum of ranks is kept. These are ranked by how the second pass, with mined
+    masks, changes the two errors, and the one with the median sum of ranks is taken. So the demo shows neither the best
+    nor the worst of the model and of the method.
 
     Args:
         model: a .safetensors written by `vggtjax train` or `vggtjax calibrate-cues`.
