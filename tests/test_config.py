@@ -43,6 +43,7 @@ def test_json_round_trip(config):
         ({"embed_dim": 10**12}, "at most 1000000"),
         ({"motion": {"offsets": (0,)}}, "offsets other than 0"),
         ({"motion": {"cues": []}}, "cues is .*at least 1 values"),
+        ({"motion": {"mask_pairs": 10**12}}, "mask_pairs is 1000000000000; expected a whole number .* at most 1000000"),
         ({"motion": {"floor": 1.5}}, "floor is 1.5; expected a number of at least 0 and at most 1"),
     ],
 )

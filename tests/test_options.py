@@ -21,6 +21,7 @@ MOTION = MotionConfig()
         ({"gram": "sine"}, "gram is 'sine'; expected one of"),
         ({"mask_pairs": -1}, "mask_pairs is -1; expected a whole number of at least 0"),
         ({"mask_pairs": 2.5}, "mask_pairs is 2.5"),
+        ({"mask_pairs": 10**12}, "mask_pairs is 1000000000000; expected at most 1000000"),
         ({"smooth_frames": 2}, "smooth_frames is 2; expected an odd number"),
         ({"compute_dtype": "float16"}, "compute_dtype is 'float16'"),
         ({"align_scale": 1}, "align_scale is 1"),

@@ -12,8 +12,8 @@ from msgspec import Meta
 from vggtjax.errors import InputError
 from vggtjax.storage.json_values import Count, Natural, Share, check_fields, parse_json
 
-_LARGEST = 1_000_000  # size of one part of a network
-Size = Annotated[int, Meta(ge=1, le=_LARGEST)]
+LARGEST = 1_000_000  # size of one part of a network
+Size = Annotated[int, Meta(ge=1, le=LARGEST)]
 Gram = Literal["cosine", "dot"]
 Suppress = Literal["zero", "drop"]
 HEAD_NAMES = ("camera", "depth", "points", "tracks")
@@ -60,7 +60,7 @@ class MotionConfig:
     offsets: Annotated[tuple[int, ...], Meta(min_length=1)] = (-6, -4, -2, 2, 4, 6)
     reference_depth: Count = 24
     floor: Share = 0.0
-    mask_pairs: Natural = 5
+    mask_pairs: Annotated[int, Meta(ge=0, le=LARGEST)] = 5
 
     def __post_init__(self) -> None:
         check_fields(self, "motion")
@@ -108,7 +108,7 @@ class VGGTConfig:
     track_features: Size = 128
     track_hidden: Size = 384
     track_corr_levels: Size = 7
-    track_corr_radius: Annotated[int, Meta(ge=0, le=_LARGEST)] = 4
+    track_corr_radius: Annotated[int, Meta(ge=0, le=LARGEST)] = 4
     track_position_embedding: bool = False
     heads: tuple[str, ...] = HEAD_NAMES  # of the model; a conversion can omit some
     motion: MotionConfig = field(default_factory=MotionConfig)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from vggtjax.config import Gram, MotionConfig, Suppress
+from vggtjax.config import LARGEST, Gram, MotionConfig, Suppress
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields
@@ -139,6 +139,8 @@ class Options:
         find_method(self.method)
         if self.mask_pairs is not None:
             object.__setattr__(self, "mask_pairs", whole_number("mask_pairs", self.mask_pairs, 0))
+            if self.mask_pairs > LARGEST:
+                raise InputError(f"mask_pairs is {self.mask_pairs}; expected at most {LARGEST}")
         object.__setattr__(self, "smooth_frames", odd_frames(self.smooth_frames))
         check_fields(self)
 
