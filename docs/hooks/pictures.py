@@ -24,7 +24,7 @@ logger = logging.getLogger("mkdocs.hooks.pictures")
 
 FOLDER = Path(__file__).resolve().parents[1] / "pictures" / "made"
 SCENES, SCENE_SEED = 4, 200  # of the gallery: the first of the seed, whatever came out
-SCENE_FRAMES, SCENE_SIDE = 12, 64
+SCENE_FRAMES, SCENE_SIDE = 12, 96
 _TURNTABLE: dict[str, Any] = {"seconds": 5.0, "fps": 10.0, "size": (480, 300)}
 _BACKGROUND, _TEXT, _FAINT = "#14141a", "#ececf0", "#9696a0"
 _FIRST, _SECOND, _FUSED, _TRUE = "#6db7ff", "#ff9a4a", "#7ddc8b", "#f5f5f5"
