@@ -38,10 +38,10 @@ def test_facts_as_json(cache, capsys):
     assert found["cache"] == {"folder": str(cache), "bytes": 16, "parts": dict.fromkeys(cache_parts(), 4)}
     assert found["devices"][0]["platform"] == "cpu"
     clip = {clip["model"]: clip for clip in found["clips"]}["demo"]
-    assert (clip["width"], clip["height"]) == (64, 32)
+    assert (clip["width"], clip["height"]) == (96, 56)
     if clip["frames"] is not None:  # the system tells its memory
         free = min(room["bytes"] for room in found["memory"]["room"])
-        frames = memory.most_frames(demo_model(), 32, 64, free)
+        frames = memory.most_frames(demo_model(), 56, 96, free)
         assert clip["frames"] == pytest.approx(frames, rel=0.3)  # the process has changed since
 
 

@@ -24,11 +24,13 @@ from vggtjax.storage.free_memory import Room, in_gigabytes
 from vggtjax.windows.plan import Windows
 from vggtjax.windows.store import FOLDER, write_cut
 
+SIDE = 96  # of the embedded model's frames
+
 
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory):
     folder = tmp_path_factory.mktemp("frames")
-    for number, value in enumerate(np.random.default_rng(0).integers(0, 255, (7, 64, 64, 3), np.uint8)):
+    for number, value in enumerate(np.random.default_rng(0).integers(0, 255, (7, SIDE, SIDE, 3), np.uint8)):
         Image.fromarray(value).save(folder / f"{number}.png")
     return folder
 
@@ -64,7 +66,7 @@ def test_points_outside_the_frames_end_a_windowed_run_before_the_work(frames, tm
 
 def free_for(monkeypatch, count, clips=1, *, hard=False):
     """Make up the free memory: what so many frames need, and one byte; nothing is known for None."""
-    needed = 0 if count is None else memory.predicted_bytes(load_model("demo"), count, 64, 64, clips=clips) + 1
+    needed = 0 if count is None else memory.predicted_bytes(load_model("demo"), count, SIDE, SIDE, clips=clips) + 1
     monkeypatch.setattr(memory, "available", lambda _: None if count is None else Room(needed, "of a test", hard))
     return needed
 
@@ -85,7 +87,7 @@ def fail_once(monkeypatch):
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory):
-    return write_video(tmp_path_factory.mktemp("video") / "clip.mp4", range(0, 1600, 100), size=(64, 64))
+    return write_video(tmp_path_factory.mktemp("video") / "clip.mp4", range(0, 1600, 100), size=(SIDE, SIDE))
 
 
 _WORDS = ["--model", "demo", "--method", "vggt", "--only", "cameras", "--no-loops"]
@@ -103,7 +105,7 @@ def test_a_video_that_does_not_fit_in_memory_is_run_in_windows(video, in_windows
     free = free_for(monkeypatch, 10)
     assert cli.main(["reconstruct", str(video), *_WORDS, "--out", str(tmp_path / "cut")]) == 0
     said = " ".join(capsys.readouterr().err.split())
-    needed = memory.predicted_bytes(load_model("demo"), 16, 64, 64)
+    needed = memory.predicted_bytes(load_model("demo"), 16, SIDE, SIDE)
     sizes = f"16 frames need about {in_gigabytes(needed)}, {in_gigabytes(free)} are free of a test"
     assert f"{sizes}: running windows of 8 frames, overlap 2; --window 0 runs all together" in said
     cut = Reconstruction.load(tmp_path / "cut")
@@ -118,7 +120,7 @@ def test_a_run_without_memory_is_run_once_more_in_windows(video, in_windows, tmp
     words = ["reconstruct", str(video), *_WORDS, "--window", "0", "--no-memory-check"]
     assert cli.main([*words, "--out", str(tmp_path / "out")]) == 0
     said = " ".join(capsys.readouterr().err.split())
-    assert "16 frames of 64 x 64 pixels do not fit in the memory of the device" in said
+    assert f"16 frames of {SIDE} x {SIDE} pixels do not fit in the memory of the device" in said
     assert "running once more, in windows of 8 frames" in said
     assert len(calls) > 1
     assert np.array_equal(Reconstruction.load(tmp_path / "out").depth, in_windows.depth)
@@ -154,7 +156,7 @@ def test_a_clip_that_cannot_fit_is_refused_before_the_work(frames, tmp_path, cap
     words = ["reconstruct", str(frames), "--model", "demo", "--out", str(tmp_path / "out")]
     assert cli.main([*words, "--window", "0"]) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert "GB are free of a test; what fits: --max-frames 5, or --size 48, or weights of half the size" in said
+    assert "GB are free of a test; what fits: --max-frames 5, or --size 80, or weights of half the size" in said
     assert said.endswith("(--no-memory-check runs it all the same)")
     assert not (tmp_path / "out").exists()
 
@@ -178,7 +180,7 @@ def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, mon
             frames=str(frames),
             source=open_source(str(frames)),
             sampling=Sampling(),
-            fitter=Fitter(size=64, patch=8),
+            fitter=Fitter(size=SIDE, patch=8),
             model=model,
             fusion=None,
             options=Options(**options),
@@ -206,10 +208,10 @@ def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, mon
     with pytest.raises(DeviceMemoryError, match="what fits: --max-frames 3"):
         with_room(3, window=4)
     monkeypatch.setattr("jax.local_device_count", lambda: 2)  # a split CPU, whose devices share one memory
-    with pytest.raises(DeviceMemoryError, match=r"7 frames need about 0\.61 GB"):
+    with pytest.raises(DeviceMemoryError, match=r"7 frames need about 0\.63 GB"):
         with_room(6, devices=2)
     assert with_room(100, devices=2) == (Windows(), None)
-    assert memory.most_frames(model, 64, 64, memory.predicted_bytes(model, 100, 64, 64)) == 100
+    assert memory.most_frames(model, SIDE, SIDE, memory.predicted_bytes(model, 100, SIDE, SIDE)) == 100
     (tmp_path / FOLDER).mkdir()
     write_cut(tmp_path, 4, 2)  # of a run that was stopped
     assert with_room(7) == (Windows(4, 2), 7)
