@@ -4,6 +4,7 @@ from functools import partial
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -166,3 +167,15 @@ def test_the_recipe_for_a_gpu_fits_the_wheel_and_takes_a_step():
     metrics, gradient = jax.eval_shape(step, state.trained, batch)
     assert metrics["loss"].shape == ()
     assert jax.tree.structure(gradient) == jax.tree.structure(state.ema)
+
+
+def test_gamma_makes_clips_darker_and_brighter():
+    textures, phase = load_textures("training"), Phase(1, 8, (2,), 28, 28)
+
+    def spread(gamma: float) -> float:
+        batch = make_batch(jax.random.key(0), textures, dataclasses.replace(phase, gamma=gamma), 2)
+        return float(np.log(batch.clips.images.mean(axis=(1, 2, 3, 4))).std())
+
+    assert spread(4.0) > 1.5 * spread(0.0)
+    with pytest.raises(InputError, match="gamma is 5"):
+        dataclasses.replace(phase, gamma=5)
