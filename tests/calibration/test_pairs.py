@@ -74,6 +74,10 @@ def test_the_command(model, tmp_path, capsys):
     told = json.loads((out / "calibration.json").read_text())["mask_pairs"]
     assert [row["pairs"] for row in told["errors"]] == [0, 1, 2]
     motion = load_model(out / "model.safetensors").config.motion
+    assert json.loads((out / "calibration.json").read_text())["choice"]["motion"]["mask_pairs"] == motion.mask_pairs
+    again = tmp_path / "again"  # without numbers to try, the model keeps its own
+    calibrate_cues(str(out / "model.safetensors"), again, scenes=SCENES, frames=FRAMES, size=SIZE, max_terms=1)
+    assert load_model(again / "model.safetensors").config.motion.mask_pairs == motion.mask_pairs != 5
     assert motion.mask_pairs == told["recommended"]
     assert len(motion.cues) == 1
     assert "recommended" in capsys.readouterr().out

@@ -56,6 +56,7 @@ def save_calibration(
     check_folder(folder)
     auc = sweep.auc()
     config = calibrated(model, choice, pairs).config
+    choice = choice._replace(motion=config.motion)
     numbers = calibration_numbers(model, sweep, choice, auc) | {"source": dict(source or {})}
     if pairs is not None:
         numbers["mask_pairs"] = _pairs(pairs)

@@ -142,7 +142,7 @@ def sweep(
         DeviceMemoryError: a clip does not fit in the device's memory.
     """
     default = MotionConfig()
-    table = dataclasses.replace(default, offsets=config.motion.offsets)
+    table = dataclasses.replace(default, offsets=config.motion.offsets, mask_pairs=config.motion.mask_pairs)
     cues = SweepCues(table, config.depth)
     maps, saliencies, truths, first_shape = [], [], [], None
     for done, (images, mask) in enumerate(clips, 1):

@@ -50,7 +50,7 @@ def soft_masking(
 
     `mask_pairs` is the number of pairs; the configuration's own if None.
     """
-    mask_pairs = config.motion.mask_pairs if mask_pairs is None else mask_pairs
+    mask_pairs = (motion or config.motion).mask_pairs if mask_pairs is None else mask_pairs
     return SoftMasking(
         jnp.zeros(()),
         jnp.asarray(temperature, float),

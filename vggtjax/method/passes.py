@@ -268,7 +268,7 @@ def run_passes(
         changes: fields of `options` by name, such as `gram="dot"`; `mask_pairs` can be traced.
     """
     mask_pairs: Any = changes.pop("mask_pairs", options.mask_pairs)  # not in the options: the number can be traced
-    mask_pairs = config.motion.mask_pairs if mask_pairs is None else mask_pairs
+    mask_pairs = (motion or config.motion).mask_pairs if mask_pairs is None else mask_pairs
     options = options.changed(**changes)
     method, compute = options.row, Compute.of(options)
     if second is None:
