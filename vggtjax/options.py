@@ -166,8 +166,8 @@ class Options:
         `motion` is the model's. `on_accelerator` is as for `computed`.
         """
         row = self.row
-        pairs = motion.mask_pairs if self.mask_pairs is None else self.mask_pairs
-        values = {"gram": row.gram, "suppress": row.suppress, "refine_mask": row.refine, "mask_pairs": pairs}
+        values = {"gram": row.gram, "suppress": row.suppress, "refine_mask": row.refine}
+        values["mask_pairs"] = motion.pairs(self.mask_pairs)
         return dataclasses.replace(self.computed(on_accelerator), **values)
 
     def computed(self, on_accelerator: bool | None = None) -> Options:

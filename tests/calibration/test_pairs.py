@@ -13,6 +13,9 @@ from vggtjax.commands.calibrate_cues import calibrate_cues, generated_clips
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
+from vggtjax.evaluation.sources import ModelSource
+from vggtjax.learning.soft import soft_masking
+from vggtjax.options import Options
 
 FRAMES, SIZE, SCENES = 4, 28, 3
 
@@ -33,12 +36,14 @@ def test_the_smallest_sum_of_shares_of_the_first_pass():
     assert PairsChoice(8, {0: first, 5: worse, 8: worse}).best == 5  # the smaller of equal ones, and never 0
 
 
-def test_errors_are_those_of_the_second_pass(model):
+@pytest.mark.parametrize(("gram", "suppress"), [("cosine", "zero"), ("dot", "drop")])
+def test_errors_are_those_of_the_second_pass(model, gram, suppress):
     clips = list(generated_clips(SCENES, FRAMES, SIZE, seed=1))
-    found = choose_pairs(model, clips, [2, 1])
+    found = choose_pairs(model, clips, [2, 1], gram=gram)
     assert list(found.errors) == [0, 1, 2]
     for pairs in (1, 2):
-        settings = {"methods": ["vggt", "4dvggt-d"], "masks": ["mined"], "mask_pairs": [pairs]}
+        settings = {"methods": ["vggt", "4dvggt-d"], "masks": ["mined"], "mask_pairs": [pairs], "gram": gram}
+        settings["suppress"] = [suppress]
         rows = [[_errors(row) for row in ladder(model, clip, **settings)] for clip in clips]
         scored = [each for each in rows if np.isfinite(each).all()]
         assert found.scenes == len(scored) > 0
@@ -59,9 +64,15 @@ def test_a_model_recommends_its_number(model, tmp_path):
     clip = np.asarray(next(generated_clips(1, FRAMES, SIZE, seed=0)).images)
     masks = np.zeros(clip.shape[:3], bool)
     masks[:, :14] = True
-    made, one, five = (
-        reconstruct(load_model(path), clip, mask_pairs=pairs, masks=masks, size=SIZE) for pairs in (None, 1, 5)
-    )
+    loaded = load_model(path)
+    made, one, five = (reconstruct(loaded, clip, mask_pairs=pairs, masks=masks, size=SIZE) for pairs in (None, 1, 5))
+    assert ModelSource(loaded, ["4dvggt-d"]).settings["mask_pairs"] == 1
+    assert ModelSource(loaded, ["4dvggt-d"], Options(mask_pairs=3)).settings["mask_pairs"] == 3
+    assert soft_masking(config).strength.sum() == 1
+    assert soft_masking(model.config).strength.sum() == 4
+    assert soft_masking(model.config, motion=config.motion).strength.sum() == 1
+    rows = ladder(loaded, next(generated_clips(1, FRAMES, SIZE, seed=0)), methods=["4dvggt-d"])
+    assert {row.mask_pairs for row in rows} == {1}
     assert made.settings["mask_pairs"] == one.settings["mask_pairs"] == 1
     assert np.array_equal(made.camera_from_world, one.camera_from_world)
     assert not np.array_equal(made.camera_from_world, five.camera_from_world)
@@ -83,4 +94,7 @@ def test_the_command(model, tmp_path, capsys):
     assert "recommended" in capsys.readouterr().out
     with pytest.raises(InputError, match="mask_pairs is"):
         calibrate_cues(str(path), tmp_path / "other", mask_pairs=(9,))
+    for invalid in ((), (0, 3)):  # refused before the model is looked for
+        with pytest.raises(InputError, match=r"mask_pairs (is 0|has no value)"):
+            calibrate_cues("nowhere.safetensors", tmp_path / "other", mask_pairs=invalid)
     assert not (tmp_path / "other").exists()

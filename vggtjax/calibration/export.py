@@ -1,10 +1,10 @@
-"""Write a calibration as files.
+"""Write a calibration, of cues and perhaps of the number of pairs, as files.
 
 In the folder:
 
-    model.safetensors       the model with the chosen table in its configuration, for load_model
+    model.safetensors       the model with the chosen table, and number of pairs, in its configuration, for load_model
     sweep.png               the quality of each pair's maps; chosen maps are outlined
-    calibration.json        the numbers: sweep, choice, clips; written last, when the other files are complete
+    calibration.json        the numbers: sweep, choice, pairs, clips; written last, when the other files are complete
 """
 
 from __future__ import annotations

@@ -11,6 +11,7 @@ from vggtjax.checkpoint import Model
 from vggtjax.config import Gram
 from vggtjax.errors import InputError, whole_number
 from vggtjax.evaluation.ladder import ClipTruth, LadderRow, ladder
+from vggtjax.options import METHODS
 from vggtjax.progress import Progress, no_progress
 
 
@@ -61,17 +62,26 @@ def choose_pairs(
         model: the network, with the cues that its masks are mined by.
         clips: dynamic clips with exact truth, one at a time.
         pairs: numbers of pairs from 1 to the model's depth.
-        gram: similarity of the cues.
+        gram: similarity of the cues; keys are suppressed as in the methods that use it.
         progress: called with the number of clips done and `total`.
 
     Raises:
         InputError: an invalid number, or no clip whose cameras can be scored.
     """
     numbers = check_pairs(pairs, model.config.depth)
+    suppress = next(method.suppress for method in METHODS.values() if method.gram == gram)
     scenes = []
     for done, clip in enumerate(clips, 1):
-        methods = ("vggt", "pose-decoupling")
-        rows = ladder(model, clip, methods=methods, masks=["mined"], mask_pairs=numbers, gram=gram, batch_size=1)
+        rows = ladder(
+            model,
+            clip,
+            methods=("vggt", "pose-decoupling"),
+            masks=["mined"],
+            mask_pairs=numbers,
+            suppress=[suppress],
+            gram=gram,
+            batch_size=1,
+        )
         errors = {row.mask_pairs or 0: _errors(row) for row in rows}
         scenes.append(np.array([errors[number] for number in (0, *numbers)]))
         (progress or no_progress)(done, total)

@@ -27,7 +27,7 @@ def calibrate_cues(
     gram: Gram = "cosine",
     max_terms: int = 5,
     floor: float = 0.0,
-    mask_pairs: tuple[int, ...] = (),
+    mask_pairs: InWords[tuple[int, ...] | None] = None,
     seed: int = 0,
 ) -> None:
     """Choose a model's motion cues on generated scenes, and save the model with them.
@@ -40,16 +40,20 @@ def calibrate_cues(
         scenes: number of scenes; every second one is held out.
         frames: of each scene.
         size: side of the images in pixels; the model's own by default.
-        gram: similarity of the cues.
+        gram: similarity of the cues; with dot, --mask-pairs tries dropped keys, as in vggt4d, else zeroed ones.
         max_terms: largest number of cues.
         floor: added to every map before the product, from 0 (as in the papers) to 1; the model's own does not count.
-        mask_pairs: numbers of pairs to try on the same scenes, with mined masks. The one with the lowest camera errors
-            becomes what the model recommends, in place of its own number.
+        mask_pairs: numbers of pairs to try on all of the scenes, with mined masks. The one with the lowest camera
+            errors becomes what the model recommends; the model keeps its own number by default.
         seed: another seed draws other scenes.
     """
     if scenes < 2:
         raise InputError(f"scenes is {scenes}; expected at least 2, one to choose the cues and one to confirm them")
     whole_number("max_terms", max_terms, 1)
+    if mask_pairs == ():
+        raise InputError("mask_pairs has no value; expected numbers of pairs to try, such as 1 3 5")
+    for number in mask_pairs or ():
+        whole_number("mask_pairs", number, 1)
     floor = share("floor", floor)
     if not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed}; expected a number in [0, 2**31)")
@@ -69,7 +73,7 @@ def calibrate_cues(
         side = loaded.config.image_size if size is None else size
         if side < 1 or side % loaded.config.patch_size:
             raise InputError(f"size is {side}; expected a multiple of the patch size {loaded.config.patch_size}")
-        numbers = check_pairs(mask_pairs, loaded.config.depth) if mask_pairs else ()
+        numbers = None if mask_pairs is None else check_pairs(mask_pairs, loaded.config.depth)
         with report.stage("sweep") as progress:
             drawn = generated_clips(scenes, frames, side, seed)
             clips = ((np.asarray(clip.images), np.asarray(clip.dynamic_mask)) for clip in drawn)

@@ -35,7 +35,7 @@ def train(
         recipe: JSON file with the recipe.
         out: folder for the model, checkpoints and metrics; an existing run in it is resumed.
         init: a model to start from: "demo", a .safetensors, a PyTorch checkpoint, or a hub id; random parameters by
-            default. The recipe's image size and cues replace those of the model.
+            default. The recipe's image size, cues and number of masked pairs replace those of the model.
         steps: total number of steps; phases, warm-up and decay keep their shares. The recipe's own by default.
         options: how the run logs, saves, ends, and uses the cores of a CPU.
     """

@@ -48,14 +48,15 @@ def soft_masking(
 ) -> SoftMasking:
     """Return the paper's values: Otsu's threshold, suppression in the first pairs, the plain product of cues.
 
-    `mask_pairs` is the number of pairs; the configuration's own if None.
+    `motion` is the table of cues, the configuration's own if None. `mask_pairs` is the number of pairs, the table's if
+    None.
     """
-    mask_pairs = (motion or config.motion).mask_pairs if mask_pairs is None else mask_pairs
+    motion = motion or config.motion
     return SoftMasking(
         jnp.zeros(()),
         jnp.asarray(temperature, float),
-        (jnp.arange(config.depth) < mask_pairs).astype(float),
-        jnp.ones(len((motion or config.motion).cues)),
+        (jnp.arange(config.depth) < motion.pairs(mask_pairs)).astype(float),
+        jnp.ones(len(motion.cues)),
     )
 
 

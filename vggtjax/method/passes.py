@@ -261,14 +261,14 @@ def run_passes(
         images: RGB in [0, 1]; any batch and any number of frames.
         config: the model's configuration.
         options: how motion is mined and keys are suppressed; masks are not refined.
-        motion: the table of cues; the configuration's own if None.
+        motion: the table of cues, and the number of pairs unless the options have one; the configuration's own if None.
         clusters: number of clusters that the saliency is averaged in, 0 for none; the method's own if None.
         threshold: "otsu" or "multi-otsu", which cuts the saliency; the method's own if None.
         second: outputs of the second pass, () for no second pass; the outputs that the method needs if None.
         changes: fields of `options` by name, such as `gram="dot"`; `mask_pairs` can be traced.
     """
-    mask_pairs: Any = changes.pop("mask_pairs", options.mask_pairs)  # not in the options: the number can be traced
-    mask_pairs = (motion or config.motion).mask_pairs if mask_pairs is None else mask_pairs
+    given: Any = changes.pop("mask_pairs", options.mask_pairs)  # not in the options: the number can be traced
+    mask_pairs = (motion or config.motion).pairs(given)
     options = options.changed(**changes)
     method, compute = options.row, Compute.of(options)
     if second is None:

@@ -32,8 +32,9 @@ class Suppression:
             booleans scale a key by 1 - m, with a gradient with respect to m.
         suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value are excluded from the softmax, VGGT4D;
             not with shares or a strength).
-        mask_pairs: number of pairs of blocks, from the first, in which keys are suppressed (L_mask of the paper). It
-            can be traced: one compilation serves all numbers.
+        mask_pairs: number of pairs of blocks, from the first, in which keys are suppressed (L_mask of the paper; the
+            default is VGGT-1B's, another model may recommend its own: `MotionConfig.mask_pairs`). It can be traced:
+            one compilation serves all numbers.
         strength: share of the suppression in every pair, in [0, 1], in place of `mask_pairs`: a key is scaled by
             1 - strength m.
     """
