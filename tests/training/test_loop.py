@@ -12,7 +12,7 @@ from vggtjax.checkpoint import read_model
 from vggtjax.errors import CheckpointError, InputError, OutputError, VggtjaxError
 from vggtjax.network.model import init_params
 from vggtjax.training.checkpoints import latest
-from vggtjax.training.loop import draw_frames, train
+from vggtjax.training.loop import draw_shape, train
 from vggtjax.training.metrics import read_metrics
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import OptimiserConfig, Phase, read_recipe
@@ -181,12 +181,21 @@ def test_bfloat16_model(tmp_path):
     assert read_model(tmp_path / "model.safetensors").dtype == "bfloat16"
 
 
-def test_frames_depend_on_seed_and_step_alone():
-    recipe = dataclasses.replace(SHORT, stages=(Phase(60, 1, (2, 3, 5), 28, 28),))
-    drawn = [draw_frames(recipe, step) for step in range(60)]
-    assert drawn == [draw_frames(recipe, step) for step in range(60)]
-    assert set(drawn) == {2, 3, 5}
-    assert drawn != [draw_frames(dataclasses.replace(recipe, data_seed=1), step) for step in range(60)]
+def test_frames_and_sizes_depend_on_seed_and_step_alone():
+    phase = Phase(60, 1, (2, 3, 5), 28, 28, sizes=((14, 28), (28, 42)))
+
+    def drawn(phase: Phase, data_seed: int) -> list[tuple[int, int, int]]:
+        recipe = dataclasses.replace(SHORT, stages=(phase,), data_seed=data_seed)
+        shapes = [draw_shape(recipe, step) for step in range(60)]
+        assert all(one == dataclasses.replace(phase, height=one.height, width=one.width, sizes=()) for one, _ in shapes)
+        return [(frames, one.height, one.width) for one, frames in shapes]
+
+    shapes = drawn(phase, 0)
+    assert shapes == drawn(phase, 0) != drawn(phase, 1)
+    assert {frames for frames, *_ in shapes} == {2, 3, 5}
+    assert {tuple(size) for _, *size in shapes} == {(28, 28), (14, 28), (28, 42)}
+    alone = drawn(dataclasses.replace(phase, sizes=()), 0)  # further sizes leave the numbers of frames as they were
+    assert [frames for frames, *_ in alone] == [frames for frames, *_ in shapes]
 
 
 def test_another_recipe_in_the_folder(tmp_path, caplog):

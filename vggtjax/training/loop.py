@@ -145,10 +145,12 @@ def train(
     return RunOutcome(run.state, finished, run.model_path)
 
 
-def draw_frames(recipe: Recipe, step: int) -> int:
-    """Return the number of frames of a step's clips: one of its phase's, by the data seed and the step."""
+def draw_shape(recipe: Recipe, step: int) -> tuple[Phase, int]:
+    """Return a step's phase, with one of its sizes, and the number of frames: drawn by the data seed and the step."""
     _, phase = recipe.phase_at(step)
-    return int(np.random.default_rng((recipe.data_seed, step)).choice(phase.frames))
+    generator = np.random.default_rng((recipe.data_seed, step))
+    frames, sizes = int(generator.choice(phase.frames)), phase.of_one_size()
+    return sizes[generator.integers(len(sizes))], frames
 
 
 class _Trainer:
@@ -168,8 +170,8 @@ class _Trainer:
     def step(self) -> None:
         """Do one step of the run."""
         run, recipe = self._run, self._run.recipe
-        index, phase = recipe.phase_at(run.step)
-        frames = draw_frames(recipe, run.step)
+        index, _ = recipe.phase_at(run.step)
+        phase, frames = draw_shape(recipe, run.step)
         is_timed = self.timed < _TIMED and (phase, frames) in self._compiled
         wait = jax.block_until_ready if is_timed else lambda tree: tree
         wait(run.state)

@@ -35,9 +35,10 @@ Gamma = Annotated[float, Meta(ge=0, le=4)]
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of training on clips of one size.
+    """A stretch of training.
 
-    Each step draws one of `frames` as the number of frames of its clips; height and width are in pixels.
+    Each step draws one of `frames` as the number of frames of its clips, and one of (`height`, `width`) and `sizes` as
+    their size in pixels.
     """
 
     steps: Count
@@ -50,11 +51,20 @@ class Phase:
     suppressed: Share = 0.0  # share of clips in which the keys of random regions are suppressed, whatever moves
     suppress: Suppress = "zero"  # how; in the first pairs of blocks, their number drawn for each step
     gamma: Gamma = 0.5  # width of the range around 0 from which the logarithm of a clip's gamma is drawn
+    sizes: tuple[tuple[int, int], ...] = ()  # further heights and widths
 
     def __post_init__(self) -> None:
         check_fields(self, "phase")
-        for frames in self.frames:
-            self.scenes(frames)
+        for phase in self.of_one_size():
+            for frames in self.frames:
+                phase.scenes(frames)
+
+    def of_one_size(self) -> tuple[Phase, ...]:
+        """Return the phase once for each size of its clips, without further sizes."""
+        if not self.sizes:
+            return (self,)
+        sizes = ((self.height, self.width), *self.sizes)
+        return tuple(dataclasses.replace(self, height=height, width=width, sizes=()) for height, width in sizes)
 
     def scenes(self, frames: int) -> SceneConfig:
         """Return the configuration of scenes of `frames` frames. Raises InputError for invalid values."""
@@ -133,7 +143,7 @@ class Recipe:
                 f"the model has no head {absent[0]!r}, only {self.model.heads}; training needs 'camera', and "
                 "those of losses.depth and losses.points unless these are 0"
             )
-        for phase in self.stages:
+        for phase in (phase for each in self.stages for phase in each.of_one_size()):
             if phase.height % self.model.patch_size or phase.width % self.model.patch_size:
                 raise InputError(
                     f"a phase has frames of {phase.height} x {phase.width} pixels; expected multiples of the "
