@@ -59,6 +59,7 @@ class Settings:
     dynamic: int
     seeds: int
     frames: int
+    height: int | None  # the model's own size if None
     mask_pairs: int | None  # the number that the model recommends if None
     sweep: tuple[int, ...]
     sweep_seeds: int
@@ -84,6 +85,7 @@ def demo_model(
     dynamic: int = 64,
     seeds: int = 5,
     frames: int = 12,
+    height: int | None = None,
     mask_pairs: int | None = None,
     sweep: tuple[int, ...] = (1, 3, 5, 8, 12, 24),
     sweep_seeds: int = 1,
@@ -101,6 +103,7 @@ def demo_model(
         dynamic: number of held-out dynamic scenes of each seed.
         seeds: number of draws of dynamic scenes, for the spread.
         frames: frames of a scene, and of a window of a filmed clip.
+        height: of generated scenes, in pixels, for frames that are wider than high; they are square by default.
         mask_pairs: pairs in which keys are suppressed; the number that the model recommends by default.
         sweep: further numbers of pairs to try.
         sweep_seeds: number of draws of dynamic scenes for the sweep.
@@ -109,7 +112,9 @@ def demo_model(
         batch: clips per run of the network.
         dtype: type of the blocks' matrix products.
     """
-    settings = Settings(static, dynamic, seeds, frames, mask_pairs, sweep, sweep_seeds, training_scenes, batch, dtype)
+    settings = Settings(
+        static, dynamic, seeds, frames, height, mask_pairs, sweep, sweep_seeds, training_scenes, batch, dtype
+    )
     check_extra("plotting", "train", "matplotlib")  # before hours of measuring
     with staging(out):  # an unwritable folder fails now
         pass
@@ -197,8 +202,9 @@ class _Bench:
         return Laddered(rows, summarise(main), summarise(swept), saliency_auc(rows))
 
     def scenes(self, kind: Literal["static", "dynamic"], count: int, seed: int) -> Truth:
-        side = self.model.config.image_size
-        config = SceneConfig(height=side, width=side, frames=self.settings.frames, dynamic=kind == "dynamic")
+        width = self.model.config.image_size
+        height = self.settings.height or width
+        config = SceneConfig(height, width, self.settings.frames, dynamic=kind == "dynamic")
         return batched_truth(held_out_scenes(kind, count, config, seed=seed))
 
     def prior(self, height: int, width: int) -> Prior:

@@ -91,7 +91,8 @@ def test_files_and_nothing_else(written):
 def test_every_file_says_what_the_renderer_said(written):
     """The scene is drawn again from what index.json says."""
     index = read_index(written)
-    assert index["config"] == json.loads(json.dumps(dataclasses.asdict(CONFIG)))
+    config = json.loads(json.dumps(dataclasses.asdict(CONFIG)))
+    assert index["config"] | {"pitch": [0, 0], "roll": 0} == config  # fields that older sets lack are left out
     assert (index["kind"], index["split"], index["seed"]) == ("dynamic", "training", 3)
     recipe = re.fullmatch(r"scene n is generate\(fold_in\(fold_in\(key\(3\), (\d+)\), n\), .*", index["key"])
     assert recipe
@@ -208,6 +209,7 @@ def test_fewer_scenes_keep_those_that_are_there(written, tmp_path):
         ({"kind": "static"}, "kind 'dynamic' instead of 'static'"),
         ({"split": "test"}, "split 'training' instead of 'test'"),
         ({"config": dataclasses.replace(CONFIG, width=40)}, "with width of config 32 instead of 40; choose"),
+        ({"config": dataclasses.replace(CONFIG, roll=9)}, "with roll of config 0.0 instead of 9.0; choose"),
     ],
 )
 def test_sets_of_other_settings_are_not_mixed(written, changes, says):

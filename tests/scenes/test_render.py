@@ -256,6 +256,28 @@ def test_static_cameras_stand_still(share):
     assert (change == 0).all() if share else (change > 1e-4).all()
 
 
+@pytest.mark.parametrize(
+    ("change", "axis", "least", "most"), [({"pitch": (-10, 30)}, 2, -10, 30), ({"roll": 20}, 0, -20, 20)]
+)
+def test_a_tilted_camera_turns_on_the_spot(change, axis, least, most):
+    """Pitch turns the forward axis, roll the right axis, down for positive angles; by one angle in a clip."""
+
+    def poses(key):
+        cameras = [sample_scene(key, 3, config).camera for config in (DYNAMIC, dataclasses.replace(DYNAMIC, **change))]
+        return [jax.vmap(lambda time, seen=seen: camera_pose(seen, time))(jnp.asarray(TIMES)) for seen in cameras]
+
+    (level, before), (tilted, after) = jax.device_get(jax.jit(jax.vmap(poses), compiler_options=QUICK)(keys(200)))
+    np.testing.assert_array_equal(before, after)
+    kept, turned = 2 - axis, np.einsum("ntij,ntik->ntjk", level, tilted)  # axes of the tilted camera in the level one
+    if axis == 0:
+        np.testing.assert_allclose(turned[..., kept, kept], 1, atol=1e-5)
+    cosine, falls = turned[..., axis, axis], tilted[..., 1, axis] > level[..., 1, axis]
+    angle = np.where(falls, 1, -1) * np.degrees(np.arccos(cosine.clip(-1, 1)))
+    assert np.ptp(angle, axis=1).max() < 0.1
+    assert least - 0.1 < angle.min() < least + 3
+    assert most - 3 < angle.max() < most + 0.1
+
+
 def test_samples_and_exposures_change_images_only(dynamic):
     for n in range(2):
         blurred = jax.tree.map(lambda leaf, n=n: leaf[n], clips(BLURRED, 2))

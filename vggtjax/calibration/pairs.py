@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vggtjax.checkpoint import Model
-from vggtjax.config import Gram
+from vggtjax.config import Gram, Suppress
 from vggtjax.errors import InputError, whole_number
 from vggtjax.evaluation.ladder import ClipTruth, LadderRow, ladder
 from vggtjax.options import METHODS
@@ -69,7 +69,7 @@ def choose_pairs(
         InputError: an invalid number, or no clip whose cameras can be scored.
     """
     numbers = check_pairs(pairs, model.config.depth)
-    suppress = next(method.suppress for method in METHODS.values() if method.gram == gram)
+    suppress: Suppress = next(method.suppress for method in METHODS.values() if method.gram == gram)
     scenes = []
     for done, clip in enumerate(clips, 1):
         rows = ladder(

@@ -14,6 +14,8 @@ Side = Annotated[int, Meta(ge=8, le=2048)]  # pixels
 Objects = Annotated[int, Meta(ge=1, le=64)]
 Travel = Annotated[float, Meta(ge=0, le=2)]
 Degrees = Annotated[float, Meta(ge=10, le=150)]
+Tilt = Annotated[float, Meta(ge=-60, le=60)]  # degrees
+Roll = Annotated[float, Meta(ge=0, le=180)]  # degrees
 BODY = (("box", 1), ("ellipsoid", 1), ("cylinder", 4))  # parts of the articulated figure: torso, head, four limbs
 
 
@@ -28,6 +30,8 @@ class SceneConfig:
         boxes, ellipsoids, cylinders: most objects of a scene besides the articulated figure; each is present or absent.
         motion: range of the camera's share of its largest path, in [0, 2].
         static_camera: share of clips whose camera stands still.
+        pitch: range of the angle by which the camera looks below the point of interest, in degrees.
+        roll: largest roll in either direction, in degrees, besides that of a hand-held camera.
         field_of_view: range of the horizontal field of view, in degrees.
         samples: rays per pixel along each side, averaged in the image; truth is that of the pixel's centre.
         shutter: share of the time between frames that the shutter is open (motion blur), in `exposures` steps.
@@ -45,6 +49,8 @@ class SceneConfig:
     cylinders: Objects = 2
     motion: tuple[Travel, Travel] = (0.1, 1.0)
     static_camera: Share = 0.05
+    pitch: tuple[Tilt, Tilt] = (0.0, 0.0)
+    roll: Roll = 0.0
     field_of_view: tuple[Degrees, Degrees] = (45.0, 75.0)
     samples: Annotated[int, Meta(ge=1, le=8)] = 1
     shutter: Share = 0.0
@@ -55,7 +61,7 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in ("motion", "field_of_view"):
+        for name in ("motion", "pitch", "field_of_view"):
             low, high = getattr(self, name)
             if low > high:
                 raise InputError(f"{name} is {(low, high)}; expected two numbers, the smaller first")

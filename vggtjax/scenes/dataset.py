@@ -37,6 +37,7 @@ from vggtjax.storage.writing import staging, writing
 INDEX, PREVIEW = "index.json", "preview.png"
 _MOST_SCENES = 10_000
 _FORMAT_VERSION = 1
+_LATER = {"pitch": [0.0, 0.0], "roll": 0.0}  # as in sets before these fields
 _STREAM = 0x73657473  # folded into the seed's key, so that no other use of a seed draws these scenes
 _MILLIMETRES = 1000.0
 _PNG_LEVEL = 3  # zlib's; higher ones take several times as long for a few percent
@@ -152,11 +153,17 @@ def _check_folder(out: Path, index: dict[str, Any]) -> None:
         if leftovers:
             raise OutputError(f"{leftovers[0]} exists without {INDEX} beside it; choose another folder or move it away")
         return
-    existing = read_index(out)
+    existing, index = _with_later(read_index(out)), _with_later(index)
     other = [name for name in ("kind", "split", "seed", "config") if existing.get(name) != index[name]]
     if other:
         values = ", ".join(_difference(name, existing.get(name), index[name]) for name in other)
         raise InputError(f"{out} holds scenes with {values}; choose another folder, or the same settings to resume")
+
+
+def _with_later(index: dict[str, Any]) -> dict[str, Any]:
+    """Return an index with the fields of `_LATER` that it leaves out."""
+    config = index.get("config")
+    return index | ({"config": _LATER | config} if isinstance(config, dict) else {})
 
 
 def _difference(name: str, there: Any, wanted: Any) -> str:
@@ -169,6 +176,7 @@ def _difference(name: str, there: Any, wanted: Any) -> str:
 
 def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str, Any]:
     """Return the index of a set without its scenes."""
+    values = json.loads(json.dumps(dataclasses.asdict(config)))
     return {
         "format": "vggtjax scenes",
         "version": _FORMAT_VERSION,
@@ -179,7 +187,7 @@ def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str
         "split": split,
         "seed": seed,
         "key": f"scene n is generate(fold_in(fold_in(key({seed}), {_STREAM}), n), textures of the split, config)",
-        "config": json.loads(json.dumps(dataclasses.asdict(config))),
+        "config": {name: value for name, value in values.items() if (name, value) not in _LATER.items()},
         "objects": [0, *(1 + number for number in config.objects)],
         "about_objects": "thing that each part belongs to, by number of the part; 0 is the room, 1 the figure",
     }

@@ -92,9 +92,9 @@ def sample_scene(key: Array, tiles: int, config: SceneConfig) -> Scene:
         material=_materials(draw, tiles, distance, K),
         light=light,
         ambient=draw(0.35, 0.7),
-        camera=camera,
         exposure=_exposure(draw, config.flicker),
         noise=config.noise * draw(0.0, 1.0),
+        camera=_tilted(draw, camera, config),
     )
 
 
@@ -121,7 +121,13 @@ def _camera(draw: _Draws, distance: Array, azimuth: Array, config: SceneConfig) 
     shake = Wave(jnp.zeros(3), moving * distance * draw(0.0, 0.012, 3), draw(2.0, 5.0, 3), draw(-jnp.pi, jnp.pi, 3))
     start = jnp.stack([azimuth, draw(-0.05, 0.3), draw(-0.05, 0.05), draw(-0.08, 0.08)])
     low, high = config.field_of_view
-    return Camera(start, orbit, target, shake, distance, jnp.deg2rad(draw(low, high)) / 2)
+    return Camera(start, orbit, target, shake, distance, jnp.deg2rad(draw(low, high)) / 2, jnp.zeros(()))
+
+
+def _tilted(draw: _Draws, camera: Camera, config: SceneConfig) -> Camera:
+    low, high = config.pitch
+    pitch, roll = jnp.deg2rad(draw(low, high)), jnp.deg2rad(draw(-config.roll, config.roll))
+    return camera._replace(start=camera.start.at[3].add(roll), pitch=pitch)
 
 
 def _ground(draw: _Draws, count: int, distance: Array, azimuth: Array) -> tuple[Float[Array, " O"], Float[Array, " O"]]:

@@ -26,7 +26,10 @@ class Wave(NamedTuple):
 
 
 class Camera(NamedTuple):
-    """A hand-held camera and its wandering target; `start` and `orbit` hold azimuth, elevation, log distance, roll."""
+    """A hand-held camera and its wandering target; `start` and `orbit` hold azimuth, elevation, log distance, roll.
+
+    The camera looks by `pitch` below the target.
+    """
 
     start: Float[Array, 4]
     orbit: Wave
@@ -34,6 +37,7 @@ class Camera(NamedTuple):
     shake: Wave
     distance: Float[Array, ""]
     half_angle: Float[Array, ""]  # of the horizontal field of view, radians
+    pitch: Float[Array, ""]  # radians
 
 
 class Scene(NamedTuple):
@@ -85,6 +89,8 @@ def camera_pose(camera: Camera, time: Float[Array, ""]) -> tuple[Float[Array, "3
     right = jnp.cross(jnp.asarray([0.0, 1.0, 0.0]), forward)
     right = right / jnp.linalg.norm(right)
     down = jnp.cross(forward, right)
+    cos, sin = jnp.cos(camera.pitch), jnp.sin(camera.pitch)
+    forward, down = cos * forward + sin * down, cos * down - sin * forward
     cos, sin = jnp.cos(roll), jnp.sin(roll)
     return jnp.stack([cos * right + sin * down, cos * down - sin * right, forward], axis=-1), centre
 

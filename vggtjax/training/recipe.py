@@ -52,6 +52,8 @@ class Phase:
     suppress: Suppress = "zero"  # how; in the first pairs of blocks, their number drawn for each step
     gamma: Gamma = 0.5  # width of the range around 0 from which the logarithm of a clip's gamma is drawn
     sizes: tuple[tuple[int, int], ...] = ()  # further heights and widths
+    pitch: tuple[float, float] = (0.0, 0.0)  # as in `SceneConfig`
+    roll: float = 0.0
 
     def __post_init__(self) -> None:
         check_fields(self, "phase")
@@ -68,7 +70,8 @@ class Phase:
 
     def scenes(self, frames: int) -> SceneConfig:
         """Return the configuration of scenes of `frames` frames. Raises InputError for invalid values."""
-        return SceneConfig(self.height, self.width, frames, self.dynamic, motion=self.motion)
+        size, tilt = (self.height, self.width), {"pitch": self.pitch, "roll": self.roll}
+        return SceneConfig(*size, frames, self.dynamic, motion=self.motion, **tilt)
 
 
 @dataclass(frozen=True)
