@@ -1,6 +1,7 @@
 """Artefacts: run where this package cannot be imported, with equal numbers; what does not fit is one sentence."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -66,6 +67,23 @@ def site(tmp_path) -> Path:
             if path.name in (name, f"{name}.libs") or path.match(f"{name}-*.dist-info"):
                 (folder / path.name).symlink_to(path)
     return folder
+
+
+@pytest.mark.parametrize(
+    ("platforms", "precision", "has_tf32"),
+    [(("cuda",), None, True), (("cuda",), "highest", False), (("cpu", "cuda"), None, False)],
+)
+def test_a_program_for_gpus_alone_has_their_precision_wherever_it_is_written(
+    model, tmp_path, platforms, precision, has_tf32
+):
+    frames, height, width = SHAPE
+    options = {"platforms": platforms, "precision": precision}
+    folder = write_artefact(model, tmp_path / "it", frames=frames, height=height, width=width, **options)
+    assert (json.loads((folder / serve.MANIFEST).read_text())["options"].get("precision") == "tf32") == has_tf32
+    program = jax.export.deserialize(bytearray((folder / serve.PROGRAM).read_bytes())).mlir_module()
+    convolutions = "\n".join(line for line in program.splitlines() if "stablehlo.convolution" in line)
+    found = set(re.findall(r"<precision (\w+)>", convolutions))
+    assert found == ({"HIGH", "HIGHEST"} if has_tf32 else {"HIGHEST"})
 
 
 def test_jax_alone_gives_the_numbers_of_infer(written, site, tmp_path, model):

@@ -50,9 +50,12 @@ class Compute:
             check_choice("attention", self.attention, get_args(Attention))
 
     @classmethod
-    def of(cls, options: Options, frames: Frames = Frames()) -> Compute:
-        """Return how the network is computed by options, with the platform's values in place of None."""
-        options = options.computed()
+    def of(cls, options: Options, frames: Frames = Frames(), on_accelerator: bool | None = None) -> Compute:
+        """Return how the network is computed by options, with the platform's values in place of None.
+
+        `on_accelerator` is as for `Options.computed`.
+        """
+        options = options.computed(on_accelerator)
         return cls(str(options.compute_dtype), str(options.precision), attention=options.attention, frames=frames)
 
 

@@ -111,7 +111,7 @@ def write_artefact(
         OutputError: the folder exists or cannot be written.
     """
     out, on_stage = Path(out), on_stage or no_stage
-    options = options.changed(**changes).resolved(model.config.motion, on_accelerator="cpu" not in platforms)
+    options = options.changed(**changes).resolved(model.config.motion, _on_accelerator(platforms))
     check_artefact(out, frames, height, width, platforms, options)
     check_fuses(fusion, options.method)
     patch = model.config.patch_size
@@ -141,6 +141,11 @@ def write_artefact(
     return out
 
 
+def _on_accelerator(platforms: Sequence[str]) -> bool:
+    """Return whether the program is for accelerators alone, wherever it is written."""
+    return "cpu" not in platforms
+
+
 def _lowered(
     model: Model,
     weights: dict[str, Any],
@@ -151,7 +156,8 @@ def _lowered(
     fusion: FusionParams | None,
 ) -> export.Exported:
     frames, height, width = shape
-    stages = Stages(model.config, options, frames, (height, width), run=inline)
+    on_accelerator = _on_accelerator(platforms)
+    stages = Stages(model.config, options, frames, (height, width), run=inline, on_accelerator=on_accelerator)
 
     names = list(weights)  # in the order of the structure; jax sorts those of a dictionary
 

@@ -139,14 +139,15 @@ class Stages:
     run: Callable[..., Any] = field(default_factory=Execute)  # Execute, Compile or inline
     mesh: Mesh | None = None  # of the devices that share the frames
     padded: int | None = None  # frames with those of `ClipInputs.frame_count`, without those that make shares equal
+    on_accelerator: bool | None = None  # whether the network will be computed on one; whether jax has one if None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "options", self.options.resolved(self.config.motion))
+        object.__setattr__(self, "options", self.options.resolved(self.config.motion, self.on_accelerator))
 
     @property
     def _passes(self) -> dict[str, Any]:
         frames = Frames(self.mesh, None if self.mesh is None else self.padded or self.frames)
-        return {"config": self.config, "compute": Compute.of(self.options, frames)}
+        return {"config": self.config, "compute": Compute.of(self.options, frames, self.on_accelerator)}
 
     @property
     def _real(self) -> Frames:
