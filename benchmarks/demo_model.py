@@ -59,7 +59,7 @@ class Settings:
     dynamic: int
     seeds: int
     frames: int
-    height: int | None  # the model's own size if None
+    height: int | None  # as wide as high if None
     mask_pairs: int | None  # the number that the model recommends if None
     sweep: tuple[int, ...]
     sweep_seeds: int
@@ -103,7 +103,8 @@ def demo_model(
         dynamic: number of held-out dynamic scenes of each seed.
         seeds: number of draws of dynamic scenes, for the spread.
         frames: frames of a scene, and of a window of a filmed clip.
-        height: of generated scenes, in pixels, for frames that are wider than high; they are square by default.
+        height: of generated scenes in pixels, a multiple of the model's patch size; by default their width, which is
+            the model's image size. The scenes are chosen on square frames whatever it is.
         mask_pairs: pairs in which keys are suppressed; the number that the model recommends by default.
         sweep: further numbers of pairs to try.
         sweep_seeds: number of draws of dynamic scenes for the sweep.
@@ -123,7 +124,7 @@ def demo_model(
     with bench.running():
         results: dict[str, Any] = {
             "model": loaded.summary(),
-            "settings": dataclasses.asdict(settings) | {"mask_pairs": bench.pairs},
+            "settings": dataclasses.asdict(settings) | {"height": bench.height, "mask_pairs": bench.pairs},
         }
         results["static"] = bench.static_scenes() if static else None
         results["hololens"] = bench.filmed([clips / "hololens"], "hololens")
@@ -145,7 +146,11 @@ class _Bench:
 
     def __init__(self, model: Model, settings: Settings) -> None:
         self.model, self.settings = model, settings
-        self.pairs = model.config.motion.mask_pairs if settings.mask_pairs is None else settings.mask_pairs
+        self.pairs = model.config.motion.masked_pairs(settings.mask_pairs)
+        self.width, patch = model.config.image_size, model.config.patch_size
+        self.height = settings.height or self.width
+        if self.height % patch:
+            raise InputError(f"height is {self.height}; expected a multiple of the model's patch size {patch}")
         columns = (TextColumn("{task.description:<28}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
         self.console = Console(stderr=True)
         self.progress = Bars(*columns, console=self.console, disable=not self.console.is_terminal)
@@ -202,9 +207,7 @@ class _Bench:
         return Laddered(rows, summarise(main), summarise(swept), saliency_auc(rows))
 
     def scenes(self, kind: Literal["static", "dynamic"], count: int, seed: int) -> Truth:
-        width = self.model.config.image_size
-        height = self.settings.height or width
-        config = SceneConfig(height, width, self.settings.frames, dynamic=kind == "dynamic")
+        config = SceneConfig(self.height, self.width, self.settings.frames, dynamic=kind == "dynamic")
         return batched_truth(held_out_scenes(kind, count, config, seed=seed))
 
     def prior(self, height: int, width: int) -> Prior:
@@ -221,8 +224,11 @@ class _Bench:
 
 def report_text(model: Model, results: dict[str, Any]) -> str:
     """Return the report as markdown."""
-    frames = results["settings"]["frames"]
-    parts = [f"# Benchmark of {model.name}", f"{model.parameter_count / 1e6:.1f} M parameters, {frames} frames a clip."]
+    frames, size = results["settings"]["frames"], f"{model.config.image_size} x {results['settings']['height']}"
+    parts = [
+        f"# Benchmark of {model.name}",
+        f"{model.parameter_count / 1e6:.1f} M parameters, {frames} frames a clip, generated ones of {size} pixels.",
+    ]
     if left_out := [name for name in ("static", "hololens", "composite", "dynamic") if not results[name]]:
         parts.append(f"Left out, as not asked for or not there: {', '.join(left_out)}.")
     for name in ("static", "hololens", "composite"):

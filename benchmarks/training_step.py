@@ -45,9 +45,10 @@ def training_step(
 ) -> None:
     """Time the parts of a training step, against the ceilings of the machine measured around every round.
 
-    The first phase of the recipe counts. The products of forward and backward pass are counted from the shapes: three
-    times those of the forward pass. With `before`, both checkouts take turns, and their losses on the same clips are
-    compared first. Each of them sets its process up as its own `vggtjax train` does.
+    The first phase of the recipe counts, with its height and width and its first number of frames. The products of
+    forward and backward pass are counted from the shapes: three times those of the forward pass. With `before`, both
+    checkouts take turns, and their losses on the same clips are compared first. Each of them sets its process up as its
+    own `vggtjax train` does.
 
     Args:
         recipe: JSON file with the recipe.

@@ -22,7 +22,7 @@ CONFIG = tiny_config(
 )
 RECIPE = Recipe(
     name="tiny",
-    stages=(Phase(4, 2, (2, 3), 28, 28), Phase(2, 1, (2,), 28, 42)),
+    stages=(Phase(4, 2, (2, 3), 28, 28, sizes=((28, 42),)), Phase(2, 1, (2,), 28, 42)),
     model=CONFIG,
     optimiser=OptimiserConfig(learning_rate=1e-2, warmup_steps=2, decay_steps=2),
     untrained=("track_head", "depth_head", "point_head"),

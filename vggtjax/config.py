@@ -82,8 +82,8 @@ class MotionConfig:
         scale = (depth - 1) / max(self.reference_depth - 1, 1)
         return tuple(round(layer * scale) for layer in cue.layers)
 
-    def pairs(self, given: int | None) -> int:
-        """Return the number of pairs that is `given`, or the recommended one for None."""
+    def masked_pairs(self, given: int | None) -> int:
+        """Return `given`, or the recommended number of pairs if it is None."""
         return self.mask_pairs if given is None else given
 
 

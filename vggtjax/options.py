@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -11,7 +12,7 @@ import tyro
 from vggtjax.config import LARGEST, Gram, MotionConfig, Suppress
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.storage.flags import InWords, Switch
-from vggtjax.storage.json_values import check_fields
+from vggtjax.storage.json_values import check_fields, without_defaults
 
 Pass = Literal["first", "second"]
 Threshold = Literal["otsu", "multi-otsu"]
@@ -72,6 +73,19 @@ def odd_frames(frames: object) -> int:
     if number % 2 == 0:
         raise InputError(f"smooth_frames is {number}; expected an odd number of frames, such as 3")
     return number
+
+
+def pairs_to_try(pairs: Sequence[int], depth: int | None = None) -> tuple[int, ...]:
+    """Return different numbers of pairs in order.
+
+    Raises InputError for none, and for a number outside [1, `depth`], the pairs of a model.
+    """
+    numbers = tuple(sorted({whole_number("mask_pairs", number, 1) for number in pairs}))
+    if not numbers:
+        raise InputError(f"mask_pairs is {list(pairs)}; expected numbers of pairs to try, such as 1 3 5")
+    if depth is not None and numbers[-1] > depth:
+        raise InputError(f"mask_pairs is {list(pairs)}; expected numbers from 1 to {depth}, the pairs of the model")
+    return numbers
 
 
 _READ_AFTER_THE_PASSES = ("method", "align_scale", "refine_mask", "refine_cameras")
@@ -167,13 +181,14 @@ class Options:
         """
         row = self.row
         values = {"gram": row.gram, "suppress": row.suppress, "refine_mask": row.refine}
-        values["mask_pairs"] = motion.pairs(self.mask_pairs)
+        values |= {"mask_pairs": motion.masked_pairs(self.mask_pairs)}
         return dataclasses.replace(self.computed(on_accelerator), **values)
 
     def computed(self, on_accelerator: bool | None = None) -> Options:
         """Return the options with the platform's types in place of None.
 
-        `on_accelerator` tells whether the network will be computed on a GPU or TPU; by default, whether jax has one.
+        `on_accelerator` tells whether the network will be computed on a GPU or TPU; by default, whether jax has one. A
+        CPU computes in float32 whatever is given: there the precision is the highest.
         """
         dtype, precision = self.compute_dtype, self.precision
         if dtype is None or precision != "highest":
@@ -195,7 +210,7 @@ class Options:
 
     def to_json(self) -> dict[str, Any]:
         """Return the options as JSON values, without those of `_LATER` at their default: as in results before them."""
-        return {name: value for name, value in dataclasses.asdict(self).items() if (name, value) not in _LATER.items()}
+        return without_defaults(dataclasses.asdict(self), _LATER)
 
 
 def _has_accelerator() -> bool:

@@ -198,6 +198,7 @@ def test_a_small_run_of_everything(tmp_path, config, capsys):
     write_clip(tmp_path / "clips" / "hololens", frames=13)
     write_clip(tmp_path / "clips" / "composite" / "one", frames=13, mask=True)
     arguments = "--static 2 --dynamic 2 --seeds 1 --frames 12 --mask-pairs 2 --sweep 1 --training-scenes 2 --batch 2"
+    arguments += " --height 14"
     out = tmp_path / "out"
     code = benchmarks.main(
         ["demo-model", "--model", str(model), "--out", str(out), "--clips", str(tmp_path / "clips"), *arguments.split()]
@@ -207,6 +208,7 @@ def test_a_small_run_of_everything(tmp_path, config, capsys):
     text = (out / "report.md").read_text()
     assert text.strip() in shown.out
     for heading in (
+        f"generated ones of {SIDE} x 14 pixels",
         "guesses: static, 2 clips",
         "guesses: hololens, 2 clips",
         "Methods: dynamic",
@@ -235,6 +237,8 @@ def test_a_small_run_of_everything(tmp_path, config, capsys):
         (["--model", "{tmp}/none.safetensors"], "none.safetensors"),
         (["--frames", "2"], "frames is 2; expected at least 3"),
         (["--seeds", "0"], "seeds is 0"),
+        (["--height", "0"], "height is 0; expected at least 1"),
+        (["--height", "50"], "height is 50; expected a multiple of the model's patch size 8"),
         (["--sweep", "3", "-1"], "sweep has [-1]"),
         (["--out", "{tmp}/file/out"], "cannot write"),
     ],

@@ -7,15 +7,15 @@ import pytest
 
 from tests.tiny import tiny_config
 from vggtjax import Model, MotionConfig, init_params, load_model, reconstruct
-from vggtjax.calibration.pairs import CameraErrors, PairsChoice, check_pairs, choose_pairs
+from vggtjax.calibration.pairs import CameraErrors, PairsChoice, choose_pairs
 from vggtjax.checkpoint import save_model
 from vggtjax.commands.calibrate_cues import calibrate_cues, generated_clips
-from vggtjax.config import VGGTConfig
+from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
 from vggtjax.evaluation.sources import ModelSource
 from vggtjax.learning.soft import soft_masking
-from vggtjax.options import Options
+from vggtjax.options import Options, pairs_to_try
 
 FRAMES, SIZE, SCENES = 4, 28, 3
 
@@ -41,19 +41,23 @@ def test_errors_are_those_of_the_second_pass(model, gram, suppress):
     clips = list(generated_clips(SCENES, FRAMES, SIZE, seed=1))
     found = choose_pairs(model, clips, [2, 1], gram=gram)
     assert list(found.errors) == [0, 1, 2]
-    for pairs in (1, 2):
+
+    def scores(pairs: int, suppress: Suppress) -> list[list[list[float]]]:
         settings = {"methods": ["vggt", "4dvggt-d"], "masks": ["mined"], "mask_pairs": [pairs], "gram": gram}
-        settings["suppress"] = [suppress]
-        rows = [[_errors(row) for row in ladder(model, clip, **settings)] for clip in clips]
-        scored = [each for each in rows if np.isfinite(each).all()]
+        rows = [[_errors(row) for row in ladder(model, clip, suppress=[suppress], **settings)] for clip in clips]
+        return [each for each in rows if np.isfinite(each).all()]
+
+    for pairs in (1, 2):
+        scored = scores(pairs, suppress)
         assert found.scenes == len(scored) > 0
         np.testing.assert_allclose([found.errors[0], found.errors[pairs]], np.mean(scored, axis=0), rtol=1e-4)
+    assert not np.allclose(scored, scores(2, "zero" if suppress == "drop" else "drop"), rtol=1e-3)
 
 
 @pytest.mark.parametrize(("pairs", "found"), [([], r"\[\]"), ([3, 0], "is 0"), ([5], r"\[5\]; .* from 1 to 4")])
 def test_numbers_that_a_model_does_not_have(model, pairs, found):
     with pytest.raises(InputError, match=found):
-        check_pairs(pairs, model.config.depth)
+        pairs_to_try(pairs, model.config.depth)
 
 
 def test_a_model_recommends_its_number(model, tmp_path):
@@ -95,6 +99,6 @@ def test_the_command(model, tmp_path, capsys):
     with pytest.raises(InputError, match="mask_pairs is"):
         calibrate_cues(str(path), tmp_path / "other", mask_pairs=(9,))
     for invalid in ((), (0, 3)):  # refused before the model is looked for
-        with pytest.raises(InputError, match=r"mask_pairs (is 0|has no value)"):
+        with pytest.raises(InputError, match=r"mask_pairs is (0|\[\]); expected"):
             calibrate_cues("nowhere.safetensors", tmp_path / "other", mask_pairs=invalid)
     assert not (tmp_path / "other").exists()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tests.training_runs import RECIPE
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.scenes import load_textures
+from vggtjax.scenes import SceneConfig, load_textures
 from vggtjax.training.data import make_batch
 from vggtjax.training.objective import LossWeights, init_probes, objective
 from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe, read_recipe
@@ -102,7 +102,16 @@ def test_whole_numbers_become_floats():
         (changed(stages=[PHASE | {"sizes": [[28, 30]]}]), "28 x 30 pixels; expected multiples of the model's"),
         (changed(stages=[PHASE | {"pitch": [0, 70]}]), r"stages\[0\]: pitch\[1\] is 70.0; expected a number"),
         (changed(stages=[PHASE | {"sizes": [[28]]}]), r"stages\[0\].sizes\[0\] is \[28\]; expected a list of 2"),
-        (changed(stages=[PHASE | {"sizes": [[0, 28]]}]), r"stages\[0\]: height is 0; expected a whole number"),
+        (
+            changed(stages=[PHASE | {"sizes": [[0, 28]]}]),
+            r"sizes\[0\]\[0\] is 0; expected a whole number",
+        ),
+        (
+            changed(stages=[PHASE | {"sizes": [[28, 42]]}]),
+            r"sizes is .*; expected sizes other than \(28, 42\)",
+        ),
+        (changed(stages=[PHASE | {"sizes": [[28, 28]] * 2}]), r"stages\[0\]: sizes is .*, each once"),
+        (changed(stages=[PHASE | {"sizes": [[28, 28]] * 17}]), r"stages\[0\].sizes .* at most 16"),
         (changed(optimiser={"learning_rate": 0}), "optimiser.learning_rate is 0; expected a number of more than 0"),
         (changed(optimiser={"learning_rate": float("nan")}), "is not JSON"),
         (changed(optimiser={"learning_rate": 10**400}), "optimiser.learning_rate is a number of more than 64 bits"),
@@ -160,17 +169,22 @@ def test_recipes_of_the_docs_load(path):
 
 
 def test_the_recipe_for_a_gpu_fits_the_wheel_and_takes_a_step():
-    """The model takes at most 24 MB in bfloat16; shapes of a step of the last phase, at its most frames."""
+    """The model takes at most 24 MB in bfloat16; shapes of a step of the last two phases: each size, most frames."""
     recipe = read_recipe(DOCS / "recipes" / "gpu.json")
     state = state_shapes(recipe, init_probes(0, recipe.model))
     assert 2 * sum(leaf.size for leaf in jax.tree.leaves(state.trained["model"])) < 24e6
-    phase = recipe.stages[-1]
-    draw = partial(make_batch, textures=load_textures("training"), phase=phase, frames=max(phase.frames))
-    batch = jax.eval_shape(draw, jax.random.key(0))
-    step = partial(loss_and_gradient, recipe=recipe, objective=objective)
-    metrics, gradient = jax.eval_shape(step, state.trained, batch)
-    assert metrics["loss"].shape == ()
-    assert jax.tree.structure(gradient) == jax.tree.structure(state.ema)
+    step, textures = partial(loss_and_gradient, recipe=recipe, objective=objective), load_textures("training")
+    for phase in recipe.stages[-2:]:
+        for index in range(len(phase.all_sizes)):
+            draw = partial(make_batch, textures=textures, phase=phase.of_size(index), frames=max(phase.frames))
+            metrics, gradient = jax.eval_shape(step, state.trained, jax.eval_shape(draw, jax.random.key(0)))
+            assert metrics["loss"].shape == ()
+            assert jax.tree.structure(gradient) == jax.tree.structure(state.ema)
+
+
+def test_fields_of_a_phase_reach_its_scenes():
+    scenes = Phase(1, 8, (2,), 28, 42, dynamic=0.5, motion=(0.2, 0.3), pitch=(1, 2), roll=3).scenes(2)
+    assert scenes == SceneConfig(28, 42, 2, 0.5, motion=(0.2, 0.3), pitch=(1, 2), roll=3)
 
 
 def test_gamma_makes_clips_darker_and_brighter():

@@ -9,9 +9,9 @@ import numpy as np
 
 from vggtjax.checkpoint import Model
 from vggtjax.config import Gram, Suppress
-from vggtjax.errors import InputError, whole_number
+from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ClipTruth, LadderRow, ladder
-from vggtjax.options import METHODS
+from vggtjax.options import pairs_to_try
 from vggtjax.progress import Progress, no_progress
 
 
@@ -39,14 +39,6 @@ class PairsChoice(NamedTuple):
         return min((pairs for pairs in self.errors if pairs), key=lambda pairs: (loss(pairs), pairs))
 
 
-def check_pairs(pairs: Sequence[int], depth: int) -> tuple[int, ...]:
-    """Return the different numbers in order. Raises InputError for none, and for those outside [1, `depth`]."""
-    numbers = tuple(sorted({whole_number("mask_pairs", number, 1) for number in pairs}))
-    if not numbers or numbers[-1] > depth:
-        raise InputError(f"mask_pairs is {list(pairs)}; expected numbers from 1 to {depth}, the pairs of the model")
-    return numbers
-
-
 def choose_pairs(
     model: Model,
     clips: Iterable[ClipTruth],
@@ -62,14 +54,15 @@ def choose_pairs(
         model: the network, with the cues that its masks are mined by.
         clips: dynamic clips with exact truth, one at a time.
         pairs: numbers of pairs from 1 to the model's depth.
-        gram: similarity of the cues; keys are suppressed as in the methods that use it.
+        gram: similarity of the cues. Keys are zeroed with cosines, and dropped with dot products, as in VGGT4D; masks
+            are mined as in 4DVGGT-D with either.
         progress: called with the number of clips done and `total`.
 
     Raises:
         InputError: an invalid number, or no clip whose cameras can be scored.
     """
-    numbers = check_pairs(pairs, model.config.depth)
-    suppress: Suppress = next(method.suppress for method in METHODS.values() if method.gram == gram)
+    numbers = pairs_to_try(pairs, model.config.depth)
+    suppress: Suppress = "drop" if gram == "dot" else "zero"  # as the methods with these cues do
     scenes = []
     for done, clip in enumerate(clips, 1):
         rows = ladder(

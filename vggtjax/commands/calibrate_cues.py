@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
 
 from vggtjax.commands.report import Report
 from vggtjax.config import Gram
 from vggtjax.errors import InputError, share, whole_number
+from vggtjax.options import pairs_to_try
 from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
     from vggtjax.scenes import SyntheticClip
 
+_Pairs = Annotated[tuple[int, ...] | None, tyro.conf.arg(help_behavior_hint="", metavar="INT [INT ...]")]
 _KEYS = 0x63756573  # folded into the seed's key, so that no other use of a seed draws these scenes
 
 
@@ -27,7 +31,7 @@ def calibrate_cues(
     gram: Gram = "cosine",
     max_terms: int = 5,
     floor: float = 0.0,
-    mask_pairs: InWords[tuple[int, ...] | None] = None,
+    mask_pairs: _Pairs = None,
     seed: int = 0,
 ) -> None:
     """Choose a model's motion cues on generated scenes, and save the model with them.
@@ -40,7 +44,7 @@ def calibrate_cues(
         scenes: number of scenes; every second one is held out.
         frames: of each scene.
         size: side of the images in pixels; the model's own by default.
-        gram: similarity of the cues; with dot, --mask-pairs tries dropped keys, as in vggt4d, else zeroed ones.
+        gram: similarity of the cues; with dot, --mask-pairs tries dropped keys instead of zeroed ones.
         max_terms: largest number of cues.
         floor: added to every map before the product, from 0 (as in the papers) to 1; the model's own does not count.
         mask_pairs: numbers of pairs to try on all of the scenes, with mined masks. The one with the lowest camera
@@ -50,10 +54,8 @@ def calibrate_cues(
     if scenes < 2:
         raise InputError(f"scenes is {scenes}; expected at least 2, one to choose the cues and one to confirm them")
     whole_number("max_terms", max_terms, 1)
-    if mask_pairs == ():
-        raise InputError("mask_pairs has no value; expected numbers of pairs to try, such as 1 3 5")
-    for number in mask_pairs or ():
-        whole_number("mask_pairs", number, 1)
+    if mask_pairs is not None:
+        pairs_to_try(mask_pairs)
     floor = share("floor", floor)
     if not 0 <= seed < 2**31:
         raise InputError(f"seed is {seed}; expected a number in [0, 2**31)")
@@ -63,7 +65,7 @@ def calibrate_cues(
 
         from vggtjax.calibration.choice import choose
         from vggtjax.calibration.export import calibrated, check_folder, save_calibration
-        from vggtjax.calibration.pairs import check_pairs, choose_pairs
+        from vggtjax.calibration.pairs import choose_pairs
         from vggtjax.calibration.sweep import sweep
         from vggtjax.pretrained.load import load_model
 
@@ -73,7 +75,7 @@ def calibrate_cues(
         side = loaded.config.image_size if size is None else size
         if side < 1 or side % loaded.config.patch_size:
             raise InputError(f"size is {side}; expected a multiple of the patch size {loaded.config.patch_size}")
-        numbers = None if mask_pairs is None else check_pairs(mask_pairs, loaded.config.depth)
+        numbers = None if mask_pairs is None else pairs_to_try(mask_pairs, loaded.config.depth)
         with report.stage("sweep") as progress:
             drawn = generated_clips(scenes, frames, side, seed)
             clips = ((np.asarray(clip.images), np.asarray(clip.dynamic_mask)) for clip in drawn)

@@ -123,7 +123,7 @@ def ladder(
         raise InputError(f"batch_size is {batch_size}; expected at least 1")
     masked = tuple(name for name in methods if find_method(name).needs_second_pass)
     plain = tuple(name for name in methods if name not in masked)
-    pairs = (model.config.motion.pairs(None),) if mask_pairs is None else mask_pairs
+    pairs = (model.config.motion.mask_pairs,) if mask_pairs is None else mask_pairs
     settings = [_Setting(*values) for values in product(masks, pairs, suppress)]
     frames, *size = truth.images.shape[1:4]
     options = Options(gram=gram, compute_dtype=compute_dtype)

@@ -55,7 +55,7 @@ def soft_masking(
     return SoftMasking(
         jnp.zeros(()),
         jnp.asarray(temperature, float),
-        (jnp.arange(config.depth) < motion.pairs(mask_pairs)).astype(float),
+        (jnp.arange(config.depth) < motion.masked_pairs(mask_pairs)).astype(float),
         jnp.ones(len(motion.cues)),
     )
 

@@ -268,7 +268,7 @@ def run_passes(
         changes: fields of `options` by name, such as `gram="dot"`; `mask_pairs` can be traced.
     """
     given: Any = changes.pop("mask_pairs", options.mask_pairs)  # not in the options: the number can be traced
-    mask_pairs = (motion or config.motion).pairs(given)
+    mask_pairs = (motion or config.motion).masked_pairs(given)
     options = options.changed(**changes)
     method, compute = options.row, Compute.of(options)
     if second is None:

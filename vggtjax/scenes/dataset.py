@@ -30,7 +30,7 @@ from vggtjax.scenes.held_out import Kind
 from vggtjax.scenes.render import SyntheticClip, generate
 from vggtjax.scenes.sheet import draw_sheet
 from vggtjax.scenes.textures import Split, load_textures
-from vggtjax.storage.json_values import read_json
+from vggtjax.storage.json_values import read_json, without_defaults
 from vggtjax.storage.trajectories import write_trajectory
 from vggtjax.storage.writing import staging, writing
 
@@ -153,17 +153,13 @@ def _check_folder(out: Path, index: dict[str, Any]) -> None:
         if leftovers:
             raise OutputError(f"{leftovers[0]} exists without {INDEX} beside it; choose another folder or move it away")
         return
-    existing, index = _with_later(read_index(out)), _with_later(index)
+    existing = read_index(out)
+    if isinstance(existing.get("config"), dict):
+        existing["config"] = _LATER | existing["config"]
     other = [name for name in ("kind", "split", "seed", "config") if existing.get(name) != index[name]]
     if other:
         values = ", ".join(_difference(name, existing.get(name), index[name]) for name in other)
         raise InputError(f"{out} holds scenes with {values}; choose another folder, or the same settings to resume")
-
-
-def _with_later(index: dict[str, Any]) -> dict[str, Any]:
-    """Return an index with the fields of `_LATER` that it leaves out."""
-    config = index.get("config")
-    return index | ({"config": _LATER | config} if isinstance(config, dict) else {})
 
 
 def _difference(name: str, there: Any, wanted: Any) -> str:
@@ -176,7 +172,6 @@ def _difference(name: str, there: Any, wanted: Any) -> str:
 
 def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str, Any]:
     """Return the index of a set without its scenes."""
-    values = json.loads(json.dumps(dataclasses.asdict(config)))
     return {
         "format": "vggtjax scenes",
         "version": _FORMAT_VERSION,
@@ -187,7 +182,7 @@ def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str
         "split": split,
         "seed": seed,
         "key": f"scene n is generate(fold_in(fold_in(key({seed}), {_STREAM}), n), textures of the split, config)",
-        "config": {name: value for name, value in values.items() if (name, value) not in _LATER.items()},
+        "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "objects": [0, *(1 + number for number in config.objects)],
         "about_objects": "thing that each part belongs to, by number of the part; 0 is the room, 1 the figure",
     }
@@ -195,8 +190,9 @@ def _describe(config: SceneConfig, kind: str, split: str, seed: int) -> dict[str
 
 def _write_index(out: Path, index: dict[str, Any]) -> None:
     scenes = sorted(path.name for path in out.glob("scene_[0-9][0-9][0-9][0-9]") if path.is_dir())
+    index = index | {"config": without_defaults(index["config"], _LATER), "scenes": scenes}
     with writing(out / INDEX) as path:
-        path.write_text(json.dumps(index | {"scenes": scenes}, indent=2) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(index, indent=2) + "\n", encoding="utf-8")
 
 
 def _write_scene(folder: Path, clip: SyntheticClip) -> None:

@@ -61,7 +61,8 @@ def held_out_scenes(
         kind: "static", or "dynamic" with moving objects.
         count: number of scenes; a larger count begins with the scenes of a smaller one.
         config: size and frames; 12 frames of 112 x 112 pixels by default. `kind` replaces its `dynamic`. The selection
-            of scenes depends on the seed, the kind and the number of frames, not on the image size or `frozen`.
+            of scenes depends on the other fields, the seed and the kind, not on the image size or `frozen`: it is made
+            on square frames.
         seed: of the set; different seeds share no scene.
         progress: called with the number of selected scenes and `count`.
 

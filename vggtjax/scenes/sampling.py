@@ -94,7 +94,7 @@ def sample_scene(key: Array, tiles: int, config: SceneConfig) -> Scene:
         ambient=draw(0.35, 0.7),
         exposure=_exposure(draw, config.flicker),
         noise=config.noise * draw(0.0, 1.0),
-        camera=_tilted(draw, camera, config),
+        camera=_tilted(draw, camera, config),  # the last draws: scenes without a tilt are older
     )
 
 

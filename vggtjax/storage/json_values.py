@@ -96,6 +96,11 @@ def check_fields(instance: Any, what: str = "", *, error: type[InputError] = Inp
         object.__setattr__(instance, name, value)
 
 
+def without_defaults(values: Mapping[str, Any], later: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values without those of `later` at their default there: fields that older files do not have."""
+    return {name: value for name, value in values.items() if (name, value) not in later.items()}
+
+
 @lru_cache(maxsize=256)
 def _hints(kind: type) -> dict[str, Any]:
     hints = typing.get_type_hints(kind, include_extras=True)
@@ -187,7 +192,9 @@ def _expected(info: kinds.Type) -> str:
     if isinstance(info, kinds.TupleType):
         return f"a list of {len(info.item_types)} values"
     if isinstance(info, _ITEMS):
-        return "a list" + (f" of at least {info.min_length} values" if info.min_length else "")
+        limits = (("at least", info.min_length), ("at most", info.max_length))
+        bounds = " and ".join(f"{words} {limit}" for words, limit in limits if limit)
+        return f"a list of {bounds} values" if bounds else "a list"
     if isinstance(info, kinds.IntType | kinds.FloatType):
         limits = {words: getattr(info, name) for name, words in _BOUNDS.items()}
         bounds = [f"{words} {limit}" for words, limit in limits.items() if limit is not None]

@@ -20,7 +20,8 @@ _SUPPRESSION = 1 << 20  # folded into keys: an index beyond those of `split`, so
 def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> Batch:
     """Return the batch of a JAX random key: `phase.batch` clips of `frames` frames, in random order and colours.
 
-    In a share `phase.suppressed` of the clips, random regions are suppressed. Pure; `phase` and `frames` are static.
+    The clips have the phase's height and width; its further `sizes` are not read. In a share `phase.suppressed` of the
+    clips, random regions are suppressed. Pure; `phase` and `frames` are static.
     """
     config = phase.scenes(frames)
 

@@ -102,8 +102,8 @@ def train(
         recipe: the model, the data, the losses and the optimiser.
         out: folder for recipe.json, metrics.csv, metrics.png, checkpoints/ and model.safetensors with the averaged
             parameters.
-        init: a model to start from, or its parameters; None for random ones. Image size and cues of the recipe replace
-            those of a model. Without effect when there is a checkpoint.
+        init: a model to start from, or its parameters; None for random ones. Image size, cues and number of masked
+            pairs of the recipe replace those of a model. Without effect when there is a checkpoint.
         options: intervals of metrics and checkpoints, time limit, type of the exported weights.
         progress: called with a Status.
         task: the data and the loss.
@@ -145,12 +145,15 @@ def train(
     return RunOutcome(run.state, finished, run.model_path)
 
 
-def draw_shape(recipe: Recipe, step: int) -> tuple[Phase, int]:
-    """Return a step's phase, with one of its sizes, and the number of frames: drawn by the data seed and the step."""
-    _, phase = recipe.phase_at(step)
+def draw_shape(recipe: Recipe, step: int) -> tuple[int, Phase, int]:
+    """Return the index of a step's phase, the phase with one of its sizes, and one of its numbers of frames.
+
+    The draw depends on the data seed and the step alone.
+    """
+    index, phase = recipe.phase_at(step)
     generator = np.random.default_rng((recipe.data_seed, step))
-    frames, sizes = int(generator.choice(phase.frames)), phase.of_one_size()
-    return sizes[generator.integers(len(sizes))], frames
+    frames = int(generator.choice(phase.frames))
+    return index, phase.of_size(int(generator.integers(len(phase.all_sizes)))), frames
 
 
 class _Trainer:
@@ -170,8 +173,7 @@ class _Trainer:
     def step(self) -> None:
         """Do one step of the run."""
         run, recipe = self._run, self._run.recipe
-        index, _ = recipe.phase_at(run.step)
-        phase, frames = draw_shape(recipe, run.step)
+        index, phase, frames = draw_shape(recipe, run.step)
         is_timed = self.timed < _TIMED and (phase, frames) in self._compiled
         wait = jax.block_until_ready if is_timed else lambda tree: tree
         wait(run.state)

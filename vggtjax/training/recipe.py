@@ -14,7 +14,7 @@ from msgspec import Meta
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError, whole_number
 from vggtjax.network.model import DENSE_HEADS, HEADS
-from vggtjax.scenes.config import SceneConfig
+from vggtjax.scenes.config import SceneConfig, Side
 from vggtjax.storage.json_values import (
     Count,
     Natural,
@@ -31,6 +31,7 @@ _MOST_FILE_BYTES = 1 << 20
 Decay = Annotated[float, Meta(ge=0, lt=1)]
 Seed = Annotated[int, Meta(ge=0, lt=2**31)]
 Gamma = Annotated[float, Meta(ge=0, le=4)]
+Sizes = Annotated[tuple[tuple[Side, Side], ...], Meta(max_length=16)]
 
 
 @dataclass(frozen=True)
@@ -51,27 +52,32 @@ class Phase:
     suppressed: Share = 0.0  # share of clips in which the keys of random regions are suppressed, whatever moves
     suppress: Suppress = "zero"  # how; in the first pairs of blocks, their number drawn for each step
     gamma: Gamma = 0.5  # width of the range around 0 from which the logarithm of a clip's gamma is drawn
-    sizes: tuple[tuple[int, int], ...] = ()  # further heights and widths
-    pitch: tuple[float, float] = (0.0, 0.0)  # as in `SceneConfig`
-    roll: float = 0.0
+    sizes: Sizes = ()  # further heights and widths
+    pitch: tuple[float, float] = (0.0, 0.0)  # range of the angle by which cameras look further down, in degrees
+    roll: float = 0.0  # largest further roll of a camera, in degrees
 
     def __post_init__(self) -> None:
         check_fields(self, "phase")
-        for phase in self.of_one_size():
-            for frames in self.frames:
-                phase.scenes(frames)
+        if len(set(self.all_sizes)) <= len(self.sizes):
+            raise InputError(f"sizes is {self.sizes}; expected sizes other than {(self.height, self.width)}, each once")
+        for frames in self.frames:
+            self.scenes(frames)
 
-    def of_one_size(self) -> tuple[Phase, ...]:
-        """Return the phase once for each size of its clips, without further sizes."""
-        if not self.sizes:
-            return (self,)
-        sizes = ((self.height, self.width), *self.sizes)
-        return tuple(dataclasses.replace(self, height=height, width=width, sizes=()) for height, width in sizes)
+    @property
+    def all_sizes(self) -> tuple[tuple[int, int], ...]:
+        """Height and width of the phase, and its further sizes."""
+        return ((self.height, self.width), *self.sizes)
+
+    def of_size(self, index: int) -> Phase:
+        """Return the phase with one of `all_sizes` alone."""
+        height, width = self.all_sizes[index]
+        return dataclasses.replace(self, height=height, width=width, sizes=()) if self.sizes else self
 
     def scenes(self, frames: int) -> SceneConfig:
         """Return the configuration of scenes of `frames` frames. Raises InputError for invalid values."""
-        size, tilt = (self.height, self.width), {"pitch": self.pitch, "roll": self.roll}
-        return SceneConfig(*size, frames, self.dynamic, motion=self.motion, **tilt)
+        return SceneConfig(
+            self.height, self.width, frames, self.dynamic, motion=self.motion, pitch=self.pitch, roll=self.roll
+        )
 
 
 @dataclass(frozen=True)
@@ -146,10 +152,10 @@ class Recipe:
                 f"the model has no head {absent[0]!r}, only {self.model.heads}; training needs 'camera', and "
                 "those of losses.depth and losses.points unless these are 0"
             )
-        for phase in (phase for each in self.stages for phase in each.of_one_size()):
-            if phase.height % self.model.patch_size or phase.width % self.model.patch_size:
+        for height, width in (size for phase in self.stages for size in phase.all_sizes):
+            if height % self.model.patch_size or width % self.model.patch_size:
                 raise InputError(
-                    f"a phase has frames of {phase.height} x {phase.width} pixels; expected multiples of the "
+                    f"a phase has frames of {height} x {width} pixels; expected multiples of the "
                     f"model's patch_size {self.model.patch_size}"
                 )
         layers = [layer for layer in self.losses.match_layers if layer >= self.model.depth]
