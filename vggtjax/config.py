@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from vggtjax.errors import InputError
-from vggtjax.storage.json_values import Count, Natural, Share, check_fields, parse_json
+from vggtjax.storage.json_values import Count, Natural, Share, check_fields, parse_json, without_defaults
 
 LARGEST = 1_000_000  # size of one part of a network
 Size = Annotated[int, Meta(ge=1, le=LARGEST)]
@@ -87,7 +87,7 @@ class MotionConfig:
         return self.mask_pairs if given is None else given
 
 
-_PAPERS = MotionConfig()
+_LATER = {"floor": MotionConfig.floor, "mask_pairs": MotionConfig.mask_pairs}
 
 
 @dataclass(frozen=True)
@@ -155,9 +155,7 @@ class VGGTConfig:
         conversions stay the same.
         """
         values = dataclasses.asdict(self)
-        for name in ("floor", "mask_pairs"):
-            if values["motion"][name] == getattr(_PAPERS, name):
-                del values["motion"][name]
+        values["motion"] = without_defaults(values["motion"], _LATER)
         return json.dumps(values, separators=(",", ":"))
 
     @classmethod

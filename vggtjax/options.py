@@ -180,9 +180,13 @@ class Options:
         `motion` is the model's. `on_accelerator` is as for `computed`.
         """
         row = self.row
-        values = {"gram": row.gram, "suppress": row.suppress, "refine_mask": row.refine}
-        values |= {"mask_pairs": motion.masked_pairs(self.mask_pairs)}
-        return dataclasses.replace(self.computed(on_accelerator), **values)
+        return dataclasses.replace(
+            self.computed(on_accelerator),
+            gram=row.gram,
+            suppress=row.suppress,
+            refine_mask=row.refine,
+            mask_pairs=motion.masked_pairs(self.mask_pairs),
+        )
 
     def computed(self, on_accelerator: bool | None = None) -> Options:
         """Return the options with the platform's types in place of None.
