@@ -8,13 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from tests.tiny import tiny_model
 from tests.training_runs import RECIPE, init_probes
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.network.backbone import encode
-from vggtjax.network.model import init_params
+from vggtjax.network.model import forward, init_params
 from vggtjax.pretrained.embedded import demo_model
 from vggtjax.training.recipe import Recipe, Start, read_recipe
-from vggtjax.training.state import adapted, initial_state, start_params
+from vggtjax.training.start import adapted, deepened, start_params
+from vggtjax.training.state import initial_state
+
+
+def with_model(recipe: Recipe, **changes) -> Recipe:
+    """Return the recipe with another model."""
+    return dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, **changes))
 
 
 def test_the_default_is_vggts_start():
@@ -38,9 +45,9 @@ def test_the_embedded_model_starts_its_last_recipe():
     recipe = read_recipe(Path(__file__).parents[2] / "docs" / "embedded" / "5-four-frames.json")
     model = demo_model()
     assert (model.config.image_size, model.config.motion) != (recipe.model.image_size, recipe.model.motion)
-    params = adapted(model, recipe.model)
+    params = adapted(model, recipe)
     jax.eval_shape(lambda params: initial_state(recipe, init_probes(0, recipe.model), params), params)
-    same = adapted(model, dataclasses.replace(recipe.model, image_size=model.config.image_size))
+    same = adapted(model, with_model(recipe, image_size=model.config.image_size))
     assert jax.tree.all(jax.tree.map(np.array_equal, same, model.params))
     images = jnp.asarray(np.random.default_rng(0).uniform(size=(1, 1, 112, 112, 3)), jnp.float32)
     tokens = [
@@ -48,7 +55,37 @@ def test_the_embedded_model_starts_its_last_recipe():
     ]
     np.testing.assert_allclose(tokens[0], tokens[1], atol=1e-5)  # the backbone resizes the table alike
     with pytest.raises(CheckpointError, match="it has embed_dim 128, not 256, num_heads 4, not 8; use these values in"):
-        adapted(model, dataclasses.replace(recipe.model, embed_dim=256, num_heads=8))
+        adapted(model, with_model(recipe, embed_dim=256, num_heads=8))
+
+
+def test_a_deeper_model_computes_the_same_and_its_new_pairs_learn():
+    shallow = tiny_model()
+    new = (0, 2)
+    recipe = dataclasses.replace(RECIPE, model=shallow.config, start=Start(new_pairs=new))
+    with pytest.raises(CheckpointError, match=r"it has depth 6, not 4, taps \(1, 3, 4, 5\), not \(0, 1, 2, 3\)"):
+        adapted(shallow, recipe)
+    recipe = with_model(recipe, depth=6, taps=(1, 3, 4, 5))
+    params = adapted(shallow, recipe)
+    images = jnp.asarray(np.random.default_rng(0).uniform(size=(1, 2, 28, 28, 3)), jnp.float32)
+
+    def poses(params, config):
+        return jnp.asarray(forward(params, images, config, outputs=("camera",)).pose_encoding)
+
+    np.testing.assert_array_equal(poses(params, recipe.model), poses(shallow.params, shallow.config))
+    gradient = jax.grad(lambda params: poses(params, recipe.model).sum())(params)["aggregator"]
+    for blocks in ("frame_blocks", "global_blocks"):
+        assert np.abs(np.asarray(gradient[blocks]["scale1"])[list(new)]).max(axis=-1).min() > 0
+
+
+@pytest.mark.parametrize("new", [(1, 1), (4,), (0, 9)])
+def test_new_pairs_that_do_not_fit_are_refused(new):
+    with pytest.raises(CheckpointError, match="expected different indices below"):
+        deepened(tiny_model(), new)
+
+
+def test_new_pairs_without_a_model_are_refused():
+    with pytest.raises(InputError, match=r"start\.new_pairs is \(0,\) and no model to start from is given"):
+        start_params(dataclasses.replace(RECIPE, start=Start(new_pairs=(0,))))
 
 
 def test_a_start_of_no_scale_is_refused():

@@ -30,7 +30,8 @@ from vggtjax.training.objective import with_counts
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, Recipe
 from vggtjax.training.run import Run, labels_of
-from vggtjax.training.state import Metrics, Objective, TrainingState, adapted, apply_gradient, loss_and_gradient
+from vggtjax.training.start import adapted
+from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient
 from vggtjax.training.workers import Workers, check_workers
 
 GENERATED_NOTE = "model trained on generated scenes alone"
@@ -103,7 +104,8 @@ def train(
         out: folder for recipe.json, metrics.csv, metrics.png, checkpoints/ and model.safetensors with the averaged
             parameters.
         init: a model to start from, or its parameters; None for random ones. Image size, cues and number of masked
-            pairs of the recipe replace those of a model. Without effect when there is a checkpoint.
+            pairs of the recipe replace those of a model, and its new pairs make one deeper. Without effect when there
+            is a checkpoint.
         options: intervals of metrics and checkpoints, time limit, type of the exported weights.
         progress: called with a Status.
         task: the data and the loss.
@@ -115,7 +117,7 @@ def train(
         VggtjaxError: 50 steps in a row had a loss or gradient that is not finite, or a worker has ended.
     """
     labels = labels_of(recipe, init, GENERATED_NOTE if task is None else "")
-    params = adapted(init, recipe.model) if isinstance(init, Model) else init
+    params = adapted(init, recipe) if isinstance(init, Model) else init
     options, task = options or RunOptions(), task or Task()
     check_workers(recipe, options.workers)
     with locked_folder(out, "checkpoints and a model"):

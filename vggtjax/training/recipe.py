@@ -106,17 +106,20 @@ class OptimiserConfig:
 
 @dataclass(frozen=True)
 class Start:
-    """Random parameters to start from. The defaults are VGGT's, whose backbone is pretrained.
+    """The parameters to start from. The defaults of random ones are VGGT's, whose backbone is pretrained.
 
     Attributes:
         layer_scale: start of the aggregator's LayerScale. 0.01 keeps attention across frames out of the residual
             stream for hundreds of steps; a model without a pretrained backbone needs more.
         tied_keys: the keys of the global blocks start equal to their queries, so that attention starts as similarity
             and finds equal tokens in other frames from the first step on.
+        new_pairs: indices of the pairs that the recipe's model has more than the model to start from. A new pair starts
+            as a copy of the next pair of that model, with a LayerScale of 0: the deeper model computes the same.
     """
 
     layer_scale: Positive = 0.01
     tied_keys: bool = False
+    new_pairs: tuple[Natural, ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(self, "start")
@@ -131,7 +134,7 @@ class Recipe:
     model: VGGTConfig = field(default_factory=VGGTConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     losses: LossWeights = field(default_factory=LossWeights)
-    start: Start = field(default_factory=Start)  # not read if initial parameters are given
+    start: Start = field(default_factory=Start)  # of random parameters, unless a model to start from is given
     trainable: Literal["all", "heads"] = "all"  # "heads": backbone and aggregator stay unchanged
     untrained: tuple[str, ...] = ("track_head",)  # modules of the model that stay unchanged: those without a loss
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"  # bfloat16 on a GPU, else float32

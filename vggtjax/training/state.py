@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,17 +9,15 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.traverse_util import flatten_dict
 from jaxtyping import Array, Float, Int
 
-from vggtjax.checkpoint import Model, check_parameters
-from vggtjax.config import VGGTConfig
-from vggtjax.errors import CheckpointError
-from vggtjax.network.backbone import patch_positions
+from vggtjax.checkpoint import check_parameters
 from vggtjax.network.layers import Params
-from vggtjax.network.model import init_params, parameter_shapes
+from vggtjax.network.model import parameter_shapes
 from vggtjax.training.optimiser import join, make_optimiser, make_schedule, split
 from vggtjax.training.recipe import Recipe
+from vggtjax.training.start import start_params
 
 Objective = Callable[..., tuple[Float[Array, ""], dict[str, Float[Array, ""]]]]
 Metrics = dict[str, Float[Array, ""]]
@@ -115,35 +112,3 @@ def compute_dtype(recipe: Recipe) -> str:
     if recipe.compute_dtype != "auto":
         return recipe.compute_dtype
     return "bfloat16" if jax.default_backend() == "gpu" else "float32"
-
-
-def start_params(recipe: Recipe) -> Params:
-    """Return the random parameters that a recipe starts from, by its `seed` and its `start`."""
-    flat: dict[Any, Any] = flatten_dict(init_params(recipe.seed, recipe.model))
-    for path, leaf in flat.items():
-        if path[0] == "aggregator" and path[-1] in ("scale1", "scale2"):
-            flat[path] = jnp.full_like(leaf, recipe.start.layer_scale)
-        if recipe.start.tied_keys and path[:2] == ("aggregator", "global_blocks") and path[-2:] == ("qkv", "kernel"):
-            query, _, value = jnp.split(leaf, 3, axis=-1)
-            flat[path] = jnp.concatenate([query, query, value], axis=-1)
-    return unflatten_dict(flat)
-
-
-def adapted(model: Model, config: VGGTConfig) -> Params:
-    """Return a model's parameters for a configuration with another image size or other motion cues.
-
-    The table of positions is resized as the backbone resizes the table for images of another size.
-
-    Raises CheckpointError for a configuration that differs in anything else.
-    """
-    names = [field.name for field in dataclasses.fields(config) if field.name not in ("image_size", "motion")]
-    if other := [name for name in names if getattr(model.config, name) != getattr(config, name)]:
-        values = ", ".join(f"{name} {getattr(model.config, name)}, not {getattr(config, name)}" for name in other)
-        raise CheckpointError(
-            f"the model '{model.name}' cannot start this recipe: it has {values}; use these values in the recipe's "
-            "model, or start from another model"
-        )
-    backbone, side = model.params["backbone"], config.grid_size
-    table = backbone["position_embedding"].astype(jnp.float32)
-    patches = patch_positions(table[1:], model.config.grid_size, (side, side))
-    return {**model.params, "backbone": {**backbone, "position_embedding": jnp.concatenate([table[:1], patches])}}
