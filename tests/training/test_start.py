@@ -10,6 +10,7 @@ import pytest
 
 from tests.tiny import tiny_model
 from tests.training_runs import RECIPE, init_probes
+from vggtjax.config import MotionConfig
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.network.backbone import encode
 from vggtjax.network.model import forward, init_params
@@ -40,11 +41,10 @@ def test_tied_keys_and_layer_scale():
     assert Recipe.from_json(recipe.to_json()) == recipe
 
 
-def test_the_embedded_model_starts_its_last_recipe():
-    """The recipe has the default cues, and images of another size."""
-    recipe = read_recipe(Path(__file__).parents[2] / "docs" / "embedded" / "5-four-frames.json")
+def test_the_embedded_model_starts_a_recipe_with_another_image_size_and_other_cues():
+    recipe = read_recipe(Path(__file__).parents[2] / "docs" / "embedded" / "11-twelve-pairs.json")
     model = demo_model()
-    assert (model.config.image_size, model.config.motion) != (recipe.model.image_size, recipe.model.motion)
+    recipe = dataclasses.replace(with_model(recipe, image_size=112, motion=MotionConfig()), start=Start())
     params = adapted(model, recipe)
     jax.eval_shape(lambda params: initial_state(recipe, init_probes(0, recipe.model), params), params)
     same = adapted(model, with_model(recipe, image_size=model.config.image_size))
