@@ -16,7 +16,7 @@ from vggtjax.network.backbone import encode
 from vggtjax.network.model import forward, init_params
 from vggtjax.pretrained.embedded import demo_model
 from vggtjax.training.recipe import Recipe, Start, read_recipe
-from vggtjax.training.start import adapted, deepened, start_params
+from vggtjax.training.start import adapted, start_params
 from vggtjax.training.state import initial_state
 
 
@@ -59,33 +59,35 @@ def test_the_embedded_model_starts_a_recipe_with_another_image_size_and_other_cu
 
 
 def test_a_deeper_model_computes_the_same_and_its_new_pairs_learn():
-    shallow = tiny_model()
-    new = (0, 2)
-    recipe = dataclasses.replace(RECIPE, model=shallow.config, start=Start(new_pairs=new))
-    with pytest.raises(CheckpointError, match=r"it has depth 6, not 4, taps \(1, 3, 4, 5\), not \(0, 1, 2, 3\)"):
-        adapted(shallow, recipe)
-    recipe = with_model(recipe, depth=6, taps=(1, 3, 4, 5))
+    shallow, new = tiny_model(), (0, 2)
+    model = dataclasses.replace(shallow.config, depth=6, taps=(1, 3, 4, 5))
+    recipe = dataclasses.replace(RECIPE, model=model, start=Start(new_pairs=new))
+    assert recipe.initial_model == shallow.config
     params = adapted(shallow, recipe)
     images = jnp.asarray(np.random.default_rng(0).uniform(size=(1, 2, 28, 28, 3)), jnp.float32)
 
     def poses(params, config):
         return jnp.asarray(forward(params, images, config, outputs=("camera",)).pose_encoding)
 
-    np.testing.assert_array_equal(poses(params, recipe.model), poses(shallow.params, shallow.config))
-    gradient = jax.grad(lambda params: poses(params, recipe.model).sum())(params)["aggregator"]
+    np.testing.assert_array_equal(poses(params, model), poses(shallow.params, shallow.config))
+    gradient = jax.grad(lambda params: poses(params, model).sum())(params)["aggregator"]
     for blocks in ("frame_blocks", "global_blocks"):
         assert np.abs(np.asarray(gradient[blocks]["scale1"])[list(new)]).max(axis=-1).min() > 0
+    with pytest.raises(CheckpointError, match=r"it has depth 4, not 5, .*model \(without its start.new_pairs \(0,\)\)"):
+        adapted(shallow, dataclasses.replace(recipe, start=Start(new_pairs=(0,))))
 
 
-@pytest.mark.parametrize("new", [(1, 1), (4,), (0, 9)])
+@pytest.mark.parametrize("new", [(1, 1), (5,), (1, 9), (3,)])
 def test_new_pairs_that_do_not_fit_are_refused(new):
-    with pytest.raises(CheckpointError, match="expected different indices below"):
-        deepened(tiny_model(), new)
+    model = dataclasses.replace(tiny_model().config, depth=6, taps=(0, 2, 3, 5))
+    with pytest.raises(InputError, match="expected different indices below 5, the last pair of a model of depth 6"):
+        dataclasses.replace(RECIPE, model=model, start=Start(new_pairs=new))
 
 
 def test_new_pairs_without_a_model_are_refused():
+    recipe = with_model(RECIPE, depth=6, taps=(1, 3, 4, 5))
     with pytest.raises(InputError, match=r"start\.new_pairs is \(0,\) and no model to start from is given"):
-        start_params(dataclasses.replace(RECIPE, start=Start(new_pairs=(0,))))
+        start_params(dataclasses.replace(recipe, start=Start(new_pairs=(0,))))
 
 
 def test_a_start_of_no_scale_is_refused():

@@ -35,7 +35,8 @@ def train(
         recipe: JSON file with the recipe.
         out: folder for the model, checkpoints and metrics; an existing run in it is resumed.
         init: a model to start from: "demo", a .safetensors, a PyTorch checkpoint, or a hub id; random parameters by
-            default. The recipe's image size, cues and number of masked pairs replace those of the model.
+            default. The recipe's image size, cues and number of masked pairs replace those of the model, and its
+            new pairs are added.
         steps: total number of steps; phases, warm-up and decay keep their shares. The recipe's own by default.
         options: how the run logs, saves, ends, and uses the cores of a CPU.
     """
@@ -55,7 +56,7 @@ def train(
             with report.stage("load model") as progress:
                 from vggtjax.pretrained.load import load_weights
 
-                model = load_weights(init, config=chosen.model, progress=progress)
+                model = load_weights(init, config=chosen.initial_model, progress=progress)
         report.note("the first step compiles, once for each size of a phase: seconds to minutes")
         with report.stage("train") as advance:
             shown = time.perf_counter()

@@ -104,14 +104,15 @@ def train(
         out: folder for recipe.json, metrics.csv, metrics.png, checkpoints/ and model.safetensors with the averaged
             parameters.
         init: a model to start from, or its parameters; None for random ones. Image size, cues and number of masked
-            pairs of the recipe replace those of a model, and its new pairs make one deeper. Without effect when there
-            is a checkpoint.
+            pairs of the recipe replace those of a model, and its new pairs are added; parameters must have them. A
+            model must fit the recipe also when there is a checkpoint, from which the run then resumes.
         options: intervals of metrics and checkpoints, time limit, type of the exported weights.
         progress: called with a Status.
         task: the data and the loss.
 
     Raises:
-        InputError: the workers of `options` cannot share the recipe's batches, or the device is no CPU.
+        InputError: the workers of `options` cannot share the recipe's batches, the device is no CPU, or the recipe has
+            new pairs and `init` is None.
         CheckpointError: the checkpoint in `out` is of another model, or `init` does not fit the recipe's.
         OutputError: `out` cannot be written, or another run is writing into it.
         VggtjaxError: 50 steps in a row had a loss or gradient that is not finite, or a worker has ended.

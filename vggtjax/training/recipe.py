@@ -113,8 +113,8 @@ class Start:
             stream for hundreds of steps; a model without a pretrained backbone needs more.
         tied_keys: the keys of the global blocks start equal to their queries, so that attention starts as similarity
             and finds equal tokens in other frames from the first step on.
-        new_pairs: indices of the pairs that the recipe's model has more than the model to start from. A new pair starts
-            as a copy of the next pair of that model, with a LayerScale of 0: the deeper model computes the same.
+        new_pairs: indices, in the recipe's model, of the pairs that the model to start from lacks. A new pair starts as
+            a copy of the next old one, with a LayerScale of 0: a plain pass of the deeper model computes the same.
     """
 
     layer_scale: Positive = 0.01
@@ -134,7 +134,7 @@ class Recipe:
     model: VGGTConfig = field(default_factory=VGGTConfig)
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
     losses: LossWeights = field(default_factory=LossWeights)
-    start: Start = field(default_factory=Start)  # of random parameters, unless a model to start from is given
+    start: Start = field(default_factory=Start)
     trainable: Literal["all", "heads"] = "all"  # "heads": backbone and aggregator stay unchanged
     untrained: tuple[str, ...] = ("track_head",)  # modules of the model that stay unchanged: those without a loss
     compute_dtype: Literal["auto", "float32", "bfloat16"] = "auto"  # bfloat16 on a GPU, else float32
@@ -161,6 +161,12 @@ class Recipe:
                     f"a phase has frames of {height} x {width} pixels; expected multiples of the "
                     f"model's patch_size {self.model.patch_size}"
                 )
+        new, last = self.start.new_pairs, self.model.depth - 1
+        if len(set(new)) < len(new) or any(pair >= last or pair in self.model.taps for pair in new):
+            raise InputError(
+                f"start.new_pairs is {new}; expected different indices below {last}, the last pair of a model of depth "
+                f"{self.model.depth}, and none of its taps {self.model.taps}"
+            )
         layers = [layer for layer in self.losses.match_layers if layer >= self.model.depth]
         if self.losses.match and (layers or not self.losses.match_layers or self.model.num_heads < 2):
             raise InputError(
@@ -174,6 +180,13 @@ class Recipe:
                 f"warm-up and decay take {spent} steps and the phases have {self.total_steps}; lower "
                 "optimiser.warmup_steps or optimiser.decay_steps"
             )
+
+    @property
+    def initial_model(self) -> VGGTConfig:
+        """Configuration of the model to start from: the recipe's without the new pairs."""
+        old = [pair for pair in range(self.model.depth) if pair not in self.start.new_pairs]
+        first, second, third, fourth = (old.index(tap) for tap in self.model.taps)
+        return dataclasses.replace(self.model, depth=len(old), taps=(first, second, third, fourth))
 
     @property
     def frozen(self) -> tuple[str, ...]:
