@@ -208,7 +208,7 @@ def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, mon
     with pytest.raises(DeviceMemoryError, match="what fits: --max-frames 3"):
         with_room(3, window=4)
     monkeypatch.setattr("jax.local_device_count", lambda: 2)  # a split CPU, whose devices share one memory
-    with pytest.raises(DeviceMemoryError, match=r"7 frames need about 0\.63 GB"):
+    with pytest.raises(DeviceMemoryError, match=r"7 frames need about 0\.64 GB"):
         with_room(6, devices=2)
     assert with_room(100, devices=2) == (Windows(), None)
     assert memory.most_frames(model, SIDE, SIDE, memory.predicted_bytes(model, 100, SIDE, SIDE)) == 100
