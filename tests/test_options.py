@@ -53,10 +53,11 @@ def test_keywords_are_the_fields():
 def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     """A new option is one of them unless it is named there."""
     other = {"gram": "dot", "suppress": "drop", "mask_pairs": 2, "smooth_frames": 3, "compute_dtype": "bfloat16"}
+    other |= {"threshold": "multi-otsu"}
     other |= {"attention": "merged"}  # absent where it is exact, as is the precision where it is the highest
     fields = {field.name for field in dataclasses.fields(Options)}
     key = Options().passes_settings(MOTION)
-    named = fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters", "threshold"}
+    named = fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters"}
     assert set(key) == named - {"attention", "precision"}
     assert set(Options(attention="merged").passes_settings(MOTION)) == named - {"precision"}
     assert all(Options(**{name: value}).passes_settings(MOTION) != key for name, value in other.items())
@@ -68,7 +69,9 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
 def test_the_method_fills_in_what_is_not_given():
     cpu = {"compute_dtype": "float32", "precision": "highest"}
     made = Options("vggt4d").resolved(MOTION)
-    wanted = Options("vggt4d", gram="dot", suppress="drop", mask_pairs=5, refine_mask=True, **cpu)  # pyright: ignore
+    wanted = Options(
+        "vggt4d", gram="dot", suppress="drop", mask_pairs=5, threshold="multi-otsu", refine_mask=True, **cpu
+    )  # pyright: ignore
     assert made == wanted
     assert Options("vggt4d", gram="cosine", refine_mask=False).resolved(MOTION).gram == "cosine"
 
@@ -78,6 +81,18 @@ def test_the_model_recommends_the_number_of_pairs():
     assert Options().resolved(motion).mask_pairs == 2
     assert Options(mask_pairs=0).resolved(motion).mask_pairs == 0
     assert Options().passes_settings(motion) == Options(mask_pairs=2).passes_settings(MOTION)
+
+
+def test_the_threshold_is_the_given_one_or_the_models_or_the_methods():
+    motion = MotionConfig(threshold="multi-otsu")
+    assert Options().resolved(motion).threshold == Options("vggt4d").resolved(MOTION).threshold == "multi-otsu"
+    assert Options(threshold="otsu").resolved(motion).threshold == Options().resolved(MOTION).threshold == "otsu"
+    assert Options().passes_settings(motion) == Options(threshold="multi-otsu").passes_settings(MOTION)
+    told = [
+        options.resolved(MOTION).to_json()
+        for options in (Options(), Options("vggt4d"), Options("vggt4d", threshold="otsu"))
+    ]
+    assert [each.get("threshold") for each in told] == [None, None, "otsu"]
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ LARGEST = 1_000_000  # size of one part of a network
 Size = Annotated[int, Meta(ge=1, le=LARGEST)]
 Gram = Literal["cosine", "dot"]
 Suppress = Literal["zero", "drop"]
+Threshold = Literal["otsu", "multi-otsu"]
 HEAD_NAMES = ("camera", "depth", "points", "tracks")
 
 
@@ -48,6 +49,8 @@ class MotionConfig:
 
     `mask_pairs` is the number of pairs, from the first, in which the second pass suppresses the keys of dynamic tokens
     (L_mask) where the options leave it open. The default is that of the papers for VGGT-1B.
+
+    `threshold` cuts the saliency of every method where the options leave it open; None leaves it to the method.
     """
 
     cues: Annotated[tuple[Cue, ...], Meta(min_length=1)] = (
@@ -61,6 +64,7 @@ class MotionConfig:
     reference_depth: Count = 24
     floor: Share = 0.0
     mask_pairs: Annotated[int, Meta(ge=0, le=LARGEST)] = 5
+    threshold: Threshold | None = None
 
     def __post_init__(self) -> None:
         check_fields(self, "motion")
@@ -87,7 +91,7 @@ class MotionConfig:
         return self.mask_pairs if given is None else given
 
 
-_LATER = {"floor": MotionConfig.floor, "mask_pairs": MotionConfig.mask_pairs}
+_LATER = {name: getattr(MotionConfig, name) for name in ("floor", "mask_pairs", "threshold")}
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,12 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from vggtjax.config import LARGEST, Gram, MotionConfig, Suppress
+from vggtjax.config import LARGEST, Gram, MotionConfig, Suppress, Threshold
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields, without_defaults
 
 Pass = Literal["first", "second"]
-Threshold = Literal["otsu", "multi-otsu"]
 _ShownDType = Literal["float32", "bfloat16"]  # on the command line
 Attention = Literal["exact", "merged"]
 ComputeDType = Literal["float32", "bfloat16", "float64"]
@@ -128,6 +127,9 @@ class Options:
     mask_pairs: InWords[int | None] = None
     """in how many pairs of blocks, from the first on, keys of dynamic tokens are ignored (L_mask of the paper); by
     default the number that the model recommends, 5 for VGGT-1B"""
+    threshold: InWords[Threshold | None] = None
+    """where the saliency is cut: otsu, one threshold; multi-otsu, the highest of up to three, with a smaller mask; by
+    default what the model recommends, or multi-otsu for vggt4d and otsu for the others"""
     align_scale: Switch = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1
@@ -165,12 +167,13 @@ class Options:
 
     @property
     def row(self) -> Method:
-        """The method's row, with `gram` and `suppress` overridden where they are given."""
+        """The method's row, with `gram`, `suppress` and `threshold` overridden where they are given."""
         method = METHODS[self.method]
         return dataclasses.replace(
             method,
             gram=self.gram or method.gram,
             suppress=self.suppress or method.suppress,
+            threshold=self.threshold or method.threshold,
             refine=method.refine if self.refine_mask is None else self.refine_mask,
         )
 
@@ -186,6 +189,7 @@ class Options:
             suppress=row.suppress,
             refine_mask=row.refine,
             mask_pairs=motion.masked_pairs(self.mask_pairs),
+            threshold=self.threshold or motion.threshold or row.threshold,
         )
 
     def computed(self, on_accelerator: bool | None = None) -> Options:
@@ -202,7 +206,8 @@ class Options:
 
     def passes_settings(self, motion: MotionConfig) -> dict[str, Any]:
         """What the two passes of a model depend on, as JSON values; methods with equal values share one run of them."""
-        settings = self.resolved(motion).to_json() | {"clusters": self.row.clusters, "threshold": self.row.threshold}
+        options = self.resolved(motion)
+        settings = options.to_json() | {"clusters": options.row.clusters, "threshold": options.threshold}
         return {name: value for name, value in settings.items() if name not in _READ_AFTER_THE_PASSES}
 
     def changed(self, **changes: Any) -> Options:
@@ -213,8 +218,14 @@ class Options:
         return dataclasses.replace(self, **changes) if changes else self
 
     def to_json(self) -> dict[str, Any]:
-        """Return the options as JSON values, without those of `_LATER` at their default: as in results before them."""
-        return without_defaults(dataclasses.asdict(self), _LATER)
+        """Return the options as JSON values, without those of `_LATER` at their default: as in results before them.
+
+        A threshold is among them if it is not the method's own.
+        """
+        values = without_defaults(dataclasses.asdict(self), _LATER)
+        if self.threshold in (None, METHODS[self.method].threshold):
+            del values["threshold"]
+        return values
 
 
 def _has_accelerator() -> bool:

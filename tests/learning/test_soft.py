@@ -1,5 +1,6 @@
 """Soft masks: the method itself in the limit, and every gradient against finite differences in float64."""
 
+import dataclasses
 import functools
 from typing import Any
 
@@ -41,10 +42,12 @@ softly = jax.jit(
 )
 
 
-def test_at_temperature_0_it_is_the_method():
-    assembly, passes = infer(params(), images(), CONFIG)
+@pytest.mark.parametrize("threshold", [None, "multi-otsu"])
+def test_at_temperature_0_it_is_the_method(threshold):
+    config = dataclasses.replace(CONFIG, motion=dataclasses.replace(CONFIG.motion, threshold=threshold))
+    assembly, passes = infer(params(), images(), config)
     assert 0 < np.asarray(passes.dynamic_mask).mean() < 1
-    soft = softly(params(), images(), CONFIG, soft_masking(CONFIG))
+    soft = softly(params(), images(), config, soft_masking(config))
     assert (np.asarray(soft.dynamic) == np.asarray(passes.dynamic_mask)).all()
     assert np.allclose(soft.depth, assembly.depth, rtol=2e-6)
     assert np.allclose(np.exp(soft.log_precision), assembly.confidence, rtol=1e-5)

@@ -105,8 +105,9 @@ def test_every_option_of_the_passes_is_compared_and_the_type_of_the_weights_is_n
         warn_if_fitted_otherwise(path, used, Options(gram="cosine", refine_mask=True))
     assert not caplog.records
     other = Options(
-        gram="dot", suppress="drop", mask_pairs=2, align_scale=True, smooth_frames=3, compute_dtype="float64"
-    )
+        gram="dot", suppress="drop", mask_pairs=2, threshold="multi-otsu", align_scale=True, smooth_frames=3,
+        compute_dtype="float64",
+    )  # fmt: skip
     warn_if_fitted_otherwise(path, model, other)
-    names = {"gram", "suppress", "mask_pairs", "align_scale", "smooth_frames", "compute_dtype"}
+    names = {"gram", "suppress", "mask_pairs", "threshold", "align_scale", "smooth_frames", "compute_dtype"}
     assert {record.args[1] for record in caplog.records} == names  # pyright: ignore

@@ -167,7 +167,7 @@ def test_passes_take_options_or_their_fields(params, config, images):
     def shapes(**options):
         return jax.eval_shape(lambda images: run_passes(params, images, config, **options), images)
 
-    assert shapes() == shapes(options=Options(gram="dot"), mask_pairs=2, clusters=8, threshold="otsu")
+    assert shapes() == shapes(options=Options(gram="dot"), mask_pairs=2, clusters=8, threshold="multi-otsu")
     assert shapes(method="vggt").second is None
     assert shapes(second=()).second is None
     assert shapes(method="vggt4d").second == shapes(second=("camera",)).second

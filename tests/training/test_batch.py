@@ -66,6 +66,13 @@ def test_a_share_of_clips_has_regions_and_the_clips_stay_the_same(batch):
     assert float(batch.pairs.min()) == float(batch.pairs.max())
 
 
+def test_the_share_of_pairs_is_drawn_from_the_range():
+    """The same draw, moved into the range: the whole one is the default."""
+    whole = np.float64(drawn(dataclasses.replace(PHASE, batch=1, suppressed=1.0)).pairs[0])
+    phase = dataclasses.replace(PHASE, batch=1, suppressed=1.0, suppressed_pairs=(0.5, 0.75))
+    assert drawn(phase).pairs[0] == pytest.approx(0.5 + 0.25 * whole, abs=1e-6)
+
+
 @pytest.mark.parametrize("suppress", ["zero", "drop"])
 def test_the_objective_suppresses_keys_as_a_second_pass_does(batch, suppress):
     """The camera loss is that of the network's own suppressed pass; without regions it is the plain pass's."""

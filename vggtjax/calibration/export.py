@@ -1,10 +1,10 @@
-"""Write a calibration, of cues and perhaps of the number of pairs, as files.
+"""Write a calibration, of cues and perhaps of the second pass, as files.
 
 In the folder:
 
-    model.safetensors       the model with the chosen table, and number of pairs, in its configuration, for load_model
+    model.safetensors       the model with the chosen cues and second pass in its configuration, for load_model
     sweep.png               the quality of each pair's maps; chosen maps are outlined
-    calibration.json        the numbers: sweep, choice, pairs, clips; written last, when the other files are complete
+    calibration.json        the numbers: sweep, choice, second pass, clips; written last, after the other files
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from PIL import Image
 
 from vggtjax.calibration.choice import Choice, Rating, Step, halves
 from vggtjax.calibration.heatmap import draw_sweep
-from vggtjax.calibration.pairs import PairsChoice
+from vggtjax.calibration.second_pass import SecondPassChoice, Setting
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, UNCLEAR, Sweep
 from vggtjax.checkpoint import Model, save_model
 from vggtjax.storage.writing import check_free, says_format, staging
@@ -31,9 +31,15 @@ VERSION = 1
 NUMBERS, MODEL, PICTURE = "calibration.json", "model.safetensors", "sweep.png"
 
 
-def calibrated(model: Model, choice: Choice, pairs: PairsChoice | None = None) -> Model:
-    """Return the model with the chosen cues, and the number of pairs if one was chosen."""
-    motion = choice.motion if pairs is None else dataclasses.replace(choice.motion, mask_pairs=pairs.best)
+def calibrated(model: Model, choice: Choice, second: Setting | None = None) -> Model:
+    """Return the model with the chosen cues, and with a setting of its second pass if one was chosen.
+
+    Otsu's threshold is that of the methods with these masks, so that it is not written into the model.
+    """
+    motion = choice.motion
+    if second is not None:
+        threshold = None if second.threshold == "otsu" else second.threshold
+        motion = dataclasses.replace(motion, mask_pairs=second.pairs, threshold=threshold)
     return dataclasses.replace(model, config=dataclasses.replace(model.config, motion=motion))
 
 
@@ -43,23 +49,23 @@ def save_calibration(
     sweep: Sweep,
     choice: Choice,
     *,
-    pairs: PairsChoice | None = None,
+    second: SecondPassChoice | None = None,
     source: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the calibrated model, the numbers and the picture; return the model's path.
 
-    The folder is made if missing; an earlier calibration in it is replaced. `pairs` is what `choose_pairs` returned;
-    without it the model keeps its number. `source` are JSON values about the clips.
-    Raises OutputError if the folder cannot be written, or holds files with these names of another origin.
+    The folder is made if missing; an earlier calibration in it is replaced. `second` is what `choose_second_pass`
+    returned; without it the model keeps its number of pairs and its threshold. `source` are JSON values about the
+    clips. Raises OutputError if the folder cannot be written, or holds files with these names of another origin.
     """
     folder = Path(folder)
     check_folder(folder)
     auc = sweep.auc()
-    config = calibrated(model, choice, pairs).config
+    config = calibrated(model, choice, None if second is None else second.best).config
     choice = choice._replace(motion=config.motion)
     numbers = calibration_numbers(model, sweep, choice, auc) | {"source": dict(source or {})}
-    if pairs is not None:
-        numbers["mask_pairs"] = _pairs(pairs)
+    if second is not None:
+        numbers["second_pass"] = _second_pass(second)
     with staging(folder) as staged:
         names = {"name": model.name or None, "note": model.note}
         save_model(staged / MODEL, model.params, config, **names, untrained_heads=model.untrained_heads)
@@ -107,9 +113,10 @@ def calibration_numbers(
     }
 
 
-def _pairs(pairs: PairsChoice) -> dict[str, Any]:
-    errors = [{"pairs": number, **error._asdict()} for number, error in pairs.errors.items()]
-    return {"recommended": pairs.best, "scenes": pairs.scenes, "errors": errors}
+def _second_pass(second: SecondPassChoice) -> dict[str, Any]:
+    errors = [setting._asdict() | error._asdict() for setting, error in second.errors.items()]
+    numbers = {"recommended": second.best._asdict(), "scenes": second.scenes}
+    return numbers | {"first_pass": second.first._asdict(), "errors": errors}
 
 
 def _step(step: Step) -> dict[str, Any]:

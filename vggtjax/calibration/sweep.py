@@ -142,7 +142,8 @@ def sweep(
         DeviceMemoryError: a clip does not fit in the device's memory.
     """
     default = MotionConfig()
-    table = dataclasses.replace(default, offsets=config.motion.offsets, mask_pairs=config.motion.mask_pairs)
+    kept = {name: getattr(config.motion, name) for name in ("offsets", "mask_pairs", "threshold")}
+    table = dataclasses.replace(default, **kept)
     cues = SweepCues(table, config.depth)
     maps, saliencies, truths, first_shape = [], [], [], None
     for done, (images, mask) in enumerate(clips, 1):

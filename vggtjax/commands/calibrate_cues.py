@@ -36,7 +36,8 @@ def calibrate_cues(
 ) -> None:
     """Choose a model's motion cues on generated scenes, and save the model with them.
 
-    With --mask-pairs, also choose in how many pairs of blocks its second pass ignores keys.
+    With --mask-pairs, also choose the threshold of its masks, and in how many pairs of blocks its second pass ignores
+    keys.
 
     Args:
         model: a converted .safetensors, a PyTorch checkpoint, or a hub id such as facebook/VGGT-1B.
@@ -47,8 +48,9 @@ def calibrate_cues(
         gram: similarity of the cues; with dot, --mask-pairs tries dropped keys instead of zeroed ones.
         max_terms: largest number of cues.
         floor: added to every map before the product, from 0 (as in the papers) to 1; the model's own does not count.
-        mask_pairs: numbers of pairs to try on all of the scenes, with mined masks. The one with the lowest camera
-            errors becomes what the model recommends; the model keeps its own number by default.
+        mask_pairs: numbers of pairs to try on all of the scenes, with masks mined by both thresholds (otsu,
+            multi-otsu). Number and threshold with the lowest camera errors become what the model recommends; the model
+            keeps its own by default.
         seed: another seed draws other scenes.
     """
     if scenes < 2:
@@ -65,7 +67,7 @@ def calibrate_cues(
 
         from vggtjax.calibration.choice import choose
         from vggtjax.calibration.export import calibrated, check_folder, save_calibration
-        from vggtjax.calibration.pairs import choose_pairs
+        from vggtjax.calibration.second_pass import choose_second_pass
         from vggtjax.calibration.sweep import sweep
         from vggtjax.pretrained.load import load_model
 
@@ -82,16 +84,16 @@ def calibrate_cues(
             swept = sweep(loaded.params, clips, loaded.config, progress=progress, total=scenes)
         with report.stage("choose") as progress:
             choice = choose(swept, gram=gram, max_terms=max_terms, floor=floor, progress=progress)
-        pairs = None
+        second = None
         if numbers:
-            with report.stage("try pairs") as progress:
+            with report.stage("try second passes") as progress:
                 clips = generated_clips(scenes, frames, side, seed)
                 with_cues = calibrated(loaded, choice)
-                pairs = choose_pairs(with_cues, clips, numbers, gram=gram, progress=progress, total=scenes)
+                second = choose_second_pass(with_cues, clips, numbers, gram=gram, progress=progress, total=scenes)
         source = {"scenes": scenes, "frames": frames, "size": side, "textures": "training"}
         source |= {"key": f"fold_in(fold_in(key({seed}), {_KEYS}), scene)"}
         with report.stage("write"):
-            path = save_calibration(out, loaded, swept, choice, pairs=pairs, source=source)
+            path = save_calibration(out, loaded, swept, choice, second=second, source=source)
     rows = {
         step.cue.name + (" (1 - m)" if step.cue.inverted else ""): f"{calibration:.3f}   {held_out:.3f}"
         for step in choice.steps
@@ -101,14 +103,15 @@ def calibrate_cues(
     report.table(rows | {"default table": "{:.3f}   {:.3f}".format(*choice.table), "model": path})
     if choice.steps[-1].rating.held_out < choice.table.held_out:
         report.line("On the held-out half the default table is better than the chosen table; try more scenes.")
-    if pairs is not None:
-        report.line(f"Second pass by number of pairs, 0 for the first pass, on {pairs.scenes} scenes (mined masks):")
+    if second is not None:
+        report.line(f"Cameras of the second pass with mined masks, on {second.scenes} scenes:")
+        rows = {f"{pairs} pairs, {threshold}": errors for (pairs, threshold), errors in second.errors.items()}
         report.table(
             {
-                f"{number} pairs": f"rotation {errors.rotation:.2f} degrees, centres {errors.centres:.4f} median depths"
-                for number, errors in pairs.errors.items()
+                name: f"rotation {errors.rotation:.2f} degrees, centres {errors.centres:.4f} median depths"
+                for name, errors in ({"first pass": second.first} | rows).items()
             }
-            | {"recommended": str(pairs.best)}
+            | {"recommended": f"{second.best.pairs} pairs, {second.best.threshold}"}
         )
     if loaded.note:
         report.line(loaded.warning)

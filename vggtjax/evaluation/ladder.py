@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import ClipTruth, Truth, batched_truth
-from vggtjax.config import Gram, Suppress
+from vggtjax.config import Gram, Suppress, Threshold
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.depth import depth_errors, measured, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
@@ -89,6 +89,7 @@ def ladder(
     mask_pairs: Sequence[int] | None = None,
     suppress: Sequence[Suppress] = ("zero",),
     gram: Gram = "cosine",
+    threshold: Threshold | None = None,
     compute_dtype: ComputeDType = "float32",
     batch_size: int = 4,
     progress: Progress | None = None,
@@ -103,7 +104,7 @@ def ladder(
         masks: "mined" from the first pass, or the "true" masks, an upper bound for any mining.
         mask_pairs: numbers of pairs in which the keys of dynamic tokens are suppressed; the model's own if None.
         suppress: ways to suppress them, in place of the methods' own.
-        gram, compute_dtype: as in `Options`.
+        gram, threshold, compute_dtype: as in `Options`.
         batch_size: number of clips that go through the network together.
         progress: called with the number of passes done and of all passes.
 
@@ -126,7 +127,7 @@ def ladder(
     pairs = (model.config.motion.mask_pairs,) if mask_pairs is None else mask_pairs
     settings = [_Setting(*values) for values in product(masks, pairs, suppress)]
     frames, *size = truth.images.shape[1:4]
-    options = Options(gram=gram, compute_dtype=compute_dtype)
+    options = Options(gram=gram, threshold=threshold, compute_dtype=compute_dtype)
     shared = Stages(model.config, options, frames, (size[0], size[1]))
     second_stages = [
         replace(shared, options=options.changed(mask_pairs=setting.mask_pairs, suppress=setting.suppress))

@@ -86,6 +86,8 @@ class ModelSource:
         settings |= {"model_note": self.model.note} if self.model.note else {}
         settings |= {name: value for name, value in self.options.to_json().items() if name != "method"}
         settings["mask_pairs"] = self.options.resolved(self.model.config.motion).mask_pairs
+        if (threshold := self.options.threshold or self.model.config.motion.threshold) is not None:
+            settings["threshold"] = threshold  # of all methods
         if self.fusion is not None:
             from vggtjax.method.fusion_file import fusion_digest
 

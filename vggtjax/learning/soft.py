@@ -10,10 +10,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vggtjax.cameras import Cameras, unproject
-from vggtjax.config import Gram, MotionConfig, VGGTConfig
+from vggtjax.config import Gram, MotionConfig, Threshold, VGGTConfig
 from vggtjax.method.fusion_family import FusionParams, fuse, identity, soft_mask
 from vggtjax.method.fusion_inputs import observe
-from vggtjax.method.mask import CONSTANT, otsu_threshold, upsample
+from vggtjax.method.mask import CONSTANT, multi_otsu_threshold, otsu_threshold, upsample
 from vggtjax.method.passes import Passes, first_pass, second_pass
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
@@ -26,7 +26,7 @@ from vggtjax.network.suppression import Suppression
 class SoftMasking(NamedTuple):
     """Differentiable parameters of the masks; `soft_masking` returns the paper's values."""
 
-    offset: Float[Array, ""]  # added to Otsu's threshold tau of the saliency
+    offset: Float[Array, ""]  # added to the threshold tau of the saliency: the model's, or Otsu's
     temperature: Float[Array, ""]  # T of sigmoid((saliency - tau) / T); 0 for the hard mask
     strength: Float[Array, " depth"]  # of the suppression in every pair, in [0, 1]
     exponents: Float[Array, " cues"]  # of the cues in their product
@@ -88,7 +88,7 @@ def reconstruct_softly(
         fusion: a tree of the family; the paper's rule if None. Its offset and temperature blend the depths of the
             passes; those of the masking suppress keys.
         gram: similarity of the motion cues.
-        motion: the table of cues; the configuration's own if None.
+        motion: the table of cues, and the threshold; the configuration's own if None.
         compute_dtype: type of the blocks' matrix products.
         stop_camera_gradient: as for `forward`.
         remat: compute activations again on the way back, which takes less memory.
@@ -97,7 +97,8 @@ def reconstruct_softly(
     compute = Compute(compute_dtype, remat=remat)
     mining = {"gram": gram, "motion": motion, "exponents": masking.exponents}
     first, saliency = first_pass(params, clips, config, compute=compute, **mining)
-    dynamic = soft_pixels(saliency, (images.shape[2], images.shape[3]), masking)
+    threshold = (motion or config.motion).threshold or "otsu"
+    dynamic = soft_pixels(saliency, (images.shape[2], images.shape[3]), masking, threshold)
     compute = dataclasses.replace(compute, stop_camera_gradient=stop_camera_gradient)
     suppression = Suppression(strength=masking.strength)
     second = second_pass(params, clips, dynamic, config, suppression=suppression, compute=compute)
@@ -109,12 +110,18 @@ def reconstruct_softly(
 
 
 def soft_pixels(
-    saliency: Float[Array, "B S h w"], size: tuple[int, int], masking: SoftMasking
+    saliency: Float[Array, "B S h w"], size: tuple[int, int], masking: SoftMasking, threshold: Threshold = "otsu"
 ) -> Float[Array, "B S H W"]:
     """Return the dynamic share of every pixel; 0 in a clip of constant saliency."""
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Float[Array, "S H W"]:
         varies = pixels.max() - pixels.min() >= CONSTANT
-        return jnp.where(varies, soft_mask(pixels - otsu_threshold(pixels) - masking.offset, masking.temperature), 0)
+        if threshold == "otsu":
+            margin = pixels - otsu_threshold(pixels) - masking.offset
+            is_dynamic = margin >= 0
+        else:
+            margin = pixels - multi_otsu_threshold(pixels) - masking.offset
+            is_dynamic = margin > 0
+        return jnp.where(varies, soft_mask(margin, masking.temperature, is_dynamic.astype(margin.dtype)), 0)
 
     return jax.vmap(one_clip)(upsample(saliency, size))

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from vggtjax.config import Threshold
 from vggtjax.method.clustering import kmeans
 from vggtjax.method.cues import normalise
 from vggtjax.network.frames import Frames
-from vggtjax.options import Threshold, odd_frames
+from vggtjax.options import odd_frames
 
 BINS = 256
 MOST_CLASSES = 4  # of multi-Otsu

@@ -25,7 +25,7 @@ from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
-from vggtjax.options import Options, Threshold, find_method
+from vggtjax.options import Options, find_method
 
 _Value = TypeVar("_Value")
 
@@ -248,7 +248,6 @@ def run_passes(
     options: Options = Options(),
     motion: MotionConfig | None = None,
     clusters: int | None = None,
-    threshold: Threshold | None = None,
     second: tuple[str, ...] | None = None,
     **changes: Any,
 ) -> Passes:
@@ -261,14 +260,15 @@ def run_passes(
         images: RGB in [0, 1]; any batch and any number of frames.
         config: the model's configuration.
         options: how motion is mined and keys are suppressed; masks are not refined.
-        motion: the table of cues, and the number of pairs unless the options have one; the configuration's own if None.
+        motion: the table of cues, with the number of pairs and the threshold unless the options have one; the
+            configuration's own if None.
         clusters: number of clusters that the saliency is averaged in, 0 for none; the method's own if None.
-        threshold: "otsu" or "multi-otsu", which cuts the saliency; the method's own if None.
         second: outputs of the second pass, () for no second pass; the outputs that the method needs if None.
         changes: fields of `options` by name, such as `gram="dot"`; `mask_pairs` can be traced.
     """
     given: Any = changes.pop("mask_pairs", options.mask_pairs)  # not in the options: the number can be traced
-    mask_pairs = (motion or config.motion).masked_pairs(given)
+    recommended = motion or config.motion
+    mask_pairs = recommended.masked_pairs(given)
     options = options.changed(**changes)
     method, compute = options.row, Compute.of(options)
     if second is None:
@@ -281,7 +281,7 @@ def run_passes(
         patch_tokens,
         (images.shape[2], images.shape[3]),
         clusters=method.clusters if clusters is None else clusters,
-        threshold=threshold or method.threshold,
+        threshold=options.threshold or recommended.threshold or method.threshold,
         smooth_frames=options.smooth_frames,
     )
     if not second:

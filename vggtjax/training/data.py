@@ -21,7 +21,7 @@ def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> Bat
     """Return the batch of a JAX random key: `phase.batch` clips of `frames` frames, in random order and colours.
 
     The clips have the phase's height and width; its further `sizes` are not read. In a share `phase.suppressed` of the
-    clips, random regions are suppressed. Pure; `phase` and `frames` are static.
+    clips, random regions are suppressed, in the same pairs of blocks. Pure; `phase` and `frames` are static.
     """
     config = phase.scenes(frames)
 
@@ -42,7 +42,8 @@ def make_batch(key: Array, textures: Textures, phase: Phase, frames: int) -> Bat
     clips, regions = jax.vmap(one)(jax.random.split(key, phase.batch))
     if regions is None:
         return Batch(clips)
-    pairs = 1 - jax.random.uniform(jax.random.fold_in(key, _SUPPRESSION))
+    low, high = phase.suppressed_pairs
+    pairs = high - (high - low) * jax.random.uniform(jax.random.fold_in(key, _SUPPRESSION))
     return Batch(clips, regions, jnp.broadcast_to(pairs, (phase.batch,)), phase.suppress)
 
 

@@ -50,7 +50,8 @@ class Phase:
     dynamic: float = 0.0  # share of scenes in which objects move
     motion: tuple[float, float] = (0.1, 1.0)  # range of the camera's share of its largest path
     suppressed: Share = 0.0  # share of clips in which the keys of random regions are suppressed, whatever moves
-    suppress: Suppress = "zero"  # how; in the first pairs of blocks, their number drawn for each step
+    suppress: Suppress = "zero"  # how
+    suppressed_pairs: tuple[Share, Share] = (0.0, 1.0)  # in which pairs: range of a share of all, from the first
     gamma: Gamma = 0.5  # width of the range around 0 from which the logarithm of a clip's gamma is drawn
     sizes: Sizes = ()  # further heights and widths
     pitch: tuple[float, float] = (0.0, 0.0)  # range of the angle by which cameras look further down, in degrees
@@ -60,6 +61,11 @@ class Phase:
         check_fields(self, "phase")
         if len(set(self.all_sizes)) <= len(self.sizes):
             raise InputError(f"sizes is {self.sizes}; expected sizes other than {(self.height, self.width)}, each once")
+        low, high = self.suppressed_pairs
+        if not (low <= high and high > 0):
+            raise InputError(
+                f"suppressed_pairs is {self.suppressed_pairs}; expected a range of shares that ends above 0"
+            )
         for frames in self.frames:
             self.scenes(frames)
 

@@ -1,13 +1,15 @@
-"""The number of pairs in which keys are suppressed: chosen by errors of cameras, kept in the model, used by default."""
+"""Threshold and number of pairs of the second pass: chosen by errors of cameras, kept in the model, used by default."""
 
+import dataclasses
 import json
+from functools import partial
 
 import numpy as np
 import pytest
 
 from tests.tiny import tiny_config
-from vggtjax import Model, MotionConfig, init_params, load_model, reconstruct
-from vggtjax.calibration.pairs import CameraErrors, PairsChoice, choose_pairs
+from vggtjax import Model, MotionConfig, init_params, load_model, reconstruct, run_passes
+from vggtjax.calibration.second_pass import CameraErrors, SecondPassChoice, Setting, choose_second_pass
 from vggtjax.checkpoint import save_model
 from vggtjax.commands.calibrate_cues import calibrate_cues, generated_clips
 from vggtjax.config import VGGTConfig
@@ -32,20 +34,24 @@ def _errors(row):
 
 def test_the_smallest_sum_of_shares_of_the_first_pass():
     first, better, worse = CameraErrors(4.0, 0.02), CameraErrors(3.0, 0.022), CameraErrors(2.9, 0.03)
-    assert PairsChoice(8, {0: first, 1: worse, 3: better}).best == 3  # 0.75 + 1.1 against 0.725 + 1.5
-    assert PairsChoice(8, {0: first, 5: worse, 8: worse}).best == 5  # the smaller of equal ones, and never 0
+    one, three, other = Setting(1, "otsu"), Setting(3, "otsu"), Setting(1, "multi-otsu")
+    assert SecondPassChoice(8, first, {one: worse, three: better}).best == three  # 0.75 + 1.1 against 0.725 + 1.5
+    assert SecondPassChoice(8, first, {one: worse, three: worse, other: worse}).best == one  # the first of equal ones
 
 
 def test_errors_are_those_of_the_second_pass(model):
-    clips = list(generated_clips(SCENES, FRAMES, SIZE, seed=1))
-    found = choose_pairs(model, clips, [2, 1])
-    assert list(found.errors) == [0, 1, 2]
-    for pairs in (1, 2):
-        settings = {"methods": ["vggt", "4dvggt-d"], "masks": ["mined"], "mask_pairs": [pairs]}
-        rows = [[_errors(row) for row in ladder(model, clip, **settings)] for clip in clips]
+    clips = list(generated_clips(SCENES, FRAMES, 2 * SIZE, seed=1))  # the two thresholds cut 16 patches differently
+    found = choose_second_pass(model, clips, [2, 1])
+    assert list(found.errors) == [(1, "otsu"), (2, "otsu"), (1, "multi-otsu"), (2, "multi-otsu")]
+    assert len(set(found.errors.values())) == 4
+    for setting in found.errors:
+        motion = dataclasses.replace(model.config.motion, mask_pairs=setting.pairs, threshold=setting.threshold)
+        asked = dataclasses.replace(model, config=dataclasses.replace(model.config, motion=motion))
+        methods = {"methods": ["vggt", "4dvggt-d"], "masks": ["mined"]}
+        rows = [[_errors(row) for row in ladder(asked, clip, **methods)] for clip in clips]
         scored = [each for each in rows if np.isfinite(each).all()]
         assert found.scenes == len(scored) > 0
-        np.testing.assert_allclose([found.errors[0], found.errors[pairs]], np.mean(scored, axis=0), rtol=1e-4)
+        np.testing.assert_allclose([found.first, found.errors[setting]], np.mean(scored, axis=0), rtol=1e-4)
 
 
 @pytest.mark.parametrize(("gram", "suppress"), [("cosine", "zero"), ("dot", "drop")])
@@ -55,14 +61,36 @@ def test_keys_are_suppressed_as_in_the_method_with_these_cues(model, monkeypatch
         assert settings["gram"] == gram
         return [LadderRow(0, "vggt", None, pairs, None, 1, 1, 1, 1, 1, 1, 1, 1, 1) for pairs in (None, 1)]
 
-    monkeypatch.setattr("vggtjax.calibration.pairs.ladder", stand_in)
-    assert choose_pairs(model, [None], [1], gram=gram).best == 1  # pyright: ignore[reportArgumentType]
+    monkeypatch.setattr("vggtjax.calibration.second_pass.ladder", stand_in)
+    assert choose_second_pass(model, [None], [1], gram=gram).best == (1, "otsu")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(("pairs", "found"), [([], r"\[\]"), ([3, 0], "is 0"), ([5], r"\[5\]; .* from 1 to 4")])
 def test_numbers_that_a_model_does_not_have(model, pairs, found):
     with pytest.raises(InputError, match=found):
         pairs_to_try(pairs, model.config.depth)
+
+
+def test_a_model_recommends_its_threshold(model, tmp_path):
+    config = tiny_config(motion=MotionConfig(offsets=(-1, 1), threshold="multi-otsu"))
+    assert "threshold" not in json.loads(model.config.to_json())["motion"]
+    assert VGGTConfig.from_json(config.to_json()) == config
+    loaded = load_model(save_model(tmp_path / "one.safetensors", model.params, config))
+    clip = np.asarray(next(generated_clips(1, FRAMES, 2 * SIZE, seed=1)).images)
+    run = partial(reconstruct, clip=clip, size=2 * SIZE)
+    made, asked = run(loaded), run(model, threshold="multi-otsu")
+    plain, otsu = run(model), run(loaded, threshold="otsu")
+    assert np.array_equal(made.dynamic_mask, asked.dynamic_mask)
+    assert made.settings["threshold"] == asked.settings["threshold"] == "multi-otsu"
+    assert np.array_equal(plain.dynamic_mask, otsu.dynamic_mask)
+    assert not {"threshold"} & (plain.settings.keys() | otsu.settings.keys())
+    assert not np.array_equal(made.dynamic_mask, plain.dynamic_mask)
+    asked = [(loaded, None), (model, "multi-otsu"), (model, None)]
+    masks = [run_passes(of.params, clip[None], of.config, threshold=name).dynamic_mask for of, name in asked]
+    assert np.array_equal(masks[0], masks[1])
+    assert not np.array_equal(masks[0], masks[2])
+    assert ModelSource(loaded, ["4dvggt-d"]).settings["threshold"] == "multi-otsu"
+    assert "threshold" not in ModelSource(model, ["4dvggt-d"]).settings
 
 
 def test_a_model_recommends_its_number(model, tmp_path):
@@ -91,14 +119,15 @@ def test_the_command(model, tmp_path, capsys):
     path = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
     out = tmp_path / "out"
     calibrate_cues(str(path), out, scenes=SCENES, frames=FRAMES, size=SIZE, max_terms=1, mask_pairs=(1, 2))
-    told = json.loads((out / "calibration.json").read_text())["mask_pairs"]
-    assert [row["pairs"] for row in told["errors"]] == [0, 1, 2]
+    told = json.loads((out / "calibration.json").read_text())["second_pass"]
+    assert [row["pairs"] for row in told["errors"]] == [1, 2, 1, 2]
     motion = load_model(out / "model.safetensors").config.motion
     assert json.loads((out / "calibration.json").read_text())["choice"]["motion"]["mask_pairs"] == motion.mask_pairs
     again = tmp_path / "again"  # without numbers to try, the model keeps its own
     calibrate_cues(str(out / "model.safetensors"), again, scenes=SCENES, frames=FRAMES, size=SIZE, max_terms=1)
     assert load_model(again / "model.safetensors").config.motion.mask_pairs == motion.mask_pairs != 5
-    assert motion.mask_pairs == told["recommended"]
+    assert motion.mask_pairs == told["recommended"]["pairs"]
+    assert (motion.threshold or "otsu") == told["recommended"]["threshold"]
     assert len(motion.cues) == 1
     assert "recommended" in capsys.readouterr().out
     with pytest.raises(InputError, match="mask_pairs is"):
