@@ -67,11 +67,10 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
 
 
 def test_the_method_fills_in_what_is_not_given():
-    cpu = {"compute_dtype": "float32", "precision": "highest"}
+    cpu = Options(compute_dtype="float32", precision="highest")
     made = Options("vggt4d").resolved(MOTION)
-    wanted = Options(
-        "vggt4d", gram="dot", suppress="drop", mask_pairs=5, threshold="multi-otsu", refine_mask=True, **cpu
-    )  # pyright: ignore
+    mining = {"gram": "dot", "threshold": "multi-otsu", "refine_mask": True}
+    wanted = cpu.changed(method="vggt4d", suppress="drop", mask_pairs=5, **mining)
     assert made == wanted
     assert Options("vggt4d", gram="cosine", refine_mask=False).resolved(MOTION).gram == "cosine"
 

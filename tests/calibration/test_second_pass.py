@@ -4,6 +4,7 @@ import dataclasses
 import json
 from functools import partial
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -47,8 +48,10 @@ def test_errors_are_those_of_the_second_pass(model):
     for setting in found.errors:
         motion = dataclasses.replace(model.config.motion, mask_pairs=setting.pairs, threshold=setting.threshold)
         asked = dataclasses.replace(model, config=dataclasses.replace(model.config, motion=motion))
-        methods = {"methods": ["vggt", "4dvggt-d"], "masks": ["mined"]}
-        rows = [[_errors(row) for row in ladder(asked, clip, **methods)] for clip in clips]
+        rows = [
+            [_errors(row) for row in ladder(asked, clip, methods=["vggt", "4dvggt-d"], masks=["mined"])]
+            for clip in clips
+        ]
         scored = [each for each in rows if np.isfinite(each).all()]
         assert found.scenes == len(scored) > 0
         np.testing.assert_allclose([found.first, found.errors[setting]], np.mean(scored, axis=0), rtol=1e-4)
@@ -86,7 +89,8 @@ def test_a_model_recommends_its_threshold(model, tmp_path):
     assert not {"threshold"} & (plain.settings.keys() | otsu.settings.keys())
     assert not np.array_equal(made.dynamic_mask, plain.dynamic_mask)
     asked = [(loaded, None), (model, "multi-otsu"), (model, None)]
-    masks = [run_passes(of.params, clip[None], of.config, threshold=name).dynamic_mask for of, name in asked]
+    images = jnp.asarray(clip[None])
+    masks = [run_passes(of.params, images, of.config, threshold=name).dynamic_mask for of, name in asked]
     assert np.array_equal(masks[0], masks[1])
     assert not np.array_equal(masks[0], masks[2])
     assert ModelSource(loaded, ["4dvggt-d"]).settings["threshold"] == "multi-otsu"
