@@ -124,7 +124,9 @@ def demo_model(
     with bench.running():
         results: dict[str, Any] = {
             "model": loaded.summary(),
-            "settings": dataclasses.asdict(settings) | {"height": bench.height, "mask_pairs": bench.pairs},
+            "settings": dataclasses.asdict(settings)
+            | {"height": bench.height, "mask_pairs": bench.pairs}
+            | {"threshold": loaded.config.motion.cut_by(None, "otsu")},
         }
         results["static"] = bench.static_scenes() if static else None
         results["hololens"] = bench.filmed([clips / "hololens"], "hololens")

@@ -23,6 +23,7 @@ MOTION = MotionConfig()
         ({"mask_pairs": 2.5}, "mask_pairs is 2.5"),
         ({"mask_pairs": 10**12}, "mask_pairs is 1000000000000; expected at most 1000000"),
         ({"smooth_frames": 2}, "smooth_frames is 2; expected an odd number"),
+        ({"threshold": "mean"}, "threshold is 'mean'; expected"),
         ({"compute_dtype": "float16"}, "compute_dtype is 'float16'"),
         ({"align_scale": 1}, "align_scale is 1"),
     ],
@@ -73,6 +74,13 @@ def test_the_method_fills_in_what_is_not_given():
     wanted = cpu.changed(method="vggt4d", suppress="drop", mask_pairs=5, **mining)
     assert made == wanted
     assert Options("vggt4d", gram="cosine", refine_mask=False).resolved(MOTION).gram == "cosine"
+
+
+@pytest.mark.parametrize("option", [{"smooth_frames": 3}, {"threshold": "otsu"}])
+def test_options_of_mined_masks_are_refused_with_given_ones(option):
+    Options().check_given_masks()
+    with pytest.raises(InputError, match=f"{next(iter(option))} is .*; leave it out, as given masks"):
+        Options(**option).check_given_masks()
 
 
 def test_the_model_recommends_the_number_of_pairs():

@@ -90,6 +90,10 @@ class MotionConfig:
         """Return `given`, or the recommended number of pairs if it is None."""
         return self.mask_pairs if given is None else given
 
+    def cut_by(self, given: Threshold | None, own: Threshold) -> Threshold:
+        """Return the threshold that is `given`, or else the recommended one, or else the method's `own`."""
+        return given or self.threshold or own
+
 
 _LATER = {name: getattr(MotionConfig, name) for name in ("floor", "mask_pairs", "threshold")}
 
@@ -155,8 +159,8 @@ class VGGTConfig:
     def to_json(self) -> str:
         """Return the configuration as a JSON object; `from_json` reads it back.
 
-        A floor of 0 and the papers' number of pairs are left out, as in files before them: digests and cached
-        conversions stay the same.
+        A floor of 0, the papers' number of pairs and no threshold are left out, as in files before them: digests and
+        cached conversions stay the same.
         """
         values = dataclasses.asdict(self)
         values["motion"] = without_defaults(values["motion"], _LATER)

@@ -128,8 +128,8 @@ class Options:
     """in how many pairs of blocks, from the first on, keys of dynamic tokens are ignored (L_mask of the paper); by
     default the number that the model recommends, 5 for VGGT-1B"""
     threshold: InWords[Threshold | None] = None
-    """where the saliency is cut: otsu, one threshold; multi-otsu, the highest of up to three, with a smaller mask; by
-    default what the model recommends, or multi-otsu for vggt4d and otsu for the others"""
+    """where the saliency is cut: otsu, one threshold; multi-otsu, the highest of up to three, usually with a smaller
+    mask; by default what the model recommends, else multi-otsu for vggt4d and otsu for the others"""
     align_scale: Switch = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1
@@ -161,9 +161,11 @@ class Options:
         check_fields(self)
 
     def check_given_masks(self) -> None:
-        """Raise InputError for options of mined masks; call it where the user gives masks."""
+        """Raise InputError for options of mined masks; call it where the user gives masks, before `resolved`."""
         if self.smooth_frames != 1:
             raise InputError(f"smooth_frames is {self.smooth_frames}; leave it out, as given masks are not smoothed")
+        if self.threshold is not None:
+            raise InputError(f"threshold is {self.threshold!r}; leave it out, as given masks are not mined")
 
     @property
     def row(self) -> Method:
@@ -189,7 +191,7 @@ class Options:
             suppress=row.suppress,
             refine_mask=row.refine,
             mask_pairs=motion.masked_pairs(self.mask_pairs),
-            threshold=self.threshold or motion.threshold or row.threshold,
+            threshold=motion.cut_by(self.threshold, row.threshold),
         )
 
     def computed(self, on_accelerator: bool | None = None) -> Options:
@@ -220,7 +222,8 @@ class Options:
     def to_json(self) -> dict[str, Any]:
         """Return the options as JSON values, without those of `_LATER` at their default: as in results before them.
 
-        A threshold is among them if it is not the method's own.
+        A threshold is among them if it is not the method's own, so that it is lost where the model recommends another
+        one: resolve the options first.
         """
         values = without_defaults(dataclasses.asdict(self), _LATER)
         if self.threshold in (None, METHODS[self.method].threshold):

@@ -10,6 +10,8 @@ import pytest
 
 from tests.tiny import tiny_config
 from vggtjax import Model, MotionConfig, init_params, load_model, reconstruct, run_passes
+from vggtjax.calibration.choice import Choice, Rating
+from vggtjax.calibration.export import calibrated
 from vggtjax.calibration.second_pass import CameraErrors, SecondPassChoice, Setting, choose_second_pass
 from vggtjax.checkpoint import save_model
 from vggtjax.commands.calibrate_cues import calibrate_cues, generated_clips
@@ -94,7 +96,20 @@ def test_a_model_recommends_its_threshold(model, tmp_path):
     assert np.array_equal(masks[0], masks[1])
     assert not np.array_equal(masks[0], masks[2])
     assert ModelSource(loaded, ["4dvggt-d"]).settings["threshold"] == "multi-otsu"
+    assert ModelSource(loaded, ["4dvggt-d"], Options(threshold="otsu")).settings["threshold"] == "otsu"
     assert "threshold" not in ModelSource(model, ["4dvggt-d"]).settings
+
+
+@pytest.mark.parametrize(
+    ("gram", "threshold", "written"),
+    [("cosine", "multi-otsu", "multi-otsu"), ("cosine", "otsu", None), ("dot", "otsu", "otsu")],
+)
+def test_the_chosen_setting_is_written(model, gram, threshold, written):
+    motion = dataclasses.replace(model.config.motion, threshold="multi-otsu")  # of an earlier calibration
+    choice = Choice(motion, gram, (), None, Rating(0.5, 0.5))
+    assert calibrated(model, choice).config.motion == motion
+    found = calibrated(model, choice, Setting(3, threshold)).config.motion
+    assert (found.mask_pairs, found.threshold) == (3, written)
 
 
 def test_a_model_recommends_its_number(model, tmp_path):

@@ -102,6 +102,7 @@ def test_whole_numbers_become_floats():
         (changed(stages=[PHASE | {"sizes": [[28, 30]]}]), "28 x 30 pixels; expected multiples of the model's"),
         (changed(stages=[PHASE | {"pitch": [0, 70]}]), r"stages\[0\]: pitch\[1\] is 70.0; expected a number"),
         (changed(stages=[PHASE | {"suppressed_pairs": [0.5, 0.2]}]), r"suppressed_pairs is \(0.5, 0.2\); expected"),
+        (changed(stages=[PHASE | {"suppressed_pairs": [0, 0]}]), r"suppressed_pairs is \(0.0, 0.0\); expected"),
         (changed(stages=[PHASE | {"sizes": [[28]]}]), r"stages\[0\].sizes\[0\] is \[28\]; expected a list of 2"),
         (
             changed(stages=[PHASE | {"sizes": [[0, 28]]}]),

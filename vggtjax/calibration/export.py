@@ -34,11 +34,11 @@ NUMBERS, MODEL, PICTURE = "calibration.json", "model.safetensors", "sweep.png"
 def calibrated(model: Model, choice: Choice, second: Setting | None = None) -> Model:
     """Return the model with the chosen cues, and with a setting of its second pass if one was chosen.
 
-    Otsu's threshold is that of the methods with these masks, so that it is not written into the model.
+    With cosines, Otsu's threshold is the methods' own, and None is written: it leaves vggt4d, too, its own.
     """
     motion = choice.motion
     if second is not None:
-        threshold = None if second.threshold == "otsu" else second.threshold
+        threshold = None if choice.gram == "cosine" and second.threshold == "otsu" else second.threshold
         motion = dataclasses.replace(motion, mask_pairs=second.pairs, threshold=threshold)
     return dataclasses.replace(model, config=dataclasses.replace(model.config, motion=motion))
 

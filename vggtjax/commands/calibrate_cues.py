@@ -36,7 +36,7 @@ def calibrate_cues(
 ) -> None:
     """Choose a model's motion cues on generated scenes, and save the model with them.
 
-    With --mask-pairs, also choose the threshold of its masks, and in how many pairs of blocks its second pass ignores
+    With --mask-pairs, also choose the threshold of the masks, and in how many pairs of blocks the second pass ignores
     keys.
 
     Args:
@@ -49,8 +49,8 @@ def calibrate_cues(
         max_terms: largest number of cues.
         floor: added to every map before the product, from 0 (as in the papers) to 1; the model's own does not count.
         mask_pairs: numbers of pairs to try on all of the scenes, with masks mined by both thresholds (otsu,
-            multi-otsu). Number and threshold with the lowest camera errors become what the model recommends; the model
-            keeps its own by default.
+            multi-otsu). The number and the threshold with the lowest camera errors become what the model recommends;
+            without this option the model keeps its own.
         seed: another seed draws other scenes.
     """
     if scenes < 2:

@@ -87,7 +87,7 @@ class ModelSource:
         settings |= {name: value for name, value in self.options.to_json().items() if name != "method"}
         settings["mask_pairs"] = self.options.resolved(self.model.config.motion).mask_pairs
         if (threshold := self.options.threshold or self.model.config.motion.threshold) is not None:
-            settings["threshold"] = threshold  # of all methods
+            settings["threshold"] = threshold  # `to_json` leaves out a method's own
         if self.fusion is not None:
             from vggtjax.method.fusion_file import fusion_digest
 

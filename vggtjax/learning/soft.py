@@ -26,7 +26,7 @@ from vggtjax.network.suppression import Suppression
 class SoftMasking(NamedTuple):
     """Differentiable parameters of the masks; `soft_masking` returns the paper's values."""
 
-    offset: Float[Array, ""]  # added to the threshold tau of the saliency: the model's, or Otsu's
+    offset: Float[Array, ""]  # added to the threshold tau of the saliency
     temperature: Float[Array, ""]  # T of sigmoid((saliency - tau) / T); 0 for the hard mask
     strength: Float[Array, " depth"]  # of the suppression in every pair, in [0, 1]
     exponents: Float[Array, " cues"]  # of the cues in their product
@@ -46,7 +46,7 @@ class SoftReconstruction(NamedTuple):
 def soft_masking(
     config: VGGTConfig, *, temperature: float = 0.0, mask_pairs: int | None = None, motion: MotionConfig | None = None
 ) -> SoftMasking:
-    """Return the paper's values: Otsu's threshold, suppression in the first pairs, the plain product of cues.
+    """Return the paper's values: no offset to the threshold, suppression in the first pairs, the plain product of cues.
 
     `motion` is the table of cues, the configuration's own if None. `mask_pairs` is the number of pairs, the table's if
     None.
@@ -116,12 +116,9 @@ def soft_pixels(
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Float[Array, "S H W"]:
         varies = pixels.max() - pixels.min() >= CONSTANT
-        if threshold == "otsu":
-            margin = pixels - otsu_threshold(pixels) - masking.offset
-            is_dynamic = margin >= 0
-        else:
-            margin = pixels - multi_otsu_threshold(pixels) - masking.offset
-            is_dynamic = margin > 0
+        tau = otsu_threshold(pixels) if threshold == "otsu" else multi_otsu_threshold(pixels)
+        margin = pixels - tau - masking.offset
+        is_dynamic = margin >= 0 if threshold == "otsu" else margin > 0  # as `dynamic_pixels`
         return jnp.where(varies, soft_mask(margin, masking.temperature, is_dynamic.astype(margin.dtype)), 0)
 
     return jax.vmap(one_clip)(upsample(saliency, size))

@@ -281,7 +281,7 @@ def run_passes(
         patch_tokens,
         (images.shape[2], images.shape[3]),
         clusters=method.clusters if clusters is None else clusters,
-        threshold=options.threshold or recommended.threshold or method.threshold,
+        threshold=recommended.cut_by(options.threshold, method.threshold),
         smooth_frames=options.smooth_frames,
     )
     if not second:

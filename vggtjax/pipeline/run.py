@@ -94,14 +94,15 @@ def reconstruct(
         DeviceMemoryError: the clip does not fit in the memory of the device.
         MissingExtraError: cameras are to be refined, and pycolmap is not installed.
     """
-    options = options.changed(**changes).resolved(model.config.motion)
+    options = options.changed(**changes)
+    if masks is not None:
+        options.check_given_masks()
+    options = options.resolved(model.config.motion)
     on_stage = on_stage or no_stage
     mesh = frames_mesh(devices)
     if mesh is not None and tracks is not None:
         raise InputError(f"devices is {devices} and points are to be tracked, which takes one device; leave one out")
     check_fuses(fusion, options.method)
-    if masks is not None:
-        options.check_given_masks()
     check_refinement(options.refine_cameras, known is not None and known.poses is not None)
     if known is not None:
         check_readable(known)

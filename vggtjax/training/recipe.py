@@ -51,7 +51,7 @@ class Phase:
     motion: tuple[float, float] = (0.1, 1.0)  # range of the camera's share of its largest path
     suppressed: Share = 0.0  # share of clips in which the keys of random regions are suppressed, whatever moves
     suppress: Suppress = "zero"  # how
-    suppressed_pairs: tuple[Share, Share] = (0.0, 1.0)  # in which pairs: range of a share of all, from the first
+    suppressed_pairs: tuple[Share, Share] = (0.0, 1.0)  # range of the share of pairs, from the first, that do
     gamma: Gamma = 0.5  # width of the range around 0 from which the logarithm of a clip's gamma is drawn
     sizes: Sizes = ()  # further heights and widths
     pitch: tuple[float, float] = (0.0, 0.0)  # range of the angle by which cameras look further down, in degrees
