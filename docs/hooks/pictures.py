@@ -155,7 +155,8 @@ def cues(clip: Clip) -> Figure:
     figure, axes = pyplot.subplots(len(frames), columns, figsize=(11.5, 4.7), layout="constrained")
     saliency = result.saliency
     assert saliency is not None
-    maps = {name.replace("_", " ", 1).replace("_", "\n"): values for name, values in clip.cues.items()}
+    titles = (name.replace("1 - ", "1 -\n").replace("_", "\n", 1).replace("_", " ") for name in clip.cues)
+    maps = dict(zip(titles, clip.cues.values(), strict=True))
     for row, frame in zip(axes, frames, strict=True):
         top = frame == frames[0]
         _image(row[0], result.images[frame], "picture" if top else "", f"frame {frame}")
