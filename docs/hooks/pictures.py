@@ -170,15 +170,14 @@ def mask(clip: Clip) -> Figure:
     """The histogram of the saliency of all pixels with the threshold, and the mask it gives."""
     from matplotlib import pyplot
 
-    from vggtjax.method.mask import BINS, multi_otsu_threshold, otsu_threshold, upsample
+    from vggtjax.method.mask import BINS, find_threshold, upsample
     from vggtjax.results.previews import overlay
 
     result, frames = clip.result, (2, 7, 12)
     assert result.saliency is not None
     pixels = np.asarray(upsample(result.saliency[None], result.depth.shape[1:3]))[0]  # pyright: ignore
-    is_multi = result.settings.get("threshold") == "multi-otsu"
-    cut, name = (multi_otsu_threshold, "multi-Otsu's") if is_multi else (otsu_threshold, "Otsu's")
-    threshold = float(cut(pixels))  # pyright: ignore
+    kind = result.settings.get("threshold", "otsu")  # absent where it is the method's own
+    threshold = float(find_threshold(pixels, kind))  # pyright: ignore
     figure = pyplot.figure(figsize=(11.5, 5.0), layout="constrained")
     grid = figure.add_gridspec(3, 7)
     axes = figure.add_subplot(grid[:, :4])
@@ -188,7 +187,7 @@ def mask(clip: Clip) -> Figure:
     axes.hist(low, edges, color="#5b5b8f", label=f"static: {low.size / pixels.size:.0%} of the pixels")
     axes.hist(pixels[pixels >= threshold], edges, color=_SECOND, label=f"dynamic: {1 - low.size / pixels.size:.0%}")
     axes.axvline(threshold, color=_TRUE, linewidth=1.2)
-    axes.annotate(f"{name} threshold, {threshold:.2f}", (threshold, axes.get_ylim()[1] * 0.8), (8, 0),
+    axes.annotate(f"{kind}: {threshold:.2f}", (threshold, axes.get_ylim()[1] * 0.8), (8, 0),
                   textcoords="offset points")  # fmt: skip
     axes.set(xlabel="saliency", ylabel="pixels of all frames", title="one threshold for the clip")
     axes.legend(loc="upper right")

@@ -13,7 +13,7 @@ from vggtjax.cameras import Cameras, unproject
 from vggtjax.config import Gram, MotionConfig, Threshold, VGGTConfig
 from vggtjax.method.fusion_family import FusionParams, fuse, identity, soft_mask
 from vggtjax.method.fusion_inputs import observe
-from vggtjax.method.mask import CONSTANT, multi_otsu_threshold, otsu_threshold, upsample
+from vggtjax.method.mask import CONSTANT, find_threshold, upsample
 from vggtjax.method.passes import Passes, first_pass, second_pass
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
@@ -112,12 +112,11 @@ def reconstruct_softly(
 def soft_pixels(
     saliency: Float[Array, "B S h w"], size: tuple[int, int], masking: SoftMasking, threshold: Threshold = "otsu"
 ) -> Float[Array, "B S H W"]:
-    """Return the dynamic share of every pixel; 0 in a clip of constant saliency."""
+    """Return the dynamic share of every pixel; 0 in a clip of constant saliency. `threshold` is the model's."""
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Float[Array, "S H W"]:
         varies = pixels.max() - pixels.min() >= CONSTANT
-        tau = otsu_threshold(pixels) if threshold == "otsu" else multi_otsu_threshold(pixels)
-        margin = pixels - tau - masking.offset
+        margin = pixels - find_threshold(pixels, threshold) - masking.offset
         is_dynamic = margin >= 0 if threshold == "otsu" else margin > 0  # as `dynamic_pixels`
         return jnp.where(varies, soft_mask(margin, masking.temperature, is_dynamic.astype(margin.dtype)), 0)
 

@@ -44,6 +44,15 @@ def otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS, frames: Fram
     return jnp.where(high > low, centres[jnp.argmax(between)], low)
 
 
+def find_threshold(
+    pixels: Float[Array, "S H W"], threshold: Threshold = "otsu", frames: Frames = Frames()
+) -> Float[Array, ""]:
+    """Return the value at which a clip's saliency is cut. With `frames` the pixels are of all devices."""
+    if threshold == "otsu":
+        return otsu_threshold(pixels, frames=frames)
+    return multi_otsu_threshold(frames.gather(pixels, axis=0)[: frames.counted(len(pixels))])
+
+
 def dynamic_pixels(
     saliency: Float[Array, "B S h w"],
     size: tuple[int, int],
@@ -65,11 +74,8 @@ def dynamic_pixels(
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
         low, high = _extremes(pixels, frames)
-        varies = high - low >= CONSTANT
-        if threshold == "otsu":
-            return (pixels >= otsu_threshold(pixels, frames=frames)) & varies
-        every = frames.gather(pixels, axis=0)[: frames.counted(len(pixels))]
-        return (pixels > multi_otsu_threshold(every)) & varies
+        cut = find_threshold(pixels, threshold, frames)
+        return (pixels >= cut if threshold == "otsu" else pixels > cut) & (high - low >= CONSTANT)
 
     mask = jax.vmap(one_clip)(upsample(saliency, size))
     return mask if is_counted is None else mask & is_counted[None, :, None, None]

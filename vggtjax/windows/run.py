@@ -106,10 +106,10 @@ def reconstruct_long(
         OutputError: the folder cannot be written, or another run is writing it.
         DeviceMemoryError: a window does not fit in the memory of the device.
     """
-    options = options.changed(**changes)
+    asked = options.changed(**changes)
     if masks is not None:
-        options.check_given_masks()
-    options = options.resolved(model.config.motion)
+        asked.check_given_masks()
+    options = asked.resolved(model.config.motion)
     check_fuses(fusion, options.method)
     if long_run is not None and isinstance(long_run.tracks, str):
         check_words(long_run.tracks)
@@ -127,7 +127,7 @@ def reconstruct_long(
         "versions": versions(),
     }
     return run_windows(
-        source, Path(out), plan, tools_of(model, options, plan.fitter.size, fusion=fusion, masks=masks), settings
+        source, Path(out), plan, tools_of(model, asked, plan.fitter.size, fusion=fusion, masks=masks), settings
     )
 
 
@@ -140,14 +140,13 @@ def tools_of(
     masks: str | Path | bool | None = None,
 ) -> Tools:
     """Return what runs a window by `reconstruct`, and describes frames by the means of their patch tokens."""
-    config, options = model.config, options.resolved(model.config.motion)
+    config = model.config
 
     def run(clip: Clip) -> Reconstruction:
-        moving, asked = None, options
+        moving = None
         if masks is not None:
-            asked = options.changed(threshold=None)  # it is filled in, and refused with masks
             moving = load_masks(str(masks), clip) if masks is not False else np.zeros(clip.images.shape[:3], bool)
-        return reconstruct(model, clip, options=asked, size=size, masks=moving, fusion=fusion)
+        return reconstruct(model, clip, options=options, size=size, masks=moving, fusion=fusion)
 
     def describe(images: Float32[np.ndarray, "F H W 3"]) -> Float32[np.ndarray, "F C"]:
         stages = Stages(config, options, len(images), (images.shape[1], images.shape[2]))
