@@ -64,7 +64,7 @@ class Phase:
         low, high = self.suppressed_pairs
         if not (low <= high and high > 0):
             raise InputError(
-                f"suppressed_pairs is {self.suppressed_pairs}; expected a range of shares that ends above 0"
+                f"suppressed_pairs is {self.suppressed_pairs}; expected the smaller share first, the larger above 0"
             )
         for frames in self.frames:
             self.scenes(frames)
