@@ -74,8 +74,9 @@ def dynamic_pixels(
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
         low, high = _extremes(pixels, frames)
+        varies = high - low >= CONSTANT
         cut = find_threshold(pixels, threshold, frames)
-        return (pixels >= cut if threshold == "otsu" else pixels > cut) & (high - low >= CONSTANT)
+        return (pixels >= cut if threshold == "otsu" else pixels > cut) & varies
 
     mask = jax.vmap(one_clip)(upsample(saliency, size))
     return mask if is_counted is None else mask & is_counted[None, :, None, None]
