@@ -18,9 +18,10 @@ METRICS = {  # fields of LadderRow, and their names in tables and plots
     "rotation_error": "rotation (deg)",
     "centre_error": "centres",
     "centre_error_ratio": "centres / depth",
+    "point_distance": "points",
     "mask_jaccard": "mask J",
 }
-AGAINST_FIRST = ("abs_rel", "rotation_error", "centre_error")  # also as ratios to the plain pass
+AGAINST_FIRST = ("abs_rel", "rotation_error", "centre_error", "point_distance")  # also as ratios to the plain pass
 
 _GUESSES = {
     "mean_depth_map": "mean depth map",

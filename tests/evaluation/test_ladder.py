@@ -16,6 +16,7 @@ from vggtjax.evaluation.ladder import LadderRow, error_table, ladder, second_pas
 from vggtjax.evaluation.metrics.depth import depth_errors, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
+from vggtjax.geometry.similarity import umeyama_sim3
 from vggtjax.method.mask import upsample
 from vggtjax.options import LADDER
 
@@ -110,11 +111,30 @@ def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
     assert row.rotation_error == pytest.approx(rotation_error(poses, clip.camera_from_world), rel=1e-3)
     assert row.centre_error == pytest.approx(centre_error(poses, clip.camera_from_world), rel=1e-3)
     assert row.centre_error_ratio == pytest.approx(row.centre_error / np.median(clip.depth[:, 3:]))
+    assert row.point_distance == pytest.approx(
+        point_distance(depth, np.asarray(made.intrinsics[1]), poses, clip), rel=1e-3
+    )
     pixels = np.asarray(upsample(passes.saliency, SIZE)[1])
     assert row.saliency_auc == pytest.approx(auc(pixels, clip.dynamic_mask), abs=1e-3)
     mined = np.asarray(passes.dynamic_mask[1])
     expected = None if method == "vggt" else pytest.approx(jaccard(mined, clip.dynamic_mask), abs=1e-3)
     assert row.mask_jaccard == expected
+
+
+def point_distance(depth, intrinsics, poses, clip) -> float:
+    """Lift pixel by pixel, from the definition."""
+
+    def place(pose, x) -> np.ndarray:
+        return pose[:, :3].T @ (x - pose[:, 3])
+
+    found = [place(pose, np.zeros(3)) for pose in poses], [place(pose, np.zeros(3)) for pose in clip.camera_from_world]
+    similarity, distances = umeyama_sim3(*map(np.stack, found)), []
+    for frame, row, column in np.argwhere(clip.depth > 0):
+        pixel, points = np.array([column, row, 1.0]), []
+        for z, K, pose in ((depth, intrinsics, poses), (clip.depth, clip.intrinsics, clip.camera_from_world)):
+            points.append(place(pose[frame], z[frame, row, column] * (np.linalg.inv(K[frame]) @ pixel)))
+        distances.append(np.linalg.norm(similarity.apply(points[0][None])[0] - points[1]))
+    return float(np.mean(distances))
 
 
 def test_suppressing_nothing_is_the_plain_pass(rows):
@@ -167,7 +187,14 @@ def test_what_the_truth_leaves_undefined_is_none(model, truth):
         dynamic_mask=np.zeros_like(truth.dynamic_mask), camera_from_world=np.tile(np.eye(3, 4), (CLIPS, FRAMES, 1, 1))
     )
     row = ladder(model, still, methods=["vggt"], batch_size=2)[0]
-    assert row.abs_rel_dynamic is row.saliency_auc is row.centre_error is row.centre_error_ratio is None
+    assert (
+        row.abs_rel_dynamic
+        is row.saliency_auc
+        is row.centre_error
+        is row.centre_error_ratio
+        is row.point_distance
+        is None
+    )
     assert row.abs_rel_static == row.abs_rel
     assert row.rotation_error is not None
     assert row.failure == "the true cameras do not move; their centres cannot be aligned"

@@ -17,7 +17,10 @@ from vggtjax.config import Gram, Suppress, Threshold
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.depth import depth_errors, measured, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
+from vggtjax.evaluation.metrics.point_clouds import paired_distance
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
+from vggtjax.evaluation.truth_at_pixels import known_points
+from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.method.mask import upsample
 from vggtjax.method.passes import Assembly, Passes, assemble
 from vggtjax.network.clip_batch import ClipBatch
@@ -51,6 +54,9 @@ class LadderRow:
     rotation_error: float | None  # degrees, mean over frames, relative to frame 0
     centre_error: float | None  # RMSE after Sim(3), in the truth's unit
     centre_error_ratio: float | None  # centre error over the clip's median true depth
+    point_distance: (
+        float | None
+    )  # mean ||X - X*|| of a pixel's points, after Sim(3) of the centres, in the truth's unit
     saliency_auc: float | None  # of the first pass, over pixels
     mask_jaccard: float | None  # of the mask of the second pass
     failure: str = ""
@@ -61,6 +67,7 @@ class _Scene(NamedTuple):
 
     clip: int
     truth: Truth
+    points: Float[np.ndarray, "N 3"]  # of the pixels with a true depth
     saliency: Float[np.ndarray, "S H W"]
 
 
@@ -145,7 +152,7 @@ def ladder(
         first, saliency = shared.first_pass(model.params, batch, second_follows=bool(masked))
         mined = shared.dynamic_mask(saliency, patch_tokens)
         pixels = np.asarray(_upsample(saliency, size=tuple(size)))
-        scenes = [_Scene(clip, Truth(*(a[clip] for a in truth)), pixels[i]) for i, clip in enumerate(clips)]
+        scenes = [_scene(int(clip), truth, pixels[i]) for i, clip in enumerate(clips)]
         rows += _scored(Passes(first, None, saliency, mined), plain, scenes, _Setting())
         advance()
         for setting, stages in zip(settings, second_stages, strict=True) if masked else ():
@@ -227,12 +234,19 @@ def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         yield indices[indices < count], np.minimum(indices, count - 1)
 
 
+def _scene(clip: int, truth: Truth, saliency: Float[np.ndarray, "S H W"]) -> _Scene:
+    own = Truth(*(array[clip] for array in truth))
+    points = known_points(own.depth, own.intrinsics, own.camera_from_world, measured(own.depth))
+    return _Scene(clip, own, points, saliency)
+
+
 def _scored(passes: Passes, methods: tuple[str, ...], scenes: list[_Scene], setting: _Setting) -> Iterator[LadderRow]:
     mask = np.asarray(passes.dynamic_mask)
     for method, assembly in zip(methods, _assemble(passes, methods=methods), strict=True):
-        depth, cameras = np.asarray(assembly.depth), np.asarray(assembly.camera_from_world)
+        depth, intrinsics = np.asarray(assembly.depth), np.asarray(assembly.intrinsics)
+        cameras = np.asarray(assembly.camera_from_world)
         for i, scene in enumerate(scenes):
-            yield _row(scene, method, setting, depth[i], cameras[i], mask[i])
+            yield _row(scene, method, setting, depth[i], intrinsics[i], cameras[i], mask[i])
 
 
 def _row(
@@ -240,6 +254,7 @@ def _row(
     method: str,
     setting: _Setting,
     depth: Float[np.ndarray, "S H W"],
+    intrinsics: Float[np.ndarray, "S 3 3"],
     camera_from_world: Float[np.ndarray, "S 3 4"],
     mask: Bool[np.ndarray, "S H W"],
 ) -> LadderRow:
@@ -252,17 +267,19 @@ def _row(
             failures.append(str(error))
             return None
 
-    centres = attempt(centre_error, camera_from_world, truth.camera_from_world)
+    off_centre = attempt(centre_error, camera_from_world, truth.camera_from_world)
+    points = None if off_centre is None else attempt(_point_distance, depth, intrinsics, camera_from_world, scene)
     known, dynamic = measured(truth.depth), truth.dynamic_mask
     distance = float(np.median(truth.depth[known])) if known.any() else None
     return LadderRow(
-        clip=int(scene.clip),
+        clip=scene.clip,
         method=method,
         **setting._asdict(),
         **(attempt(_depth_scores, depth, truth) or dict.fromkeys(_DEPTH_SCORES)),
         rotation_error=attempt(rotation_error, camera_from_world, truth.camera_from_world),
-        centre_error=centres,
-        centre_error_ratio=None if centres is None or distance is None else centres / distance,
+        centre_error=off_centre,
+        centre_error_ratio=None if off_centre is None or distance is None else off_centre / distance,
+        point_distance=points,
         saliency_auc=attempt(auc, scene.saliency, dynamic) if dynamic.any() and not dynamic.all() else None,
         mask_jaccard=None if setting.mask_source is None else jaccard(mask, dynamic),
         failure="; ".join(failures),
@@ -281,3 +298,14 @@ def _depth_scores(depth: Float[np.ndarray, "S H W"], truth: Truth) -> dict[str, 
 
     values = (whole.abs_rel, within(~truth.dynamic_mask), within(truth.dynamic_mask), whole.delta1)
     return dict(zip(_DEPTH_SCORES, values, strict=True))
+
+
+def _point_distance(
+    depth: Float[np.ndarray, "S H W"],
+    intrinsics: Float[np.ndarray, "S 3 3"],
+    camera_from_world: Float[np.ndarray, "S 3 4"],
+    scene: _Scene,
+) -> float:
+    similarity = umeyama_sim3(centres(camera_from_world), centres(scene.truth.camera_from_world))
+    points = known_points(depth, intrinsics, camera_from_world, measured(scene.truth.depth))
+    return paired_distance(similarity.apply(points), scene.points).mean
