@@ -43,7 +43,7 @@ class Choice(NamedTuple):
     motion: MotionConfig
     gram: Gram
     steps: tuple[Step, ...]  # one per cue of the table
-    refused: Step | None  # the next best cue, not confirmed by the held-out half
+    refused: Step | None  # the next cue, not worth it on the held-out half
     table: Rating  # of the sweep's own table
 
 
@@ -60,15 +60,16 @@ def choose(
 
     The first, third, ... clips are the calibration half; the others are held out. Each step adds the map, plain or
     inverted, with the largest area under the ROC curve of the product (as in `GramCues.saliency`) on the calibration
-    half. The choice ends where the held-out half gains nothing or less than `min_gain`. As that half decides the number
-    of cues, the rating on it is slightly optimistic. Candidates are all maps of one pair, and the means over two or
-    three neighbouring pairs.
+    half, up to `max_terms` of them, while it grows. The held-out half decides how many are kept: those with the largest
+    area on it, where each cue has to bring at least `min_gain` on average. A cue that brings little stays if the cues
+    after it bring more. The rating on that half is slightly optimistic. Candidates are all maps of one pair, and the
+    means over two or three neighbouring pairs.
 
     Args:
         sweep: result of `sweep`.
         gram: similarity of the table.
         max_terms: largest number of cues.
-        min_gain: smallest gain in area on the held-out half for another cue.
+        min_gain: smallest gain in area on the held-out half for a further cue, on average.
         floor: added to every map, in [0, 1]: see `MotionConfig`.
         progress: called with the number of tried candidates and the largest possible number.
 
@@ -82,11 +83,10 @@ def choose(
     _check_truth("calibration", calibration)
     _check_truth("held-out", held_out)
     pool = candidates(sweep.depth)
-    steps: list[Step] = []
-    refused = None
-    while len(steps) < max_terms and refused is None:
-        chosen = [step.cue for step in steps]
-        best_cue, best = None, steps[-1].rating.calibration if steps else -1.0
+    path: list[Step] = []
+    while len(path) < max_terms:
+        chosen = [step.cue for step in path]
+        best_cue, best = None, path[-1].rating.calibration if path else -1.0
         saliency = _product(calibration, gram, chosen, floor)
         for tried, cue in enumerate(pool, 1):
             for inverted in (False, True):
@@ -94,16 +94,14 @@ def choose(
                 value = _product_auc(saliency * _term(calibration, gram, candidate, floor), calibration.truth)
                 if value > best and cue.name not in [other.name for other in chosen]:
                     best_cue, best = candidate, value
-            (progress or no_progress)(len(steps) * len(pool) + tried, max_terms * len(pool))
+            (progress or no_progress)(len(path) * len(pool) + tried, max_terms * len(pool))
         if best_cue is None:
             break
         confirmed = _product_auc(_product(held_out, gram, [*chosen, best_cue], floor), held_out.truth)
-        rating = Rating(best, confirmed)
-        gain = rating.held_out - steps[-1].rating.held_out if steps else 1.0
-        if gain > 0 and gain >= min_gain:
-            steps.append(Step(best_cue, rating))
-        else:
-            refused = Step(best_cue, rating)
+        path.append(Step(best_cue, Rating(best, confirmed)))
+    worth = [step.rating.held_out - min_gain * count for count, step in enumerate(path)]
+    kept = 1 + int(np.argmax(worth))  # of equal ones the fewest cues
+    steps, refused = path[:kept], path[kept] if kept < len(path) else None
     cues = tuple(step.cue for step in steps)
     motion = dataclasses.replace(sweep.table, cues=cues, reference_depth=sweep.depth, floor=floor)
     table = Rating(*(token_auc(half.table_saliency[GRAMS.index(gram)], half.truth) for half in (calibration, held_out)))
