@@ -102,6 +102,11 @@ def test_whole_numbers_become_floats():
         (changed(stages=[PHASE | {"sizes": [[28, 30]]}]), "28 x 30 pixels; expected multiples of the model's"),
         (changed(stages=[PHASE | {"pitch": [0, 70]}]), r"stages\[0\]: pitch\[1\] is 70.0; expected a number"),
         (changed(stages=[PHASE | {"suppressed_pairs": [0.5, 0.2]}]), r"suppressed_pairs is \(0.5, 0.2\); expected"),
+        (
+            changed(stages=[PHASE | {"field_of_view": [80, 40]}]),
+            r"field_of_view is \(80.0, 40.0\); expected two numbers",
+        ),
+        (changed(stages=[PHASE | {"boxes": 65}]), r"stages\[0\]: boxes is 65; expected a whole number"),
         (changed(stages=[PHASE | {"suppressed_pairs": [0, 0]}]), r"suppressed_pairs is \(0.0, 0.0\); expected"),
         (changed(stages=[PHASE | {"sizes": [[28]]}]), r"stages\[0\].sizes\[0\] is \[28\]; expected a list of 2"),
         (
@@ -185,8 +190,9 @@ def test_the_recipe_for_a_gpu_fits_the_wheel_and_takes_a_step():
 
 
 def test_fields_of_a_phase_reach_its_scenes():
-    scenes = Phase(1, 8, (2,), 28, 42, dynamic=0.5, motion=(0.2, 0.3), pitch=(1, 2), roll=3).scenes(2)
-    assert scenes == SceneConfig(28, 42, 2, 0.5, motion=(0.2, 0.3), pitch=(1, 2), roll=3)
+    changed = {"pitch": (1, 2), "roll": 3, "field_of_view": (40, 50), "boxes": 6, "ellipsoids": 7, "cylinders": 8}
+    scenes = Phase(1, 8, (2,), 28, 42, dynamic=0.5, motion=(0.2, 0.3), **changed).scenes(2)
+    assert scenes == SceneConfig(28, 42, 2, 0.5, motion=(0.2, 0.3), **changed)
 
 
 def test_gamma_makes_clips_darker_and_brighter():

@@ -56,6 +56,10 @@ class Phase:
     sizes: Sizes = ()  # further heights and widths
     pitch: tuple[float, float] = (0.0, 0.0)  # range of the angle by which cameras look further down, in degrees
     roll: float = 0.0  # largest further roll of a camera, in degrees
+    field_of_view: tuple[float, float] = SceneConfig.field_of_view  # range of the horizontal one, in degrees
+    boxes: int = SceneConfig.boxes  # most boxes of a scene; each is present or absent
+    ellipsoids: int = SceneConfig.ellipsoids
+    cylinders: int = SceneConfig.cylinders
 
     def __post_init__(self) -> None:
         check_fields(self, "phase")
@@ -81,8 +85,9 @@ class Phase:
 
     def scenes(self, frames: int) -> SceneConfig:
         """Return the configuration of scenes of `frames` frames. Raises InputError for invalid values."""
+        same = ("boxes", "ellipsoids", "cylinders", "motion", "pitch", "roll", "field_of_view")
         return SceneConfig(
-            self.height, self.width, frames, self.dynamic, motion=self.motion, pitch=self.pitch, roll=self.roll
+            self.height, self.width, frames, self.dynamic, **{name: getattr(self, name) for name in same}
         )
 
 
