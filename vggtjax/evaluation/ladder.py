@@ -54,9 +54,7 @@ class LadderRow:
     rotation_error: float | None  # degrees, mean over frames, relative to frame 0
     centre_error: float | None  # RMSE after Sim(3), in the truth's unit
     centre_error_ratio: float | None  # centre error over the clip's median true depth
-    point_distance: (
-        float | None
-    )  # mean ||X - X*|| of a pixel's points, after Sim(3) of the centres, in the truth's unit
+    point_distance: float | None  # mean over pixels, after Sim(3) of the centres, in the truth's unit
     saliency_auc: float | None  # of the first pass, over pixels
     mask_jaccard: float | None  # of the mask of the second pass
     failure: str = ""
