@@ -147,22 +147,24 @@ def passes(clip: Clip) -> Figure:
 
 
 def cues(clip: Clip) -> Figure:
-    """The maps, as they enter the product before the floor is added, and the saliency that comes of them."""
+    """The maps in the frame where most moves, as they enter the product before the floor, and the saliency they give."""
     from matplotlib import pyplot
 
-    result, frames = clip.result, (2, 7, 12)
-    columns = 3 + len(clip.cues)
-    figure, axes = pyplot.subplots(len(frames), columns, figsize=(11.5, 4.7), layout="constrained")
-    saliency = result.saliency
-    assert saliency is not None
-    titles = (name.replace("1 - ", "1 -\n").replace("_", "\n", 1).replace("_", " ") for name in clip.cues)
-    maps = dict(zip(titles, clip.cues.values(), strict=True))
-    for row, frame in zip(axes, frames, strict=True):
-        top = frame == frames[0]
-        _image(row[0], result.images[frame], "picture" if top else "", f"frame {frame}")
-        for cell, (name, values) in zip(row[1:], (maps | {"saliency:\nthe product": saliency}).items(), strict=False):
-            _image(cell, values[frame], name if top else "", cmap="inferno", vmin=0, vmax=1)
-        _image(row[-1], clip.truth.dynamic_mask[frame], "what moves\n(truth)" if top else "", cmap="gray")
+    result, moving = clip.result, clip.truth.dynamic_mask
+    frame = int(moving.sum(axis=(1, 2)).argmax())
+    assert result.saliency is not None
+    names = (name.replace("_", " ") for name in clip.cues)
+    maps = dict(zip(names, clip.cues.values(), strict=True)) | {"saliency: the product": result.saliency}
+    columns = 5
+    rows = -(-(len(maps) + 2) // columns)
+    figure, axes = pyplot.subplots(rows, columns, figsize=(11.5, 2.4 * rows), layout="constrained")
+    cells = iter(axes.ravel())
+    _image(next(cells), result.images[frame], f"picture, frame {frame}")
+    for title, values in maps.items():
+        _image(next(cells), values[frame], title, cmap="inferno", vmin=0, vmax=1)
+    _image(next(cells), moving[frame], "what moves (truth)", cmap="gray")
+    for cell in cells:
+        cell.set_axis_off()
     return figure
 
 
