@@ -147,7 +147,7 @@ def passes(clip: Clip) -> Figure:
 
 
 def cues(clip: Clip) -> Figure:
-    """The maps in the frame where most moves, as they enter the product before the floor, and the saliency they give."""
+    """The maps in the frame where most moves, as they enter the product before the floor, and their saliency."""
     from matplotlib import pyplot
 
     result, moving = clip.result, clip.truth.dynamic_mask
