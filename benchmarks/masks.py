@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -17,11 +18,13 @@ from vggtjax.clips.clip import load_clip
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.masks import jaccard
+from vggtjax.method.mask import smooth_over_time, upsample
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
 
+BEST = "at the best threshold"
 REFINED = {"as it is": None, "refined": "result", "refined by true geometry": "truth"}
 
 
@@ -36,6 +39,8 @@ def masks(
     seed: int = 0,
 ) -> None:
     """Measure masks against the truth, on held-out dynamic scenes and on filmed clips where they are present.
+
+    The last row of a method has the clip's best threshold, which is found with the truth: what its saliency allows.
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.
@@ -76,8 +81,17 @@ def precision_recall(predicted: Bool[np.ndarray, "S H W"], truth: Bool[np.ndarra
     return correct / positives if positives else 1.0, correct / true_pixels if true_pixels else 1.0
 
 
+def best_mask(saliency: Float[np.ndarray, "S H W"], truth: Bool[np.ndarray, "S H W"]) -> Bool[np.ndarray, "S H W"]:
+    """Return the mask saliency >= t with the largest IoU that any threshold t gives."""
+    order = np.argsort(-saliency, axis=None, kind="stable")
+    values, met = saliency.ravel()[order], np.cumsum(truth.ravel()[order])
+    ends = np.flatnonzero(np.append(values[1:] < values[:-1], True))  # pixels of equal saliency go together
+    iou = met[ends] / np.maximum(ends + 1 + truth.sum() - met[ends], 1)
+    return saliency >= values[ends[np.argmax(iou)]]
+
+
 def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int) -> None:
-    scores: dict[str, list[tuple[float, ...]]] = {name: [] for name in REFINED}
+    scores: dict[str, list[tuple[float, ...]]] = {name: [] for name in (*REFINED, BEST)}
     for clip in (Truth(*arrays) for arrays in zip(*truth, strict=True)):
         fitted = load_clip(clip.images, size=clip.images.shape[2], patch=model.config.patch_size)
         size = clip.images.shape[2]
@@ -86,15 +100,19 @@ def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int
             "result": (made.depth, made.camera_from_world, made.intrinsics),
             "truth": _in_units(clip),
         }
+        assert made.saliency is not None
+        smoothed = smooth_over_time(jnp.asarray(made.saliency[None]), window)
+        found = {BEST: best_mask(np.asarray(upsample(smoothed, clip.images.shape[1:3]))[0], clip.dynamic_mask)}
         for name, source in REFINED.items():
             mask = made.dynamic_mask
             if source is not None:
                 depth, poses, intrinsics = geometry[source]
                 known = depth > 0  # filmed depth has holes without truth
                 mask = refine_masks(clip.images, depth, mask, poses, intrinsics, valid=known) | (mask & ~known)
-            scores[name].append(
-                (jaccard(mask, clip.dynamic_mask), *precision_recall(mask, clip.dynamic_mask), mask.mean())
-            )
+            found[name] = mask
+        for name, mask in found.items():
+            accuracy = jaccard(mask, clip.dynamic_mask), *precision_recall(mask, clip.dynamic_mask)
+            scores[name].append((*accuracy, mask.mean()))
     plain = np.array(scores["as it is"])[:, 0]
     for name, values in scores.items():
         iou, precision, recall, share = np.mean(values, axis=0)
