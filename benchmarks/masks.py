@@ -20,6 +20,7 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.masks import jaccard
 from vggtjax.method.mask import smooth_over_time, upsample
 from vggtjax.method.mask_refinement import refine_masks
+from vggtjax.options import find_method
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
@@ -40,7 +41,8 @@ def masks(
 ) -> None:
     """Measure masks against the truth, on held-out dynamic scenes and on filmed clips where they are present.
 
-    The last row of a method has the clip's best threshold, which is found with the truth: what its saliency allows.
+    The last row, of methods without clusters, has each clip's best threshold, which only the truth tells: the most that
+    any threshold of the saliency gives.
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.
@@ -82,16 +84,17 @@ def precision_recall(predicted: Bool[np.ndarray, "S H W"], truth: Bool[np.ndarra
 
 
 def best_mask(saliency: Float[np.ndarray, "S H W"], truth: Bool[np.ndarray, "S H W"]) -> Bool[np.ndarray, "S H W"]:
-    """Return the mask saliency >= t with the largest IoU that any threshold t gives."""
-    order = np.argsort(-saliency, axis=None, kind="stable")
+    """Return the mask saliency >= t with the largest IoU, of all thresholds t that leave a pixel."""
+    order = np.argsort(-saliency, axis=None)
     values, met = saliency.ravel()[order], np.cumsum(truth.ravel()[order])
     ends = np.flatnonzero(np.append(values[1:] < values[:-1], True))  # pixels of equal saliency go together
-    iou = met[ends] / np.maximum(ends + 1 + truth.sum() - met[ends], 1)
+    iou = met[ends] / (ends + 1 + truth.sum() - met[ends])
     return saliency >= values[ends[np.argmax(iou)]]
 
 
 def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int) -> None:
-    scores: dict[str, list[tuple[float, ...]]] = {name: [] for name in (*REFINED, BEST)}
+    names = (*REFINED, BEST) if find_method(method).clusters == 0 else tuple(REFINED)
+    scores: dict[str, list[tuple[float, ...]]] = {name: [] for name in names}
     for clip in (Truth(*arrays) for arrays in zip(*truth, strict=True)):
         fitted = load_clip(clip.images, size=clip.images.shape[2], patch=model.config.patch_size)
         size = clip.images.shape[2]
@@ -100,9 +103,12 @@ def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int
             "result": (made.depth, made.camera_from_world, made.intrinsics),
             "truth": _in_units(clip),
         }
-        assert made.saliency is not None
-        smoothed = smooth_over_time(jnp.asarray(made.saliency[None]), window)
-        found = {BEST: best_mask(np.asarray(upsample(smoothed, clip.images.shape[1:3]))[0], clip.dynamic_mask)}
+        found = {}
+        if BEST in scores:
+            assert made.saliency is not None
+            smoothed = smooth_over_time(jnp.asarray(made.saliency[None]), window)
+            pixels = np.asarray(upsample(smoothed, clip.images.shape[1:3]))[0]
+            found[BEST] = best_mask(pixels, clip.dynamic_mask)
         for name, source in REFINED.items():
             mask = made.dynamic_mask
             if source is not None:
@@ -118,7 +124,7 @@ def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int
         iou, precision, recall, share = np.mean(values, axis=0)
         better = int((np.array(values)[:, 0] > plain).sum())
         cells = (f"{iou:.3f}", f"{precision:.3f}", f"{recall:.3f}", f"{share:.1%}")
-        table.add_row(method, str(window), name, *cells, "" if name == "as it is" else f"{better} of {len(values)}")
+        table.add_row(method, str(window), name, *cells, f"{better} of {len(values)}" if REFINED.get(name) else "")
 
 
 def _in_units(clip: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -19,9 +19,11 @@ METRICS = {  # fields of LadderRow, and their names in tables and plots
     "centre_error": "centres",
     "centre_error_ratio": "centres / depth",
     "point_distance": "points",
+    "point_distance_first": "points, first camera",
     "mask_jaccard": "mask J",
 }
-AGAINST_FIRST = ("abs_rel", "rotation_error", "centre_error", "point_distance")  # also as ratios to the plain pass
+# also relative to the plain pass
+AGAINST_FIRST = ("abs_rel", "rotation_error", "centre_error", "point_distance_first")
 
 _GUESSES = {
     "mean_depth_map": "mean depth map",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -147,22 +148,21 @@ def passes(clip: Clip) -> Figure:
 
 
 def cues(clip: Clip) -> Figure:
-    """The maps in the frame where most moves, as they enter the product before the floor, and their saliency."""
+    """The maps in the frame where most moves, before the floor is added, and the saliency that is their product."""
     from matplotlib import pyplot
 
     result, moving = clip.result, clip.truth.dynamic_mask
     frame = int(moving.sum(axis=(1, 2)).argmax())
     assert result.saliency is not None
-    names = (name.replace("_", " ") for name in clip.cues)
-    maps = dict(zip(names, clip.cues.values(), strict=True)) | {"saliency: the product": result.saliency}
+    maps = clip.cues | {"saliency: the product": result.saliency}
     columns = 5
-    rows = -(-(len(maps) + 2) // columns)
+    rows = math.ceil((len(maps) + 2) / columns)
     figure, axes = pyplot.subplots(rows, columns, figsize=(11.5, 2.4 * rows), layout="constrained")
     cells = iter(axes.ravel())
     _image(next(cells), result.images[frame], f"picture, frame {frame}")
-    for title, values in maps.items():
-        _image(next(cells), values[frame], title, cmap="inferno", vmin=0, vmax=1)
-    _image(next(cells), moving[frame], "what moves (truth)", cmap="gray")
+    for name, values in maps.items():
+        _image(next(cells), values[frame], name.replace("_", " "), cmap="inferno", vmin=0, vmax=1)
+    _image(next(cells), moving[frame], "what moves (truth)", cmap="gray", vmin=0, vmax=1)
     for cell in cells:
         cell.set_axis_off()
     return figure

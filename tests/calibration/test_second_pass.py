@@ -64,7 +64,7 @@ def test_keys_are_suppressed_as_in_the_method_with_these_cues(model, monkeypatch
     def stand_in(model, clip, **settings):
         assert settings["suppress"] == [METHODS["vggt4d" if gram == "dot" else "4dvggt-d"].suppress] == [suppress]
         assert settings["gram"] == gram
-        return [LadderRow(0, "vggt", None, pairs, None, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1) for pairs in (None, 1)]
+        return [LadderRow(0, "vggt", None, pairs, None, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1) for pairs in (None, 1)]
 
     monkeypatch.setattr("vggtjax.calibration.second_pass.ladder", stand_in)
     assert choose_second_pass(model, [None], [1], gram=gram).best == (1, "otsu")  # pyright: ignore[reportArgumentType]

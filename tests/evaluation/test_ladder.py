@@ -111,9 +111,8 @@ def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
     assert row.rotation_error == pytest.approx(rotation_error(poses, clip.camera_from_world), rel=1e-3)
     assert row.centre_error == pytest.approx(centre_error(poses, clip.camera_from_world), rel=1e-3)
     assert row.centre_error_ratio == pytest.approx(row.centre_error / np.median(clip.depth[:, 3:]))
-    assert row.point_distance == pytest.approx(
-        point_distance(depth, np.asarray(made.intrinsics[1]), poses, clip), rel=1e-3
-    )
+    of_points = point_distances(depth, np.asarray(made.intrinsics[1]), poses, clip)
+    assert (row.point_distance, row.point_distance_first) == pytest.approx(of_points, rel=1e-3)
     pixels = np.asarray(upsample(passes.saliency, SIZE)[1])
     assert row.saliency_auc == pytest.approx(auc(pixels, clip.dynamic_mask), abs=1e-3)
     mined = np.asarray(passes.dynamic_mask[1])
@@ -121,20 +120,24 @@ def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
     assert row.mask_jaccard == expected
 
 
-def point_distance(depth, intrinsics, poses, clip) -> float:
-    """Lift pixel by pixel, from the definition."""
+def point_distances(depth, intrinsics, poses, clip) -> tuple[float, float]:
+    """Lift pixel by pixel, from the definition: aligned by all centres, and as seen from the first camera."""
 
     def place(pose, x) -> np.ndarray:
         return pose[:, :3].T @ (x - pose[:, 3])
 
     found = [place(pose, np.zeros(3)) for pose in poses], [place(pose, np.zeros(3)) for pose in clip.camera_from_world]
     similarity, distances = umeyama_sim3(*map(np.stack, found)), []
+    scale = np.median(clip.depth[clip.depth > 0] / depth[clip.depth > 0])
     for frame, row, column in np.argwhere(clip.depth > 0):
         pixel, points = np.array([column, row, 1.0]), []
         for z, K, pose in ((depth, intrinsics, poses), (clip.depth, clip.intrinsics, clip.camera_from_world)):
             points.append(place(pose[frame], z[frame, row, column] * (np.linalg.inv(K[frame]) @ pixel)))
-        distances.append(np.linalg.norm(similarity.apply(points[0][None])[0] - points[1]))
-    return float(np.mean(distances))
+        seen = [pose[0] @ [*x, 1] for x, pose in zip(points, (poses, clip.camera_from_world), strict=True)]
+        apart = similarity.apply(points[0][None])[0] - points[1], scale * seen[0] - seen[1]
+        distances.append(np.linalg.norm(apart, axis=1))
+    after_all, after_first = np.mean(distances, axis=0)
+    return float(after_all), float(after_first)
 
 
 def test_suppressing_nothing_is_the_plain_pass(rows):

@@ -20,7 +20,7 @@ from vggtjax.evaluation.metrics.masks import auc, jaccard
 from vggtjax.evaluation.metrics.point_clouds import paired_distance
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.evaluation.truth_at_pixels import known_points
-from vggtjax.geometry.similarity import centres, umeyama_sim3
+from vggtjax.geometry.similarity import Similarity, centres, umeyama_sim3
 from vggtjax.method.mask import upsample
 from vggtjax.method.passes import Assembly, Passes, assemble
 from vggtjax.network.clip_batch import ClipBatch
@@ -55,6 +55,7 @@ class LadderRow:
     centre_error: float | None  # RMSE after Sim(3), in the truth's unit
     centre_error_ratio: float | None  # centre error over the clip's median true depth
     point_distance: float | None  # mean over pixels, after Sim(3) of the centres, in the truth's unit
+    point_distance_first: float | None  # the same, after alignment of the first camera and one median scale
     saliency_auc: float | None  # of the first pass, over pixels
     mask_jaccard: float | None  # of the mask of the second pass
     failure: str = ""
@@ -266,8 +267,12 @@ def _row(
             return None
 
     off_centre = attempt(centre_error, camera_from_world, truth.camera_from_world)
-    points = None if off_centre is None else attempt(_point_distance, depth, intrinsics, camera_from_world, scene)
     known, dynamic = measured(truth.depth), truth.dynamic_mask
+
+    def distance_after(alignment: Callable[..., Similarity]) -> float:
+        points = known_points(depth, intrinsics, camera_from_world, known)
+        return paired_distance(alignment(depth, camera_from_world, truth).apply(points), scene.points).mean
+
     distance = float(np.median(truth.depth[known])) if known.any() else None
     return LadderRow(
         clip=scene.clip,
@@ -277,10 +282,11 @@ def _row(
         rotation_error=attempt(rotation_error, camera_from_world, truth.camera_from_world),
         centre_error=off_centre,
         centre_error_ratio=None if off_centre is None or distance is None else off_centre / distance,
-        point_distance=points,
+        point_distance=None if off_centre is None else attempt(distance_after, _all_cameras),
+        point_distance_first=attempt(distance_after, _first_camera),
         saliency_auc=attempt(auc, scene.saliency, dynamic) if dynamic.any() and not dynamic.all() else None,
         mask_jaccard=None if setting.mask_source is None else jaccard(mask, dynamic),
-        failure="; ".join(failures),
+        failure="; ".join(dict.fromkeys(failures)),
     )
 
 
@@ -298,12 +304,15 @@ def _depth_scores(depth: Float[np.ndarray, "S H W"], truth: Truth) -> dict[str, 
     return dict(zip(_DEPTH_SCORES, values, strict=True))
 
 
-def _point_distance(
-    depth: Float[np.ndarray, "S H W"],
-    intrinsics: Float[np.ndarray, "S 3 3"],
-    camera_from_world: Float[np.ndarray, "S 3 4"],
-    scene: _Scene,
-) -> float:
-    similarity = umeyama_sim3(centres(camera_from_world), centres(scene.truth.camera_from_world))
-    points = known_points(depth, intrinsics, camera_from_world, measured(scene.truth.depth))
-    return paired_distance(similarity.apply(points), scene.points).mean
+def _all_cameras(depth: object, camera_from_world: Float[np.ndarray, "S 3 4"], truth: Truth) -> Similarity:
+    """Return the similarity that brings the camera centres closest to the true ones."""
+    return umeyama_sim3(centres(camera_from_world), centres(truth.camera_from_world))
+
+
+def _first_camera(
+    depth: Float[np.ndarray, "S H W"], camera_from_world: Float[np.ndarray, "S 3 4"], truth: Truth
+) -> Similarity:
+    """Return the similarity that brings the first camera to the true one, and depth to the truth by a median scale."""
+    scale, pose, true_pose = median_scale(depth, truth.depth), camera_from_world[0], truth.camera_from_world[0]
+    to_first = Similarity(scale, pose[:, :3], scale * pose[:, 3])
+    return Similarity(1, true_pose[:, :3], true_pose[:, 3]).inverse().after(to_first)
