@@ -41,8 +41,7 @@ def masks(
 ) -> None:
     """Measure masks against the truth, on held-out dynamic scenes and on filmed clips where they are present.
 
-    The last row, of methods without clusters, has each clip's best threshold, which only the truth tells: the most that
-    any threshold of the saliency gives.
+    Methods without clusters have one more row: the mask at each clip's best threshold, which only the truth tells.
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.
@@ -124,7 +123,7 @@ def _add_rows(table: Table, model: Model, truth: Truth, method: str, window: int
         iou, precision, recall, share = np.mean(values, axis=0)
         better = int((np.array(values)[:, 0] > plain).sum())
         cells = (f"{iou:.3f}", f"{precision:.3f}", f"{recall:.3f}", f"{share:.1%}")
-        table.add_row(method, str(window), name, *cells, f"{better} of {len(values)}" if REFINED.get(name) else "")
+        table.add_row(method, str(window), name, *cells, "" if name == "as it is" else f"{better} of {len(values)}")
 
 
 def _in_units(clip: Truth) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -268,10 +268,16 @@ def _row(
 
     off_centre = attempt(centre_error, camera_from_world, truth.camera_from_world)
     known, dynamic = measured(truth.depth), truth.dynamic_mask
+    points = attempt(known_points, depth, intrinsics, camera_from_world, known)
 
-    def distance_after(alignment: Callable[..., Similarity]) -> float:
-        points = known_points(depth, intrinsics, camera_from_world, known)
-        return paired_distance(alignment(depth, camera_from_world, truth).apply(points), scene.points).mean
+    def distance_after(align: Callable[[], Similarity]) -> float | None:
+        return None if points is None else paired_distance(align().apply(points), scene.points).mean
+
+    def all_cameras() -> Similarity:
+        return umeyama_sim3(centres(camera_from_world), centres(truth.camera_from_world))
+
+    def first_camera() -> Similarity:
+        return _first_to_first(camera_from_world[0], truth.camera_from_world[0], median_scale(depth, truth.depth))
 
     distance = float(np.median(truth.depth[known])) if known.any() else None
     return LadderRow(
@@ -282,8 +288,8 @@ def _row(
         rotation_error=attempt(rotation_error, camera_from_world, truth.camera_from_world),
         centre_error=off_centre,
         centre_error_ratio=None if off_centre is None or distance is None else off_centre / distance,
-        point_distance=None if off_centre is None else attempt(distance_after, _all_cameras),
-        point_distance_first=attempt(distance_after, _first_camera),
+        point_distance=None if off_centre is None else attempt(distance_after, all_cameras),
+        point_distance_first=attempt(distance_after, first_camera),
         saliency_auc=attempt(auc, scene.saliency, dynamic) if dynamic.any() and not dynamic.all() else None,
         mask_jaccard=None if setting.mask_source is None else jaccard(mask, dynamic),
         failure="; ".join(dict.fromkeys(failures)),
@@ -304,15 +310,7 @@ def _depth_scores(depth: Float[np.ndarray, "S H W"], truth: Truth) -> dict[str, 
     return dict(zip(_DEPTH_SCORES, values, strict=True))
 
 
-def _all_cameras(depth: object, camera_from_world: Float[np.ndarray, "S 3 4"], truth: Truth) -> Similarity:
-    """Return the similarity that brings the camera centres closest to the true ones."""
-    return umeyama_sim3(centres(camera_from_world), centres(truth.camera_from_world))
-
-
-def _first_camera(
-    depth: Float[np.ndarray, "S H W"], camera_from_world: Float[np.ndarray, "S 3 4"], truth: Truth
-) -> Similarity:
-    """Return the similarity that brings the first camera to the true one, and depth to the truth by a median scale."""
-    scale, pose, true_pose = median_scale(depth, truth.depth), camera_from_world[0], truth.camera_from_world[0]
-    to_first = Similarity(scale, pose[:, :3], scale * pose[:, 3])
-    return Similarity(1, true_pose[:, :3], true_pose[:, 3]).inverse().after(to_first)
+def _first_to_first(pose: Float[np.ndarray, "3 4"], true_pose: Float[np.ndarray, "3 4"], scale: float) -> Similarity:
+    """Return the similarity that brings a camera to the true one, with points scaled as seen from it."""
+    to_camera = Similarity(scale, pose[:, :3], scale * pose[:, 3])
+    return Similarity(1, true_pose[:, :3], true_pose[:, 3]).inverse().after(to_camera)
