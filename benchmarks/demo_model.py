@@ -16,7 +16,15 @@ from rich.progress import Progress as Bars
 from benchmarks.blind_guesses import Comparison, Guess, Prior, compare, guesses, training_prior
 from benchmarks.plots import plot_ladder, plot_rotations, plot_sweep
 from benchmarks.real_clips import is_clip_folder, load_windows
-from benchmarks.summaries import Spread, Summary, comparison_table, ladder_table, saliency_auc, summarise
+from benchmarks.summaries import (
+    Spread,
+    Summary,
+    changes_table,
+    comparison_table,
+    ladder_table,
+    saliency_auc,
+    summarise,
+)
 from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth, batched_truth
 from vggtjax.errors import InputError, check_extra
@@ -239,13 +247,20 @@ def report_text(model: Model, results: dict[str, Any]) -> str:
             parts += [comparison_table(compared.comparisons), *_failures(compared.rows)]
     for name in ("composite ladder", "dynamic"):
         if laddered := results[name]:
-            parts += [f"## Methods: {name}", f"Saliency AUC {laddered.saliency_auc or '-'}."]
+            auc, draws = laddered.saliency_auc, len(laddered.rows)
+            parts += [f"## Methods: {name}", f"Saliency AUC {auc.text() if auc else '-'}."]
             parts += [ladder_table(laddered.summaries), *_failures(row for rows in laddered.rows for row in rows)]
+            parts += [
+                "Changes against vggt on the same clips, with their standard errors; after the semicolon the number "
+                f"of draws, of {draws}, in which the method is better than vggt, and in which it is the best of vggt "
+                "and all methods with this mask and way of suppression:",
+                changes_table(laddered.summaries),
+            ]
             if swept := sorted(
                 (s for s in laddered.sweep if s.method in SWEPT),
                 key=lambda s: (s.method, s.mask_source, s.suppress, s.mask_pairs),
             ):
-                parts += [f"## Pairs with suppressed keys: {name}", ladder_table(swept)]
+                parts += [f"## Pairs with suppressed keys: {name}", ladder_table(swept), changes_table(swept)]
     return "\n\n".join(parts)
 
 

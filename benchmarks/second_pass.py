@@ -9,25 +9,42 @@ compared with the frozen scene's own mask it tells whether the movers' keys are 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 from rich.console import Console
-from rich.progress import track
-from rich.table import Table
+from rich.progress import Progress as Bars
 
+from benchmarks.summaries import markdown_table
+from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.method.mask import dynamic_tokens
 from vggtjax.network.model import forward
 from vggtjax.network.pose import decode_pose
+from vggtjax.options import pairs_to_try
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, SyntheticClip, held_out_scenes
+from vggtjax.storage.writing import writing
 
 _forward = jax.jit(forward, static_argnames=("config", "suppress", "outputs"))
 _AT_ONCE = 4
+
+
+class Run(NamedTuple):
+    """A pass over all scenes."""
+
+    scene: Literal["moving", "frozen"]
+    mask: Literal["none", "the movers'", "another scene's"]
+    pairs: int  # in which keys are suppressed; 0 in the plain pass
+
+
+Errors = dict[Run, Float[np.ndarray, "N 2"]]  # rotation in degrees, centres in median depths
 
 
 def second_pass(
@@ -36,89 +53,140 @@ def second_pass(
     scenes: int = 64,
     frames: int = 12,
     seed: int = 0,
+    seeds: int = 1,
     size: int | None = None,
     pairs: tuple[int, ...] = (1, 2, 3, 5),
     suppress: Literal["zero", "drop"] = "zero",
+    out: Path | None = None,
 ) -> None:
     """Measure errors of the cameras on moving scenes and on their frozen twins, with and without suppressed keys.
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.
-        scenes: number of held-out dynamic scenes, at least two.
+        scenes: number of held-out dynamic scenes of each draw, at least two.
         frames: frames of a scene.
         seed: another seed draws other scenes.
+        seeds: number of draws of scenes, with seeds from `seed` on.
         size: side of the frames in pixels; the model's own by default.
         pairs: numbers of pairs in which keys are suppressed.
         suppress: how keys are suppressed.
+        out: file for the report, in markdown; it is printed only by default.
     """
     if scenes < 2:
         raise InputError(f"scenes is {scenes}; expected at least 2: each scene uses the mask of another")
+    if seeds < 1:
+        raise InputError(f"seeds is {seeds}; expected at least 1")
     loaded = load_model(model)
-    config = loaded.config
-    side = size or config.image_size
-    wanted = SceneConfig(height=side, width=side, frames=frames)
-    console = Console()
-    with console.status("scenes"):
-        moving = held_out_scenes("dynamic", scenes, wanted, seed=seed)
-        frozen = held_out_scenes("dynamic", scenes, dataclasses.replace(wanted, frozen=True), seed=seed)
-    twins = {"moving": moving, "frozen": frozen}
-    runs: dict[tuple[str, str, int], tuple[SyntheticClip, Any]] = {}
-    for scene, clips in twins.items():
-        runs[scene, "none", 0] = (clips, None)
-    for count in pairs:
-        for scene, clips in twins.items():
-            runs[scene, "true", count] = (clips, clips.dynamic_mask)
-            runs[scene, "another scene's", count] = (clips, np.roll(clips.dynamic_mask, 1, axis=0))
-    errors = {}
-    for name, (clips, mask) in track(runs.items(), description="passes", console=console):
-        poses = []
-        for start in range(0, scenes, _AT_ONCE):
-            some = np.minimum(np.arange(start, start + _AT_ONCE), scenes - 1)
-            tokens = None if mask is None else dynamic_tokens(jnp.asarray(mask[some]), config.patch_size)
-            images = jnp.asarray(clips.images[some], jnp.float32)
-            made = _forward(
-                loaded.params, images, config, dynamic_tokens=tokens, suppress=suppress,
-                mask_pairs=name[2], outputs=("camera",),
-            )  # fmt: skip
-            poses.append(np.asarray(decode_pose(jnp.asarray(made.pose_encoding), (side, side))[0]))
-        found = np.concatenate(poses)[:scenes]
-        depth = np.median(clips.depth.reshape(scenes, -1), axis=1)
-        errors[name] = np.array(
-            [
-                [rotation_error(one, true), centre_error(one, true) / unit]
-                for one, true, unit in zip(found, clips.camera_from_world, depth, strict=True)
-            ]
-        )
-    console.print(_table(errors, suppress))
+    numbers = pairs_to_try(pairs, loaded.config.depth)
+    side = size or loaded.config.image_size
+    config = SceneConfig(height=side, width=side, frames=frames)
+    runs = [Run(scene, "none", 0) for scene in ("moving", "frozen")]
+    runs += [
+        Run(scene, mask, number)
+        for number in numbers
+        for scene in ("moving", "frozen")
+        for mask in ("the movers'", "another scene's")
+    ]
+    console = Console(stderr=True)
+    draws = []
+    with Bars(console=console, disable=not console.is_terminal) as bars:
+        task = bars.add_task("passes", total=seeds * len(runs))
+        for draw in range(seed, seed + seeds):
+            errors = {}
+            for run, measured in _draw(loaded, config, scenes, draw, runs, suppress):
+                errors[run] = measured
+                bars.advance(task)
+            draws.append(errors)
+    errors = {run: np.concatenate([draw[run] for draw in draws]) for run in runs}
+    text = report_text(errors, suppress)
+    if out is not None:
+        with writing(out) as temporary:
+            temporary.write_text(text + "\n")
+    Console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def _table(errors: dict[tuple[str, str, int], np.ndarray], suppress: str) -> Table:
-    table = Table(title=f"keys: {suppress}; means over {len(next(iter(errors.values())))} scenes", box=None)
-    for heading in ("scene", "mask", "pairs"):
-        table.add_column(heading)
-    for heading in ("rotation", "against plain", "centres", "against plain"):
-        table.add_column(heading, justify="right")
-    for (scene, mask, pairs), values in errors.items():
-        mean, spread = _difference(values, errors[scene, "none", 0])
-        changes = [f"{a:+.{n}f} ± {b:.{n}f}" if pairs else "" for a, b, n in zip(mean, spread, (2, 4), strict=True)]
+def _draw(
+    model: Model, config: SceneConfig, scenes: int, seed: int, runs: list[Run], suppress: Literal["zero", "drop"]
+) -> Iterator[tuple[Run, Float[np.ndarray, "N 2"]]]:
+    """Measure every run on one draw of scenes."""
+    moving = held_out_scenes("dynamic", scenes, config, seed=seed)
+    frozen = held_out_scenes("dynamic", scenes, dataclasses.replace(config, frozen=True), seed=seed)
+    for run in runs:
+        clips = moving if run.scene == "moving" else frozen
+        mask = {
+            "none": None,
+            "the movers'": clips.dynamic_mask,
+            "another scene's": np.roll(clips.dynamic_mask, 1, axis=0),
+        }[run.mask]
+        yield run, camera_errors(model, clips, mask, run.pairs, suppress)
+
+
+def camera_errors(
+    model: Model,
+    clips: SyntheticClip,
+    mask: Bool[np.ndarray, "N S H W"] | None,
+    pairs: int,
+    suppress: Literal["zero", "drop"],
+) -> Float[np.ndarray, "N 2"]:
+    """Return rotation errors in degrees, and errors of the centres in median depths, of the masked pass over clips."""
+    scenes, (height, width), poses = len(clips.images), clips.images.shape[2:4], []
+    for start in range(0, scenes, _AT_ONCE):
+        some = np.minimum(np.arange(start, start + _AT_ONCE), scenes - 1)
+        tokens = None if mask is None else dynamic_tokens(jnp.asarray(mask[some]), model.config.patch_size)
+        images = jnp.asarray(clips.images[some], jnp.float32)
+        made = _forward(
+            model.params, images, model.config, dynamic_tokens=tokens, suppress=suppress,
+            mask_pairs=pairs, outputs=("camera",),
+        )  # fmt: skip
+        poses.append(np.asarray(decode_pose(jnp.asarray(made.pose_encoding), (height, width))[0]))
+    found = np.concatenate(poses)[:scenes]
+    depth = np.median(clips.depth.reshape(scenes, -1), axis=1)
+    errors = [
+        [rotation_error(one, true), centre_error(one, true) / unit]
+        for one, true, unit in zip(found, clips.camera_from_world, depth, strict=True)
+    ]
+    return np.array(errors)
+
+
+def report_text(errors: Errors, suppress: str) -> str:
+    """Return a markdown table of all runs, and what follows from them."""
+    rows = []
+    for run, values in errors.items():
+        change = _change(values, errors[run._replace(mask="none", pairs=0)]) if run.pairs else ("", "")
         rotation, centre = values.mean(axis=0)
-        table.add_row(scene, mask, str(pairs or "-"), f"{rotation:.2f}°", changes[0], f"{centre:.4f}", changes[1])
-    moving, frozen = errors["moving", "none", 0], errors["frozen", "none", 0]
-    lines = [f"cost of motion in the plain pass: {_apart(moving, frozen)}"]
-    for pairs in sorted({pairs for _, _, pairs in errors if pairs}):
-        own, lent = errors["frozen", "true", pairs], errors["frozen", "another scene's", pairs]
-        lines.append(f"frozen, {pairs} pairs, the movers' keys against another scene's mask: {_apart(own, lent)}")
-    table.caption = "\n".join([*lines, "centres in median depths; standard errors over scenes"])
-    return table
+        pairs = str(run.pairs or "-")
+        rows.append([run.scene, run.mask, pairs, f"{rotation:.2f}", change[0], f"{centre:.4f}", change[1]])
+    header = ["scene", "keys suppressed", "pairs", "rotation (deg)", "change", "centres / depth", "change"]
+    moving, frozen = errors[Run("moving", "none", 0)], errors[Run("frozen", "none", 0)]
+    lines = [
+        f"Means over {len(moving)} scenes, keys: {suppress}. Changes are against the plain pass on the same scenes, "
+        "with their standard errors.",
+        markdown_table(header, rows),
+        f"- Motion costs the plain pass {_words(moving, frozen)}.",
+    ]
+    for pairs in sorted({run.pairs for run in errors if run.pairs}):
+        masked = errors[Run("moving", "the movers'", pairs)]
+        shares = (moving - masked).mean(axis=0) / (moving - frozen).mean(axis=0)
+        lines.append(
+            f"- {pairs} pairs without the movers' keys win back {100 * shares[0]:.0f} % of the rotation and "
+            f"{100 * shares[1]:.0f} % of the centres that motion costs."
+        )
+        own, lent = errors[Run("frozen", "the movers'", pairs)], errors[Run("frozen", "another scene's", pairs)]
+        change = (own - frozen).mean(axis=0) / frozen.mean(axis=0)
+        lines.append(
+            f"- In frozen scenes this changes rotations by {100 * change[0]:+.1f} % and centres by "
+            f"{100 * change[1]:+.1f} %. Compared with another scene's mask it is {_words(own, lent)}."
+        )
+    return "\n\n".join([*lines[:2], "\n".join(lines[2:])])
 
 
-def _apart(errors: np.ndarray, others: np.ndarray) -> str:
-    """Return by how much errors are larger than others, as text."""
-    mean, spread = _difference(errors, others)
-    return f"rotation {mean[0]:+.2f} ± {spread[0]:.2f} degrees, centres {mean[1]:+.4f} ± {spread[1]:.4f}"
+def _words(errors: Float[np.ndarray, "N 2"], others: Float[np.ndarray, "N 2"]) -> str:
+    rotation, centres = _change(errors, others)
+    return f"{rotation} degrees and {centres} median depths"
 
 
-def _difference(errors: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return by how much errors [scenes, 2] are larger than others: the mean over scenes, and its standard error."""
+def _change(errors: Float[np.ndarray, "N 2"], others: Float[np.ndarray, "N 2"]) -> tuple[str, str]:
+    """Return by how much errors are larger than others, with the standard error over scenes, as text."""
     difference = errors - others
-    return difference.mean(axis=0), difference.std(axis=0, ddof=1) / len(difference) ** 0.5
+    mean, spread = difference.mean(axis=0), difference.std(axis=0, ddof=1) / len(difference) ** 0.5
+    return f"{mean[0]:+.2f} ± {spread[0]:.2f}", f"{mean[1]:+.4f} ± {spread[1]:.4f}"

@@ -1,4 +1,4 @@
-"""Means and spreads of ladder rows over seeds, and everything as markdown tables."""
+"""Means, spreads and changes of ladder rows over draws of scenes, and everything as markdown tables."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from benchmarks.blind_guesses import Comparison
 from vggtjax.evaluation.ladder import LadderRow
@@ -22,8 +23,9 @@ METRICS = {  # fields of LadderRow, and their names in tables and plots
     "point_distance_first": "points, first camera",
     "mask_jaccard": "mask J",
 }
-# also relative to the plain pass
-AGAINST_FIRST = ("abs_rel", "rotation_error", "centre_error", "point_distance_first")
+DIGITS = {"rotation_error": 2, "centre_error_ratio": 4}  # decimals in tables; 3 for others
+# compared with the plain pass
+AGAINST_FIRST = ("abs_rel", "rotation_error", "centre_error", "point_distance", "point_distance_first")
 
 _GUESSES = {
     "mean_depth_map": "mean depth map",
@@ -43,8 +45,25 @@ class Spread:
     deviation: float | None  # None for a single seed
     seeds: int
 
-    def __str__(self) -> str:
-        return f"{self.mean:.4f}" + ("" if self.deviation is None else f" ± {self.deviation:.4f}")
+    def text(self, digits: int = 3) -> str:
+        return f"{self.mean:.{digits}f}" + ("" if self.deviation is None else f" ± {self.deviation:.{digits}f}")
+
+
+@dataclass(frozen=True)
+class Change:
+    """A metric of one setting against the plain pass, on the clips where both have one."""
+
+    mean: float  # over all clips
+    error: float | None  # standard error over clips; None for a single clip
+    share: float | None  # of the plain pass's mean; None where that is 0
+    better: int  # draws whose mean is lower than the plain pass's
+    best: int  # draws without a lower mean, of the plain pass and of methods with this kind of mask and suppression
+    draws: int
+
+    def text(self, digits: int = 3) -> str:
+        spread = "" if self.error is None else f" ± {self.error:.{digits}f}"
+        share = "" if self.share is None else f" ({100 * self.share:+.1f} %)"
+        return f"{self.mean:+.{digits}f}{spread}{share}; {self.better}, {self.best}"
 
 
 @dataclass(frozen=True)
@@ -59,6 +78,7 @@ class Summary:
     failed: int  # clips with a failed metric
     scores: dict[str, Spread]
     ratios: dict[str, Spread]  # mean error relative to the plain pass on the same clips
+    changes: dict[str, Change]  # none for the plain pass
 
 
 def spread(values: Sequence[float]) -> Spread:
@@ -75,6 +95,8 @@ def summarise(by_seed: Sequence[Sequence[LadderRow]]) -> list[Summary]:
         chosen = [(rows, plain) for rows, plain in zip(chosen, first, strict=True) if rows]
         scores = {name: [_mean(rows, name) for rows, _ in chosen] for name in METRICS}
         ratios = {name: [_ratio(rows, plain, name) for rows, plain in chosen] for name in AGAINST_FIRST}
+        rivals = [[row for row in rows if _setting(row)[1:] == setting[1:]] for rows in by_seed]
+        changes = {name: _change(chosen, [rows for rows in rivals if rows], name) for name in AGAINST_FIRST}
         found.append(
             Summary(
                 *setting,
@@ -82,6 +104,7 @@ def summarise(by_seed: Sequence[Sequence[LadderRow]]) -> list[Summary]:
                 failed=sum(bool(row.failure) for rows, _ in chosen for row in rows),
                 scores=_spreads(scores),
                 ratios=_spreads(ratios),
+                changes={name: change for name, change in changes.items() if change and setting[1] is not None},
             )
         )
     return found
@@ -115,19 +138,29 @@ def comparison_table(comparisons: Sequence[Comparison]) -> str:
 
 
 def ladder_table(summaries: Sequence[Summary]) -> str:
-    """Return a markdown table of the ladder: mean ± standard deviation between seeds."""
+    """Return a markdown table of the ladder: mean ± standard deviation between draws."""
     rows = [
         [
-            s.method,
-            *("-" if value is None else str(value) for value in (s.mask_source, s.mask_pairs, s.suppress)),
-            *(str(s.scores.get(name, "-")) for name in METRICS),
-            *(str(s.ratios.get(name, "-")) for name in AGAINST_FIRST),
+            *_named(s),
+            *(s.scores[name].text(DIGITS.get(name, 3)) if name in s.scores else "-" for name in METRICS),
             f"{s.clips}" + (f", {s.failed} failed" if s.failed else ""),
         ]
         for s in summaries
     ]
-    against = [f"{METRICS[name]} / vggt" for name in AGAINST_FIRST]
-    return markdown_table(["method", "mask", "pairs", "suppress", *METRICS.values(), *against, "clips"], rows)
+    return markdown_table(["method", "mask", "pairs", "suppress", *METRICS.values(), "clips"], rows)
+
+
+def changes_table(summaries: Sequence[Summary]) -> str:
+    """Return a markdown table of what the methods change: mean ± standard error over clips, share, numbers of draws."""
+    rows = [
+        [
+            *_named(s),
+            *(s.changes[name].text(DIGITS.get(name, 3)) if name in s.changes else "-" for name in AGAINST_FIRST),
+        ]
+        for s in summaries
+        if s.changes
+    ]
+    return markdown_table(["method", "mask", "pairs", "suppress", *(METRICS[name] for name in AGAINST_FIRST)], rows)
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -144,18 +177,52 @@ def _setting(row: LadderRow) -> tuple[str, str | None, int | None, str | None]:
     return row.method, row.mask_source, row.mask_pairs, row.suppress
 
 
+def _named(summary: Summary) -> list[str]:
+    fields = summary.method, summary.mask_source, summary.mask_pairs, summary.suppress
+    return ["-" if value is None else str(value) for value in fields]
+
+
 def _mean(rows: Sequence[LadderRow], name: str) -> float | None:
     values = [value for row in rows if (value := getattr(row, name)) is not None]
     return float(np.mean(values)) if values else None
 
 
-def _ratio(rows: Sequence[LadderRow], plain: Sequence[LadderRow], name: str) -> float | None:
-    """Return the mean error of rows relative to the plain pass, on the clips where both have one."""
+def _both(rows: Sequence[LadderRow], plain: Sequence[LadderRow], name: str) -> Float[np.ndarray, "N 2"]:
+    """Return a metric of rows and of the plain pass, on the clips where both have one."""
     first = {row.clip: getattr(row, name) for row in plain}
     pairs = [(getattr(row, name), first.get(row.clip)) for row in rows]
-    there = [(ours, theirs) for ours, theirs in pairs if ours is not None and theirs is not None]
-    below = sum(theirs for _, theirs in there)
-    return float(sum(ours for ours, _ in there) / below) if below > 0 else None
+    return np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
+
+
+def _ratio(rows: Sequence[LadderRow], plain: Sequence[LadderRow], name: str) -> float | None:
+    ours, theirs = _both(rows, plain, name).sum(axis=0)
+    return float(ours / theirs) if theirs > 0 else None
+
+
+def _change(
+    draws: Sequence[tuple[Sequence[LadderRow], Sequence[LadderRow]]], rivals: Sequence[Sequence[LadderRow]], name: str
+) -> Change | None:
+    """Return the change of a setting's rows against the plain pass's, draw by draw; `rivals` have the same setting."""
+    every = np.concatenate([_both(rows, plain, name) for rows, plain in draws])
+    if not len(every):
+        return None
+    better = best = 0
+    for (rows, plain), others in zip(draws, rivals, strict=True):
+        own, first = _mean(rows, name), _mean(plain, name)
+        by_method = {row.method: [other for other in others if other.method == row.method] for row in others}
+        means = [mean for same in (plain, *by_method.values()) if (mean := _mean(same, name)) is not None]
+        better += own is not None and first is not None and own < first
+        best += own is not None and own <= min(means)
+    difference, plain_mean = every[:, 0] - every[:, 1], float(every[:, 1].mean())
+    error = difference.std(ddof=1) / len(difference) ** 0.5 if len(difference) > 1 else None
+    return Change(
+        float(difference.mean()),
+        None if error is None else float(error),
+        float(difference.mean() / plain_mean) if plain_mean > 0 else None,
+        better,
+        best,
+        len(draws),
+    )
 
 
 def _spreads(values: dict[str, list[float | None]]) -> dict[str, Spread]:

@@ -1,8 +1,7 @@
-"""The benchmarks: blind guesses, filmed clips, summaries over seeds, and a small run of everything."""
+"""The benchmarks: blind guesses, filmed clips, and a small run of everything."""
 
 import json
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +12,13 @@ from benchmarks import __main__ as benchmarks
 from benchmarks import speed
 from benchmarks.blind_guesses import Prior, compare, guesses, mean_depth_map, training_prior
 from benchmarks.real_clips import load_windows, takes, window_starts
-from benchmarks.summaries import comparison_table, ladder_table, saliency_auc, spread, summarise
+from benchmarks.summaries import comparison_table
+from tests.benchmarks.rows import row
 from tests.tiny import tiny_config
 from vggtjax.checkpoint import save_model
 from vggtjax.clips.truth import Truth
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.evaluation.ladder import LadderRow
 from vggtjax.network.model import init_params
 
 SIDE, FRAMES = 28, 3
@@ -51,11 +50,6 @@ def write_clip(folder, frames=FRAMES, mask=False, jump_at=None) -> None:
             Image.fromarray(moving).save(folder / f"mask/{frame:05}.png")
     np.savetxt(folder / "world_from_camera.txt", poses.reshape(frames, 16))
     np.savetxt(folder / "K.txt", [[50, 0, 28], [0, 50, 28], [0, 0, 1]])
-
-
-def row(**fields) -> LadderRow:
-    values: dict[str, Any] = dict.fromkeys(LadderRow.__dataclass_fields__)
-    return LadderRow(**(values | {"clip": 0, "method": "vggt", "failure": ""} | fields))
 
 
 def test_windows_cover_takes_and_spread_evenly():
@@ -158,31 +152,6 @@ def test_guesses_and_comparisons_by_hand():
     assert "FAIL" in comparison_table([rotation])
 
 
-def test_summaries_by_hand():
-    plain = [row(clip=0, abs_rel=0.2, saliency_auc=0.5), row(clip=1, abs_rel=0.4, saliency_auc=0.7)]
-    setting = {"method": "4dvggt-d", "mask_source": "mined", "mask_pairs": 5, "suppress": "zero"}
-    masked = [row(clip=0, abs_rel=0.1, **setting), row(clip=1, failure="odd", **setting)]
-    better = [row(clip=0, abs_rel=0.3, **setting)]
-    by_seed = [plain + masked, [*plain[:1], *better]]
-    first, second = summarise(by_seed)
-    assert (first.method, first.mask_source, first.clips, first.failed) == ("vggt", None, 3, 0)
-    assert first.scores["abs_rel"].mean == pytest.approx((0.3 + 0.2) / 2)
-    assert first.scores["abs_rel"].deviation == pytest.approx(0.1 / np.sqrt(2))
-    assert first.ratios["abs_rel"].mean == 1
-    assert (second.clips, second.failed) == (3, 1)
-    assert second.scores["abs_rel"].mean == pytest.approx((0.1 + 0.3) / 2)
-    assert second.ratios["abs_rel"].mean == pytest.approx((0.1 / 0.2 + 0.3 / 0.2) / 2)
-    assert "rotation_error" not in second.scores
-    assert saliency_auc(by_seed) == spread([0.6, 0.5])
-    assert saliency_auc([masked]) is None
-    assert str(spread([0.25])) == "0.2500"
-    assert str(spread([1, 3])) == "2.0000 ± 1.4142"
-    table = ladder_table([first, second]).splitlines()
-    assert len(table) == 4
-    assert len({len(line) for line in table}) == 1
-    assert "1 failed" in table[3]
-
-
 def test_a_small_run_of_everything(tmp_path, config, capsys):
     model = save_model(tmp_path / "tiny.safetensors", init_params(0, config), config)
     write_clip(tmp_path / "clips" / "hololens", frames=13)
@@ -202,6 +171,7 @@ def test_a_small_run_of_everything(tmp_path, config, capsys):
         "guesses: static, 2 clips",
         "guesses: hololens, 2 clips",
         "Methods: dynamic",
+        "better than vggt",
         "Pairs with suppressed",
     ):
         assert heading in text
