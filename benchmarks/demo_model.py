@@ -248,19 +248,18 @@ def report_text(model: Model, results: dict[str, Any]) -> str:
     for name in ("composite ladder", "dynamic"):
         if laddered := results[name]:
             auc, draws = laddered.saliency_auc, len(laddered.rows)
+            auc = laddered.saliency_auc
             parts += [f"## Methods: {name}", f"Saliency AUC {auc.text() if auc else '-'}."]
-            parts += [ladder_table(laddered.summaries), *_failures(row for rows in laddered.rows for row in rows)]
-            parts += [
-                "Changes against vggt on the same clips, with their standard errors; after the semicolon the number "
-                f"of draws, of {draws}, in which the method is better than vggt, and in which it is the best of vggt "
-                "and all methods with this mask and way of suppression:",
-                changes_table(laddered.summaries),
-            ]
+            parts += [_explained(len(laddered.rows)), ladder_table(laddered.summaries)]
+            parts += ["Changes:", changes_table(laddered.summaries)]
+            parts += _failures(row for rows in laddered.rows for row in rows)
             if swept := sorted(
                 (s for s in laddered.sweep if s.method in SWEPT),
                 key=lambda s: (s.method, s.mask_source, s.suppress, s.mask_pairs),
             ):
-                parts += [f"## Pairs with suppressed keys: {name}", ladder_table(swept), changes_table(swept)]
+                draws = max(spread.seeds for s in swept for spread in s.scores.values())
+                parts += [f"## Pairs with suppressed keys: {name}", f"Means over {_draws(draws)}."]
+                parts += [ladder_table(swept), "Changes:", changes_table(swept)]
     return "\n\n".join(parts)
 
 
@@ -283,6 +282,22 @@ def write_report(out: Path, results: dict[str, Any], text: str, mask_pairs: int)
             plot_ladder(out / f"{stem}-{how}.png", chosen, title)
         for method in SWEPT if laddered.sweep else ():
             plot_sweep(out / f"{stem}-sweep-{method}.png", laddered.sweep, method)
+
+
+def _explained(draws: int) -> str:
+    spread = " ± their standard deviation" if draws > 1 else ""
+    return (
+        f"Means over {_draws(draws)}{spread}. Changes are against vggt on the same clips, ± their standard error over "
+        "clips. Behind them stands the number of draws in which the method is better than vggt, and of those in which "
+        "neither vggt nor another method with the same mask, pairs and suppression is better. Centres and points are "
+        "in the truth's unit: metres in generated scenes. Points: mean distance of each pixel's point, after the "
+        "similarity that brings all camera centres closest; for the first camera, after it is brought to the true one "
+        "and depth to the truth by one median scale."
+    )
+
+
+def _draws(count: int) -> str:
+    return "one draw of clips" if count == 1 else f"{count} draws of clips"
 
 
 def _failures(rows) -> list[str]:

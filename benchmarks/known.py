@@ -175,7 +175,7 @@ def _table(seeds: list[dict[str, list[Errors | str]]]) -> str:
                 )
                 for seed in seeds
             ]
-            text = str(spread([float(average(rows[:, 0])) for rows in pairs]))
+            text = spread([float(average(rows[:, 0])) for rows in pairs]).text(4)
             value, base = np.concatenate(pairs).T
             changed = (np.abs(value - base) > 1e-6).any()
             cells.append(f"{text}, {100 * np.mean(value < base - 1e-9):.0f} %" if changed else text)

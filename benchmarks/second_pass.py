@@ -30,16 +30,19 @@ from vggtjax.network.pose import decode_pose
 from vggtjax.options import pairs_to_try
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, SyntheticClip, held_out_scenes
-from vggtjax.storage.writing import writing
+from vggtjax.storage.writing import staging, writing
 
 _forward = jax.jit(forward, static_argnames=("config", "suppress", "outputs"))
 _AT_ONCE = 4
 
 
+Scene = Literal["moving", "frozen"]
+
+
 class Run(NamedTuple):
     """A pass over all scenes."""
 
-    scene: Literal["moving", "frozen"]
+    scene: Scene
     mask: Literal["none", "the movers'", "another scene's"]
     pairs: int  # in which keys are suppressed; 0 in the plain pass
 
@@ -76,6 +79,9 @@ def second_pass(
         raise InputError(f"scenes is {scenes}; expected at least 2: each scene uses the mask of another")
     if seeds < 1:
         raise InputError(f"seeds is {seeds}; expected at least 1")
+    if out is not None:
+        with staging(out.parent):  # an unwritable folder fails now
+            pass
     loaded = load_model(model)
     numbers = pairs_to_try(pairs, loaded.config.depth)
     side = size or loaded.config.image_size
@@ -98,7 +104,9 @@ def second_pass(
                 bars.advance(task)
             draws.append(errors)
     errors = {run: np.concatenate([draw[run] for draw in draws]) for run in runs}
-    text = report_text(errors, suppress)
+    drawn = f"seed {seed}" if seeds == 1 else f"seeds {seed} to {seed + seeds - 1}"
+    clips = f"{scenes * seeds} scenes ({drawn}) of {frames} frames, {side} x {side} pixels"
+    text = report_text(errors, f"Model {loaded.name}, {clips}; keys: {suppress}.")
     if out is not None:
         with writing(out) as temporary:
             temporary.write_text(text + "\n")
@@ -148,8 +156,8 @@ def camera_errors(
     return np.array(errors)
 
 
-def report_text(errors: Errors, suppress: str) -> str:
-    """Return a markdown table of all runs, and what follows from them."""
+def report_text(errors: Errors, heading: str) -> str:
+    """Return the heading, a markdown table of all runs, and what follows from them."""
     rows = []
     for run, values in errors.items():
         change = _change(values, errors[run._replace(mask="none", pairs=0)]) if run.pairs else ("", "")
@@ -158,31 +166,23 @@ def report_text(errors: Errors, suppress: str) -> str:
         rows.append([run.scene, run.mask, pairs, f"{rotation:.2f}", change[0], f"{centre:.4f}", change[1]])
     header = ["scene", "keys suppressed", "pairs", "rotation (deg)", "change", "centres / depth", "change"]
     moving, frozen = errors[Run("moving", "none", 0)], errors[Run("frozen", "none", 0)]
-    lines = [
-        f"Means over {len(moving)} scenes, keys: {suppress}. Changes are against the plain pass on the same scenes, "
-        "with their standard errors.",
-        markdown_table(header, rows),
-        f"- Motion costs the plain pass {_words(moving, frozen)}.",
+    facts = [
+        ["moving", "-", "cost of motion: the plain pass, minus that on frozen scenes", *_change(moving, frozen)],
+        ["moving", "-", "the same as a share of the plain pass's errors", *_shares(moving - frozen, moving)],
+    ]
+    compared: list[tuple[Scene, np.ndarray, np.ndarray, str]] = [
+        ("moving", moving, moving - frozen, "the cost of motion"),
+        ("frozen", frozen, frozen, "the plain pass's errors"),
     ]
     for pairs in sorted({run.pairs for run in errors if run.pairs}):
-        masked = errors[Run("moving", "the movers'", pairs)]
-        shares = (moving - masked).mean(axis=0) / (moving - frozen).mean(axis=0)
-        lines.append(
-            f"- {pairs} pairs without the movers' keys win back {100 * shares[0]:.0f} % of the rotation and "
-            f"{100 * shares[1]:.0f} % of the centres that motion costs."
-        )
-        own, lent = errors[Run("frozen", "the movers'", pairs)], errors[Run("frozen", "another scene's", pairs)]
-        change = (own - frozen).mean(axis=0) / frozen.mean(axis=0)
-        lines.append(
-            f"- In frozen scenes this changes rotations by {100 * change[0]:+.1f} % and centres by "
-            f"{100 * change[1]:+.1f} %. Compared with another scene's mask it is {_words(own, lent)}."
-        )
-    return "\n\n".join([*lines[:2], "\n".join(lines[2:])])
-
-
-def _words(errors: Float[np.ndarray, "N 2"], others: Float[np.ndarray, "N 2"]) -> str:
-    rotation, centres = _change(errors, others)
-    return f"{rotation} degrees and {centres} median depths"
+        for scene, plain, whole, name in compared:
+            own, lent = errors[Run(scene, "the movers'", pairs)], errors[Run(scene, "another scene's", pairs)]
+            share = _shares(own - plain, whole)
+            facts.append([scene, str(pairs), f"change by the movers' mask as a share of {name}", *share])
+            facts.append([scene, str(pairs), "another scene's mask, minus the movers'", *_change(lent, own)])
+    note = "Changes are against the plain pass on the same scenes; ± is a standard error over scenes."
+    told = ["scenes", "pairs", "what", "rotation (deg)", "centres / depth"]
+    return "\n\n".join([f"{heading} {note}", markdown_table(header, rows), markdown_table(told, facts)])
 
 
 def _change(errors: Float[np.ndarray, "N 2"], others: Float[np.ndarray, "N 2"]) -> tuple[str, str]:
@@ -190,3 +190,10 @@ def _change(errors: Float[np.ndarray, "N 2"], others: Float[np.ndarray, "N 2"]) 
     difference = errors - others
     mean, spread = difference.mean(axis=0), difference.std(axis=0, ddof=1) / len(difference) ** 0.5
     return f"{mean[0]:+.2f} ± {spread[0]:.2f}", f"{mean[1]:+.4f} ± {spread[1]:.4f}"
+
+
+def _shares(part: Float[np.ndarray, "N 2"], whole: Float[np.ndarray, "N 2"]) -> list[str]:
+    """Return the ratio of means, with its standard error over scenes, of either error, as text."""
+    share = part.mean(axis=0) / whole.mean(axis=0)
+    spread = (part - share * whole).std(axis=0, ddof=1) / np.abs(whole.mean(axis=0)) / len(part) ** 0.5
+    return [f"{100 * one:+.1f} ± {100 * error:.1f} %" for one, error in zip(share, spread, strict=True)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -23,7 +24,7 @@ METRICS = {  # fields of LadderRow, and their names in tables and plots
     "point_distance_first": "points, first camera",
     "mask_jaccard": "mask J",
 }
-DIGITS = {"rotation_error": 2, "centre_error_ratio": 4}  # decimals in tables; 3 for others
+DIGITS = {"rotation_error": 2, "centre_error_ratio": 4}  # decimals in tables, one more for changes; 3 for others
 # compared with the plain pass
 AGAINST_FIRST = ("abs_rel", "rotation_error", "centre_error", "point_distance", "point_distance_first")
 
@@ -57,13 +58,13 @@ class Change:
     error: float | None  # standard error over clips; None for a single clip
     share: float | None  # of the plain pass's mean; None where that is 0
     better: int  # draws whose mean is lower than the plain pass's
-    best: int  # draws without a lower mean, of the plain pass and of methods with this kind of mask and suppression
+    best: int  # draws in which neither the plain pass nor a method with the same mask, pairs and suppression has less
     draws: int
 
-    def text(self, digits: int = 3) -> str:
+    def text(self, digits: int = 4) -> str:
         spread = "" if self.error is None else f" ± {self.error:.{digits}f}"
-        share = "" if self.share is None else f" ({100 * self.share:+.1f} %)"
-        return f"{self.mean:+.{digits}f}{spread}{share}; {self.better}, {self.best}"
+        share = "" if self.share is None else f" ({100 * self.share:+z.1f} %)"
+        return f"{self.mean:+z.{digits}f}{spread}{share}; {self.better}/{self.draws}, {self.best}/{self.draws}"
 
 
 @dataclass(frozen=True)
@@ -88,23 +89,20 @@ def spread(values: Sequence[float]) -> Spread:
 
 def summarise(by_seed: Sequence[Sequence[LadderRow]]) -> list[Summary]:
     """Summarise the ladder's rows of several seeds, setting by setting, in the order of the first seed."""
-    first = [[row for row in rows if row.mask_source is None] for rows in by_seed]
     found = []
     for setting in dict.fromkeys(_setting(row) for rows in by_seed for row in rows):
-        chosen = [[row for row in rows if _setting(row) == setting] for rows in by_seed]
-        chosen = [(rows, plain) for rows, plain in zip(chosen, first, strict=True) if rows]
-        scores = {name: [_mean(rows, name) for rows, _ in chosen] for name in METRICS}
-        ratios = {name: [_ratio(rows, plain, name) for rows, plain in chosen] for name in AGAINST_FIRST}
-        rivals = [[row for row in rows if _setting(row)[1:] == setting[1:]] for rows in by_seed]
-        changes = {name: _change(chosen, [rows for rows in rivals if rows], name) for name in AGAINST_FIRST}
+        draws = [draw for rows in by_seed if (draw := _draw(rows, setting)).rows]
+        scores = {name: [_mean(draw.rows, name) for draw in draws] for name in METRICS}
+        ratios = {name: [_ratio(draw, name) for draw in draws] for name in AGAINST_FIRST}
+        changes = {name: _change(draws, name) for name in AGAINST_FIRST if setting[1] is not None}
         found.append(
             Summary(
                 *setting,
-                clips=sum(len(rows) for rows, _ in chosen),
-                failed=sum(bool(row.failure) for rows, _ in chosen for row in rows),
+                clips=sum(len(draw.rows) for draw in draws),
+                failed=sum(bool(row.failure) for draw in draws for row in draw.rows),
                 scores=_spreads(scores),
                 ratios=_spreads(ratios),
-                changes={name: change for name, change in changes.items() if change and setting[1] is not None},
+                changes={name: change for name, change in changes.items() if change},
             )
         )
     return found
@@ -123,9 +121,8 @@ def comparison_table(comparisons: Sequence[Comparison]) -> str:
         [
             METRICS[c.metric],
             _GUESSES[c.guess],
-            _number(c.model_error),
-            _number(c.guess_error),
-            _number(c.ratio),
+            *(_number(value, DIGITS.get(c.metric, 3)) for value in (c.model_error, c.guess_error)),
+            _number(c.ratio, 2),
             f"{c.threshold}",
             "pass" if c.passed else "FAIL",
             f"{100 * c.better:.0f} %",
@@ -155,7 +152,7 @@ def changes_table(summaries: Sequence[Summary]) -> str:
     rows = [
         [
             *_named(s),
-            *(s.changes[name].text(DIGITS.get(name, 3)) if name in s.changes else "-" for name in AGAINST_FIRST),
+            *(s.changes[name].text(DIGITS.get(name, 3) + 1) if name in s.changes else "-" for name in AGAINST_FIRST),
         ]
         for s in summaries
         if s.changes
@@ -173,6 +170,21 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     )
 
 
+class _Draw(NamedTuple):
+    """Rows of one draw of scenes."""
+
+    rows: list[LadderRow]  # of one setting
+    plain: list[LadderRow]  # of the plain pass
+    rivals: list[list[LadderRow]]  # of every method with the setting's mask, pairs and suppression
+
+
+def _draw(rows: Sequence[LadderRow], setting: tuple[str, str | None, int | None, str | None]) -> _Draw:
+    alike = [row for row in rows if _setting(row)[1:] == setting[1:]]
+    rivals = [[row for row in alike if row.method == method] for method in dict.fromkeys(row.method for row in alike)]
+    own = [row for row in alike if row.method == setting[0]]
+    return _Draw(own, [row for row in rows if row.mask_source is None], rivals)
+
+
 def _setting(row: LadderRow) -> tuple[str, str | None, int | None, str | None]:
     return row.method, row.mask_source, row.mask_pairs, row.suppress
 
@@ -187,42 +199,37 @@ def _mean(rows: Sequence[LadderRow], name: str) -> float | None:
     return float(np.mean(values)) if values else None
 
 
-def _both(rows: Sequence[LadderRow], plain: Sequence[LadderRow], name: str) -> Float[np.ndarray, "N 2"]:
-    """Return a metric of rows and of the plain pass, on the clips where both have one."""
-    first = {row.clip: getattr(row, name) for row in plain}
-    pairs = [(getattr(row, name), first.get(row.clip)) for row in rows]
+def _both(draw: _Draw, name: str) -> Float[np.ndarray, "N 2"]:
+    """Return a metric of a setting and of the plain pass, on the clips where both have one."""
+    first = {row.clip: getattr(row, name) for row in draw.plain}
+    pairs = [(getattr(row, name), first.get(row.clip)) for row in draw.rows]
     return np.array([pair for pair in pairs if None not in pair], float).reshape(-1, 2)
 
 
-def _ratio(rows: Sequence[LadderRow], plain: Sequence[LadderRow], name: str) -> float | None:
-    ours, theirs = _both(rows, plain, name).sum(axis=0)
+def _ratio(draw: _Draw, name: str) -> float | None:
+    """Return the mean error relative to the plain pass, on the clips where both have one."""
+    ours, theirs = _both(draw, name).sum(axis=0)
     return float(ours / theirs) if theirs > 0 else None
 
 
-def _change(
-    draws: Sequence[tuple[Sequence[LadderRow], Sequence[LadderRow]]], rivals: Sequence[Sequence[LadderRow]], name: str
-) -> Change | None:
-    """Return the change of a setting's rows against the plain pass's, draw by draw; `rivals` have the same setting."""
-    every = np.concatenate([_both(rows, plain, name) for rows, plain in draws])
+def _change(draws: Sequence[_Draw], name: str) -> Change | None:
+    every = np.concatenate([_both(draw, name) for draw in draws])
     if not len(every):
         return None
-    better = best = 0
-    for (rows, plain), others in zip(draws, rivals, strict=True):
-        own, first = _mean(rows, name), _mean(plain, name)
-        by_method = {row.method: [other for other in others if other.method == row.method] for row in others}
-        means = [mean for same in (plain, *by_method.values()) if (mean := _mean(same, name)) is not None]
-        better += own is not None and first is not None and own < first
-        best += own is not None and own <= min(means)
-    difference, plain_mean = every[:, 0] - every[:, 1], float(every[:, 1].mean())
-    error = difference.std(ddof=1) / len(difference) ** 0.5 if len(difference) > 1 else None
-    return Change(
-        float(difference.mean()),
-        None if error is None else float(error),
-        float(difference.mean() / plain_mean) if plain_mean > 0 else None,
-        better,
-        best,
-        len(draws),
-    )
+    better = sum(len(both := _both(draw, name)) > 0 and bool(np.diff(both.mean(axis=0)) > 0) for draw in draws)
+    best = sum(_is_best(draw, name) for draw in draws)
+    difference, plain = every[:, 0] - every[:, 1], float(every[:, 1].mean())
+    mean = float(difference.mean())
+    error = float(difference.std(ddof=1) / len(difference) ** 0.5) if len(difference) > 1 else None
+    return Change(mean, error, mean / plain if plain > 0 else None, better, best, len(draws))
+
+
+def _is_best(draw: _Draw, name: str) -> bool:
+    """Return whether neither the plain pass nor a rival has a lower mean, on the clips where all have one."""
+    values = [{row.clip: getattr(row, name) for row in rows} for rows in (draw.rows, draw.plain, *draw.rivals)]
+    common = [clip for clip in values[0] if None not in [column.get(clip) for column in values]]
+    own, *others = (sum(column[clip] for clip in common) for column in values)
+    return bool(common) and own <= min(others)
 
 
 def _spreads(values: dict[str, list[float | None]]) -> dict[str, Spread]:
@@ -230,5 +237,5 @@ def _spreads(values: dict[str, list[float | None]]) -> dict[str, Spread]:
     return {name: spread(column) for name, column in there.items() if column}
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}"
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

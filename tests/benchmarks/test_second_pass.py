@@ -1,8 +1,5 @@
-"""What the second pass costs and brings: the report by hand, and a small run."""
+"""What the second pass costs and brings: the report by hand, errors of a pass, and draws that are joined."""
 
-from functools import partial
-
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,7 +10,6 @@ from benchmarks.second_pass import Run, camera_errors, report_text
 from tests.tiny import tiny_model
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.method.mask import dynamic_tokens
-from vggtjax.network.model import forward
 from vggtjax.network.pose import decode_pose
 from vggtjax.scenes import SyntheticClip
 
@@ -27,13 +23,18 @@ def test_the_report_by_hand():
         Run("frozen", "the movers'", 5): np.array([[1.5, 0.1], [1.1, 0.1]]),
         Run("frozen", "another scene's", 5): np.array([[1.5, 0.2], [1.5, 0.2]]),
     }
-    text = report_text(errors, "zero")
-    assert "Motion costs the plain pass +2.00 ± 1.00 degrees and +0.2000 ± 0.1000 median depths." in text
-    assert "5 pairs without the movers' keys win back 50 % of the rotation and 50 % of the centres" in text
-    assert "this changes rotations by +30.0 % and centres by +0.0 %" in text
-    assert "another scene's mask it is -0.20 ± 0.20 degrees and -0.1000 ± 0.0000 median depths" in text
+    text = report_text(errors, "Two scenes.")
+    assert text.startswith("Two scenes. Changes are")
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
     assert cells[4] == ["moving", "the movers'", "5", "2.00", "-1.00 ± 0.00", "0.2000", "-0.1000 ± 0.1000"]
+    facts = {(row[0], row[1], row[2].split(" ")[0]): row[3:] for row in cells if len(row) == 5}
+    assert facts["moving", "-", "cost"] == ["+2.00 ± 1.00", "+0.2000 ± 0.1000"]
+    assert facts["moving", "-", "the"] == ["+66.7 ± 11.1 %", "+66.7 ± 11.1 %"]
+    # the changes are -1, -1 of 3, 1, and -0.2, 0 of 0.3, 0.1: residuals -1/2, 1/2 and -0.05, 0.05
+    assert facts["moving", "5", "change"] == ["-50.0 ± 25.0 %", "-50.0 ± 25.0 %"]
+    assert facts["moving", "5", "another"] == ["+2.00 ± 1.00", "+0.2000 ± 0.0000"]
+    assert facts["frozen", "5", "change"] == ["+30.0 ± 20.0 %", "+0.0 ± 0.0 %"]
+    assert facts["frozen", "5", "another"] == ["+0.20 ± 0.20", "+0.1000 ± 0.0000"]
 
 
 def test_errors_of_the_masked_pass():
@@ -45,35 +46,48 @@ def test_errors_of_the_masked_pass():
     moving[:, :, :14] = True
     clips = SyntheticClip(images, depth, *[None] * 2, moving, None, poses, *[None] * 2)  # type: ignore[arg-type]
     found = camera_errors(model, clips, moving, 2, "zero")
-    masked = jax.jit(partial(forward, config=model.config, mask_pairs=2, outputs=("camera",)))
     for clip in range(3):
-        tokens = dynamic_tokens(jnp.asarray(moving[clip, None]), model.config.patch_size)
-        made = masked(model.params, jnp.asarray(images[clip, None]), dynamic_tokens=tokens)
+        four = np.full(4, clip)
+        tokens = dynamic_tokens(jnp.asarray(moving[four]), model.config.patch_size)
+        made = benchmark._forward(
+            model.params, jnp.asarray(images[four]), model.config, dynamic_tokens=tokens,
+            suppress="zero", mask_pairs=2, outputs=("camera",),
+        )  # fmt: skip
         cameras = np.asarray(decode_pose(jnp.asarray(made.pose_encoding), (28, 28))[0])[0]
         wanted = rotation_error(cameras, poses[clip]), centre_error(cameras, poses[clip]) / 2**clip
         assert found[clip] == pytest.approx(wanted, rel=1e-3)
-    assert np.abs(camera_errors(model, clips, None, 0, "zero") - found).min() > 1e-4
+    assert np.abs(camera_errors(model, clips, ~moving, 2, "zero") - found).min() > 1e-4
 
 
 def test_draws_are_joined(tmp_path, capsys, monkeypatch):
-    """A stand-in measures: the errors of a draw are its seed."""
-    asked = []
+    """Stand-ins draw and measure: a scene's error is its seed, and 10 with a mask of its own."""
+    measured = []
 
-    def draw(model, config, scenes, seed, runs, suppress):
-        asked.append((config.height, scenes, seed, suppress))
-        return ((run, np.full((scenes, 2), seed + (run.scene == "moving"))) for run in runs)
+    def draw(kind, count, config, seed):
+        assert (kind, count, config.height, config.frames) == ("dynamic", 2, 96, 12)
+        number = np.full(count, seed + 0.5 * config.frozen)
+        return SyntheticClip(number, *[None] * 3, np.array(["first", "second"]), *[None] * 4)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(benchmark, "_draw", draw)
+    def measure(model, clips, mask, pairs, suppress):
+        measured.append((pairs, None if mask is None else mask.tolist(), suppress))
+        own = mask is not None and mask.tolist() == clips.dynamic_mask.tolist()
+        return np.stack([clips.images + 10 * own] * 2, axis=1)
+
+    monkeypatch.setattr(benchmark, "held_out_scenes", draw)
+    monkeypatch.setattr(benchmark, "camera_errors", measure)
     out = tmp_path / "report.md"
     arguments = ["--scenes", "2", "--pairs", "3", "1", "3", "--seed", "4", "--seeds", "2", "--out", str(out)]
     assert benchmarks.main(["second-pass", *arguments]) == 0, capsys.readouterr().err
     shown = capsys.readouterr().out
-    assert asked == [(96, 2, 4, "zero"), (96, 2, 5, "zero")]
     assert shown.strip() == out.read_text().strip()
-    assert "Means over 4 scenes" in shown
-    rows = [[cell.strip() for cell in line.split("|")] for line in shown.splitlines() if line.startswith("| ")][2:]
-    assert [row[3] for row in rows] == ["-", "-", *["1"] * 4, *["3"] * 4]
-    assert {(row[1], row[4]) for row in rows} == {("moving", "5.50"), ("frozen", "4.50")}
+    assert "4 scenes (seeds 4 to 5) of 12 frames, 96 x 96 pixels; keys: zero." in shown
+    own, lent = ["first", "second"], ["second", "first"]
+    assert measured[:4] == [(0, None, "zero")] * 2 + [(1, own, "zero"), (1, lent, "zero")]
+    rows = [[cell.strip() for cell in line.split("|")] for line in shown.splitlines() if line.startswith("| ")]
+    rotations = {tuple(row[1:4]): row[4] for row in rows if len(row) == 9}
+    assert rotations["moving", "none", "-"] == "4.50"
+    assert rotations["frozen", "none", "-"] == "5.00"
+    assert [rotations["frozen", mask, "3"] for mask in ("the movers'", "another scene's")] == ["15.00", "5.00"]
 
 
 @pytest.mark.parametrize(
@@ -83,10 +97,12 @@ def test_draws_are_joined(tmp_path, capsys, monkeypatch):
         (["--seeds", "0"], "seeds is 0; expected at least 1"),
         (["--pairs", "0"], "mask_pairs is 0; expected a whole number of at least 1"),
         (["--pairs", "99"], "expected numbers from 1 to 12"),
+        (["--out", "{tmp}/file/report.md"], "cannot write"),
     ],
 )
-def test_bad_numbers_are_one_sentence(capsys, arguments, sentence):
-    assert benchmarks.main(["second-pass", *arguments]) == 2
+def test_bad_input_is_one_sentence(tmp_path, capsys, arguments, sentence):
+    (tmp_path / "file").write_text("")
+    assert benchmarks.main(["second-pass", *(argument.format(tmp=tmp_path) for argument in arguments)]) == 2
     error = capsys.readouterr().err
     assert sentence in error
     assert len(error.strip().splitlines()) == 1

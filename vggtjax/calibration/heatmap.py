@@ -49,20 +49,24 @@ def draw_sweep(auc: Float64[np.ndarray, "G C L"], choice: Choice, *, title: str 
         color = _COLORS[round(255 * (0.5 + (value - 0.5) / (2 * reach)))]
         draw.rectangle((x, y, x + _CELL[0] - 2, y + _CELL[1] - 2), tuple(color.tolist()))
         ink = _DARK if color.mean() > 110 else TEXT
-        draw.text((x + _CELL[0] / 2 - 1, y + _CELL[1] / 2 - 1), f"{value:.2f}", ink, tiny, "mm")
+        draw.text((x + _CELL[0] / 2 - 1, y + _CELL[1] - 10), f"{value:.2f}", ink, tiny, "mm")  # below numbers of cues
         if layer == 0:
             text = f"{GRAMS[g]}  {(KINDS[c].rows + KINDS[c].columns).upper()} {KINDS[c].statistic}"
             draw.text((left - 12, y + _CELL[1] / 2), text, TEXT, small, "rm")
 
+    corners: dict[tuple[int, int], list[int]] = {}  # of the outlines, with the numbers of the cues that begin there
     for number, step in enumerate(choice.steps, 1):
         x = left + step.cue.layers[0] * _CELL[0]
         y = _row(top, GRAMS.index(choice.gram), kind_index(step.cue))
         right = x + len(step.cue.layers) * _CELL[0]
         draw.rectangle((x - 2, y - 2, right, y + _CELL[1]), outline=_OUTLINE, width=3)
-        draw.rectangle((x - 2, y - 2, x + 10, y + 12), _OUTLINE)
-        draw.text((x + 4, y + 5), str(number), _DARK, tiny, "mm")
+        corners.setdefault((x, y), []).append(number)
+    for (x, y), numbers in corners.items():
+        text = ", ".join(map(str, numbers))
+        draw.rectangle((x - 2, y - 2, x + 4 + draw.textlength(text, tiny), y + 12), _OUTLINE)
+        draw.text((x + 1, y + 5), text, _DARK, tiny, "lm")
     floor = f", floor {choice.motion.floor:g}" if choice.motion.floor else ""
-    heading = f"Chosen for {choice.gram} similarity{floor}; AUC of the product of each cue and those above it"
+    heading = f"Chosen for {choice.gram} similarity{floor}; AUC of the product up to each cue"
     rows: list[tuple[str, ...]] = [(heading, "calibration", "held-out half")]
     for number, (cue, rating) in enumerate(choice.steps, 1):
         name = f"{number}  {cue.name}{'  (1 - m)' if cue.inverted else ''}"
