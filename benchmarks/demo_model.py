@@ -37,6 +37,12 @@ from vggtjax.storage.writing import staging, writing
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 SUPPRESS = ("zero", "drop")
 SWEPT = ("pose-decoupling", "4dvggt-d")  # methods whose sweep is shown; report.json has all
+_READING = """\
+Changes are against vggt on the same clips, ± their standard error over clips. Behind them stand two numbers of draws:
+in how many the method is better than vggt, and in how many neither vggt nor another method with the same mask, pairs
+and suppression is better. Centres and points are in the truth's unit: metres in generated scenes. Points: mean
+distance of each pixel's point, after the similarity that brings all camera centres closest; for the first camera,
+after it is brought to the true one and depth to the truth by one median scale."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -245,20 +251,20 @@ def report_text(model: Model, results: dict[str, Any]) -> str:
         if compared := results[name]:
             parts += [f"## Plain pass against blind guesses: {name}, {len(compared.clips)} clips"]
             parts += [comparison_table(compared.comparisons), *_failures(compared.rows)]
+    if results["composite ladder"] or results["dynamic"]:
+        parts += ["## How to read the tables of methods", _READING]
     for name in ("composite ladder", "dynamic"):
         if laddered := results[name]:
-            auc, draws = laddered.saliency_auc, len(laddered.rows)
             auc = laddered.saliency_auc
-            parts += [f"## Methods: {name}", f"Saliency AUC {auc.text() if auc else '-'}."]
-            parts += [_explained(len(laddered.rows)), ladder_table(laddered.summaries)]
-            parts += ["Changes:", changes_table(laddered.summaries)]
+            parts += [f"## Methods: {name}", f"{_draws(len(laddered.rows))} Saliency AUC {auc.text() if auc else '-'}."]
+            parts += [ladder_table(laddered.summaries), "Changes:", changes_table(laddered.summaries)]
             parts += _failures(row for rows in laddered.rows for row in rows)
             if swept := sorted(
                 (s for s in laddered.sweep if s.method in SWEPT),
                 key=lambda s: (s.method, s.mask_source, s.suppress, s.mask_pairs),
             ):
-                draws = max(spread.seeds for s in swept for spread in s.scores.values())
-                parts += [f"## Pairs with suppressed keys: {name}", f"Means over {_draws(draws)}."]
+                seeds = max(spread.seeds for s in swept for spread in s.scores.values())
+                parts += [f"## Pairs with suppressed keys: {name}", _draws(seeds)]
                 parts += [ladder_table(swept), "Changes:", changes_table(swept)]
     return "\n\n".join(parts)
 
@@ -284,20 +290,8 @@ def write_report(out: Path, results: dict[str, Any], text: str, mask_pairs: int)
             plot_sweep(out / f"{stem}-sweep-{method}.png", laddered.sweep, method)
 
 
-def _explained(draws: int) -> str:
-    spread = " ± their standard deviation" if draws > 1 else ""
-    return (
-        f"Means over {_draws(draws)}{spread}. Changes are against vggt on the same clips, ± their standard error over "
-        "clips. Behind them stands the number of draws in which the method is better than vggt, and of those in which "
-        "neither vggt nor another method with the same mask, pairs and suppression is better. Centres and points are "
-        "in the truth's unit: metres in generated scenes. Points: mean distance of each pixel's point, after the "
-        "similarity that brings all camera centres closest; for the first camera, after it is brought to the true one "
-        "and depth to the truth by one median scale."
-    )
-
-
 def _draws(count: int) -> str:
-    return "one draw of clips" if count == 1 else f"{count} draws of clips"
+    return "Means over one draw of clips." if count == 1 else f"Means over {count} draws ± their standard deviation."
 
 
 def _failures(rows) -> list[str]:

@@ -103,6 +103,8 @@ def second_pass(
                 errors[run] = measured
                 bars.advance(task)
             draws.append(errors)
+            if not console.is_terminal:  # a log gets a line for each draw
+                console.print(f"scenes of seed {draw}: done", highlight=False)
     errors = {run: np.concatenate([draw[run] for draw in draws]) for run in runs}
     drawn = f"seed {seed}" if seeds == 1 else f"seeds {seed} to {seed + seeds - 1}"
     clips = f"{scenes * seeds} scenes ({drawn}) of {frames} frames, {side} x {side} pixels"

@@ -130,7 +130,7 @@ def comparison_table(comparisons: Sequence[Comparison]) -> str:
         ]
         for c in comparisons
     ]
-    header = ["metric", "guess", "model", "its error", "ratio", "threshold", "", "model better", "clips"]
+    header = ["metric", "guess", "model's error", "guess's error", "ratio", "threshold", "", "model better", "clips"]
     return markdown_table(header, rows)
 
 
