@@ -35,7 +35,6 @@ from vggtjax.storage.writing import staging, writing
 _forward = jax.jit(forward, static_argnames=("config", "suppress", "outputs"))
 _AT_ONCE = 4
 
-
 Scene = Literal["moving", "frozen"]
 
 

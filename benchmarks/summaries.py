@@ -24,10 +24,10 @@ METRICS = {  # fields of LadderRow, and their names in tables and plots
     "point_distance_first": "points, first camera",
     "mask_jaccard": "mask J",
 }
-DIGITS = {"rotation_error": 2, "centre_error_ratio": 4}  # decimals in tables, one more for changes; 3 for others
 # compared with the plain pass
 AGAINST_FIRST = ("abs_rel", "rotation_error", "centre_error", "point_distance", "point_distance_first")
 
+_SETTING = ("method", "mask", "pairs", "suppress")  # columns
 _GUESSES = {
     "mean_depth_map": "mean depth map",
     "no_rotation": "no rotation",
@@ -61,7 +61,7 @@ class Change:
     best: int  # draws in which neither the plain pass nor a method with the same mask, pairs and suppression has less
     draws: int
 
-    def text(self, digits: int = 4) -> str:
+    def text(self, digits: int) -> str:
         spread = "" if self.error is None else f" ± {self.error:.{digits}f}"
         share = "" if self.share is None else f" ({100 * self.share:+z.1f} %)"
         return f"{self.mean:+z.{digits}f}{spread}{share}; {self.better}/{self.draws}, {self.best}/{self.draws}"
@@ -121,7 +121,7 @@ def comparison_table(comparisons: Sequence[Comparison]) -> str:
         [
             METRICS[c.metric],
             _GUESSES[c.guess],
-            *(_number(value, DIGITS.get(c.metric, 3)) for value in (c.model_error, c.guess_error)),
+            *(_number(value, _digits(c.metric)) for value in (c.model_error, c.guess_error)),
             _number(c.ratio, 2),
             f"{c.threshold}",
             "pass" if c.passed else "FAIL",
@@ -139,12 +139,12 @@ def ladder_table(summaries: Sequence[Summary]) -> str:
     rows = [
         [
             *_named(s),
-            *(s.scores[name].text(DIGITS.get(name, 3)) if name in s.scores else "-" for name in METRICS),
+            *(s.scores[name].text(_digits(name)) if name in s.scores else "-" for name in METRICS),
             f"{s.clips}" + (f", {s.failed} failed" if s.failed else ""),
         ]
         for s in summaries
     ]
-    return markdown_table(["method", "mask", "pairs", "suppress", *METRICS.values(), "clips"], rows)
+    return markdown_table([*_SETTING, *METRICS.values(), "clips"], rows)
 
 
 def changes_table(summaries: Sequence[Summary]) -> str:
@@ -152,12 +152,12 @@ def changes_table(summaries: Sequence[Summary]) -> str:
     rows = [
         [
             *_named(s),
-            *(s.changes[name].text(DIGITS.get(name, 3) + 1) if name in s.changes else "-" for name in AGAINST_FIRST),
+            *(s.changes[name].text(_digits(name) + 1) if name in s.changes else "-" for name in AGAINST_FIRST),
         ]
         for s in summaries
         if s.changes
     ]
-    return markdown_table(["method", "mask", "pairs", "suppress", *(METRICS[name] for name in AGAINST_FIRST)], rows)
+    return markdown_table([*_SETTING, *(METRICS[name] for name in AGAINST_FIRST)], rows)
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -235,6 +235,11 @@ def _is_best(draw: _Draw, name: str) -> bool:
 def _spreads(values: dict[str, list[float | None]]) -> dict[str, Spread]:
     there = {name: [value for value in column if value is not None] for name, column in values.items()}
     return {name: spread(column) for name, column in there.items() if column}
+
+
+def _digits(name: str) -> int:
+    """Return a metric's decimals in tables; changes have one more."""
+    return {"rotation_error": 2, "centre_error_ratio": 4}.get(name, 3)
 
 
 def _number(value: float | None, digits: int) -> str:
