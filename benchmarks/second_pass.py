@@ -78,8 +78,10 @@ def second_pass(
         raise InputError(f"scenes is {scenes}; expected at least 2: each scene uses the mask of another")
     if seeds < 1:
         raise InputError(f"seeds is {seeds}; expected at least 1")
-    if out is not None:
-        with staging(out.parent):  # an unwritable folder fails now
+    if out is not None:  # what cannot be written fails now
+        if out.is_dir():
+            raise InputError(f"{out} is a folder; expected the name of a file for the report")
+        with staging(out.parent):
             pass
     loaded = load_model(model)
     numbers = pairs_to_try(pairs, loaded.config.depth)
@@ -108,10 +110,10 @@ def second_pass(
     drawn = f"seed {seed}" if seeds == 1 else f"seeds {seed} to {seed + seeds - 1}"
     clips = f"{scenes * seeds} scenes ({drawn}) of {frames} frames, {side} x {side} pixels"
     text = report_text(errors, f"Model {loaded.name}, {clips}; keys: {suppress}.")
+    Console().print(text, markup=False, highlight=False, soft_wrap=True)
     if out is not None:
         with writing(out) as temporary:
             temporary.write_text(text + "\n")
-    Console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _draw(

@@ -98,6 +98,7 @@ def test_draws_are_joined(tmp_path, capsys, monkeypatch):
         (["--pairs", "0"], "mask_pairs is 0; expected a whole number of at least 1"),
         (["--pairs", "99"], "expected numbers from 1 to 12"),
         (["--out", "{tmp}/file/report.md"], "cannot write"),
+        (["--out", "{tmp}"], "is a folder; expected the name of a file"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, capsys, arguments, sentence):
