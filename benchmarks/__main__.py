@@ -22,7 +22,6 @@ from benchmarks.kills import kills
 from benchmarks.known import known
 from benchmarks.leads import leads
 from benchmarks.long_clips import long_clips
-from benchmarks.make_checkpoint import main as make_checkpoint
 from benchmarks.masks import masks
 from benchmarks.mutants import mutants
 from benchmarks.peak_memory import peak_memory
@@ -37,6 +36,7 @@ from benchmarks.suite.gpu_targets import gpu_targets
 from benchmarks.suite.memory import memory
 from benchmarks.training_step import training_step
 from benchmarks.viewer import viewer
+from testing.make_checkpoint import main as make_checkpoint
 from vggtjax.errors import VggtjaxError
 
 COMMANDS = {

@@ -28,8 +28,8 @@ from rich.table import Table
 
 from benchmarks.file_contents import BROKEN, content
 from benchmarks.killed_process import KILLED, finish, fork, start
-from benchmarks.make_checkpoint import make_checkpoint
-from benchmarks.seeded import seeded_images
+from testing.make_checkpoint import make_checkpoint
+from testing.seeded import seeded_images
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.storage.json_values import read_json

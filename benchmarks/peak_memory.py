@@ -17,7 +17,7 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.seeded import seeded_images
+from testing.seeded import seeded_images
 from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
 from vggtjax.pipeline import memory

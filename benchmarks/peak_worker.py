@@ -8,8 +8,8 @@ from __future__ import annotations
 import json
 import sys
 
-from benchmarks.process_memory import process_bytes
 from benchmarks.worker import PeakMemory
+from testing.process_memory import process_bytes
 from vggtjax.commands.main import main
 
 

@@ -19,8 +19,8 @@ from unittest import mock
 
 import numpy as np
 
-from benchmarks.process_memory import process_bytes
-from benchmarks.seeded import seeded_images
+from testing.process_memory import process_bytes
+from testing.seeded import seeded_images
 
 Outputs = dict[str, np.ndarray]
 Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S, 3, H, W] in [0, 1], mask [S, H, W]

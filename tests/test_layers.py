@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-TOPS = ("vggtjax", "converters", "benchmarks")
+TOPS = ("vggtjax", "converters", "testing", "benchmarks")
 FACES = ("vggtjax", "vggtjax.__main__")  # the public names, and `python -m vggtjax`: above all layers
 Graph = dict[str, set[str]]
 
@@ -123,6 +123,14 @@ def test_every_kind_of_import_is_found(tmp_path, layer, file, text):
         (tmp_path / "vggtjax" / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "vggtjax" / path).write_text(content)
     assert upward(imports(tmp_path), layer) == ["vggtjax.network.rope -> vggtjax.method.mask"]
+
+
+@pytest.mark.parametrize(("folder", "other"), [("tests", "benchmarks"), ("benchmarks", "tests"), ("testing", "tests")])
+def test_tests_and_benchmarks_share_testing_alone(folder, other):
+    """But for tests/benchmarks, which tests the benchmarks' own code."""
+    files = [path for path in (ROOT / folder).rglob("*.py") if path.parent != ROOT / "tests/benchmarks"]
+    importing = re.compile(rf"^\W*(from|import) {other}\b", flags=re.MULTILINE)
+    assert [str(path) for path in files if importing.search(path.read_text())] == []
 
 
 def test_the_root_is_small():

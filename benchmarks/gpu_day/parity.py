@@ -8,10 +8,10 @@ from functools import partial
 import jax
 import numpy as np
 
-from benchmarks.golden import BFLOAT16, FORWARD, GOLDEN, OUTPUTS, TOLERANCE, GoldenPass, golden_params, spread_error
 from benchmarks.gpu_day.lines import Lines
-from benchmarks.seeded import seeded_images
 from benchmarks.suite.cases import Size
+from testing.golden import BFLOAT16, FORWARD, GOLDEN, OUTPUTS, TOLERANCE, GoldenPass, golden_params, spread_error
+from testing.seeded import seeded_images
 from vggtjax.method.cues import GramCues
 from vggtjax.network.model import forward
 

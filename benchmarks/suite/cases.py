@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from benchmarks.seeded import seeded_images
 from benchmarks.suite.work import Grid
+from testing.seeded import seeded_images
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.layers import Params

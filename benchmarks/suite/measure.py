@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.process_memory import process_bytes, reset_high_water
+from testing.process_memory import process_bytes, reset_high_water
 from vggtjax.network.precision import full_precision
 
 _SUSTAINED = 0.05  # seconds

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.make_checkpoint import make_checkpoint
 from benchmarks.suite import work
 from benchmarks.suite.cases import Case
 from benchmarks.suite.measure import Measured, measure_calls, measure_program, timed
 from converters.torch_to_flax import convert, source_shapes
+from testing.make_checkpoint import make_checkpoint
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
 from vggtjax.method.mask_refinement import refine_masks

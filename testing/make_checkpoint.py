@@ -1,8 +1,9 @@
-"""Write a checkpoint of VGGT's PyTorch layout with seeded weights: python -m benchmarks.make_checkpoint OUT."""
+"""Write a checkpoint of VGGT's PyTorch layout with seeded weights: python -m testing.make_checkpoint OUT."""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from math import prod
 from pathlib import Path
@@ -12,7 +13,8 @@ import numpy as np
 import tyro
 from rich.progress import Progress
 
-from benchmarks.seeded import seeded_tensor
+from testing.seeded import seeded_tensor
+from vggtjax.errors import VggtjaxError
 from vggtjax.storage.tensor_file import Spec, write_tensors
 from vggtjax.storage.writing import staging, writing
 
@@ -102,5 +104,15 @@ def _write_torch(path: Path, shapes: Shapes, make: Make) -> None:
         torch.save(tensors, temporary)
 
 
+def run(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return the exit code: 0, or 2 for bad input or output."""
+    try:
+        tyro.cli(main, prog="python -m testing.make_checkpoint", args=arguments)
+    except VggtjaxError as error:
+        sys.stderr.write(f"make_checkpoint: {error}\n")
+        return 2
+    return 0
+
+
 if __name__ == "__main__":
-    tyro.cli(main)
+    sys.exit(run())

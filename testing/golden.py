@@ -12,8 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.seeded import seeded_images, seeded_state_dict
 from converters import convert_state_dict
+from testing.seeded import seeded_images, seeded_state_dict
 from vggtjax.config import VGGTConfig
 from vggtjax.network.layers import Params
 
