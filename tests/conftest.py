@@ -7,7 +7,7 @@ import jax
 import pytest
 from hypothesis import settings
 
-from benchmarks.golden import GOLDEN, golden_config, golden_params
+from testing.golden import GOLDEN, golden_config, golden_params
 from vggtjax import VGGTConfig
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"

@@ -17,9 +17,9 @@ from safetensors import safe_open
 from safetensors.numpy import save_file
 
 import converters.torch_to_flax
-from benchmarks.make_checkpoint import make_checkpoint
-from benchmarks.seeded import seeded_state_dict
 from converters import convert_state_dict
+from testing.make_checkpoint import make_checkpoint
+from testing.seeded import seeded_state_dict
 from vggtjax import load_model
 from vggtjax.checkpoint import Model, is_checkpoint, read_model, save_model
 from vggtjax.errors import CheckpointError, InputError, OutputError

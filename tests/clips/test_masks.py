@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.seeded import seeded_images
+from testing.seeded import seeded_images
 from tests.tiny import tiny_config
 from vggtjax import Model, init_params, load_clip, reconstruct
 from vggtjax.clips.masks import load_masks, masks_at_clip_pixels

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.seeded import seeded_images
+from testing.seeded import seeded_images
 from tests.tiny import tiny_config
 from vggtjax import Model, Reconstruction, forward, init_params, load_clip, reconstruct
 from vggtjax.clips.queries import Queries, check_words, parse_queries

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 import vggtjax
-from benchmarks.seeded import seeded_images, seeded_state_dict
+from testing.seeded import seeded_images, seeded_state_dict
 from vggtjax import Reconstruction, __main__
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.preprocessing import Framing

@@ -14,11 +14,11 @@ import pytest
 import torch
 from safetensors.numpy import save_file
 
-from benchmarks.make_checkpoint import make_checkpoint
-from benchmarks.seeded import seeded_state_dict
 from converters import convert, convert_state_dict
 from converters.files import choose_file, read_state_dict, weight_files
 from converters.locate import locate
+from testing.make_checkpoint import make_checkpoint
+from testing.seeded import seeded_state_dict
 from vggtjax import load_model
 from vggtjax.checkpoint import save_model
 from vggtjax.errors import CheckpointError, MissingExtraError

@@ -15,10 +15,10 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.make_checkpoint import make_checkpoint
-from benchmarks.seeded import seeded_state_dict
 from converters import convert, convert_state_dict
 from converters.locate import locate
+from testing.make_checkpoint import make_checkpoint
+from testing.seeded import seeded_state_dict
 from vggtjax import load_model
 from vggtjax.errors import CheckpointError, MissingExtraError
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from benchmarks.seeded import seeded_state_dict
 from converters import convert, convert_state_dict
 from converters.locate import locate
 from converters.strangers import STRANGERS, refuse_strangers
+from testing.seeded import seeded_state_dict
 from vggtjax.errors import CheckpointError
 
 # Keys as the networks' public code builds them.

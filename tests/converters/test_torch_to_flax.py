@@ -18,10 +18,10 @@ from flax.traverse_util import flatten_dict
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
-from benchmarks.seeded import seeded_images, seeded_state_dict
 from converters import convert, convert_state_dict
 from converters.rules import CONV, DENSE, DEPTH_TO_SPACE, IGNORED, POINTWISE, RULES, SAME, TRACKS, UNBATCHED
 from converters.torch_to_flax import source_shapes
+from testing.seeded import seeded_images, seeded_state_dict
 from vggtjax import VGGTConfig, forward, load_model, vggt_1b
 from vggtjax.checkpoint import flat_shapes
 from vggtjax.errors import MOST_LETTERS, CheckpointError, InputError, OutputError

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.seeded import seeded_images
+from testing.seeded import seeded_images
 from tests.tiny import tiny_config
 from vggtjax import Model, Passes, assemble, infer, init_params, load_clip, reconstruct
 from vggtjax.clips.truth import Truth

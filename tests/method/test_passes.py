@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.seeded import seeded_images
+from testing.seeded import seeded_images
 from vggtjax import (
     METHODS,
     Model,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.seeded import seeded_images
+from testing.seeded import seeded_images
 from vggtjax import VGGTConfig, encode, forward
 from vggtjax.errors import InputError
 from vggtjax.network.model import parameter_shapes

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.golden import FORWARD, OUTPUTS, TOLERANCE, GoldenPass, spread_error
+from testing.golden import FORWARD, OUTPUTS, TOLERANCE, GoldenPass, spread_error
 from vggtjax import decode_pose, encode, encode_pose, forward
 from vggtjax.network.aggregator import aggregate, identity
 

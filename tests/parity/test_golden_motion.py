@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.seeded import seeded_images
+from testing.seeded import seeded_images
 from vggtjax import forward
 from vggtjax.method.cues import GramCues
 from vggtjax.method.mask import cluster_means, multi_otsu_threshold, upsample

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.golden import BFLOAT16, GoldenPass, spread_error
+from testing.golden import BFLOAT16, GoldenPass, spread_error
 from tests.parity.test_golden_forward import assert_close
 from vggtjax import forward
 from vggtjax.config import Suppress

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.seeded import seeded_images
+from testing.seeded import seeded_images
 from tests.tiny import tiny_model
 from vggtjax import infer, write_artefact
 from vggtjax.commands import main as cli

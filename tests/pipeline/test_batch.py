@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import __main__ as benchmarks
 from tests.moving_ball import moving_ball
 from tests.servers import empty_memory, served
 from tests.tiny import tiny_model
@@ -370,8 +369,3 @@ def test_what_is_no_clip(clips, tmp_path):
         clips_by_name([str(clips), str(clips / "clip0")])
     with pytest.raises(ClipError, match="no clips"):
         clips_by_name([])
-
-
-def test_the_benchmark_needs_clips(capsys):
-    assert benchmarks.main(["batch", "--clips", "1"]) == 2
-    assert "clips is 1; expected at least 2" in capsys.readouterr().err

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from sklearn.neighbors import NearestNeighbors
 
-from benchmarks import point_clouds as benchmark
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics import point_clouds
 from vggtjax.evaluation.metrics.point_clouds import (
@@ -227,25 +226,3 @@ def test_points_without_partners_have_no_paired_distance():
 def test_points_that_are_no_image_have_no_normals():
     with pytest.raises(InputError, match=r"shape \(3, 3\); expected one for each pixel"):
         normals_of(TRUTH)
-
-
-def test_the_room_of_the_benchmark_is_a_room():
-    count = 2 * 294 * 518 + 1000
-    cloud = benchmark.room(count, seed=1)
-    assert cloud.shape == (count, 3)
-    assert cloud.dtype == np.float32
-    assert np.isfinite(cloud).all()
-    walls = np.abs(np.abs(cloud) / (benchmark.ROOM / 2) - 1).min(axis=1)
-    assert walls.max() < 2 * benchmark.RELIEF / benchmark.ROOM.min()
-    assert not np.array_equal(cloud, benchmark.room(count, seed=1, shift=0.5))
-
-
-def test_the_benchmark_runs(capsys):
-    benchmark.point_clouds(points=5000, repeats=2)
-    printed = capsys.readouterr().out
-    assert "5,000 points against 5,000" in printed
-    assert "run 2" in printed
-    assert "peak memory" in printed
-    for wrong, sentence in (({"points": 0}, "points is 0"), ({"repeats": 0}, "repeats is 0"), ({"noise": -1}, "noise")):
-        with pytest.raises(InputError, match=sentence):
-            benchmark.point_clouds(**wrong)

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from benchmarks.blind import still
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.trajectory import associate, centre_error, from_first, rotation_error, trajectory_errors
 from vggtjax.geometry.similarity import Similarity, align, centres, umeyama_sim3
@@ -18,6 +17,10 @@ def cameras(points, rotation=None) -> np.ndarray:
     points = np.asarray(points, float)
     turned = np.tile(np.eye(3), (len(points), 1, 1)) if rotation is None else rotation.as_matrix()
     return np.concatenate([turned, -np.einsum("sij,sj->si", turned, points)[:, :, None]], axis=2)
+
+
+def still(frames) -> np.ndarray:
+    return cameras(np.zeros((frames, 3)))
 
 
 def random_cameras(generator, frames=7) -> np.ndarray:
