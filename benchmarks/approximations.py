@@ -15,7 +15,6 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.block_sparse import sparse_attention
 from vggtjax.cameras import unproject
 from vggtjax.checkpoint import Model
 from vggtjax.config import VGGTConfig
@@ -26,7 +25,7 @@ from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.block import Block
 from vggtjax.network.layers import Params
 from vggtjax.network.merging import merged_attention
-from vggtjax.network.model import forward, init_params
+from vggtjax.network.model import forward
 from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import full_precision
 from vggtjax.network.quantised import is_quantised, quantise
@@ -36,18 +35,15 @@ from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
 from vggtjax.storage.kept_memory import keep_freed_memory
 
-_SPARSE = {"queries": 32, "keys": 16}  # patches of a block in a frame of 64 patches: as large a share as 128 of 777
 WAYS: dict[str, str | Callable] = {
     "exact": "exact",
     "merged, 2 x 2": "merged",
     "merged, 3 x 3": partial(merged_attention, region=3, stride=None),
     "merged, 4 x 4": partial(merged_attention, region=4, stride=None),
-    "sparse, 50 %": partial(sparse_attention, keep=0.5),
-    "sparse, 25 %": partial(sparse_attention, keep=0.25),
     "exact, int8 weights": "exact",
 }
-_FULL_SIZE = VGGTConfig(heads=("camera", "depth"))
 _HEADS, _WIDTH = 16, 1024
+_SEED = 3  # of the scenes
 
 
 def approximations(
@@ -55,28 +51,21 @@ def approximations(
     model: str = "demo",
     scenes: int = 16,
     frames: tuple[int, ...] = (16, 32),
-    size: int | None = None,
-    seed: int = 3,
     speed: tuple[int, ...] = (2, 4, 8, 16),
     height: int = 294,
     width: int = 518,
     repeats: int = 2,
-    full_size: int = 0,
 ) -> None:
-    """Measure errors of a plain pass and the time of blocks, with exact, merged and block-sparse global attention.
+    """Measure errors of a plain pass and the time of blocks, with exact and merged global attention.
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.
         scenes: held-out dynamic scenes.
         frames: numbers of frames of the scenes, at least 12; () for no errors.
-        size: side of the scenes' frames in pixels; the model's own by default.
-        seed: another seed draws other scenes.
         speed: numbers of frames of which blocks of VGGT-1B's width are timed; () for no times.
         height: of those frames, in pixels.
         width: of those frames, in pixels.
         repeats: timed runs of each; the fastest counts.
-        full_size: frames of 112 x 112 pixels on which VGGT-1B with random weights is compared; 0 for none. It takes 5
-            GB of memory.
     """
     if min(scenes, repeats) < 1:
         raise InputError(f"scenes and repeats are {scenes} and {repeats}; expected at least 1")
@@ -86,16 +75,9 @@ def approximations(
     if frames:
         loaded = load_model(model)
         for count in frames:
-            console.print(_errors(loaded, count, scenes, size or loaded.config.image_size, seed))
-    if full_size:
-        console.print(_full_size(full_size))
+            console.print(_errors(loaded, count, scenes))
     for count in speed:
         console.print(_times(count, (height // 14, width // 14), repeats))
-
-
-def _of_small_frames(way: str | Callable) -> str | Callable:
-    """Return block-sparse attention with blocks that suit frames of 64 patches."""
-    return partial(way, **_SPARSE) if isinstance(way, partial) and way.func is sparse_attention else way
 
 
 def _weights(name: str, params: Params, prefix: str = "") -> Params:
@@ -108,13 +90,13 @@ def _weights(name: str, params: Params, prefix: str = "") -> Params:
 
 
 def _run(params: Params, images: Any, config: VGGTConfig, way: str | Callable) -> Callable[..., Any]:
-    compute: Any = {"attention": _of_small_frames(way)}
+    compute: Any = {"attention": way}
     return jax.jit(lambda params, images: forward(params, images, config, **compute)).lower(params, images).compile()
 
 
-def _errors(model: Model, frames: int, scenes: int, side: int, seed: int) -> Table:
-    config = model.config
-    clips = held_out_scenes("dynamic", scenes, SceneConfig(height=side, width=side, frames=frames), seed=seed)
+def _errors(model: Model, frames: int, scenes: int) -> Table:
+    config, side = model.config, model.config.image_size
+    clips = held_out_scenes("dynamic", scenes, SceneConfig(height=side, width=side, frames=frames), seed=_SEED)
     table = Table(title=f"{scenes} scenes of {frames} frames of {side} x {side} pixels", box=None)
     for heading in ("attention", "depth", "rotation", "centres", "depth to exact", "rotation", "points"):
         table.add_column(heading, justify="left" if heading == "attention" else "right")
@@ -161,29 +143,6 @@ def _points(outputs: tuple, others: tuple) -> float:
     return float(
         np.median(np.linalg.norm(scale * np.asarray(ours) - np.asarray(theirs), axis=-1)) / np.median(others[0])
     )
-
-
-def _full_size(frames: int) -> Table:
-    """Compare VGGT-1B with random weights, whose LayerScale is that of benchmarks/seeded.py."""
-
-    def layer_scale(path, leaf):
-        return jnp.full_like(leaf, 0.3) if path[-1].key in ("scale1", "scale2") else leaf
-
-    params = jax.tree_util.tree_map_with_path(layer_scale, init_params(0, _FULL_SIZE))
-    images = jnp.asarray(np.random.default_rng(0).random((1, frames, 112, 112, 3), np.float32))
-    table = Table(title=f"VGGT-1B with random weights, {frames} frames of 112 x 112 pixels", box=None)
-    for heading in ("attention", "pose encoding", "depth"):
-        table.add_column(heading, justify="left" if heading == "attention" else "right")
-    exact = None
-    for name, way in WAYS.items():
-        weights = _weights(name, params)
-        predictions = _run(weights, images, _FULL_SIZE, way)(weights, images)
-        outputs = [np.asarray(x) for x in (predictions.pose_encoding, predictions.depth)]
-        exact = exact or outputs
-        apart = [np.abs(a - b).mean() / np.abs(b).mean() for a, b in zip(outputs, exact, strict=True)]
-        table.add_row(name, *(f"{value:.2%}" for value in apart))
-    table.caption = "mean difference to exact in mean sizes"
-    return table
 
 
 def _times(frames: int, grid: tuple[int, int], repeats: int) -> Table:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,8 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bars
 
 from benchmarks.blind_guesses import Comparison, Guess, Prior, compare, guesses, training_prior
-from benchmarks.plots import plot_ladder, plot_rotations, plot_sweep
-from benchmarks.real_clips import is_clip_folder, load_windows
+from benchmarks.plots import plot_ladder, plot_sweep
+from benchmarks.real_clips import Windows, load_windows
 from benchmarks.summaries import (
     Spread,
     Summary,
@@ -36,6 +35,7 @@ from vggtjax.storage.writing import staging, writing
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 SUPPRESS = ("zero", "drop")
+_AT_ONCE = 4  # clips
 SWEPT = ("pose-decoupling", "4dvggt-d")  # methods whose sweep is shown; report.json has all
 _READING = """\
 Changes are against vggt on the same clips, ± their standard error over clips. Behind them stand two numbers of draws:
@@ -61,7 +61,7 @@ class Laddered:
 
     rows: list[list[LadderRow]]  # of each seed
     summaries: list[Summary]  # for the requested number of pairs
-    sweep: list[Summary]  # for every number of pairs, over the seeds of the sweep
+    sweep: list[Summary]  # for every number of pairs, on the first seed
     saliency_auc: Spread | None
 
 
@@ -76,13 +76,10 @@ class Settings:
     height: int | None  # as wide as high if None
     mask_pairs: int | None  # the number that the model recommends if None
     sweep: tuple[int, ...]
-    sweep_seeds: int
     training_scenes: int
-    batch: int
-    dtype: Literal["float32", "bfloat16"]
 
     def __post_init__(self) -> None:
-        lowest = {"static": 0, "dynamic": 0, "frames": 3, "mask_pairs": 0, "sweep_seeds": 0}
+        lowest = {"static": 0, "dynamic": 0, "frames": 3, "mask_pairs": 0}
         for field in dataclasses.fields(self):
             value, least = getattr(self, field.name), lowest.get(field.name, 1)
             if isinstance(value, int) and value < least:
@@ -102,11 +99,8 @@ def demo_model(
     height: int | None = None,
     mask_pairs: int | None = None,
     sweep: tuple[int, ...] = (1, 3, 5, 8, 12, 24),
-    sweep_seeds: int = 1,
     training_scenes: int = 256,
     clips: Path = CLIPS,
-    batch: int = 4,
-    dtype: Literal["float32", "bfloat16"] = "float32",
 ) -> None:
     """Compare a model with guesses without images, and the methods with each other.
 
@@ -120,22 +114,17 @@ def demo_model(
         height: of generated scenes in pixels, a multiple of the model's patch size; by default their width, which is
             the model's image size. The scenes are chosen on square frames whatever it is.
         mask_pairs: pairs in which keys are suppressed; the number that the model recommends by default.
-        sweep: further numbers of pairs to try.
-        sweep_seeds: number of draws of dynamic scenes for the sweep.
+        sweep: further numbers of pairs to try on the first draw of dynamic scenes.
         training_scenes: number of training scenes behind the blind guesses.
-        clips: folder with hololens/ and composite/ inside; absent folders are skipped.
-        batch: clips per run of the network.
-        dtype: type of the blocks' matrix products.
+        clips: folder with hololens/ and composite/ inside, filmed clips in the layout plain; absent ones are skipped.
     """
-    settings = Settings(
-        static, dynamic, seeds, frames, height, mask_pairs, sweep, sweep_seeds, training_scenes, batch, dtype
-    )
+    settings = Settings(static, dynamic, seeds, frames, height, mask_pairs, sweep, training_scenes)
     check_extra("plotting", "train", "matplotlib")  # before hours of measuring
     with staging(out):  # an unwritable folder fails now
         pass
     loaded = load_model(model)
     bench = _Bench(loaded, settings)
-    with bench.running():
+    with bench.progress:
         results: dict[str, Any] = {
             "model": loaded.summary(),
             "settings": dataclasses.asdict(settings)
@@ -143,10 +132,10 @@ def demo_model(
             | {"threshold": loaded.config.motion.cut_by(None, "otsu")},
         }
         results["static"] = bench.static_scenes() if static else None
-        results["hololens"] = bench.filmed([clips / "hololens"], "hololens")
-        folders = sorted(clips.joinpath("composite").glob("*"))
-        results["composite"] = bench.filmed(folders, "composite")
-        results["composite ladder"] = bench.filmed_ladder(folders)
+        hololens, composite = (bench.windows(clips / name) for name in ("hololens", "composite"))
+        results["hololens"] = hololens and bench.compared("hololens", hololens)
+        results["composite"] = composite and bench.compared("composite", composite)
+        results["composite ladder"] = composite and bench.laddered("composite", [composite.truth])
         results["dynamic"] = bench.dynamic_scenes() if dynamic else None
     text = report_text(loaded, results)
     write_report(out, results, text, bench.pairs)
@@ -172,11 +161,6 @@ class _Bench:
         self.progress = Bars(*columns, console=self.console, disable=not self.console.is_terminal)
         self.priors: dict[tuple[int, int], Prior] = {}
 
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        with self.progress:
-            yield
-
     def stage(self, name: str) -> Progress:
         task = self.progress.add_task(name, total=None)
 
@@ -189,37 +173,30 @@ class _Bench:
 
     def static_scenes(self) -> Compared:
         truth = self.scenes("static", self.settings.static, 0)
-        return self.compared("static scenes", [f"scene {i}" for i in range(len(truth.images))], truth)
+        return self.compared("static scenes", Windows([f"scene {i}" for i in range(len(truth.images))], truth))
 
     def dynamic_scenes(self) -> Laddered:
         seeds = range(self.settings.seeds)
         return self.laddered("dynamic scenes", (self.scenes("dynamic", self.settings.dynamic, seed) for seed in seeds))
 
-    def filmed(self, folders: Sequence[Path], name: str) -> Compared | None:
-        if not (folders := [folder for folder in folders if is_clip_folder(folder)]):
-            return None
-        windows = load_windows(folders, self.model.config, self.settings.frames)
-        return self.compared(name, windows.names, windows.truth)
+    def windows(self, folder: Path) -> Windows | None:
+        return load_windows(folder, self.model.config, self.settings.frames) if folder.is_dir() else None
 
-    def filmed_ladder(self, folders: Sequence[Path]) -> Laddered | None:
-        if not (folders := [folder for folder in folders if is_clip_folder(folder)]):
-            return None
-        return self.laddered("composite", [load_windows(folders, self.model.config, self.settings.frames).truth])
-
-    def compared(self, name: str, clips: list[str], truth: Truth) -> Compared:
+    def compared(self, name: str, clips: Windows) -> Compared:
+        names, truth = clips
         prior = self.prior(truth.images.shape[2], truth.images.shape[3])
-        rows = ladder(self.model, truth, methods=["vggt"], **self._network(name))
+        rows = ladder(self.model, truth, methods=["vggt"], batch_size=_AT_ONCE, progress=self.stage(name))
         guessed = guesses(truth, prior)
-        return Compared(clips, rows, guessed, compare(rows, guessed))
+        return Compared(names, rows, guessed, compare(rows, guessed))
 
     def laddered(self, name: str, truths: Iterable[Truth]) -> Laddered:
         settings, rows = self.settings, []
         for seed, truth in enumerate(truths):
-            pairs = {self.pairs, *(settings.sweep if seed < settings.sweep_seeds else ())}
-            network = self._network(f"ladder, {name} {seed}")
-            rows.append(ladder(self.model, truth, mask_pairs=sorted(pairs), suppress=SUPPRESS, **network))
+            pairs = {self.pairs, *(settings.sweep if seed == 0 else ())}
+            how: dict[str, Any] = {"mask_pairs": sorted(pairs), "suppress": SUPPRESS, "batch_size": _AT_ONCE}
+            rows.append(ladder(self.model, truth, **how, progress=self.stage(f"ladder, {name} {seed}")))
         main = [[row for row in found if row.mask_pairs in (None, self.pairs)] for found in rows]
-        swept = rows[: settings.sweep_seeds] if settings.sweep else []
+        swept = rows[:1] if settings.sweep else []
         return Laddered(rows, summarise(main), summarise(swept), saliency_auc(rows))
 
     def scenes(self, kind: Literal["static", "dynamic"], count: int, seed: int) -> Truth:
@@ -232,10 +209,6 @@ class _Bench:
             advance = self.stage(f"training scenes {width} x {height}")
             self.priors[height, width] = training_prior(config, self.settings.training_scenes, progress=advance)
         return self.priors[height, width]
-
-    def _network(self, name: str) -> dict[str, Any]:
-        settings = self.settings
-        return {"compute_dtype": settings.dtype, "batch_size": settings.batch, "progress": self.stage(name)}
 
 
 def report_text(model: Model, results: dict[str, Any]) -> str:
@@ -263,8 +236,7 @@ def report_text(model: Model, results: dict[str, Any]) -> str:
                 (s for s in laddered.sweep if s.method in SWEPT),
                 key=lambda s: (s.method, s.mask_source, s.suppress, s.mask_pairs),
             ):
-                seeds = max(spread.seeds for s in swept for spread in s.scores.values())
-                parts += [f"## Pairs with suppressed keys: {name}", _draws(seeds)]
+                parts += [f"## Pairs with suppressed keys: {name}", _draws(1)]
                 parts += [ladder_table(swept), "Changes:", changes_table(swept)]
     return "\n\n".join(parts)
 
@@ -275,9 +247,6 @@ def write_report(out: Path, results: dict[str, Any], text: str, mask_pairs: int)
         temporary.write_text(json.dumps(results, default=dataclasses.asdict, indent=1, allow_nan=False) + "\n")
     with writing(out / "report.md") as temporary:
         temporary.write_text(text + "\n")
-    compared = {name: found for name in ("static", "hololens", "composite") if (found := results[name])}
-    if compared:
-        plot_rotations(out / "rotations.png", {name: (found.rows, found.guesses) for name, found in compared.items()})
     for name in ("composite ladder", "dynamic"):
         if not (laddered := results[name]):
             continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import multiprocessing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -87,7 +87,6 @@ def known(
     model: str = "demo",
     clips: int = 64,
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4),
-    rows: tuple[str, ...] = (),
     folder: Path = Path("known-clips"),
     workers: int = 1,
 ) -> None:
@@ -99,7 +98,6 @@ def known(
         model: "demo", or weights as for vggtjax reconstruct.
         clips: number of clips of a seed.
         seeds: of the clips.
-        rows: of the table; all by default. The errors with nothing known always come first.
         folder: keeps clips and predictions; a later run with the same model takes them from there.
         workers: processes, each of which takes a seed at a time.
     """
@@ -107,21 +105,18 @@ def known(
         raise InputError(
             f"clips is {clips}, seeds {seeds} and workers {workers}; expected at least 2 clips, a seed and a worker"
         )
-    if unknown := [name for name in rows if name not in ROWS]:
-        raise InputError(f"rows has {unknown}; expected some of {list(ROWS)}")
-    chosen = [name for name in ROWS if name == NOTHING or name in rows or not rows]
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        found = list(pool.map(partial(_of_seed, model, clips, folder, chosen), seeds))
+        found = list(pool.map(partial(_of_seed, model, clips, folder), seeds))
     Console(width=200).print(_table(found), markup=False, highlight=False, soft_wrap=True)
 
 
-def _of_seed(model: str, clips: int, folder: Path, rows: Sequence[str], seed: int) -> dict[str, list[Errors | str]]:
+def _of_seed(model: str, clips: int, folder: Path, seed: int) -> dict[str, list[Errors | str]]:
     logging.getLogger("vggtjax").setLevel(logging.ERROR)  # the true poses fit this model's predictions poorly
-    found: dict[str, list[Errors | str]] = {name: [] for name in rows}
+    found: dict[str, list[Errors | str]] = {name: [] for name in ROWS}
     made = clips_of_seed(load_model(model), seed, clips, folder)
     for clip in track(made, f"seed {seed}", clips, console=Console(stderr=True)):
-        for name in rows:
-            found[name].append(_measured(clip, ROWS[name](clip)))
+        for name, given in ROWS.items():
+            found[name].append(_measured(clip, given(clip)))
     return found
 
 

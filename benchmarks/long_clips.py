@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import csv
-import json
-import subprocess
-import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import numpy as np
@@ -18,14 +15,14 @@ from jaxtyping import Float
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command_worker import run_command
 from benchmarks.plots import plot_paths
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sampling import Sampling
-from vggtjax.clips.sources import ClipSource, open_source
+from vggtjax.clips.sources import open_source
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.table import find_sequences
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.pipeline.run import reconstruct
@@ -45,23 +42,14 @@ _LEAST_MOVING, _MOST_MOVING = 0.08, 0.5  # share of the pixels of a dynamic walk
 _TRIES = 20
 
 
-class Way(NamedTuple):
-    """A way to reconstruct a walk."""
-
-    name: str
-    overlap: int = 0  # 0: all frames together
-    masks: bool = True
-    loops: bool = False
-
-
 class Row(NamedTuple):
-    """Errors of a way on a clip; lengths are shares of the extent of the true path, or of that of all frames."""
+    """Errors of a way on a walk; lengths are shares of the extent of the true path."""
 
-    clip: str
+    walk: str
     way: str
-    to_truth: float | None  # None without true cameras
+    to_truth: float
     to_full: float | None  # None for the path of all frames
-    turned: float | None  # degrees, mean
+    turned: float  # degrees, mean
     loops: str  # used of tried
 
 
@@ -73,13 +61,10 @@ def long_clips(
     window: int = 16,
     overlaps: tuple[int, ...] = (4, 8),
     walks: int = 2,
-    kinds: tuple[Kind, ...] = ("static", "dynamic"),
-    clips: tuple[Path, ...] = (),
-    datasets: tuple[tuple[str, Path], ...] = (),
     memory: tuple[int, ...] = (100, 300),
     seed: int = 0,
 ) -> None:
-    """Measure the paths of long walks and filmed clips in windows, and the peak memory of long clips.
+    """Measure the paths of long walks in windows, and the peak memory of long clips.
 
     Args:
         out: folder for the table and the plots.
@@ -87,10 +72,7 @@ def long_clips(
         frames: of a walk, which comes back to where it began.
         window: frames of a window.
         overlaps: frames that neighbouring windows share.
-        walks: of each kind.
-        kinds: "static", and "dynamic" ones, in which things move.
-        clips: videos, or folders of pictures, without true cameras.
-        datasets: folders of data sets by the names that `vggtjax evaluate` knows, such as tum FOLDER.
+        walks: static ones, and as many in which things move.
         memory: numbers of frames of the first walk of which memory and time are measured, all together and in
             windows, each in a process of its own; () for none.
         seed: another seed draws other walks.
@@ -100,7 +82,7 @@ def long_clips(
     loaded, console = load_model(model), Console()
     out.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
-    for kind in kinds:
+    for kind in get_args(Kind):
         before = len(rows)
         for number, walk in enumerate(drawn_walks(kind, walks, frames, loaded.config.image_size, seed)):
             if not rows:
@@ -110,9 +92,6 @@ def long_clips(
             _write(out / "paths.csv", rows)
         if walks:
             console.print(_table(f"{kind} walks, means", _means(rows[before:])))
-    for name, source, true in sequences(clips, datasets):
-        rows += _measured(name, loaded, source, true, window, overlaps, out, console)
-        _write(out / "paths.csv", rows)
     for count in memory:
         for length in (0, window):
             console.print(_peak(out / "frames", model, count, length, max(overlaps)))
@@ -142,52 +121,38 @@ def drawn_walks(kind: Kind, count: int, frames: int, side: int, seed: int) -> It
         found += 1
 
 
-def sequences(
-    clips: Iterable[Path], datasets: Iterable[tuple[str, Path]]
-) -> Iterator[tuple[str, ClipSource, Float[np.ndarray, "S 3 4"] | None]]:
-    """Yield the name, the pictures and the true cameras, if any, of filmed clips."""
-    for clip in clips:
-        yield clip.stem, clip, None
-    for dataset, root in datasets:
-        for name, opened in find_sequences(dataset, root, sampling=Sampling(stride=1)).items():
-            found = opened()
-            true = None if found.world_from_camera is None else np.linalg.inv(found.world_from_camera)[:, :3]
-            yield f"{dataset} {name}", [str(picture) for picture in found.pictures], true
-
-
 def _measured(
     name: str,
     model: Model,
-    source: ClipSource,
-    true: Float[np.ndarray, "S 3 4"] | None,
+    images: Float[np.ndarray, "S H W 3"],
+    true: Float[np.ndarray, "S 3 4"],
     window: int,
     overlaps: tuple[int, ...],
     out: Path,
     console: Console,
 ) -> list[Row]:
-    """Return the errors of every way on a clip, and draw the paths."""
-    paths = dict(_paths(model, source, window, overlaps, console))
+    """Return the errors of every way on a walk, and draw the paths."""
+    paths = dict(_paths(model, images, window, overlaps, console))
     full = next(iter(paths.values()))[0]
     rows = [_row(name, way, cameras, loops, full, true) for way, (cameras, loops) in paths.items()]
     shown = {way: cameras for way, (cameras, _) in paths.items()}
-    against, called = (full, "all together") if true is None else (true, "true")
-    plot_paths(out / f"{name.replace(' ', '-')}.png", shown, against, f"{name}, {len(full)} frames", called)
+    plot_paths(out / f"{name.replace(' ', '-')}.png", shown, true, f"{name}, {len(full)} frames")
     console.print(_table(f"{name}, {len(full)} frames", rows))
     return rows
 
 
 def _paths(
-    model: Model, source: ClipSource, window: int, overlaps: tuple[int, ...], console: Console
+    model: Model, images: Float[np.ndarray, "S H W 3"], window: int, overlaps: tuple[int, ...], console: Console
 ) -> Iterator[tuple[str, tuple[Float[np.ndarray, "S 3 4"], str]]]:
     """Yield the name, the cameras and the loops of each way; windows of one overlap are run once for all ways."""
     config = model.config
     fitter = Fitter(size=config.image_size, patch=config.patch_size)
     began = time.perf_counter()
-    clip = load_clip(source, size=fitter.size, patch=fitter.patch)
+    clip = load_clip(images, size=fitter.size, patch=fitter.patch)
     full = reconstruct(model, clip).camera_from_world
     console.print(f"all frames together: {time.perf_counter() - began:.0f} s")
     yield "all frames together", (full, "")
-    opened, tools = open_source(source), tools_of(model)
+    opened, tools = open_source(images), tools_of(model)
     for overlap in overlaps:
         began = time.perf_counter()
         cut = plan_windows(len(clip), window, overlap)
@@ -207,28 +172,20 @@ def _paths(
 
 
 def _row(name: str, way: str, cameras, loops: str, full, true) -> Row:
-    scale, truth = 1.0, full  # what lengths are multiplied by, and measured against
-    if true is not None:
-        scale, truth = umeyama_sim3(centres(full), centres(true)).scale, true  # the full path in the truth's unit
-    extent = float(np.linalg.norm(np.ptp(centres(truth), axis=0)))
-    to_truth = None if true is None else centre_error(cameras, true) / extent
+    scale = umeyama_sim3(centres(full), centres(true)).scale  # of the full path in the truth's unit
+    extent = float(np.linalg.norm(np.ptp(centres(true), axis=0)))
     to_full = None if cameras is full else scale * centre_error(cameras, full) / extent
-    turned = None if cameras is full and true is None else rotation_error(cameras, truth)
-    return Row(name, way, to_truth, to_full, turned, loops)
+    return Row(name, way, centre_error(cameras, true) / extent, to_full, rotation_error(cameras, true), loops)
 
 
 def _means(rows: list[Row]) -> list[Row]:
-    """Return the mean of each way over clips."""
-
-    def mean(values: Iterable[float | None]) -> float | None:
-        there = [value for value in values if value is not None]
-        return float(np.mean(there)) if there else None
-
+    """Return the mean of each way over walks."""
     means = []
     for way in dict.fromkeys(row.way for row in rows):
         here = [row for row in rows if row.way == way]
-        columns = zip(*((row.to_truth, row.to_full, row.turned) for row in here), strict=True)
-        means.append(Row("", way, *map(mean, columns), loops=""))
+        to_full = [row.to_full for row in here if row.to_full is not None]
+        to_truth, turned = (float(np.mean([getattr(row, name) for row in here])) for name in ("to_truth", "turned"))
+        means.append(Row("", way, to_truth, float(np.mean(to_full)) if to_full else None, turned, ""))
     return means
 
 
@@ -236,13 +193,9 @@ def _table(title: str, rows: list[Row]) -> Table:
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
     for heading in ("way", "ATE / extent", "to all frames", "rotation (deg)", "loops"):
         table.add_column(heading)
-
-    def shown(value: float | None, style: str) -> str:
-        return "" if value is None else format(value, style)
-
     for row in rows:
-        cells = (shown(row.to_truth, ".2%"), shown(row.to_full, ".2%"), shown(row.turned, ".2f"))
-        table.add_row(row.way, *cells, row.loops)
+        to_full = "" if row.to_full is None else f"{row.to_full:.2%}"
+        table.add_row(row.way, f"{row.to_truth:.2%}", to_full, f"{row.turned:.2f}", row.loops)
     return table
 
 
@@ -264,11 +217,10 @@ def write_frames(images: Float[np.ndarray, "S H W 3"], folder: Path) -> None:
 
 def _peak(folder: Path, model: str, frames: int, window: int, overlap: int) -> str:
     """Return the peak memory and the time of a long clip with its files, measured in a process of its own."""
-    words = [str(folder), model, str(frames), str(window), str(overlap)]
-    process = subprocess.run(
-        [sys.executable, "-m", "benchmarks.long_clips_worker", *words], capture_output=True, text=True, check=True
-    )
-    found = json.loads(process.stdout.splitlines()[-1])
+    with TemporaryDirectory() as out:
+        cut = ["--window", str(window), *(["--overlap", str(overlap)] if window else [])]
+        words = ["reconstruct", str(folder), "--model", model, "--max-frames", str(frames), *cut]
+        found = run_command([*words, "--out", f"{out}/result"], Path(out) / "cache")
     how, memory = f"in windows of {window}" if window else "together", (found["own"] / 1e6, found["total"] / 1e6)
     return (
         f"{frames} frames {how}: peak {memory[0]:.0f} MB of its own, {memory[1]:.0f} MB with mapped files, "

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from vggtjax.cameras import world_from_camera
 from vggtjax.clips.clip import load_clip
-from vggtjax.clips.truth import Truth, at_clip_pixels, batched_truth
+from vggtjax.clips.truth import at_clip_pixels, batched_truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.trajectory import rotation_error, trajectory_errors
 from vggtjax.pretrained.load import load_model
@@ -81,7 +81,7 @@ def refine_cameras(
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.
-        out: folder for the rendered clips, rows.json and report.md.
+        out: folder for rows.json and report.md.
         static: number of static clips.
         dynamic: number of clips with moving objects.
         frames: of a clip.
@@ -98,7 +98,7 @@ def refine_cameras(
     config = SceneConfig(height=side, width=side, frames=frames, samples=2)
     rows: list[Row] = []
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        jobs = _jobs(model, {"static": static, "dynamic": dynamic}, config, out)
+        jobs = _jobs(model, {"static": static, "dynamic": dynamic}, config)
         for row in pool.map(_refined, jobs):
             rows.append(row)
             change = f"ATE {row.ate[0]:.3f} -> {row.ate[1]:.3f}" + ("" if row.refined else f" ({row.reason})")
@@ -111,7 +111,7 @@ def refine_cameras(
     Console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def _jobs(model: str, counts: dict[Kind, int], config: SceneConfig, out: Path) -> Iterator[Job]:
+def _jobs(model: str, counts: dict[Kind, int], config: SceneConfig) -> Iterator[Job]:
     """Yield the clips with their results and masks."""
     from vggtjax.pipeline.run import reconstruct
 
@@ -119,7 +119,7 @@ def _jobs(model: str, counts: dict[Kind, int], config: SceneConfig, out: Path) -
     for kind in get_args(Kind):
         if not counts[kind]:
             continue
-        truth = _scenes(kind, counts[kind], config, out)
+        truth = batched_truth(held_out_scenes(kind, counts[kind], config))
         for number in range(counts[kind]):
             pictures = np.rint(255 * truth.images[number]).astype(np.uint8)
             clip = load_clip(pictures, size=network.config.image_size, patch=network.config.patch_size)
@@ -133,19 +133,6 @@ def _jobs(model: str, counts: dict[Kind, int], config: SceneConfig, out: Path) -
                 masked = dataclasses.replace(result, dynamic_mask=masks[name])
                 poses = truth.camera_from_world[number], truth.intrinsics[number]
                 yield Job(kind, number, name, masked, pictures, *poses)
-
-
-def _scenes(kind: Kind, count: int, config: SceneConfig, out: Path) -> Truth:
-    """Return rendered clips, kept in a file for the next run."""
-    path = out / f"{kind}-{count}-of-{config.frames}x{config.width}.npz"
-    if not path.is_file():
-        truth = batched_truth(held_out_scenes(kind, count, config))
-        with writing(path) as temporary, temporary.open("wb") as file:
-            arrays: dict[str, Any] = truth._asdict() | {"images": np.rint(255 * truth.images).astype(np.uint8)}
-            np.savez(file, **arrays)
-    with np.load(path) as stored:
-        arrays = {name: stored[name] for name in Truth._fields}
-    return Truth(**arrays | {"images": arrays["images"].astype(np.float32) / 255})
 
 
 def _refined(job: Job) -> Row:

@@ -56,7 +56,6 @@ def second_pass(
     frames: int = 12,
     seed: int = 0,
     seeds: int = 1,
-    size: int | None = None,
     pairs: tuple[int, ...] = (1, 2, 3, 5),
     suppress: Literal["zero", "drop"] = "zero",
     out: Path | None = None,
@@ -69,7 +68,6 @@ def second_pass(
         frames: frames of a scene.
         seed: another seed draws other scenes.
         seeds: number of draws of scenes, with seeds from `seed` on.
-        size: side of the frames in pixels; the model's own by default.
         pairs: numbers of pairs in which keys are suppressed.
         suppress: how keys are suppressed.
         out: file for the report, in markdown; it is printed only by default.
@@ -85,7 +83,7 @@ def second_pass(
             pass
     loaded = load_model(model)
     numbers = pairs_to_try(pairs, loaded.config.depth)
-    side = size or loaded.config.image_size
+    side = loaded.config.image_size
     config = SceneConfig(height=side, width=side, frames=frames)
     runs = [Run(scene, "none", 0) for scene in ("moving", "frozen")]
     runs += [

@@ -44,7 +44,6 @@ class Spread:
 
     mean: float
     deviation: float | None  # None for a single seed
-    seeds: int
 
     def text(self, digits: int = 3) -> str:
         return f"{self.mean:.{digits}f}" + ("" if self.deviation is None else f" ± {self.deviation:.{digits}f}")
@@ -84,7 +83,7 @@ class Summary:
 
 def spread(values: Sequence[float]) -> Spread:
     """Return mean and sample standard deviation of one number per seed."""
-    return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None, len(values))
+    return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else None)
 
 
 def summarise(by_seed: Sequence[Sequence[LadderRow]]) -> list[Summary]:

@@ -81,7 +81,7 @@ def _run(outcomes: Sequence[Outcome], size: str, limit: float, out: Path) -> Non
     """Run the last part in a process of its own, for at most `limit` seconds."""
     outcome, began = outcomes[-1], time.monotonic()
     lines, log = out / f"{outcome.name}.jsonl", out / f"{outcome.name}.log"
-    command = [sys.executable, "-m", "benchmarks.gpu_day.worker", outcome.name, size, str(lines.resolve())]
+    command = [sys.executable, "-m", "benchmarks.gpu_day.parts", outcome.name, size, str(lines.resolve())]
     with log.open("wb") as said, subprocess.Popen(
         command, cwd=_ROOT, stdin=subprocess.PIPE, stdout=said, stderr=subprocess.STDOUT
     ) as process:  # fmt: skip

@@ -1,9 +1,16 @@
-"""The parts of gpu-day, in their order."""
+"""The parts of gpu-day, in their order, and a process that runs one: python -m benchmarks.gpu_day.parts PART SIZE FILE.
+
+It ends when its input ends.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from benchmarks.gpu_day.kernels import kernels
 from benchmarks.gpu_day.lines import Lines
@@ -11,6 +18,8 @@ from benchmarks.gpu_day.parity import parity
 from benchmarks.gpu_day.paths import attention_paths
 from benchmarks.gpu_day.speed import speed
 from benchmarks.suite.cases import Size
+from benchmarks.suite.report import describe, machine
+from vggtjax.network.attention import cudnn_works
 
 
 class Part(NamedTuple):
@@ -27,3 +36,22 @@ PARTS = {
     "speed": Part("How long do the parts take, how much memory, and are the targets met?", 0.40, speed),
     "kernels": Part("Where does the time of both passes go?", 0.16, kernels),
 }  # fmt: skip
+
+
+def main(part: str, size: Any, file: str) -> None:
+    """Run a part; its lines go to the file."""
+    threading.Thread(target=_end_with_input, daemon=True).start()
+    lines = Lines(Path(file))
+    lines.facts(machine=describe(machine()), cudnn="works" if cudnn_works() else "not used")
+    PARTS[part].run(size, lines)
+
+
+def _end_with_input() -> None:
+    """End the process where its starter is gone. A buffered read would hold a lock that Python's end waits for."""
+    while os.read(sys.stdin.fileno(), 1):
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -7,10 +7,26 @@ import jax
 from benchmarks.gpu_day.lines import Cell, Lines
 from benchmarks.suite.cases import Case, DType, Size, config_of, frame_size, load
 from benchmarks.suite.command import measured_rows
-from benchmarks.suite.gpu_targets import FRAME, HEADINGS, PUBLISHED, TARGETS, figure
 from benchmarks.suite.measure import compiling_anew
+from benchmarks.suite.report import Row
 from benchmarks.suite.workloads import WORKLOADS
 
+FRAME = (392, 518)  # of targets and published figures; by number of frames
+TARGETS = {  # for an H200, the full model in bfloat16
+    "aggregator": {1: 8.0, 8: 55.0, 20: 190.0, 50: 850.0, 100: 2800.0},  # ms
+    "depth-head": dict.fromkeys((1, 8, 20, 50, 100, 200), 2.0),  # ms a frame
+    "two-passes": {100: 6.5},  # s
+    "memory": {200: 9.0},  # GB beyond weights
+}
+PUBLISHED = {  # VGGT (arXiv 2503.11651 and its repository) on an H100 with FlashAttention 3
+    "aggregator": {1: 40.0, 8: 110.0, 20: 310.0, 50: 1040.0, 100: 3120.0, 200: 8750.0},
+    "depth-head": dict.fromkeys((1, 8, 20, 50, 100, 200), 30.0),
+}
+HEADINGS = {
+    "aggregator": "aggregator (ms)",
+    "depth-head": "depth head (ms a frame)",
+    "two-passes": "two passes (s)",
+}
 _REPEATS = 3
 _JOBS = {  # in the order of what they tell: a cut-off run has the first ones
     "tiny": (("aggregator", 2), ("depth-head", 2)),
@@ -45,6 +61,19 @@ def speed(size: Size, lines: Lines) -> None:
             cells |= {"compile_s": row.measured.compile_seconds, "memory_GB": memory}
             cells["memory_target"] = wanted.get("memory", {}).get(frames) if name == "aggregator" else None
             lines.row(title, **cells)
+
+
+def figure(name: str, row: Row) -> float | None:
+    """Return a figure of a measured row in the unit of its heading, or its "memory"; None: unknown.
+
+    Memory is beyond weights and inputs: the device's own count, or XLA's analysis where there is none.
+    """
+    measured = row.measured
+    if name == "memory":
+        size = measured.xla_bytes if measured.device_bytes is None else measured.device_bytes
+        return None if size is None else size / 1e9
+    scale = {"aggregator": 1e3, "depth-head": 1e3 / (row.frames or 1), "two-passes": 1.0}[name]
+    return None if measured.median is None else scale * measured.median
 
 
 def full_frame(size: Size) -> tuple[int, int]:

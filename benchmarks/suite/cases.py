@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import jax
@@ -18,15 +17,13 @@ from vggtjax.errors import InputError
 from vggtjax.network.layers import Params
 from vggtjax.network.model import init_params
 from vggtjax.pretrained.embedded import demo_model
-from vggtjax.pretrained.load import load_model
 
 Size = Literal["tiny", "demo", "full"]
 DType = Literal["float32", "bfloat16"]
 
 TINY = VGGTConfig(
     image_size=56, embed_dim=16, depth=4, num_heads=2, dino_depth=1, dino_num_heads=2, camera_depth=1,
-    camera_num_heads=2, dpt_features=8, dpt_channels=(8, 8, 8, 8), taps=(0, 1, 2, 3), track_features=8,
-    track_hidden=16, track_corr_levels=3, track_corr_radius=2,
+    camera_num_heads=2, dpt_features=8, dpt_channels=(8, 8, 8, 8), taps=(0, 1, 2, 3), heads=("camera", "depth"),
 )  # fmt: skip
 _FULL_FRAME = (294, 518)
 _PAGE = 4096
@@ -63,17 +60,11 @@ def config_of(size: Size) -> VGGTConfig:
     return {"tiny": lambda: TINY, "demo": lambda: demo_model().config, "full": VGGTConfig}[size]()
 
 
-def load(size: Size, weights: Path | None = None) -> tuple[VGGTConfig, Params]:
-    """Return the embedded model, a converted one or a random one, with all its pages in memory."""
-    if weights is not None:
-        if not weights.is_file():
-            raise InputError(f"{weights} does not exist; expected a .safetensors file written by vggtjax convert")
-        model = load_model(weights)
-    elif size == "demo":
-        model = demo_model()
-    else:
-        config = config_of(size)
-        return config, init_params(0, config)
+def load(size: Size) -> tuple[VGGTConfig, Params]:
+    """Return the embedded model with all its pages in memory, or a random one."""
+    if size != "demo":
+        return config_of(size), init_params(0, config_of(size))
+    model = demo_model()
     if jax.default_backend() == "cpu":
         for leaf in jax.tree.leaves(model.params):  # mapped files are read at the first access
             np.asarray(leaf).reshape(-1).view(np.uint8)[::_PAGE].sum()

@@ -55,15 +55,6 @@ def measure_program(function: Callable[..., Any], arguments: tuple, rounds: Iter
     return Measured(tuple(timed(run)[1] for _ in rounds), compile_seconds, temp, output, host, device)
 
 
-def measure_calls(call: Callable[[], object], rounds: Iterable[int], *, compiles: bool = False) -> Measured:
-    """Call once to warm up, once for its memory, then time it; `compiles`: report the first call's extra time."""
-    first = timed(call)[1]
-    host, device = memory_of(call)
-    seconds = tuple(timed(call)[1] for _ in rounds)
-    compiling = max(first - float(np.median(seconds)), 0.0) if compiles else None
-    return Measured(seconds, compiling, host_bytes=host, device_bytes=device)
-
-
 def timed(call: Callable[[], Any]) -> tuple[Any, float]:
     """Return a call's result and its seconds."""
     began = time.perf_counter()

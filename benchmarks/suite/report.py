@@ -203,11 +203,7 @@ def write_rows(path: Path, rows: Sequence[Row], **more: Any) -> None:
         derived = {name: getattr(row, name) for name in ("flop", "floor_seconds", "flop_per_second", "share_of_floor")}
         return values | times | asdict(row.measured) | derived
 
-    write_json(path, {"machine": machine(), **more, "rows": [plain(row) for row in rows]})
-
-
-def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Write values as JSON."""
+    values = {"machine": machine(), **more, "rows": [plain(row) for row in rows]}
     with writing(path) as temporary:
         temporary.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
 

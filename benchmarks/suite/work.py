@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network import camera_head as camera
-from vggtjax.network import track_head as tracker
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.backbone import REGISTERS
 from vggtjax.network.dpt_head import CHANNELS, HIDDEN
@@ -70,14 +69,21 @@ def camera_head(config: VGGTConfig, S: int) -> list[Work]:
 
 
 def depth_head(config: VGGTConfig, S: int, grid: Grid) -> list[Work]:
-    """Count a dense head of depth and confidence, with the projections of what it reads."""
-    F, P = config.dpt_features, grid[0] * grid[1]
-    pixels = S * P * config.patch_size**2
+    """Count a dense head of depth and confidence: what it reads, its DPT, and the last layers at every pixel."""
+    (h, w), F, c = grid, config.dpt_features, config.dpt_channels
+    P, half = h * w, ((h + 1) // 2) * ((w + 1) // 2)
+    sizes = (16 * P, 4 * P, P, half)
+    finer, coarsest, pixels = 21 * P, half, P * config.patch_size**2
+    linear = 2 * P * 2 * config.embed_dim * sum(c) + 2 * P * (16 * c[0] ** 2 + 4 * c[1] ** 2)
+    linear += 2 * F**2 * (finer + coarsest)
+    products = 9 * c[3] ** 2 * half + 9 * F * sum(a * b for a, b in zip(c, sizes, strict=True))
+    products += 9 * F**2 * (4 * finer + 2 * coarsest) + 9 * F * (F // 2) * 64 * P
+    features = {"linear, float32": float(S * linear), "convolution": 2.0 * S * products}
     last = {
-        "convolution": 18.0 * pixels * (F // 2) * HIDDEN,
-        "linear, float32": 2.0 * pixels * HIDDEN * CHANNELS["depth"],
+        "convolution": 18.0 * S * pixels * (F // 2) * HIDDEN,
+        "linear, float32": 2.0 * S * pixels * HIDDEN * CHANNELS["depth"],
     }
-    return [_features(config, S, grid, F, F // 2), last]
+    return [features, last]
 
 
 def cues(config: VGGTConfig, S: int, grid: Grid) -> list[Work]:
@@ -89,46 +95,12 @@ def cues(config: VGGTConfig, S: int, grid: Grid) -> list[Work]:
     return [{"linear, float32": 2.0 * S * P * config.embed_dim * columns}]
 
 
-def track_head(config: VGGTConfig, S: int, grid: Grid, Q: int) -> list[Work]:
-    """Count the tracker of Q points: its feature maps, its correlations, and its transformer."""
-    F, C, V, n = config.track_features, config.track_hidden, tracker.VIRTUAL_TRACKS, tracker.ITERATIONS
-    levels, radius = config.track_corr_levels, config.track_corr_radius
-    E, window, seen = 3 * F + 4, (2 * radius + 2) ** 2, levels * (2 * radius + 1) ** 2
-    rows = 2.0 * S * Q * (levels * window * F + seen * C + C * F + E * C + C * (F + 2) + F * F)
-    attended = (
-        (Q + V, S, S),
-        (S, V, Q),
-        (S, V, V),
-        (S, Q, V),
-    )  # over time; virtual to points, virtual, points to virtual
-    total = Counter({"linear, float32": rows})
-    for sequences, queries, keys in attended:
-        total.update(_attended(tracker.LAYERS * sequences, queries, keys, C, tracker.HEADS, "linear, float32"))
-    return [_features(config, S, grid, F, F), {kind: n * amount for kind, amount in total.items()}]
-
-
 def _blocks(layers: int, sequences: int, tokens: int, C: int, heads: int) -> dict[str, float]:
-    return _attended(layers * sequences, tokens, tokens, C, heads, "linear")
-
-
-def _attended(sequences: int, queries: int, keys: int, C: int, heads: int, linear: str) -> dict[str, float]:
-    """Count blocks: q, projection and MLP of every query, k and v of every key, and the attention between them."""
+    """Count blocks: the linear layers of every token, and the attention between all."""
+    count = 1.0 * layers * sequences
     return {
-        linear: sequences * 2.0 * C**2 * (10 * queries + 2 * keys),
-        "attention": sequences * 4.0 * queries * keys * C,
-        "exp": sequences * 1.0 * heads * queries * keys,
-        "GELU": sequences * 4.0 * queries * C,
+        "linear": count * 24 * C**2 * tokens,
+        "attention": count * 4 * tokens**2 * C,
+        "exp": count * heads * tokens**2,
+        "GELU": count * 4 * tokens * C,
     }
-
-
-def _features(config: VGGTConfig, S: int, grid: Grid, F: int, out: int) -> dict[str, float]:
-    """Count a DPT's projections and reassembly into `out` channels at eight times the grid."""
-    (h, w), c = grid, config.dpt_channels
-    P, half = h * w, ((h + 1) // 2) * ((w + 1) // 2)
-    pixels = (16 * P, 4 * P, P, half)
-    finer, coarsest = 21 * P, half
-    linear = 2 * P * 2 * config.embed_dim * sum(c) + 2 * P * (16 * c[0] ** 2 + 4 * c[1] ** 2)
-    linear += 2 * F**2 * (finer + coarsest)
-    products = 9 * c[3] ** 2 * half + 9 * F * sum(a * b for a, b in zip(c, pixels, strict=True))
-    products += 9 * F**2 * (4 * finer + 2 * coarsest) + 9 * F * out * 64 * P
-    return {"linear, float32": float(S * linear), "convolution": 2.0 * S * products}

@@ -7,35 +7,25 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from benchmarks.suite import work
 from benchmarks.suite.cases import Case
-from benchmarks.suite.measure import Measured, measure_calls, measure_program, timed
-from converters.torch_to_flax import convert, source_shapes
-from testing.make_checkpoint import make_checkpoint
+from benchmarks.suite.measure import Measured, measure_program, timed
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
-from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.network.aggregator import aggregate
 from vggtjax.network.backbone import encode
 from vggtjax.network.dpt_head import predict_dense, project_tap
 from vggtjax.network.model import forward
 from vggtjax.network.precision import Compute
-from vggtjax.network.track_head import predict_tracks
 from vggtjax.pipeline.infer import infer
-from vggtjax.scenes import SceneConfig, load_textures
-from vggtjax.scenes.render import generate
 
 Program = tuple[Callable[..., Any], tuple]  # a function of arrays, and those arrays
 
-TRACKED = 64  # points
-_GROWN = 4  # pixels by which the mask to refine is larger than the truth
 DEMO = ("-m", "vggtjax", "demo")
 _STEPS = ("trace", "lower", "XLA")
 _IMPORTED = "import sys, atexit; atexit.register(lambda: sys.stderr.write(str('jax' in sys.modules))); "
@@ -51,7 +41,7 @@ class Workload(NamedTuple):
     about: str
     measure: Callable[[Case, Iterable[int]], dict[str, Measured]]  # a case, a round per timed run -> results by name
     parts: Callable[[Case], list[work.Work]] | None = None
-    scope: Literal["clip", "model", "process"] = "clip"  # what it depends on
+    of_a_clip: bool = True  # depends on a model and the shape of a clip
 
 
 def aggregator(case: Case) -> Program:
@@ -104,17 +94,6 @@ def depth_head(case: Case) -> Program:
     return run, (case.params["depth_head"], *_tapped(case))
 
 
-def tracks(case: Case) -> Program:
-    """Tracks of points of the first frame, from the outputs of four pairs of blocks."""
-
-    def run(params, tokens, shifts, points):
-        return predict_tracks(params, _taps(params, tokens, shifts, case), points, case.config, case.grid)
-
-    x, y = np.meshgrid(*(np.linspace(0.1, 0.9, int(TRACKED**0.5)) * side for side in (case.width, case.height)))
-    points = jnp.asarray(np.stack([x, y], axis=-1).reshape(1, -1, 2), jnp.float32)
-    return run, (case.params["track_head"], *_tapped(case), points)
-
-
 def _tapped(case: Case) -> tuple[Any, Any]:
     tokens = case.drawn(1, case.frames, case.grid[0] * case.grid[1], case.config.tap_dim)
     return tokens, jnp.arange(4) / 10
@@ -123,29 +102,6 @@ def _tapped(case: Case) -> tuple[Any, Any]:
 def _taps(params, tokens, shifts, case: Case) -> list[Any]:
     """Return four different taps from one array; equal taps would share one norm in the compiled program."""
     return [project_tap(params, tokens + shifts[slot], slot, case.config) for slot in range(4)]
-
-
-def _conversion(case: Case, rounds: Iterable[int]) -> dict[str, Measured]:
-    with tempfile.TemporaryDirectory() as folder:
-        source, made = Path(folder) / "torch.safetensors", Path(folder) / "flax.safetensors"
-        make_checkpoint(source, source_shapes(case.config))
-        return {"": measure_calls(lambda: convert(source, made, config=case.config), rounds)}
-
-
-def _refinement(case: Case, rounds: Iterable[int]) -> dict[str, Measured]:
-    from scipy.ndimage import binary_dilation
-
-    scene = SceneConfig(case.height, case.width, case.frames, dynamic=1.0, static_camera=0.0)
-    key = jax.random.key(0)
-    clip = jax.tree.map(np.asarray, jax.jit(generate, static_argnums=2)(key, load_textures("test"), scene))
-    unit = np.median(clip.depth)
-    pose = np.concatenate([clip.camera_from_world[..., :3], clip.camera_from_world[..., 3:] / unit], axis=-1)
-    mask = np.stack([binary_dilation(one, iterations=_GROWN) for one in clip.dynamic_mask])
-
-    def refine():
-        return refine_masks(clip.images, clip.depth / unit, mask, pose, clip.intrinsics)
-
-    return {"": measure_calls(refine, rounds, compiles=True)}
 
 
 def _start_up(case: Case, rounds: Iterable[int]) -> dict[str, Measured]:
@@ -213,13 +169,6 @@ WORKLOADS = {
     "depth-head": _program(
         "the depth head alone", depth_head, lambda case: work.depth_head(case.config, case.frames, case.grid)
     ),
-    "tracks": _program(
-        f"the track head alone, {TRACKED} points",
-        tracks,
-        lambda case: work.track_head(case.config, case.frames, case.grid, TRACKED),
-    ),
-    "refinement": Workload("mask refinement of a generated clip", _refinement),
     "compile": Workload("tracing, lowering and compiling both passes, with no cache", _compile_steps),
-    "conversion": Workload("a PyTorch checkpoint to a file of this library", _conversion, scope="model"),
-    "start-up": Workload("fresh processes, with an empty cache of their own", _start_up, scope="process"),
+    "start-up": Workload("fresh processes, with an empty cache of their own", _start_up, of_a_clip=False),
 }

@@ -1,26 +1,24 @@
-"""Predicted and measured peak memory of whole processes: python -m benchmarks peak-memory."""
+"""Predicted and measured peak memory of whole processes: python -m benchmarks memory."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
 from PIL import Image
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
+from benchmarks.command_worker import run_command
 from testing.seeded import seeded_images
 from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
-from vggtjax.pipeline import memory
+from vggtjax.pipeline.memory import predicted_bytes
 from vggtjax.pretrained.load import load_model
 from vggtjax.storage.writing import writing
 
@@ -96,83 +94,54 @@ class Row(NamedTuple):
         return self.predicted / self.measured
 
 
-def peak_memory(
-    *, full: Path | None = None, embedded: bool = True, split: bool = False, out: Path | None = None
-) -> None:
+def memory(*, full: Path | None = None, embedded: bool = True, split: bool = False, out: Path | None = None) -> None:
     """Compare the predicted memory of `vggtjax reconstruct` with the peaks of processes, each of one setting.
 
     Nothing is taken from the cache, so that every process traces and compiles its programs, as a first run does.
 
     Args:
-        full: a checkpoint of VGGT-1B's size, such as `make-checkpoint` writes and `vggtjax convert` converts; its four
-            settings take 8 GB of memory.
+        full: a checkpoint of VGGT-1B's size, such as `python -m testing.make_checkpoint` writes and `vggtjax convert`
+            converts; its four settings take 8 GB of memory.
         embedded: measure the sixteen settings of the embedded model.
         split: measure nine settings of the embedded model on a CPU that is split into devices.
         out: JSON file for the rows.
     """
-    work = [("demo", EMBEDDED)] if embedded else []
-    work += [("demo", SPLIT)] if split else []
-    work += [] if full is None else [(str(full), FULL)]
+    work = [("demo", setting) for setting in EMBEDDED if embedded]
+    work += [("demo", setting) for setting in SPLIT if split]
+    work += [] if full is None else [(str(full), setting) for setting in FULL]
     if not work:
         raise InputError("nothing is measured; give a checkpoint as full, or leave out --no-embedded")
     if split:  # to predict what such a process takes
         jax.config.update("jax_num_cpu_devices", max(setting.devices for setting in SPLIT))
+    models = {name: load_model(name) for name, _ in work}
     rows, screen = [], Console()
-    for name, settings in work:
-        for row in measure(name, settings):
-            rows.append(row)
-            screen.print(
-                f"{_label(row)}: predicted {row.predicted / _GIGA:.2f}, measured {row.measured / _GIGA:.2f} GB"
-            )
-            if out is not None:
-                with writing(out) as temporary:
-                    temporary.write_text(json.dumps([row._asdict() for row in rows], indent=2) + "\n")
     table = Table(title="peak memory of a process (GB)", box=None)
     for heading in ("setting", "predicted", "measured", "ratio", "without mapped files"):
         table.add_column(heading, justify="left" if heading == "setting" else "right")
-    for row in rows:
+    for name, setting in track(work, "processes", console=Console(stderr=True), transient=True):
+        rows.append(row := measured(models[name], name, setting))
         sizes = [f"{value / _GIGA:.2f}" for value in (row.predicted, row.measured)]
         table.add_row(_label(row), *sizes, f"{row.ratio:.2f}", f"{row.own / _GIGA:.2f}")
+        if out is not None:
+            with writing(out) as temporary:
+                temporary.write_text(json.dumps([row._asdict() for row in rows], indent=2) + "\n")
     screen.print(table)
     off = [row for row in rows if abs(row.ratio - 1) > WITHIN]
     screen.print(f"{len(rows) - len(off)} of {len(rows)} within {100 * WITHIN:.0f} %")
 
 
-def measure(name: str, settings: tuple[Setting, ...]) -> Iterator[Row]:
-    """Yield the row of each setting of a model."""
-    model = load_model(name)
-    for setting in settings:
-        with TemporaryDirectory() as folder:
-            yield _measured(model, name, setting, Path(folder))
-
-
-def _measured(model: Model, name: str, setting: Setting, folder: Path) -> Row:
-    frames = folder / "frames"
-    frames.mkdir()
+def measured(model: Model, name: str, setting: Setting) -> Row:
+    """Run one setting in a process of its own."""
     shape = setting.frames, setting.height, setting.width
-    for number, image in enumerate(seeded_images(*shape).transpose(0, 2, 3, 1)):
-        Image.fromarray(np.round(255 * image).astype(np.uint8)).save(frames / f"{number:04}.png")
-    predicted = memory.predicted_bytes(model, *shape, method=setting.method, devices=setting.devices)
-    words = ["reconstruct", str(frames), "--model", name, "--out", str(folder / "out")]
-    answer = run_worker([*words, *setting.words], folder / "cache", setting.devices)
+    predicted = predicted_bytes(model, *shape, method=setting.method, devices=setting.devices)
+    with TemporaryDirectory() as folder:
+        frames = Path(folder) / "frames"
+        frames.mkdir()
+        for number, image in enumerate(seeded_images(*shape).transpose(0, 2, 3, 1)):
+            Image.fromarray(np.round(255 * image).astype(np.uint8)).save(frames / f"{number:04}.png")
+        words = ["reconstruct", str(frames), "--model", name, "--out", f"{folder}/out", *setting.words]
+        answer = run_command(words, Path(folder) / "cache", setting.devices)
     return Row("embedded" if name == "demo" else "full", setting, predicted, answer["total"], answer["own"])
-
-
-def run_worker(words: list[str], cache: Path, devices: int = 1) -> dict[str, Any]:
-    """Run a command in a process with a cache of its own and return what it took. Raises InputError if it fails."""
-    command = [sys.executable, "-m", "benchmarks.peak_worker", *words]
-    environment = os.environ | {"VGGTJAX_CACHE": str(cache)}
-    if devices > 1:
-        count = f"--xla_force_host_platform_device_count={devices}"
-        environment["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {count}"
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-    last = done.stdout.strip().rpartition("\n")[2]
-    if done.returncode or not last.startswith("{"):
-        raise InputError(f"{' '.join(words)} ended with code {done.returncode}: {done.stderr[-500:]}")
-    answer = json.loads(last)
-    if answer["code"]:
-        raise InputError(f"{' '.join(words)} failed: {done.stderr[-500:]}")
-    return answer
 
 
 def _label(row: Row) -> str:
