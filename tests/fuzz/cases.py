@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 import tempfile
-import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
@@ -40,7 +39,6 @@ class Outcome(NamedTuple):
 
     kind: str
     words: str
-    seconds: float
     bytes: int
 
 
@@ -78,7 +76,7 @@ class Sample:
         return outcome
 
     def keep(self, seed: int, folder: Path) -> None:
-        """Copy the files of a case that are not those of the sample, for the corpus."""
+        """Run a case again, and copy its files that are not those of the sample: the corpus takes them."""
         self.run(seed)
         for path in sorted(self._scratch.rglob("*")):
             same = self._folder / path.relative_to(self._scratch)
@@ -99,7 +97,6 @@ def scratch_folder() -> Iterator[Path]:
 def read(function: Callable[[Path], object], path: Path, refusals: type[Exception] = VggtjaxError) -> Outcome:
     """Call a reader; every outcome but success and one good sentence is found."""
     before = _peak(reset=True)
-    start = time.monotonic()
     try:
         with warnings.catch_warnings(), _limited():
             warnings.simplefilter("ignore")
@@ -107,15 +104,13 @@ def read(function: Callable[[Path], object], path: Path, refusals: type[Exceptio
         kind, words = "accepted", ""
     except refusals as error:
         kind, words = _judged(error)
-    except HangError:
-        kind, words = "found", f"hangs: {_place()}"
-    except Exception as error:  # all else is what this looks for
+    except (Exception, HangError) as error:  # all else is what this looks for
         where = traceback.extract_tb(error.__traceback__)
         own = [frame for frame in where if "/vggtjax/" in frame.filename or "/converters/" in frame.filename]
         frame = (own or where)[-1]
         words = f"{type(error).__name__} at {Path(frame.filename).name}:{frame.lineno}: {str(error)[:200]!r}"
         kind = "found"
-    return Outcome(kind, words, time.monotonic() - start, max(0, _peak() - before))
+    return Outcome(kind, words, max(0, _peak() - before))
 
 
 def change(folder: Path, random: Random) -> None:
@@ -135,33 +130,26 @@ def change(folder: Path, random: Random) -> None:
             random.choice(_TREE)(path, random)
 
 
-def _removed(path: Path, random: Random) -> None:
-    path.unlink()
-
-
-def _replaced_by_folder(path: Path, random: Random) -> None:
+def _replaced_by_folder(path: Path, _: Random) -> None:
     path.unlink()
     path.mkdir()
 
 
 def _linked(path: Path, random: Random) -> None:
-    target = random.choice(("/dev/zero", "/etc/passwd", "/", ".", path.name, "missing", "/dev/stdin", "/proc/self/mem"))
     path.unlink()
-    path.symlink_to(target)
+    path.symlink_to(random.choice(("/dev/zero", "/etc/passwd", "/", ".", path.name, "missing", "/proc/self/mem")))
 
 
-def _piped(path: Path, random: Random) -> None:
+def _piped(path: Path, _: Random) -> None:
     path.unlink()
     os.mkfifo(path)
 
 
 def _renamed(path: Path, random: Random) -> None:
-    name = random.choice(
-        (*(name for name in NAMES if "/" not in name and "\0" not in name), " ", "-x", "$(x)", "x" * 250)
-    )
-    place = os.fsencode(path.parent) + b"/" + name.encode("utf-8", "surrogateescape")[:240] + os.fsencode(path.suffix)
+    names = [name for name in NAMES if "/" not in name and "\0" not in name]
+    name = random.choice((*names, " ", "-x", "$(x)", "x" * 250)).encode("utf-8", "surrogateescape")[:240]
     with suppress(OSError):  # ".." is there
-        os.rename(path, place)  # noqa: PTH104 - names of bytes
+        os.rename(path, os.fsencode(path.parent) + b"/" + name + os.fsencode(path.suffix))  # noqa: PTH104 - bytes
 
 
 def _copied(path: Path, random: Random) -> None:
@@ -170,12 +158,10 @@ def _copied(path: Path, random: Random) -> None:
         shutil.copy(path, path.parent / name)
 
 
-def _emptied(path: Path, random: Random) -> None:
-    path.write_bytes(b"")
-
-
-_TREE: tuple[Callable[[Path, Random], Any], ...] = (
-    *(_removed, _replaced_by_folder, _linked, _piped, _renamed, _copied, _emptied),
+_TREE: tuple[Callable[[Path, Random], object], ...] = (
+    lambda path, _: path.unlink(),
+    lambda path, _: path.write_bytes(b""),
+    *(_replaced_by_folder, _linked, _piped, _renamed, _copied),
 )
 
 
@@ -188,20 +174,12 @@ def _judged(error: Exception) -> tuple[str, str]:
     return "refused", words
 
 
-_hung: list[str] = []
-
-
-def _place() -> str:
-    return _hung.pop() if _hung else ""
-
-
 @contextmanager
 def _limited() -> Iterator[None]:
     """Raise HangError after MOST_SECONDS, where Python code runs or waits for a file."""
 
-    def stop(_number: int, frame: Any) -> None:
-        _hung[:] = ["".join(traceback.format_stack(frame, limit=4))[-600:]]
-        raise HangError
+    def stop(_number: int, _frame: Any) -> None:
+        raise HangError(f"after {MOST_SECONDS} s")
 
     earlier = signal.signal(signal.SIGALRM, stop)
     signal.setitimer(signal.ITIMER_REAL, MOST_SECONDS)

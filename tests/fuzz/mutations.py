@@ -11,12 +11,12 @@ from collections.abc import Callable
 from functools import partial
 from random import Random
 
-from tests.fuzz.changes import containers, headers
+from tests.fuzz.changes import headers
 from tests.fuzz.changes.arrays import change_npy
 from tests.fuzz.changes.parquet import change_parquet
 from tests.fuzz.changes.pictures import change_jpeg, change_png
 from tests.fuzz.changes.plain import change_bytes, change_word
-from tests.fuzz.changes.records import Layout, change_records
+from tests.fuzz.changes.records import BOXES, RIFF, change_records
 from tests.fuzz.changes.text import change_json, change_text
 from tests.fuzz.changes.weights import change_pickle, change_safetensors
 from tests.fuzz.changes.zips import change_zip
@@ -33,27 +33,14 @@ def mutated(content: bytes, random: Random) -> bytes:
         return change_bytes(content, random)  # it is mutated already, and lacks what this change needs
 
 
-def _records(layout: Layout, skip: int = 0) -> Callable[[bytes, Random], bytes]:
-    return partial(change_records, layout=layout, skip=skip)
-
-
 _FORMATS: tuple[tuple[Callable[[bytes], object], Callable[[bytes, Random], bytes]], ...] = (
     (lambda content: content[:6] == b"\x93NUMPY", change_npy),
     (lambda content: content[:4] == b"PAR1", change_parquet),
     (lambda content: content[:2] == b"PK", partial(change_zip, mutated=mutated)),
     (lambda content: content[:4] == b"\x89PNG", change_png),
     (lambda content: content[:2] == b"\xff\xd8", change_jpeg),
-    (lambda content: content[4:8] in (b"ftyp", b"moov", b"wide", b"jP  "), _records(containers.BOXES)),
-    (lambda content: content[:4] == b"\x1a\x45\xdf\xa3", _records(containers.EBML)),
-    (lambda content: content[:4] == b"RIFF", _records(containers.RIFF)),
-    (lambda content: content[:4] == b"OggS", _records(containers.OGG)),
-    (lambda content: content[:3] == b"FLV", _records(containers.FLV, 13)),
-    (lambda content: content[:4] == b"\0\0\1\xba", _records(containers.PROGRAM)),
-    (lambda content: content[:189:188] == b"GG", _records(containers.TRANSPORT)),
-    (lambda content: content[:4] == b"\x30\x26\xb2\x75", _records(containers.ASF)),
-    (lambda content: content[:4] == b"\x06\x0e\x2b\x34", _records(containers.KLV)),
-    (lambda content: content[:4] == b"GIF8", containers.change_gif),
-    (lambda content: content[:4] in (b"II*\0", b"MM\0*"), headers.change_tiff),
+    (lambda content: content[4:8] in (b"ftyp", b"moov", b"wide", b"jP  "), partial(change_records, layout=BOXES)),
+    (lambda content: content[:4] == b"RIFF", partial(change_records, layout=RIFF)),
     (lambda content: content[:4] == b"\x76\x2f\x31\x01", headers.change_exr),
     (lambda content: content[:2] == b"BM", partial(headers.change_fields, fields=headers.BMP)),
     (lambda content: content[:4] == b"PIEH", partial(headers.change_fields, fields=headers.DPT)),

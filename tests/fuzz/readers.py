@@ -4,13 +4,6 @@ What a reader gives is used as the commands use it: frames are decoded, depth an
 mapped tensors are touched.
 """
 
-from tests.fuzz.rows import known, media, own_files, runs, sets, weights
+from tests.fuzz.rows import own_files, strangers, weights
 
-READERS = (
-    *weights.ROWS,  # and what goes with them: configurations, recipes, training
-    *own_files.ROWS,  # arrays, results, kept parts of runs
-    *runs.ROWS,  # what a run goes on from
-    *media.ROWS,  # pictures, videos, masks
-    *known.ROWS,  # lists of clips, points, depths, cameras
-    *sets.ROWS,  # captures, data sets, results of other programs
-)
+READERS = (*weights.ROWS, *own_files.ROWS, *strangers.ROWS)

@@ -1,19 +1,21 @@
-"""Every reader of strangers' files, on fifty structural mutations of a valid sample, and on the cases found earlier.
+"""Every reader of strangers' files, on structural mutations of a valid sample, and on cases that were found earlier.
 
-`python -m benchmarks fuzz` runs thousands. A found case becomes files in corpus/READER/CASE/, put over the sample.
+A found case becomes files in corpus/READER/CASE/, put over the sample: the long test writes them, and says where.
 """
 
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.dataset_files import write
 from tests.fuzz.cases import Reader, Sample, read, scratch_folder
 from tests.fuzz.readers import READERS
 from vggtjax.errors import ClipError, InputError, VggtjaxError
 
-CASES = 50
+CASES, MANY = 4, 2000
 PATIENCE = 60.0  # seconds of a case; a busy machine is no fault of the reader
 CORPUS = Path(__file__).parent / "corpus"
 # Readers of our own caches and kept results: what is damaged is made anew, without a word.
@@ -26,15 +28,34 @@ def folder():
         yield folder
 
 
-@pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
-def test_only_sentences_escape(reader, folder, caplog, monkeypatch):
+@pytest.fixture
+def sample(reader, folder, caplog, monkeypatch) -> Sample:
     monkeypatch.setattr("tests.fuzz.cases.MOST_SECONDS", PATIENCE)
     caplog.set_level("CRITICAL")
-    sample = Sample(reader, folder)
+    return Sample(reader, folder)
+
+
+every_reader = pytest.mark.parametrize("reader", READERS, ids=lambda reader: reader.name)
+
+
+@every_reader
+def test_only_sentences_escape(sample):
     outcomes = {seed: sample.run(seed) for seed in range(CASES)}
     assert {seed: outcome.words for seed, outcome in outcomes.items() if outcome.kind == "found"} == {}
-    refused = sum(outcome.kind == "refused" for outcome in outcomes.values())
-    assert (refused == 0) if reader.name in SILENT else (refused >= CASES // 10)
+
+
+@pytest.mark.proof
+@every_reader
+def test_only_sentences_escape_from_thousands_of_changes(sample, reader, tmp_path):
+    found, refused = {}, 0
+    for seed in range(CASES, MANY):
+        outcome = sample.run(seed)
+        refused += outcome.kind == "refused"
+        if outcome.kind == "found":
+            sample.keep(seed, tmp_path / str(seed))
+            found[str(tmp_path / str(seed))] = outcome.words
+    assert found == {}
+    assert (refused == 0) if reader.name in SILENT else (refused >= MANY // 10)
 
 
 def _corpus() -> list[tuple[str, Path]]:
@@ -52,45 +73,28 @@ def slug(name: str) -> str:
     return re.sub(r"\W+", "-", name).strip("-").lower()
 
 
+def raising(error: Exception) -> Callable[[Path], object]:
+    def reader(_: Path) -> None:
+        raise error
+
+    return reader
+
+
 def test_what_the_harness_looks_for_is_found(folder, monkeypatch):
     monkeypatch.setattr("tests.fuzz.cases.MOST_SECONDS", 0.2)
-    taken = []
-
-    def long_sentence(_: Path) -> None:
-        raise InputError("x" * 6000)
-
-    def empty_sentence(_: Path) -> None:
-        raise ClipError("")
-
-    def waits(path: Path) -> None:
-        os.mkfifo(path / "pipe")
-        (path / "pipe").read_bytes()
-
-    def raw(_: Path) -> None:
-        raise KeyError("x")
-
-    for function in (long_sentence, empty_sentence, waits, raw):
-        assert read(function, folder).kind == "found"
-    assert read(lambda path: taken.append(bytearray(2**26)), folder).bytes > 2**25
-
-    class _UnprintableError(VggtjaxError):
-        def __str__(self) -> str:
-            return "two\nlines"
-
-    def unprintable(_: Path) -> None:
-        raise _UnprintableError("two\nlines")
-
-    assert read(unprintable, folder).kind == "found"
-
-    def make(folder: Path) -> Path:
-        (folder / "file").write_bytes(b"valid")
-        return folder / "file"
+    odd = type("Odd", (VggtjaxError,), {"__str__": lambda _: "two\nlines"})
+    for error in (InputError("x" * 6000), ClipError(""), KeyError("x"), odd()):
+        assert read(raising(error), folder).kind == "found"
+    assert read(raising(InputError("a sentence")), folder).kind == "refused"
+    os.mkfifo(folder / "pipe")
+    assert "HangError" in read(lambda path: (path / "pipe").read_bytes(), folder).words
+    taken: list[bytearray] = []
 
     def greedy(path: Path) -> None:
         if path.read_bytes() != b"valid":
             taken.append(bytearray(2**27))
 
-    case = folder / "case"
-    case.mkdir()
-    (case / "file").write_bytes(b"other")
-    assert "took" in Sample(Reader("greedy", make, greedy), folder / "greedy").run(case).words
+    (folder / "case").mkdir()
+    (folder / "case/file").write_bytes(b"other")
+    reader = Reader("greedy", lambda place: write(place / "file", b"valid"), greedy)
+    assert "took" in Sample(reader, folder / "greedy").run(folder / "case").words

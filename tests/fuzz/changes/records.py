@@ -1,4 +1,4 @@
-"""Changes of files that are records in a row, such as boxes, chunks, packets: lengths and checksums follow."""
+"""Changes of files that are records in a row, such as the boxes of MP4 and the chunks of RIFF: lengths follow."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _WEIGHT = 30  # of a record that holds records; others have 1
 
 
 class Record(NamedTuple):
-    """A record: its head without what follows from the body (its length, a checksum), its body, and where it ends."""
+    """A record: its head without its length, its body, and where it ends."""
 
     head: bytes
     body: bytes
@@ -68,9 +68,22 @@ def sized(
     return Layout(cut, join, inner)
 
 
-def change_records(content: bytes, random: Random, *, layout: Layout, skip: int = 0) -> bytes:
+_BOXES = (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"edts", b"udta", b"dinf", b"mvex", b"moof", b"traf")
+_BOXES += (b"iprp", b"ipco", b"jp2h")
+_SKIPPED = {b"stsd": 8, b"meta": 4, b"iinf": 6}  # bytes before the boxes of a box
+
+
+def _in_box(name: bytes) -> tuple[int, Layout] | None:
+    return (_SKIPPED.get(name, 0), BOXES) if name in _BOXES or name in _SKIPPED else None
+
+
+BOXES = sized(4, ">I", size_first=True, counted=8, inner=_in_box)  # MP4, QuickTime, AVIF, JPEG 2000
+RIFF = sized(4, "<I", even=True, inner=lambda name: (4, RIFF) if name in (b"RIFF", b"LIST") else None)
+
+
+def change_records(content: bytes, random: Random, *, layout: Layout) -> bytes:
     """Change one record at any depth: leave it out, double or move it, change its head or its body."""
-    records, places = [], [skip]
+    records, places = [], [0]
     with suppress(LookupError, ValueError, struct.error):
         while (at := places[-1]) < len(content) and (record := layout.cut(content, at)) and record.end > at:
             records.append(record)
@@ -100,4 +113,4 @@ def change_records(content: bytes, random: Random, *, layout: Layout, skip: int 
         pieces.insert(random.randrange(len(pieces)), pieces.pop(place))
     else:
         tail = change_bytes(tail, random)
-    return content[:skip] + b"".join(pieces) + tail
+    return b"".join(pieces) + tail

@@ -9,35 +9,9 @@ from typing import Any
 
 from tests.fuzz.changes.plain import change_bytes
 
-NAMES = (
-    "../../../etc/passwd",
-    "/etc/passwd",
-    "C:\\x",
-    "..",
-    "a\nb",
-    "\x1b[31mred",
-    "\0",
-    "x" * 5000,
-    "\udcff",
-    "é" * 300,
-)
+NAMES = ("../../etc/passwd", "/etc/passwd", "C:\\x", "..", "a\nb", "\x1b[31mred", "\0", "x" * 5000, "\udcff", "é" * 300)
 WORDS = (
-    "nan",
-    "inf",
-    "-inf",
-    "1e400",
-    "-1",
-    "0",
-    "9" * 400,
-    "1_000",
-    "٣",
-    "0x10",
-    "1,5",
-    "",
-    "#",
-    '"',
-    "x" * 9000,
-    "\0",
+    *("nan", "inf", "-inf", "1e400", "-1", "0", "9" * 400, "1_000", "٣", "0x10", "1,5", "", "#", '"', "x" * 9000, "\0"),
 )
 _RAW = (  # JSON text
     *("null", "true", "-1", "0", "1e308", "-1e400", "9" * 400, "-" + "9" * 400, "0." + "3" * 400, "NaN", "Infinity"),

@@ -22,31 +22,23 @@ def change_safetensors(content: bytes, random: Random) -> bytes:
     change = random.randrange(8)
     if change < 2 and isinstance(metadata := header.get("__metadata__"), dict) and metadata:
         key = random.choice(list(metadata))
-        inner = str(metadata[key])
-        metadata[key] = (
-            change_json(inner.encode(), random).decode("utf-8", "replace")
-            if random.random() < 0.7
-            else random.choice(WORDS)
-        )
+        text = change_json(str(metadata[key]).encode(), random).decode("utf-8", "replace")
+        metadata[key] = text if random.random() < 0.7 else random.choice(WORDS)
     elif change == 2 and tensors:
-        header[random.choice(tensors)]["dtype"] = random.choice(
-            ("F32", "F64", "BF16", "I8", "U64", "F8_E4M3", "BOOL", "x", 5)
-        )
+        kinds = ("F32", "F64", "BF16", "I8", "U64", "F8_E4M3", "BOOL", "x", 5)
+        header[random.choice(tensors)]["dtype"] = random.choice(kinds)
     elif change == 3 and tensors:
         tensor = header[random.choice(tensors)]
-        tensor["shape"] = random.choice(
-            ([2**40], [0], [], [-1], [1] * 200, [2**62, 2**62], tensor["shape"][::-1], [1, *tensor["shape"]])
-        )
+        turned = tensor["shape"][::-1]
+        tensor["shape"] = random.choice(([2**40], [0], [], [-1], [1] * 200, [2**62, 2**62], turned, [1, *turned]))
     elif change == 4 and tensors:
         tensor = header[random.choice(tensors)]
         start, end = tensor["data_offsets"]
-        tensor["data_offsets"] = random.choice(
-            ([start, end + 4], [end, start], [0, 2**62], [start, start], [start + 4, end + 4])
-        )
+        places = ([start, end + 4], [end, start], [0, 2**62], [start, start], [start + 4, end + 4])
+        tensor["data_offsets"] = random.choice(places)
     elif change == 5 and tensors:
-        header[random.choice((*NAMES, "x", "")).encode("utf-8", "replace").decode()] = header.pop(
-            random.choice(tensors)
-        )
+        name = random.choice((*NAMES, "x", "")).encode("utf-8", "replace").decode()
+        header[name] = header.pop(random.choice(tensors))
     elif change == 6 and len(data) >= 4:
         at = random.randrange(len(data) // 4) * 4
         data = data[:at] + struct.pack("<f", random.choice(FLOATS[:5])) + data[at + 4 :]
@@ -58,13 +50,7 @@ def change_safetensors(content: bytes, random: Random) -> bytes:
 
 
 _OPCODES = (  # of pickles: numbers, names that run code, containers, ends
-    *(
-        b"K\x00",
-        b"J\xff\xff\xff\x7f",
-        b"J\xff\xff\xff\xff",
-        b"\x8a\x08" + b"\xff" * 7 + b"\x7f",
-        b"L" + b"9" * 400 + b"L\n",
-    ),
+    *(b"K\x00", b"J\xff\xff\xff\x7f", b"\x8a\x08" + b"\xff" * 7 + b"\x7f", b"L" + b"9" * 400 + b"L\n"),
     *(b"cos\nsystem\n", b"cbuiltins\neval\n", b"ctorch._utils\n_rebuild_tensor_v2\n", b"ccollections\nOrderedDict\n"),
     *(b")", b"]", b"}", b"(", b"t", b"R", b"b", b"0", b"2", b"N", b"\x88", b".", b"s", b"u", b"Q", b"h\x00", b"\x81"),
     *(b"G" + struct.pack(">d", value) for value in FLOATS[:3]),

@@ -1,30 +1,49 @@
-"""Rows of arrays, and of the files that the library itself writes and reads again."""
+"""Rows of files that the library itself writes and reads again: results, kept parts, what a run goes on from."""
 
 from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
+from functools import cache
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
+import jax
 import numpy as np
 
-from tests.dataset_files import npy, write
-from tests.fuzz import samples
+from tests.dataset_files import npy
 from tests.fuzz.cases import Reader
+from tests.fuzz.rows.strangers import file
 from tests.room import make_room
+from tests.simulated import simulate
 from vggtjax.app.posted import cleaned
+from vggtjax.errors import InputError
+from vggtjax.evaluation.page import is_report
 from vggtjax.evaluation.records import Record, Records
+from vggtjax.learning.clip_passes import ClipPasses, kept_passes
+from vggtjax.learning.clip_passes import _read as read_passes
+from vggtjax.learning.fit import FitClips, FitConfig, fit_fusion
+from vggtjax.method.fusion_family import identity
 from vggtjax.pipeline.contact import _read as read_card
+from vggtjax.pipeline.destination import SETTINGS_NAME, LocalFolder, RemoteFolder
 from vggtjax.results.archive import saved_names
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.storage import arrays
+from vggtjax.scenes.dataset import read_index
+from vggtjax.storage import arrays, programs
 from vggtjax.training.metrics import read_metrics
 from vggtjax.windows.loops import find_loops
 from vggtjax.windows.store import WindowStore, unfinished_cut, write_cut
 from vggtjax.windows.whole import window_name
 
 
-def _archive(path: Path) -> None:
+def _archive(folder: Path) -> Path:
+    make_room(3).save_archive(folder / "reconstruction.npz")
+    return folder / "reconstruction.npz"
+
+
+def _read_archive(path: Path) -> None:
     saved_names(path)
     read_card(path)
     result = Reconstruction.load(path)
@@ -33,7 +52,13 @@ def _archive(path: Path) -> None:
         assert value is not None
 
 
-def _npz(path: Path) -> None:
+def _npz(folder: Path) -> Path:
+    values = {"depth": np.ones((4, 6, 8), np.float32), "mask": np.ones((3, 4), bool), "words": np.array(["a", "b"])}
+    np.savez_compressed(folder / "arrays.npz", allow_pickle=False, **values)
+    return folder / "arrays.npz"
+
+
+def _read_npz(path: Path) -> None:
     arrays.read_headers(path)
     for array in arrays.read_arrays(path).values():
         array.tofile(os.devnull)  # pages of mapped arrays are read
@@ -54,53 +79,23 @@ def _read_record(path: Path) -> None:
 
 
 def _passes(folder: Path) -> Path:
-    from vggtjax.learning.clip_passes import ClipPasses, kept_passes
-
-    maps = {
-        name: np.ones((2, 4, 4), np.float32) for name in ("depth1", "confidence1", "depth2", "confidence2", "truth")
-    }
-    passes = ClipPasses(
-        **maps,
-        saliency=np.ones((2, 2, 2), np.float32),
-        dynamic_mask=np.zeros((2, 4, 4), bool),
-        images=np.zeros((2, 4, 4, 3), np.uint8),
-        camera_from_world=np.ones((2, 3, 4), np.float32),
-        intrinsics=np.ones((2, 3, 3), np.float32),
-        true_dynamic=np.zeros((2, 4, 4), bool),
+    maps: dict[str, Any] = dict.fromkeys(
+        ("depth1", "confidence1", "depth2", "confidence2", "truth"), np.ones((2, 4, 4), np.float32)
     )
-    kept_passes({}, lambda: passes, folder)
+    maps |= dict.fromkeys(("dynamic_mask", "true_dynamic"), np.zeros((2, 4, 4), bool))
+    maps |= {"saliency": np.ones((2, 2, 2), np.float32), "images": np.zeros((2, 4, 4, 3), np.uint8)}
+    maps |= {"camera_from_world": np.ones((2, 3, 4), np.float32), "intrinsics": np.ones((2, 3, 3), np.float32)}
+    kept_passes({}, lambda: ClipPasses(**maps), folder)
     return next(folder.glob("*.npz"))
 
 
-def _read_passes(path: Path) -> None:
-    from vggtjax.learning.clip_passes import _read
-
-    _read(path)
-
-
 def _program(folder: Path) -> Path:
-    from vggtjax.storage.programs import _keep
-
-    _keep(folder / "program.bin", b"content" * 30)
+    programs._keep(folder / "program.bin", b"content" * 30)
     return folder / "program.bin"
 
 
 def _read_program(path: Path) -> None:
-    from vggtjax.storage.programs import _read_kept
-
-    assert _read_kept(path) in (None, b"content" * 30), "a damaged program is used"
-
-
-def _scenes(folder: Path) -> Path:
-    index = {"format": "vggtjax scenes", "version": 1, "scenes": ["scene_0000"], "config": {"height": 4}}
-    write(folder / "index.json", json.dumps(index))
-    return folder
-
-
-def _read_scenes(path: Path) -> None:
-    from vggtjax.scenes.dataset import read_index
-
-    read_index(path)
+    assert programs._read_kept(path) in (None, b"content" * 30), "a damaged program is used"
 
 
 def _cut(folder: Path) -> Path:
@@ -108,21 +103,20 @@ def _cut(folder: Path) -> Path:
     return folder
 
 
-_SETTINGS = {"model": "tiny", "window": 3}
+_WINDOWS = {"model": "tiny", "window": 3}
 
 
 def _windows(folder: Path) -> Path:
     """Store three windows of three frames, as a run that was stopped leaves them."""
-    store, room = WindowStore(folder, _SETTINGS), make_room(3)
+    store, room = WindowStore(folder, _WINDOWS), make_room(3)
     for number in range(3):
-        features = np.random.default_rng(number).random((4, 8), np.float32)
-        store.save(window_name(number), room, features)
+        store.save(window_name(number), room, np.random.default_rng(number).random((4, 8), np.float32))
     return folder
 
 
 def _read_windows(path: Path) -> None:
     """Take the windows that are whole, and look for loops among them, as a run that goes on does."""
-    store, room = WindowStore(path, _SETTINGS), make_room(3)
+    store, room = WindowStore(path, _WINDOWS), make_room(3)
     names = [window_name(number) for number in range(3)]
     if all(store.find(name, room.frame_names, room.images) is not None for name in names):
         find_loops(store.features(names, 4), [range(3), range(3, 6), range(6, 9)], 1)
@@ -133,24 +127,77 @@ def _posted(path: Path) -> None:
         cleaned(path.read_bytes(), {0: 5})
 
 
-_POSTED = {"data": [[{"path": f"/tmp/{'0' * 64}/a.mp4"}], "demo", "vggt", 2, 0], "fn_index": 0, "session_hash": "x"}
+_SETTINGS = {"model": "tiny", "method": "vggt", "size": 28, "outputs": ["depth", "mask"], "frames": None}
 
+
+def _read_remote_settings(path: Path) -> None:
+    """Read settings as those of a batch at a URL, whose server gives what the file holds."""
+    content = path.read_bytes() if path.is_file() and not path.is_symlink() else None
+    given = patch("vggtjax.pipeline.destination.read_url", return_value=content)
+    with given, patch("vggtjax.pipeline.destination.write_url"):
+        RemoteFolder("s3://bucket/results").begin(_SETTINGS)
+
+
+@cache
+def _fit() -> tuple[Any, ...]:
+    """Return clips to fit to, clips that are held out, and settings: two evaluations after the first."""
+    clips = [FitClips(*simulate(jax.random.key(seed), identity(), (2, 1, 1, 20))) for seed in (0, 1)]
+    return *clips, FitConfig(("scale",), steps=20, clips_at_once=1)
+
+
+def _state(folder: Path) -> Path:
+    """Write the state of a fit that was interrupted after ten of its twenty steps."""
+
+    def stop(_done: int, _total: int | None) -> None:
+        raise KeyboardInterrupt
+
+    with suppress(KeyboardInterrupt):
+        fit_fusion(*_fit(), checkpoint=folder / "state.npz", progress=stop)
+    return folder / "state.npz"
+
+
+def _go_on(path: Path) -> None:
+    blocked = patch("vggtjax.learning.fit._keep")  # a folder in place of the file
+    with blocked, suppress(InputError):  # parameters that give a loss without a value
+        outcome = fit_fusion(*_fit(), checkpoint=path)
+        assert len(outcome.losses) == 3
+        assert np.isfinite(outcome.losses).all(), "a damaged state is gone on from"
+
+
+_SCENES = {"format": "vggtjax scenes", "version": 1, "scenes": ["scene_0000"], "config": {"height": 4}}
+_METRICS = "step,stage,seconds,samples,loss\n1,0,0.5,4,2.5\n2,0,1.0,8,2.25\n"
+_POSTED = {"data": [[{"path": f"/tmp/{'0' * 64}/a.mp4"}], "demo", "vggt", 2, 0], "fn_index": 0, "session_hash": "x"}
+_EVALUATION = {
+    "settings": {"dataset": "plain", "methods": ["vggt"]},
+    "sequences": [{"name": "a", "method": "vggt", "metrics": {"abs_rel": 0.1}, "notes": []}],
+    "mean": {"vggt": {"abs_rel": 0.1}},
+    "seconds": {"vggt": {"depth": 0.5}},
+}
 _ARCHIVE = 2**26 + 2**23  # slack where an .npz is read: one of any size may declare 64 MiB
 
+
+def _json(name: str, value: Any):
+    return file(name, json.dumps(value))
+
+
 ROWS = (
-    Reader("npz", samples.npz, _npz, _ARCHIVE),
-    Reader("npy", samples.text_file("array.npy", npy(np.ones((8, 6), np.float32))), arrays.read_array),
-    Reader("result", samples.archive, _archive, _ARCHIVE),
+    Reader("npz", _npz, _read_npz, _ARCHIVE),
+    Reader("npy", file("array.npy", npy(np.ones((8, 6), np.float32))), arrays.read_array),
+    Reader("result", _archive, _read_archive, _ARCHIVE),
     Reader("record", _record, _read_record, _ARCHIVE),
-    Reader(
-        "metrics",
-        samples.text_file("metrics.csv", "step,stage,seconds,samples,loss\n1,0,0.5,4,2.5\n2,0,1.0,8,2.25\n"),
-        read_metrics,
-    ),
-    Reader("kept passes", _passes, _read_passes, _ARCHIVE),
+    Reader("metrics", file("metrics.csv", _METRICS), read_metrics),
+    Reader("kept passes", _passes, read_passes, _ARCHIVE),
     Reader("cached program", _program, _read_program),
-    Reader("index of scenes", _scenes, _read_scenes),
+    Reader("index of scenes", _json("index.json", _SCENES), lambda path: read_index(path.parent)),
     Reader("cut of windows", _cut, unfinished_cut),
     Reader("stored windows", _windows, _read_windows, _ARCHIVE),
-    Reader("request of the app's page", samples.json_file("posted.json", _POSTED), _posted),
+    Reader("request of the app's page", _json("posted.json", _POSTED), _posted),
+    Reader(
+        "settings of a batch",
+        _json(SETTINGS_NAME, _SETTINGS),
+        lambda path: LocalFolder(path.parent).begin(_SETTINGS),
+    ),
+    Reader("settings at a URL", _json(SETTINGS_NAME, _SETTINGS), _read_remote_settings),
+    Reader("state of a fit", _state, _go_on, _ARCHIVE),
+    Reader("evaluation", _json("results.json", _EVALUATION), is_report),
 )

@@ -12,24 +12,32 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax import export
 
+from converters.files import read_state_dict
+from converters.hub_record import HubFile, HubRecord, read_record, record_path, write_record
 from tests.dataset_files import write
-from tests.fuzz import samples
 from tests.fuzz.cases import Reader
+from tests.fuzz.rows.strangers import file
 from tests.tiny import tiny_config
+from vggtjax.checkpoint import flat_shapes, read_model, write_checkpoint
 from vggtjax.config import VGGTConfig
+from vggtjax.method.fusion_family import start
+from vggtjax.method.fusion_file import load_fusion, save_fusion
 from vggtjax.pipeline import serve
 from vggtjax.storage.json_values import read_json
 from vggtjax.storage.tensor_file import Spec, write_tensors
+from vggtjax.training.checkpoints import restore, save
 from vggtjax.training.recipe import read_recipe
+from vggtjax.training.state import TrainingState
 
 _RECIPE = Path(__file__).parents[3] / "docs/recipes/smoke.json"
 
 
 def _weights(path: Path) -> None:
-    from converters.files import read_state_dict
-
     for tensor in read_state_dict(path).tensors.values():
         np.array(tensor)
 
@@ -58,8 +66,6 @@ def _torch_file(folder: Path, **options: Any) -> Path:
 
 
 def _checkpoint(folder: Path) -> Path:
-    from vggtjax.checkpoint import flat_shapes, write_checkpoint
-
     config = tiny_config(depth=4, track_features=8, track_hidden=16)
     specs = {name: Spec(shape, np.dtype(np.float32)) for name, shape in flat_shapes(config).items()}
     zeros = {name: np.zeros(spec.shape, np.float32) for name, spec in specs.items()}
@@ -68,33 +74,14 @@ def _checkpoint(folder: Path) -> Path:
     return write_checkpoint(folder / "tiny.safetensors", specs, lambda name: [zeros[name]], config, **labels)
 
 
-def _read_checkpoint(path: Path) -> None:
-    from vggtjax.checkpoint import read_model
-
-    read_model(path)
-
-
 def _fusion(folder: Path) -> Path:
-    from vggtjax.method.fusion_family import start
-    from vggtjax.method.fusion_file import save_fusion
-
     save_fusion(folder / "rule.safetensors", start(()), {"model": "demo", "mask_pairs": 5})
     return folder / "rule.safetensors"
-
-
-def _read_fusion(path: Path) -> None:
-    from vggtjax.method.fusion_file import load_fusion
-
-    load_fusion(path)
 
 
 @cache
 def _state() -> Any:
     """Return the state of a run whose model has one array."""
-    import jax.numpy as jnp
-
-    from vggtjax.training.state import TrainingState
-
     kernel = {"kernel": jnp.ones((4, 3))}
     probes = {"mean": {"bias": jnp.zeros(3)}}
     moments = (jnp.int32(3), {"mu": kernel})
@@ -102,25 +89,16 @@ def _state() -> Any:
 
 
 def _training_checkpoint(folder: Path) -> Path:
-    from vggtjax.training.checkpoints import save
-
     save(folder / "checkpoints", _state(), read_recipe(_RECIPE), {"seconds": 0.5})
     return folder / "checkpoints"
 
 
 def _read_training_checkpoint(path: Path) -> None:
-    import jax
-
-    from vggtjax.training.checkpoints import restore
-
     restore(path, jax.eval_shape(_state), read_recipe(_RECIPE))
 
 
 def _artefact(folder: Path) -> Path:
     """Write what `write_artefact` writes, with a small program, and a clip for it."""
-    import jax
-    from jax import export
-
     place, shape = folder / "artefact", (2, 4, 6, 3)
     weights = {"scale": np.ones((1, 1, 1, 3), np.float32), "shift": np.zeros((1, 1, 1, 3), np.float16)}
     specs = {name: Spec(value.shape, value.dtype) for name, value in weights.items()}
@@ -165,8 +143,6 @@ _HUB_ID = "facebook/VGGT-1B"
 
 
 def _hub_record(folder: Path) -> Path:
-    from converters.hub_record import HubFile, HubRecord, record_path, write_record
-
     commit = "0123456789" * 4
     files = {"model.safetensors": HubFile("a" * 64, "b" * 64), "model.safetensors.index.json": HubFile("c" * 40)}
     with patch.dict(os.environ, VGGTJAX_CACHE=str(folder)):
@@ -175,8 +151,6 @@ def _hub_record(folder: Path) -> Path:
 
 
 def _read_hub_record(path: Path) -> None:
-    from converters.hub_record import read_record
-
     with patch.dict(os.environ, VGGTJAX_CACHE=str(path.parents[2])):
         read_record(_HUB_ID)
 
@@ -186,14 +160,14 @@ ROWS = (
     Reader("shards with an index", _shards, _weights),
     Reader("torch file", _torch_file, _weights),
     Reader("torch file before 1.6", partial(_torch_file, _use_new_zipfile_serialization=False), _weights),
-    Reader("checkpoint", _checkpoint, _read_checkpoint),
+    Reader("checkpoint", _checkpoint, read_model),
     Reader(
         "config",
-        samples.text_file("config.json", tiny_config().to_json()),
+        file("config.json", tiny_config().to_json()),
         lambda path: read_json(path, VGGTConfig, "configuration"),
     ),
-    Reader("recipe", lambda folder: write(folder / "recipe.json", _RECIPE.read_bytes()), read_recipe),
-    Reader("fusion file", _fusion, _read_fusion),
+    Reader("recipe", file("recipe.json", _RECIPE.read_bytes()), read_recipe),
+    Reader("fusion file", _fusion, load_fusion),
     Reader("training checkpoint", _training_checkpoint, _read_training_checkpoint),
     Reader("artefact", _artefact, _read_artefact, refusals=serve.ArtefactError),
     Reader("hub record", _hub_record, _read_hub_record),

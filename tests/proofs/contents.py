@@ -16,11 +16,17 @@ from PIL import Image
 from safetensors.numpy import load_file
 
 BROKEN = "half-written"
+Files = dict[str, str]  # names below a folder, with those of folders -> digests
 _TIMES = {"seconds", "render_share"}  # keys of JSON objects, and columns of tables
 _TIMES_OF_PAGES = re.compile(rb"<h2>Time</h2>.*?</table>|\d+\.\d+ s\b|width: \d+\.\d+%", re.DOTALL)
 
 
-def content(path: Path) -> str:
+def files_below(folder: Path) -> Files:
+    """Return the files and folders below a folder, hidden ones too, with digests of what is in the files."""
+    return {str(path.relative_to(folder)): _content(path) for path in sorted(folder.rglob("*"))}
+
+
+def _content(path: Path) -> str:
     """Return a digest of a file without its times, "" for a folder, and `BROKEN` for a file that cannot be read."""
     if not path.is_file():
         return ""
