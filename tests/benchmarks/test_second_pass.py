@@ -88,22 +88,3 @@ def test_draws_are_joined(tmp_path, capsys, monkeypatch):
     assert rotations["moving", "none", "-"] == "4.50"
     assert rotations["frozen", "none", "-"] == "5.00"
     assert [rotations["frozen", mask, "3"] for mask in ("the movers'", "another scene's")] == ["15.00", "5.00"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (["--scenes", "1"], "scenes is 1; expected at least 2"),
-        (["--seeds", "0"], "seeds is 0; expected at least 1"),
-        (["--pairs", "0"], "mask_pairs is 0; expected a whole number of at least 1"),
-        (["--pairs", "99"], "expected numbers from 1 to 12"),
-        (["--out", "{tmp}/file/report.md"], "cannot write"),
-        (["--out", "{tmp}"], "is a folder; expected the name of a file"),
-    ],
-)
-def test_bad_input_is_one_sentence(tmp_path, capsys, arguments, sentence):
-    (tmp_path / "file").write_text("")
-    assert benchmarks.main(["second-pass", *(argument.format(tmp=tmp_path) for argument in arguments)]) == 2
-    error = capsys.readouterr().err
-    assert sentence in error
-    assert len(error.strip().splitlines()) == 1

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.summaries import changes_table, ladder_table, saliency_auc, spread, summarise
-from tests.benchmarks.rows import row
+from tests.benchmarks.scenes import row
 
 
 def test_summaries_by_hand():
