@@ -94,7 +94,7 @@ def long_clips(
             console.print(_table(f"{kind} walks, means", _means(rows[before:])))
     for count in memory:
         for length in (0, window):
-            console.print(_peak(out / "frames", model, count, length, max(overlaps)))
+            console.print(_peak(out / "frames", model, count, length, max(overlaps)), soft_wrap=True)
 
 
 def drawn_walks(kind: Kind, count: int, frames: int, side: int, seed: int) -> Iterator[SyntheticClip]:

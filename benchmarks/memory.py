@@ -15,6 +15,7 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.command_worker import run_command
+from benchmarks.suite.report import console
 from testing.seeded import seeded_images
 from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
@@ -114,7 +115,7 @@ def memory(*, full: Path | None = None, embedded: bool = True, split: bool = Fal
     if split:  # to predict what such a process takes
         jax.config.update("jax_num_cpu_devices", max(setting.devices for setting in SPLIT))
     models = {name: load_model(name) for name, _ in work}
-    rows, screen = [], Console()
+    rows, screen = [], console()
     table = Table(title="peak memory of a process (GB)", box=None)
     for heading in ("setting", "predicted", "measured", "ratio", "without mapped files"):
         table.add_column(heading, justify="left" if heading == "setting" else "right")

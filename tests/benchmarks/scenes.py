@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from tests.tiny import tiny_config
@@ -16,8 +18,13 @@ SIDE = 28
 
 def tiny_file(folder: Path) -> Path:
     """Write a model for pictures of 28 x 28 pixels."""
-    config = tiny_config(image_size=SIDE)
-    return save_model(folder / "tiny.safetensors", init_params(0, config), config)
+    config = tiny_config(image_size=SIDE, track_features=8, track_hidden=16)
+
+    def layer_scale(path, leaf):  # so large that attention shows
+        return jnp.full_like(leaf, 0.5) if path[-1].key in ("scale1", "scale2") else leaf
+
+    params = jax.tree_util.tree_map_with_path(layer_scale, init_params(0, config))
+    return save_model(folder / "tiny.safetensors", params, config)
 
 
 def drawn_scenes(kind: str, count: int, config: SceneConfig, *, seed: int = 0) -> SyntheticClip:

@@ -23,6 +23,7 @@ from benchmarks import (
 )
 from tests.benchmarks.scenes import SIDE, drawn_scenes, tiny_file
 from vggtjax.checkpoint import read_model
+from vggtjax.errors import InputError
 from vggtjax.pretrained.embedded import demo_clip
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
@@ -76,7 +77,8 @@ def test_approximations(run, tiny, monkeypatch):
     assert timed[3::2] == ["1.00", "1.00"]
 
 
-def test_known(run, tiny, tmp_path):
+def test_known(run, tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(known_clips, "FRAMES", 4)
     shown = cells(run("known", "--model", tiny, "--clips", 2, "--seeds", 0, "--folder", tmp_path))
     assert set(shown) - {"known"} - {name for name in shown if not name.strip("-")} == set(known.ROWS)
     assert shown["intrinsics"][0].startswith("0.0000, 100 %")
@@ -131,9 +133,7 @@ def test_memory(run, tmp_path, monkeypatch):
         return {"total": 2e9, "own": 1e9}
 
     monkeypatch.setattr(memory, "run_command", answer)
-    monkeypatch.setattr(
-        memory, "predicted_bytes", lambda model, *shape, method, devices: 2.1e9 if devices == 1 else 3e9
-    )
+    monkeypatch.setattr(memory, "predicted_bytes", lambda model, *shape, **how: 2.1e9)
     monkeypatch.setattr(memory, "EMBEDDED", memory.EMBEDDED[:1])
     monkeypatch.setattr(memory, "SPLIT", ())
     shown = run("memory", "--out", tmp_path / "rows.json")
@@ -149,8 +149,9 @@ def test_what_a_command_takes(capfd, tmp_path):
     answer = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert answer["code"] == 0
     assert answer["seconds"] > 0
-    with pytest.raises(command_worker.InputError, match=r"reconstruct none ended with code 2: .*none"):
-        command_worker.run_command(["reconstruct", "none"], tmp_path)
+    words = ["reconstruct", "none", "--model", "demo", "--out", str(tmp_path / "out")]
+    with pytest.raises(InputError, match=r"reconstruct none --model demo .* ended with code 2: .*none"):
+        command_worker.run_command(words, tmp_path)
 
 
 def test_embed(run, tiny, tmp_path, monkeypatch):

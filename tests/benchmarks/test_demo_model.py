@@ -152,14 +152,11 @@ def test_a_small_run_of_everything(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(demo_model, "held_out_scenes", drawn_scenes)
     monkeypatch.setattr(demo_model, "SUPPRESS", ("zero",))
 
-    prior = Prior(np.full((14, SIDE), 2.0), np.array([0, 0.1, 0]))
-    filmed = prior._replace(depth=np.full((SIDE, SIDE), 2.0))
-    monkeypatch.setattr(
-        demo_model, "training_prior", lambda config, scenes, progress: prior if config.height == 14 else filmed
-    )
+    prior = Prior(np.full((SIDE, SIDE), 2.0), np.array([0, 0.1, 0]))
+    monkeypatch.setattr(demo_model, "training_prior", lambda config, scenes, progress: prior)
     write_clip(tmp_path / "clips/hololens", frames=3)
     write_clip(tmp_path / "clips/composite/one", frames=5, mask=True)
-    out, small = tmp_path / "out", "--static 2 --dynamic 2 --seeds 1 --frames 3 --mask-pairs 2 --sweep 1 --height 14"
+    out, small = tmp_path / "out", "--static 2 --dynamic 2 --seeds 1 --frames 3 --mask-pairs 2 --sweep 1"
     files = ["--model", str(tiny_file(tmp_path)), "--out", str(out), "--clips", str(tmp_path / "clips")]
     code = benchmarks.main(["demo-model", *files, *small.split()])
     shown = capsys.readouterr()
@@ -167,7 +164,7 @@ def test_a_small_run_of_everything(tmp_path, capsys, monkeypatch):
     text = (out / "report.md").read_text()
     assert text.strip() in shown.out
     for heading in (
-        f"generated ones of {SIDE} x 14 pixels",
+        f"generated ones of {SIDE} x {SIDE} pixels",
         "guesses: static, 2 clips",
         "guesses: hololens, 1 clips",
         "Methods: dynamic",
