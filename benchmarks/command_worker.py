@@ -21,7 +21,8 @@ from vggtjax.errors import InputError
 
 def run_command(words: list[str], cache: Path, devices: int = 1) -> dict[str, Any]:
     """Run a command in a process with a cache of its own and return what it took. Raises InputError if it fails."""
-    environment = os.environ | {"VGGTJAX_CACHE": str(cache)}
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_COMPILATION")}
+    environment |= {"VGGTJAX_CACHE": str(cache)}
     if devices > 1:
         count = f"--xla_force_host_platform_device_count={devices}"
         environment["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {count}"

@@ -108,7 +108,8 @@ def _is_known(program: str, arguments: list[str]) -> bool:
     if program == "make":
         return {word for word in arguments if "=" not in word} <= {word for names in TARGETS for word in names.split()}
     if program.startswith("python"):
-        return arguments[:2] in (["-m", "benchmarks"], ["-m", "venv"]) or (ROOT / arguments[0]).is_file()
+        modules = ("benchmarks", "testing.make_checkpoint", "pytest", "venv")
+        return (arguments[0] == "-m" and arguments[1] in modules) or (ROOT / arguments[0]).is_file()
     return program in (*OTHERS, ".", "cd")
 
 

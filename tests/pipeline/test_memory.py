@@ -53,13 +53,13 @@ def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
     assert needs[1] - needs[0] == pytest.approx(4 * keys * (rows[1] - rows[0]))
 
 
-@pytest.mark.parametrize(("devices", "counted"), [(2, 1055e6), (4, 753e6), (8, 526e6)])  # by benchmarks devices
+@pytest.mark.parametrize(("devices", "counted"), [(2, 1055e6), (4, 753e6), (8, 526e6)])  # by XLA's analysis
 def test_so_are_those_of_each_device_that_shares_the_frames(two_cores, devices, counted):
     assert memory.pass_bytes(vggt_1b(), 32, 294, 518, devices=devices) == pytest.approx(counted, rel=1 / 3)
 
 
 @pytest.mark.parametrize(
-    ("frames", "height", "width", "method", "measured"),  # peaks in MB of processes, by benchmarks peak-memory
+    ("frames", "height", "width", "method", "measured"),  # peaks in MB of processes, by benchmarks memory
     [
         (8, 64, 64, "4dvggt-d", 579),
         (32, 64, 64, "vggt4d", 771),

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+
 LONGEST = 900.0  # seconds of one run
 # events of Python -> positions of its paths, and of the open folders that relative paths start from
 _PATHS = {
@@ -84,6 +86,8 @@ def _run(function: Callable[[], int], place: Path, out: Path, change: int | None
         os.dup2(file.fileno(), 2)
     tempfile.tempdir = str(place / "tmp")  # of this process; TMPDIR of those that it starts
     os.environ |= {"TMPDIR": tempfile.tempdir, "VGGTJAX_CACHE": str(place / "cache")}
+    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)  # of all tests
+    jax.config.update("jax_compilation_cache_dir", None)
     done = _count_changes(out, change)
     if size is not None:
         signal.signal(signal.SIGXFSZ, signal.SIG_DFL)  # Python ignores it

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 from PIL import Image
+from safetensors.numpy import save_file
 
 from testing.golden import GOLDEN
 from testing.make_checkpoint import make_checkpoint
@@ -64,10 +65,18 @@ CASES = {
 
 
 @pytest.fixture(scope="module")
-def inputs(tmp_path_factory) -> Path:
+def weights(tmp_path_factory) -> Path:
+    """A folder with weights to convert."""
     folder = tmp_path_factory.mktemp("inputs")
     shutil.copy(GOLDEN / "config.json", folder / "config.json")
     make_checkpoint(folder / "source.safetensors", read_json(GOLDEN / "shapes.json", dict[str, list[int]], "shapes"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def inputs(weights) -> Path:
+    """The same folder with what the other commands read."""
+    folder = weights
     shutil.copy(ROOT / "docs/recipes/smoke.json", folder / "recipe.json")
     save_model(folder / "model.safetensors", tiny_model().params, tiny_config())
     make_room(FRAMES).save(folder / "result")
@@ -200,8 +209,8 @@ def test_a_command_that_is_killed_and_run_again(name, inputs, tmp_path):
     assert found.problems == []
 
 
-def test_a_conversion_that_is_killed(inputs, tmp_path):
-    found = trial("convert", inputs, tmp_path)
+def test_a_conversion_that_is_killed(weights, tmp_path):
+    found = trial("convert", weights, tmp_path)
     assert found.kill(change=found.changes // 2).killed
     assert found.kill(size=found.largest // 2).killed
     assert found.problems == []
@@ -231,7 +240,7 @@ def test_what_a_careless_command_leaves_is_found(tmp_path):
 
 def test_half_written_files_are_told_apart_and_times_are_not_compared(tmp_path):
     np.savez(tmp_path / "a.npz", x=np.ones(100))
-    save_model(tmp_path / "a.safetensors", tiny_model().params, tiny_config())
+    save_file({"x": np.ones(100, np.float32)}, tmp_path / "a.safetensors")
     Image.fromarray(np.eye(30, dtype=np.uint8)).save(tmp_path / "a.png")
     (tmp_path / "a.json").write_text('{"x": 1, "seconds": {"all": 2.5}}')
     (tmp_path / "a.html").write_text("<p>1.5 s</p></html>")

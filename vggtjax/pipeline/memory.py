@@ -3,8 +3,8 @@
 It is the weights, the process, and the larger of two: what the compiler takes of programs that are compiled side by
 side, and what the passes hold: the blocks of every frame, the dense head of the frames that it computes at once, and
 pictures and results. Devices that share the frames hold keys and values of all of them, too. The rates are fitted to
-XLA's own counts of both passes on a CPU (`python -m benchmarks memory`) and to measured peaks of processes that compile
-their programs (`python -m benchmarks peak-memory`).
+XLA's own counts of both passes on a CPU, and to measured peaks of processes that compile their programs
+(`python -m benchmarks memory`).
 """
 
 from __future__ import annotations
