@@ -178,14 +178,7 @@ def _times(frames: int, grid: tuple[int, int], repeats: int) -> Table:
                 spent = (time.perf_counter() - began, time.process_time() - worked)
                 best[name] = min(best[name][0], spent[0]), min(best[name][1], spent[1])
     table = Table(title=f"{frames} frames of {tokens} tokens, {_WIDTH} channels, float32", box=None)
-    for heading in (
-        "attention",
-        "global block, s",
-        "processor s",
-        "ratio",
-        "72 blocks, processor s",
-        "ratio",
-    ):
+    for heading in ("attention", "global block, s", "processor s", "ratio", "72 blocks, processor s", "ratio"):
         table.add_column(heading, justify="left" if heading == "attention" else "right")
     frame = best.pop("a frame")
     whole = {name: 24 * (2 * frame[1] + spent[1]) for name, spent in best.items()}

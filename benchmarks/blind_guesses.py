@@ -101,11 +101,8 @@ def mean_depth_map(clips: Float[np.ndarray, "N S H W"]) -> Float64[np.ndarray, "
     Broadcast to a clip's frames, it is aligned like a prediction.
 
     Raises:
-        InputError: another number of axes than 4, or a pixel without depth in every frame.
+        InputError: a pixel without depth in every frame.
     """
-    clips = np.asarray(clips)
-    if clips.ndim != 4:
-        raise InputError(f"depths have shape {clips.shape}; expected clips [N, S, H, W]")
     known = measured(clips)
     counts = known.sum(axis=(0, 1))
     if not counts.all():

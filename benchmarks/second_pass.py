@@ -54,7 +54,6 @@ def second_pass(
     model: str = "demo",
     scenes: int = 64,
     frames: int = 12,
-    seed: int = 0,
     seeds: int = 1,
     pairs: tuple[int, ...] = (1, 2, 3, 5),
     suppress: Literal["zero", "drop"] = "zero",
@@ -66,8 +65,7 @@ def second_pass(
         model: "demo", or weights as for vggtjax reconstruct.
         scenes: number of held-out dynamic scenes of each draw, at least two.
         frames: frames of a scene.
-        seed: another seed draws other scenes.
-        seeds: number of draws of scenes, with seeds from `seed` on.
+        seeds: number of draws of scenes.
         pairs: numbers of pairs in which keys are suppressed.
         suppress: how keys are suppressed.
         out: file for the report, in markdown; it is printed only by default.
@@ -96,7 +94,7 @@ def second_pass(
     draws = []
     with Bars(console=console, disable=not console.is_terminal) as bars:
         task = bars.add_task("passes", total=seeds * len(runs))
-        for draw in range(seed, seed + seeds):
+        for draw in range(seeds):
             errors = {}
             for run, measured in _draw(loaded, config, scenes, draw, runs, suppress):
                 errors[run] = measured
@@ -105,7 +103,7 @@ def second_pass(
             if not console.is_terminal:  # a log gets a line for each draw
                 console.print(f"scenes of seed {draw}: done", highlight=False)
     errors = {run: np.concatenate([draw[run] for draw in draws]) for run in runs}
-    drawn = f"seed {seed}" if seeds == 1 else f"seeds {seed} to {seed + seeds - 1}"
+    drawn = "seed 0" if seeds == 1 else f"seeds 0 to {seeds - 1}"
     clips = f"{scenes * seeds} scenes ({drawn}) of {frames} frames, {side} x {side} pixels"
     text = report_text(errors, f"Model {loaded.name}, {clips}; keys: {suppress}.")
     Console().print(text, markup=False, highlight=False, soft_wrap=True)

@@ -114,14 +114,9 @@ def console() -> Console:
 def machine() -> dict[str, Any]:
     """Return the properties of the machine that figures depend on."""
     device = jax.local_devices()[0]
-    try:
-        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, OSError, ValueError):  # unknown on some systems
-        memory = None
     return {
         "cpu": _cpu(),
         "cores": os.cpu_count(),
-        "memory_bytes": memory,
         "system": platform.platform(),
         "platform": device.platform,
         "device": device.device_kind,
@@ -153,7 +148,7 @@ def ceiling_sheet(title: str, measurements: Mapping[str, Sequence[float]]) -> Sh
 def row_sheet(title: str, rows: Sequence[Row]) -> Sheet:
     """Return a table of rows."""
     headings = (
-        "workload", "frames", "compile s", "median s", "min s", "max s", "temp MB", "output MB",
+        "workload", "frames", "compile s", "median s", "temp MB", "output MB",
         "host MB", "device MB", "GFLOP/s", "floor s", "floor/run",
     )  # fmt: skip
     return Sheet(
@@ -165,12 +160,11 @@ def row_sheet(title: str, rows: Sequence[Row]) -> Sheet:
 
 def _cells(row: Row) -> tuple[str, ...]:
     m = row.measured
-    seconds = [number(value) for value in (m.median, *((min(m.seconds), max(m.seconds)) if m.seconds else ()))]
     return (
         row.workload,
         str(row.frames or ""),
         number(m.compile_seconds),
-        *([m.failure, "", ""] if m.failure else seconds),
+        m.failure or number(m.median),
         *(number(_over(value, 1e6)) for value in (m.temp_bytes, m.output_bytes, m.host_bytes, m.device_bytes)),
         number(_over(row.flop_per_second, 1e9)),
         number(row.floor_seconds),

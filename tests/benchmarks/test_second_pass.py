@@ -76,15 +76,15 @@ def test_draws_are_joined(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(benchmark, "held_out_scenes", draw)
     monkeypatch.setattr(benchmark, "camera_errors", measure)
     out = tmp_path / "report.md"
-    arguments = ["--scenes", "2", "--pairs", "3", "1", "3", "--seed", "4", "--seeds", "2", "--out", str(out)]
+    arguments = ["--scenes", "2", "--pairs", "3", "1", "3", "--seeds", "2", "--out", str(out)]
     assert benchmarks.main(["second-pass", *arguments]) == 0, capsys.readouterr().err
     shown = capsys.readouterr().out
     assert shown.strip() == out.read_text().strip()
-    assert "4 scenes (seeds 4 to 5) of 12 frames, 96 x 96 pixels; keys: zero." in shown
+    assert "4 scenes (seeds 0 to 1) of 12 frames, 96 x 96 pixels; keys: zero." in shown
     own, lent = ["first", "second"], ["second", "first"]
     assert measured[:4] == [(0, None, "zero")] * 2 + [(1, own, "zero"), (1, lent, "zero")]
     rows = [[cell.strip() for cell in line.split("|")] for line in shown.splitlines() if line.startswith("| ")]
     rotations = {tuple(row[1:4]): row[4] for row in rows if len(row) == 9}
-    assert rotations["moving", "none", "-"] == "4.50"
-    assert rotations["frozen", "none", "-"] == "5.00"
-    assert [rotations["frozen", mask, "3"] for mask in ("the movers'", "another scene's")] == ["15.00", "5.00"]
+    assert rotations["moving", "none", "-"] == "0.50"
+    assert rotations["frozen", "none", "-"] == "1.00"
+    assert [rotations["frozen", mask, "3"] for mask in ("the movers'", "another scene's")] == ["11.00", "1.00"]
