@@ -90,10 +90,6 @@ class Row(NamedTuple):
     measured: float
     own: float  # without mapped files
 
-    @property
-    def ratio(self) -> float:
-        return self.predicted / self.measured
-
 
 def memory(*, full: Path | None = None, embedded: bool = True, split: bool = False, out: Path | None = None) -> None:
     """Compare the predicted memory of `vggtjax reconstruct` with the peaks of processes, each of one setting.
@@ -122,12 +118,12 @@ def memory(*, full: Path | None = None, embedded: bool = True, split: bool = Fal
     for name, setting in track(work, "processes", console=Console(stderr=True), transient=True):
         rows.append(row := measured(models[name], name, setting))
         sizes = [f"{value / _GIGA:.2f}" for value in (row.predicted, row.measured)]
-        table.add_row(_label(row), *sizes, f"{row.ratio:.2f}", f"{row.own / _GIGA:.2f}")
+        table.add_row(_label(row), *sizes, f"{row.predicted / row.measured:.2f}", f"{row.own / _GIGA:.2f}")
         if out is not None:
             with writing(out) as temporary:
                 temporary.write_text(json.dumps([row._asdict() for row in rows], indent=2) + "\n")
     screen.print(table)
-    off = [row for row in rows if abs(row.ratio - 1) > WITHIN]
+    off = [row for row in rows if abs(row.predicted / row.measured - 1) > WITHIN]
     screen.print(f"{len(rows) - len(off)} of {len(rows)} within {100 * WITHIN:.0f} %")
 
 
