@@ -12,8 +12,8 @@ from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.storage.writing import writing
 
 SHOWN = ("abs_rel", "rotation_error", "centre_error", "point_distance_first")  # of those compared with the plain pass
-_COLOURS = {"mined": "tab:blue", "true": "tab:orange"}
-_NAMES = {"mined": "mined mask", "true": "true mask"}
+_COLOURS: dict[str | None, str] = {"mined": "tab:blue", "true": "tab:orange"}
+_NAMES: dict[str | None, str] = {"mined": "mined mask", "true": "true mask"}
 
 
 def plot_ladder(path: Path, summaries: Sequence[Summary], title: str) -> None:

@@ -80,7 +80,7 @@ def measured_rows(
     """Measure a workload; return a row for each of its results, with ceilings if its work is known."""
     parts = workload.parts(case) if workload.parts else []
     rounds = Rounds(repeats, ceilings) if parts and ceilings else range(repeats)
-    about = (case.size, case.frames, case.height, case.width) if workload.of_a_clip else (None,) * 4
+    about = (case.size, case.frames, case.height, case.width) if workload.of_a_clip else (None, None, None, None)
     results = without_memory(lambda: workload.measure(case, rounds))
     rates = rounds.rates if isinstance(rounds, Rounds) else ()
     names = [f"{name}: {result}" if result else name for result in results]

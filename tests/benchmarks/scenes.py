@@ -39,10 +39,8 @@ def drawn_scenes(kind: str, count: int, config: SceneConfig, *, seed: int = 0) -
     poses[..., 3] = 0.1 * np.arange(S)[:, None] + 0.03 * generator.normal(size=(count, S, 3))
     intrinsics = np.array([[W, 0, W / 2], [0, W, H / 2], [0, 0, 1.0]])
     images = generator.random((count, S, H, W, 3), np.float32)
-    still: Any = None  # fields that no benchmark reads
-    return SyntheticClip(
-        images, depth, still, still, moving, still, poses, np.tile(intrinsics, (count, S, 1, 1)), still
-    )
+    arrays: Any = (images, depth, None, None, moving, None, poses, np.tile(intrinsics, (count, S, 1, 1)), None)
+    return SyntheticClip(*arrays)  # what is None no benchmark reads
 
 
 def row(**fields) -> LadderRow:
