@@ -1,4 +1,4 @@
-"""Drop the changes that the filter left out of a session, or cr-rate counts them as noticed: drop_skipped.py SESSION."""
+"""Drop what the filter left out of a session, or cr-rate counts it as noticed: python drop_skipped.py SESSION."""
 
 import sqlite3
 import sys
