@@ -45,6 +45,7 @@ def test_only_sentences_escape(sample):
 
 
 @pytest.mark.proof
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # Pillow leaves some files to be closed
 @every_reader
 def test_only_sentences_escape_from_thousands_of_changes(sample, reader, tmp_path):
     found, refused = {}, 0
