@@ -200,10 +200,10 @@ def trial(name: str, inputs: Path, place: Path) -> Trial:
 def test_a_command_that_is_killed_and_run_again(name, inputs, tmp_path):
     """Kills spread over the changes of files, in writes and at random moments; and two runs at once."""
     found, draws = trial(name, inputs, tmp_path), random.Random(name)
-    kills: list[dict[str, Any]] = [{"change": at} for at in {1 + n * found.changes // 16 for n in range(16)}]
-    kills += [{"size": draws.randrange(1, found.largest)} for _ in range(4)]
+    kills: list[dict[str, Any]] = [{"change": at} for at in {1 + n * found.changes // 12 for n in range(12)}]
+    kills += [{"size": draws.randrange(1, found.largest)} for _ in range(3)]
     assert sum(found.kill(**kill).killed for kill in kills) > 0.8 * len(kills)  # some of those that hang on a clock
-    for _ in range(4):
+    for _ in range(3):
         found.kill(seconds=draws.uniform(0, found.seconds))
         found.two_at_once()
     assert found.problems == []

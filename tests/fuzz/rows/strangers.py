@@ -184,7 +184,6 @@ ROWS = (
         Reader(f"list of clips {end}", partial(_manifest, name=f"clips{end}"), _clips)
         for end in (".csv", ".jsonl", ".parquet")
     ),
-    # what is known of a clip
     Reader("points", file("points.csv", "x,y,frame\n3,4,0\n5.5,6,1\n"), lambda path: parse_queries(str(path), clip())),
     Reader(
         "depths", file("depths.csv", "frame,x,y,depth\n0,3,4,2.5\n1,5,6,3\n"), lambda path: read_depths(path, clip())
