@@ -1,6 +1,9 @@
 """What every test shares: strict jax settings, the tiny model of the golden files, real footage where it is present."""
 
+import hashlib
 import os
+import platform
+import shutil
 from pathlib import Path
 
 import jax
@@ -12,6 +15,7 @@ from vggtjax import VGGTConfig
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 _MAPPINGS = 2**14  # Linux allows 65530
+_CACHE_BYTES = 2**31  # a larger cache of compiled programs is emptied
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of the code
@@ -23,13 +27,51 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Compiling is two thirds of the time that the tests take."""
+    """Compiling takes most of the time of the tests."""
     if config.getoption("--hasty"):
         flags = ["--xla_backend_optimization_level=0"]
         if jax.__version_info__ < (0, 11):  # XLA ends a process for a flag that it does not know
             flags.append("--xla_cpu_use_fusion_emitters=false")
         given = os.environ.get("XLA_FLAGS", "").split()  # a worker's has them already
         os.environ["XLA_FLAGS"] = " ".join([*given, *(flag for flag in flags if flag not in given)])
+    _share_compiled_programs(config)
+
+
+def pytest_report_header(config) -> str:
+    return f"compiled programs: {os.environ.get('JAX_COMPILATION_CACHE_DIR', 'not cached')}"
+
+
+def _share_compiled_programs(config) -> None:
+    """Let all workers, their child processes and later runs share one cache of compiled programs.
+
+    It lies in pytest's own cache, so `--cache-clear` empties it and `-p no:cacheprovider` does without. A cache that
+    cannot be written is not used; jax compiles anew what it cannot read.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ or not hasattr(config, "cache"):
+        return
+    try:
+        folder = config.cache.mkdir(f"compiled-{_processor()}")
+        (folder / "writable").touch()
+        if not hasattr(config, "workerinput") and sum(file.stat().st_size for file in folder.iterdir()) > _CACHE_BYTES:
+            shutil.rmtree(folder)
+    except OSError:
+        return
+    settings = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    for name, value in settings.items():
+        jax.config.update(name, value)
+        os.environ[name.upper()] = str(value)  # for child processes
+
+
+def _processor() -> str:
+    """Return a digest of the processor's features: programs compiled for one may not run on another."""
+    features = Path("/proc/cpuinfo")
+    text = features.read_text() if features.is_file() else ""
+    flags = next((line for line in text.splitlines() if line.startswith(("flags", "Features"))), platform.processor())
+    return hashlib.sha256(flags.encode()).hexdigest()[:16]
 
 
 @pytest.fixture(scope="module", autouse=True)
