@@ -1,5 +1,6 @@
 """What every test shares: strict jax settings, the tiny model of the golden files, real footage where it is present."""
 
+import gc
 import hashlib
 import os
 import platform
@@ -11,12 +12,15 @@ import pytest
 from hypothesis import settings
 
 from benchmarks.golden import GOLDEN, golden_config, golden_params
+from tests.tiny import save_tiny_demo
 from vggtjax import VGGTConfig
+from vggtjax.pretrained import embedded
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 _MAPPINGS = 2**14  # Linux allows 65530
 _CACHE_BYTES = 2**31  # a larger cache of compiled programs is emptied
 
+gc.set_threshold(50_000, 50, 100)  # tracing makes many small objects, which are not garbage
 jax.config.update("jax_numpy_rank_promotion", "raise")
 settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of the code
 settings.load_profile("untimed")
@@ -112,6 +116,18 @@ def seeded_params():
 @pytest.fixture(scope="session")
 def params(seeded_params):
     return seeded_params(7)
+
+
+@pytest.fixture(scope="session")
+def tiny_demo_file(tmp_path_factory) -> Path:
+    return save_tiny_demo(tmp_path_factory.mktemp("model") / "model.safetensors")
+
+
+@pytest.fixture
+def tiny_demo(tiny_demo_file, monkeypatch) -> Path:
+    """Let the model "demo" be a tiny network, where a test does not depend on what the embedded one has learnt."""
+    monkeypatch.setattr(embedded, "MODEL", tiny_demo_file)
+    return tiny_demo_file
 
 
 @pytest.fixture(scope="session")
