@@ -5,6 +5,7 @@ import hashlib
 import os
 import platform
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -123,11 +124,12 @@ def tiny_demo_file(tmp_path_factory) -> Path:
     return save_tiny_demo(tmp_path_factory.mktemp("model") / "model.safetensors")
 
 
-@pytest.fixture
-def tiny_demo(tiny_demo_file, monkeypatch) -> Path:
-    """Let the model "demo" be a tiny network, where a test does not depend on what the embedded one has learnt."""
-    monkeypatch.setattr(embedded, "MODEL", tiny_demo_file)
-    return tiny_demo_file
+@pytest.fixture(scope="module")
+def tiny_demo(tiny_demo_file) -> Iterator[Path]:
+    """Let the model "demo" be a tiny network for the tests of a module, which do not depend on what it has learnt."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(embedded, "MODEL", tiny_demo_file)
+        yield tiny_demo_file
 
 
 @pytest.fixture(scope="session")

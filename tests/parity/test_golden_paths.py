@@ -34,7 +34,7 @@ def implementation(request, monkeypatch):
 
 
 def masked_pass(case, images=None, tokens=None, suppress: Suppress = "drop", **options):
-    """Return a masked pass, which takes every path of a plain one, too; a new jit, so that what is patched is traced."""
+    """Return a masked pass, which takes every path of a plain one, too; a new jit traces what is patched."""
     images = case.images if images is None else images
     tokens = case.tokens if tokens is None else tokens
     masked = partial(forward, config=case.config, suppress=suppress, **options)
@@ -67,7 +67,9 @@ def test_padded_clips(case):
 
 @pytest.mark.parametrize("name", ["plain", pytest.param("drop", marks=pytest.mark.proof)])
 def test_bfloat16_stays_within_its_bound(case, name):
-    run = jax.jit(lambda p, x, t: forward(p, x, case.config, dynamic_tokens=t, suppress="drop", compute_dtype="bfloat16"))
+    run = jax.jit(
+        lambda p, x, t: forward(p, x, case.config, dynamic_tokens=t, suppress="drop", compute_dtype="bfloat16")
+    )
     made = run(case.params, case.images, None if name == "plain" else case.tokens)
     for value, key in ((made.pose_encoding, "pose_enc"), (made.depth, "depth"), (made.depth_confidence, "depth_conf")):
         error = spread_error(value, case.arrays[f"{name}/{key}"])
