@@ -3,8 +3,9 @@
 # The environment of the lock, every file by its hash: `make locked`, before the others. `make lock` makes the lock anew,
 # from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the last commit,
 # without what is not committed: the same wheel anywhere.
-# While you work: `make check`, which is lint, types and the tests that run no network, in a few minutes.
+# While you work: `make check`, which is lint, types and the tests that run no network, in two minutes.
 # `make coverage` counts the lines and branches that the tests run, and `make shuffled` runs them in a random order.
+# `make proofs` runs what takes long and rarely breaks; `make mutants` measures how many faults the tests notice.
 
 PYTHON ?= python3
 VENV := .venv
@@ -16,20 +17,14 @@ SUPPLY := $(VENV)/supply
 COMPILE = $(SUPPLY)/bin/uv pip compile --no-config --quiet --upgrade --exclude-newer '7 days' --generate-hashes \
   --universal --python-version 3.11 --index-url https://pypi.org/simple --no-emit-index-url \
   --custom-compile-command 'make lock'
-PYTEST = $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
-COUNTED = --cov --cov-append --cov-report= --cov-fail-under=0
+# Workers share compiled programs in pytest's cache: CLEAR=--cache-clear empties it.
+PYTEST = $(BIN)/python -m pytest --hasty -n $(WORKERS) --dist worksteal $(CLEAR)
 RANDOM = -p randomly --randomly-seed=$(SEED) --randomly-dont-reset-seed
-
-# All tests, with the options (1), or those of TESTS. What is compared with the public code is compiled well.
-define tests
-$(if $(filter tests,$(TESTS)),$(PYTEST) $(1) tests/parity)
-$(PYTEST) $(1) $(TESTS) --ignore tests/parity --hasty
-endef
 
 # Tests that compile networks take nearly all of the time.
 SLOW = parity network method pipeline training calibration learning commands benchmarks pretrained
 
-.PHONY: demo pictures docs test check fast coverage shuffled lint format clean locked lock audit sbom dist
+.PHONY: demo pictures docs test proofs mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
@@ -42,20 +37,23 @@ docs: $(VENV)/.docs
 	@echo "open site/index.html"
 
 test: lint
-	$(call tests)
+	$(PYTEST) $(TESTS)
+
+# Numbers of the public code once more, with programs that are compiled well: --hasty is left out.
+proofs: $(VENV)/.development
+	$(BIN)/python -m pytest -n $(WORKERS) tests/parity -m ""
+	$(PYTEST) $(TESTS) -m proof
 
 check: lint fast
 
 fast: $(VENV)/.development
-	$(PYTEST) tests --hasty $(SLOW:%=--ignore tests/%)
+	$(PYTEST) tests $(SLOW:%=--ignore tests/%)
 
 coverage: $(VENV)/.coverage
-	$(BIN)/coverage erase
-	$(call tests,$(COUNTED))
-	$(BIN)/coverage report --skip-covered
+	$(PYTEST) --cov --cov-report=term:skip-covered $(TESTS)
 
 shuffled: $(VENV)/.coverage
-	$(call tests,$(RANDOM))
+	$(PYTEST) $(RANDOM) $(TESTS)
 
 lint: $(VENV)/.development
 	$(BIN)/ruff check

@@ -1,6 +1,11 @@
 """What every test shares: strict jax settings, the tiny model of the golden files, real footage where it is present."""
 
+import gc
+import hashlib
 import os
+import platform
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -8,11 +13,15 @@ import pytest
 from hypothesis import settings
 
 from testing.golden import GOLDEN, golden_config, golden_params
+from tests.tiny import save_tiny_demo
 from vggtjax import VGGTConfig
+from vggtjax.pretrained import embedded
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 _MAPPINGS = 2**14  # Linux allows 65530
+_CACHE_BYTES = 2**31  # a larger cache of compiled programs is emptied
 
+gc.set_threshold(50_000, 50, 100)  # tracing makes many small objects, which are not garbage
 jax.config.update("jax_numpy_rank_promotion", "raise")
 settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of the code
 settings.load_profile("untimed")
@@ -23,13 +32,51 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Compiling is two thirds of the time that the tests take."""
+    """Compiling takes most of the time of the tests."""
     if config.getoption("--hasty"):
         flags = ["--xla_backend_optimization_level=0"]
         if jax.__version_info__ < (0, 11):  # XLA ends a process for a flag that it does not know
             flags.append("--xla_cpu_use_fusion_emitters=false")
         given = os.environ.get("XLA_FLAGS", "").split()  # a worker's has them already
         os.environ["XLA_FLAGS"] = " ".join([*given, *(flag for flag in flags if flag not in given)])
+    _share_compiled_programs(config)
+
+
+def pytest_report_header(config) -> str:
+    return f"compiled programs: {os.environ.get('JAX_COMPILATION_CACHE_DIR', 'not cached')}"
+
+
+def _share_compiled_programs(config) -> None:
+    """Let all workers, their child processes and later runs share one cache of compiled programs.
+
+    It lies in pytest's own cache, so `--cache-clear` empties it and `-p no:cacheprovider` does without. A cache that
+    cannot be written is not used; jax compiles anew what it cannot read.
+    """
+    if "JAX_COMPILATION_CACHE_DIR" in os.environ or not hasattr(config, "cache"):
+        return
+    try:
+        folder = config.cache.mkdir(f"compiled-{_processor()}")
+        (folder / "writable").touch()
+        if not hasattr(config, "workerinput") and sum(file.stat().st_size for file in folder.iterdir()) > _CACHE_BYTES:
+            shutil.rmtree(folder)
+    except OSError:
+        return
+    settings = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    for name, value in settings.items():
+        jax.config.update(name, value)
+        os.environ[name.upper()] = str(value)  # for child processes
+
+
+def _processor() -> str:
+    """Return a digest of the processor's features: programs compiled for one may not run on another."""
+    features = Path("/proc/cpuinfo")
+    text = features.read_text() if features.is_file() else ""
+    flags = next((line for line in text.splitlines() if line.startswith(("flags", "Features"))), platform.processor())
+    return hashlib.sha256(flags.encode()).hexdigest()[:16]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -70,6 +117,19 @@ def seeded_params():
 @pytest.fixture(scope="session")
 def params(seeded_params):
     return seeded_params(7)
+
+
+@pytest.fixture(scope="session")
+def tiny_demo_file(tmp_path_factory) -> Path:
+    return save_tiny_demo(tmp_path_factory.mktemp("model") / "model.safetensors")
+
+
+@pytest.fixture(scope="module")
+def tiny_demo(tiny_demo_file) -> Iterator[Path]:
+    """Let the model "demo" be a tiny network for the tests of a module, which do not depend on what it has learnt."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(embedded, "MODEL", tiny_demo_file)
+        yield tiny_demo_file
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ import runpy
 import shlex
 import shutil
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import av
@@ -30,10 +31,10 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def prepared(tmp_path_factory) -> Path:
+def prepared(tmp_path_factory, tiny_demo_file) -> Path:
     """Return a folder with what pages read: the embedded clip as frames/ and clip.mp4, and the result of the latter.
 
-    Clips of one shape share their compiled programs, so that only the first page takes long.
+    Its result is that of a tiny network, which the pages run, too: their code does not depend on what a model knows.
     """
     folder = tmp_path_factory.mktemp("docs")
     pictures = (255 * demo_clip().images).round().astype(np.uint8)
@@ -46,13 +47,13 @@ def prepared(tmp_path_factory) -> Path:
             Image.fromarray(picture).save(folder / f"frames/{i:02}.png")
             video.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         video.mux(stream.encode())
-    arguments = ("--max-frames", "4", "--model", "demo", "--out", str(folder / "result"))
+    arguments = ("--max-frames", "4", "--model", str(tiny_demo_file), "--out", str(folder / "result"))
     assert cli.main(["reconstruct", str(folder / "clip.mp4"), *arguments]) == 0
     return folder
 
 
 @pytest.fixture
-def workplace(prepared, tmp_path, monkeypatch) -> Path:
+def workplace(prepared, tiny_demo, tmp_path, monkeypatch) -> Path:
     """Return the current folder of a page: a copy of the prepared one."""
     monkeypatch.setenv("MPLBACKEND", "agg")
     folder = Path(shutil.copytree(prepared, tmp_path / "here"))
@@ -60,8 +61,12 @@ def workplace(prepared, tmp_path, monkeypatch) -> Path:
     return folder
 
 
-def _with(language: str) -> list[Path]:
-    return [page for page in PAGES if any(block.language == language for block in blocks(page))]
+def _with(language: str, rule: str = "") -> list[Path]:
+    return [
+        page
+        for page in PAGES
+        if any(block.language == language and block.rule.startswith(rule) for block in blocks(page))
+    ]
 
 
 @pytest.mark.parametrize("page", _with("python"), ids=page_name)
@@ -74,8 +79,12 @@ def test_python_runs(page, workplace):
                 exec(code, names)
 
 
+@pytest.mark.proof
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=page_name)
-def test_a_notebook_runs(notebook, workplace):
+def test_a_notebook_runs(notebook, tmp_path, monkeypatch):
+    """With the embedded model, as a reader runs it."""
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.chdir(tmp_path)
     runpy.run_path(str(notebook), run_name="__main__")
 
 
@@ -86,18 +95,32 @@ def test_commands_are_understood(page, workplace, monkeypatch):
     def recorder(name, command):
         return functools.wraps(command)(lambda *_, **__: called.append(name))
 
-    real = cli.COMMANDS
-    recorders = {name: recorder(name, command) for name, command in real.items()}
+    monkeypatch.setattr(cli, "COMMANDS", {name: recorder(name, command) for name, command in cli.COMMANDS.items()})
+    for line, program, arguments in _shell_commands(page):
+        if program == "vggtjax":
+            called.clear()
+            assert cli.main(arguments) == 0, line
+            assert called == arguments[:1] or arguments == ["--version"], line
+        else:
+            assert _is_known(program, arguments), line
+
+
+@pytest.mark.proof
+@pytest.mark.parametrize("page", _with("sh", "run"), ids=page_name)
+def test_commands_run(page, prepared, tmp_path, monkeypatch):
+    """With the embedded model, as a reader runs them."""
+    monkeypatch.chdir(shutil.copytree(prepared, tmp_path / "here"))
+    for line, program, arguments in _shell_commands(page, "run"):
+        assert program == "vggtjax"
+        assert cli.main(arguments) == 0, line
+
+
+def _shell_commands(page: Path, rule: str = "") -> Iterator[tuple[str, str, list[str]]]:
+    """Yield each command of a page's blocks, of those with a rule if one is given: where it is, program, arguments."""
     for block in blocks(page):
-        for line in commands(block) if block.language == "sh" else ():
-            program, *arguments = shlex.split(line)
-            if program == "vggtjax":
-                monkeypatch.setattr(cli, "COMMANDS", real if block.rule == "run" else recorders)
-                called.clear()
-                assert cli.main(arguments) == 0, f"line {block.line}: {line}"
-                assert block.rule == "run" or called == arguments[:1] or arguments == ["--version"]
-            else:
-                assert _is_known(program, arguments), f"line {block.line}: {line}"
+        for command in commands(block) if block.language == "sh" and block.rule.startswith(rule) else ():
+            program, *arguments = shlex.split(command)
+            yield f"{page_name(page)}, block of line {block.line}: {command}", program, arguments
 
 
 def _is_known(program: str, arguments: list[str]) -> bool:

@@ -17,6 +17,8 @@ from vggtjax.pretrained.embedded import demo_clip
 FRAMES = 4
 MODEL = ("--model", "demo")
 
+pytestmark = [pytest.mark.filterwarnings("ignore:the field of view"), pytest.mark.usefixtures("tiny_demo")]
+
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
@@ -66,13 +68,12 @@ def test_what_it_will_do_is_said_before_jax_is_imported(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def evaluated(dataset, tmp_path_factory):
+def evaluated(dataset, tiny_demo, tmp_path_factory):
     out = tmp_path_factory.mktemp("evaluated")
     assert cli.main(["evaluate", "plain", str(dataset), "--out", str(out), *MODEL, "--methods", "vggt,4dvggt-d"]) == 0
     return out
 
 
-@pytest.mark.filterwarnings("ignore:the field of view")
 def test_all_of_it(dataset, evaluated, capsys):
     values = json.loads((evaluated / "results.json").read_text())
     assert {(e["name"], e["method"], e["status"]) for e in values["sequences"]} == {
@@ -103,7 +104,6 @@ def test_all_of_it(dataset, evaluated, capsys):
     assert (evaluated / "sequences/first/vggt.json").stat().st_mtime_ns == before
 
 
-@pytest.mark.filterwarnings("ignore:the field of view")
 def test_results_of_a_folder(dataset, tmp_path, capsys):
     arguments = ("--model", "demo", "--out", tmp_path / "theirs/first", "--format", "vggt4d")
     code, _, err = run(capsys, "reconstruct", dataset / "first/rgb", *arguments)

@@ -15,7 +15,7 @@ from vggtjax.learning.ablation import CHOSEN, split_clips
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, kept_passes, observations, sequence_digest
 from vggtjax.method.fusion_family import identity
 from vggtjax.method.fusion_file import load_fusion, save_fusion
-from vggtjax.pretrained.embedded import MODEL, demo_clip
+from vggtjax.pretrained.embedded import demo_clip
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.arrays import write_arrays
 
@@ -42,6 +42,7 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
 
+pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
 ARGUMENTS = ["--family", "scale", "scale+correlation", "paper", "--seeds", 2, "--steps", 20, "--pixels", 300]
 ARGUMENTS += ["--size", 64]
 
@@ -51,11 +52,11 @@ def run(*arguments) -> int:
 
 
 @pytest.fixture(scope="module")
-def fitted(dataset, cache, tmp_path_factory):
+def fitted(dataset, cache, tiny_demo_file, tmp_path_factory):
     out = tmp_path_factory.mktemp("fits")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VGGTJAX_CACHE", str(cache))
-        code = run("fit-fusion", "--out", out, "--data", f"plain={dataset}", "--model", MODEL, *ARGUMENTS)
+        code = run("fit-fusion", "--out", out, "--data", f"plain={dataset}", "--model", tiny_demo_file, *ARGUMENTS)
     assert code == 0
     return out
 
@@ -81,10 +82,10 @@ def test_all_of_it(fitted, cache):
 
 
 @pytest.mark.usefixtures("fitted")
-def test_passes_and_fits_are_kept(dataset, cache, tmp_path, monkeypatch, capsys):
+def test_passes_and_fits_are_kept(dataset, cache, tiny_demo_file, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("VGGTJAX_CACHE", str(cache))
     monkeypatch.setattr("vggtjax.learning.clip_passes.reconstruct", None)  # would fail
-    arguments = ["--out", tmp_path, "--data", f"plain={dataset}", "--model", MODEL, *ARGUMENTS]
+    arguments = ["--out", tmp_path, "--data", f"plain={dataset}", "--model", tiny_demo_file, *ARGUMENTS]
     arguments += ["--family", "scale", "--seeds", 1]
     assert run("fit-fusion", *arguments) == 0
     before = json.loads((tmp_path / "fit.json").read_text())
@@ -95,9 +96,11 @@ def test_passes_and_fits_are_kept(dataset, cache, tmp_path, monkeypatch, capsys)
 
 
 @pytest.mark.filterwarnings("ignore:the field of view")
-def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(fitted, dataset, tmp_path, capsys, caplog):
+def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(
+    fitted, dataset, tiny_demo_file, tmp_path, capsys, caplog
+):
     frames = dataset / "clip0" / "rgb"
-    (tmp_path / "link.safetensors").symlink_to(MODEL)
+    (tmp_path / "link.safetensors").symlink_to(tiny_demo_file)
     model = ["--model", tmp_path / "link.safetensors"]
     common = ["--size", 64, "--max-frames", 3, *model]
     results = {}

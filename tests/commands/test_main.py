@@ -23,7 +23,7 @@ from vggtjax.commands.one_clip import _taken
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 
-pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
+pytestmark = [pytest.mark.filterwarnings("ignore:the field of view"), pytest.mark.usefixtures("tiny_demo")]
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,9 @@ from vggtjax.storage.free_memory import Room, in_gigabytes
 from vggtjax.windows.plan import Windows
 from vggtjax.windows.store import FOLDER, write_cut
 
-SIDE = 96  # of the embedded model's frames
+SIDE = 96  # of the model's frames
+
+pytestmark = [pytest.mark.filterwarnings("ignore:the field of view"), pytest.mark.usefixtures("tiny_demo")]
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +96,7 @@ _WORDS = ["--model", "demo", "--method", "vggt", "--only", "cameras", "--no-loop
 
 
 @pytest.fixture(scope="module")
-def in_windows(video, tmp_path_factory):
+def in_windows(video, tiny_demo, tmp_path_factory):
     """The video in windows of 8 frames."""
     out = tmp_path_factory.mktemp("result") / "cut"
     assert cli.main(["reconstruct", str(video), *_WORDS, "--window", "8", "--out", str(out)]) == 0

@@ -42,7 +42,7 @@ softly = jax.jit(
 )
 
 
-@pytest.mark.parametrize("threshold", [None, "multi-otsu"])
+@pytest.mark.parametrize("threshold", [None, pytest.param("multi-otsu", marks=pytest.mark.proof)])
 def test_at_temperature_0_it_is_the_method(threshold):
     config = dataclasses.replace(CONFIG, motion=dataclasses.replace(CONFIG.motion, threshold=threshold))
     assembly, passes = infer(params(), images(), config)

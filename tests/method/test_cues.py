@@ -78,6 +78,7 @@ def test_a_floor_keeps_a_patch_that_one_map_rules_out(floor, exponents, expected
     assert np.allclose(saliency[0, 0], expected, atol=1e-5)
 
 
+@pytest.mark.proof
 def test_eight_devices_have_the_sums_of_one():
     for frames, off in printed_by(Path(__file__).with_name("cues_on_devices.py")).items():
         assert len(off) == 3, frames

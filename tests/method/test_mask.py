@@ -14,13 +14,12 @@ from skimage.filters import threshold_multiotsu, threshold_otsu
 from tests.eight_devices import printed_by
 from tests.reference import multi_otsu
 from vggtjax.errors import InputError
+from vggtjax.method import mask as eager
 from vggtjax.method.mask import (
     _between_classes,
     _partition,
     cluster_means,
-    dynamic_pixels,
     dynamic_tokens,
-    mine_mask,
     multi_otsu_threshold,
     otsu_threshold,
     smooth_over_time,
@@ -29,7 +28,9 @@ from vggtjax.method.mask import (
 from vggtjax.network.frames import BY_FRAME, Frames
 
 _otsu = jax.jit(otsu_threshold)
-_multi_otsu = jax.jit(multi_otsu_threshold)
+_multi_otsu = jax.jit(multi_otsu_threshold, static_argnames="bins")
+dynamic_pixels = jax.jit(eager.dynamic_pixels, static_argnames=("size", "threshold"))
+mine_mask = jax.jit(eager.mine_mask, static_argnames=("size", "clusters", "threshold", "smooth_frames", "frames"))
 
 
 def cut_alike(values, threshold, other) -> bool:
@@ -119,7 +120,7 @@ def test_parts_of_classes_in_the_variance_by_hand():
 def test_multi_otsu_with_a_class_of_one_value():
     values = jnp.asarray([0.0] * 4 + [0.5] * 4 + [1.0])
     assert float(_multi_otsu(values)) == pytest.approx(128.5 / 256)  # three classes: the bin of 0.5 is the last below
-    assert float(multi_otsu_threshold(values, bins=4)) == pytest.approx(2.5 / 4)
+    assert float(_multi_otsu(values, bins=4)) == pytest.approx(2.5 / 4)
     assert float(_multi_otsu(values[:8])) == pytest.approx(0.5 * 1.5 / 256)  # two classes: bin 0 goes with bin 1
 
 
@@ -135,8 +136,7 @@ def test_multi_otsu_cuts_every_clip_at_its_own_threshold():
     saliency[0, :, :2] = 1.0  # two values alone
     saliency[1] = np.random.default_rng(0).uniform(0, 0.1, size=(2, 4, 4))
     saliency[1, :, 0] += 0.5
-    run = jax.jit(dynamic_pixels, static_argnames=("size", "threshold"))
-    mask = np.asarray(run(jnp.asarray(saliency), (16, 16), threshold="multi-otsu"))
+    mask = np.asarray(dynamic_pixels(jnp.asarray(saliency), (16, 16), threshold="multi-otsu"))
     pixels = np.asarray(upsample(jnp.asarray(saliency), (16, 16)))
     for one, values in zip(mask, pixels, strict=True):
         assert np.array_equal(one, values > multi_otsu(values))
@@ -235,6 +235,7 @@ def test_frames_that_make_shares_equal_change_no_mask(options):
     assert 0.1 < shared[:, :5].mean() < 0.6
 
 
+@pytest.mark.proof
 def test_eight_devices_mine_the_masks_of_one():
     found = printed_by(Path(__file__).with_name("mask_on_devices.py"))
     assert len(found) == 3

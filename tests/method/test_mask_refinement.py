@@ -19,7 +19,8 @@ CONFIG = SceneConfig(height=96, width=96, frames=6, dynamic=1.0, noise=0.0, flic
 
 @pytest.fixture(scope="module")
 def clip():
-    clip = jax.tree.map(np.array, generate(jax.random.key(3), load_textures("training"), CONFIG))
+    draw = jax.jit(generate, static_argnames="config")
+    clip = jax.tree.map(np.array, draw(jax.random.key(3), load_textures("training"), config=CONFIG))
     unit = np.median(clip.depth)  # the thresholds know VGGT's unit, in which scenes are about 1 away
     clip.camera_from_world[..., 3] /= unit
     return clip._replace(depth=clip.depth / unit)

@@ -89,6 +89,7 @@ def write_video(path, frames, rows):
         container.mux(stream.encode())
 
 
+@pytest.mark.proof
 def test_the_command_goes_on_after_it_was_killed(model, tmp_path):
     """Twelve clips of three shapes, two of them videos and one corrupt, killed once four are done."""
     root, out, visible = tmp_path / "clips", tmp_path / "out", f"[!.]*/{ARCHIVE_NAME}"

@@ -33,6 +33,7 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install 'vggtjax[cl
 RECIPE = Recipe(options=Options(method="vggt"))
 
 
+@pytest.mark.proof
 def test_a_killed_worker_costs_its_clips_alone_and_they_are_run_again(tmp_path):
     """Eight clips, one of them corrupt, on two workers, of which one is killed once two clips are there."""
     frames = (255 * moving_ball(2)).astype(np.uint8)

@@ -6,8 +6,8 @@ import socket
 import subprocess
 import sys
 from collections import defaultdict
-from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +26,6 @@ from vggtjax.pipeline.devices import frames_mesh
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs" / "how-to" / "several-devices.md"
 WORKER = Path(__file__).with_name("devices_worker.py")
-DEVICES = (1, 8)  # compiling for each takes most of a minute; the worker alone runs 2 and 4 too, 16 frames, which 8
-FRAMES = 13  # divides, and the gradient of both passes
 NAMED = {  # in docs/how-to/several-devices.md
     "image features": set(),
     "first pass": {"all-gather", "collective-permute"},
@@ -40,9 +38,21 @@ CLOSE = 1e-5  # of the spread of an array
 Kept = dict[str, dict[int, dict[str, np.ndarray]]]
 
 
-def start(out: Path, *arguments: str) -> subprocess.Popen:
+class Run(NamedTuple):
+    """Numbers of devices and frames; the method whose gradient is computed, if any."""
+
+    devices: int
+    frames: int
+    gradient_of: str
+
+
+TWO = Run(2, 5, "")
+EIGHT = Run(8, 13, "vggt")  # the frames are padded
+
+
+def start(run: Run, out: Path, *arguments: str) -> subprocess.Popen:
     environment = os.environ | {"PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu"}
-    environment |= {"COUNTS": " ".join(map(str, DEVICES)), "FRAMES": str(FRAMES), "METHOD": "vggt"}
+    environment |= {"COUNTS": f"1 {run.devices}", "FRAMES": str(run.frames), "METHOD": run.gradient_of}
     words = [sys.executable, str(WORKER), str(out), *arguments]
     return subprocess.Popen(words, cwd=ROOT, env=environment, stderr=subprocess.PIPE, text=True)
 
@@ -59,10 +69,15 @@ def finished(process: subprocess.Popen, out: Path) -> Kept:
     return kept
 
 
+@pytest.fixture(scope="module", params=[TWO, pytest.param(EIGHT, marks=pytest.mark.proof)], ids=str)
+def run(request) -> Run:
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory) -> Kept:
+def kept(run, tmp_path_factory) -> Kept:
     out = tmp_path_factory.mktemp("devices") / "one.npz"
-    return finished(start(out), out)
+    return finished(start(run, out), out)
 
 
 def check_equal(expected: dict[str, np.ndarray], found: dict[str, np.ndarray]) -> None:
@@ -79,26 +94,27 @@ def check_equal(expected: dict[str, np.ndarray], found: dict[str, np.ndarray]) -
 
 
 @pytest.mark.parametrize("what", ["reconstruct", "infer", "gradient"])
-def test_several_devices_give_the_numbers_of_one(kept, what):
-    for devices in set(DEVICES) - {1}:
-        check_equal(kept[f"{what} {FRAMES}"][1], kept[f"{what} {FRAMES}"][devices])
+def test_several_devices_give_the_numbers_of_one(run, kept, what):
+    if what == "reconstruct" or run.gradient_of:
+        check_equal(kept[f"{what} {run.frames}"][1], kept[f"{what} {run.frames}"][run.devices])
 
 
-def test_a_pass_has_only_the_collectives_that_the_docs_name(kept):
+def test_a_pass_has_only_the_collectives_that_the_docs_name(run, kept):
     rows = dict(re.findall(r"^\| (\S.*?) \| .* \| (.*) \|$", DOCS.read_text(), flags=re.MULTILINE))
     for stage, kinds in NAMED.items():
         assert set(re.findall(r"`([\w-]+)`", rows[stage])) == kinds, stage
-        for devices in set(DEVICES) - {1}:
-            assert set(kept[f"collectives of {stage} {FRAMES}"][devices]) <= {f"['{name}']" for name in kinds}, stage
-    assert kept[f"collectives of first pass {FRAMES}"][8]
+        found = set(kept[f"collectives of {stage} {run.frames}"][run.devices])
+        assert found <= {f"['{name}']" for name in kinds}, stage
+    assert kept[f"collectives of first pass {run.frames}"][run.devices]
 
 
-def test_memory_of_a_device_falls_with_their_number(kept):
+def test_memory_of_a_device_falls_with_their_number(run, kept):
     for stage in ("image features", "first pass", "second pass"):
-        needs = [int(kept[f"memory {FRAMES}"][devices][f"['{stage}']"]) for devices in DEVICES]
-        assert all(more > less for more, less in pairwise(needs)), (stage, needs)
+        alone, shared = (int(kept[f"memory {run.frames}"][count][f"['{stage}']"]) for count in (1, run.devices))
+        assert alone > shared, stage
 
 
+@pytest.mark.proof
 def test_cues_of_many_frames_do_not_mix_up_their_communications(tmp_path):
     """Without an order, devices enter communications of two cues at once, and XLA ends the process."""
     frames = tmp_path / "frames"
@@ -113,6 +129,7 @@ def test_cues_of_many_frames_do_not_mix_up_their_communications(tmp_path):
     assert done.returncode == 0, done.stderr[:3000]
 
 
+@pytest.mark.proof
 def test_communications_of_a_program_run_one_after_another():
     """XLA's runtime for CPUs can mix up those of two loops or conditionals that run at the same time."""
     found = printed_by(WORKER.with_name("communications.py"))
@@ -123,19 +140,21 @@ def test_communications_of_a_program_run_one_after_another():
         assert not pairs, program
 
 
-def test_two_processes(kept, tmp_path):
+@pytest.mark.proof
+def test_two_processes(tmp_path):
+    kept = finished(start(EIGHT._replace(devices=4, gradient_of=""), tmp_path / "one.npz"), tmp_path / "one.npz")
     with socket.socket() as free:
         free.bind(("localhost", 0))
         port = str(free.getsockname()[1])
     outs = [tmp_path / f"{rank}.npz" for rank in range(2)]
-    started = [start(out, str(rank), port) for rank, out in enumerate(outs)]
+    started = [start(EIGHT, out, str(rank), port) for rank, out in enumerate(outs)]
     try:
         both = [finished(process, out) for process, out in zip(started, outs, strict=True)]
     finally:
         for process in started:
             process.kill()
     for one in both:
-        check_equal(kept[f"reconstruct {FRAMES}"][1], one["processes"][4])
+        check_equal(kept[f"reconstruct {EIGHT.frames}"][4], one["processes"][4])
 
 
 def test_more_devices_than_there_are(tmp_path, capsys):

@@ -41,7 +41,7 @@ def work():
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="a setting of glibc")
-@pytest.mark.parametrize("code", [ARRAYS, TRAINING], ids=["arrays", "training"])
+@pytest.mark.parametrize("code", [ARRAYS, pytest.param(TRAINING, marks=pytest.mark.proof)], ids=["arrays", "training"])
 def test_memory_that_was_freed_is_used_again(code):
     """In a process of its own hardly a page is faulted in most turns; without the settings, thousands in every turn.
 

@@ -63,6 +63,7 @@ def test_time_spent_rendering_is_measured(tmp_path):
     assert all(0 < row["render_share"] < 1 for row in read_metrics(tmp_path / "metrics.csv"))
 
 
+@pytest.mark.proof
 def test_interrupted_after_every_step_gives_the_same_numbers(straight, tmp_path):
     """Also in the middle of an interval that a row averages over, and between stages."""
     whole, out, _ = straight
@@ -95,6 +96,7 @@ def test_a_finished_run_stays(straight):
     assert (out / "model.safetensors").stat().st_mtime_ns == before
 
 
+@pytest.mark.proof
 def test_a_run_killed_before_its_model_is_written(straight, tmp_path, monkeypatch):
     """The checkpoint of the last step exists, and the model of an earlier one."""
 
@@ -121,7 +123,10 @@ def test_one_run_in_a_folder(tmp_path):
     assert train(PROBES, tmp_path, options=RunOptions(seconds=NOW), progress=again, task=TASK).state.step == 1
 
 
-@pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, SystemExit), (signal.SIGINT, KeyboardInterrupt)])
+@pytest.mark.parametrize(
+    ("number", "error"),
+    [(signal.SIGTERM, SystemExit), pytest.param(signal.SIGINT, KeyboardInterrupt, marks=pytest.mark.proof)],
+)
 def test_signals_end_a_run_with_a_checkpoint(straight, tmp_path, number, error):
     def interrupt(status):
         if status.step == 4:

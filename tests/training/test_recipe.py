@@ -175,18 +175,26 @@ def test_recipes_of_the_docs_load(path):
         assert read == read | phase  # later fields have their defaults
 
 
-def test_the_recipe_for_a_gpu_fits_the_wheel_and_takes_a_step():
-    """The model takes at most 24 MB in bfloat16; shapes of a step of the last two phases: each size, most frames."""
-    recipe = read_recipe(DOCS / "recipes" / "gpu.json")
-    state = state_shapes(recipe, init_probes(0, recipe.model))
+ON_A_GPU = read_recipe(DOCS / "recipes" / "gpu.json")
+
+
+@pytest.mark.parametrize(
+    ("stage", "size"),
+    [
+        pytest.param(stage, size, marks=() if (stage, size) == (-1, 0) else pytest.mark.proof)
+        for stage in (-1, -2)
+        for size in range(len(ON_A_GPU.stages[stage].all_sizes))
+    ],
+)
+def test_the_recipe_for_a_gpu_fits_the_wheel_and_takes_a_step(stage, size):
+    """The model takes at most 24 MB in bfloat16; shapes of a step of a phase with the most frames."""
+    state, phase = state_shapes(ON_A_GPU, init_probes(0, ON_A_GPU.model)), ON_A_GPU.stages[stage]
     assert 2 * sum(leaf.size for leaf in jax.tree.leaves(state.trained["model"])) < 24e6
-    step, textures = partial(loss_and_gradient, recipe=recipe, objective=objective), load_textures("training")
-    for phase in recipe.stages[-2:]:
-        for index in range(len(phase.all_sizes)):
-            draw = partial(make_batch, textures=textures, phase=phase.of_size(index), frames=max(phase.frames))
-            metrics, gradient = jax.eval_shape(step, state.trained, jax.eval_shape(draw, jax.random.key(0)))
-            assert metrics["loss"].shape == ()
-            assert jax.tree.structure(gradient) == jax.tree.structure(state.ema)
+    step, textures = partial(loss_and_gradient, recipe=ON_A_GPU, objective=objective), load_textures("training")
+    draw = partial(make_batch, textures=textures, phase=phase.of_size(size), frames=max(phase.frames))
+    metrics, gradient = jax.eval_shape(step, state.trained, jax.eval_shape(draw, jax.random.key(0)))
+    assert metrics["loss"].shape == ()
+    assert jax.tree.structure(gradient) == jax.tree.structure(state.ema)
 
 
 def test_fields_of_a_phase_reach_its_scenes():
@@ -199,7 +207,8 @@ def test_gamma_makes_clips_darker_and_brighter():
     textures, phase = load_textures("training"), Phase(1, 8, (2,), 28, 28)
 
     def spread(gamma: float) -> float:
-        batch = make_batch(jax.random.key(0), textures, dataclasses.replace(phase, gamma=gamma), 2)
+        draw = jax.jit(make_batch, static_argnames=("phase", "frames"))
+        batch = draw(jax.random.key(0), textures, phase=dataclasses.replace(phase, gamma=gamma), frames=2)
         return float(np.log(batch.clips.images.mean(axis=(1, 2, 3, 4))).std())
 
     assert spread(4.0) > 1.5 * spread(0.0)

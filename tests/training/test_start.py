@@ -1,6 +1,7 @@
 """Where training from nothing starts."""
 
 import dataclasses
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -50,8 +51,9 @@ def test_the_embedded_model_starts_a_recipe_with_another_image_size_and_other_cu
     same = adapted(model, with_model(recipe, image_size=model.config.image_size))
     assert jax.tree.all(jax.tree.map(np.array_equal, same, model.params))
     images = jnp.asarray(np.random.default_rng(0).uniform(size=(1, 1, 112, 112, 3)), jnp.float32)
+    run = jax.jit(encode, static_argnames="config")
     tokens = [
-        encode(weights, images, config) for weights, config in ((model.params, model.config), (params, recipe.model))
+        run(weights, images, config) for weights, config in ((model.params, model.config), (params, recipe.model))
     ]
     np.testing.assert_allclose(tokens[0], tokens[1], atol=1e-5)  # the backbone resizes the table alike
     with pytest.raises(CheckpointError, match="it has embed_dim 128, not 256, num_heads 4, not 8; use these values in"):
@@ -66,11 +68,12 @@ def test_a_deeper_model_computes_the_same_and_its_new_pairs_learn():
     params = adapted(shallow, recipe)
     images = jnp.asarray(np.random.default_rng(0).uniform(size=(1, 2, 28, 28, 3)), jnp.float32)
 
+    @partial(jax.jit, static_argnames="config")
     def poses(params, config):
         return jnp.asarray(forward(params, images, config, outputs=("camera",)).pose_encoding)
 
     np.testing.assert_array_equal(poses(params, model), poses(shallow.params, shallow.config))
-    gradient = jax.grad(lambda params: poses(params, model).sum())(params)["aggregator"]
+    gradient = jax.jit(jax.grad(lambda params: poses(params, model).sum()))(params)["aggregator"]
     for blocks in ("frame_blocks", "global_blocks"):
         assert np.abs(np.asarray(gradient[blocks]["scale1"])[list(new)]).max(axis=-1).min() > 0
     with pytest.raises(CheckpointError, match=r"it has depth 4, not 5, .*model \(without its start.new_pairs \(0,\)\)"):

@@ -131,7 +131,9 @@ def test_weights_of_another_model_are_refused():
         initial_state(SHORT, init_probes(0, SHORT.model), params)
 
 
-@pytest.mark.parametrize(("trainable", "kind"), [("all", "muon"), ("heads", "adamw")])
+@pytest.mark.parametrize(
+    ("trainable", "kind"), [("heads", "adamw"), pytest.param("all", "muon", marks=pytest.mark.proof)]
+)
 def test_shapes_of_the_full_model(textures, trainable, kind):
     """A step of VGGT-1B on generated clips, without its arrays."""
     stages = (Phase(5000, 1, (2,), 518, 518),)

@@ -70,6 +70,7 @@ def test_two_workers_give_the_numbers_of_one_process(alone, tmp_path, monkeypatc
     assert not multiprocessing.active_children()
 
 
+@pytest.mark.proof
 def test_a_worker_that_ends_is_said_and_the_run_resumes(tmp_path):
     def kill(status):
         if status.step == 2:
@@ -96,6 +97,10 @@ def test_an_error_in_a_worker_is_said(tmp_path):
     with pytest.raises(VggtjaxError, match="a worker of the training run failed: ValueError: no such loss") as raised:
         train(RECIPE, tmp_path, options=RunOptions(workers=2), task=task)
     assert "in broken" in raised.value.__notes__[0]  # where in the objective
+
+
+@pytest.mark.proof
+def test_a_worker_without_memory(tmp_path):
     with pytest.raises(MemoryError):
         train(RECIPE, tmp_path, options=RunOptions(workers=2), task=dataclasses.replace(TASK, objective=full))
 
