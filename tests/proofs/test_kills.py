@@ -202,7 +202,8 @@ def test_a_command_that_is_killed_and_run_again(name, inputs, tmp_path):
     found, draws = trial(name, inputs, tmp_path), random.Random(name)
     kills: list[dict[str, Any]] = [{"change": at} for at in {1 + n * found.changes // 12 for n in range(12)}]
     kills += [{"size": draws.randrange(1, found.largest)} for _ in range(3)]
-    assert sum(found.kill(**kill).killed for kill in kills) > 0.8 * len(kills)  # some of those that hang on a clock
+    least = 0.5 if found.case.timed else 0.9  # a run that hangs on the clock may end before the later changes
+    assert sum(found.kill(**kill).killed for kill in kills) >= least * len(kills)
     for _ in range(3):
         found.kill(seconds=draws.uniform(0, found.seconds))
         found.two_at_once()
