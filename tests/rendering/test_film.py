@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.errors import InputError, OutputError
+from vggtjax.errors import InputError
 from vggtjax.rendering.film import write_film
 
 
@@ -75,13 +75,10 @@ def test_a_failed_film_leaves_the_earlier_one(tmp_path):
     ("name", "shown", "fps", "message"),
     [
         ("film.avi", frames(), 12, r"film.avi has no known ending of a film; expected one of .mp4, .gif, .webp"),
-        ("film", frames(), 12, "no known ending"),
         ("film.mp4", frames(), 0, "fps is 0; expected a number above 0, at most 120"),
         ("film.gif", frames(), 60, "fps is 60; expected a number above 0, at most 50 for .gif"),
-        ("film.mp4", frames(), float("nan"), "fps is nan"),
         ("film.mp4", [], 12, "a film needs at least one frame"),
         ("film.mp4", [*frames(1), *frames(1, 20)], 12, "all of one size"),
-        ("film.mp4", frames(1, 1, 1), 12, "too small"),
         ("film.mp4", [np.zeros((4, 4, 3))], 12, "float64"),
     ],
 )
@@ -89,9 +86,3 @@ def test_bad_films(tmp_path, name, shown, fps, message):
     with pytest.raises(InputError, match=message):
         write_film(tmp_path / name, shown, fps)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_written(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(OutputError, match="is a file"):
-        write_film(tmp_path / "file" / "film.gif", frames(), 12)
