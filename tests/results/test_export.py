@@ -1,5 +1,3 @@
-import tracemalloc
-
 import numpy as np
 import pytest
 import trimesh
@@ -14,27 +12,10 @@ from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
 from vggtjax.storage.trajectories import read_trajectory
 
-FILES = {
-    "reconstruction.npz",
-    "trajectory.txt",
-    "intrinsics.txt",
-    "static.ply",
-    "scene.glb",
-    "report.html",
-    "depth/scale.txt",
-    "preview/sheet.png",
-    "preview/card.webp",
-}
-FRAME_FILES = (
-    "confidence/{}.npy",
-    "depth/{}.npy",
-    "depth/{}.png",
-    "mask/{}.png",
-    "instances/{}.png",
-    "preview/depth/{}.png",
-    "preview/overlay/{}.png",
-    "frames/{}.ply",
-)
+FILES = {"reconstruction.npz", "trajectory.txt", "intrinsics.txt", "static.ply", "scene.glb", "report.html"}
+FILES |= {"depth/scale.txt", "preview/sheet.png", "preview/card.webp"}
+FRAME_FILES = ("confidence/{}.npy", "depth/{}.npy", "depth/{}.png", "mask/{}.png", "instances/{}.png")
+FRAME_FILES += ("preview/depth/{}.png", "preview/overlay/{}.png", "frames/{}.ply")
 
 
 def files(folder):
@@ -58,13 +39,11 @@ def saved(tmp_path_factory):
     return folder
 
 
-def test_files_and_nothing_else(saved):
+def test_files_of_cameras_and_depth(saved):
     assert set(files(saved)) == expected_files(3)
-    np.testing.assert_array_equal(Reconstruction.load(saved).depth, make_room().depth)
-
-
-def test_depth_files(saved):
     room = make_room()
+    assert (saved / "intrinsics.txt").read_text().startswith("# fx fy cx cy in pixels of 42 x 28\n")
+    np.testing.assert_allclose(np.loadtxt(saved / "intrinsics.txt"), [[37.8, 37.8, 21, 14]] * 3, rtol=1e-6)
     scale = float(np.loadtxt(saved / "depth/scale.txt"))
     assert scale == pytest.approx(65535 / room.depth.max())
     for frame, depth in enumerate(room.depth):
@@ -102,7 +81,7 @@ def test_trajectory_has_the_clips_times_or_else_frame_numbers(saved, tmp_path):
     times, poses = read_trajectory(saved / "trajectory.txt")
     np.testing.assert_allclose(times, room.timestamps, atol=1e-6)
     np.testing.assert_allclose(poses, room.world_from_camera, atol=1e-5)
-    make_room(timestamps=None).save(tmp_path)
+    make_room(timestamps=None).save(tmp_path, only=("cameras",))
     np.testing.assert_array_equal(np.loadtxt(tmp_path / "trajectory.txt")[:, 0], [0, 1, 2])
 
 
@@ -115,11 +94,6 @@ def test_the_note_of_a_model_is_in_the_text_files_and_the_sheet(saved, tmp_path)
         np.testing.assert_array_equal(np.loadtxt(tmp_path / name), np.loadtxt(saved / name))
     with Image.open(tmp_path / "preview/sheet.png") as noted, Image.open(saved / "preview/sheet.png") as plain:
         assert np.any(np.asarray(noted)[70:90] != np.asarray(plain)[70:90])
-
-
-def test_intrinsics_by_hand(saved):
-    assert (saved / "intrinsics.txt").read_text().startswith("# fx fy cx cy in pixels of 42 x 28\n")
-    np.testing.assert_allclose(np.loadtxt(saved / "intrinsics.txt"), [[37.8, 37.8, 21, 14]] * 3, rtol=1e-6)
 
 
 def test_clouds(saved):
@@ -157,45 +131,24 @@ def test_original_resolution(tmp_path):
     np.testing.assert_array_equal(Reconstruction.load(tmp_path).depth, room.depth)
 
 
-def test_clouds_at_the_original_size_are_written_piece_by_piece(tmp_path):
-    frames, height, width = 12, 56, 84
-    room = make_room(
-        frames, height, width, source_size=[[480, 720]] * frames, source_scale=np.full((frames, 2), 60 / 7)
-    )
-    tracemalloc.start()
-    try:
-        room.save(tmp_path, resolution="original", confidence_percentile=0)
-        _, peak = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    assert (tmp_path / "static.ply").stat().st_size > 50_000_000
-    assert peak < 200_000_000  # a few frames at a time; all points together take more
-
-
 def test_pictures_that_do_not_fit(tmp_path):
-    room, picture = make_room(), np.zeros((56, 84, 3), np.uint8)
-    with pytest.raises(InputError, match="there are 2 pictures for 3 frames"):
-        room.save(tmp_path / "a", resolution="original", pictures=[picture, picture])
-    with pytest.raises(InputError, match="there are more pictures than the 3 frames"):
-        room.save(tmp_path / "a", resolution="original", pictures=[picture] * 4)
-    with pytest.raises(InputError, match="pictures are for the resolution 'original'"):
-        room.save(tmp_path / "a", pictures=[picture] * 3)
-    for wrong in (picture[1:], picture / 255, Image.fromarray(picture)):
-        with pytest.raises(InputError, match=r"the picture of frame 0 is .*; expected uint8 \(56, 84, 3\)"):
-            room.save(tmp_path / "b", resolution="original", pictures=[wrong] * 3)  # pyright: ignore[reportArgumentType]
-    mixed = make_room(source_size=[[56, 84], [84, 56], [56, 84]])
-    with pytest.raises(InputError, match="have 2 sizes; the format vggt4d expects one"):
-        mixed.save(tmp_path / "b", resolution="original", format="vggt4d")
-    with pytest.raises(InputError, match="resolution is 'full'; expected one of"):
-        room.save(tmp_path / "c", resolution="full")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(InputError, match="format is 'cut3r'; expected one of"):
-        room.save(tmp_path / "d", format="cut3r")  # pyright: ignore[reportArgumentType]
+    picture, options = np.zeros((56, 84, 3), np.uint8), {"resolution": "original"}
+    mixed = {"source_size": [[56, 84], [84, 56], [56, 84]]}
+    for changes, given, words in (
+        ({}, options | {"pictures": [picture] * 2}, "there are 2 pictures for 3 frames"),
+        ({}, options | {"pictures": [picture] * 4}, "there are more pictures than the 3 frames"),
+        ({}, {"pictures": [picture] * 3}, "pictures are for the resolution 'original'"),
+        ({}, options | {"pictures": [picture[1:]] * 3}, r"the picture of frame 0 is .*; expected uint8 \(56, 84, 3\)"),
+        (mixed, options | {"format": "vggt4d"}, "have 2 sizes; the format vggt4d expects one"),
+        ({}, {"resolution": "full"}, "resolution is 'full'; expected one of"),
+    ):
+        with pytest.raises(InputError, match=words):
+            make_room(**changes).save(tmp_path, **given)
     assert not any(files(tmp_path))
 
 
-@pytest.mark.parametrize("resolution", ["model", "original"])
-def test_format_of_vggt4d(tmp_path, resolution):
-    room = make_room()
+def test_format_of_vggt4d(tmp_path):
+    room, resolution = make_room(), "original"
     room.save(tmp_path, saving=Saving(format="vggt4d", resolution=resolution))
     names = ("frame_{}.png", "frame_{}.npy", "conf_{}.npy", "dynamic_mask_{}.png")
     theirs = {f"vggt4d/{name.format(f'{frame:04d}')}" for frame in range(3) for name in names}
@@ -212,11 +165,8 @@ def test_format_of_vggt4d(tmp_path, resolution):
     np.testing.assert_array_equal(again.images[2], frame.image)
     room.save(tmp_path)
     assert set(files(tmp_path)) == expected_files(3)  # the folder was part of the earlier result
-
     (tmp_path / "vggt4d").mkdir()
     (tmp_path / "vggt4d/frame_0000.npy").write_text("mine")
-    room.save(tmp_path)
-    assert (tmp_path / "vggt4d/frame_0000.npy").read_text() == "mine"
     with pytest.raises(OutputError, match="vggt4d exists and is not part of an earlier result"):
         room.save(tmp_path, layout="vggt4d")
 
@@ -255,19 +205,15 @@ def test_padding_and_infinite_depth_never_become_points(tmp_path):
     depth = make_room().depth.copy()
     depth[0, 10, 10] = np.inf
     room = make_room(depth=depth, valid_box=np.tile([3, 2, 40, 26], (3, 1)))
-    room.save(tmp_path, confidence_percentile=0)
+    calls = []
+    room.save(tmp_path, confidence_percentile=0, progress=lambda done, total: calls.append((done, total)))
+    assert calls == [(done, 8) for done in range(1, 9)]
     assert len(read_ply(tmp_path / "frames/000000.ply").vertices) == 37 * 24 - 1
     assert len(read_ply(tmp_path / "frames/000001.ply").vertices) == 37 * 24
     with Image.open(tmp_path / "depth/000000.png") as picture:
         encoded = np.asarray(picture)
     assert encoded[10, 10] == encoded[0, 0] == 0
     assert (encoded > 0).sum() == 37 * 24 - 1
-
-
-def test_progress(tmp_path):
-    calls = []
-    make_room().save(tmp_path, progress=lambda done, total: calls.append((done, total)))
-    assert calls == [(done, 8) for done in range(1, 9)]
 
 
 @pytest.mark.parametrize("rows", [13, 27])

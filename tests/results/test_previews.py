@@ -23,13 +23,6 @@ def test_near_is_warm_far_is_cold_and_none_is_grey():
     assert none.max() - none.min() < 10
 
 
-def test_equal_depth_has_one_color():
-    depth = np.full((4, 4), 3, np.float32)
-    valid = np.ones((4, 4), bool)
-    colored = previews.color_depth(depth, valid, previews.inverse_depth_range(depth[None], valid[None]))
-    assert len(np.unique(colored.reshape(-1, 3), axis=0)) == 1
-
-
 def test_overlay_by_hand():
     image = np.full((9, 9, 3), (30, 60, 90), np.uint8)
     mask = np.zeros((9, 9), bool)
@@ -41,13 +34,7 @@ def test_overlay_by_hand():
     assert (image == (30, 60, 90)).all()
 
 
-@pytest.mark.parametrize("value", [False, True])
-def test_overlay_without_a_boundary(value):
-    drawn = previews.overlay(np.zeros((5, 5, 3), np.uint8), np.full((5, 5), value))
-    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) == 1
-
-
-@pytest.mark.parametrize("frames", [1, 3, 20])
+@pytest.mark.parametrize("frames", [1, 20])
 def test_sheet_shows_frames_in_columns(frames):
     room = make_room(frames)
     sheet = previews.contact_sheet(room)
@@ -64,15 +51,5 @@ def test_a_sheet_has_no_row_for_no_saliency():
         for saliency in (None, np.zeros((2, 2, 3)), np.full((2, 2, 3), np.nan), np.full((2, 2, 3), 0.1))
     ]
     assert heights[0] == heights[1] == heights[2] < heights[3]
-
-
-@pytest.mark.parametrize(
-    ("shape", "size"), [((112, 112), (560, 560)), ((480, 14), (14, 480)), ((294, 518), (518, 294))]
-)
-def test_previews_are_enlarged_by_whole_factors(shape, size):
-    assert previews.enlarged(shape) == size
-
-
-def test_sheet_of_tall_pictures_without_times_or_depth():
-    room = make_room(2, 140, 14, timestamps=None, depth=np.zeros((2, 140, 14)), saliency=np.full((2, 10, 1), np.nan))
-    assert previews.contact_sheet(room).shape[0] < 1500
+    tall = make_room(2, 140, 14, timestamps=None, depth=np.zeros((2, 140, 14)), saliency=None)
+    assert previews.contact_sheet(tall).shape[0] < 1500

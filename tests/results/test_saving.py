@@ -11,11 +11,9 @@ from vggtjax.results.saving import Saving
     ("changes", "message"),
     [
         ({"confidence_percentile": -1}, "confidence_percentile is -1; expected a number of at least 0 and less"),
-        ({"confidence_percentile": 100}, "confidence_percentile is 100"),
         ({"confidence_percentile": float("nan")}, "confidence_percentile is nan"),
         ({"resolution": "full"}, "resolution is 'full'; expected one of"),
         ({"format": "cut3r"}, "format is 'cut3r'; expected one of"),
-        ({"layout": "cut3r"}, "format is 'cut3r'; expected one of"),
     ],
 )
 def test_values_out_of_range(changes, message):
@@ -26,7 +24,6 @@ def test_values_out_of_range(changes, message):
 def test_single_values_change():
     saving = Saving(confidence_percentile=5)
     assert saving.changed(layout="vggt4d", resolution="original") == Saving(5, "original", "vggt4d")
-    assert saving.changed() == saving
 
 
 def test_the_command_line_can_import_it_quickly():
