@@ -9,14 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.seeded import seeded_images
 from tests.tiny import tiny_config
-from vggtjax import Model, Passes, assemble, infer, init_params, load_clip, reconstruct
+from vggtjax import Model, Passes, assemble, infer, init_params
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import LadderRow, error_table, ladder, second_pass_in_words
 from vggtjax.evaluation.metrics.depth import depth_errors, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
-from vggtjax.geometry.similarity import umeyama_sim3
+from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.method.mask import upsample
 from vggtjax.options import LADDER
 
@@ -72,14 +72,14 @@ def rows(model, truth) -> list[LadderRow]:
     return found
 
 
+def close(a: LadderRow, b: LadderRow) -> bool:
+    names = [name for name, value in vars(a).items() if isinstance(value, float)]
+    return [getattr(a, name) for name in names] == pytest.approx([getattr(b, name) for name in names], rel=1e-3)
+
+
 def only(rows, **wanted) -> LadderRow:
     (row,) = (row for row in rows if all(getattr(row, name) == value for name, value in wanted.items()))
     return row
-
-
-def close(a: LadderRow, b: LadderRow, rel=1e-3) -> bool:
-    names = [name for name, value in vars(a).items() if isinstance(value, float)]
-    return [getattr(a, name) for name in names] == pytest.approx([getattr(b, name) for name in names], rel=rel)
 
 
 def test_every_setting_has_a_row(rows):
@@ -112,7 +112,7 @@ def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
     assert row.centre_error == pytest.approx(centre_error(poses, clip.camera_from_world), rel=1e-3)
     assert row.centre_error_ratio == pytest.approx(row.centre_error / np.median(clip.depth[:, 3:]))
     of_points = point_distances(depth, np.asarray(made.intrinsics[1]), poses, clip)
-    assert (row.point_distance, row.point_distance_first) == pytest.approx(of_points, rel=1e-3)
+    assert [row.point_distance, row.point_distance_first] == pytest.approx(of_points, rel=1e-3)
     pixels = np.asarray(upsample(passes.saliency, SIZE)[1])
     assert row.saliency_auc == pytest.approx(auc(pixels, clip.dynamic_mask), abs=1e-3)
     mined = np.asarray(passes.dynamic_mask[1])
@@ -120,67 +120,33 @@ def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
     assert row.mask_jaccard == expected
 
 
-def point_distances(depth, intrinsics, poses, clip) -> tuple[float, float]:
+def point_distances(depth, intrinsics, poses, clip) -> list[float]:
     """Lift pixel by pixel, from the definition: aligned by all centres, and as seen from the first camera."""
-
-    def place(pose, x) -> np.ndarray:
-        return pose[:, :3].T @ (x - pose[:, 3])
-
-    found = [place(pose, np.zeros(3)) for pose in poses], [place(pose, np.zeros(3)) for pose in clip.camera_from_world]
-    similarity, distances = umeyama_sim3(*map(np.stack, found)), []
-    scale = np.median(clip.depth[clip.depth > 0] / depth[clip.depth > 0])
+    similarity = umeyama_sim3(centres(poses), centres(clip.camera_from_world))
+    scale, distances = np.median(clip.depth[clip.depth > 0] / depth[clip.depth > 0]), []
     for frame, row, column in np.argwhere(clip.depth > 0):
-        pixel, points = np.array([column, row, 1.0]), []
+        pixel, points, seen = np.array([column, row, 1.0]), [], []
         for z, K, pose in ((depth, intrinsics, poses), (clip.depth, clip.intrinsics, clip.camera_from_world)):
-            points.append(place(pose[frame], z[frame, row, column] * (np.linalg.inv(K[frame]) @ pixel)))
-        seen = [pose[0] @ [*x, 1] for x, pose in zip(points, (poses, clip.camera_from_world), strict=True)]
+            local = z[frame, row, column] * (np.linalg.inv(K[frame]) @ pixel)
+            points.append(pose[frame, :, :3].T @ (local - pose[frame, :, 3]))
+            seen.append(pose[0] @ [*points[-1], 1])
         apart = similarity.apply(points[0][None])[0] - points[1], scale * seen[0] - seen[1]
         distances.append(np.linalg.norm(apart, axis=1))
-    after_all, after_first = np.mean(distances, axis=0)
-    return float(after_all), float(after_first)
+    return np.mean(distances, axis=0).tolist()
 
 
 def test_suppressing_nothing_is_the_plain_pass(rows):
     plain = only(rows, clip=0, method="vggt")
     for source in ("mined", "true"):
-        masked = only(rows, clip=0, method="pose-decoupling", mask_source=source, mask_pairs=0, suppress="drop")
-        assert close(plain, masked)
-
-
-def test_suppression_and_mask_change_the_second_pass(rows):
-    setting = {"clip": 0, "method": "pose-decoupling", "mask_pairs": 2}
-    errors = {
-        only(rows, mask_source=source, suppress=suppress, **setting).rotation_error
-        for source in ("mined", "true")
-        for suppress in ("zero", "drop")
-    }
-    assert len(errors) == 4
+        setting = {"clip": 0, "method": "pose-decoupling", "mask_source": source}
+        assert close(plain, only(rows, mask_pairs=0, suppress="drop", **setting))
+        zeroed, dropped = (only(rows, mask_pairs=2, suppress=how, **setting) for how in ("zero", "drop"))
+        assert len({plain.rotation_error, zeroed.rotation_error, dropped.rotation_error}) == 3
     assert all(row.mask_jaccard == 1 for row in rows if row.mask_source == "true")
-
-
-def test_a_truth_that_is_the_mined_mask_makes_both_sources_equal(model, truth, passes):
-    own = Truth(*(array[:2] for array in truth))._replace(dynamic_mask=np.asarray(passes.dynamic_mask))
-    mined, true = ladder(model, own, methods=["4dvggt-d"], batch_size=2)[:2]
-    assert mined.mask_jaccard == pytest.approx(1, abs=1e-3)
-    assert close(mined, true)
-
-
-def test_a_prediction_is_right_about_itself(model, truth, passes):
-    made = assemble(passes, "vggt")
-    own = Truth(*(array[:2] for array in truth))._replace(
-        depth=2 * np.asarray(made.depth), camera_from_world=np.asarray(made.camera_from_world)
-    )
-    row = ladder(model, own, methods=["vggt"], batch_size=2)[0]
-    assert row.abs_rel == pytest.approx(0, abs=1e-4)
-    assert row.rotation_error == pytest.approx(0, abs=1e-3)
-    assert row.centre_error == pytest.approx(0, abs=1e-4)
-    assert row.delta1 == 1
 
 
 def test_batches_do_not_matter(model, truth, rows):
     plain = [row for row in rows if row.method == "vggt"]
-    alone = ladder(model, truth, methods=["vggt"], batch_size=1)
-    assert all(close(a, b) for a, b in zip(plain, alone, strict=True))
     single = ladder(model, Truth(*(array[1] for array in truth)), methods=["vggt"])
     assert close(plain[1], replace(single[0], clip=1))
 
@@ -190,14 +156,8 @@ def test_what_the_truth_leaves_undefined_is_none(model, truth):
         dynamic_mask=np.zeros_like(truth.dynamic_mask), camera_from_world=np.tile(np.eye(3, 4), (CLIPS, FRAMES, 1, 1))
     )
     row = ladder(model, still, methods=["vggt"], batch_size=2)[0]
-    assert (
-        row.abs_rel_dynamic
-        is row.saliency_auc
-        is row.centre_error
-        is row.centre_error_ratio
-        is row.point_distance
-        is None
-    )
+    undefined = (row.abs_rel_dynamic, row.saliency_auc, row.centre_error, row.centre_error_ratio, row.point_distance)
+    assert undefined == (None,) * 5
     assert row.abs_rel_static == row.abs_rel
     assert row.rotation_error is not None
     assert row.failure == "the true cameras do not move; their centres cannot be aligned"
@@ -218,7 +178,6 @@ def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):
          "and depth is better (AbsRel 0.200 -> 0.100)"),
         (2.5, 0.03, 0.2, "does not steady the cameras (rotation 2.00° -> 2.50°, centres 0.020 -> 0.030), and depth is "
          "no better"),
-        (2.0, 0.01, 0.3, "steadies the centres of the cameras only"),
         (1.0, 0.02, 0.3, "steadies the rotation of the cameras only"),
     ],
 )  # fmt: skip
@@ -241,29 +200,9 @@ def test_words_follow_the_numbers(rows, rotation, centres, abs_rel, expected):
         ({"methods": ["vgtt"]}, "method is 'vgtt'; expected one of vggt, vggt4d"),
         ({"masks": ["guessed"]}, "guessed.*expected 'mined' or 'true'"),
         ({"mask_pairs": [-1]}, "mask_pairs is -1"),
-        ({"suppress": ["hide"]}, "suppress is 'hide'"),
-        ({"gram": "sine"}, "gram is 'sine'"),
         ({"batch_size": 0}, "batch_size is 0"),
     ],
 )
 def test_bad_input_is_one_sentence(model, truth, options, sentence):
     with pytest.raises(InputError, match=sentence):
         ladder(model, truth, **{"batch_size": 2, **options})
-
-
-def test_a_clip_that_was_reconstructed_has_the_network_traced_already(model, truth):
-    alone = Truth(*(array[0, :3] for array in truth))  # a shape that no other test has
-    reconstruct(model, load_clip(alone.images, size=SIZE[1], patch=model.config.patch_size))
-    traced = []
-
-    def listen(event: str, duration_secs: float, **known: str | int) -> None:
-        if event == "/jax/core/compile/jaxpr_trace_duration":
-            traced.append(known.get("fun_name"))
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        ladder(model, alone)
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
-    assert "upsample" in traced
-    assert not {"encode", "_first", "_mine", "_second"} & set(traced)

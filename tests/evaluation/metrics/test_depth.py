@@ -37,8 +37,6 @@ def test_scale_does_not_matter(seed, scale):
     errors, scaled = depth_errors(predicted, truth), depth_errors(scale * predicted, truth)
     assert errors.abs_rel == pytest.approx(scaled.abs_rel)
     assert median_scale(scale * predicted, truth) * scale == pytest.approx(median_scale(predicted, truth))
-    assert errors.abs_rel > 0
-    assert 0 <= errors.delta1 <= 1
     assert depth_errors(scale * truth, truth).abs_rel == pytest.approx(0, abs=1e-12)
 
 
@@ -49,7 +47,6 @@ def test_scale_does_not_matter(seed, scale):
         (np.array([[[1.0, np.inf], [0.0, 1.0]]]), None, "2 predicted depths are not finite and above 0"),
         (np.ones((1, 2, 2)), np.zeros((1, 2, 2), bool), "no pixel has a true depth"),
         (np.ones((1, 2, 2)), np.ones((1, 2, 2)), "of bool"),
-        (np.ones((1, 2, 2)), np.ones((2, 2), bool), "expected .1, 2, 2. of bool"),
     ],
 )
 def test_bad_input_is_one_sentence(predicted, valid, sentence):

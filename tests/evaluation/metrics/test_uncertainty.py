@@ -1,13 +1,7 @@
 """Claimed precision against errors: hand-computed values, properties, other definitions of the same."""
 
-from typing import Any
-
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.optimize import minimize_scalar
-from scipy.stats import norm
 
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.uncertainty import (
@@ -19,8 +13,6 @@ from vggtjax.evaluation.metrics.uncertainty import (
     sparsification_curve,
     uncertainty_scores,
 )
-
-seeds = st.integers(0, 2**32 - 1)
 
 
 def claims(seed, count=400, wrong=1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -36,6 +28,10 @@ def test_sparsification_by_hand():
     assert curve.fractions.tolist() == [0, 0.25, 0.5, 0.75]
     assert curve.remaining == pytest.approx([8 / 4, 4 / 3, 3 / 2, 1])  # without 4, then 1, then 2
     assert curve.oracle == pytest.approx([8 / 4, 4 / 3, 1, 1])  # without 4, then 2, then a 1
+    tied = sparsification_curve(np.array([3.0, 1, 8, 4]), np.array([1, 1, 0, 2]), steps=4)
+    assert tied.remaining == pytest.approx([4, 8 / 3, 3, 4])  # 8 goes first; then 2 and 2 for 3 and 1
+    with pytest.raises(InputError, match=r"shape \(4,\) and the confidence \(3,\)"):
+        sparsification_curve(errors, confidence[:3])
     # Two steps more than there are pixels to take: shares of 1 / 8 of four pixels are rounded to the even half.
     curve = sparsification_curve(errors, confidence, steps=8)
     assert curve.remaining == pytest.approx([2, 2, 4 / 3, 3 / 2, 3 / 2, 3 / 2, 1, 1])
@@ -56,48 +52,12 @@ def test_ause_by_hand():
     assert ause(0 * errors, confidence) == 0
 
 
-def test_pixels_of_one_confidence_share_their_errors():
-    curve = sparsification_curve(np.array([3.0, 1, 8, 4]), np.array([1, 1, 0, 2]), steps=4)
-    assert curve.remaining == pytest.approx([4, 8 / 3, 3, 4])  # 8 goes first; then 2 and 2 for 3 and 1
-    constant = sparsification_curve(np.array([3.0, 1, 8, 4]), np.ones(4))
-    assert constant.remaining == pytest.approx(4)
-
-
-@settings(max_examples=40)
-@given(seed=seeds)
-def test_only_the_order_of_the_confidence_counts(seed):
-    generator = np.random.default_rng(seed)
-    errors, confidence = generator.normal(size=60), generator.integers(0, 12, 60) / 4
-    area = ause(errors, confidence)
-    shuffled = generator.permutation(60)
-    assert ause(errors[shuffled].reshape(6, 10), confidence[shuffled].reshape(6, 10)) == pytest.approx(area)
-    assert ause(-3 * errors, np.exp(confidence)) == pytest.approx(area)
-    assert ause(errors, -np.abs(errors)) == pytest.approx(0, abs=1e-12)
-    curve = sparsification_curve(errors, confidence)
-    assert (curve.remaining >= curve.oracle - 1e-12).all()
-    assert area >= 0
-
-
 def test_likelihood_by_hand():
     errors, precision = np.array([1.0, -2, 3]), np.array([4.0, 1, 1])
     assert calibrated_scale(errors, precision) == pytest.approx((4 + 4 + 9) / 3)
     by_hand = [(np.log(2 * np.pi / 4) + 4) / 2, (np.log(2 * np.pi) + 4) / 2, (np.log(2 * np.pi) + 9) / 2]
     assert gaussian_nll(errors, precision, 1.0) == pytest.approx(np.mean(by_hand))
     assert gaussian_nll(np.zeros(3), np.full(3, 2 * np.pi)) == pytest.approx(0)
-
-
-@settings(max_examples=30)
-@given(seed=seeds, wrong=st.floats(0.01, 100))
-def test_the_calibrated_scale_has_the_greatest_likelihood(seed, wrong):
-    errors, precision = claims(seed, 100, wrong)
-    scale = calibrated_scale(errors, precision)
-    found: Any = minimize_scalar(lambda log: gaussian_nll(errors, precision, np.exp(log)), bracket=(-6, 6))
-    assert np.exp(found.x) == pytest.approx(scale, rel=1e-5)
-    wanted = -norm.logpdf(errors, scale=np.sqrt(scale / precision)).mean()
-    assert gaussian_nll(errors, precision, scale) == pytest.approx(wanted)
-    # A factor on the precision is a factor on the scale, and nothing else once calibrated.
-    assert calibrated_scale(errors, 7 * precision) == pytest.approx(7 * scale)
-    assert gaussian_nll(errors, 7 * precision, 7 * scale) == pytest.approx(wanted)
 
 
 def test_calibration_error_by_hand():
@@ -114,16 +74,6 @@ def test_calibration_error_by_hand():
     # Far too sure of itself: nothing is within, and the levels themselves are missed.
     assert expected_calibration_error(errors, np.full(4, 1e12)) == pytest.approx(0.5)
     assert expected_calibration_error(np.zeros(4), np.ones(4)) == pytest.approx(0.5)
-
-
-def test_a_gaussian_is_calibrated_as_a_gaussian():
-    quantiles = norm.ppf((np.arange(100_000) + 0.5) / 100_000)
-    assert expected_calibration_error(quantiles, np.ones(100_000)) < 1e-4
-    assert expected_calibration_error(quantiles / np.sqrt(3), np.full(100_000, 3.0)) < 1e-4
-    wide = expected_calibration_error(quantiles, np.full(100_000, 0.25))
-    levels = (np.arange(10) + 0.5) / 10
-    expected = np.abs(2 * norm.cdf(2 * norm.ppf((1 + levels) / 2)) - 1 - levels).mean()
-    assert wide == pytest.approx(expected, abs=1e-4)
 
 
 def test_scores_by_hand_of_the_parts():
@@ -154,21 +104,9 @@ ONES = np.ones((1, 2, 2))
         (ONES, 0 * ONES, ONES, "no errors to compare"),
         (ONES, ONES, ONES[0], r"shapes \(1, 2, 2\), \(1, 2, 2\) and \(2, 2\)"),
         (2 * ONES, ONES, 0 * ONES, "4 of 4 precisions are not above 0"),
-        (np.nan * ONES, ONES, ONES, "4 values of the errors are not finite"),
         (2 * ONES, ONES, np.inf * ONES, "4 values of the precision are not finite"),
     ],
 )
 def test_depth_without_uncertainty_is_one_sentence(predicted, truth, precision, sentence):
     with pytest.raises(InputError, match=sentence):
         uncertainty_scores(predicted, truth, precision)
-
-
-def test_bad_arguments_are_one_sentence():
-    errors, precision = claims(0, 10)
-    for call, sentence in (
-        (lambda: sparsification_curve(errors, precision[:3]), r"shape \(10,\) and the confidence \(3,\)"),
-        (lambda: ause(errors[:0], precision[:0]), "no errors to compare"),
-        (lambda: calibrated_scale(errors, -precision), "10 of 10 precisions"),
-    ):
-        with pytest.raises(InputError, match=sentence):
-            call()
