@@ -12,7 +12,7 @@ from vggtjax import errors
 from vggtjax.cameras import world_from_camera
 from vggtjax.errors import ClipError, MissingExtraError
 from vggtjax.evaluation.metrics.trajectory import rotation_error, trajectory_errors
-from vggtjax.refinement.matches import find_features, frame_pairs
+from vggtjax.refinement.matches import frame_pairs
 from vggtjax.refinement.refine import adjust_to_tracks, check_refinement, refine_cameras
 from vggtjax.refinement.tracks import join_matches
 
@@ -33,8 +33,6 @@ def test_cameras_converge_to_the_truth(wrong):
     assert (np.array(camera_errors(result, corner)) > [0.05, 2, 0.05]).all()
     assert (np.array(camera_errors(refined, corner)) < [1e-4, 0.005, 2e-4]).all()
     assert report.refined
-    assert report.error_before is not None
-    assert report.error_before > 5
     assert report.error_after == pytest.approx(0, abs=0.01)
     np.testing.assert_array_equal(refined.camera_from_world[0], result.camera_from_world[0])
     np.testing.assert_array_equal(refined.depth, result.depth)
@@ -74,19 +72,6 @@ def test_pictures_refine_cameras_and_what_moves_has_no_vote():
     assert steps[-1][0] == steps[-1][1]
 
 
-def test_features_lie_on_static_pixels_of_the_frame():
-    corner = make_corner(2)
-    result = corner_result(corner)
-    mask = np.zeros_like(result.dynamic_mask)
-    mask[:, :, 32:] = True
-    box = np.tile([0, 24, 64, 48], (2, 1))
-    places = find_features(dataclasses.replace(result, dynamic_mask=mask, valid_box=box), paint(corner), lambda: None)
-    for features in places:
-        assert len(features.positions) > 20
-        assert features.positions[:, 0].max() < 31 * SCALE  # the mask grows by a pixel
-        assert features.positions[:, 1].min() >= 24 * SCALE
-
-
 def test_clips_that_cannot_be_refined_keep_their_cameras(caplog):
     corner = make_corner()
     result = corner_result(corner)
@@ -101,8 +86,7 @@ def test_clips_that_cannot_be_refined_keep_their_cameras(caplog):
     alone = tracks._replace(frames=np.where(tracks.frames == 4, 3, tracks.frames))
     assert "frame 4 sees 0 matched points" in adjust_to_tracks(result, alone)[1].reason
     depth = result.depth * np.exp(np.random.default_rng(0).normal(0, 3, result.depth.shape)).astype(np.float32)
-    scattered = adjust_to_tracks(dataclasses.replace(result, depth=depth), tracks)[1]
-    assert not scattered.refined
+    assert not adjust_to_tracks(dataclasses.replace(result, depth=depth), tracks)[1].refined
 
 
 def test_two_frames_and_one():
