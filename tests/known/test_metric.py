@@ -55,30 +55,22 @@ def test_the_height_above_the_floor_gives_the_scale():
         apply_known(TRUE, read_known(known, TRUE))  # it shows a wall
 
 
-@pytest.mark.parametrize(
-    ("baseline", "message"),
-    [
-        ("0,7,1", "baseline names frames 0 and 7; expected frames 0 to 4"),
-        ("1,1,2", "two different frames"),
-        ("0,1,-2", "I,J,METRES"),
-    ],
-)
-def test_baselines_that_do_not_fit_are_refused(baseline, message):
-    with pytest.raises(InputError, match=message):
-        apply_known(SMALL, read_known(KnownGeometry(baseline=baseline), SMALL))
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_depths_that_do_not_fit_are_refused(tmp_path):
+    for text, message in (
         ("frame,x,y\n0,1,1\n", "line 2 is .* expected columns frame, x, y and depth"),
         ("frame,x,y,depth\n9,1,1,1\n", "line 2 is .* a frame of 0 to 4"),
         ("frame,x,y,depth\n0,1,1,-1\n", "depth above 0"),
         ("frame,x,y,depth\n0,99,1,1\n", r"line 2: \(99, 1\) lies outside .* a picture of 84 x 56 pixels"),
         ("frame,x,y,depth\n", "holds no depths"),
-    ],
+    ):
+        (tmp_path / "depths.csv").write_text(text)
+        with pytest.raises(InputError, match=message):
+            apply_known(SMALL, read_known(KnownGeometry(known_depths=str(tmp_path / "depths.csv")), SMALL))
+
+
+@pytest.mark.parametrize(
+    ("baseline", "message"), [("0,7,1", "names frames 0 and 7"), ("1,1,2", "two different"), ("0,1,-2", "I,J,METRES")]
 )
-def test_depths_that_do_not_fit_are_refused(tmp_path, text, message):
-    (tmp_path / "depths.csv").write_text(text)
+def test_baselines_that_do_not_fit_are_refused(baseline, message):
     with pytest.raises(InputError, match=message):
-        apply_known(SMALL, read_known(KnownGeometry(known_depths=str(tmp_path / "depths.csv")), SMALL))
+        apply_known(SMALL, read_known(KnownGeometry(baseline=baseline), SMALL))

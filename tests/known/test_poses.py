@@ -87,53 +87,37 @@ def test_as_many_poses_as_frames_at_other_times_go_by_their_order(tmp_path, capl
         assert ("the times of only 1 of 3 are those of frames" in caplog.text) == warned
 
 
-def _not_rigid(poses):
-    poses[1, :3, :3] *= 1.1
-
-
-def _one_place(poses):
-    poses[:, :3, 3] = [3, 2, 1]
-
-
-def _far_away(poses):
-    poses[:, :3, 3] += [50_000, 58_000, 30]
-
-
-def _turning(poses):
-    poses[:, :3, :3] = Rotation.from_rotvec(np.arange(6)[:, None] * [0, 0, np.pi / 3]).as_matrix() @ poses[:, :3, :3]
-
-
-def _opengl(poses):
-    poses[:, :3, :3] *= [1, -1, -1]
-
-
-def _inverse(poses):
-    poses[:] = np.linalg.inv(poses)
+TURNING = Rotation.from_rotvec(np.arange(6)[:, None] * [0, 0, np.pi / 3]).as_matrix()
+PLACE, ROTATION, WHOLE = np.s_[:, :3, 3], np.s_[:, :3, :3], np.s_[:]
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("part", "change", "message"),
     [
-        (_not_rigid, "the camera pose of frame 1 is not a rotation"),
-        (_one_place, r"the 6 poses of .* are at one place, \[3.0, 2.0, 1.0\]"),
-        (_far_away, r"are at about \[5000\d.0, 58000.0, \d+.0\], too far from the origin for their motion"),
-        (_turning, r"differ from the predicted ones by \d+ degrees"),
-        (_opengl, r"differ from the predicted ones by 14 degrees .* 0.0 if read in OpenGL's axes"),
-        (_inverse, r"differ from the predicted ones by \d+ degrees .* 0.0 if read as camera-from-world"),
+        (ROTATION, lambda turns: 1.1 * turns, "the camera pose of frame 0 is not a rotation"),
+        (PLACE, lambda places: 0 * places + [3, 2, 1], r"the 6 poses of .* are at one place, \[3.0, 2.0, 1.0\]"),
+        (
+            PLACE,
+            lambda places: np.add(places, [50_000, 58_000, 30]),
+            r"at about \[5000\d.0, .*, too far from",
+        ),
+        (ROTATION, lambda turns: TURNING @ turns, r"differ from the predicted ones by \d+ degrees"),
+        (ROTATION, lambda turns: turns * [1, -1, -1], "by 14 degrees .* 0.0 if read in OpenGL's axes"),
+        (WHOLE, np.linalg.inv, r"by \d+ degrees .* 0.0 if read as camera-from-world"),
     ],
 )
-def test_poses_that_do_not_fit_are_refused(tmp_path, change, message):
+def test_poses_that_do_not_fit_are_refused(tmp_path, part, change, message):
     room = make_room(frames=6)
     poses = room.world_from_camera.copy()
-    change(poses)
+    poses[part] = change(poses[part])
     with pytest.raises(InputError, match=message):
         apply_known(room, read_known(KnownGeometry(poses=_kitti(tmp_path / "poses.txt", poses)), room))
 
 
-def test_another_number_of_poses_and_too_few_are_refused(tmp_path):
-    path = _kitti(tmp_path / "poses.txt", make_room(frames=6).world_from_camera)
-    with pytest.raises(InputError, match="6 poses and the clip 5 frames; expected a pose for every frame"):
-        apply_known(make_room(frames=5), read_known(KnownGeometry(poses=path), make_room(frames=5)))
-    path = _kitti(tmp_path / "poses.txt", make_room(frames=2).world_from_camera)
-    with pytest.raises(InputError, match="2 poses; expected at least 3"):
-        apply_known(make_room(frames=2), read_known(KnownGeometry(poses=path), make_room(frames=2)))
+@pytest.mark.parametrize(
+    ("frames", "poses", "words"), [(5, 6, "expected a pose for every frame"), (2, 2, "at least 3")]
+)
+def test_another_number_of_poses_and_too_few_are_refused(tmp_path, frames, poses, words):
+    path = _kitti(tmp_path / "poses.txt", make_room(poses).world_from_camera)
+    with pytest.raises(InputError, match=f"{poses} poses.*{words}"):
+        apply_known(make_room(frames), read_known(KnownGeometry(poses=path), make_room(frames)))
