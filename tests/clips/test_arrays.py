@@ -23,9 +23,8 @@ def test_depths():
 BLACK = np.zeros((4, 5, 3), np.uint8)
 
 
-@pytest.mark.parametrize(
-    ("arrays", "message"),
-    [
+def test_what_is_no_frame():
+    for arrays, message in (
         (np.full((1, 2, 2, 3), np.nan), "frame 000000 has values that are not finite"),
         (np.full((1, 2, 2, 3), 1.5), r"has values from 1.5 to 1.5; expected floating point in \[0, 1\]"),
         (np.ones((1, 2, 2, 3), int), "frame 000000 has values of type int64"),
@@ -33,11 +32,9 @@ BLACK = np.zeros((4, 5, 3), np.uint8)
         (BLACK[None][:0], "holds no frames"),
         ([BLACK, BLACK[..., 0]], r"frame 000001 has shape \(4, 5\)"),
         ([BLACK[:, :0]], "none empty"),
-    ],
-)
-def test_what_is_no_frame(arrays, message):
-    with pytest.raises(ClipError, match=message):
-        list(ArrayFrames.from_arrays(arrays).frames(Sampling()))
+    ):
+        with pytest.raises(ClipError, match=message):
+            list(ArrayFrames.from_arrays(arrays).frames(Sampling()))
 
 
 def test_frames_are_named_by_their_index_in_the_source():

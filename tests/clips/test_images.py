@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.clips.images import ImageFiles, read_image
-from vggtjax.clips.sampling import Sampling
+from vggtjax.clips.images import read_image
 from vggtjax.errors import ClipError
 
 RAMP = np.array([[0, 128, 129, 33023, 65535]], np.uint16)
@@ -48,6 +47,8 @@ def test_floating_point_and_more_than_sixteen_bits(tmp_path):
     deep = save(tmp_path / "deep.tif", Image.fromarray(np.array([[70000, 0]], np.int32)))
     with pytest.raises(ClipError, match=r"frame deep.tif has values from 0 to 70000; expected 16 bits"):
         read_image(deep)
+    signed = Image.fromarray(RAMP.astype(np.int32))
+    np.testing.assert_array_equal(pixels(save(tmp_path / "signed.tif", signed))[0, :, 0], RAMP_8)
     image = pixels(save(tmp_path / "float.tif", Image.fromarray(np.array([[0, 0.5, 1]], np.float32))))
     np.testing.assert_array_equal(image[..., 0], [[0, 128, 255]])
     path = save(tmp_path / "nan.tif", Image.fromarray(np.array([[np.nan, 0.5]], np.float32)))
@@ -91,14 +92,6 @@ def test_exif_orientation(tmp_path):
     assert turned.shape == (4, 2, 3)
     assert turned[0, 1].tolist() == [255, 255, 255]
     assert turned.sum() == 3 * 255
-
-
-def test_files_are_frames_named_by_their_stems(tmp_path):
-    paths = tuple(save(tmp_path / f"view.{i}.png", Image.new("RGB", (2, 2), (i, 0, 0))) for i in range(4))
-    frames = list(ImageFiles(paths).frames(Sampling(start=1, stride=2)))
-    assert [frame.name for frame in frames] == ["view.1", "view.3"]
-    assert [frame.image.getpixel((0, 0)) for frame in frames] == [(1, 0, 0), (3, 0, 0)]
-    assert ImageFiles(paths).total(Sampling(start=1, stride=2)) == 2
 
 
 @pytest.mark.parametrize(("ending", "kept"), [("png", 0.6), ("jpg", 0.6), ("tif", 0.6), ("webp", 0.6), ("png", 0)])

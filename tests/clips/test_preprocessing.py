@@ -42,29 +42,25 @@ def test_pad_puts_the_odd_rest_below():
 
 
 @given(
-    width=st.integers(20, 400),
-    height=st.integers(20, 400),
+    sides=st.tuples(st.integers(20, 400), st.integers(20, 400)),
     patches=st.integers(8, 20),
     patch=st.integers(1, 16),
     mode=st.sampled_from(["crop", "pad"]),
 )
-def test_every_fit(width, height, patches, patch, mode):
+def test_every_fit(sides, patches, patch, mode):
     size = patches * patch
-    if round(min(width, height) * size / max(width, height) / patch) < 1:
+    if round(min(sides) * size / max(sides) / patch) < 1:
         return
-    fit = Fitter(mode, size, patch).fit(width, height, "a")
+    fit = Fitter(mode, size, patch).fit(*sides, "a")
     left, top, right, bottom = fit.box
     assert fit.frame_size[0] == size
     assert fit.frame_size[1] <= size if mode == "crop" else fit.frame_size[1] == size
-    assert 0 <= left < right <= fit.frame_size[0]
-    assert 0 <= top < bottom <= fit.frame_size[1]
     assert (right - left) % patch == 0 == (bottom - top) % patch
-    for edges, scale, offset, extent in zip(
-        ((left, right), (top, bottom)), fit.scale, fit.offset, (width, height), strict=True
-    ):
-        first, last = (scale * edge + offset for edge in edges)
-        assert -1e-9 <= first < last <= extent + 1e-9
-        assert np.isclose(first + last, extent, atol=scale)  # centred, up to one pixel of an odd rest
+    for axis, (first, last) in enumerate(((left, right), (top, bottom))):
+        assert 0 <= first < last <= fit.frame_size[axis]
+        first, last = (fit.scale[axis] * edge + fit.offset[axis] for edge in (first, last))
+        assert -1e-9 <= first < last <= sides[axis] + 1e-9
+        assert np.isclose(first + last, sides[axis], atol=fit.scale[axis])  # centred, up to a pixel of an odd rest
 
 
 def test_pictures_that_do_not_fit():

@@ -45,13 +45,8 @@ def test_folder(folder):
     assert names(open_source(folder)) == ordered
     assert names(open_source(str(folder))) == ordered
     assert names(open_source(f"{folder}/*")) == ordered
+    assert names(open_source([folder / "frame_10.png", str(folder / "frame_2.png")])) == [ordered[2], ordered[1]]
     assert names(open_source(f"{folder.parent}/**/frame_*.png")) == ordered[1:]
-
-
-def test_relative_paths_become_absolute(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    assert names(open_source(".")) == ["frame_1.JPG", "frame_2.png", "frame_10.png"]
-    assert names(open_source("frame_?.*")) == ["frame_1.JPG", "frame_2.png"]
 
 
 def test_single_files(folder):
@@ -69,17 +64,13 @@ def test_single_files(folder):
 def test_a_folder_without_images_says_what_it_holds(tmp_path):
     with pytest.raises(ClipError, match="holds no images; name the folder"):
         open_source(tmp_path)
-    for name in ("b10", "b9"):
-        (tmp_path / name).mkdir()
+    (tmp_path / "b10").mkdir()
     for name in ("a.mp4", "x.txt", "y.txt"):
         (tmp_path / name).touch()
-    message = r"no images, but 2 folders \(b9, b10\) and 1 video \(a.mp4\) and 2 other files \(x.txt, y.txt\)"
-    with pytest.raises(ClipError, match=message):
+    with pytest.raises(ClipError, match=r"1 folder \(b10\) and 1 video \(a.mp4\) and 2 other files \(x.txt, y.txt\)"):
         open_source(tmp_path)
     with pytest.raises(ClipError, match=r"matches no images, but 1 video \(a.mp4\)"):
         open_source(f"{tmp_path}/*.mp4")
-    with pytest.raises(ClipError, match="matches no images; expected"):
-        open_source(f"{tmp_path}/*.png")
 
 
 @pytest.mark.parametrize(
@@ -89,6 +80,7 @@ def test_a_folder_without_images_says_what_it_holds(tmp_path):
         ("https://example.org/clip.mp4?x=1", r"https://example.org/clip.mp4\?x=1 is a URL; download the file first"),
         ("x" * 5000, "cannot read x+.*: File name too long"),
         ([], "the list of frames is empty"),
+        (["missing.png"], "image missing.png does not exist"),
         (["a.png", np.zeros((1, 1, 3))], "holds ndarray, str; expected image paths only, or arrays only"),
         (b"frames", "of type bytes"),
         ("/dev/null", "is a pipe, a socket or a device; expected a file"),

@@ -50,13 +50,8 @@ def test_intrinsics_follow_the_pixels():
 
 
 def test_truth_gets_a_batch_axis_and_is_checked():
-    truth = Truth(
-        images=np.zeros((2, 4, 6, 3)),
-        depth=np.ones((2, 4, 6)),
-        dynamic_mask=np.zeros((2, 4, 6), bool),
-        camera_from_world=np.zeros((2, 3, 4)),
-        intrinsics=np.zeros((2, 3, 3)),
-    )
+    maps = np.zeros((2, 4, 6, 3)), np.ones((2, 4, 6)), np.zeros((2, 4, 6), bool)
+    truth = Truth(*maps, np.zeros((2, 3, 4)), np.zeros((2, 3, 3)))
     batch = batched_truth(truth)
     assert [array.shape[:2] for array in batch] == [(1, 2)] * 5
     assert batched_truth(batch).depth.shape == (1, 2, 4, 6)
