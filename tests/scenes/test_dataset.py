@@ -14,7 +14,7 @@ from vggtjax.errors import InputError, OutputError
 from vggtjax.evaluation.datasets import find_sequences
 from vggtjax.scenes import SceneConfig, dataset, generate
 from vggtjax.scenes.dataset import read_index, write_scenes
-from vggtjax.scenes.sheet import color_flow, color_parts
+from vggtjax.scenes.sheet import color_flow, draw_sheet
 from vggtjax.storage.trajectories import read_trajectory
 
 S, H, W = 3, 24, 32
@@ -101,15 +101,11 @@ def test_every_file_says_what_the_renderer_said(written):
 
 def test_the_preview_shows_every_scene(written):
     with Image.open(written / "preview.png") as picture:
-        assert picture.mode == "RGB"
-        width, height = picture.size
-    assert width > 7 * 200
-    assert height > 2 * 190
-    parts = color_parts(np.array([[0, 1, 2, 1]]))
-    assert (parts[0, 1] == parts[0, 3]).all()
+        assert picture.size[1] > 2 * 190
+        assert draw_sheet([written / "scene_0000"], "one scene").size[1] < picture.size[1] - 190
     flow = np.zeros((1, 3, 3))
     flow[0, 1], flow[0, 2] = (2, 0, -1), (-2, 0, 0)
-    assert color_flow(flow).tolist() == [[list(parts[0, 0]), [255, 128, 64], [0, 128, 128]]]
+    assert color_flow(flow)[:, 1:].tolist() == [[[255, 128, 64], [0, 128, 128]]]
 
 
 def test_a_set_goes_on_where_it_stopped(written, tmp_path, monkeypatch):
@@ -138,39 +134,33 @@ def test_a_set_goes_on_where_it_stopped(written, tmp_path, monkeypatch):
     assert files(out) == files(written)  # as if it had never stopped
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
+def test_sets_of_other_settings_are_not_mixed(written):
+    for changes, says in (
         ({"seed": 4}, "holds scenes with seed 3 instead of 4; choose another folder"),
         ({"config": dataclasses.replace(CONFIG, width=40)}, "with width of config 32 instead of 40; choose"),
         ({"config": dataclasses.replace(CONFIG, roll=9)}, "with roll of config 0.0 instead of 9.0; choose"),
-    ],
-)
-def test_sets_of_other_settings_are_not_mixed(written, changes, says):
-    before = files(written)
-    with pytest.raises(InputError, match=says):
-        write_scenes(written, **({"config": CONFIG, "count": 3, "seed": 3} | changes))
-    assert files(written) == before
+    ):
+        before = files(written)
+        with pytest.raises(InputError, match=says):
+            write_scenes(written, **({"config": CONFIG, "count": 3, "seed": 3} | changes))
+        assert files(written) == before
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
+def test_bad_input_is_one_sentence_before_anything_is_drawn(tmp_path, monkeypatch):
+    for changes, says in (
         ({"count": 0}, "count is 0; expected a whole number from 1 to 10000"),
         ({"split": "validation"}, "split is 'validation'; expected one of"),
         ({"seed": 2**31}, "seed is 2147483648"),
         ({"images": Images(shutter=0.5)}, "shutter is 0.5 with 1 exposures; motion blur needs"),
-    ],
-)
-def test_bad_input_is_one_sentence_before_anything_is_drawn(tmp_path, monkeypatch, changes, says):
-    monkeypatch.setattr(dataset, "_draw", None)
-    with pytest.raises(InputError, match=says):
-        scenes(tmp_path / "set", **changes)
-    assert not (tmp_path / "set").exists()
+    ):
+        monkeypatch.setattr(dataset, "_draw", None)
+        with pytest.raises(InputError, match=says):
+            scenes(tmp_path / "set", **changes)
+        assert not (tmp_path / "set").exists()
 
 
 def test_other_peoples_files_are_not_touched(tmp_path, monkeypatch):
-    monkeypatch.setattr(dataset, "_draw", None)
+    monkeypatch.setattr(dataset, "load_textures", lambda split: None)
     (tmp_path / "scene_0004").mkdir()
     with pytest.raises(OutputError, match=r"scene_0004 exists without index.json beside it"):
         write_scenes(tmp_path, CONFIG, count=1)
@@ -184,7 +174,3 @@ def test_other_peoples_files_are_not_touched(tmp_path, monkeypatch):
         with pytest.raises(InputError, match=says):
             write_scenes(tmp_path, CONFIG, count=1)
         assert (tmp_path / "index.json").read_text() == text
-    with pytest.raises(OutputError, match="cannot write"):
-        write_scenes(tmp_path / "index.json", CONFIG, count=1)
-    with pytest.raises(InputError, match=r"cannot read .*index.json"):
-        read_index(tmp_path / "scene_0004")

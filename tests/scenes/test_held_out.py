@@ -117,19 +117,17 @@ def test_hardness_by_hand():
         assert not still.kept("dynamic").any()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
+def test_bad_input_is_one_sentence():
+    for arguments, says in (
         (("moving",), "kind of scenes is 'moving'; expected one of"),
         (("static", 0), "count of scenes is 0; expected a whole number of at least 1"),
         (("dynamic", 2, SceneConfig(frames=11)), "test scenes have 11 frames; expected at least 12"),
-    ],
-)
-def test_bad_input_is_one_sentence(arguments, says):
-    with pytest.raises(InputError, match=says):
-        held_out_scenes(*arguments)
+    ):
+        with pytest.raises(InputError, match=says):
+            held_out_scenes(*arguments)
 
 
+@pytest.mark.proof
 def test_frozen_scenes_are_twins_of_those_that_move():
     config = SceneConfig(height=24, width=24, frames=12, noise=0.0)
     moving = held_out_scenes("dynamic", 2, config)

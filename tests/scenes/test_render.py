@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.generated import DYNAMIC, QUICK, STATIC, clips, gauge, keys, scenes, textures
-from vggtjax.scenes import cast, generate, sample_scene
+from vggtjax.scenes import cast, sample_scene
 from vggtjax.scenes.scene import camera_pose, part_poses
 
 COUNT = 6
@@ -205,21 +205,15 @@ def test_a_tilted_camera_turns_on_the_spot(change, axis, least, most):
 
     (level, before), (tilted, after) = jax.device_get(jax.jit(jax.vmap(poses), compiler_options=QUICK)(keys(200)))
     np.testing.assert_array_equal(before, after)
-    turned = np.einsum("ntij,ntik->ntjk", level, tilted)  # axes of the tilted camera in the level one
-    if "roll" in change:
-        np.testing.assert_allclose(turned[..., 2, 2], 1, atol=1e-5)
-    cosine, falls = turned[..., axis, axis], tilted[..., 1, axis] > level[..., 1, axis]
+    cosine = np.einsum("nti,nti->nt", level[..., axis], tilted[..., axis])
+    falls = tilted[..., 1, axis] > level[..., 1, axis]
     angle = np.where(falls, 1, -1) * np.degrees(np.arccos(cosine.clip(-1, 1)))
     assert np.ptp(angle, axis=1).max() < 0.1
     assert least - 0.1 < angle.min() < least + 3
     assert most - 3 < angle.max() < most + 0.1
 
 
-def test_a_key_has_one_clip_whatever_the_batch(dynamic):
-    alone = jax.jit(generate, static_argnums=2, compiler_options=QUICK)(keys(COUNT)[2], textures(), DYNAMIC)
-    same_clip(jax.device_get(alone), jax.tree.map(lambda leaf: leaf[2], dynamic))
-
-
+@pytest.mark.proof
 def test_samples_and_exposures_change_images_only(dynamic):
     blurred = clips(dataclasses.replace(DYNAMIC, samples=2, shutter=0.5, exposures=2), 2)
     sharp = jax.tree.map(lambda leaf: leaf[:2], dynamic)

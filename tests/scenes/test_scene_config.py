@@ -4,9 +4,8 @@ from vggtjax.errors import InputError
 from vggtjax.scenes import SceneConfig
 
 
-@pytest.mark.parametrize(
-    ("changes", "says"),
-    [
+def test_bad_values_are_one_sentence():
+    for changes, says in (
         ({"height": 7}, "height is 7; expected a whole number of at least 8 and at most 2048"),
         ({"width": 64.0}, "width is 64.0"),
         ({"dynamic": 1.5}, "dynamic is 1.5; expected a number of at least 0 and at most 1"),
@@ -17,11 +16,9 @@ from vggtjax.scenes import SceneConfig
         ({"pitch": (0.0, 90.0)}, r"pitch\[1\] is 90.0; expected a number of at least -60 and at most 60"),
         ({"motion": [[10**400], 1]}, r"motion\[0\]\[0\] is a number of more than 64 bits"),
         ({"frozen": [[]]}, r"frozen is \[\[\]\]; expected true or false"),
-    ],
-)
-def test_bad_values_are_one_sentence(changes, says):
-    with pytest.raises(InputError, match=says):
-        SceneConfig(**changes)
+    ):
+        with pytest.raises(InputError, match=says):
+            SceneConfig(**changes)
 
 
 def test_lists_become_tuples_so_that_a_config_is_static_under_jit():
