@@ -17,9 +17,9 @@ SAVINGS = [Saving(resolution="original", format="vggt4d"), Saving(only=("clouds"
 @pytest.mark.parametrize("saving", SAVINGS)
 def test_the_forecast_is_right_within_a_factor_of_two(tmp_path, saving):
     random = np.random.default_rng(0)
-    noise = random.integers(0, 60, (4, 224, 308, 3))
-    plain = make_room(4, 224, 308)
-    room = make_room(4, 224, 308, images=(plain.images // 2 + noise).astype(np.uint8))
+    noise = random.integers(0, 60, (2, 224, 308, 3))
+    plain = make_room(2, 224, 308)
+    room = make_room(2, 224, 308, images=(plain.images // 2 + noise).astype(np.uint8))
     room.save(tmp_path, saving=saving)
     written = sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file())
     assert 0.5 < forecast_bytes(room.depth.shape, room.source_size, saving) / written < 2
@@ -33,14 +33,12 @@ def test_too_little_space_is_said_before_anything_is_written(tmp_path, monkeypat
     assert not (tmp_path / "new").exists()
 
 
-def test_large_results_are_announced(tmp_path, caplog):
+def test_large_results_are_announced(tmp_path, caplog, monkeypatch):
     caplog.set_level(logging.INFO)
+    monkeypatch.setattr(disk, "_free", lambda _: 2e9)
     announce(tmp_path / "missing", 1e6)
     assert not caplog.text
-    free = disk._free(tmp_path)
-    if free is None or free < 1.5e9:
-        pytest.skip("this disk is full")
     announce(tmp_path / "missing", 1.5e9)
     assert "will take about 1.5 GB; the disk has" in caplog.text
     with pytest.raises(OutputError):
-        check_space(tmp_path / "missing", free + 1e12)
+        check_space(tmp_path / "missing", 3e9)

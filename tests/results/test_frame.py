@@ -36,22 +36,15 @@ CASES = [((160, 90), "crop"), ((90, 160), "pad"), ((30, 40), "crop")]
 
 
 @pytest.mark.parametrize(("size", "mode"), CASES)
-def test_points_project_to_the_same_pixels_through_both(size, mode):
-    clip = load_clip(np.zeros((2, *size, 3), np.uint8), size=56, mode=mode)
-    result = result_of(clip)
-    frame = frame_of(result, 1, "original")
-    points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], size=(50, 3))
-    local = points @ result.camera_from_world[1, :, :3].T + result.camera_from_world[1, :, 3]
-    small, large = ((local @ K.T)[:, :2] / local[:, 2:] for K in (result.intrinsics[1].astype(float), frame.intrinsics))
-    assert np.abs(clip.to_source(1, small) - large).max() < 1e-4
-
-
-@pytest.mark.parametrize(("size", "mode"), CASES)
 def test_depth_and_masks_lie_where_they_belong(size, mode):
     clip = load_clip(np.zeros((2, *size, 3), np.uint8), size=56, mode=mode)
     result = result_of(clip)
     frame = frame_of(result, 0, "original")
     assert frame.depth.shape == frame.dynamic_mask.shape == frame.seen.shape == size
+    points = np.random.default_rng(0).uniform([-1, -1, 3], [1, 1, 5], size=(50, 3))
+    local = points @ result.camera_from_world[0, :, :3].T + result.camera_from_world[0, :, 3]
+    small, large = ((local @ K.T)[:, :2] / local[:, 2:] for K in (result.intrinsics[0].astype(float), frame.intrinsics))
+    assert np.abs(clip.to_source(0, small) - large).max() < 1e-4
     y, x = np.nonzero(frame.seen)
     places = clip.from_source(0, np.stack([x + 0.5, y + 0.5], axis=-1))
     left, top, right, bottom = clip.valid_box[0]
@@ -99,13 +92,9 @@ def test_valid_pixels_by_hand():
 
 def test_pictures_are_those_of_the_source_or_else_enlarged():
     picture = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8).repeat(5, axis=0).repeat(5, axis=1)
-    clip = load_clip(picture[None], size=112)
-    result = result_of(clip)
-    given = next(clip.pictures())
-    np.testing.assert_array_equal(given, picture)
-    assert frame_of(result, 0, "original", picture=given).image is given
+    result = result_of(load_clip(picture[None], size=112))
+    assert frame_of(result, 0, "original", picture=picture).image is picture
     enlarged = frame_of(result, 0, "original").image.astype(float)
-    assert np.corrcoef(enlarged.ravel(), picture.ravel())[0, 1] > 0.9
     for shift in (-3, 3):  # where it belongs, to a pixel or so
         assert abs(np.roll(enlarged, shift, axis=1) - picture).mean() > abs(enlarged - picture).mean()
     with pytest.raises(InputError, match=r"frame 0 is uint8 \(30, 40, 3\); expected uint8 \(150, 200, 3\)"):

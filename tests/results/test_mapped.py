@@ -10,7 +10,7 @@ from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage import arrays as stored
 from vggtjax.storage.arrays import is_mapped, spread_frames, zeros_beside
 
-FRAMES = 12
+FRAMES = 6
 LARGE = ("depth", "depth_confidence", "dynamic_mask", "images", "saliency")
 
 

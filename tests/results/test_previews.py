@@ -5,24 +5,6 @@ from tests.room import make_room
 from vggtjax.results import previews
 
 
-def test_range_by_hand():
-    depth = np.array([[[1, 2, 4]]], np.float32)
-    far, near = previews.inverse_depth_range(depth, np.ones((1, 1, 3), bool))
-    # Of 0.25, 0.5, 1 the 2nd percentile lies 0.04 of the way from the first to the second.
-    assert (far, near) == pytest.approx((0.26, 0.98))
-    assert previews.inverse_depth_range(depth, depth < 2) == (1, 1)
-    assert previews.inverse_depth_range(depth, depth < 0) == (0, 1)
-
-
-def test_near_is_warm_far_is_cold_and_none_is_grey():
-    depth = np.array([[1, 5, 1000, np.inf]], np.float32)
-    near, middle, far, none = previews.color_depth(depth, np.isfinite(depth), (0.0, 0.4))[0].astype(int)
-    assert near[0] > near[2] + 80
-    assert middle[1] > 200
-    assert far[2] >= far[0]
-    assert none.max() - none.min() < 10
-
-
 def test_overlay_by_hand():
     image = np.full((9, 9, 3), (30, 60, 90), np.uint8)
     mask = np.zeros((9, 9), bool)

@@ -151,10 +151,4 @@ def test_files_that_are_cut_off_or_absent(stored, tmp_path):
     path.unlink()
     with pytest.raises(ResultError, match=r"there is no .*reconstruction\.npz; give the folder"):
         Reconstruction.load(tmp_path)
-
-
-def test_is_result(stored, tmp_path):
-    assert is_result(stored(format_version=np.array(2)))
-    assert not is_result(stored(depth=None))
-    assert not is_result(tmp_path / "absent")
-    assert not is_result(tmp_path)
+    assert not is_result(path)

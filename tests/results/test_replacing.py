@@ -58,14 +58,10 @@ def test_what_fails_leaves_nothing_behind(tmp_path):
     with pytest.raises(InputError, match="confidence_percentile is 100"):
         make_room(1).save(tmp_path, confidence_percentile=100)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_folder_that_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"cannot write .*file: .*file is a file; choose"):
-        make_room(1).save(tmp_path / "file")
-    with pytest.raises(OutputError, match=r"below: .*file is a file"):
-        make_room(1).save(tmp_path / "file" / "below")
+    for folder in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(OutputError, match=r"cannot write .*file is a file"):
+            make_room(1).save(folder)
 
 
 def test_what_is_no_longer_written_goes_away_as_a_whole(tmp_path):
@@ -118,3 +114,10 @@ def test_links_are_replaced_and_not_followed(tmp_path):
     make_room(2).save(tmp_path / "result")
     assert set(files(elsewhere)) == {"000000.ply"}
     assert set(files(tmp_path / "result")) == expected_files(2)
+
+
+def test_values_out_of_range():
+    for changes in ({"confidence_percentile": float("nan")}, {"resolution": "full"}, {"format": "cut3r"}):
+        with pytest.raises(InputError, match=f"{next(iter(changes))} is .*; expected"):
+            Saving().changed(**changes)
+    assert Saving(5).changed(layout="vggt4d", resolution="original") == Saving(5, "original", "vggt4d")
