@@ -47,14 +47,15 @@ def test_vggt4d_does_as_load_clip(width, height):
 
 
 @pytest.mark.parametrize(
-    ("picture", "frame", "scale", "offset"),
+    ("layout", "picture", "frame", "scale", "offset"),
     [
-        ((1000, 600), (512, 304), 1000 / 512, (0, 1 * 600 / 307)),  # 307 rows, of which 304 about the middle
-        ((1024, 1024), (512, 384), 2, (0, 2 * 64)),  # squares are cut to 4 : 3
+        ("da3", (1920, 1080), (504, 280), (1920 / 504, 1080 / 280), (0, 0)),  # stretches
+        ("monst3r", (1000, 600), (512, 304), 1000 / 512, (0, 1 * 600 / 307)),  # 307 rows, of which 304 about the middle
+        ("monst3r", (1024, 1024), (512, 384), 2, (0, 2 * 64)),  # squares are cut to 4 : 3
     ],
 )
-def test_monst3r_cuts_about_the_middle(picture, frame, scale, offset):
-    made = placed(of_size(*frame), "monst3r", [picture] * 2, ["a", "b"])
+def test_others_cut_about_the_middle_or_stretch(layout, picture, frame, scale, offset):
+    made = placed(of_size(*frame), layout, [picture] * 2, ["a", "b"])
     np.testing.assert_allclose(made.source_scale[0], scale, rtol=2e-3)
     np.testing.assert_allclose(made.source_offset[0], offset, atol=1e-9)
 
@@ -68,9 +69,3 @@ def test_frames_of_the_pictures_own_size_are_those_and_others_are_refused(layout
         placed(of_size(518, 294), layout, [(480, 854)] * 2, ["a", "b"])
     with pytest.raises(InputError, match="the result has 2 frames, the sequence 3; expected equal numbers"):
         placed(of_size(512, 384), layout, [(640, 480)] * 3, ["a", "b", "c"])
-
-
-def test_depth_anything_3_stretches():
-    made = placed(of_size(504, 280), "da3", [(1920, 1080)] * 2, ["a", "b"])
-    np.testing.assert_allclose(made.source_scale[0], [1920 / 504, 1080 / 280])
-    assert not made.source_offset.any()

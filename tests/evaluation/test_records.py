@@ -37,9 +37,7 @@ def test_what_is_finished_is_not_done_again(tmp_path, three):
     assert again.calls == [
         ("a", ("vggt4d",)), ("b", ("vggt", "4dvggt-d")), ("b", ("vggt4d",)), ("../c <i>", ("vggt4d",)),
     ]  # fmt: skip
-    assert [r.status for r in after] == ["ok"] * 9
-    assert [r.method for r in after[:3]] == ["vggt", "4dvggt-d", "vggt4d"]
-    assert after[0].metrics == records[0].metrics
+    assert [(r.status, r.method) for r in after] == 3 * [("ok", "vggt"), ("ok", "4dvggt-d"), ("ok", "vggt4d")]
 
 
 def test_a_killed_run_leaves_nothing_that_stops_the_next_one(tmp_path, monkeypatch):
@@ -179,9 +177,7 @@ def test_all_files_of_a_report(tmp_path, three):
     assert values["mean"]["vggt"]["j_mean"] == 1
     page = (out / "index.html").read_text()
     assert "<i>" not in page
-    assert "../c &lt;i&gt;" in page
-    assert "&lt;b&gt;mind" in page
-    assert "b cannot be read" in page
+    assert all(words in page for words in ("../c &lt;i&gt;", "&lt;b&gt;mind", "b cannot be read"))
     for picture in ("paths", "depth", "masks", "distances", "calibration"):
         assert (out / f"plots/a/{picture}.png").stat().st_size > 2000
         assert f"plots/a/{picture}.png" in page

@@ -9,7 +9,6 @@ from tests.dataset_files import camera_json, cameras_bin, images_bin, npy, opene
 from vggtjax.errors import InputError
 
 FRAMES = 25
-HALF = 0.5**0.5
 
 
 def disparity(frame):
@@ -39,7 +38,7 @@ def dycheck_folder(folder, frames=FRAMES):
     # PINHOLE is model 1: fx fy cx cy, of pictures of twice the size
     write(extra / "colmap" / "sparse" / "cameras.bin", cameras_bin([(1, 1, 8, 6, [16.0, 18.0, 4.5, 3.5])]))
     # in no order, a point list of another length each, as COLMAP leaves them
-    images = [(i + 1, (HALF, 0, HALF, 0), (i, 2.0, 3.0), 1, f"{name}.png") for i, name in enumerate(names)]
+    images = [(i + 1, (0.5**0.5, 0, 0.5**0.5, 0), (i, 2.0, 3.0), 1, f"{name}.png") for i, name in enumerate(names)]
     write(extra / "colmap" / "sparse" / "images.bin", images_bin(images[::-1]))
     return folder
 
@@ -64,21 +63,21 @@ def test_easi3r(tmp_path):
 
 def test_the_cut_of_easi3r_is_the_lower_median_over_all_frames(tmp_path):
     dycheck_folder(tmp_path / "apple", frames=12)  # six frames of 2 metres at most, six of 4
-    path = tmp_path / "apple" / "flow3d_preprocessed" / "aligned_depth_anything_colmap" / "1x" / "0_00000.npy"
-    write(path, npy(np.full((3, 4), -1, np.float32)))  # 1 / 1e-3, so the order is 2 2 2 2 2 4 4 4 4 4 4 1000
-    (sequence,) = opened("dycheck", tmp_path)
-    assert np.allclose(sequence.depth(0), 2.5 * 4)
-    write(path, npy(np.full((3, 4), 1, np.float32)))  # 1 2 2 2 2 2 | 4 4 4 4 4 4
-    write(path.with_name("0_00010.npy"), npy(np.full((3, 4), 0, np.float32)))  # 1 2 2 2 2 | 4 4 ... 1000
-    assert np.allclose(opened("dycheck", tmp_path)[0].depth(1), 2.5 * 4)
-    write(path.with_name("0_00001.npy"), npy(np.full((3, 4), 1, np.float32)))  # 1 1 2 2 2 2 | 4 4 4 4 4 1000
-    assert np.allclose(opened("dycheck", tmp_path)[0].depth(1), 2.5 * 2)
-    write(path, npy(np.full((3, 4), np.nan, np.float32)))
+    folder = tmp_path / "apple" / "flow3d_preprocessed" / "aligned_depth_anything_colmap" / "1x"
+
+    def depth(frame, **disparities):
+        for name, value in disparities.items():
+            write(folder / f"0_000{name[1:]}.npy", npy(np.full((3, 4), value, np.float32)))
+        return opened("dycheck", tmp_path)[0].depth(frame)
+
+    assert np.allclose(depth(0, f00=-1), 2.5 * 4)  # 1 / 1e-3, so the order is 2 2 2 2 2 4 4 4 4 4 4 1000
+    assert np.allclose(depth(1, f00=1, f10=0), 2.5 * 4)  # 1 2 2 2 2 | 4 4 ... 1000
+    assert np.allclose(depth(1, f01=1), 2.5 * 2)  # 1 1 2 2 2 2 | 4 4 4 4 4 1000
     with pytest.raises(InputError, match=r"0_00000\.npy has values that are not finite"):
-        opened("dycheck", tmp_path)[0].depth(1)  # the cut is over all frames
-    write(path, npy(np.ones((4, 3), np.float32)))
+        depth(1, f00=np.nan)  # the cut is over all frames
+    write(folder / "0_00000.npy", npy(np.ones((4, 3), np.float32)))
     with pytest.raises(InputError, match=r"0_00000\.npy has shape \(4, 3\)"):
-        opened("dycheck", tmp_path)[0].depth(0)
+        depth(0)
 
 
 def test_lidar(tmp_path):
@@ -117,14 +116,11 @@ def test_what_is_missing_is_noted_and_never_taken_from_the_other_truth(tmp_path)
         "apple: 1 of 3 frames have no depth, 0_00010 first",
         "apple: it has no flow3d_preprocessed/colmap/sparse/images.bin, so no cameras",
     )
+    write(extra / "colmap" / "sparse" / "images.bin", images_bin([(1, (1, 0, 0, 0), (0, 0, 0), 1, "0_00000.png")]))
+    assert "apple: 2 of 3 frames are not in" in opened("dycheck", folder)[0].notes[-1]
     (sequence,) = opened("dycheck", folder, gt="lidar")
     assert sequence.world_from_camera is None
     assert sequence.notes[2:] == ("apple: 1 of 3 frames have no camera, 0_00020 first; no cameras",)
-    images = [(1, (1, 0, 0, 0), (0, 0, 0), 1, "0_00000.png")]
-    write(extra / "colmap" / "sparse" / "images.bin", images_bin(images))
-    (sequence,) = opened("dycheck", folder)
-    assert sequence.world_from_camera is None
-    assert "apple: 2 of 3 frames are not in flow3d_preprocessed/colmap/sparse, 0_00010" in sequence.notes[-1]
 
 
 SPLIT, CAMERA = "splits/train.json", "camera/0_00000.json"

@@ -60,7 +60,7 @@ def test_takes_split_where_the_camera_jumps(tmp_path):
     x = np.array([0, 0, 0, 0, 1, 2, 3, 3, 3, 3, 30, 31])  # pauses, steps of 1, a jump of 27
     assert takes(np.outer(x, [1, 0, 0])) == [range(10), range(10, 12)]
     assert takes(np.zeros((4, 3))) == [range(4)]
-    poses = [f"1 0 0 {x} 0 1 0 0 0 0 1 0 0 0 0 1" for x in (0, 0.1, 0.2, 9, 9.1)]
+    poses = [f"1 0 0 {x} 0 1 0 0 0 0 1 0" for x in (0, 0.1, 0.2, 9, 9.1)]
     folder = plain_folder(tmp_path / "walk", frames=5, poses=poses)
     first, second = opened("hololens", folder)
     assert (first.name, len(first)) == ("walk 0-2", 3)
@@ -71,10 +71,8 @@ def test_takes_split_where_the_camera_jumps(tmp_path):
 
 def test_what_is_missing_is_noted(tmp_path):
     folder = plain_folder(tmp_path / "clip")
-    (folder / "depth" / "01.png").unlink()
-    (folder / "mask" / "02.png").unlink()
-    (folder / "K.txt").unlink()
-    (folder / "world_from_camera.txt").unlink()
+    for name in ("depth/01.png", "mask/02.png", "K.txt", "world_from_camera.txt"):
+        (folder / name).unlink()
     (sequence,) = opened("plain", folder)
     assert sequence.notes == (
         "clip: 1 of 3 frames have no depth, 01 first",
@@ -117,21 +115,18 @@ def test_one_bad_sequence_does_not_hide_the_others(tmp_path):
         find_sequences("tum", tmp_path)["far"]()
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "message"),
-    [
+def test_arguments_that_cannot_work(tmp_path):
+    for name, options, message in (
         ("imagenet", {}, "'imagenet' is not known; expected one of plain, composite"),
         ("plain", {"sequences": ["clip", "other"]}, r"'other' of plain is not in .*; it has clip"),
         ("plain", {"sequences": ["clip", "clip"]}, "each once"),
         ("plain", {"sequences": []}, "at least one name"),
         ("plain", {"gt": "lidar"}, "gt is 'lidar'; plain has one ground truth"),
         ("dycheck", {"gt": "colmap"}, "gt is 'colmap'; dycheck has easi3r and lidar"),
-    ],
-)
-def test_arguments_that_cannot_work(tmp_path, name, options, message):
-    plain_folder(tmp_path / "clip")
-    with pytest.raises(InputError, match=message):
-        opened(name, tmp_path, **options)
+    ):
+        plain_folder(tmp_path / "clip")
+        with pytest.raises(InputError, match=message):
+            opened(name, tmp_path, **options)
 
 
 @pytest.mark.parametrize("name", DATASETS)
@@ -140,6 +135,9 @@ def test_an_empty_folder_is_refused(tmp_path, name):
         opened(name, tmp_path)
     with pytest.raises(InputError, match="is not a folder"):
         opened(name, tmp_path / "nowhere")
+    (tmp_path / "rgb").mkdir()
+    with pytest.raises(InputError, match="holds no "):
+        opened("plain", tmp_path)
 
 
 def davis_folder(root, *names, frames=2):

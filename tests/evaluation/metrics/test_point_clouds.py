@@ -18,22 +18,13 @@ TRUTH = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]])
 PREDICTED = np.array([[0, 0, 1], [0, 3, 4], [2, 0, 0], [2, 0, 0.5]])
 
 
-def clouds(seed, counts, kind):
-    generator = np.random.default_rng(seed)
-    return [generator.normal(size=(count, 3)).astype(kind) for count in counts]
-
-
-def unit_vectors(generator, count) -> np.ndarray:
-    vectors = generator.normal(size=(count, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
 def test_accuracy_completeness_and_distance_by_hand():
     errors = point_cloud_errors(PREDICTED, TRUTH)
     assert errors.accuracy == pytest.approx(((1 + 5 + 0 + 0.5) / 4, 0.75))  # median of 0, 0.5, 1, 5
     assert errors.completeness == pytest.approx(((1 + 1 + 0) / 3, 1))  # (1, 0, 0) is nearest to (2, 0, 0)
     assert errors.distance_chamfer == pytest.approx((np.mean([errors.accuracy[0], errors.completeness[0]]), 0.875))
     assert errors.normal_consistency is None
+    assert paired_distance(PREDICTED[:3], TRUTH) == pytest.approx(((1 + np.sqrt(26) + 0) / 3, 1))
 
 
 def test_the_distances_behind_accuracy_by_hand(monkeypatch):
@@ -57,29 +48,20 @@ def test_normal_consistency_by_hand():
     assert errors.normal_consistency == pytest.approx((1 + 1 / 3) / 2)  # the two directions weigh alike
 
 
-def test_paired_distance_by_hand():
-    assert paired_distance(PREDICTED[:3], TRUTH) == pytest.approx(((1 + np.sqrt(26) + 0) / 3, 1))
-
-
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 def test_another_librarys_neighbours_give_the_same(monkeypatch, kind):
     monkeypatch.setattr(point_clouds, "_CHUNK", 170)  # several chunks, the last one not full
-    predicted, truth = clouds(0, (700, 900), kind)
-    truth[100:400] = truth[:300]  # points that coincide
     generator = np.random.default_rng(0)
-    normals = unit_vectors(generator, 700), unit_vectors(generator, 900)
-    normals[1][100:400] = normals[1][:300]
-    errors = point_cloud_errors(predicted, truth, normals=normals)
-    consistency = []
-    for source, target, ours, theirs, found in (
-        (predicted, truth, *normals, errors.accuracy),
-        (truth, predicted, *normals[::-1], errors.completeness),
-    ):
-        distances, nearest = NearestNeighbors(n_neighbors=1, algorithm="brute").fit(target).kneighbors(source)
-        assert found == pytest.approx((distances.mean(), np.median(distances)), rel=1e-4)
+    clouds = [generator.normal(size=(count, 3)).astype(kind) for count in (700, 900)]
+    clouds[1][100:400] = clouds[1][:300]  # points that coincide
+    normals = [cloud / np.linalg.norm(cloud, axis=1, keepdims=True) for cloud in map(np.float64, clouds)]
+    errors, consistency = point_cloud_errors(*clouds, normals=tuple(normals)), []
+    for found, way in ((errors.accuracy, slice(None)), (errors.completeness, slice(None, None, -1))):
+        (source, target), (ours, theirs) = clouds[way], normals[way]
+        nearest = NearestNeighbors(n_neighbors=1, algorithm="brute").fit(target).kneighbors(source)[1][:, 0]
         exact = np.linalg.norm(source.astype(float)[:, None] - target.astype(float)[None], axis=2).min(axis=1)
         assert found == pytest.approx((exact.mean(), np.median(exact)), rel=1e-12)
-        consistency.append(np.abs((ours * theirs[nearest[:, 0]]).sum(axis=1)).mean())
+        consistency.append(np.abs((ours * theirs[nearest]).sum(axis=1)).mean())
     assert errors.normal_consistency == pytest.approx(np.mean(consistency))
 
 

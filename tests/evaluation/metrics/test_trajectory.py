@@ -36,15 +36,6 @@ def about(axis, degrees) -> Rotation:
 seeds = st.integers(0, 2**32 - 1)
 
 
-def test_umeyama_by_hand():
-    source = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
-    target = 2 * source[:, [1, 0, 2]] * [-1, 1, 1] + [3, 0, 0]  # (x, y, z) -> (-y, x, z): a quarter turn about z
-    found = umeyama_sim3(source, target)
-    assert found.scale == pytest.approx(2)
-    assert np.allclose(found.rotation, [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    assert np.allclose(found.translation, [3, 0, 0])
-
-
 @settings(max_examples=15)
 @given(seed=seeds, mirrored=st.booleans())
 def test_umeyamas_similarity_is_the_best(seed, mirrored):
@@ -59,17 +50,6 @@ def test_umeyamas_similarity_is_the_best(seed, mirrored):
     left = best.apply(source) - target
     assert np.allclose(left.mean(axis=0), 0)
     assert (left * (best.apply(source) - best.apply(source).mean(axis=0))).sum() == pytest.approx(0, abs=1e-9)
-
-
-def test_aligning_keeps_the_images():
-    generator = np.random.default_rng(1)
-    poses, similarity, points = random_cameras(generator), random_similarity(generator), generator.normal(size=(9, 3))
-
-    def seen(cameras, world):
-        inside = np.einsum("sij,nj->sni", cameras[:, :, :3], world) + cameras[:, None, :, 3]
-        return inside[..., :2] / inside[..., 2:]
-
-    assert np.allclose(seen(poses, points), seen(align(poses, similarity), similarity.apply(points)))
 
 
 def test_rotation_error_by_hand():
@@ -123,22 +103,6 @@ def test_trajectory_errors_by_hand():
     assert first[:2] == pytest.approx((np.sqrt(6 / 4), np.sqrt(5 / 3)))
 
 
-@settings(max_examples=15)
-@given(seed=seeds)
-def test_the_world_of_the_prediction_does_not_matter(seed):
-    generator = np.random.default_rng(seed)
-    predicted, truth = wandering(generator)
-    camera_from_world, similarity = np.linalg.inv(predicted)[:, :3], random_similarity(generator)
-    for how in ("sim3", "se3", "first"):
-        moved = align(camera_from_world, similarity if how == "sim3" else similarity._replace(scale=1.0))
-        assert trajectory_errors(world_from(moved), truth, how) == pytest.approx(
-            trajectory_errors(predicted, truth, how)
-        )
-        assert trajectory_errors(truth, truth, how) == pytest.approx((0, 0, 0), abs=1e-5)
-    errors = trajectory_errors(predicted, truth)
-    assert errors.ate == pytest.approx(centre_error(camera_from_world, np.linalg.inv(truth)[:, :3]))
-
-
 @pytest.mark.parametrize("how", ["sim3", "se3", "first"])
 def test_evo_agrees(how):
     """An independent program (Grupp 2017): APE and RPE of the translation, RPE of the angle, RMSE, one frame apart."""
@@ -159,7 +123,10 @@ def test_evo_agrees(how):
     ):
         measure.process_data((reference, estimate))
         wanted.append(measure.get_statistic(metrics.StatisticsType.rmse))
-    assert trajectory_errors(predicted, truth, how) == pytest.approx(tuple(wanted), abs=1e-6, rel=1e-6)
+    errors = trajectory_errors(predicted, truth, how)
+    assert errors == pytest.approx(tuple(wanted), abs=1e-6, rel=1e-6)
+    if how == "sim3":
+        assert errors.ate == pytest.approx(centre_error(*(np.linalg.inv(poses)[:, :3] for poses in (predicted, truth))))
 
 
 MANY, FEW, STILL = (world_from(poses) for poses in (cameras(np.eye(4, 3)), still(2), still(4)))

