@@ -81,13 +81,12 @@ def test_tracks_survive_a_round_trip(tmp_path, tracked, clip):
 
 def test_a_grid_lies_inside_the_picture():
     clip = load_clip(np.zeros((2, 90, 160, 3), np.uint8), size=56, mode="pad")
-    left, top, right, bottom = clip.valid_box[0]
+    box = clip.valid_box[0].reshape(2, 2)  # corners
     queries = parse_queries("grid:3", clip)
     assert len(queries.points) == 9
     assert not queries.frames.any()
-    low, high = queries.points.min(axis=0), queries.points.max(axis=0)
-    assert np.allclose(low, [left + (right - left) / 6, top + (bottom - top) / 6])
-    assert np.allclose(high, [right - (right - left) / 6, bottom - (bottom - top) / 6])
+    rim = (box[1] - box[0]) / 6
+    assert np.allclose([queries.points.min(axis=0), queries.points.max(axis=0)], [box[0] + rim, box[1] - rim])
 
 
 def test_a_file_of_points_in_pixels_of_the_source(tmp_path):

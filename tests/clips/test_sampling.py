@@ -1,5 +1,7 @@
 """Which frames are taken: by index, by presentation time, and arguments that cannot work."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -28,7 +30,8 @@ def test_each_tick_takes_the_first_frame_at_or_after_it():
     assert taken(times, fps=2, max_frames=2) == [0, 3]
     assert taken(times, fps=1e6) == list(range(8))
     assert taken(np.round(np.arange(30) / 30, 3), fps=15) == list(range(0, 30, 2))  # of rounded times, too
-    assert Sampling(start=np.int64(1), fps=np.float32(2)) == Sampling(1, fps=2)
+    numbers: Any = {"start": np.int64(1), "fps": np.float32(2)}
+    assert Sampling(**numbers) == Sampling(1, fps=2)
 
 
 def test_no_frame_is_asked_for_after_the_last_one_taken():
@@ -55,12 +58,13 @@ def test_rate_against_its_definition(steps, period, start):
 
 
 def test_arguments_that_cannot_work():
-    for values, message in (
+    cases: Any = (
         ({"stride": 0}, "stride is 0; expected a whole number of at least 1"),
         ({"start": -1}, "start is -1; expected a whole number of at least 0"),
         ({"fps": float("nan")}, "fps is nan"),
         ({"fps": 2, "stride": 2}, "exclude each other"),
-    ):
+    )
+    for values, message in cases:
         with pytest.raises(InputError, match=message):
             Sampling(**values)
 
