@@ -135,28 +135,28 @@ def test_a_set_goes_on_where_it_stopped(written, tmp_path, monkeypatch):
 
 
 def test_sets_of_other_settings_are_not_mixed(written):
-    for changes, says in (
-        ({"seed": 4}, "holds scenes with seed 3 instead of 4; choose another folder"),
-        ({"config": dataclasses.replace(CONFIG, width=40)}, "with width of config 32 instead of 40; choose"),
-        ({"config": dataclasses.replace(CONFIG, roll=9)}, "with roll of config 0.0 instead of 9.0; choose"),
-    ):
-        before = files(written)
-        with pytest.raises(InputError, match=says):
-            write_scenes(written, **({"config": CONFIG, "count": 3, "seed": 3} | changes))
-        assert files(written) == before
+    before = files(written)
+    with pytest.raises(InputError, match="holds scenes with seed 3 instead of 4; choose another folder"):
+        write_scenes(written, CONFIG, count=3, seed=4)
+    with pytest.raises(InputError, match=r"with roll of config 0.0 instead of 9.0; choose"):
+        write_scenes(written, dataclasses.replace(CONFIG, roll=9), count=3, seed=3)
+    assert files(written) == before
 
 
-def test_bad_input_is_one_sentence_before_anything_is_drawn(tmp_path, monkeypatch):
-    for changes, says in (
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
         ({"count": 0}, "count is 0; expected a whole number from 1 to 10000"),
         ({"split": "validation"}, "split is 'validation'; expected one of"),
         ({"seed": 2**31}, "seed is 2147483648"),
         ({"images": Images(shutter=0.5)}, "shutter is 0.5 with 1 exposures; motion blur needs"),
-    ):
-        monkeypatch.setattr(dataset, "_draw", None)
-        with pytest.raises(InputError, match=says):
-            scenes(tmp_path / "set", **changes)
-        assert not (tmp_path / "set").exists()
+    ],
+)
+def test_bad_input_is_one_sentence_before_anything_is_drawn(tmp_path, monkeypatch, changes, says):
+    monkeypatch.setattr(dataset, "_draw", None)
+    with pytest.raises(InputError, match=says):
+        scenes(tmp_path / "set", **changes)
+    assert not (tmp_path / "set").exists()
 
 
 def test_other_peoples_files_are_not_touched(tmp_path, monkeypatch):

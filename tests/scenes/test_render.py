@@ -217,16 +217,8 @@ def test_a_tilted_camera_turns_on_the_spot(change, axis, least, most):
 def test_samples_and_exposures_change_images_only(dynamic):
     blurred = clips(dataclasses.replace(DYNAMIC, samples=2, shutter=0.5, exposures=2), 2)
     sharp = jax.tree.map(lambda leaf: leaf[:2], dynamic)
-    same_clip(blurred._replace(images=sharp.images), sharp)
+    assert (np.abs(blurred.depth - sharp.depth) > 2e-3).mean() < 1e-3  # but for rounding at edges
+    assert (blurred.part_ids != sharp.part_ids).mean() < 1e-3
     difference = np.abs(blurred.images - sharp.images)
     assert difference.max() > 0.1
     assert difference.mean() < 0.05  # it is the same scene
-
-
-def same_clip(found, expected):
-    """Equal but for rounding, which may turn a pixel on an edge or a texel's level."""
-    for name, a, b in zip(found._fields, found, expected, strict=True):
-        assert a.shape == b.shape
-        assert a.dtype == b.dtype
-        differs = np.abs(a.astype(np.float64) - b.astype(np.float64)) > 2e-3
-        assert differs.mean() < 1e-3, name

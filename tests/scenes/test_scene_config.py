@@ -1,3 +1,5 @@
+from typing import Any
+
 import pytest
 
 from vggtjax.errors import InputError
@@ -5,7 +7,7 @@ from vggtjax.scenes import SceneConfig
 
 
 def test_bad_values_are_one_sentence():
-    for changes, says in (
+    cases: Any = (
         ({"height": 7}, "height is 7; expected a whole number of at least 8 and at most 2048"),
         ({"width": 64.0}, "width is 64.0"),
         ({"dynamic": 1.5}, "dynamic is 1.5; expected a number of at least 0 and at most 1"),
@@ -16,7 +18,8 @@ def test_bad_values_are_one_sentence():
         ({"pitch": (0.0, 90.0)}, r"pitch\[1\] is 90.0; expected a number of at least -60 and at most 60"),
         ({"motion": [[10**400], 1]}, r"motion\[0\]\[0\] is a number of more than 64 bits"),
         ({"frozen": [[]]}, r"frozen is \[\[\]\]; expected true or false"),
-    ):
+    )
+    for changes, says in cases:
         with pytest.raises(InputError, match=says):
             SceneConfig(**changes)
 
