@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 import trimesh
@@ -126,14 +128,15 @@ def test_original_resolution(tmp_path):
 def test_pictures_that_do_not_fit(tmp_path):
     picture, options = np.zeros((56, 84, 3), np.uint8), {"resolution": "original"}
     mixed = {"source_size": [[56, 84], [84, 56], [56, 84]]}
-    for changes, given, words in (
+    cases: Any = (
         ({}, options | {"pictures": [picture] * 2}, "there are 2 pictures for 3 frames"),
         ({}, options | {"pictures": [picture] * 4}, "there are more pictures than the 3 frames"),
         ({}, {"pictures": [picture] * 3}, "pictures are for the resolution 'original'"),
         ({}, options | {"pictures": [picture[1:]] * 3}, r"the picture of frame 0 is .*; expected uint8 \(56, 84, 3\)"),
         (mixed, options | {"format": "vggt4d"}, "have 2 sizes; the format vggt4d expects one"),
         ({}, {"resolution": "full"}, "resolution is 'full'; expected one of"),
-    ):
+    )
+    for changes, given, words in cases:
         with pytest.raises(InputError, match=words):
             make_room(**changes).save(tmp_path, **given)
     assert not any(files(tmp_path))
@@ -207,13 +210,11 @@ def test_padding_and_infinite_depth_never_become_points(tmp_path):
 
 @pytest.mark.parametrize("rows", [13, 27])
 def test_mostly_invalid_depth_is_warned_about(tmp_path, caplog, rows):
-    room = make_room(1)
-    depth = room.depth.copy()
+    depth = make_room(1).depth.copy()
     depth[:, :rows] = np.nan
-    make_room(1, depth=depth).save(tmp_path)
+    make_room(1, depth=depth).save(tmp_path, only=("cameras",))
     said = f"{27 * 42} of {28 * 42} pixels (96.43%) have an invalid depth or confidence"
-    assert (said in caplog.text) == (rows == 27)
-    assert ("invalid" in caplog.text) == (rows == 27)
+    assert (said in caplog.text) == ("invalid" in caplog.text) == (rows == 27)
 
 
 def confident(room, percentile):

@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -46,10 +48,11 @@ def test_frames_that_are_due(room):
 
 
 def test_bad_options_are_found_before_drawing(room):
-    for options, message in (
+    cases: Any = (
         ({"path": "spiral"}, "path is 'spiral'; expected one of orbit, camera"),
         ({"size": (8, 90)}, "width is 8; expected 16 to 4096 pixels"),
         ({"seconds": 1e9}, "at most 10000 frames"),
-    ):
+    )
+    for options, message in cases:
         with pytest.raises(InputError, match=message):
             film_frames(room, **options)

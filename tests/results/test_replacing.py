@@ -1,6 +1,7 @@
 """Results saved over earlier files: replaced as a whole, or left untouched."""
 
 import errno
+from typing import Any
 
 import numpy as np
 import pytest
@@ -117,7 +118,8 @@ def test_links_are_replaced_and_not_followed(tmp_path):
 
 
 def test_values_out_of_range():
-    for changes in ({"confidence_percentile": float("nan")}, {"resolution": "full"}, {"format": "cut3r"}):
-        with pytest.raises(InputError, match=f"{next(iter(changes))} is .*; expected"):
-            Saving().changed(**changes)
+    for name, value in (("confidence_percentile", float("nan")), ("resolution", "full"), ("format", "cut3r")):
+        wrong: Any = {name: value}
+        with pytest.raises(InputError, match=f"{name} is .*; expected"):
+            Saving().changed(**wrong)
     assert Saving(5).changed(layout="vggt4d", resolution="original") == Saving(5, "original", "vggt4d")

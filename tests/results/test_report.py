@@ -14,8 +14,6 @@ from vggtjax.results.report import REPORT_NAME, ErrorTable, RunFacts, report_pag
 from vggtjax.storage.markup import write_page
 
 HOSTILE = "<script>alert('1')</script><img src=x onerror=alert(2)>\"'&\n\u202e\ud800"
-
-
 TEXTS = {"html", "head", "meta", "title", "style", "body", "main", "header", "section", "div", "span", "p", "b", "code"}
 PARTS = {"h1", "h2", "h3", "picture", "source", "table", "tr", "th", "td", "ul", "li", "a", "img", "input", "label"}
 DRAWN = {"svg", "path", "circle", "text"}
@@ -27,10 +25,14 @@ class Reader(HTMLParser):
     def __init__(self, text):
         super().__init__()
         self.tags, self.texts = [], []
-        self.handle_starttag = lambda tag, attrs: self.tags.append((tag, dict(attrs)))
-        self.handle_data = self.texts.append
         self.feed(text)
         self.close()
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+
+    def handle_data(self, data):
+        self.texts.append(data)
 
 
 def report(tmp_path, result, facts=None):

@@ -77,10 +77,11 @@ def test_each_voxel_keeps_its_most_confident_point(seed, budget, chunks, ties):
 
 
 def test_bad_options(room):
-    for options, message in (
+    cases: Any = (
         ({"static_percentile": 100}, "static_percentile is 100; expected at least 0 and less than 100"),
         ({"edges": 0.0}, "edges is 0.0; expected a share above 0, or None"),
         ({"most_static": -1}, "most_static is -1; expected a whole number of at least 0"),
-    ):
+    )
+    for options, message in cases:
         with pytest.raises(InputError, match=message):
             shown_points(room, **options)
