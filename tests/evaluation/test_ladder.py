@@ -135,12 +135,6 @@ def test_suppressing_nothing_is_the_plain_pass(rows):
     assert all(row.mask_jaccard == 1 for row in rows if row.mask_source == "true")
 
 
-def test_batches_do_not_matter(model, truth, rows):
-    plain = [row for row in rows if row.method == "vggt"]
-    single = ladder(model, Truth(*(array[1] for array in truth)), methods=["vggt"])
-    assert close(plain[1], replace(single[0], clip=1))
-
-
 def test_what_the_truth_leaves_undefined_is_none(model, truth):
     still = truth._replace(
         dynamic_mask=np.zeros_like(truth.dynamic_mask), camera_from_world=np.tile(np.eye(3, 4), (CLIPS, FRAMES, 1, 1))

@@ -23,5 +23,3 @@ def test_a_result_is_drawn_next_to_its_truth():
     found, true = (sheet[top + row * step :][:height, left:][:, :width] for row in (1, 2))
     assert np.abs(found.astype(int) - true).max() <= 4
     assert (found != sheet[0, 0]).any()
-    poses = np.tile(np.eye(3, 4, dtype=np.float32), (4, 1, 1))  # cameras that stand still are drawn, too
-    assert truth_sheet(make_room(4, camera_from_world=poses), truth._replace(camera_from_world=poses)).ndim == 3

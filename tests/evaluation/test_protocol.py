@@ -88,7 +88,6 @@ def test_what_is_lacking_is_said():
 
 
 def named(sentences):
-    """What the sentences are about."""
     return {sentence.split(":")[0] for sentence in sentences}
 
 

@@ -16,12 +16,16 @@ from vggtjax.method.fusion_file import check_fuses
 from vggtjax.progress import no_stage
 
 
+@pytest.fixture(scope="module")
+def model():
+    return tiny_model()
+
+
 def retrained(model):
     return dataclasses.replace(model, params=jax.tree.map(lambda leaf: leaf * 1.001, model.params))
 
 
-def test_retrained_weights_are_another_model(tmp_path):
-    model = tiny_model()
+def test_retrained_weights_are_another_model(tmp_path, model):
     read = read_model(save_model(tmp_path / "m.safetensors", model.params, model.config))
     read_again = read_model(save_model(tmp_path / "m.safetensors", retrained(model).params, model.config))
     for one, other in ((model, retrained(model)), (read, read_again), (read, retrained(read))):
@@ -30,14 +34,14 @@ def test_retrained_weights_are_another_model(tmp_path):
         assert ModelSource(other, ["vggt"]).settings["model"]["sha256"] != before["model"]["sha256"]
 
 
-def test_the_note_of_a_model_is_a_warning_and_a_setting():
-    source = ModelSource(dataclasses.replace(tiny_model(), note="first attempt"), ["vggt"])
+def test_the_note_of_a_model_is_a_warning_and_a_setting(model):
+    source = ModelSource(dataclasses.replace(model, note="first attempt"), ["vggt"])
     assert source.warnings == ("The model tiny is a first attempt.",)
     assert source.settings["model_note"] == "first attempt"
 
 
-def test_methods_that_do_not_fuse_run_beside_those_that_do(monkeypatch):
-    model, fusion, calls = tiny_model(), identity(), []
+def test_methods_that_do_not_fuse_run_beside_those_that_do(monkeypatch, model):
+    fusion, calls = identity(), []
 
     def methods(model, clip, names, *, fusion, **_):
         check_fuses(fusion, *names)  # as reconstruct_methods does

@@ -1,6 +1,7 @@
 """Opening data sets: what is taken and what is noted, and plain folders."""
 
 import logging
+from typing import Any
 
 import numpy as np
 import pytest
@@ -116,14 +117,15 @@ def test_one_bad_sequence_does_not_hide_the_others(tmp_path):
 
 
 def test_arguments_that_cannot_work(tmp_path):
-    for name, options, message in (
+    cases: Any = (
         ("imagenet", {}, "'imagenet' is not known; expected one of plain, composite"),
         ("plain", {"sequences": ["clip", "other"]}, r"'other' of plain is not in .*; it has clip"),
         ("plain", {"sequences": ["clip", "clip"]}, "each once"),
         ("plain", {"sequences": []}, "at least one name"),
         ("plain", {"gt": "lidar"}, "gt is 'lidar'; plain has one ground truth"),
         ("dycheck", {"gt": "colmap"}, "gt is 'colmap'; dycheck has easi3r and lidar"),
-    ):
+    )
+    for name, options, message in cases:
         plain_folder(tmp_path / "clip")
         with pytest.raises(InputError, match=message):
             opened(name, tmp_path, **options)

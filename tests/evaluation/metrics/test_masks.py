@@ -57,7 +57,7 @@ def slow_boundary_f(predicted, truth) -> float:
     if not found.any() or not sought.any():
         return 0.0
     precision, recall = (
-        (distance_transform_edt(~b)[a] <= radius).mean() for a, b in ((found, sought), (sought, found))
+        (np.asarray(distance_transform_edt(~b))[a] <= radius).mean() for a, b in ((found, sought), (sought, found))
     )
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 

@@ -130,8 +130,6 @@ def test_evo_agrees(how):
 
 
 MANY, FEW, STILL = (world_from(poses) for poses in (cameras(np.eye(4, 3)), still(2), still(4)))
-
-
 TURNING = cameras(np.tile([3.0, -1, 4], (4, 1)), about(2, [0, 9, 18, 27])).astype(np.float32)  # in place, but rounded
 
 

@@ -15,13 +15,6 @@ from vggtjax.evaluation.metrics.uncertainty import (
 )
 
 
-def claims(seed, count=400, wrong=1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of a Gaussian with the claimed precision, up to a factor of the variance."""
-    generator = np.random.default_rng(seed)
-    precision = np.exp(generator.normal(size=count))
-    return np.sqrt(wrong / precision) * generator.normal(size=count), precision
-
-
 def test_sparsification_by_hand():
     errors, confidence = np.array([4.0, -1, 2, 1]), np.array([1, 4, 3, 2])
     curve = sparsification_curve(errors, confidence, steps=4)
@@ -74,7 +67,9 @@ def test_calibration_error_by_hand():
 
 
 def test_scores_by_hand_of_the_parts():
-    errors, precision = claims(3, wrong=5.0)
+    generator = np.random.default_rng(3)
+    precision = np.exp(generator.normal(size=400))
+    errors = np.sqrt(5 / precision) * generator.normal(size=400)  # five times the variance that the precision claims
     truth = np.full(400, 50.0)
     truth[:30] = np.tile([0, np.nan, -1], 10)  # not measured
     predicted = np.where(np.arange(400) < 30, np.nan, truth + errors)

@@ -1,5 +1,7 @@
 """Depth of a sequence: hand-computed values, invariances, other optimisers on the same objectives."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.optimize import linprog
@@ -80,7 +82,7 @@ def test_all_frames_share_one_alignment():
 
 
 def test_depth_that_cannot_be_compared_is_one_sentence():
-    for predicted, truth, options, sentence in (
+    cases: Any = (
         (np.ones((2, 1, 3)), TRUTH, {}, "resize the prediction first"),
         (np.ones((1, 2)), TRUTH[0], {}, r"expected a sequence \[S, H, W\]"),
         (np.ones((2, 1, 2)), 0 * TRUTH, {}, "no pixel has a true depth above 0 to compare with"),
@@ -88,6 +90,7 @@ def test_depth_that_cannot_be_compared_is_one_sentence():
         (np.ones((2, 1, 2)), TRUTH, {"align": "affine"}, "align is 'affine'; expected one of metric, median, scale,"),
         (-np.ones((2, 1, 2)), TRUTH, {}, "the mean of the predicted depth is -1; expected it above 0"),
         (np.zeros((2, 1, 2)), TRUTH, {"align": "scale-shift"}, "is 0 in all valid pixels"),
-    ):
+    )
+    for predicted, truth, options, sentence in cases:
         with pytest.raises(InputError, match=sentence):
             video_depth_errors(predicted, truth, **options)
