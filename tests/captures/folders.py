@@ -186,16 +186,14 @@ def colmap_binary(folder: Path, truth: Truth) -> Path:
     """The same model as COLMAP writes it by default, without points."""
     colmap_text(folder, truth)
     cameras, images = [], []
-    for frame in range(FRAMES):
-        K, pose = truth.intrinsics[frame], truth.world_from_camera[frame]
+    for frame, (K, pose) in enumerate(zip(truth.intrinsics, truth.world_from_camera, strict=True)):
         cameras.append((frame + 1, 1, WIDTH, HEIGHT, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
         rotation = pose[:3, :3].T
         quaternion = Rotation.from_matrix(rotation).as_quat(scalar_first=True)
         images.append((40 - frame, quaternion, -rotation @ pose[:3, 3], frame + 1, f"view_{8 + frame}.png"))
-    for name, content in (("cameras", cameras_bin(cameras)), ("images", images_bin(images))):
-        (folder / f"sparse/0/{name}.txt").unlink()
+    for name, content in (("cameras", cameras_bin(cameras)), ("images", images_bin(images)), ("points3D", bytes(8))):
+        (folder / f"sparse/0/{name}.txt").unlink(missing_ok=True)
         (folder / f"sparse/0/{name}.bin").write_bytes(content)
-    (folder / "sparse/0/points3D.bin").write_bytes(bytes(8))
     return folder
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.clips.images import ImageFiles, is_image_name, read_image
-from vggtjax.clips.sampling import Sampling
+from vggtjax.clips.images import read_image
 from vggtjax.errors import ClipError
 
 RAMP = np.array([[0, 128, 129, 33023, 65535]], np.uint16)
@@ -26,7 +25,7 @@ def save(path, image, **options):
     return path
 
 
-@pytest.mark.parametrize("name", ["grey.png", "grey.tif", "grey.pgm"])
+@pytest.mark.parametrize("name", ["grey.png", "grey.tif"])
 def test_sixteen_bit_grey_is_scaled_not_clipped(tmp_path, name):
     image = pixels(save(tmp_path / name, Image.fromarray(RAMP)))
     np.testing.assert_array_equal(image, np.repeat(np.array([RAMP_8])[..., None], 3, 2))
@@ -44,13 +43,12 @@ def test_sixteen_bit_colour_is_scaled_not_clipped(tmp_path):
     np.testing.assert_array_equal(pixels(path), [[[0, 128, 255], [255, 0, 1]]])
 
 
-def test_more_than_sixteen_bits(tmp_path):
-    path = save(tmp_path / "deep.tif", Image.fromarray(np.array([[70000, 0]], np.int32)))
+def test_floating_point_and_more_than_sixteen_bits(tmp_path):
+    deep = save(tmp_path / "deep.tif", Image.fromarray(np.array([[70000, 0]], np.int32)))
     with pytest.raises(ClipError, match=r"frame deep.tif has values from 0 to 70000; expected 16 bits"):
-        read_image(path)
-
-
-def test_floating_point(tmp_path):
+        read_image(deep)
+    signed = Image.fromarray(RAMP.astype(np.int32))
+    np.testing.assert_array_equal(pixels(save(tmp_path / "signed.tif", signed))[0, :, 0], RAMP_8)
     image = pixels(save(tmp_path / "float.tif", Image.fromarray(np.array([[0, 0.5, 1]], np.float32))))
     np.testing.assert_array_equal(image[..., 0], [[0, 128, 255]])
     path = save(tmp_path / "nan.tif", Image.fromarray(np.array([[np.nan, 0.5]], np.float32)))
@@ -70,19 +68,14 @@ def test_transparency_is_composited_over_white(tmp_path):
     np.testing.assert_array_equal(pixels(save(tmp_path / "la.png", grey))[0, :, 0], [255, 100])
 
 
-def test_palettes(tmp_path):
-    image = Image.new("P", (3, 1))
-    image.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
-    image.putdata([0, 1, 2])
+def test_palettes_one_bit_and_cmyk(tmp_path):
+    palette = Image.new("P", (3, 1))
+    palette.putpalette([255, 0, 0, 0, 255, 0, 0, 0, 255])
+    palette.putdata([0, 1, 2])
     colours = [[255, 0, 0], [0, 255, 0], [0, 0, 255]]
-    np.testing.assert_array_equal(pixels(save(tmp_path / "p.png", image))[0], colours)
-    white = [[255, 255, 255], *colours[1:]]
-    np.testing.assert_array_equal(pixels(save(tmp_path / "index.png", image, transparency=0))[0], white)
-    alpha = bytes([0, 255, 255])
-    np.testing.assert_array_equal(pixels(save(tmp_path / "bytes.png", image, transparency=alpha))[0], white)
-
-
-def test_one_bit_and_cmyk(tmp_path):
+    np.testing.assert_array_equal(pixels(save(tmp_path / "p.png", palette))[0], colours)
+    colours[0] = [255, 255, 255]
+    np.testing.assert_array_equal(pixels(save(tmp_path / "clear.png", palette, transparency=0))[0], colours)
     bits = Image.new("1", (2, 1))
     bits.putpixel((1, 0), 1)
     np.testing.assert_array_equal(pixels(save(tmp_path / "bits.png", bits))[0, :, 0], [0, 255])
@@ -101,16 +94,7 @@ def test_exif_orientation(tmp_path):
     assert turned.sum() == 3 * 255
 
 
-def test_files_are_frames_named_by_their_stems(tmp_path):
-    paths = tuple(save(tmp_path / f"view.{i}.png", Image.new("RGB", (2, 2), (i, 0, 0))) for i in range(4))
-    frames = list(ImageFiles(paths).frames(Sampling(start=1, stride=2)))
-    assert [frame.name for frame in frames] == ["view.1", "view.3"]
-    assert [frame.image.getpixel((0, 0)) for frame in frames] == [(1, 0, 0), (3, 0, 0)]
-    assert ImageFiles(paths).total(Sampling(start=1, stride=2)) == 2
-
-
-@pytest.mark.parametrize("ending", ["png", "jpg", "tif", "bmp", "webp", "ppm"])
-@pytest.mark.parametrize("kept", [0.0, 0.6])
+@pytest.mark.parametrize(("ending", "kept"), [("png", 0.6), ("jpg", 0.6), ("tif", 0.6), ("webp", 0.6), ("png", 0)])
 def test_truncated_files(tmp_path, ending, kept):
     noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), np.uint8)
     path = save(tmp_path / f"cut.{ending}", Image.fromarray(noise))
@@ -124,11 +108,8 @@ def test_files_that_are_no_images(tmp_path):
     path = tmp_path / "a.png"
     with pytest.raises(ClipError, match="does not exist"):
         read_image(path)
-    path.write_text("not a picture")
-    with pytest.raises(ClipError, match="not an image of a known format; expected one of PNG, JPEG"):
-        read_image(path)
     path.write_text("%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 10 10\n")  # a program for another interpreter
-    with pytest.raises(ClipError, match="not an image of a known format"):
+    with pytest.raises(ClipError, match="not an image of a known format; expected one of PNG, JPEG"):
         read_image(path)
     with pytest.raises(ClipError, match=r"cannot read image .*directory"):
         read_image(tmp_path)
@@ -139,8 +120,3 @@ def test_an_absurdly_large_image(tmp_path, monkeypatch):
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 400 * 400 // 3)
     with pytest.raises(ClipError, match=r"cannot read image .*bomb.png.*exceeds limit"):
         read_image(path)
-
-
-def test_names_of_images(tmp_path):
-    assert all(is_image_name(tmp_path / name) for name in ("a.png", "a.JPG", "a.jpeg", "a.tiff", "a.webp"))
-    assert not any(is_image_name(tmp_path / name) for name in ("a.mp4", "a.gif", "a.txt", "a.eps", "png", "a"))

@@ -1,5 +1,7 @@
 """Which frames are taken: by index, by presentation time, and arguments that cannot work."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -26,16 +28,10 @@ def test_each_tick_takes_the_first_frame_at_or_after_it():
     assert taken(times, fps=10) == [0, 2, 3, 5, 6, 7]  # ticks at 0, 0.1, 0.2, ...; no frame twice
     assert taken(times, fps=2, start=2) == [2, 5, 6]  # ticks at 0.1, 0.6, 1.1, 1.6
     assert taken(times, fps=2, max_frames=2) == [0, 3]
-
-
-def test_times_rounded_to_milliseconds_keep_an_even_spacing():
-    times = np.round(np.arange(30) / 30, 3)
-    assert taken(times, fps=15) == list(range(0, 30, 2))
-    assert taken(times, fps=10) == list(range(0, 30, 3))
-
-
-def test_a_rate_above_the_videos_takes_every_frame_once():
-    assert taken(np.arange(10) / 25, fps=1e6) == list(range(10))
+    assert taken(times, fps=1e6) == list(range(8))
+    assert taken(np.round(np.arange(30) / 30, 3), fps=15) == list(range(0, 30, 2))  # of rounded times, too
+    numbers: Any = {"start": np.int64(1), "fps": np.float32(2)}
+    assert Sampling(**numbers) == Sampling(1, fps=2)
 
 
 def test_no_frame_is_asked_for_after_the_last_one_taken():
@@ -61,54 +57,23 @@ def test_rate_against_its_definition(steps, period, start):
     assert taken(times, fps=1 / period, start=start) == sorted({i for i in firsts if i is not None})
 
 
-@given(count=st.integers(1, 50), start=st.integers(0, 49), stride=st.integers(1, 9), most=st.integers(1, 60))
-def test_images_and_video_agree_on_start_and_stride(count, start, stride, most):
-    sampling = Sampling(start, stride, None, most)
-    if start < count:
-        selected = [index for index, _, _ in sampling.select((float(i), None) for i in range(count))]
-        assert selected == list(sampling.indices(count))
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
+def test_arguments_that_cannot_work():
+    cases: Any = (
         ({"stride": 0}, "stride is 0; expected a whole number of at least 1"),
-        ({"stride": 1.5}, "stride is 1.5"),
-        ({"stride": True}, "stride is True"),
         ({"start": -1}, "start is -1; expected a whole number of at least 0"),
-        ({"max_frames": 0}, "max_frames is 0"),
-        ({"fps": 0}, "fps is 0"),
         ({"fps": float("nan")}, "fps is nan"),
-        ({"fps": float("inf")}, "fps is inf"),
-        ({"fps": "2"}, "fps is '2'"),
         ({"fps": 2, "stride": 2}, "exclude each other"),
-    ],
-)
-def test_arguments_that_cannot_work(values, message):
-    with pytest.raises(InputError, match=message):
-        Sampling(**values)
-
-
-@pytest.mark.parametrize(
-    ("values", "same"),
-    [
-        ({"start": np.int64(1), "stride": np.uint8(2), "max_frames": np.int32(3)}, Sampling(1, 2, None, 3)),
-        ({"fps": np.float32(2)}, Sampling(fps=2)),
-    ],
-)
-def test_numbers_of_numpy_are_numbers(values, same):
-    assert Sampling(**values) == same
+    )
+    for values, message in cases:
+        with pytest.raises(InputError, match=message):
+            Sampling(**values)
 
 
 def test_past_the_end():
-    with pytest.raises(ClipError, match="start is 5, but the source has only 5 frames"):
-        Sampling(start=5).indices(5)
-    with pytest.raises(ClipError, match="start is 5, but the source has only 3 frames"):
-        taken([0.0, 0.1, 0.2], start=5)
+    for select in (lambda: Sampling(start=5).indices(5), lambda: taken([0.0, 0.1, 0.2], start=5)):
+        with pytest.raises(ClipError, match="start is 5, but the source has only"):
+            select()
     with pytest.raises(ClipError, match="no frames"):
         taken([])
-
-
-def test_still_images_have_no_rate():
     with pytest.raises(InputError, match="still images have no presentation times"):
         Sampling(fps=2).indices(5)

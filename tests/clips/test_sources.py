@@ -45,17 +45,8 @@ def test_folder(folder):
     assert names(open_source(folder)) == ordered
     assert names(open_source(str(folder))) == ordered
     assert names(open_source(f"{folder}/*")) == ordered
+    assert names(open_source([folder / "frame_10.png", str(folder / "frame_2.png")])) == [ordered[2], ordered[1]]
     assert names(open_source(f"{folder.parent}/**/frame_*.png")) == ordered[1:]
-
-
-def test_relative_paths_become_absolute(folder, monkeypatch):
-    monkeypatch.chdir(folder)
-    assert names(open_source(".")) == ["frame_1.JPG", "frame_2.png", "frame_10.png"]
-    assert names(open_source("frame_?.*")) == ["frame_1.JPG", "frame_2.png"]
-
-
-def test_a_list_keeps_its_order(folder):
-    assert names(open_source([folder / "frame_10.png", str(folder / "frame_2.png")])) == ["frame_10.png", "frame_2.png"]
 
 
 def test_single_files(folder):
@@ -63,35 +54,23 @@ def test_single_files(folder):
     video = folder / "clip.MP4"
     video.touch()
     assert open_source(video) == VideoFile(video)
-
-
-def test_a_name_with_brackets_is_not_a_pattern(folder):
-    (folder / "frame_2.png").rename(folder / "frame[2].png")
+    (folder / "frame_2.png").rename(folder / "frame[2].png")  # no pattern
     assert names(open_source(str(folder / "frame[2].png"))) == ["frame[2].png"]
-
-
-def test_arrays():
-    frames = np.zeros((2, 4, 5, 3), np.uint8)
-    for source in (frames, list(frames), tuple(frames)):
-        opened = open_source(source)
-        assert isinstance(opened, ArrayFrames)
-        assert len(opened.arrays) == 2
+    (folder / "weights.pt").touch()
+    with pytest.raises(ClipError, match="name of neither an image nor a video"):
+        open_source(folder / "weights.pt")
 
 
 def test_a_folder_without_images_says_what_it_holds(tmp_path):
     with pytest.raises(ClipError, match="holds no images; name the folder"):
         open_source(tmp_path)
-    for name in ("b10", "b9"):
-        (tmp_path / name).mkdir()
+    (tmp_path / "b10").mkdir()
     for name in ("a.mp4", "x.txt", "y.txt"):
         (tmp_path / name).touch()
-    message = r"no images, but 2 folders \(b9, b10\) and 1 video \(a.mp4\) and 2 other files \(x.txt, y.txt\)"
-    with pytest.raises(ClipError, match=message):
+    with pytest.raises(ClipError, match=r"1 folder \(b10\) and 1 video \(a.mp4\) and 2 other files \(x.txt, y.txt\)"):
         open_source(tmp_path)
     with pytest.raises(ClipError, match=r"matches no images, but 1 video \(a.mp4\)"):
         open_source(f"{tmp_path}/*.mp4")
-    with pytest.raises(ClipError, match="matches no images; expected"):
-        open_source(f"{tmp_path}/*.png")
 
 
 @pytest.mark.parametrize(
@@ -99,14 +78,11 @@ def test_a_folder_without_images_says_what_it_holds(tmp_path):
     [
         ("missing/frames", "'missing/frames' does not exist"),
         ("https://example.org/clip.mp4?x=1", r"https://example.org/clip.mp4\?x=1 is a URL; download the file first"),
-        ("", "'' is not a path"),
-        ("a\0b", "is not a path"),
         ("x" * 5000, "cannot read x+.*: File name too long"),
         ([], "the list of frames is empty"),
         (["missing.png"], "image missing.png does not exist"),
         (["a.png", np.zeros((1, 1, 3))], "holds ndarray, str; expected image paths only, or arrays only"),
         (b"frames", "of type bytes"),
-        (7, "of type int"),
         ("/dev/null", "is a pipe, a socket or a device; expected a file"),
     ],
 )
@@ -115,23 +91,9 @@ def test_sources_that_are_none(source, message):
         open_source(source)
 
 
-def test_a_file_of_another_kind(tmp_path):
-    path = tmp_path / "weights.pt"
-    path.touch()
-    with pytest.raises(ClipError, match="name of neither an image nor a video"):
-        open_source(path)
-
-
-def test_an_unreadable_folder(tmp_path, monkeypatch):
-    def refuse(self):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(Path, "iterdir", refuse)
-    with pytest.raises(ClipError, match=r"cannot read .*: Permission denied"):
-        open_source(tmp_path)
-
-
 def test_a_list_of_pil_images_is_read_like_their_files():
     transparent = Image.new("RGBA", (28, 14), (255, 0, 0, 0))
     frames = list(open_source([transparent, Image.new("L", (28, 14), 7)]).frames(Sampling()))
     assert [frame.image.getpixel((0, 0)) for frame in frames] == [(255, 255, 255), (7, 7, 7)]
+    arrays = np.zeros((2, 4, 5, 3), np.uint8)
+    assert all(isinstance(open_source(given), ArrayFrames) for given in (arrays, list(arrays), tuple(arrays)))

@@ -1,34 +1,31 @@
 """Frames of video files: which, when, which way up, and files that break off."""
 
 import gc
-import logging
 import struct
 from fractions import Fraction
 
 import av
-import av.filter
 import numpy as np
 import pytest
 from av.stream import Disposition
-from av.video.format import VideoFormat
 
 from vggtjax.clips.sampling import Sampling
-from vggtjax.clips.video import VideoFile, is_video_name, upright
+from vggtjax.clips.video import VideoFile, upright
 from vggtjax.errors import ClipError
 
 WIDTH, HEIGHT = 64, 48
 
-# Upper left (a, b, c, d) of a display matrix, x' = a x + c y and y' = b x + d y with y down, and the filters of FFmpeg
-# that do the same to a frame.
+# Upper left (a, b, c, d) of a display matrix, x' = a x + c y and y' = b x + d y with y down, and what FFmpeg's filters
+# of the same names make of the rows abc and def.
 ORIENTATIONS = {
-    "as stored": ((1, 0, 0, 1), []),
-    "90 clockwise": ((0, 1, -1, 0), [("transpose", "clock")]),
-    "180": ((-1, 0, 0, -1), [("hflip", None), ("vflip", None)]),
-    "90 counterclockwise": ((0, -1, 1, 0), [("transpose", "cclock")]),
-    "mirrored": ((-1, 0, 0, 1), [("hflip", None)]),
-    "upside down": ((1, 0, 0, -1), [("vflip", None)]),
-    "transposed": ((0, 1, 1, 0), [("transpose", "cclock_flip")]),
-    "transposed the other way": ((0, -1, -1, 0), [("transpose", "clock_flip")]),
+    (1, 0, 0, 1): ["abc", "def"],  # as stored
+    (0, 1, -1, 0): ["da", "eb", "fc"],  # 90 degrees clockwise
+    (-1, 0, 0, -1): ["fed", "cba"],
+    (0, -1, 1, 0): ["cf", "be", "ad"],  # counterclockwise
+    (-1, 0, 0, 1): ["cba", "fed"],  # mirrored
+    (1, 0, 0, -1): ["def", "abc"],  # upside down
+    (0, 1, 1, 0): ["ad", "be", "cf"],  # transposed
+    (0, -1, -1, 0): ["fc", "eb", "da"],
 }
 
 
@@ -76,21 +73,6 @@ def seconds(frames):
     return np.array([frame.time for frame in frames], np.float64)
 
 
-def filtered(pixels, filters):
-    graph = av.filter.Graph()
-    height, width = pixels.shape[:2]
-    nodes = [graph.add_buffer(width=width, height=height, format=VideoFormat("rgb24"), time_base=Fraction(1, 30))]
-    nodes += [graph.add(name, argument) for name, argument in filters]
-    nodes.append(graph.add("buffersink"))
-    graph.link_nodes(*nodes).configure()
-    frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
-    frame.pts = 0
-    graph.push(frame)
-    shown = graph.pull()
-    assert isinstance(shown, av.VideoFrame)
-    return shown.to_ndarray(format="rgb24")
-
-
 @pytest.fixture(scope="module")
 def even(tmp_path_factory):
     """Twenty frames, 10 a second."""
@@ -106,101 +88,35 @@ def test_every_frame(even):
     assert VideoFile(even).total(Sampling()) is None
 
 
-@pytest.mark.parametrize(
-    ("values", "indices"),
-    [
-        ({"stride": 6}, [0, 6, 12, 18]),
-        ({"start": 5, "stride": 4, "max_frames": 3}, [5, 9, 13]),
-        ({"fps": 5}, list(range(0, 20, 2))),
-        ({"fps": 4}, [0, 3, 5, 8, 10, 13, 15, 18]),
-        ({"fps": 2, "start": 3}, [3, 8, 13, 18]),
-        ({"fps": 60}, list(range(20))),
-    ],
-)
-def test_sampling(even, values, indices):
-    assert [int(frame.name) for frame in read(even, **values)] == indices
-
-
 @pytest.mark.parametrize("ending", ["mp4", "mkv"])
 def test_times_of_a_variable_frame_rate(tmp_path, ending):
     times = [0, 40, 100, 500, 520, 1000, 1300, 1540]
-    path = write_video(tmp_path / f"uneven.{ending}", times)
+    path = write_video(tmp_path / f"uneven.{ending}", [5000 + time for time in times])  # they count from the first
     np.testing.assert_allclose(seconds(read(path)), np.array(times) / 1000, atol=1e-3)
     assert [int(frame.name) for frame in read(path, fps=2)] == [0, 3, 5, 7]
+    assert [int(frame.name) for frame in read(path, start=1, stride=3, max_frames=2)] == [1, 4]
 
 
-@pytest.mark.parametrize("ending", ["mov", "avi", "ts", "webm"])
-def test_other_containers(tmp_path, ending):
-    path = write_video(tmp_path / f"clip.{ending.replace('webm', 'mkv')}", range(0, 500, 100))
-    frames = read(path.rename(tmp_path / f"clip.{ending}"))
-    assert len(frames) >= 5
-    assert (np.diff(seconds(frames)) > 0).all()
-
-
-def test_frames_without_times(tmp_path):
-    # A program stream need not say when each frame is shown, and this one's rate does not tell either.
-    with pytest.raises(ClipError, match=r"frame 1 of video .* has no presentation time; write the video as MP4"):
-        read(write_video(tmp_path / "untimed.mpg", range(0, 500, 100)))
-
-
-@pytest.mark.parametrize("ending", ["mp4", "mkv"])
-def test_times_count_from_the_first_frame(tmp_path, ending):
-    frames = read(write_video(tmp_path / f"late.{ending}", range(5000, 6000, 250)))
-    np.testing.assert_allclose(seconds(frames), [0, 0.25, 0.5, 0.75], atol=1e-3)
-
-
-@pytest.mark.parametrize("name", ORIENTATIONS)
-def test_frames_are_shown_the_way_ffmpeg_shows_them(tmp_path, name):
-    matrix, filters = ORIENTATIONS[name]
-    path = write_video(tmp_path / "a.mp4", [0])
-    stored = np.asarray(read(path)[0].image)
-    shown = np.asarray(read(orient(path, matrix))[0].image)
-    np.testing.assert_array_equal(shown, filtered(stored, filters))
-
-
-def test_a_quarter_turn_by_hand():
-    pixels = np.array([["a", "b", "c"], ["d", "e", "f"]])[..., None]
-    clockwise = upright(pixels, np.array([[0, 1], [-1, 0]]))
-    assert clockwise[..., 0].tolist() == [["d", "a"], ["e", "b"], ["f", "c"]]
-    counterclockwise = upright(pixels, np.array([[0, -1], [1, 0]]))
-    assert counterclockwise[..., 0].tolist() == [["c", "f"], ["b", "e"], ["a", "d"]]
+@pytest.mark.parametrize(("matrix", "expected"), ORIENTATIONS.items())
+def test_quarter_turns_by_hand(matrix, expected):
+    pixels = np.array([list("abc"), list("def")])[..., None]
+    shown = upright(pixels, np.reshape(matrix, (2, 2)))
+    assert ["".join(row) for row in shown[..., 0]] == expected
 
 
 def test_the_rotation_of_a_telephone(tmp_path):
     # Held upright, its sensor lies on its side: the left of what is stored is the top of what is seen.
-    path = orient(write_video(tmp_path / "portrait.mp4", [0]), ORIENTATIONS["90 clockwise"][0])
-    image = read(path)[0].image
+    image = read(orient(write_video(tmp_path / "portrait.mp4", [0]), (0, 1, -1, 0)))[0].image
     assert image.size == (HEIGHT, WIDTH)
     red = np.asarray(image)[..., 0].astype(int)
     assert red[: WIDTH // 2 - 2].min() > 150
     assert red[WIDTH // 2 + 2 :].max() < 50
 
 
-@pytest.mark.parametrize("matrix", [(0.8, 0.6, -0.6, 0.8), (0.97, 0.26, -0.26, 0.97), (1, 0, 1, 0)])
-def test_a_matrix_that_is_no_quarter_turn(tmp_path, matrix):
-    path = orient(write_video(tmp_path / "tilted.mp4", [0]), matrix)
+def test_a_matrix_that_is_no_quarter_turn(tmp_path):
+    path = orient(write_video(tmp_path / "tilted.mp4", [0]), (0.97, 0.26, -0.26, 0.97))
     with pytest.raises(ClipError, match=r"shown turned by -?\d+ degrees; expected a multiple of 90"):
         read(path)
-
-
-@pytest.mark.parametrize("matrix", [(2, 0, 0, 1), (0, 0, 0, 0)])
-def test_a_matrix_without_a_turn(tmp_path, matrix):
-    path = write_video(tmp_path / "a.mp4", [0])
-    stored = np.asarray(read(path)[0].image)
-    np.testing.assert_array_equal(np.asarray(read(orient(path, matrix))[0].image), stored)
-
-
-def test_pixels_that_are_not_square(tmp_path, caplog):
-    path = tmp_path / "wide.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=10)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
-        container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(0), format="rgb24")))
-        container.mux(stream.encode())
-    with caplog.at_level(logging.WARNING):
-        assert read(path)[0].image.size == (WIDTH, HEIGHT)
-    assert "pixels of aspect 4/3; they are taken as square" in caplog.text
 
 
 @pytest.fixture
@@ -212,18 +128,14 @@ def broken(tmp_path):
     return path, ends
 
 
-def test_a_video_that_breaks_off_within_a_frame(broken):
+def test_a_video_that_breaks_off_within_a_frame(broken, monkeypatch):
     path, ends = broken
     path.write_bytes(path.read_bytes()[: ends[8] - 2])
     with pytest.raises(ClipError, match=r"broken.mp4 breaks off at frame 8 .*; set max_frames"):
         read(path)
     assert len(read(path, max_frames=8)) == 8  # nothing after the last frame taken is looked at
-
-
-def test_a_video_that_breaks_off_between_frames(broken):
-    path, ends = broken
-    path.write_bytes(path.read_bytes()[: ends[8]])
-    with pytest.raises(ClipError, match=r"broken.mp4 breaks off at frame 9"):
+    monkeypatch.setattr("vggtjax.clips.video._MOST_PIXELS", WIDTH * HEIGHT - 1)
+    with pytest.raises(ClipError, match=f"has frames of {WIDTH} x {HEIGHT}"):
         read(path)
 
 
@@ -235,15 +147,6 @@ def test_a_matroska_file_that_breaks_off(tmp_path):
         read(path)
 
 
-def test_damage_in_the_middle(broken):
-    path, ends = broken
-    data = bytearray(path.read_bytes())
-    data[ends[4] : ends[12]] = bytes(ends[12] - ends[4])
-    path.write_bytes(data)
-    with pytest.raises(ClipError, match=r"broken.mp4 breaks off at frame 5"):
-        read(path)
-
-
 def test_files_that_are_no_video(tmp_path, even):
     path = tmp_path / "a.mp4"
     with pytest.raises(ClipError, match=r"cannot read video .*a.mp4: No such file"):
@@ -251,9 +154,9 @@ def test_files_that_are_no_video(tmp_path, even):
     path.touch()
     with pytest.raises(ClipError, match=r"cannot read video .*a.mp4: Invalid data"):
         read(path)
-    path.write_bytes(np.random.default_rng(0).bytes(5000))
-    with pytest.raises(ClipError, match=r"cannot read video .*a.mp4: Invalid data"):
-        read(path)
+    # A program stream need not say when each frame is shown, and this one's rate does not tell either.
+    with pytest.raises(ClipError, match=r"frame 1 of video .* has no presentation time; write the video as MP4"):
+        read(write_video(tmp_path / "untimed.mpg", range(0, 500, 100)))
     path.write_bytes(even.read_bytes()[:200])
     with pytest.raises(ClipError, match=r"a.mp4"):
         read(path)
@@ -281,34 +184,20 @@ def test_a_playlist_is_not_followed(tmp_path, even):
         read(path)
 
 
-@pytest.mark.parametrize("cover", [False, True])
-def test_sound_without_moving_pictures(tmp_path, cover):
+def test_sound_and_a_cover_are_no_video(tmp_path):
     path = tmp_path / "sound.mp4"
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("aac", rate=16000)
-        if cover:
-            picture_stream = container.add_stream("mjpeg", rate=1)
-            picture_stream.width, picture_stream.height, picture_stream.pix_fmt = WIDTH, HEIGHT, "yuvj420p"
-            picture_stream.disposition = Disposition.attached_pic
-            container.mux(picture_stream.encode(av.VideoFrame.from_ndarray(picture(0), format="rgb24")))
-            container.mux(picture_stream.encode())
+        sound, cover = container.add_stream("aac", rate=16000), container.add_stream("mjpeg", rate=1)
+        cover.width, cover.height, cover.pix_fmt = WIDTH, HEIGHT, "yuvj420p"
+        cover.disposition = Disposition.attached_pic
+        container.mux(cover.encode(av.VideoFrame.from_ndarray(picture(0), format="rgb24")))
+        container.mux(cover.encode())
         frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
         frame.sample_rate = 16000
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode())
+        container.mux(sound.encode(frame))
+        container.mux(sound.encode())
     with pytest.raises(ClipError, match=r"sound.mp4 has no video stream"):
         read(path)
-
-
-def test_past_the_end(even):
-    with pytest.raises(ClipError, match="start is 20, but the source has only 20 frames"):
-        read(even, start=20)
-
-
-def test_frames_larger_than_any_camera_makes(even, monkeypatch):
-    monkeypatch.setattr("vggtjax.clips.video._MOST_PIXELS", WIDTH * HEIGHT - 1)
-    with pytest.raises(ClipError, match=f"has frames of {WIDTH} x {HEIGHT}"):
-        read(even)
 
 
 def test_frames_are_let_go(even):
@@ -320,8 +209,3 @@ def test_frames_are_let_go(even):
         assert not [thing for thing in gc.get_objects() if type(thing) is av.VideoFrame][1:]
     finally:
         gc.enable()
-
-
-def test_names_of_videos(tmp_path):
-    assert all(is_video_name(tmp_path / name) for name in ("a.mp4", "a.MOV", "a.mkv", "a.webm", "a.gif"))
-    assert not any(is_video_name(tmp_path / name) for name in ("a.png", "a.m3u8", "mp4", "a.h264"))

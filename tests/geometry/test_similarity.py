@@ -31,7 +31,6 @@ def test_the_inverse_undoes(seed):
     generator = np.random.default_rng(seed)
     similarity, points = random_similarity(generator), generator.normal(size=(5, 3))
     assert np.allclose(similarity.inverse().apply(similarity.apply(points)), points)
-    assert np.allclose(similarity.after(similarity.inverse()).apply(points), points)
 
 
 @settings(max_examples=30)
@@ -46,8 +45,5 @@ def test_a_whole_weight_is_as_many_points(seed):
     assert one.scale == pytest.approx(other.scale)
     assert np.allclose(one.rotation, other.rotation)
     assert np.allclose(one.translation, other.translation)
-
-
-def test_weights_of_another_number_are_refused():
-    with pytest.raises(InputError, match="3 weights for 4 points"):
-        umeyama_sim3(np.eye(4, 3), np.eye(4, 3), weights=np.ones(3))
+    with pytest.raises(InputError, match="6 weights for 7 points"):
+        umeyama_sim3(np.eye(7, 3), np.eye(7, 3), weights=np.ones(6))

@@ -49,15 +49,11 @@ def test_intrinsics_poses_and_depth_come_from_the_source():
 
 
 @pytest.mark.parametrize(
-    ("known", "message"),
-    [
-        ({"intrinsics": "source"}, "capture has no intrinsics"),
-        ({"poses": "source"}, "capture has no poses"),
-        ({"known_depths": "source"}, "capture has no depth maps"),
-    ],
+    ("name", "message"), [("intrinsics", "no intrinsics"), ("poses", "no poses"), ("known_depths", "no depth maps")]
 )
-def test_a_capture_that_lacks_something_is_refused(known, message):
-    with pytest.raises(InputError, match=message):
+def test_a_capture_that_lacks_something_is_refused(name, message):
+    known: dict[str, Any] = {name: "source"}
+    with pytest.raises(InputError, match=f"capture has {message}"):
         apply_known(TRUE, read_known(KnownGeometry(**known), TRUE, capture=_capture()))
 
 
@@ -79,11 +75,6 @@ def test_depth_maps_of_a_capture_are_read_before_the_work():
         read_known(KnownGeometry(known_depths="source"), TRUE, capture=capture)
 
 
-def test_a_source_that_is_no_capture_is_refused():
-    with pytest.raises(InputError, match=r"intrinsics and poses shall come from the source, .* is no capture"):
-        apply_known(TRUE, read_known(KnownGeometry(intrinsics="source", poses="source"), TRUE))
-
-
 def test_pixels_left_out_have_no_points_and_do_not_move():
     sky = np.zeros(TRUE.depth.shape, bool)
     sky[:, :40] = True
@@ -100,33 +91,20 @@ def test_pixels_left_out_have_no_points_and_do_not_move():
             read_known(KnownGeometry(), clip, leave_out=masks)
 
 
-@pytest.mark.parametrize(
-    ("known", "message"),
-    [
-        ({"intrinsics": "1,1,1,1", "shared_focal": True}, "exclude each other"),
-        ({"baseline": "0,1,1", "camera_height": 1.5}, "--baseline and --camera-height each set the scale"),
-        ({"camera_height": -1.0}, "expected 0.01 to 10000 metres"),
-    ],
-)
-def test_opposites_are_refused(known, message):
-    with pytest.raises(InputError, match=message):
-        KnownGeometry(**known)
+def test_opposites_are_refused():
+    with pytest.raises(InputError, match="exclude each other"):
+        KnownGeometry(intrinsics="1,1,1,1", shared_focal=True)
+    with pytest.raises(InputError, match="--baseline and --camera-height each set the scale"):
+        KnownGeometry(baseline="0,1,1", camera_height=1.5)
 
 
 @pytest.mark.parametrize("name", ["intrinsics", "poses", "known_depths", "leave_out"])
-def test_missing_files_are_found_before_the_work(name):
+def test_missing_and_unreadable_files_are_found_before_the_work(tmp_path, name):
     value: Any = Path("nothing") if name == "leave_out" else "nothing"
-    too_long: Any = 300 * "a"
     with pytest.raises(InputError, match=f"{name} is 'nothing'"):
         KnownGeometry(**{name: value}).check_files()
-    with pytest.raises(InputError, match=f"{name} is 'aaa"):
-        KnownGeometry(**{name: too_long}).check_files()
-
-
-@pytest.mark.parametrize("name", ["intrinsics", "poses"])
-def test_unreadable_files_are_found_before_the_work(tmp_path, name):
-    path = tmp_path / "numbers.txt"
-    path.write_text("1 2 nan\n")
-    known: dict[str, Any] = {name: str(path)}
-    with pytest.raises(InputError, match=r"numbers\.txt"):
-        check_readable(KnownGeometry(**known))
+    if name in ("intrinsics", "poses"):
+        known: dict[str, Any] = {name: str(tmp_path / "numbers.txt")}
+        (tmp_path / "numbers.txt").write_text("1 2 nan\n")
+        with pytest.raises(InputError, match=r"numbers\.txt"):
+            check_readable(KnownGeometry(**known))

@@ -22,15 +22,18 @@ def _check(known):
     assert found.known_facts["scale"].startswith("4 metres per unit")
 
 
-def test_a_baseline_gives_the_scale():
-    metres = np.linalg.norm(TRUE.camera_centres[1] - TRUE.camera_centres[4])
-    _check(KnownGeometry(baseline=f"1,4,{metres}"))
-
-
 def test_known_depths_give_the_scale_despite_an_outlier(tmp_path):
     lines = [f"{i},{2 * x + 1},{2 * y + 1},{TRUE.depth[i, y, x]}" for i, x, y in ((0, 3, 4), (2, 8, 2), (4, 5, 9))]
     (tmp_path / "depths.csv").write_text("\n".join(["frame,x,y,depth", *lines, "1,3,3,900", ""]))
     _check(KnownGeometry(known_depths=str(tmp_path / "depths.csv")))
+
+
+def test_a_baseline_gives_the_scale():
+    metres = np.linalg.norm(TRUE.camera_centres[1] - TRUE.camera_centres[4])
+    _check(KnownGeometry(baseline=f"1,4,{metres}"))
+    still = make_room(frames=5, camera_from_world=np.tile(SMALL.camera_from_world[:1], (5, 1, 1)))
+    with pytest.raises(InputError, match=r"frames 0 and 2 are predicted .* median depths apart, which is no motion"):
+        apply_known(still, read_known(KnownGeometry(baseline="0,2,1"), still))
 
 
 def _over_a_floor():
@@ -43,52 +46,31 @@ def _over_a_floor():
 
 
 def test_the_height_above_the_floor_gives_the_scale():
-    found, unit = apply_known(
-        scaled(_over_a_floor(), 0.25), read_known(KnownGeometry(camera_height=1.6), scaled(_over_a_floor(), 0.25))
-    )
+    true, known = _over_a_floor(), KnownGeometry(camera_height=1.6)
+    small = scaled(true, 0.25)
+    found, unit = apply_known(small, read_known(known, small))
     assert unit == pytest.approx(4, rel=1e-5)
-    np.testing.assert_allclose(found.depth, _over_a_floor().depth, rtol=1e-5)
-
-
-def test_without_a_floor_the_height_is_refused():
+    np.testing.assert_allclose(found.depth, true.depth, rtol=1e-5)
     with pytest.raises(InputError, match="finds no floor"):
-        apply_known(TRUE, read_known(KnownGeometry(camera_height=1.6), TRUE))  # it shows a wall
+        apply_known(TRUE, read_known(known, TRUE))  # it shows a wall
 
 
-@pytest.mark.parametrize(
-    ("baseline", "message"),
-    [
-        ("0,7,1", "baseline names frames 0 and 7; expected frames 0 to 4"),
-        ("1,1,2", "two different frames"),
-        ("0,1", "I,J,METRES"),
-        ("0,1,-2", "I,J,METRES"),
-    ],
-)
-def test_baselines_that_do_not_fit_are_refused(baseline, message):
-    with pytest.raises(InputError, match=message):
-        apply_known(SMALL, read_known(KnownGeometry(baseline=baseline), SMALL))
-
-
-def test_a_baseline_without_motion_is_refused():
-    still = np.tile(SMALL.camera_from_world[:1], (5, 1, 1))
-    with pytest.raises(InputError, match=r"frames 0 and 2 are predicted .* median depths apart, which is no motion"):
-        apply_known(
-            make_room(frames=5, camera_from_world=still),
-            read_known(KnownGeometry(baseline="0,2,1"), make_room(frames=5, camera_from_world=still)),
-        )
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
+def test_depths_that_do_not_fit_are_refused(tmp_path):
+    for text, message in (
         ("frame,x,y\n0,1,1\n", "line 2 is .* expected columns frame, x, y and depth"),
         ("frame,x,y,depth\n9,1,1,1\n", "line 2 is .* a frame of 0 to 4"),
         ("frame,x,y,depth\n0,1,1,-1\n", "depth above 0"),
         ("frame,x,y,depth\n0,99,1,1\n", r"line 2: \(99, 1\) lies outside .* a picture of 84 x 56 pixels"),
         ("frame,x,y,depth\n", "holds no depths"),
-    ],
+    ):
+        (tmp_path / "depths.csv").write_text(text)
+        with pytest.raises(InputError, match=message):
+            apply_known(SMALL, read_known(KnownGeometry(known_depths=str(tmp_path / "depths.csv")), SMALL))
+
+
+@pytest.mark.parametrize(
+    ("baseline", "message"), [("0,7,1", "names frames 0 and 7"), ("1,1,2", "two different"), ("0,1,-2", "I,J,METRES")]
 )
-def test_depths_that_do_not_fit_are_refused(tmp_path, text, message):
-    (tmp_path / "depths.csv").write_text(text)
+def test_baselines_that_do_not_fit_are_refused(baseline, message):
     with pytest.raises(InputError, match=message):
-        apply_known(SMALL, read_known(KnownGeometry(known_depths=str(tmp_path / "depths.csv")), SMALL))
+        apply_known(SMALL, read_known(KnownGeometry(baseline=baseline), SMALL))

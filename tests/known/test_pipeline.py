@@ -7,7 +7,7 @@ from PIL import Image
 from tests.moving_ball import moving_ball
 from tests.tiny import tiny_model
 from vggtjax import KnownGeometry, Reconstruction, load_clip, reconstruct, reconstruct_many
-from vggtjax.errors import ClipError, InputError
+from vggtjax.errors import InputError
 
 
 @pytest.fixture(scope="module")
@@ -45,19 +45,6 @@ def test_masks_intrinsics_and_scale_reach_the_result(model, clip, tmp_path):
     assert set(made.known_facts) == {"left out", "intrinsics", "scale"}
 
 
-@pytest.mark.parametrize(
-    ("known", "message"),
-    [
-        ({"poses": "nothing.txt"}, "there is no such file"),
-        ({"intrinsics": "source"}, "clip's source is no capture"),
-    ],
-)
-@pytest.mark.filterwarnings("ignore:the field of view")
-def test_known_geometry_that_does_not_fit_is_refused(model, clip, known, message):
-    with pytest.raises(InputError, match=message):
-        reconstruct(model, clip, method="vggt", known=KnownGeometry(**known))
-
-
 @pytest.mark.filterwarnings("ignore:the field of view")
 def test_a_batch_takes_what_its_clips_share(model, tmp_path):
     frames = (255 * np.asarray(moving_ball(3))).astype(np.uint8)
@@ -69,11 +56,3 @@ def test_a_batch_takes_what_its_clips_share(model, tmp_path):
     np.testing.assert_allclose(intrinsics, intrinsics[:1].repeat(3, axis=0))
     with pytest.raises(InputError, match="--baseline is of one clip"):
         next(reconstruct_many(model, {}, tmp_path, known=KnownGeometry(baseline="0,1,2")))
-
-
-@pytest.mark.filterwarnings("ignore:the field of view")
-def test_masks_of_another_shape_are_refused(model, clip, tmp_path):
-    for name in clip.frame_names:
-        Image.fromarray(np.full((20, 90), 255, np.uint8)).save(tmp_path / f"{name}.png")
-    with pytest.raises(ClipError, match=r"mask .* is 90 x 20 and its frame"):
-        reconstruct(model, clip, method="vggt", known=KnownGeometry(leave_out=tmp_path))

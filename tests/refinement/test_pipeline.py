@@ -37,13 +37,10 @@ def test_the_option_and_its_outcome_reach_the_result(model, tmp_path):
     assert "refine_cameras" not in Options().to_json()
 
 
-def test_known_poses_are_not_refined(model, tmp_path):
+def test_known_poses_and_several_methods_are_not_refined(model, tmp_path):
     (tmp_path / "poses.txt").write_text("")
     clip = load_clip(paint(make_corner(2, 0.5)), size=56)
     with pytest.raises(InputError, match="refine_cameras and known poses exclude each other"):
         reconstruct(model, clip, refine_cameras=True, known=KnownGeometry(poses=str(tmp_path / "poses.txt")))
-
-
-def test_several_methods_are_not_refined_at_once(model):
     with pytest.raises(InputError, match="refine_cameras is for one method"):
-        reconstruct_methods(model, load_clip(paint(make_corner(2, 0.5)), size=56), ["vggt"], refine_cameras=True)
+        reconstruct_methods(model, clip, ["vggt"], refine_cameras=True)

@@ -12,16 +12,10 @@ def real():
     return Cameras(room.camera_from_world, room.intrinsics)
 
 
-def test_all_that_is_filmed_fits(real):
-    intrinsics = fitted_intrinsics(real, (42, 28), (960, 540))
-    focal = 0.9 * 42
-    np.testing.assert_allclose(
-        intrinsics, [[focal * 540 / 28, 0, 480], [0, focal * 540 / 28, 270], [0, 0, 1]], rtol=1e-6
-    )
-
-
 def test_the_orbit_looks_at_the_middle_and_closes(real):
     intrinsics = fitted_intrinsics(real, (42, 28), (96, 54))
+    focal = 0.9 * 42 * 54 / 28  # all that is filmed fits
+    np.testing.assert_allclose(intrinsics, [[focal, 0, 48], [0, focal, 27], [0, 0, 1]], rtol=1e-6)
     path = orbit(real, intrinsics, 4.0, 48)
     middle = middle_camera(real)
     pose = real.camera_from_world[middle].astype(np.float64)

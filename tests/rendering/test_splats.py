@@ -1,11 +1,9 @@
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vggtjax.cameras import Cameras
-from vggtjax.errors import InputError
-from vggtjax.rendering.splats import BACKGROUND, Splats, draw_splats, half_run, pixel_radii, project
+from vggtjax.rendering.splats import BACKGROUND, Splats, draw_splats, pixel_radii, project
 
 FRONT = np.eye(4)[:3]
 
@@ -52,20 +50,6 @@ def test_equals_a_loop_over_points_and_pixels(seed, count, supersampling, width,
     np.testing.assert_array_equal(picture, drawn_slowly(splats, view, (width, height), supersampling))
 
 
-def one_point(depth, diameter):
-    return Splats(
-        np.array([[0, 0, depth]], np.float32), np.array([[200, 100, 50]], np.uint8), np.array([diameter], np.float32)
-    )
-
-
-def test_a_disc_shrinks_with_depth():
-    widths = []
-    for depth in (1, 2, 4):
-        picture = draw_splats(one_point(depth, 1), camera(41, 41), (41, 41), supersampling=1)
-        widths.append((picture[20, :, 0] == 200).sum())
-    assert widths == [11, 5, 3]  # 10, 5 and 2.5 pixels
-
-
 def test_a_wall_at_its_own_spacing_has_no_holes():
     rows, columns = np.mgrid[-20:20, -20:20]
     positions = np.stack([columns / 10, rows / 10, np.full(rows.shape, 2.0)], axis=-1).reshape(-1, 3)
@@ -78,21 +62,3 @@ def test_points_behind_too_near_or_broken_are_not_drawn():
     positions = np.array([[0, 0, -1], [0, 0, 0], [np.nan, 0, 1], [0, np.inf, 1], [0, 0, 0.5]], np.float32)
     splats = Splats(positions, np.full((5, 3), 255, np.uint8), np.ones(5, np.float32))
     assert (draw_splats(splats, camera(8, 8), (8, 8), near=0.5) == BACKGROUND).all()
-
-
-def test_edges_are_mixed_with_the_background():
-    picture = draw_splats(one_point(2, 1), camera(21, 21), (21, 21), background=(0, 0, 0))
-    assert len(np.unique(picture[..., 0])) > 2
-
-
-def test_a_disc_is_round():
-    assert [half_run(2, down) for down in range(3)] == [2, 2, 1]
-    assert [half_run(1, down) for down in range(2)] == [1, 1]
-
-
-@pytest.mark.parametrize(
-    ("size", "message"), [((0, 4), "width is 0"), ((4, 2.5), "height is 2.5"), ((9000, 9000), "too large")]
-)
-def test_bad_sizes(size, message):
-    with pytest.raises(InputError, match=message):
-        draw_splats(one_point(1, 1), camera(8, 8), size)

@@ -68,7 +68,7 @@ ALL = (*NAMES, *OPTIONAL_FILES)
 FEW = ("scene.glb", "vggt4d")
 
 
-@pytest.mark.parametrize(("old", "new"), [(None, ALL), (NAMES, ALL), (ALL, NAMES), (ALL, FEW), (FEW, NAMES), (FEW, ())])
+@pytest.mark.parametrize(("old", "new"), [(None, NAMES), (ALL, FEW)])
 def test_a_killed_replacement_is_finished_by_the_next(tmp_path, old, new):
     (tmp_path / "old").mkdir()
     if old is not None:
@@ -96,7 +96,7 @@ def test_a_killed_replacement_is_finished_by_the_next(tmp_path, old, new):
     assert frames_of(folder) == 2
 
 
-@pytest.mark.parametrize("failing", range(1, 29, 3))
+@pytest.mark.parametrize("failing", [1, 13, 25, 28])
 def test_a_failed_replacement_is_undone(tmp_path, monkeypatch, failing):
     make_room(2).save(tmp_path)
     before = files(tmp_path)
@@ -121,60 +121,34 @@ def test_a_failed_replacement_is_undone(tmp_path, monkeypatch, failing):
 SAVER = """
 import sys
 from pathlib import Path
-from tests.results.test_folder import NAMES, save
-folder, frames, pausing = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
-print("ready", flush=True)
-sys.stdin.readline()
-if pausing:
-    rename = Path.rename
-    def pause(source, target):
-        if source.name == target.name == "depth":
-            Path.rename = rename
-            print("moving", flush=True)
-            sys.stdin.readline()
-        return rename(source, target)
-    Path.rename = pause
-for _ in range(1 if pausing else 12):
-    save(folder, frames, ("depth", "tracks.npz") if frames == 2 else NAMES)
+from tests.results.test_folder import save
+rename = Path.rename
+def pause(source, target):
+    if source.name == target.name == "depth":
+        Path.rename = rename
+        print("moving", flush=True)
+        sys.stdin.readline()
+    return rename(source, target)
+Path.rename = pause
+save(Path(sys.argv[1]), 3)
 assert "jax" not in sys.modules
 """
 
 
-def saver(*arguments):
-    """Start a process that saves results of this many frames into a folder once a line is written to it."""
-    command = [sys.executable, "-c", SAVER, *map(str, arguments)]
-    return subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parents[2]
-    )
-
-
-def start(process):
-    process.stdin.write("go\n")
-    process.stdin.flush()
-
-
-def heard(process):
-    return process.stdout.readline().strip()
-
-
-def test_two_processes_save_into_one_folder(tmp_path, monkeypatch):
-    folder = tmp_path / "result"
-    with saver(folder, 1) as one, saver(folder, 2) as other, saver(folder, 3, "pausing") as slow:
-        assert [heard(process) for process in (one, other, slow)] == ["ready"] * 3
-        start(one)
-        start(other)
-        assert [one.wait(60), other.wait(60)] == [0, 0]
-        assert frames_of(folder) in (1, 2)
-        assert not list(folder.glob(".*"))
-        start(slow)
-        assert heard(slow) == "moving"
-        before = sorted(folder.rglob("*"))
+def test_another_process_waits_for_one_that_saves(tmp_path, monkeypatch):
+    save(tmp_path, 1)
+    command, pipe = [sys.executable, "-c", SAVER, str(tmp_path)], subprocess.PIPE
+    with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True, cwd=Path(__file__).parents[2]) as slow:
+        assert slow.stdin is not None
+        assert slow.stdout is not None
+        assert slow.stdout.readline() == "moving\n"
+        before = sorted(tmp_path.rglob("*"))
         monkeypatch.setattr(folders, "_WAIT", 0.1)
-        for attempt in (lambda: check_folder(folder), lambda: save(folder, 4)):
+        for attempt in (lambda: check_folder(tmp_path), lambda: save(tmp_path, 4)):
             with pytest.raises(OutputError, match="another run is writing a result"):
                 attempt()
-        assert sorted(folder.rglob("*")) == before
-        start(slow)
-        assert slow.wait(60) == 0
-    assert frames_of(folder) == 3
-    assert not list(folder.glob(".*"))
+        assert sorted(tmp_path.rglob("*")) == before
+        slow.communicate("go\n", 60)
+    assert slow.returncode == 0
+    assert frames_of(tmp_path) == 3
+    assert not list(tmp_path.glob(".*"))

@@ -26,20 +26,15 @@ def test_nodes_and_points():
     np.testing.assert_allclose(static[:, 2], -WALL, rtol=1e-5)  # glTF looks along -z
     highest = room.world_points()[~room.dynamic_mask][:, 1].min()  # y is down in the result, up in the file
     np.testing.assert_allclose(static[:, 1].max(), -highest, rtol=1e-5)
-
-
-def test_colors_are_linear():
-    moving = load_scene(make_room()).geometry["dynamic_000001"].colors
-    # ((220 / 255 + 0.055) / 1.055) ** 2.4 = 0.7157; 40 -> 0.0212; 30 -> 0.0130
-    assert (moving == (183, 5, 3, 255)).all()
+    # linear: ((220 / 255 + 0.055) / 1.055) ** 2.4 = 0.7157; 40 -> 0.0212; 30 -> 0.0130
+    assert (scene.geometry["dynamic_000001"].colors == (183, 5, 3, 255)).all()
 
 
 def test_dark_tones_stay_apart_and_nothing_is_lit():
     assert (np.diff(_LINEAR) > 0).all()
     np.testing.assert_allclose(_LINEAR[[0, 10, 255]], [0, 10 / 255 / 12.92, 1], rtol=1e-6)
-    cloud = point_cloud.PointCloud(
-        np.zeros((256, 3), np.float32), np.repeat(np.arange(256), 3).reshape(-1, 3).astype("u1")
-    )
+    greys = np.repeat(np.arange(256), 3).reshape(-1, 3).astype("u1")
+    cloud = point_cloud.PointCloud(np.zeros((256, 3), np.float32), greys)
     glb = glb_bytes(build_scene(make_room(1), limited_clouds(cloud, [])))
     size = int.from_bytes(glb[12:16], "little")
     tree, buffer = json.loads(glb[20 : 20 + size]), glb[28 + size :]
@@ -55,9 +50,8 @@ def test_dark_tones_stay_apart_and_nothing_is_lit():
     np.testing.assert_array_equal(values[:, 0], _LINEAR)
 
 
-@pytest.mark.parametrize("frame", [0, 1, 2])
-def test_cameras_open_toward_what_they_see(frame):
-    room = make_room()
+def test_cameras_open_toward_what_they_see():
+    room, frame = make_room(), 2
     cameras = camera_mesh(room, 0.06)
     pose = room.world_from_camera[frame]
     # In the camera (x right, y down, z forward).
@@ -70,20 +64,6 @@ def test_cameras_open_toward_what_they_see(frame):
     assert roof[1] < near[:, 1].mean()
 
 
-def test_first_and_last_camera_differ_in_color():
-    colors = camera_mesh(make_room(), 0.06).colors
-    assert len(np.unique(colors, axis=0)) == 3
-
-
-def test_camera_size_follows_the_scene():
-    small = load_scene(make_room()).geometry["cameras"]
-    room = make_room()
-    moved = room.camera_from_world.copy()
-    moved[:, :, 3] *= 10
-    large = load_scene(make_room(camera_from_world=moved, depth=room.depth * 10)).geometry["cameras"]
-    np.testing.assert_allclose(large.extents, 10 * small.extents, rtol=1e-4)
-
-
 def test_points_are_limited_evenly_and_reproducibly():
     room = make_room()
     scene, again = load_scene(room, point_limit=1000), load_scene(room, point_limit=1000)
@@ -94,45 +74,3 @@ def test_points_are_limited_evenly_and_reproducibly():
         kept += len(scene.geometry[name].vertices)
         np.testing.assert_array_equal(scene.geometry[name].vertices, again.geometry[name].vertices)
     assert 990 < kept <= 1000
-
-
-@pytest.mark.parametrize(
-    ("changes", "names"),
-    [
-        ({"dynamic_mask": np.zeros((3, 28, 42), bool)}, {"static", "cameras"}),
-        (
-            {"dynamic_mask": np.ones((3, 28, 42), bool)},
-            {"cameras", "dynamic_000000", "dynamic_000001", "dynamic_000002"},
-        ),
-        ({"depth": np.zeros((3, 28, 42))}, {"cameras"}),
-    ],
-)
-def test_nothing_or_everything_moves(changes, names):
-    assert set(load_scene(make_room(**changes)).geometry) == names
-
-
-def test_single_frame_and_cameras_in_one_place():
-    assert len(load_scene(make_room(1)).geometry["cameras"].faces) == 8 * 8 + 2
-    still = np.tile(np.eye(4)[:3], (3, 1, 1))
-    assert len(load_scene(make_room(camera_from_world=still)).geometry["cameras"].faces) == 3 * (8 * 8 + 2)
-
-
-@pytest.mark.filterwarnings("ignore::vggtjax.results.result.FieldOfViewWarning")
-def test_extreme_depths_and_fields_of_view():
-    depth = make_room().depth.copy()
-    depth[:, ::2] = 1e38
-    intrinsics = make_room().intrinsics.copy()
-    intrinsics[0, 0, 0], intrinsics[1, 1, 1] = np.inf, -3
-    cameras = load_scene(make_room(depth=depth, intrinsics=intrinsics)).geometry["cameras"]
-    assert np.isfinite(cameras.vertices).all()
-
-
-def test_camera_faces_look_outward():
-    vertices, faces, _ = camera_mesh(make_room(1), 0.06)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    bars, roof = mesh.faces[:-2], mesh.faces[-2:]
-    middles = mesh.vertices[:64].reshape(8, 8, 3).mean(axis=1)  # eight bars of eight corners
-    outward = mesh.vertices[bars].mean(axis=1) - middles[bars[:, 0] // 8]
-    assert (np.einsum("fi,fi->f", outward, mesh.face_normals[:-2]) > 0).all()
-    assert sorted(roof[0]) == sorted(roof[1])
-    np.testing.assert_allclose(mesh.face_normals[-2], -mesh.face_normals[-1])

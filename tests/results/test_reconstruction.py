@@ -1,5 +1,4 @@
 import dataclasses
-import json
 import zipfile
 
 import numpy as np
@@ -17,11 +16,8 @@ def assert_equal(first: Reconstruction, second: Reconstruction) -> None:
     for field in dataclasses.fields(Reconstruction):
         left, right = getattr(first, field.name), getattr(second, field.name)
         assert type(left) is type(right), field.name
-        if isinstance(left, np.ndarray):
-            assert left.dtype == right.dtype, field.name
-            np.testing.assert_array_equal(left, right, err_msg=field.name)
-        else:
-            assert left == right, field.name
+        assert getattr(left, "dtype", None) == getattr(right, "dtype", None), field.name
+        np.testing.assert_equal(left, right, err_msg=field.name)
 
 
 @pytest.fixture
@@ -52,16 +48,8 @@ def test_archive_round_trip(tmp_path, timestamps):
     assert_equal(loaded, dataclasses.replace(room, passes=None))
     assert_equal(loaded, Reconstruction.load(tmp_path / "reconstruction.npz"))
     assert loaded.depth.flags.writeable
-
-
-def test_cameras():
-    room = make_room()
-    np.testing.assert_allclose(
-        room.camera_centres, [[1, -0.3 * np.cos(1), -0.2], [0, -0.3, 0], [-1, -0.3 * np.cos(1), -0.2]], atol=1e-6
-    )
-    bottom = np.tile(np.array([[[0, 0, 0, 1]]], np.float32), (3, 1, 1))
-    product = room.world_from_camera @ np.concatenate([room.camera_from_world, bottom], axis=1)
-    np.testing.assert_allclose(product, np.tile(np.eye(4), (3, 1, 1)), atol=1e-6)
+    assert repr(loaded).startswith("Reconstruction(3 frames of 42 x 28 pixels, method '4dvggt-d', model 'tiny', 10.2%")
+    assert_equal(loaded, dataclasses.replace(loaded, valid_box=room.valid_box.astype(np.int32)))  # types are cast
 
 
 def test_nothing_moves_in_padding():
@@ -71,32 +59,12 @@ def test_nothing_moves_in_padding():
     assert room.dynamic_share == 1
 
 
-def test_the_text_of_a_result_is_one_line():
-    text = repr(make_room())
-    assert text == "Reconstruction(3 frames of 42 x 28 pixels, method '4dvggt-d', model 'tiny', 10.2% dynamic)"
-    assert dataclasses.replace(make_room(), method="vggt").method == "vggt"
-
-
-def test_pixel_offset_moves_points_by_half_a_pixel():
-    room = make_room(1, camera_from_world=np.eye(4)[None, :3])
-    moved = room.world_points() - room.world_points(pixel_offset=0.0)
-    np.testing.assert_allclose(moved[..., 0], room.depth / room.intrinsics[0, 0, 0] / 2, rtol=1e-4)
-    np.testing.assert_allclose(moved[..., 2], 0)
-
-
-def test_wider_types_are_cast():
-    room = make_room()
-    wide = make_room(depth=room.depth.astype(np.float64), valid_box=room.valid_box.astype(np.int32))
-    assert_equal(room, wide)
-
-
 def test_fields_of_view_are_clamped_with_a_warning():
     intrinsics = make_room(14).intrinsics.copy()
     intrinsics[:12, 1, 1] = np.inf
     intrinsics[13, 0, 0] = -5
-    with pytest.warns(
-        FieldOfViewWarning, match=r"frames 0, 1, .*, 9 and 3 more was clamped to \[0.01, 3.1\] rad"
-    ) as seen:
+    words = r"frames 0, 1, .*, 9 and 3 more was clamped to \[0.01, 3.1\] rad"
+    with pytest.warns(FieldOfViewWarning, match=words) as seen:
         room = make_room(14, intrinsics=intrinsics)
     assert len(seen) == 1
     np.testing.assert_allclose(room.intrinsics[0, 1, 1], 14 / np.tan(0.005), rtol=1e-6)
@@ -116,32 +84,19 @@ def nan_at(name, index):
     [
         ({"depth": np.ones((28, 42))}, r"depth has shape \(28, 42\); expected \(frames, rows, columns\)"),
         ({"depth": np.ones((0, 28, 42))}, "none of them 0"),
-        (
-            {"depth_confidence": np.ones((3, 28, 41))},
-            r"depth_confidence has shape \(3, 28, 41\); expected \(3, 28, 42\)",
-        ),
-        ({"camera_from_world": np.tile(np.eye(4), (3, 1, 1))}, r"expected \(3, 3, 4\)"),
-        ({"frame_names": ("a",)}, r"frame_names has shape \(1,\); expected \(3,\)"),
-        ({"timestamps": np.zeros(2)}, r"timestamps has shape"),
+        ({"depth_confidence": np.ones((3, 28, 41))}, r"depth_confidence has shape \(3, 28, 41\); expected"),
         ({"saliency": np.zeros((3, 5, 3))}, "5 x 3 patches, which do not divide 28 x 42 pixels"),
         ({"images": np.zeros((3, 28, 42, 3))}, "images has type float64; expected uint8"),
-        ({"dynamic_mask": np.zeros((3, 28, 42), np.uint8)}, "dynamic_mask has type uint8; expected bool"),
         ({"valid_box": np.array([[0, 0, 42, 28]] * 2 + [[0, 0, 43, 28]])}, r"valid_box of frame 2 is \[0, 0, 43, 28\]"),
-        ({"valid_box": np.array([[5, 0, 5, 28]] * 3)}, "valid_box of frame 0"),
-        ({"camera_from_world": 2 * np.tile(np.eye(4)[:3], (3, 1, 1))}, "camera_from_world of frame 0"),
         ({"camera_from_world": np.tile(np.diag([1, 1, -1, 1.0])[:3], (3, 1, 1))}, "camera_from_world of frame 0"),
         (nan_at("camera_from_world", (1, 0, 3)), "camera_from_world of frame 1"),
-        (nan_at("camera_from_world", (2, 0, 0)), "camera_from_world of frame 2"),
         (nan_at("intrinsics", (1, 0, 0)), "field of view of frame 1"),
-        (nan_at("intrinsics", (1, 0, 2)), "intrinsics holds nan"),
         (nan_at("timestamps", 0), "timestamps holds nan"),
-        (nan_at("source_scale", (0, 0)), "source_scale holds nan"),
         (
             {"depth": np.where(np.arange(3)[:, None, None] == 1, np.nan, make_room().depth)},
             r"depth of frame 1 has no finite value, and 1176 of 3528 values .* are not finite; check the weights",
         ),
         ({"depth_confidence": np.full((3, 28, 42), np.inf)}, "depth_confidence of frame 0 has no finite value"),
-        ({"settings": {"a": object()}}, "settings cannot be written as JSON"),
         ({"settings": {"a": float("nan")}}, "settings cannot be written as JSON"),
         ({"settings": [1]}, "settings is a list"),
     ],
@@ -155,21 +110,13 @@ def test_fields_that_do_not_fit(changes, message):
     ("changes", "message"),
     [
         ({"depth": None}, "missing or unknown: depth"),
-        ({"format_version": None}, "no format version"),
         ({"format_version": np.array("1")}, "no format version"),
         ({"format_version": np.array(99)}, "format version 99; expected 1"),
-        ({"extra": np.zeros(3)}, "missing or unknown: extra"),
         ({"depth": np.zeros((2, 28, 42))}, "depth has type float64; expected float32"),
-        ({"depth": np.zeros((2, 28, 41), np.float32)}, "expected"),
         ({"method": np.zeros(())}, "method has type float64; expected text"),
-        ({"method": np.array(["a", "b"])}, r"method has shape \(2,\)"),
-        ({"frame_names": np.array(["a"])}, "frame_names has shape"),
-        ({"settings": np.array("{")}, "Expecting property name"),
         ({"settings": np.array("[" * 100_000)}, "recursion"),
         ({"settings": np.array('{"a": ' + "7" * 5000 + "}")}, "settings are not JSON"),
-        ({"settings": np.array('{"a": NaN}')}, "settings cannot be written as JSON"),
         ({"settings": np.array('{"a": 1e999}')}, "settings cannot be written as JSON"),
-        ({"settings": np.array("[1]")}, "settings is a list"),
         ({"method": np.frombuffer(b"\xff" * 4, "<U1").reshape(())}, "text that is not Unicode"),
         ({"valid_box": np.zeros((2, 4), np.int64)}, "valid_box of frame 0"),
     ],
@@ -204,15 +151,4 @@ def test_files_that_are_cut_off_or_absent(stored, tmp_path):
     path.unlink()
     with pytest.raises(ResultError, match=r"there is no .*reconstruction\.npz; give the folder"):
         Reconstruction.load(tmp_path)
-
-
-def test_is_result(stored, tmp_path):
-    assert is_result(stored(format_version=np.array(2)))
-    assert not is_result(stored(depth=None))
-    assert not is_result(tmp_path / "absent")
-    assert not is_result(tmp_path)
-
-
-def test_settings_are_json_text(stored):
-    with np.load(stored(), allow_pickle=False) as arrays:
-        assert json.loads(str(arrays["settings"])) == {"mask_pairs": 5, "gram": None}
+    assert not is_result(path)

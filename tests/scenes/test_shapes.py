@@ -18,48 +18,6 @@ def interval(shape, origin, direction, size):
     return float(near[0, 0]), float(far[0, 0])
 
 
-@pytest.mark.parametrize(
-    ("shape", "origin", "direction", "size", "expected"),
-    [
-        ("box", (-5, 0, 0), (1, 0, 0), SIZE, (4, 6)),
-        ("box", (-5, 0, 0), (2, 0, 0), SIZE, (2, 3)),  # in units of the direction's length
-        ("box", (-5, 0, 0), (-1, 0, 0), SIZE, (-6, -4)),  # behind
-        ("box", (0, 0, 0), (0, 1, 0), SIZE, (-2, 2)),  # from inside
-        ("box", (0.5, 1.5, -4), (0, 0, 1), SIZE, (1, 7)),
-        ("box", (-3, -4, 0), (1, 1, 0), SIZE, (2, 4)),  # in through x or y, out through x
-        ("ellipsoid", (0, 0, -9), (0, 0, 1), SIZE, (6, 12)),
-        ("ellipsoid", (0, -4, 0), (0, 0.5, 0), SIZE, (4, 12)),
-        ("ellipsoid", (3, 0, -10), (0, 0, 1), (5, 5, 5), (6, 14)),  # half the chord is 4 of 3, 4, 5
-        ("ellipsoid", (0, 0, 0), (1, 0, 0), SIZE, (-1, 1)),
-        ("cylinder", (-5, 0, 0), (1, 0, 0), (2, 1, 3), (3, 7)),
-        ("cylinder", (0, 0.5, -5), (0, 0, 1), (2, 1, 3), (2, 8)),
-        ("cylinder", (0.5, -4, 0.5), (0, 1, 0), (2, 1, 3), (3, 5)),  # along the axis, cap to cap
-        ("cylinder", (-1, -2, 0), (1, 1, 0), (1, 1, 1), (1, 2)),  # in through a cap, out through the side
-        ("cylinder", (3, 0, -10), (0, 0, 1), (5, 1, 5), (6, 14)),
-    ],
-)
-def test_intervals_by_hand(shape, origin, direction, size, expected):
-    assert interval(shape, origin, direction, size) == pytest.approx(expected, rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("shape", "origin", "direction"),
-    [
-        ("box", (-5, 2.1, 0), (1, 0, 0)),  # parallel to a face, past it
-        ("box", (-3, 2, 0), (1, 1, 0)),
-        ("ellipsoid", (0.8, 1.7, -9), (0, 0, 1)),  # through a corner of the box around it
-        ("ellipsoid", (-5, 0, 3.1), (1, 0, 0)),
-        ("cylinder", (-5, 2.1, 0), (1, 0, 0)),  # above the cap
-        ("cylinder", (0.8, 0, 2.7), (0, 1, 0)),  # along the axis, beside it
-        ("cylinder", (0.8, -9, 2.7), (0, 1, 0)),
-        ("cylinder", (-2, 1.5, 0), (1, 1, 0)),  # meets the side only above the cap
-    ],
-)
-def test_misses_leave_before_they_enter(shape, origin, direction):
-    near, far = interval(shape, origin, direction, SIZE)
-    assert not near < far
-
-
 def test_normals_by_hand():
     size = jnp.asarray(SIZE)[:, None] * jnp.ones((1, 4))
     points = jnp.asarray([(1, 0.5, 0.5), (-0.2, -2, 1), (0, 1.9, -3), (-1, 1.9, 2.9)]).T
@@ -82,7 +40,7 @@ extent = st.floats(0.2, 2)
 
 
 @pytest.mark.parametrize("shape", list(SHAPES))
-@settings(max_examples=60)
+@settings(max_examples=40)
 @given(start=vector, through=vector, size=st.tuples(extent, extent, extent))
 def test_a_ray_enters_and_leaves_on_the_surface(shape, start, through, size):
     origin, size = 8 * np.array(start), np.array(size)

@@ -1,7 +1,6 @@
 """The page in a real browser: it opens from a file, plays, and shows the frame that is due."""
 
 import io
-import threading
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from scipy import ndimage
 from tests import chromium
 from tests.room import make_room
 from vggtjax.viewer.page import viewer_page
-from vggtjax.viewer.server import PageServer
 
 FRAMES, HEIGHT, WIDTH = 6, 28, 42
 BAR = 46  # pixels of the time line
@@ -83,11 +81,15 @@ def look_through_the_clips_camera(page):
     page.keyboard.press("f")
 
 
-def test_the_page_opens_from_a_file_plays_and_shows_the_frame_that_is_due(page, room, tmp_path):
-    file = tmp_path / "viewer.html"
-    file.write_text(viewer_page([room], names=[NAME]), encoding="utf-8")
+def open_page(page, folder, results, **options):
+    file = folder / "viewer.html"
+    file.write_text(viewer_page(results, **options), encoding="utf-8")
     page.goto(file.as_uri())
     page.evaluate(READY)
+
+
+def test_the_page_opens_from_a_file_plays_and_shows_the_frame_that_is_due(page, room, tmp_path):
+    open_page(page, tmp_path, [room], names=[NAME])
     assert NAME.startswith(page.locator("h1").inner_text()[:20])
     assert page.title() == NAME
 
@@ -109,70 +111,9 @@ def test_the_page_opens_from_a_file_plays_and_shows_the_frame_that_is_due(page, 
     assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
 
 
-def test_the_served_viewer_moves_with_its_time_line(page, room):
-    with PageServer(viewer_page([room]), port=0) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-        thread.start()
-        try:
-            page.goto(server.url)
-            page.evaluate(READY)
-            look_through_the_clips_camera(page)
-            set_slider(page, "#time", 0)
-            first = red(page)
-            set_slider(page, "#time", FRAMES - 1)
-            last = red(page)
-        finally:
-            server.shutdown()
-            thread.join()
-    assert agreement(first, room.dynamic_mask[0]) > 0.75
-    assert agreement(last, room.dynamic_mask[-1]) > 0.75
-    assert [line for line in page.complaints if "404" not in line] == []  # a browser asks for an icon
-
-
-def test_two_results_side_by_side_and_swapped_by_a_key(page, room, tmp_path):
-    file = tmp_path / "viewer.html"
-    file.write_text(viewer_page([room, make_room(FRAMES, HEIGHT, WIDTH, method="vggt")], names=["ours", "theirs"]))
-    page.goto(file.as_uri())
-    page.evaluate(READY)
-    page.keyboard.press("v")
-    page.locator("#pictures").evaluate("box => box.click()")
-    both = red(page)
-    assert both[:, : WIDTH // 2].any()
-    assert both[:, WIDTH // 2 :].any()
-    page.keyboard.press("2")
-    assert page.locator("h1").inner_text() == "theirs"
-    options = page.locator("#color option").all_inner_texts()
-    assert "picture" in options
-    assert "pass" not in options
-    page.keyboard.press("c")
-    assert page.locator("#color").input_value() == "1"
-    assert page.complaints == []
-
-
-def test_of_five_results_four_stand_side_by_side_under_their_names(page, room, tmp_path):
-    file = tmp_path / "viewer.html"
-    file.write_text(viewer_page([room] * 5, names=list("abcde")))
-    page.goto(file.as_uri())
-    page.evaluate(READY)
-    for key, names in (("1", "abcd"), ("2", "bcde"), ("5", "bcde")):
-        page.keyboard.press(key)
-        page.keyboard.press("v")
-        assert page.locator("#columns h2").all_inner_texts() == list(names)
-        assert page.evaluate("window.vggtjax.viewer.views().map(view => view.model.result.name)") == list(names)
-        width = page.evaluate("window.vggtjax.viewer.canvas.clientWidth")
-        for number, name in enumerate(page.locator("#columns div").all()):
-            assert name.bounding_box()["x"] == pytest.approx(number * width / 4, abs=1)
-    assert not page.locator("h1").is_visible()
-    page.evaluate("MediaRecorder.isTypeSupported = () => false")
-    page.keyboard.press("t")
-    assert "records no video" in page.locator("#message").inner_text()
-    assert page.complaints == []
-
-
 def test_every_slider_and_the_tracks_change_what_is_drawn(page, room, tmp_path):
-    depth = np.where(
-        room.dynamic_mask, 0.8 * room.depth.max(axis=(1, 2), keepdims=True), room.depth
-    )  # steps of depth that the slider reaches
+    near = 0.8 * room.depth.max(axis=(1, 2), keepdims=True)  # steps of depth that the slider reaches
+    depth = np.where(room.dynamic_mask, near, room.depth)
     along = np.linspace(6, 30, FRAMES)[:, None, None] * [1.0, 0.5]
     tracked = {
         "track_positions": (along + np.arange(3)[:, None] * [3.0, 2.0]).astype(np.float32),
@@ -180,10 +121,7 @@ def test_every_slider_and_the_tracks_change_what_is_drawn(page, room, tmp_path):
         "track_confidence": np.ones((FRAMES, 3), np.float32),
         "track_frames": np.zeros(3, np.int32),
     }
-    file = tmp_path / "viewer.html"
-    file.write_text(viewer_page([make_room(FRAMES, HEIGHT, WIDTH, depth=depth, **tracked)]), encoding="utf-8")
-    page.goto(file.as_uri())
-    page.evaluate(READY)
+    open_page(page, tmp_path, [make_room(FRAMES, HEIGHT, WIDTH, depth=depth, **tracked)])
     assert page.locator("#steps").get_attribute("max") == "0.3"
     set_slider(page, "#time", FRAMES - 1)
     before = drawn(page)
@@ -198,11 +136,15 @@ def test_every_slider_and_the_tracks_change_what_is_drawn(page, room, tmp_path):
     assert page.complaints == []
 
 
-def test_by_itself_it_plays_and_on_a_narrow_window_without_the_settings(browser, room, tmp_path):
-    file = tmp_path / "viewer.html"
-    file.write_text(viewer_page([room]), encoding="utf-8")
-    page = browser.new_page(viewport={"width": 500, "height": 700}, reduced_motion="no-preference")
-    page.goto(file.as_uri())
-    page.evaluate(until("window.vggtjax?.viewer.frame > 0"))
-    assert not page.locator("#panel").is_visible()
-    page.close()
+def test_two_results_side_by_side_and_swapped_by_a_key(page, room, tmp_path):
+    theirs = make_room(FRAMES, HEIGHT, WIDTH, method="vggt")
+    open_page(page, tmp_path, [room, theirs], names=["ours", "theirs"])
+    page.keyboard.press("v")
+    page.locator("#pictures").evaluate("box => box.click()")
+    both = red(page)
+    assert both[:, : WIDTH // 2].any()
+    assert both[:, WIDTH // 2 :].any()
+    page.keyboard.press("2")
+    assert page.locator("h1").inner_text() == "theirs"
+    assert "pass" not in page.locator("#color option").all_inner_texts()
+    assert page.complaints == []

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from tests.room import make_room
+from vggtjax.known.apply import scaled
 from vggtjax.results.result import missing_fields
 from vggtjax.results.shown import middle_and_radius
 from vggtjax.viewer.page import viewer_page
-from vggtjax.viewer.scene import Budget, Place, contracted, home_view, place_beside, scene_of
+from vggtjax.viewer.scene import Budget, Place, home_view, place_beside, scene_of
 
 SAME = Place(1.0, np.eye(3), np.zeros(3))
 
@@ -39,22 +40,6 @@ def test_moving_points_lie_on_the_box_of_their_frame():
     assert all(len(color["values"]) in (len(positions), 3 * len(positions)) for color in scene["colors"])
 
 
-def test_positions_are_fine_near_the_centre_and_finite_far_away():
-    centre = np.array([1.0, -2.0, 3.0], np.float32)
-    points = centre + np.array([[0, 0, 0], [0.5, 0, 0], [3e4, -2e4, 1e5]], np.float32)
-    scene = {"positions": contracted(points, centre, 2.0).ravel(), "centre": centre, "scale": 2.0}
-    back = positions_of(scene)
-    np.testing.assert_allclose(back[:2], points[:2], atol=2e-4)
-    assert np.isfinite(back).all()
-
-
-@pytest.mark.parametrize("missing", [7, "images", {"images": 1}, [["images"], 7, None]])
-def test_odd_settings_say_that_nothing_is_missing(missing):
-    result = make_room(2, settings={"missing": missing})
-    assert missing_fields(result) == ()
-    assert names(result)[0] == "picture"
-
-
 def test_only_colours_that_the_result_has_are_offered():
     result = make_room(3)
     everything = ["picture", "depth", "confidence", "mask", "object", "saliency", "pass", "time"]
@@ -62,14 +47,12 @@ def test_only_colours_that_the_result_has_are_offered():
     fused = dataclasses.replace(result, settings={"fusion": "abc"})
     assert names(fused) == [*everything[:3], "fused precision", *everything[3:]]
     assert "pass" not in names(dataclasses.replace(result, method="vggt"))
-    foreign = dataclasses.replace(
-        result,
-        method="cut3r",
-        saliency=None,
-        dynamic_mask=np.zeros_like(result.dynamic_mask),
-        settings={"missing": ["images", "dynamic_mask", "depth_confidence"]},
-    )
+    missing = {"missing": ["images", "dynamic_mask", "depth_confidence"]}
+    still = np.zeros_like(result.dynamic_mask)
+    foreign = dataclasses.replace(result, method="cut3r", saliency=None, dynamic_mask=still, settings=missing)
     assert names(foreign) == ["depth", "time"]
+    for missing in (7, {"images": 1}, [["images"], 7, None]):  # nothing
+        assert missing_fields(make_room(2, settings={"missing": missing})) == ()
 
 
 def test_a_second_result_is_placed_on_the_first_camera_at_its_scale():
@@ -88,27 +71,19 @@ def test_a_second_result_is_placed_on_the_first_camera_at_its_scale():
 @pytest.mark.parametrize("factor", [1e-20, 1e15])
 def test_worlds_of_any_size(factor):
     room = make_room(2)
-    cameras = room.camera_from_world.copy()
-    cameras[:, :, 3] *= factor
-    other = dataclasses.replace(room, depth=room.depth * np.float32(factor), camera_from_world=cameras)
+    other = scaled(room, factor)
     for place in (SAME, place_beside(other, room)):
         scene = scene_of(other, "other", place, budget=Budget())
         assert scene["staticCount"] > 100
         assert np.isfinite(positions_of(scene)).all()
 
 
-def test_results_at_the_edge_of_what_there_is():
-    still = dataclasses.replace(make_room(1), dynamic_mask=np.zeros((1, 28, 42), bool), timestamps=None)
-    scene = scene_of(still, "still", SAME, budget=Budget())
-    assert scene["offsets"].tolist() == [scene["staticCount"]] * 2
-    empty = dataclasses.replace(make_room(2), depth=np.zeros((2, 28, 42), np.float32))
-    assert scene_of(empty, "empty", SAME, budget=Budget())["staticCount"] == 0
-
-
 def test_depth_at_the_end_of_float32_still_gives_a_page():
     far = make_room(2, depth=np.full((2, 28, 42), 3e38, np.float32))
     for results in ([far], [make_room(2), far], [far, make_room(2)]):
         assert "Infinity" not in viewer_page(results)
+    empty = dataclasses.replace(make_room(1), depth=np.zeros((1, 28, 42), np.float32), timestamps=None)
+    assert scene_of(empty, "empty", SAME, budget=Budget())["offsets"].tolist() == [0, 0]
 
 
 def test_the_first_view_stands_behind_and_above_the_middle_camera_and_looks_along_it():

@@ -49,16 +49,8 @@ def test_elsewhere_every_request_needs_the_token():
         assert server.token
         assert server.url.endswith(f"/?token={server.token}")
         cookie = f"vggtjax_{server.server_port}"
-        for path, headers in (
-            ("/", {}),
-            ("/?token=", {}),
-            ("/?token=wrong", {}),
-            (f"/?token={server.token}x", {}),
-            ("/?token=%C3%A9", {}),
-            ("/", {"Cookie": f"{cookie}=wrong"}),
-            ("/", UPGRADE),
-            ("/any", {}),
-        ):
+        wrong = {"Cookie": f"{cookie}=wrong"}
+        for path, headers in (("/", {}), ("/?token=%C3%A9", {}), ("/", wrong), ("/", UPGRADE), ("/any", {})):
             status, body, _ = get(server, path, **headers)
             assert status == 403
             assert "the page" not in body

@@ -6,7 +6,6 @@ import pytest
 from tests.captures import folders
 from tests.captures.folders import FRAMES, HEIGHT, WIDTH, make_truth
 from tests.dataset_files import opened
-from vggtjax.errors import InputError
 
 TRUTH = make_truth()
 
@@ -34,22 +33,11 @@ def test_a_capture_is_a_sequence(tmp_path):
 def test_files_of_record3d_stand_beside_folders(tmp_path):
     pytest.importorskip("lzfse")
     (tmp_path / "all").mkdir()
-    (tmp_path / "blind").mkdir()
     folder = folders.record3d(tmp_path / "unpacked", TRUTH)
     folders.zipped(folder, tmp_path / "all/walk.r3d")
-    folders.colmap_text(tmp_path / "all/yard", TRUTH)
-    folders.colmap_text(tmp_path / "all/both", TRUTH)
-    folders.zipped(folder, tmp_path / "all/both.R3D")
-    both, with_suffix, walk, yard = sorted(opened("capture", tmp_path / "all"), key=lambda sequence: sequence.name)
-    assert (both.name, with_suffix.name, walk.name, yard.name) == ("both", "both.R3D", "walk", "yard")
-    assert with_suffix.depth is not None
+    folders.colmap_text(tmp_path / "all/walk", TRUTH)
+    yard, walk = sorted(opened("capture", tmp_path / "all"), key=lambda sequence: sequence.name)
+    assert (yard.name, walk.name) == ("walk", "walk.r3d")
     assert walk.depth(0).any()
-    for path in folder.glob("rgbd/*.depth"):
-        path.unlink()
-    (blind,) = opened("capture", folders.zipped(folder, tmp_path / "blind/blind.r3d").parent)
-    assert blind.depth is None
-    assert blind.pictures[0].is_file()  # of an archive that only the sequence keeps
-    assert yard.depth is None
-    assert yard.notes[-1] == "yard: it has no depth"
-    with pytest.raises(InputError, match="holds no sequence; expected a capture"):
-        opened("capture", tmp_path / "all/yard/images")
+    assert walk.pictures[0].is_file()  # of an archive that only the sequence keeps
+    assert yard.notes[-1] == "walk: it has no depth"

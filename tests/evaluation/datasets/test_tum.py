@@ -2,13 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from tests.dataset_files import QUARTER_ABOUT_Y, depth_png, opened, picture, write
 from vggtjax.cameras import checked_poses
-from vggtjax.captures.tum import partners
 from vggtjax.errors import InputError
 
 
@@ -69,80 +65,36 @@ def test_tum_without_partners(tmp_path):
     folder = tum_folder(tmp_path / "somewhere", times, depth_times=times[:2] + 0.019, pose_times=times + 0.021)
     (sequence,) = opened("tum", folder, stride=1)
     assert sequence.world_from_camera is sequence.intrinsics is None
-    assert [note.removeprefix("somewhere: ") for note in sequence.notes[1:]] == [
+    notes = " ".join(sequence.notes)
+    for words in (
         "no frame has a pose within 0.02 s",
-        "its camera is unknown; name the folder after the camera, or put fx fy cx cy in calibration.txt",
-        "2 of 4 frames have no depth, 50.200000 first",
-    ]
-    assert sequence.depth(1).any()
-    assert not sequence.depth(2).any()
+        "its camera is unknown",
+        "2 of 4 frames have no depth, 50.2",
+    ):
+        assert words in notes
+    assert [sequence.depth(frame).any() for frame in (1, 2)] == [True, False]
     write(folder / "calibration.txt", "# fx fy cx cy\n500 501 320 240\n")
-    (folder / "depth.txt").unlink()
-    (folder / "groundtruth.txt").unlink()
     (sequence,) = opened("tum", folder, stride=1)
     assert np.array_equal(sequence.intrinsics[3], [[500, 0, 320.5], [0, 501, 240.5], [0, 0, 1]])
-    assert sequence.notes[1:] == ("somewhere: it has no groundtruth.txt", "somewhere: it has no depth")
 
 
-@pytest.mark.parametrize("name", ["tum", "bonn"])
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
         ("rgb.txt", "1.0 /etc/passwd\n", "names the file '/etc/passwd'; expected a path inside"),
-        ("rgb.txt", "1.0 rgb/../../secret.png\n", "names the file 'rgb/../../secret.png'"),
-        ("rgb.txt", "1.0 C:\\secret.png\n", "names the file 'C:"),
-        ("rgb.txt", "1.0 ..\\secret.png\n", "expected a path inside"),
-        ("depth.txt", "1.0 ../depth/1.png\n", "expected a path inside"),
         ("rgb.txt", "1.0 rgb/nothing.png\n" * 40, "nothing.png is missing"),
-        ("rgb.txt", "soon rgb/1.png\n", "in line 1; expected a timestamp and a path"),
         ("rgb.txt", "# only\n1.0\n", "in line 2; expected a timestamp and a path"),
-        ("rgb.txt", "nan rgb/1.png\n", "in line 1; expected a timestamp and a path"),
         ("rgb.txt", "# nothing\n", "names no files"),
-        ("rgb.txt", b"\xff\xfe\x00", "not a text file"),
-        ("groundtruth.txt", "1.0 0 0 0 0 0 0\n", "groundtruth.txt has 7 numbers"),
+        ("calibration.txt", "500 500 320 240\n1 1 1 1\n", "2 rows; expected one: fx fy cx cy"),
         ("groundtruth.txt", "1.0 0 0 0 0 0 0 2\n", "quaternion of length 2"),
     ],
 )
-def test_lists_that_cannot_be_right_are_refused(tmp_path, name, file, content, message):
+def test_lists_that_cannot_be_right_are_refused(tmp_path, file, content, message):
     folder = tum_folder(tmp_path / "clip", 1 + np.arange(40) / 30)
     write(tmp_path / "secret.png", picture())
     write(folder / file, content)
     with pytest.raises(InputError, match=message.replace("\\", r"\\")):
-        opened(name, folder)
-
-
-def test_an_unknown_calibration_is_refused(tmp_path):
-    folder = tum_folder(tmp_path / "clip", [1.0])
-    write(folder / "calibration.txt", "500 500 320 240\n1 1 1 1\n")
-    with pytest.raises(InputError, match="2 rows; expected one: fx fy cx cy"):
         opened("tum", folder)
-
-
-def slow_associate(first, second, apart):
-    """All pairs, closest first: what the benchmark's tool does, without its shortcuts or ours."""
-    pairs = sorted(
-        (abs(a - b), a, b, i, j) for i, a in enumerate(first) for j, b in enumerate(second) if abs(a - b) < apart
-    )
-    partners = [-1] * len(first)
-    for _, _, _, i, j in pairs:
-        if partners[i] < 0 and j not in partners:
-            partners[i] = j
-    return partners
-
-
-seconds = st.lists(st.integers(0, 60).map(lambda n: n / 200), min_size=1, max_size=12)
-
-
-@settings(max_examples=200)
-@given(first=seconds, second=seconds)
-def test_association_is_that_of_all_pairs(first, second):
-    assert partners(np.array(first), np.array(second)).tolist() == slow_associate(first, second, 0.02)
-
-
-def test_association_by_hand():
-    # 0.03 is nearer to 0.02 than 0.0 is, so 0.0 is left without
-    assert partners(np.array([0.005, 0.03, 1]), np.array([0.02])).tolist() == [-1, 0, -1]
-    assert partners(np.array([1.0, 2.0]), np.array([2.02, 1.019])).tolist() == [1, -1]  # less than, not up to
 
 
 def test_bonn(tmp_path):
@@ -153,6 +105,10 @@ def test_bonn(tmp_path):
     assert len(sequence) == 110
     assert np.allclose(sequence.timestamps, times[30:140], atol=1e-6)
     assert sequence.depth(0)[0, 3] == np.float32(5031 / 5000)
+    tum_folder(tmp_path / "lost" / "crowd2", times, pose_times=np.delete(times, [2, 40]))
+    (lost,) = opened("bonn", tmp_path / "lost")  # the window stays where poses are missing
+    assert (len(lost), lost.world_from_camera) == (110, None)
+    assert f"crowd2: 1 of 110 frames have no pose within 0.02 s, {times[40]:.6f} first; no poses" in lost.notes
     assert sequence.notes[0] == (
         "4 of 5 published sequences of bonn are missing: balloon2, crowd3, person_tracking2, synchronous"
     )
@@ -169,17 +125,3 @@ def test_bonn(tmp_path):
     # a scaled rotation: what is left of the published matrix when its scale of 1.059 is taken out
     scaled = (ros @ truth @ ros)[:3, :3] @ markers / np.cbrt(np.linalg.det(markers))
     assert np.allclose(sequence.world_from_camera[0, :3, :3], scaled, atol=1e-3)
-
-
-def test_bonn_keeps_its_window_where_poses_are_missing(tmp_path):
-    times = 10 + np.arange(60) / 30
-    tum_folder(tmp_path / "rgbd_bonn_crowd2", times, pose_times=np.delete(times, [2, 40]))
-    (sequence,) = opened("bonn", tmp_path)
-    assert np.allclose(sequence.timestamps, times[30:], atol=1e-6)
-    assert sequence.world_from_camera is None
-    assert "crowd2: it has 60 frames; the protocol takes 30 to 139" in sequence.notes
-    assert f"crowd2: 1 of 30 frames have no pose within 0.02 s, {times[40]:.6f} first; no poses" in sequence.notes
-
-
-def test_quaternions_of_the_fixture_are_the_quarter_turn():
-    assert np.allclose(Rotation.from_quat([0, 0.5**0.5, 0, 0.5**0.5]).as_matrix(), QUARTER_ABOUT_Y)

@@ -4,18 +4,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.optimize import linprog, minimize_scalar
+from scipy.optimize import linprog
 
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.video_depth import depth_alignment, video_depth_errors
 
 TRUTH = np.array([[[2.0, 4.0]], [[8.0, 0.0]]])  # two frames of two pixels; the last is not measured
-seeds = st.integers(0, 2**32 - 1)
 
 
-def depths(seed, shape=(3, 6, 7)) -> tuple[np.ndarray, np.ndarray]:
+def depths(seed, shape) -> tuple[np.ndarray, np.ndarray]:
     """A prediction off by scale, shift and heavy-tailed noise, and a truth with holes."""
     generator = np.random.default_rng(seed)
     truth = np.exp(0.5 * generator.normal(size=shape)) + 1
@@ -43,29 +40,14 @@ def test_alignments_by_hand():
     # Medians 2 and 4: scale 2, so 2, 4, 12.
     assert video_depth_errors(predicted, TRUTH, "median").abs_rel == pytest.approx(0.5 / 3)
     assert depth_alignment(predicted, TRUTH, "median") == (2, 0)
-    assert depth_alignment(predicted.ravel(), TRUTH.ravel(), "median") == (2, 0)
     assert depth_alignment(predicted, TRUTH, "metric") == (1, 0)
     # |s - 2| + |2 s - 4| + |6 s - 8| is least at 4 / 3, where the deepest is exact; the rest is 4 / 3 and 8 / 3.
     scaled = video_depth_errors(predicted, TRUTH, "scale")
     assert depth_alignment(predicted, TRUTH) == pytest.approx((4 / 3, 0), rel=1e-3)
     assert scaled.abs_rel == pytest.approx(2 / 9, rel=1e-3)
     assert scaled.rmse == pytest.approx(np.sqrt((4 / 9 + 16 / 9) / 3), rel=1e-3)
-
-
-def test_ten_rounds_by_hand():
-    """Two pixels of depth 1 in the prediction, 1 and 3 in the truth: the start, 2, is where all rounds stay."""
-    errors = video_depth_errors(np.ones((1, 1, 2)), np.array([[[1.0, 3.0]]]), "scale")
-    assert errors.abs_rel == pytest.approx((1 + 1 / 3) / 2)
-
-
-def test_scale_and_shift_by_hand():
-    """Four of five pixels are on the line 2 d + 1; least squares would follow the fifth."""
-    predicted = np.array([[[1.0, 2.0, 3.0, 4.0, 5.0]]])
-    truth = np.array([[[3.0, 5.0, 7.0, 9.0, 31.0]]])
-    errors = video_depth_errors(predicted, truth, "scale-shift")
-    assert errors.abs_rel == pytest.approx(20 / 31 / 5, rel=1e-3)
-    assert depth_alignment(predicted, truth, "scale-shift") == pytest.approx((2, 1), rel=1e-3)
-    assert errors.delta1 == pytest.approx(0.8)
+    # Two pixels of depth 1, of which the truth is 1 and 3: the start, mean over mean, is where all rounds stay.
+    assert depth_alignment(np.ones(2), np.array([1.0, 3.0])).scale == pytest.approx(2)
 
 
 def test_a_depth_behind_the_camera_is_close_to_nothing():
@@ -74,50 +56,7 @@ def test_a_depth_behind_the_camera_is_close_to_nothing():
     assert errors.abs_rel == pytest.approx((2.5 + 1 + 0) / 3)
 
 
-@settings(max_examples=40)
-@given(seed=seeds, scale=st.floats(1e-2, 1e2), shift=st.floats(-3, 3))
-def test_what_the_alignment_finds_does_not_matter(seed, scale, shift):
-    predicted, truth = depths(seed)
-    for align in ("scale", "median", "scale-shift"):
-        errors = video_depth_errors(predicted, truth, align)
-        assert video_depth_errors(scale * predicted, truth, align) == pytest.approx(errors, rel=1e-5)
-        perfect = video_depth_errors(scale * np.where(truth > 0, truth, 5), truth, align)
-        assert perfect == pytest.approx((0, 0, 1, 1, 1, errors.pixels), abs=1e-9)
-    moved = video_depth_errors(predicted + shift, truth, "scale-shift")
-    assert moved == pytest.approx(video_depth_errors(predicted, truth, "scale-shift"), rel=1e-5)
-    assert video_depth_errors(truth, truth, "metric") == (0, 0, 1, 1, 1, (truth > 0).sum())
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_the_scale_is_that_of_another_optimiser(seed):
-    predicted, truth = depths(seed, (4, 20, 20))
-    g, d = truth[truth > 0], predicted[truth > 0]
-
-    def error(scale) -> float:
-        return float(np.abs(scale * d - g).sum())
-
-    found: Any = minimize_scalar(error, bounds=(0, 3 * g.mean() / d.mean()), method="bounded", options={"xatol": 1e-10})
-    errors = video_depth_errors(predicted, truth, "scale")
-    scale = weighted_rounds(d, g)
-    assert errors.abs_rel == pytest.approx(float((np.abs(scale * d - g) / g).mean()), rel=1e-6)
-    assert depth_alignment(d, g).scale == pytest.approx(scale, rel=1e-6)
-    assert error(found.x) <= error(scale) <= 1.002 * error(found.x)  # ten rounds come close to the optimum
-    assert scale == pytest.approx(found.x, rel=0.02)
-
-
-def weighted_rounds(d, g) -> float:
-    """The protocol, one pixel after another: mean g / mean d, then ten times sum w d g / sum w d^2."""
-    scale = sum(g) / len(g) / (sum(d) / len(d))
-    for _ in range(10):
-        above = below = 0.0
-        for one, other in zip(d.tolist(), g.tolist(), strict=True):
-            weight = 1 / (abs(scale * one - other) + 1e-8)
-            above, below = above + weight * one * other, below + weight * one * one
-        scale = above / below
-    return scale
-
-
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(2))
 def test_scale_and_shift_have_the_least_absolute_error_of_a_linear_program(seed):
     predicted, truth = depths(seed, (2, 14, 14))
     g, d = truth[truth > 0], predicted[truth > 0]
@@ -142,22 +81,16 @@ def test_all_frames_share_one_alignment():
         assert video_depth_errors(predicted, truth, align).delta3 == 0  # 50 is close to neither 1 nor 99
 
 
-@pytest.mark.parametrize(
-    ("predicted", "truth", "options", "sentence"),
-    [
+def test_depth_that_cannot_be_compared_is_one_sentence():
+    cases: Any = (
         (np.ones((2, 1, 3)), TRUTH, {}, "resize the prediction first"),
         (np.ones((1, 2)), TRUTH[0], {}, r"expected a sequence \[S, H, W\]"),
         (np.ones((2, 1, 2)), 0 * TRUTH, {}, "no pixel has a true depth above 0 to compare with"),
-        (np.ones((2, 1, 2)), TRUTH, {"max_depth": 1}, "no pixel has a true depth above 0 below 1"),
-        (np.ones((2, 1, 2)), TRUTH, {"max_depth": -1}, "max_depth is -1"),
         (np.full((2, 1, 2), np.inf), TRUTH, {}, "3 predicted depths are not finite"),
         (np.ones((2, 1, 2)), TRUTH, {"align": "affine"}, "align is 'affine'; expected one of metric, median, scale,"),
         (-np.ones((2, 1, 2)), TRUTH, {}, "the mean of the predicted depth is -1; expected it above 0"),
-        (np.zeros((2, 1, 2)), TRUTH, {"align": "median"}, "the median of the predicted depth is 0"),
-        (np.full((2, 1, 2), 0.1), TRUTH, {"align": "scale-shift"}, "is 0.1 in all valid pixels"),
         (np.zeros((2, 1, 2)), TRUTH, {"align": "scale-shift"}, "is 0 in all valid pixels"),
-    ],
-)
-def test_depth_that_cannot_be_compared_is_one_sentence(predicted, truth, options, sentence):
-    with pytest.raises(InputError, match=sentence):
-        video_depth_errors(predicted, truth, **options)
+    )
+    for predicted, truth, options, sentence in cases:
+        with pytest.raises(InputError, match=sentence):
+            video_depth_errors(predicted, truth, **options)
