@@ -14,6 +14,7 @@ WORKERS ?= 2
 TESTS ?= tests
 SEED ?= default
 SUPPLY := $(VENV)/supply
+MUTANTS := $(VENV)/mutants
 COMPILE = $(SUPPLY)/bin/uv pip compile --no-config --quiet --upgrade --exclude-newer '7 days' --generate-hashes \
   --universal --python-version 3.11 --index-url https://pypi.org/simple --no-emit-index-url \
   --custom-compile-command 'make lock'
@@ -43,6 +44,11 @@ test: lint
 proofs: $(VENV)/.development
 	$(BIN)/python -m pytest -n $(WORKERS) tests/parity -m ""
 	$(PYTEST) $(TESTS) -m proof
+
+mutants: $(VENV)/.development $(MUTANTS)/.installed
+	rm -rf build/mutants
+	git clone --quiet . build/mutants
+	PATH="$(abspath $(BIN)):$(abspath $(MUTANTS)/bin):$$PATH" MODULES="$(MODULES)" build/mutants/tests/proofs/mutants/run.sh
 
 check: lint fast
 
@@ -110,7 +116,7 @@ $(VENV)/.docs: pyproject.toml | $(BIN)/python
 	touch $@ $(VENV)/.runtime
 
 $(VENV)/.development: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-compile --editable '.[dev]'
 	touch $@ $(VENV)/.runtime $(VENV)/.docs
 
 $(VENV)/.coverage: requirements/coverage.lock | $(VENV)/.development
@@ -120,4 +126,9 @@ $(VENV)/.coverage: requirements/coverage.lock | $(VENV)/.development
 $(SUPPLY)/.installed: requirements/supply.lock
 	$(PYTHON) -m venv $(SUPPLY)
 	$(SUPPLY)/bin/python -m pip install --quiet --require-hashes --requirement requirements/supply.lock
+	touch $@
+
+$(MUTANTS)/.installed:
+	$(PYTHON) -m venv $(MUTANTS)
+	$(MUTANTS)/bin/python -m pip install --quiet 'cosmic-ray>=8.3'
 	touch $@

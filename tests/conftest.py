@@ -79,6 +79,14 @@ def _processor() -> str:
     return hashlib.sha256(flags.encode()).hexdigest()[:16]
 
 
+@pytest.fixture(scope="session", autouse=True)
+def short_films():
+    """Let the film of a report have 2 of its 24 pictures, which take most of the time of a result that is saved."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vggtjax.results.thumbnail._FRAMES", 2)
+        yield
+
+
 @pytest.fixture(scope="module", autouse=True)
 def few_programs():
     """Forget compiled programs before the kernel's limit on a process's mappings, of which each program takes some."""

@@ -90,7 +90,7 @@ def test_what_the_harness_looks_for_is_found(folder, monkeypatch):
 
     def greedy(path: Path) -> None:
         if path.read_bytes() != b"valid":
-            taken.append(bytearray(2**27))
+            taken.append(bytearray(b"x") * 2**27)  # written, so that it is memory
 
     (folder / "case").mkdir()
     (folder / "case/file").write_bytes(b"other")
