@@ -11,7 +11,7 @@ import pytest
 from tests.scored_room import SETTINGS, Perfect, run
 from vggtjax.evaluation import tables
 from vggtjax.evaluation.page import is_report, write_report
-from vggtjax.evaluation.records import BOTH_OVER_ONE, Record, Records, costs, summary
+from vggtjax.evaluation.records import BOTH_OVER_ONE, Record, Records, costs, safe_name, summary
 
 
 def redone(store, result, sequence, settings=SETTINGS, **options):
@@ -163,6 +163,13 @@ def test_tables_by_hand():
     assert r"a\_b|$<$c$>$" in tables.latex(means)
     text = tables.comma_separated([record("=1+1", ate=0.5), record("b", status="failed")])  # inert
     assert text.splitlines() == ["sequence,method,status,frames,ate,reason", "'=1+1,m,ok,1,0.5,", "b,m,failed,1,,"]
+
+
+def test_names_of_files():
+    assert safe_name("walking_xyz-1") == "walking_xyz-1"
+    names = {safe_name(name) for name in ("../a", "..\\a", "a b", "a.b", "", "é" * 300)}
+    assert len(names) == 6
+    assert all(name and "/" not in name and "." not in name and len(name) < 100 for name in names)
 
 
 def test_all_files_of_a_report(tmp_path, three):
