@@ -35,6 +35,7 @@ def dynamic():
         return held_out_scenes("dynamic", 3, JUDGED)
 
 
+@pytest.mark.proof
 def test_fewer_scenes_of_another_size_are_the_same_scenes(dynamic):
     calls = []
     larger = held_out_scenes("dynamic", 2, LARGER, progress=lambda *call: calls.append(call))
