@@ -5,6 +5,7 @@ import json
 import logging
 from concurrent.futures import ThreadPoolExecutor
 
+import jax
 import numpy as np
 import pytest
 
@@ -15,6 +16,7 @@ from benchmarks import (
     embed,
     known,
     known_clips,
+    long_clips,
     memory,
     refine_cameras,
     speed,
@@ -89,6 +91,21 @@ def test_refine_cameras(run, tiny, tmp_path):
         "static mined", "dynamic mined", "dynamic none", "dynamic true",
     ]  # fmt: skip
     assert [row["ate"][0] == row["ate"][1] for row in rows] == [not row["refined"] for row in rows]
+
+
+@pytest.mark.proof
+def test_long_clips(run, tiny, tmp_path, monkeypatch):
+    def walk(kind, count, frames, side, seed):
+        config = long_clips.SceneConfig(height=side, width=side, frames=frames)
+        yield jax.tree.map(lambda array: array[0], drawn_scenes(kind, 1, config))
+
+    taken = {"own": 1e6, "total": 2e6, "seconds": 3.0, "processor": 4.0}
+    monkeypatch.setattr(long_clips, "run_command", lambda words, cache, devices=1: taken)
+    monkeypatch.setattr(long_clips, "drawn_walks", walk)
+    small = ["--frames", "8", "--window", "5", "--overlaps", "2", "--walks", "1", "--memory", "6"]
+    shown = run("long-clips", "--model", tiny, "--out", tmp_path, *small)
+    assert len((tmp_path / "paths.csv").read_text().splitlines()) == 1 + 2 * 5
+    assert "6 frames in windows of 5: peak 1 MB of its own, 2 MB with mapped files, 3 s, 4 s of the processors" in shown
 
 
 def test_memory(run, tmp_path, monkeypatch):

@@ -87,11 +87,11 @@ def test_guesses_and_comparisons_by_hand():
     assert mean_depth_map(measured_in_part).tolist() == [[4, 6]]
 
     rows = [row(clip=0, rotation_error=2.0), row(clip=1, rotation_error=3.0), row(clip=1)]
-    compared = compare(rows, [guess, replace(guess, clip=1, no_rotation=2.0)])
+    compared = compare(rows, [guess, replace(guess, clip=1, no_rotation=3.5)])
     found = {(each.metric, each.guess): each for each in compared}
     rotation, missing = found["rotation_error", "no_rotation"], found["abs_rel", "mean_depth_map"]
-    assert (rotation.model_error, rotation.guess_error, rotation.ratio) == (2.5, 3.0, pytest.approx(2.5 / 3))
-    assert (rotation.better, rotation.failed, rotation.clips, rotation.passed) == (pytest.approx(1 / 3), 1, 3, False)
+    assert (rotation.model_error, rotation.guess_error, rotation.ratio) == (2.5, 3.75, pytest.approx(2.5 / 3.75))
+    assert (rotation.better, rotation.failed, rotation.clips, rotation.passed) == (pytest.approx(2 / 3), 1, 3, False)
     assert replace(rotation, ratio=0.5, failed=0).passed
     assert not replace(rotation, ratio=0.1).passed  # a clip failed
     assert (missing.model_error, missing.ratio, missing.failed, missing.passed) == (None, None, 3, False)

@@ -1,10 +1,12 @@
 """What the second pass costs and brings: the report by hand, errors of a pass, and draws that are joined."""
 
 import numpy as np
+import pytest
 
 from benchmarks import __main__ as benchmarks
 from benchmarks import second_pass as benchmark
-from benchmarks.second_pass import Run, report_text
+from benchmarks.second_pass import Run, camera_errors, report_text
+from tests.tiny import tiny_model
 from vggtjax.scenes import SyntheticClip
 
 
@@ -29,6 +31,21 @@ def test_the_report_by_hand():
     assert facts["moving", "5", "another"] == ["+2.00 ± 1.00", "+0.2000 ± 0.0000"]
     assert facts["frozen", "5", "change"] == ["+30.0 ± 20.0 %", "+0.0 ± 0.0 %"]
     assert facts["frozen", "5", "another"] == ["+0.20 ± 0.20", "+0.1000 ± 0.0000"]
+
+
+def test_errors_of_the_masked_pass():
+    """Three clips in a group of four: each has the errors of its own pass."""
+    model, generator = tiny_model(), np.random.default_rng(0)
+    images = generator.random((3, 3, 28, 28, 3), np.float32)
+    poses = np.concatenate([np.tile(np.eye(3), (3, 3, 1, 1)), generator.normal(size=(3, 3, 3, 1))], axis=-1)
+    moving = np.zeros((3, 3, 28, 28), bool)
+    moving[:, :, :14] = True
+    clips = SyntheticClip(images, np.ones(moving.shape), *[None] * 2, moving, None, poses, *[None] * 2)  # type: ignore[arg-type]
+    found = camera_errors(model, clips, moving, 2, "zero")
+    for clip in range(3):
+        alone = SyntheticClip(*(None if array is None else array[[clip]] for array in clips))
+        assert camera_errors(model, alone, moving[[clip]], 2, "zero")[0] == pytest.approx(found[clip], rel=1e-3)
+    assert np.abs(camera_errors(model, clips, ~moving, 2, "zero") - found).min() > 1e-4
 
 
 def test_draws_are_joined(tmp_path, capsys, monkeypatch):

@@ -7,7 +7,9 @@ import pytest
 
 from benchmarks import __main__ as benchmarks
 from benchmarks.suite import ceilings, measure, work, workloads
+from benchmarks.suite.cases import TINY, Case
 from benchmarks.suite.ceilings import Ceilings, Rounds
+from benchmarks.suite.command import measured_rows
 from benchmarks.suite.measure import Measured
 from benchmarks.suite.report import Row
 from benchmarks.suite.workloads import WORKLOADS
@@ -77,6 +79,15 @@ def test_memory_of_the_process_is_seen():
         pytest.skip("this system does not tell")
     assert 190e6 < host < 230e6
     assert again < 5e6  # what is there already does not count
+
+
+def test_what_does_not_fit_is_a_row_and_not_the_end():
+    def fails(case, rounds):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    case = Case("tiny", TINY, {}, 2, 56, 56, "float32")
+    (row,) = measured_rows("pass", workloads.Workload("fails", fails), case, 2)
+    assert row.measured.failure == "out of memory"
 
 
 @pytest.mark.parametrize(
