@@ -29,8 +29,8 @@ def test_all_parts_at_small_size(tmp_path):
     paths = {row["path"] for row in told["attention"] if row.get("holds")}
     assert paths >= {"chosen here", "chosen here, gradient", "at once"}
     assert all(row["measured"] > 0 and row["memory GB"] > 0 for row in told["speed"])
-    *kernels, _ = (row["ms"] for row in told["kernels"])
-    assert kernels == sorted(kernels, reverse=True)
+    times = [row["ms"] for row in told["kernels"][:-1]]  # the last row sums up all others
+    assert times == sorted(times, reverse=True)
 
 
 START = "import time; from pathlib import Path; from benchmarks.gpu_day.lines import Lines; "
