@@ -43,7 +43,12 @@ def test_errors_of_the_masked_pass():
     clips = SyntheticClip(images, np.ones(moving.shape), *[None] * 2, moving, None, poses, *[None] * 2)  # type: ignore[arg-type]
     found = camera_errors(model, clips, moving, 2, "zero")
     for clip in range(3):
-        alone = SyntheticClip(*(None if array is None else array[[clip]] for array in clips))
+        alone = clips._replace(
+            images=images[[clip]],
+            depth=clips.depth[[clip]],
+            dynamic_mask=moving[[clip]],
+            camera_from_world=poses[[clip]],
+        )
         assert camera_errors(model, alone, moving[[clip]], 2, "zero")[0] == pytest.approx(found[clip], rel=1e-3)
     assert np.abs(camera_errors(model, clips, ~moving, 2, "zero") - found).min() > 1e-4
 

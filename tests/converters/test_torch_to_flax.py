@@ -9,6 +9,7 @@ import tracemalloc
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import ml_dtypes
 import numpy as np
 import pytest
@@ -151,7 +152,7 @@ def test_some_heads_of_a_source_that_has_no_others(state_dict, config, tmp_path)
     model = load_model(convert(tmp_path / "camera.safetensors", tmp_path / "x", config=config, heads=["camera"]).path)
     assert model.heads == ("camera",)
     with pytest.raises(InputError, match=r"outputs has \['depth'\]; this model has only the heads \('camera',\)"):
-        forward(model.params, np.zeros((1, 2, 56, 56, 3), np.float32), model.config)
+        forward(model.params, jnp.zeros((1, 2, 56, 56, 3)), model.config)
     with pytest.raises(CheckpointError, match="it has no depth_head, point_head, track_head: omit these heads"):
         convert(tmp_path / "camera.safetensors", tmp_path / "y", config=config)
     with pytest.raises(InputError, match=r"heads has \['depht'\]; expected some of \('camera'"):
