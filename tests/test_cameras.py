@@ -1,27 +1,19 @@
-import json
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from tests.room import WALL, make_room
 from vggtjax import cameras as geometry
 from vggtjax.errors import ResultError
 
 
-@pytest.mark.parametrize("name", ["forward_single", "forward_frames4"])
-def test_unproject_at_corners_equals_the_public_code(golden, name):
-    with np.load(golden / f"{name}.npz") as arrays:
-        assert json.loads(str(arrays["meta"]))["frames"] == arrays["plain/depth"].shape[1]
-        points = geometry.unproject(
-            arrays["plain/depth"][0, ..., 0],
-            arrays["plain/intrinsic"][0],
-            arrays["plain/extrinsic"][0],
-            pixel_offset=0.0,
+def test_unproject_at_corners_equals_the_public_code(golden):
+    with np.load(golden / "forward_frames4.npz") as arrays:
+        depth, intrinsics, camera_from_world, expected = (
+            arrays[f"plain/{name}"][0] for name in ("depth", "intrinsic", "extrinsic", "world_points_from_depth")
         )
-        expected = arrays["plain/world_points_from_depth"][0]
+    points = geometry.unproject(depth[..., 0], intrinsics, camera_from_world, pixel_offset=0.0)
     assert points.dtype == np.float32
     np.testing.assert_allclose(points, expected, rtol=1e-5, atol=1e-5 * expected.std())
 
@@ -61,11 +53,6 @@ def test_unprojected_points_project_to_pixel_centres(turn, centre, focal, seed):
     np.testing.assert_allclose(seen[..., :2] / seen[..., 2:], np.stack([x, y], axis=-1), atol=2e-2)
 
 
-def test_unprojected_wall_is_flat():
-    room = make_room()
-    np.testing.assert_allclose(room.world_points()[~room.dynamic_mask][:, 2], WALL, rtol=1e-5)
-
-
 def test_inverse_and_centres_by_hand():
     camera_from_world = np.array([[[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3]]], np.float32)
     np.testing.assert_array_equal(geometry.camera_centres(camera_from_world), [[-2, 1, -3]])
@@ -78,28 +65,20 @@ def test_fields_of_view_are_clamped_where_they_must():
     clamped, frames = geometry.clamp_field_of_view(fov)
     np.testing.assert_array_equal(clamped, [[1.0, 0.5], [0.01, 1.0], [1.0, 3.1], [3.1, 0.01], [0.01, 3.1]])
     assert frames == (1, 2, 3)
-
-
-def test_field_of_view_that_is_not_a_number():
     with pytest.raises(ResultError, match="frame 1 is not a number"):
         geometry.clamp_field_of_view(np.array([[1.0, 1.0], [1.0, np.nan]]))
 
 
 def test_intrinsics_are_clamped_by_their_fields_of_view():
-    intrinsics = np.tile(np.array([[40, 0, 21], [0, 30, 14], [0, 0, 1]], np.float32), (6, 1, 1))
+    intrinsics = np.tile(np.array([[40, 0, 21], [0, 30, 14], [0, 0, 1]], np.float32), (4, 1, 1))
     intrinsics[1, 0, 0] = np.inf  # field of view 0
     intrinsics[2, 1, 1] = -10  # beyond pi
-    intrinsics[3, 0, 0] = 0  # pi
-    intrinsics[4, 1, 1] = 1e9  # nearly 0
+    expected = intrinsics.copy()
+    expected[1, 0, 0] = 21 / np.tan(0.005)
+    expected[2, 1, 1] = 14 / np.tan(1.55)
     clamped, frames = geometry.clamp_intrinsics(intrinsics, 28, 42)
-    assert frames == (1, 2, 3, 4)
-    np.testing.assert_array_equal(clamped[[0, 5]], intrinsics[[0, 5]])
-    np.testing.assert_allclose(clamped[1, 0, 0], 21 / np.tan(0.005), rtol=1e-6)
-    np.testing.assert_allclose(clamped[2, 1, 1], 14 / np.tan(1.55), rtol=1e-6)
-    np.testing.assert_allclose(clamped[3, 0, 0], 21 / np.tan(1.55), rtol=1e-6)
-    np.testing.assert_allclose(clamped[4, 1, 1], 14 / np.tan(0.005), rtol=1e-6)
-    assert (clamped[:, [0, 1], [1, 0]] == 0).all()
-    assert (clamped[:, :2, 2] == [21, 14]).all()
+    assert frames == (1, 2)
+    np.testing.assert_allclose(clamped, expected, rtol=1e-6)
     again, frames = geometry.clamp_intrinsics(clamped, 28, 42)
     assert frames == ()
     np.testing.assert_array_equal(again, clamped)

@@ -10,7 +10,6 @@ from pathlib import Path
 import jax
 import ml_dtypes
 import numpy as np
-import platformdirs
 import pytest
 from flax.traverse_util import flatten_dict
 from safetensors import safe_open
@@ -65,12 +64,16 @@ def refusal(path, **options) -> str:
 # Files of this library
 
 
-def test_round_trip(saved_once, tree, config):
+def test_round_trip(saved_once, tree, config, tmp_path):
     model = load_model(saved_once)
     assert model.config == config
     assert (model.name, model.path, model.note, model.dtype) == ("tiny model", saved_once, "", "float32")
     assert jax.tree.all(jax.tree.map(np.array_equal, model.params, tree))
     assert is_checkpoint(saved_once)
+    assert load_model(saved_once.parent).path == saved_once
+    copy = save_model(tmp_path / "copy.safetensors", model.params, model.config, name=model.name)
+    assert copy.read_bytes() == saved_once.read_bytes()
+    assert (model.summary()["parameters"], model.summary()["bytes"]) == (1_806_508, 4 * 1_806_508)
 
 
 def test_bfloat16_and_mixed_round_trip(tree, config, tmp_path):
@@ -80,12 +83,6 @@ def test_bfloat16_and_mixed_round_trip(tree, config, tmp_path):
     same = jax.tree.map(lambda a, b: a.dtype == b.dtype and np.array_equal(a, b), model.params, half)
     assert jax.tree.all(same)
     assert (model.name, model.dtype) == ("half", "bfloat16")
-
-
-def test_saving_what_was_loaded_writes_the_same_bytes(saved_once, tmp_path):
-    model = load_model(saved_once)
-    copy = save_model(tmp_path / "copy.safetensors", model.params, model.config, name=model.name)
-    assert copy.read_bytes() == saved_once.read_bytes()
 
 
 def test_note_and_untrained_heads_are_in_the_file(tree, config, tmp_path):
@@ -129,16 +126,6 @@ def test_donation_does_not_write_into_the_file(saved_once):
     assert saved_once.read_bytes() == before
 
 
-def test_summary(saved_once, config):
-    model = load_model(saved_once)
-    assert model.heads == ("camera", "depth", "points", "tracks")
-    summary = model.summary()
-    assert summary["parameters"] == 1_806_508
-    assert summary["bytes"] == 4 * 1_806_508
-    assert (summary["name"], summary["dtype"], summary["pairs"]) == ("tiny model", "float32", 24)
-    json.dumps(summary)
-
-
 def test_identity(saved_once, config, tmp_path, monkeypatch):
     path = tmp_path / "copy.safetensors"
     path.write_bytes(saved_once.read_bytes())
@@ -148,16 +135,14 @@ def test_identity(saved_once, config, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(hashlib, "file_digest", None)  # one process hashes a file once
         assert again.identity == model.identity
-    assert len({model.identity, again.identity, read_model(path, name="other").identity}) == 2
-
     in_memory = Model(config, jax.tree.map(np.array, model.params), "tiny model")
     same = Model(config, model.params, "tiny model")
     assert in_memory.identity == same.identity != model.identity
     in_memory.params["camera_head"]["empty_pose"][:] += 1
     retrained = dataclasses.replace(model, params=in_memory.params)
-    half = read_model(path, dtype="bfloat16")
+    half, renamed = read_model(path, dtype="bfloat16"), read_model(path, name="other")
     other = Model(dataclasses.replace(config, num_heads=1), model.params, "tiny model")
-    assert len({m.identity for m in (model, same, retrained, half, other)}) == 5
+    assert len({m.identity for m in (model, same, retrained, half, renamed, other)}) == 6
 
 
 def test_identity_of_a_file_that_was_replaced(saved_once, tmp_path):
@@ -171,19 +156,13 @@ def test_identity_of_a_file_that_was_replaced(saved_once, tmp_path):
 
 
 def test_save_is_strict(tree, config, tmp_path):
-    flat = flatten_dict(tree, sep=".")
     wrong = {"camera_head": tree["camera_head"], "extra": np.zeros(2, np.float64)}
-    with pytest.raises(CheckpointError) as raised:
+    missing = sum(not name.startswith("camera_head") for name in flatten_dict(tree, sep="."))
+    with pytest.raises(CheckpointError, match=f"{missing + 2} problems: missing parameter"):
         save_model(tmp_path / "x.safetensors", wrong, config)
-    missing = sum(not name.startswith("camera_head") for name in flat)
-    assert f"{missing + 2} problems: missing parameter" in str(raised.value)
-    narrow = dataclasses.replace(config, dpt_features=8)
     with pytest.raises(CheckpointError, match="mis-shaped parameter depth_head"):
-        save_model(tmp_path / "x.safetensors", tree, narrow)
+        save_model(tmp_path / "x.safetensors", tree, dataclasses.replace(config, dpt_features=8))
     assert not list(tmp_path.iterdir())
-
-
-def test_save_says_where_it_cannot_write(tree, config, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         save_model(tmp_path / "file" / "x.safetensors", tree, config)
@@ -216,19 +195,12 @@ def test_file_is_checked_against_its_configuration(saved_once, tmp_path):
     [
         ({"version": "2"}, "has version '2' of the format; this vggtjax reads '1'"),
         ({"config": ""}, "x.safetensors is not JSON"),
-        ({"config": "[" * 60_000}, "x.safetensors is not JSON"),
         ({"config": "[]"}, "x.safetensors is []; expected an object"),
         ({"config": '{"depht": 1}'}, "unknown fields ['depht']"),
-        ({"config": '{"depth": "24"}'}, "depth is '24'"),
-        ({"config": '{"embed_dim": 100000000000}'}, "embed_dim is 100000000000"),
         ({"config": '{"embed_dim": 1000000, "num_heads": 10, "dino_num_heads": 10}'}, "mis-shaped parameter"),
-        ({"config": '{"motion": {"cues": [5]}}'}, "motion.cues[0] is 5"),
         ({"config": " " * 70_000}, "more than 65536 bytes"),
         ({"note": "\u001b"}, "expected up to 200 printable letters"),
         ({"untrained": '["nose"]'}, "names the untrained heads ['nose']"),
-        ({"untrained": "3"}, "the list of untrained heads of"),
-        ({"origin": "[" * 60_000}, "x.safetensors is not JSON"),
-        ({"origin": '{"a": ' + "9" * 400 + "}"}, "a is a number of more than 64 bits"),
         ({"origin": '{"a": "b"}'}, "Expected `str` matching regex"),
         ({"origin": '{"\\u001b": "' + "0" * 64 + '"}'}, "unprintable letters"),
         ({"revision": "main"}, "expected a commit of 40 hexadecimal letters"),
@@ -238,19 +210,17 @@ def test_metadata_is_not_trusted(saved_once, tmp_path, metadata, reason):
     assert reason in refusal(rewritten(saved_once, tmp_path / "x.safetensors", metadata))
 
 
-def test_unprintable_name_is_replaced_by_the_files(saved_once, tmp_path):
-    for name in ("\x1b[31mred", "", "x" * 1000):
-        assert load_model(rewritten(saved_once, tmp_path / "file.safetensors", {"name": name})).name == "file"
+@pytest.mark.parametrize("name", ["\x1b[31mred", "", "x" * 1000])
+def test_unprintable_name_is_replaced_by_the_files(saved_once, tmp_path, name):
+    assert load_model(rewritten(saved_once, tmp_path / "file.safetensors", {"name": name})).name == "file"
 
 
 def test_configuration_given_must_be_the_files(saved_once, config):
-    assert load_model(saved_once, config=config).config == config
-    other = dataclasses.replace(config, num_heads=1)
-    assert "another configuration" in refusal(saved_once, config=other)
+    assert "another configuration" in refusal(saved_once, config=dataclasses.replace(config, num_heads=1))
 
 
-def test_reading_torch_layout_as_own_is_refused(shapes, tmp_path):
-    make_checkpoint(tmp_path / "torch.safetensors", shapes)
+def test_reading_torch_layout_as_own_is_refused(tmp_path):
+    make_checkpoint(tmp_path / "torch.safetensors", {"a": [2]})
     with pytest.raises(CheckpointError, match="is not a checkpoint of this library; load_model converts"):
         read_model(tmp_path / "torch.safetensors")
 
@@ -262,8 +232,6 @@ def test_demo_model(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     model = load_model("demo")
     assert (model.name, model.dtype, model.origin) == ("demo", "float32", {})
-    again = load_model("demo")
-    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, again.params))
     assert load_model("demo", dtype="bfloat16").dtype == "bfloat16"
     assert "another configuration" in refusal("demo", config=dataclasses.replace(model.config, camera_num_heads=1))
 
@@ -301,57 +269,24 @@ def test_torch_weights_are_converted_once(shapes, tree, config, tmp_path, cache,
 
 
 def test_conversions_differ_by_what_makes_them(shapes, config, tmp_path, cache):
-    make_checkpoint(tmp_path / "weights.safetensors", shapes)
     source = tmp_path / "weights.safetensors"
-    other = dataclasses.replace(config, dino_num_heads=1)
-    models = [
-        load_model(source, config=config),
-        load_model(source, config=config, dtype="bfloat16"),
-        load_model(source, config=other),
-    ]
-    assert len({model.path for model in models}) == 3 == len(list(cache.iterdir()))
-    assert [model.dtype for model in models] == ["float32", "bfloat16", "float32"]
-    assert models[2].config == other
-
-
-def test_folder_of_shards(shapes, tree, config, tmp_path, cache):
-    make_checkpoint(tmp_path / "sharded", shapes, shards=2)
-    model = load_model(tmp_path / "sharded", config=config)
-    assert model.name == "sharded"
-    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, tree))
-    make_checkpoint(tmp_path / "sharded", shapes, shards=2, seed=1)
-    assert load_model(tmp_path / "sharded", config=config).path != model.path
-
-
-def test_missing_shard(shapes, config, tmp_path, cache):
-    make_checkpoint(tmp_path / "sharded", shapes, shards=2)
-    next((tmp_path / "sharded").glob("*-00002-of-*")).unlink()
-    assert "No such file or directory; copy or download" in refusal(tmp_path / "sharded", config=config)
-
-
-def test_folder_of_an_own_file(saved_once, cache):
-    assert load_model(saved_once.parent).path == saved_once
-    assert not cache.exists()
-
-
-def test_conversion_that_fails_leaves_nothing(shapes, config, tmp_path, cache):
-    make_checkpoint(tmp_path / "weights.safetensors", shapes)
+    make_checkpoint(source, shapes)
     narrow = dataclasses.replace(config, dpt_features=8)
-    assert "does not fit the configuration" in refusal(tmp_path / "weights.safetensors", config=narrow)
+    assert "does not fit the configuration" in refusal(source, config=narrow)
     assert not cache.exists()
+    other = dataclasses.replace(config, dino_num_heads=1)
+    models = [load_model(source, config=config, dtype="bfloat16"), load_model(source, config=other)]
+    assert len({model.path for model in models}) == 2 == len(list(cache.iterdir()))
+    assert [model.dtype for model in models] == ["bfloat16", "float32"]
+    assert [model.config for model in models] == [config, other]
 
 
-def test_cache_is_the_users(shapes, config, tmp_path, monkeypatch):
-    monkeypatch.delenv("VGGTJAX_CACHE", raising=False)
-    monkeypatch.setattr(platformdirs, "user_cache_path", lambda name: tmp_path / "user" / name)
-    make_checkpoint(tmp_path / "my weights.safetensors", shapes)
-    path = load_model(tmp_path / "my weights.safetensors", config=config).path
-    assert path is not None
-    assert path.parent == tmp_path / "user" / "vggtjax"
-    assert path.name.startswith("my-weights-")
-
-
-def test_missing_weights(tmp_path):
-    message = refusal(tmp_path / "missing.safetensors")
-    for part in ("missing.safetensors", ".pt", "index", "facebook/VGGT-1B", "'demo'"):
-        assert part in message
+def test_folder_of_shards(shapes, config, tmp_path, cache):
+    folder = tmp_path / "sharded"
+    make_checkpoint(folder, shapes, shards=2)
+    model = load_model(folder, config=config)
+    assert model.name == "sharded"
+    make_checkpoint(folder, shapes, shards=2, seed=1)
+    assert load_model(folder, config=config).path != model.path
+    next(folder.glob("*-00002-of-*")).unlink()
+    assert "No such file or directory; copy or download" in refusal(folder, config=config)

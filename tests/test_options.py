@@ -5,7 +5,6 @@ import json
 
 import numpy as np
 import pytest
-import tyro
 
 from vggtjax import MotionConfig
 from vggtjax.errors import InputError
@@ -18,13 +17,10 @@ MOTION = MotionConfig()
     ("changes", "message"),
     [
         ({"method": "best"}, "method is 'best'; expected one of vggt, vggt4d"),
-        ({"gram": "sine"}, "gram is 'sine'; expected one of"),
         ({"mask_pairs": -1}, "mask_pairs is -1; expected a whole number of at least 0"),
-        ({"mask_pairs": 2.5}, "mask_pairs is 2.5"),
         ({"mask_pairs": 10**12}, "mask_pairs is 1000000000000; expected at most 1000000"),
         ({"smooth_frames": 2}, "smooth_frames is 2; expected an odd number"),
         ({"threshold": "mean"}, "threshold is 'mean'; expected"),
-        ({"compute_dtype": "float16"}, "compute_dtype is 'float16'"),
         ({"align_scale": 1}, "align_scale is 1"),
     ],
 )
@@ -37,18 +33,6 @@ def test_numbers_of_numpy_become_plain_numbers():
     options = Options(mask_pairs=np.int64(3), smooth_frames=np.int64(3))  # pyright: ignore[reportArgumentType]
     assert options == Options(mask_pairs=3, smooth_frames=3)
     assert json.loads(json.dumps(options.to_json())) == options.to_json()
-
-
-def test_float64_is_for_python_alone(capsys):
-    assert Options(compute_dtype="float64").compute_dtype == "float64"
-    with pytest.raises(SystemExit):
-        tyro.cli(Options, args=["--dtype", "float64"])
-    assert "bfloat16" in capsys.readouterr().err
-
-
-def test_keywords_are_the_fields():
-    with pytest.raises(TypeError, match="grams"):
-        Options().changed(grams="dot")
 
 
 def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
@@ -78,28 +62,26 @@ def test_the_method_fills_in_what_is_not_given():
 
 @pytest.mark.parametrize("option", [{"smooth_frames": 3}, {"threshold": "otsu"}])
 def test_options_of_mined_masks_are_refused_with_given_ones(option):
-    Options().check_given_masks()
     with pytest.raises(InputError, match=f"{next(iter(option))} is .*; leave it out, as given masks"):
         Options(**option).check_given_masks()
 
 
-def test_the_model_recommends_the_number_of_pairs():
-    motion = MotionConfig(mask_pairs=2)
-    assert Options().resolved(motion).mask_pairs == 2
-    assert Options(mask_pairs=0).resolved(motion).mask_pairs == 0
-    assert Options().passes_settings(motion) == Options(mask_pairs=2).passes_settings(MOTION)
+def test_a_model_recommends_pairs_and_a_threshold_and_given_options_overrule_it():
+    model = MotionConfig(mask_pairs=2, threshold="multi-otsu")
+    for options, motion, pairs, threshold in (
+        (Options(), model, 2, "multi-otsu"),
+        (Options(mask_pairs=0, threshold="otsu"), model, 0, "otsu"),
+        (Options(), MOTION, 5, "otsu"),
+        (Options("vggt4d"), MOTION, 5, "multi-otsu"),
+    ):
+        made = options.resolved(motion)
+        assert (made.mask_pairs, made.threshold) == (pairs, threshold)
+    assert Options().passes_settings(model) == Options(mask_pairs=2, threshold="multi-otsu").passes_settings(MOTION)
 
 
-def test_the_threshold_is_the_given_one_or_the_models_or_the_methods():
-    motion = MotionConfig(threshold="multi-otsu")
-    assert Options().resolved(motion).threshold == Options("vggt4d").resolved(MOTION).threshold == "multi-otsu"
-    assert Options(threshold="otsu").resolved(motion).threshold == Options().resolved(MOTION).threshold == "otsu"
-    assert Options().passes_settings(motion) == Options(threshold="multi-otsu").passes_settings(MOTION)
-    told = [
-        options.resolved(MOTION).to_json()
-        for options in (Options(), Options("vggt4d"), Options("vggt4d", threshold="otsu"))
-    ]
-    assert [each.get("threshold") for each in told] == [None, None, "otsu"]
+def test_a_result_names_a_threshold_that_is_not_the_methods():
+    given = (Options(), Options("vggt4d"), Options("vggt4d", threshold="otsu"))
+    assert [options.resolved(MOTION).to_json().get("threshold") for options in given] == [None, None, "otsu"]
 
 
 @pytest.mark.parametrize(

@@ -52,15 +52,3 @@ def test_workflows_run_what_the_makefile_has():
     for path in (*WORKFLOWS, ROOT / "CONTRIBUTING.md"):
         called = set(re.findall(r"^\s*(?:- run: )?make (\w+)", path.read_text(encoding="utf-8"), re.MULTILINE))
         assert called <= targets, path.name
-
-
-def test_forms_of_issues_can_be_filled_in():
-    for path in (ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml"):
-        if path.name == "config.yml":
-            continue
-        form = _read(path)
-        fields = [part for part in form["body"] if part["type"] != "markdown"]
-        assert {"name", "description", "body"} <= set(form), path.name
-        assert len({field["id"] for field in fields}) == len(fields), path.name
-        assert all(field["attributes"]["label"] for field in fields), path.name
-        assert any(field.get("validations", {}).get("required") for field in fields), path.name

@@ -18,22 +18,16 @@ from vggtjax.app.uploads import check_clip, keep, safe_stem
 from vggtjax.errors import InputError, ResultError
 
 
-def write_video(path: Path, frames: int = 8, rate: int = 4) -> Path:
+def write_video(path: Path) -> Path:
+    """Write sixteen frames, four a second."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=rate)
+        stream = container.add_stream("mpeg4", rate=4)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        for number in range(frames):
-            picture = np.full((48, 64, 3), 20 * (number % 12), np.uint8)
+        for number in range(16):
+            picture = np.full((48, 64, 3), 15 * number, np.uint8)
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture)))
         container.mux(stream.encode())
     return path
-
-
-def write_pictures(folder: Path, count: int) -> tuple[Path, ...]:
-    paths = tuple(folder / f"frame {number}.png" for number in range(count))
-    for path in paths:
-        Image.new("RGB", (28, 28), "teal").save(path)
-    return paths
 
 
 @pytest.fixture
@@ -58,11 +52,10 @@ def wait(job: Job, state: str) -> None:
         time.sleep(0.005)
 
 
-def held(started: list[Job], release: threading.Event):
+def held(release: threading.Event):
     """Return the work of a job that takes steps until it is released."""
 
     def run(job, models, limits):
-        started.append(job)
         with job.on_stage("hold") as progress:
             while not release.wait(0.005):
                 progress(1, 2)
@@ -71,25 +64,23 @@ def held(started: list[Job], release: threading.Event):
 
 
 def test_the_second_job_waits_for_the_first(desk):
-    started: list[Job] = []
     release = threading.Event()
-    made = desk(held(started, release))
+    made = desk(held(release), max_waiting=2)
     first, second, third = (made.submit(Request((), "demo"), owner) for owner in "abc")
     wait(first, "running")
     assert [made.ahead(job) for job in (first, second, third)] == [0, 1, 2]
+    with pytest.raises(InputError, match="the queue is full, with 2 waiting"):
+        made.submit(Request((), "demo"), "d")
     assert second.state == "waiting"
-    assert started == [first]
     made.cancel("b")
     assert second.state == "cancelled"  # at once
     assert made.ahead(third) == 1
     release.set()
     wait(third, "done")
-    assert started == [first, third]
 
 
 def test_a_running_job_is_cancelled_at_its_next_step(desk):
-    started: list[Job] = []
-    made = desk(held(started, threading.Event()))
+    made = desk(held(threading.Event()))
     job = made.submit(Request((), "demo"), "a")
     wait(job, "running")
     made.cancel("somebody else")
@@ -99,16 +90,6 @@ def test_a_running_job_is_cancelled_at_its_next_step(desk):
     made.cancel("a")
     wait(job, "cancelled")
     assert not job.folder.exists()
-
-
-def test_a_full_queue_is_said(desk):
-    release = threading.Event()
-    made = desk(held([], release), max_waiting=1)
-    wait(made.submit(Request((), "demo"), "a"), "running")
-    made.submit(Request((), "demo"), "b")
-    with pytest.raises(InputError, match="the queue is full, with 1 waiting"):
-        made.submit(Request((), "demo"), "c")
-    release.set()
 
 
 def test_old_results_go(desk):
@@ -145,7 +126,6 @@ def test_a_failure_is_one_sentence(desk, error, said):
         ({"model": "/etc/passwd"}, "model is '/etc/passwd'; expected one of demo"),
         ({"method": "magic"}, "method is 'magic'"),
         ({"frames": 33}, "frames is 33; expected at most 32"),
-        ({"frames": 0}, "frames is 0"),
         ({"fps": float("nan")}, "fps is nan"),
     ],
 )
@@ -154,56 +134,55 @@ def test_only_what_the_page_offers_is_run(desk, changes, said):
         desk().submit(Request(**({"files": (), "model": "demo"} | changes)), "a")
 
 
-def test_an_upload_that_is_no_clip_is_refused(desk):
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["large.mp4"], "the upload has 1.0 MB; send at most 1 MB"),
+        (["a.txt"], "a.txt: by its name this is no video and no picture"),
+        (["a.mp4", "b.png"], "2 files with a video among them"),
+        (["../../conftest.py"], "the upload is not here any more"),
+    ],
+)
+def test_an_upload_that_is_no_clip_is_refused(desk, names, said):
     made = desk(max_upload_mb=1)
     for name, content in (("large.mp4", bytes(1_000_001)), ("a.txt", b"words"), ("a.mp4", b"words"), ("b.png", b"")):
         (made.uploads / name).write_bytes(content)
-    cases = {
-        ("large.mp4",): "the upload has 1.0 MB; send at most 1 MB",
-        ("a.txt",): "a.txt: by its name this is no video and no picture",
-        ("a.mp4", "b.png"): "2 files with a video among them",
-        ("../../conftest.py",): "the upload is not here any more",
-        ("gone.mp4",): "the upload is not here any more",
-    }
-    for names, said in cases.items():
-        with pytest.raises(InputError, match=said):
-            made.submit(Request(tuple(made.uploads / name for name in names), "demo"), "a")
+    with pytest.raises(InputError, match=said):
+        made.submit(Request(tuple(made.uploads / name for name in names), "demo"), "a")
     assert not any(made.results.iterdir())
 
 
 def test_a_file_that_is_no_video_fails_without_the_machines_paths(tmp_path):
-    folder = Desk(tmp_path / "app", Models(()), Limits())
-    try:
-        (folder.uploads / "holiday.mp4").write_bytes(b"words")
-        job = folder.submit(Request((folder.uploads / "holiday.mp4",), "demo"), "a")
-        wait(job, "failed")
-        assert "cannot read video holiday.mp4" in job.message
-        assert str(tmp_path) not in job.message
-    finally:
-        folder.close()
+    made = Desk(tmp_path / "app", Models(()), Limits())
+    (made.uploads / "holiday.mp4").write_bytes(b"words")
+    job = made.submit(Request((made.uploads / "holiday.mp4",), "demo"), "a")
+    wait(job, "failed")
+    made.close()
+    assert "cannot read video holiday.mp4" in job.message
+    assert str(tmp_path) not in job.message
 
 
 def test_a_long_video_is_refused_and_a_short_one_is_sampled_evenly(tmp_path):
-    video = write_video(tmp_path / "a.mp4", frames=16, rate=4)
+    video = write_video(tmp_path / "a.mp4")
     with pytest.raises(InputError, match="the video is 4 s long; send at most 3 s"):
         check_clip(video, 8, None, Limits(max_seconds=3))
-    source, sampling = check_clip(video, 4, None, Limits())
-    assert [frame.time for frame in source.frames(sampling)] == [0, 1, 2, 3]
-    source, sampling = check_clip(video, 4, 2.0, Limits())
-    assert [frame.time for frame in source.frames(sampling)] == [0, 0.5, 1, 1.5]
+    for rate, times in ((None, [0, 1, 2, 3]), (2.0, [0, 0.5, 1, 1.5])):
+        source, sampling = check_clip(video, 4, rate, Limits())
+        assert [frame.time for frame in source.frames(sampling)] == times
 
 
 def test_pictures_keep_their_order_under_safe_names(tmp_path):
     uploads = tmp_path / "uploads"
     uploads.mkdir()
-    paths = write_pictures(uploads, 11)
+    paths = [uploads / f"frame {number}.png" for number in range(11)]
+    for path in paths:
+        Image.new("RGB", (28, 28), "teal").save(path)
     kept = keep(sorted(paths), uploads, tmp_path / "clip", Limits())
     assert isinstance(kept, tuple)
     assert [path.name for path in kept[1:3]] == ["000001-frame-1.png", "000002-frame-2.png"]
     source, sampling = check_clip(kept, 4, 7.0, Limits())
     assert len(list(source.frames(sampling))) == 4
-    assert safe_stem("../<b>..mp4") == "b"
-    assert safe_stem("....") == "clip"
+    assert [safe_stem(name) for name in ("../<b>..mp4", "....")] == ["b", "clip"]
 
 
 def test_the_oldest_uploads_make_space(tmp_path):
@@ -219,10 +198,10 @@ def test_the_oldest_uploads_make_space(tmp_path):
 
 
 def test_models_of_one_name_are_told_apart(tmp_path):
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "model.safetensors").touch()
-    one, two = (str(tmp_path / folder / "model.safetensors") for folder in "ab")
-    assert Models((one, "facebook/VGGT-1B")).names == ("model.safetensors", "facebook/VGGT-1B", "demo")
+    one, two = (tmp_path / folder / "model.safetensors" for folder in "ab")
+    for path in (one, two):
+        path.parent.mkdir()
+        path.touch()
+    assert Models((str(one), "facebook/VGGT-1B")).names == ("model.safetensors", "facebook/VGGT-1B", "demo")
     with pytest.raises(InputError, match=r"two models are named model\.safetensors"):
-        Models((one, two))
+        Models((str(one), str(two)))

@@ -94,31 +94,17 @@ def server(tmp_path_factory):
                 loop.close()
 
 
-def test_an_upload_reaches_a_job(server):
-    sent = list(server.sent)
-    path = server.upload().json()[0]
-    assert server.join([file_data(path, url="http://127.0.0.1/a", orig_name="a.png", size=3)]).status_code == 200
-    said = server.events()
-    assert "job done" in said, said
-    assert server.sent == [*sent, b"own"]
-
-
 def test_files_of_the_machine_are_not_read(server, tmp_path, capfd):
     own = Path(server.upload().json()[0])
+    assert server.join([file_data(own, url="http://127.0.0.1/a", orig_name="a.png", size=3)]).status_code == 200
+    assert "job done" in server.events()
+    assert server.sent[-1] == b"own"
     before, sent = server.kept(), list(server.sent)
-    (tmp_path / "0.png").write_bytes(b"private")
     deep = tmp_path / ("a" * 64)
     deep.mkdir()
-    (deep / "0.png").write_bytes(b"private")
-    for path in (
-        tmp_path / "0.png",
-        "/etc/passwd",
-        "/dev/zero",
-        own.parent / ".." / ".." / "x.png",
-        f"{own.parent}/..",
-        "",
-        "\0",
-    ):
+    for private in (tmp_path / "0.png", deep / "0.png"):
+        private.write_bytes(b"private")
+    for path in (tmp_path / "0.png", "/etc/passwd", "/dev/zero", own.parent / "../../x.png", f"{own.parent}/..", "\0"):
         assert server.join([file_data(path)]).status_code == 400, path
         assert server.join([], file_data(path), "vggt", 2, 0).status_code == 400, path
     assert server.join([str(tmp_path / "0.png")]).status_code == 400
@@ -143,12 +129,9 @@ def test_no_address_is_fetched(server, monkeypatch):
     "changes",
     [
         {"data": ["x"]},
-        {"data": [[], "demo", "vggt", 2, [0]]},
         {"data": [[], "demo", "vggt", 2, {"deep": {}}]},
-        {"fn_index": 99},
         {"fn_index": "0"},
         {"session_hash": "../x"},
-        {"session_hash": None},
     ],
 )
 def test_what_the_page_does_not_send_is_refused(server, changes):
@@ -188,13 +171,5 @@ def test_only_the_routes_of_the_page_answer(server):
     for method, path in sorted(there - PAGE_ROUTES):
         asked = re.sub(r"\{[^}]*\}", "x", path)
         assert server.client.request(method, asked).status_code == 404, (method, path)
-    for path in ("/gradio_api/file=/etc/passwd", "/gradio_api/file//etc/passwd", "/gradio_api/run/own"):
-        assert server.client.get(path).status_code == 404
-    assert server.client.post("/gradio_api/run/own").status_code == 404
-
-
-def test_a_recording_is_no_upload(server):
-    before = server.kept()
-    for route in ("/gradio_api/process_recording", "/gradio_api/upload/", "/upload"):
-        assert server.upload("b.mp4", b"film", "video", route).status_code == 404
-    assert server.kept() == before
+    for method, path in (("GET", "/gradio_api/file=/etc/passwd"), ("POST", "/gradio_api/run/own"), ("POST", "/upload")):
+        assert server.client.request(method, path).status_code == 404

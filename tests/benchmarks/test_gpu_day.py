@@ -4,6 +4,8 @@ import re
 import sys
 from types import SimpleNamespace
 
+import pytest
+
 import benchmarks.__main__ as benchmarks
 from benchmarks.gpu_day import command
 from benchmarks.gpu_day.kernels import kernel_times
@@ -11,6 +13,7 @@ from benchmarks.gpu_day.lines import Lines, read_lines
 from benchmarks.gpu_day.parts import PARTS
 
 
+@pytest.mark.proof
 def test_all_parts_at_small_size(tmp_path):
     """Each in this process; the next test runs processes."""
     told, outcomes = {}, []
@@ -20,21 +23,14 @@ def test_all_parts_at_small_size(tmp_path):
         told[name] = [line["cells"] for line in lines if "sheet" in line]
         outcomes.append(command.Outcome(name, "done", 1.0, lines))
     report = command.report(outcomes)
-    for name in PARTS:
-        assert f"- {name}: done" in report
-        assert f"## {name}\n" in report
     assert "NO" not in report  # a bound that does not hold
-    assert {(row["case"], row["pass"]) for row in told["parity"]} == {("single", "plain")}
-    assert [row["output"] for row in told["parity"]].count("depth") == 2  # in both types
+    assert all(f"- {name}: done" in report and f"## {name}\n" in report for name in PARTS)
     assert all(0 < row["error"] <= row["at most"] for row in told["parity"])
-    paths = told["attention"]
-    assert {row["path"] for row in paths if row.get("holds")} >= {"chosen here", "chosen here, gradient", "at once"}
-    assert {row["error"] for row in paths if row["path"] == "cuDNN"} == {"not on this machine, or not for this type"}
-    assert len({row["work"] for row in told["speed"]}) == 2
+    paths = {row["path"] for row in told["attention"] if row.get("holds")}
+    assert paths >= {"chosen here", "chosen here, gradient", "at once"}
     assert all(row["measured"] > 0 and row["memory GB"] > 0 for row in told["speed"])
-    *kernels, others = told["kernels"]
-    assert [row["ms"] for row in kernels] == sorted((row["ms"] for row in kernels), reverse=True)
-    assert others["kernel"].endswith(" others")
+    times = [row["ms"] for row in told["kernels"][:-1]]  # the last row sums up all others
+    assert times == sorted(times, reverse=True)
 
 
 START = "import time; from pathlib import Path; from benchmarks.gpu_day.lines import Lines; "
@@ -56,7 +52,7 @@ def test_a_part_that_fails_or_hangs_does_not_stop_the_others(tmp_path, monkeypat
 
     monkeypatch.setattr(command.subprocess, "Popen", popen)
     out = tmp_path / "day"
-    arguments = ["gpu-day", "--out", str(out), "--minutes", "0.25", "--parts", "parity", "attention", "speed"]
+    arguments = ["gpu-day", "--out", str(out), "--minutes", "0.12", "--parts", "parity", "attention", "speed"]
     assert benchmarks.main(arguments) == 0
     report = (out / "report.md").read_text()
     assert "- parity: failed (1): ValueError: the device has gone" in report
@@ -65,8 +61,6 @@ def test_a_part_that_fails_or_hangs_does_not_stop_the_others(tmp_path, monkeypat
     assert "1 of 2 within bounds" in report
     assert report.count("- told: before") == 3  # what a part told before it ended stays
     assert report.index("| pass | 1.5 | NO |") < report.index("| more |  | yes |")
-    assert (out / "parity.log").exists()
-    assert not (out / "speed.log").exists()
     assert "speed: done" in capsys.readouterr().out
     with (out / "speed.jsonl").open("a") as file:
         file.write('{"sheet": "ti')  # a line that is not whole is left for later
@@ -74,18 +68,16 @@ def test_a_part_that_fails_or_hangs_does_not_stop_the_others(tmp_path, monkeypat
 
 
 def test_kernels_of_a_gpu_are_counted_once():
+    def plane(name, **lines):
+        found = [SimpleNamespace(name=each, events=[event(*kernel) for kernel in lines[each]]) for each in lines]
+        return SimpleNamespace(name=name, lines=found)
+
     def event(name, nanoseconds):
         return SimpleNamespace(name=name, duration_ns=nanoseconds, stats=[])
 
-    def line(name, *events):
-        return SimpleNamespace(name=name, events=events)
-
-    stream = line("Stream #13(Compute)", event("gemm.1", 2e6), event("gemm.2", 3e6), event("softmax", 1e6))
-    planes = [
-        SimpleNamespace(name="/device:GPU:0", lines=[stream, line("XLA Ops", event("gemm.1", 2e6)), line("Steps")]),
-        SimpleNamespace(name="/host:CPU", lines=[line("python", event("sleep", 9e9))]),
-    ]
-    times = kernel_times(SimpleNamespace(planes=planes))
-    assert times == {"gemm": [0.002, 0.003], "softmax": [0.001]}
-    tpu = SimpleNamespace(name="/device:TPU:0", lines=[line("XLA Ops", event("fusion.7", 4e6))])
+    stream = [("gemm.1", 2e6), ("gemm.2", 3e6), ("softmax", 1e6)]
+    gpu = plane("/device:GPU:0", **{"Stream #13(Compute)": stream, "XLA Ops": [("gemm.1", 2e6)], "Steps": []})
+    host = plane("/host:CPU", python=[("sleep", 9e9)])
+    assert kernel_times(SimpleNamespace(planes=[gpu, host])) == {"gemm": [0.002, 0.003], "softmax": [0.001]}
+    tpu = plane("/device:TPU:0", **{"XLA Ops": [("fusion.7", 4e6)]})
     assert kernel_times(SimpleNamespace(planes=[tpu])) == {"fusion": [0.004]}

@@ -36,7 +36,7 @@ def trunk(S, grid):
     return work.backbone(FULL, S, grid) + work.alternating(FULL, S, grid)
 
 
-def test_work_of_the_blocks():
+def test_work_against_known_figures():
     for S in (1, 8, 100):
         assert work.flop(trunk(S, SMALL)) == pytest.approx((1.538 * S + 0.0601 * S**2) * TERA, rel=0.002)
         assert work.flop(trunk(S, LARGE)) == pytest.approx((2.10 * S + 0.1065 * S**2) * TERA, rel=0.002)
@@ -44,16 +44,6 @@ def test_work_of_the_blocks():
     _, pair = work.alternating(FULL, 1, LARGE)
     assert (pair["linear"], pair["attention"]) == pytest.approx((0.629 * TERA, 0.1065 * TERA), rel=0.002)
     assert pair["exp"] == 24 * 16 * (5 + 28 * 37) ** 2
-
-
-def test_work_of_the_heads():
-    for grid, known in ((SMALL, 0.170), (LARGE, 0.226)):
-        h, w = grid
-        made = work.flop(work.depth_head(FULL, 2, grid)) / 2
-        # The known figures are of 1 x 1 convolutions after each resize, where here they are before it.
-        later = 2 * 256**2 * (64 * h * w - ((h + 1) // 2) * ((w + 1) // 2))
-        assert made + later == pytest.approx(known * TERA, rel=0.02)
-    assert round(work.flop(work.camera_head(FULL, 3)) / 3 / TERA, 3) == 0.002
     kernels = [leaf.size for leaf in jax.tree.leaves(parameter_shapes(FULL)["camera_head"]) if leaf.ndim > 1]
     assert work.camera_head(FULL, 1)[0]["weights"] == pytest.approx(4 * 4 * sum(kernels), rel=0.001)
     both = trunk(8, LARGE) + work.alternating(FULL, 8, LARGE)
@@ -84,11 +74,10 @@ def test_a_run_is_compared_with_the_better_ceilings_around_it():
 def test_memory_of_the_process_is_seen():
     kept: list[bytes] = []
     host, _ = measure.memory_of(lambda: kept.append(b"x" * 200_000_000))  # what others free meanwhile hardly counts
-    if host is None:
+    again, _ = measure.memory_of(lambda: None)
+    if host is None or again is None:
         pytest.skip("this system does not tell")
     assert 190e6 < host < 230e6
-    again, _ = measure.memory_of(lambda: None)
-    assert again is not None
     assert again < 5e6  # what is there already does not count
 
 
@@ -99,55 +88,29 @@ def test_what_does_not_fit_is_a_row_and_not_the_end():
     case = Case("tiny", TINY, {}, 2, 56, 56, "float32")
     (row,) = measured_rows("pass", workloads.Workload("fails", fails), case, 2)
     assert row.measured.failure == "out of memory"
-    assert row.share_of_floor is row.floor_seconds is None
 
 
-def test_every_workload_runs(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize(
+    "names", [("cues", "start-up"), pytest.param(sorted(set(WORKLOADS) - {"two-passes"}), marks=pytest.mark.proof)]
+)
+def test_workloads_run(tmp_path, capsys, monkeypatch, names):
     """Compiling is timed with a smaller program; fresh processes do nothing but to look for the cache of the first."""
     monkeypatch.setattr(workloads, "two_passes", workloads.cue_sums)
     look = "import os, pathlib; pathlib.Path(os.environ['VGGTJAX_CACHE']).mkdir(exist_ok=True)"
     monkeypatch.setattr(workloads, "DEMO", ("-c", look))
     monkeypatch.setattr(workloads, "_STARTS", {"nothing": "pass"})
-    names = [name for name in WORKLOADS if name != "two-passes"]
     stored = tmp_path / "a.json"
     arguments = ["suite", "--size", "tiny", "--frames", "2", "--repeats", "1"]
     assert benchmarks.main([*arguments, "--workloads", *names, "--out", str(stored)]) == 0, capsys.readouterr().err
     written = json.loads(stored.read_text())
-    assert written["machine"]["jax"] == jax.__version__
     assert all(min(rates) > 0 for rates in written["ceilings"].values())
     rows = written["rows"]
     assert {row["workload"].split(":")[0] for row in rows} == set(names)
-    assert "start-up: nothing, no jax" in {row["workload"] for row in rows}
     for row in rows:
         assert row["seconds"] == [row["median"]]
-        assert (row["frames"], row["height"]) in ((2, 56), (None, None))
         if WORKLOADS[row["workload"].split(":")[0]].parts:
             assert row["floor_seconds"] == pytest.approx(sum(row["floor"].values()))
             assert row["flop_per_second"] == pytest.approx(row["flop"] / row["median"])
-            assert row["share_of_floor"] > 0
     capsys.readouterr()
     assert benchmarks.main([*arguments, "--workloads", "cues", "--against", str(stored)]) == 0
     assert "1 of 1 rows are in both" in capsys.readouterr().out
-
-
-ROW = {"workload": "cues", "size": "tiny", "frames": 2, "height": 56, "width": 56, "dtype": "float32"}
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"\xff\xfe",
-        b"[" * 100_000,
-        b'{"rows": [{"median": 1}]}',
-        json.dumps({"rows": [ROW | {"median": "fast"}]}).encode(),
-        json.dumps({"rows": [ROW | {"median": float("nan")}]}).encode(),
-        json.dumps({"rows": [ROW | {"workload": [], "median": 1}]}).encode(),
-    ],
-)
-def test_a_strangers_file_is_one_sentence(tmp_path, capsys, content):
-    path = tmp_path / "stored.json"
-    path.write_bytes(content)
-    assert benchmarks.main(["suite", "--against", str(path)]) == 2
-    error = capsys.readouterr().err
-    assert str(path) in error
-    assert len(error.strip().splitlines()) == 1

@@ -11,25 +11,18 @@ def test_summaries_by_hand():
     plain = [row(clip=0, abs_rel=0.2, saliency_auc=0.5), row(clip=1, abs_rel=0.4, saliency_auc=0.7)]
     setting = {"method": "4dvggt-d", "mask_source": "mined", "mask_pairs": 5, "suppress": "zero"}
     masked = [row(clip=0, abs_rel=0.1, **setting), row(clip=1, failure="odd", **setting)]
-    better = [row(clip=0, abs_rel=0.3, **setting)]
-    by_seed = [plain + masked, [*plain[:1], *better]]
+    by_seed = [plain + masked, [*plain[:1], row(clip=0, abs_rel=0.3, **setting)]]
     first, second = summarise(by_seed)
     assert (first.method, first.mask_source, first.clips, first.failed) == ("vggt", None, 3, 0)
     assert first.scores["abs_rel"].mean == pytest.approx((0.3 + 0.2) / 2)
     assert first.scores["abs_rel"].deviation == pytest.approx(0.1 / np.sqrt(2))
-    assert first.ratios["abs_rel"].mean == 1
     assert (second.clips, second.failed) == (3, 1)
     assert second.scores["abs_rel"].mean == pytest.approx((0.1 + 0.3) / 2)
     assert second.ratios["abs_rel"].mean == pytest.approx((0.1 / 0.2 + 0.3 / 0.2) / 2)
     assert "rotation_error" not in second.scores
     assert saliency_auc(by_seed) == spread([0.6, 0.5])
-    assert saliency_auc([masked]) is None
-    assert spread([0.25]).text() == "0.250"
-    assert spread([1, 3]).text(2) == "2.00 ± 1.41"
-    table = ladder_table([first, second]).splitlines()
-    assert len(table) == 4
-    assert len({len(line) for line in table}) == 1
-    assert "1 failed" in table[3]
+    assert [spread([0.25]).text(), spread([1, 3]).text(2)] == ["0.250", "2.00 ± 1.41"]
+    assert "1 failed" in ladder_table([first, second]).splitlines()[3]
 
 
 def test_changes_by_hand():
@@ -49,10 +42,5 @@ def test_changes_by_hand():
     assert change.error == pytest.approx(np.std([-1, 0, 0, -1], ddof=1) / 2)
     # in draw 2 all methods have the first clip alone: a tie with vggt
     assert (change.better, change.best, change.draws) == (2, 1, 2)
-    change = ours.changes["rotation_error"]
-    assert (change.mean, change.better, change.best) == (pytest.approx((-3 + 0 + 1) / 3), 1, 1)
-    assert change.share == pytest.approx(change.mean / ((4 + 2 + 1) / 3))
-    assert set(ours.changes) == {"rotation_error"}
-    table = changes_table([plain, decoupled, ours])
-    assert "| -0.500 ± 0.289 (-16.7 %); 2/2, 1/2 " in table
-    assert "vggt |" not in table
+    assert ours.changes["rotation_error"].mean == pytest.approx((-3 + 0 + 1) / 3)
+    assert "| -0.500 ± 0.289 (-16.7 %); 2/2, 1/2 " in changes_table([plain, decoupled, ours])

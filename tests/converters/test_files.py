@@ -3,7 +3,6 @@
 import json
 import os
 import pickle
-import shutil
 import sys
 import zipfile
 
@@ -54,18 +53,6 @@ def small():
     return {"a": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.ones(5, np.float16)}
 
 
-@pytest.fixture(scope="module")
-def sharded_once(shapes, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("once") / "sharded"
-    make_checkpoint(folder, shapes, shards=3)
-    return folder
-
-
-@pytest.fixture
-def sharded(sharded_once, tmp_path):
-    return shutil.copytree(sharded_once, tmp_path / "sharded")
-
-
 @pytest.fixture
 def few(tmp_path):
     """Three tensors in three shards."""
@@ -98,9 +85,11 @@ def edit_index(folder, change):
 # Layouts
 
 
-@pytest.mark.parametrize("name", ["model.safetensors", "mislabelled.pt"])
-def test_one_safetensors_file(shapes, config, expected, tmp_path, name):
-    make_checkpoint(tmp_path / name, shapes)
+@pytest.mark.parametrize(
+    ("name", "format"), [("model.safetensors", "safetensors"), ("mislabelled.pt", "safetensors"), ("model.pth", "pt")]
+)
+def test_one_file(shapes, config, expected, tmp_path, name, format):
+    make_checkpoint(tmp_path / name, shapes, format=format)
     assert_converts(tmp_path / name, config, expected, tmp_path)
 
 
@@ -114,30 +103,16 @@ def test_other_types(state_dict, config, tmp_path, dtype):
     assert_converts(tmp_path / "model.safetensors", config, convert_state_dict(widened, config), tmp_path)
 
 
-@pytest.mark.parametrize("given", ["", INDEX])
-def test_shards(sharded, config, expected, tmp_path, given):
-    assert sorted(path.name for path in sharded.iterdir()) == [*SHARDS, INDEX]
-    assert_converts(sharded / given, config, expected, tmp_path)
-    assert weight_files(sharded / INDEX) == [sharded / INDEX, *(sharded / shard for shard in SHARDS)]
+def test_shards(shapes, config, expected, tmp_path):
+    folder = tmp_path / "sharded"
+    make_checkpoint(folder, shapes, shards=3)
+    assert_converts(folder, config, expected, tmp_path)
+    assert weight_files(folder / INDEX) == [folder / INDEX, *(folder / shard for shard in SHARDS)]
 
 
-@pytest.mark.parametrize("name", ["model.pt", "model.pth"])
-def test_torch_file(shapes, config, expected, tmp_path, name):
-    make_checkpoint(tmp_path / name, shapes, format="pt")
-    assert_converts(tmp_path / name, config, expected, tmp_path)
-
-
-@pytest.mark.parametrize("wrap", [("model",), ("state_dict",), ("state_dict", "model")])
-def test_training_checkpoint(tensors, config, expected, tmp_path, wrap):
-    content = tensors
-    for key in wrap:
-        content = {key: content, "epoch": 3, "optimizer": {"lr": 0.1}}
-    torch.save(content, tmp_path / "train.pt")
-    assert_converts(tmp_path / "train.pt", config, expected, tmp_path)
-
-
-def test_old_torch_file_is_read_into_memory(tensors, config, expected, tmp_path, caplog):
-    torch.save(tensors, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+def test_old_training_checkpoint_is_read_into_memory(tensors, config, expected, tmp_path, caplog):
+    wrapped = {"state_dict": {"model": tensors, "optimizer": {"lr": 0.1}}, "epoch": 3}
+    torch.save(wrapped, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
     assert_converts(tmp_path / "old.pt", config, expected, tmp_path)
     assert "read into memory" in caplog.text
 
@@ -173,41 +148,28 @@ def test_torch_file_by_another_name(tmp_path):
 
 
 def test_choice_among_files():
-    names = [
-        "README.md",
-        "model.pt",
-        "model.safetensors",
-        INDEX,
-        SHARDS[0],
-        ".x.partial.safetensors",
-        "sub/x.safetensors",
-    ]
-    assert choose_file(names, "here") == "model.safetensors"
-    names.remove("model.safetensors")
-    assert choose_file(names, "here") == INDEX
-    names.remove(INDEX)
-    assert choose_file(names, "here") == SHARDS[0]
-    names.remove(SHARDS[0])
-    assert choose_file(names, "here") == "model.pt"
-    names.remove("model.pt")
+    names = ["model.safetensors", INDEX, SHARDS[0], "model.pt"]  # the first choice first
+    others = ["README.md", ".x.partial.safetensors", "sub/x.safetensors"]
+    for first in range(4):
+        assert choose_file(others + names[first:], "here") == names[first]
     with pytest.raises(CheckpointError, match="here holds no weights; expected one of"):
-        choose_file(names, "here")
+        choose_file(others, "here")
     with pytest.raises(CheckpointError, match=r"here holds 2 files of weights \(a.pt, b.pth\)"):
         choose_file(["a.pt", "b.pth"], "here")
 
 
-@pytest.mark.parametrize("source", ["nowhere.pt", "weights/missing.safetensors", "./a/b", "demo2", "x" * 5000, "a\0b"])
+@pytest.mark.parametrize("source", ["nowhere.pt", "./a/b", "x" * 5000, "a\0b"])
 def test_missing_weights(source, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     message = refusal(source, locate)
     assert "there are no weights at" in message or "File name too long" in message
 
 
-def test_name_of_the_model(few, small, tmp_path):
+def test_name_of_the_model(few):
     assert locate(few).name == "few"
     assert locate(few / INDEX).name == "model"
-    save_file(small, tmp_path / "my.model.safetensors")
-    assert locate(tmp_path / "my.model.safetensors").name == "my.model"
+    (few / INDEX).rename(few / "my.model.safetensors")
+    assert locate(few / "my.model.safetensors").name == "my.model"
 
 
 # Damage and malice
@@ -225,12 +187,10 @@ def header(content: bytes) -> bytes:
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "is a Git LFS pointer"),
         (b"\x93NUMPY\x01\x00v\x00{", "is a file that starts with"),
         ((2**40).to_bytes(8, "little") + b"{}", "claims 1099511627776 bytes"),
-        ((2**63).to_bytes(8, "little") + b"{}", "is a file that starts with"),
-        ((500).to_bytes(8, "little") + b'{"a":', "is not a whole safetensors file"),
         ((8).to_bytes(8, "little") + b"{not js}", "is not a whole safetensors file"),
-        (header(b'{"a":' * 100_000), "is not a whole safetensors file"),
-        (header(b'{"a": {"dtype": "F32", "shape": [' + b"9" * 400), "is not a whole safetensors file"),
         (header(b'{"a": {"dtype": "' + b"F" * 9000 + b'"}}'), "is not a whole safetensors file"),
+        (header(b'{"a": {"dtype": "F32", "shape": [2], "data_offsets": [0, 99]}}'), "is not a whole safetensors file"),
+        (header(b'{"a": {"dtype": "F4", "shape": [2], "data_offsets": [0, 1]}}') + b"\0", "has tensors of type F4"),
     ],
 )
 def test_not_weights(tmp_path, content, reason):
@@ -239,30 +199,12 @@ def test_not_weights(tmp_path, content, reason):
     assert reason in refusal(path)
 
 
-def test_truncated_files(small, tmp_path):
-    save_file(small, tmp_path / "model.safetensors")
-    torch.save({name: torch.from_numpy(value) for name, value in small.items()}, tmp_path / "model.pt")
-    for name, reason in (("model.safetensors", "not a whole safetensors file"), ("model.pt", "not a whole torch file")):
-        content = (tmp_path / name).read_bytes()
-        (tmp_path / name).write_bytes(content[:-10])
-        assert reason in refusal(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    "spans",
-    [
-        {"a": [0, 8], "b": [4, 12]},  # overlap
-        {"a": [0, 8], "b": [12, 20]},  # gap
-        {"a": [0, 8], "b": [8, 2**40]},  # beyond the end
-        {"a": [0, 8], "b": [8, 12]},  # too small for the shape
-        {"a": [8, 0], "b": [8, 16]},  # backwards
-    ],
-)
-def test_wrong_offsets(tmp_path, spans):
-    header = json.dumps({name: {"dtype": "F32", "shape": [2], "data_offsets": span} for name, span in spans.items()})
-    path = tmp_path / "model.safetensors"
-    path.write_bytes(len(header).to_bytes(8, "little") + header.encode() + bytes(20))
-    assert "not a whole safetensors file" in refusal(path)
+@pytest.mark.parametrize("format", ["safetensors", "pt"])
+def test_truncated_files(tmp_path, format):
+    path = tmp_path / f"model.{format}"
+    make_checkpoint(path, {KEY: [4]}, format=format)
+    path.write_bytes(path.read_bytes()[:-10])
+    assert "is not a whole" in refusal(path)
 
 
 class Code:
@@ -289,7 +231,7 @@ def test_compressed_archive(tmp_path):
     assert "is a compressed archive" in refusal(tmp_path / "bomb.pt")
 
 
-@pytest.mark.parametrize("content", [[torch.ones(1)], {}, torch.ones(1), {"model": {}}])
+@pytest.mark.parametrize("content", [[torch.ones(1)], {}, {"model": {}}])
 def test_torch_file_without_state_dict(tmp_path, content):
     torch.save(content, tmp_path / "model.pt")
     assert "expected a state dict" in refusal(tmp_path / "model.pt")
@@ -309,13 +251,6 @@ def test_own_checkpoint_is_not_converted_again(expected, config, tmp_path):
     assert "is already a checkpoint of this library" in refusal(tmp_path / "ours.safetensors")
 
 
-def test_unsupported_type(tmp_path):
-    header = json.dumps({"a": {"dtype": "F4", "shape": [2], "data_offsets": [0, 1]}})
-    path = tmp_path / "model.safetensors"
-    path.write_bytes(len(header).to_bytes(8, "little") + header.encode() + bytes(1))
-    assert "has tensors of type F4" in refusal(path)
-
-
 def test_torch_is_an_extra(tmp_path, monkeypatch):
     torch.save({"a": torch.ones(1)}, tmp_path / "model.pt")
     monkeypatch.setitem(sys.modules, "torch", None)
@@ -326,9 +261,7 @@ def test_torch_is_an_extra(tmp_path, monkeypatch):
 # Shards
 
 
-@pytest.mark.parametrize(
-    "name", ["../x.safetensors", "/etc/passwd", "a/b", "..", ".", "", "a\\b", "c:x", "a\0", 3, None]
-)
+@pytest.mark.parametrize("name", ["../x.safetensors", "/etc/passwd", "..", "", "a\\b", "c:x", "a\0", 3])
 def test_index_stays_in_its_folder(few, name):
     (few.parent / "x.safetensors").write_bytes(b"outside")
     path = edit_index(few, lambda index: index["weight_map"].update({KEY: name}))
@@ -339,11 +272,7 @@ def test_index_stays_in_its_folder(few, name):
     ("content", "reason"),
     [
         ("{", "is not JSON"),
-        ("[" * 100_000, "is not JSON"),
         ("[]", "is []; expected an object"),
-        ('{"metadata": ' + "9" * 400 + "}", "metadata is a number of more than 64 bits"),
-        ('{"weight_map": {"a": ' + "[" * 70 + "]" * 70 + "}}", "is nested more than 64 levels deep"),
-        ('{"weight_map": ' + "9" * 9000 + "}", "is not JSON"),
         ('{"weight_map": []}', "no weight_map"),
     ],
 )
@@ -352,37 +281,22 @@ def test_invalid_index(few, content, reason):
     assert reason in refusal(few / INDEX)
 
 
-def test_missing_shards(few):
+def test_index_and_shards_that_disagree(few, config, tmp_path):
+    def change(index):
+        index["weight_map"] |= {"ghost": SHARDS[0], KEY: SHARDS[1]}
+        del index["weight_map"]["b"]
+
+    index = edit_index(few, change)
+    save_file({"b": np.ones(4), "c": np.ones(4)}, few / SHARDS[1])
+    expected = {
+        f"key {KEY} is in {SHARDS[0]}; the index says {SHARDS[1]}",
+        f"key b is in {SHARDS[1]}; the index says nothing",
+        f"duplicate key c in {SHARDS[1]} and {SHARDS[2]}",
+        "key ghost of the index is in no shard",
+    }
+    assert set(read_state_dict(index).problems) == expected
+    message = refusal(index, lambda path: convert(path, tmp_path / "x.safetensors", config=config))
+    assert "key ghost of the index" in message
     for shard in SHARDS[:2]:
         (few / shard).unlink()
-    message = refusal(few / INDEX)
-    assert f"2 problems: missing shard {SHARDS[0]}; missing shard {SHARDS[1]}" in message
-
-
-def test_index_and_shards_disagree(sharded, config, tmp_path):
-    def change(index):
-        first = [name for name, shard in index["weight_map"].items() if shard == SHARDS[0]]
-        del index["weight_map"][first[0]]
-        index["weight_map"][first[1]] = SHARDS[1]
-        index["weight_map"]["ghost.weight"] = SHARDS[2]
-
-    edit_index(sharded, change)
-    message = refusal(sharded, lambda path: convert(path, tmp_path / "x.safetensors", config=config))
-    assert "3 problems" in message
-    assert f"is in {SHARDS[0]}; the index says nothing" in message
-    assert f"is in {SHARDS[0]}; the index says {SHARDS[1]}" in message
-    assert "key ghost.weight of the index is in no shard" in message
-
-
-def test_key_in_two_shards_beside_other_problems(sharded, config, tmp_path):
-    twice, unknown = "aggregator.camera_token", "extra.weight"
-    for shard in (SHARDS[0], SHARDS[2]):
-        added = {twice: np.zeros((1, 2, 1, 32), np.float32)} | ({unknown: np.ones(1)} if shard == SHARDS[0] else {})
-        held = {name: np.array(value) for name, value in read_state_dict(sharded / shard).tensors.items()}
-        save_file(held | added, tmp_path / "new")
-        (tmp_path / "new").replace(sharded / shard)
-    edit_index(sharded, lambda index: index["weight_map"].update({unknown: SHARDS[0]}))
-    message = refusal(sharded, lambda path: convert(path, tmp_path / "x.safetensors", config=config))
-    assert "2 problems" in message
-    assert f"duplicate key {twice} in {SHARDS[0]} and {SHARDS[2]}" in message
-    assert f"unknown key {unknown}" in message
+    assert f"2 problems: missing shard {SHARDS[0]}; missing shard {SHARDS[1]}" in refusal(index)

@@ -15,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 
-from converters import convert, convert_state_dict
+from converters import convert_state_dict
 from converters.locate import locate
 from testing.make_checkpoint import make_checkpoint
 from testing.seeded import seeded_state_dict
@@ -114,11 +114,6 @@ def shapes(golden):
     return json.loads((golden / "shapes.json").read_text())
 
 
-@pytest.fixture(scope="module")
-def expected(shapes, config):
-    return convert_state_dict(seeded_state_dict(shapes), config)
-
-
 @pytest.fixture
 def repository(hub, tmp_path):
     folder = tmp_path / "repository"
@@ -128,10 +123,6 @@ def repository(hub, tmp_path):
     return folder
 
 
-def assert_equal(model, expected):
-    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, expected))
-
-
 def refusal(source) -> str:
     with pytest.raises(CheckpointError) as raised:
         locate(source)
@@ -139,30 +130,17 @@ def refusal(source) -> str:
     return str(raised.value)
 
 
-def test_single_file_is_downloaded_and_converted_once(hub, repository, shapes, expected, config):
+def test_single_file_is_downloaded_and_converted_once(hub, repository, shapes, config):
     make_checkpoint(repository / "model.safetensors", shapes)
     (repository / "model.pt").write_bytes(b"not asked for")
     model = load_model("maker/tiny", config=config)
-    assert_equal(model, expected)
-    assert model.name == "maker/tiny"
-    assert model.path is not None
-    assert model.path.name.startswith("maker-tiny-")
-    assert model.revision == COMMIT
-    assert model.summary()["revision"] == COMMIT
+    expected = convert_state_dict(seeded_state_dict(shapes), config)
+    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, expected))
+    assert (model.name, model.revision, model.summary()["revision"]) == ("maker/tiny", COMMIT, COMMIT)
     again = load_model("maker/tiny", config=config)
     assert again.path == model.path
     downloads = [path for method, path in hub.asked if method == "GET" and "/resolve/" in path]
     assert downloads == [f"/maker/tiny/resolve/{COMMIT}/model.safetensors"]
-
-
-def test_shards(hub, repository, shapes, expected, config, tmp_path):
-    make_checkpoint(repository, shapes, shards=2)
-    assert_equal(load_model(convert("maker/tiny", tmp_path / "out.safetensors", config=config).path), expected)
-
-
-def test_torch_file_where_there_is_nothing_better(hub, repository, shapes, expected, config):
-    make_checkpoint(repository / "weights.pt", shapes, format="pt")
-    assert_equal(load_model("maker/tiny", config=config), expected)
 
 
 def test_without_network_the_cache_serves(hub, repository, monkeypatch):
@@ -194,11 +172,8 @@ def test_a_branch_is_resolved_once_and_a_given_commit_is_used(hub, repository):
     assert locate("maker/tiny").path.read_bytes() == b"weights"
     assert len(hub.asked) == asked  # the record and the cache know all
     later = locate(f"maker/tiny/model.safetensors@{LATER}")
-    assert (later.path.read_bytes(), later.name, later.revision) == (
-        b"weights of later",
-        "maker/tiny/model.safetensors",
-        LATER,
-    )
+    assert later.path.read_bytes() == b"weights of later"
+    assert later.revision == LATER
     assert locate("maker/tiny").revision == COMMIT
     assert "revision 'main' of 'maker/tiny' is not a commit; expected its 40 hex" in refusal("maker/tiny@main")
     assert f"'maker/tiny' has no commit {'0' * 40}" in refusal(f"maker/tiny@{'0' * 40}")
@@ -235,8 +210,6 @@ def test_out_of_reach(hub, monkeypatch):
     message = refusal("maker/tiny")
     assert "'maker/tiny' is not in the hub's cache and cannot be downloaded" in message
     assert "check the network" in message
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    assert "cannot be downloaded" in refusal("maker/tiny")
 
 
 def test_missing_and_gated(hub, repository):
@@ -257,13 +230,11 @@ def test_hub_is_an_extra(monkeypatch):
         locate("maker/tiny")
 
 
-def test_one_of_several_files(hub, repository, shapes, expected, config, monkeypatch):
+def test_one_of_several_files(hub, repository, monkeypatch):
     for name in ("a_e20.pt", "a_e30.pt"):
-        make_checkpoint(repository / name, shapes, format="pt")
+        (repository / name).write_bytes(b"weights")
     assert "holds 2 files of weights (a_e20.pt, a_e30.pt)" in refusal("maker/tiny")
-    model = load_model("maker/tiny/a_e20.pt", config=config)
-    assert_equal(model, expected)
-    assert model.name == "maker/tiny/a_e20.pt"
+    assert locate("maker/tiny/a_e20.pt")[1:] == ("maker/tiny/a_e20.pt", COMMIT)
     assert "has no file a_e10.pt; its files of weights are a_e20.pt, a_e30.pt" in refusal("maker/tiny/a_e10.pt")
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     assert locate("maker/tiny/a_e20.pt").path.name == "a_e20.pt"

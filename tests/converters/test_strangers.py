@@ -57,5 +57,4 @@ def test_vggt_itself_is_no_stranger(golden):
     keys = json.loads((golden / "shapes_vggt_1b.json").read_text())
     for name in ("facebook/VGGT-1B", "facebook/VGGT-1B-Commercial", "model_tracker_fixed_e20", "vggt_1B_commercial"):
         refuse_strangers(name, keys)
-    prefixed = [f"module.{key}" for key in keys]
-    refuse_strangers("ddp", prefixed)  # unknown keys, but nobody's in particular
+    refuse_strangers("ddp", [f"module.{key}" for key in keys])  # unknown keys, but nobody's in particular

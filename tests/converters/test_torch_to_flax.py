@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import tracemalloc
-from itertools import pairwise
 from typing import Any
 
 import jax
@@ -21,10 +20,10 @@ from safetensors.numpy import save_file
 from converters import convert, convert_state_dict
 from converters.rules import CONV, DENSE, DEPTH_TO_SPACE, IGNORED, POINTWISE, RULES, SAME, TRACKS, UNBATCHED
 from converters.torch_to_flax import source_shapes
-from testing.seeded import seeded_images, seeded_state_dict
-from vggtjax import VGGTConfig, forward, load_model, vggt_1b
+from testing.seeded import seeded_state_dict
+from vggtjax import forward, load_model, vggt_1b
 from vggtjax.checkpoint import flat_shapes
-from vggtjax.errors import MOST_LETTERS, CheckpointError, InputError, OutputError
+from vggtjax.errors import CheckpointError, InputError, OutputError
 from vggtjax.network.model import HEADS
 
 VIRTUAL_TRACKS = "track_head.tracker.updateformer.virual_tracks"
@@ -84,40 +83,10 @@ def test_transforms(transform, shape, index, target_index):
     assert transform.source_shape(made.shape) == shape
 
 
-def test_layers_are_stacked_in_order(state_dict, config):
-    params = convert_state_dict(state_dict, config)
-    kernel = params["aggregator"]["frame_blocks"]["attention"]["qkv"]["kernel"]
-    assert kernel.shape == (24, 32, 96)
-    for layer in (0, 7, 23):
-        assert np.array_equal(kernel[layer], state_dict[f"aggregator.frame_blocks.{layer}.attn.qkv.weight"].T)
-
-
-def test_types_are_kept(state_dict, config):
-    params = convert_state_dict({k: v.astype(ml_dtypes.bfloat16) for k, v in state_dict.items()}, config)
-    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {np.dtype(ml_dtypes.bfloat16)}
-
-
 def test_both_spellings_of_virtual_tracks(state_dict, config):
     published = convert_state_dict(state_dict, config)
     state_dict[VIRTUAL_TRACKS.replace("virual", "virtual")] = state_dict.pop(VIRTUAL_TRACKS)
     assert jax.tree.all(jax.tree.map(np.array_equal, convert_state_dict(state_dict, config), published))
-
-
-def test_one_problem_of_each_kind(state_dict, config):
-    def without(name):
-        return {key: value for key, value in state_dict.items() if key != name}
-
-    assert f"1 problem: missing key {BIAS}" in problems(without(BIAS), config)
-    assert "1 problem: unknown key extra.weight" in problems(state_dict | {"extra.weight": np.ones(3)}, config)
-    beyond = "aggregator.frame_blocks.24.norm1.weight"
-    assert f"1 problem: unknown key {beyond}" in problems(state_dict | {beyond: np.ones(32, np.float32)}, config)
-    both = VIRTUAL_TRACKS.replace("virual", "virtual")
-    message = problems(state_dict | {both: state_dict[VIRTUAL_TRACKS]}, config)
-    assert f"1 problem: duplicate keys {VIRTUAL_TRACKS} and {both}" in message
-    message = problems(state_dict | {BIAS: np.ones((1, 64), np.float32)}, config)
-    assert f"1 problem: mis-shaped key {BIAS}: [1, 64], expected [32]" in message
-    message = problems(state_dict | {BIAS: np.ones(32, np.int64)}, config)
-    assert f"1 problem: key {BIAS} has type int64" in message
 
 
 def test_values_that_are_not_finite_are_refused_by_name(state_dict, config):
@@ -129,23 +98,21 @@ def test_values_that_are_not_finite_are_refused_by_name(state_dict, config):
 
 
 def test_all_problems_at_once(state_dict, config):
+    beyond = "aggregator.frame_blocks.24.norm1.weight"
+    both = VIRTUAL_TRACKS.replace("virual", "virtual")
     del state_dict[BIAS]
-    state_dict["extra.weight"] = np.ones(3)
+    state_dict |= {beyond: np.ones(32, np.float32), both: state_dict[VIRTUAL_TRACKS]}
     state_dict["aggregator.camera_token"] = np.ones((2, 1, 32), np.int32)
     message = problems(state_dict, config)
-    assert "4 problems" in message
-    for part in (BIAS, "extra.weight", "mis-shaped key aggregator.camera_token", "type int32"):
+    assert "5 problems" in message
+    for part in (
+        f"missing key {BIAS}",
+        f"unknown key {beyond}",
+        f"duplicate keys {VIRTUAL_TRACKS} and {both}",
+        "mis-shaped key aggregator.camera_token: [2, 1, 32], expected [1, 2, 1, 32]",
+        "key aggregator.camera_token has type int32",
+    ):
         assert part in message
-
-
-def test_many_problems_make_one_short_message(config, state_dict):
-    message = problems({}, config)
-    assert f"{len(state_dict) - 1} problems" in message
-    shown = message.count("missing key")
-    assert message.endswith(f"; and {len(state_dict) - 1 - shown} more")
-    message = problems(state_dict | {"\x1b[31m" + "x" * 10_000: np.ones(1)}, config)
-    assert "\x1b" not in message
-    assert len(message) <= MOST_LETTERS
 
 
 def test_convert_streams_the_same_arrays(state_dict, source, config, tmp_path):
@@ -156,34 +123,26 @@ def test_convert_streams_the_same_arrays(state_dict, source, config, tmp_path):
     with safe_open(out, framework="numpy") as file:
         known = {"format": "vggtjax", "version": "1", "config": config.to_json(), "name": "tiny"}
         assert file.metadata() == known | {"origin": json.dumps({"tiny.safetensors": digest})}
-        assert set(file.keys()) == set(expected)
-        for name, array in expected.items():
-            made = file.get_tensor(name)
-            assert made.dtype == np.float32
-            assert np.array_equal(made, array)
-    tensors = len(state_dict) - len(IGNORED)
-    steps = tensors + -(-source.stat().st_size // 2**20)
+        made = file.get_tensors()
+    assert set(made) == set(expected)
+    assert all(made[name].dtype == np.float32 and np.array_equal(made[name], expected[name]) for name in made)
+    steps = done.tensors + -(-source.stat().st_size // 2**20)
     assert calls == [(step, steps) for step in range(1, steps + 1)]
-    assert done.tensors == tensors
+    assert done.tensors == len(state_dict) - len(IGNORED)
     assert done.left_out == tuple(IGNORED)
     assert done.parameters == sum(array.size for array in expected.values())
     assert (done.bytes, done.dtype, done.sha256) == (out.stat().st_size, "float32", {"tiny.safetensors": digest})
-    assert load_model(out).summary()["sha256 of tiny.safetensors"] == digest
     assert [path.name for path in out.parent.iterdir()] == ["ours.safetensors"]
 
 
-@pytest.mark.parametrize("heads", [("depth", "camera"), ("camera",), ("points", "tracks")])
+@pytest.mark.parametrize("heads", [("depth", "camera"), ("points", "tracks")])
 def test_convert_some_heads(state_dict, source, config, tmp_path, heads):
     done = convert(source, tmp_path / "part.safetensors", config=config, heads=heads)
-    model = load_model(done.path)
-    assert set(model.heads) == set(heads)
     whole = convert_state_dict(state_dict, config)
     modules = {"backbone", "aggregator", *(HEADS[name] for name in heads)}
-    assert set(model.params) == modules
-    assert jax.tree.all(jax.tree.map(np.array_equal, model.params, {name: whole[name] for name in modules}))
-    prefixes = {"camera": "camera_head", "depth": "depth_head", "points": "point_head", "tracks": "track_head"}
-    absent = {prefix for name, prefix in prefixes.items() if name not in heads}
-    assert {name.split(".")[0] for name in set(done.left_out) - IGNORED} == absent
+    made = load_model(done.path).params
+    assert set(made) == modules
+    assert jax.tree.all(jax.tree.map(np.array_equal, made, {name: whole[name] for name in modules}))
     assert done.tensors + len(done.left_out) == len(state_dict)
 
 
@@ -211,14 +170,11 @@ def test_convert_rounds_to_bfloat16(state_dict, source, config, tmp_path):
 
 
 def test_large_arrays_are_aligned_for_memory_maps(source, config, tmp_path):
-    out = convert(source, tmp_path / "ours.safetensors", config=config).path
-    content = out.read_bytes()
+    content = convert(source, tmp_path / "ours.safetensors", config=config).path.read_bytes()
     length = int.from_bytes(content[:8], "little")
     header = json.loads(content[8 : 8 + length])
-    header.pop("__metadata__")
-    spans = sorted(entry["data_offsets"] for entry in header.values())
+    spans = [entry["data_offsets"] for name, entry in header.items() if name != "__metadata__"]
     assert (8 + length) % 64 == 0
-    assert all(end == begin for (_, end), (begin, _) in pairwise(spans))
     assert all(begin % 64 == 0 for begin, end in spans if (end - begin) % 64 == 0)
 
 
@@ -235,23 +191,18 @@ def test_convert_holds_one_tensor_at_a_time(config, tmp_path):
     assert peak < 0.15 * out.stat().st_size
 
 
-@pytest.mark.parametrize(
-    ("failure", "expected"),
-    [(KeyboardInterrupt(), KeyboardInterrupt), (OSError(errno.ENOSPC, "No space left on device"), OutputError)],
-)
-def test_interrupted_conversion_leaves_nothing(source, config, tmp_path, failure, expected):
+@pytest.mark.parametrize("name", ["ours.safetensors", "new.safetensors"])
+def test_interrupted_conversion_leaves_what_was_there(source, config, tmp_path, name):
     folder = tmp_path / "out"
     folder.mkdir()
     (folder / "ours.safetensors").write_text("before")
 
     def fail(done, total):
         if done == 700:
-            raise failure
+            raise OSError(errno.ENOSPC, "No space left on device")
 
-    with pytest.raises(expected):
-        convert(source, folder / "ours.safetensors", config=config, progress=fail)
-    with pytest.raises(expected):
-        convert(source, folder / "new.safetensors", config=config, progress=fail)
+    with pytest.raises(OutputError):
+        convert(source, folder / name, config=config, progress=fail)
     assert [(path.name, path.read_text()) for path in folder.iterdir()] == [("ours.safetensors", "before")]
 
 
@@ -263,16 +214,3 @@ def test_convert_checks_its_arguments(source, config, tmp_path):
     with pytest.raises(CheckpointError, match="does not fit the configuration"):
         convert(source, tmp_path / "x.safetensors")
     assert not (tmp_path / "x.safetensors").exists()
-
-
-def test_golden_forward_through_a_file(golden, shapes, tmp_path):
-    arrays = np.load(golden / "forward_single.npz")
-    meta = json.loads(str(arrays["meta"]))
-    config = VGGTConfig(**json.loads((golden / "config.json").read_text()))
-    save_file(seeded_state_dict(shapes, meta["seed"]), tmp_path / "torch.safetensors")
-    model = load_model(convert(tmp_path / "torch.safetensors", tmp_path / "ours.safetensors", config=config).path)
-    images = seeded_images(meta["frames"], meta["height"], meta["width"], meta["seed"]).transpose(0, 2, 3, 1)[None]
-    made = jax.jit(forward, static_argnames="config")(model.params, images, model.config)
-    for name, key in (("pose_encoding", "pose_enc"), ("depth", "depth"), ("depth_confidence", "depth_conf")):
-        expected = arrays[f"plain/{key}"]
-        assert np.abs(np.asarray(getattr(made, name)).reshape(expected.shape) - expected).max() < 1e-4 * expected.std()

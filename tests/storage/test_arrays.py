@@ -1,11 +1,8 @@
 import io
 import zipfile
-from contextlib import suppress
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from vggtjax.errors import ResultError
 from vggtjax.storage import arrays
@@ -58,16 +55,11 @@ def test_numpy_reads_and_writes_the_same_format(whole, tmp_path):
 def test_python_objects_are_neither_written_nor_read(tmp_path):
     with pytest.raises(ValueError, match="Object arrays cannot be saved"):
         arrays.write_arrays(tmp_path / "a.npz", {"trap": np.array([print], object)})
-    store(tmp_path / "b.npz", {"trap.npy": npy(np.array([{}], object), allow_pickle=True)})
-    for read in (arrays.read_headers, arrays.read_arrays):
-        with pytest.raises(ResultError, match="Python objects or structures, which are never loaded"):
-            read(tmp_path / "b.npz")
-
-
-def test_structured_arrays_with_objects_are_refused(tmp_path):
-    store(tmp_path / "a.npz", {"trap.npy": npy(np.array([(1, {})], [("a", "i4"), ("b", "O")]), allow_pickle=True)})
-    with pytest.raises(ResultError, match="Python objects"):
-        arrays.read_arrays(tmp_path / "a.npz")
+    for trap in (np.array([{}], object), np.array([(1, {})], [("a", "i4"), ("b", "O")])):
+        store(tmp_path / "b.npz", {"trap.npy": npy(trap, allow_pickle=True)})
+        for read in (arrays.read_headers, arrays.read_arrays):
+            with pytest.raises(ResultError, match="Python objects or structures, which are never loaded"):
+                read(tmp_path / "b.npz")
 
 
 def test_declared_sizes_are_checked_before_reading(tmp_path, monkeypatch):
@@ -86,7 +78,7 @@ def test_declared_sizes_are_checked_before_reading(tmp_path, monkeypatch):
     [
         ({"notes.txt": b"hello"}, "expected arrays alone"),
         ({"x.npy": b"hello"}, "not a whole .npz"),
-        ({"x.npy": npy(np.zeros(3), version=(3, 0))}, "version"),
+        ({"x.npy": npy(np.zeros(3), version=(3, 0))}, r"version \(3, 0\) of the array format; expected \(1, 0\) or"),
         ({"x.npy": npy(np.zeros((2, 3), order="F"))}, "column order"),
         ({"x.npy": npy(np.zeros(3, ">f4"))}, "byte order"),
         ({"x.npy": npy(np.frombuffer(b"\xff" * 4, "<U1"))}, "not Unicode"),
@@ -100,134 +92,63 @@ def test_members_that_are_not_arrays(tmp_path, members, message):
         arrays.read_arrays(tmp_path / "a.npz")
 
 
+def test_archives_that_numpy_does_not_write(tmp_path):
+    with zipfile.ZipFile(tmp_path / "twice.npz", "w") as file:
+        file.writestr("x.npy", npy(np.zeros(3)))
+        with pytest.warns(UserWarning, match="Duplicate name"):
+            file.writestr("x.npy", npy(np.ones(3)))
+    with zipfile.ZipFile(tmp_path / "bzip2.npz", "w", zipfile.ZIP_BZIP2) as file:
+        file.writestr("x.npy", npy(np.zeros(3)))
+    (tmp_path / "text.npz").write_text("not a zip")
+    for name, message in (
+        ("twice.npz", "same name"),
+        ("bzip2.npz", "compression type 12"),
+        ("text.npz", r"not a whole \.npz"),
+        ("", "cannot be read"),
+    ):
+        with pytest.raises(ResultError, match=message):
+            arrays.read_arrays(tmp_path / name)
+
+
+def header(descr="'<f4'", shape="(4,)", by_columns="False", more=""):
+    return f"{{'descr': {descr}, 'fortran_order': {by_columns}, 'shape': {shape}{more}}}"
+
+
 @pytest.mark.parametrize(
-    "header",
+    "text",
     [
-        "",
-        "{",
         "[]",
-        "3",
         "{'descr': '<f4', 'fortran_order': False}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': (4,), 'more': 1}",
-        "{'descr': '<f4', 'fortran_order': 0, 'shape': (4,)}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': 4}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': [4]}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': (True, 4)}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': (-2, -2)}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': (2.0, 2)}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': ((4,),)}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': " + "(" * 500 + ")" * 500 + "}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': (" + "9" * 5000 + ",)}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': (" + "9" * 400 + ",)}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': (0, 10000000000000000000000)}",
-        "{'descr': '<f4', 'fortran_order': False, 'shape': (4,), [1]: 2}",
-        "{'descr': '<f4\xfc', 'fortran_order': False, 'shape': (4,)}",
-        "{'descr': '<f3', 'fortran_order': False, 'shape': (4,)}",
-        "{'descr': '<f99999999999999999999', 'fortran_order': False, 'shape': (4,)}",
-        "{'descr': '<M8[xs]', 'fortran_order': False, 'shape': (2,)}",
-        "{'descr': '|S0', 'fortran_order': False, 'shape': (60000000000,)}",
-        "{'descr': '(4,)<f4', 'fortran_order': False, 'shape': (1,)}",
-        "{'descr': 'f4,f4', 'fortran_order': False, 'shape': (2,)}",
-        "{'descr': None, 'fortran_order': False, 'shape': (4,)}",
-        "{'descr': ('<f4', (4,)), 'fortran_order': False, 'shape': (1,)}",
-        "{'descr': [('a', '<f4')], 'fortran_order': False, 'shape': (4,)}",
-        "{'descr': {'x': 1}, 'fortran_order': False, 'shape': (4,)}",
+        header(more=", 'more': 1"),
+        header(more=", [1]: 2"),
+        header(by_columns="0"),
+        header(shape="4"),
+        header(shape="(True, 4)"),
+        header(shape="(-2, -2)"),
+        header(shape="(" * 500 + ")" * 500),
+        header(shape="(" + "9" * 5000 + ",)"),
+        header(shape="(0, 10000000000000000000000)"),
+        header("'<f3'"),
+        header("'<f99999999999999999999'"),
+        header("'<M8[xs]'", "(2,)"),
+        header("'|S0'", "(60000000000,)"),
+        header("'(4,)<f4'", "(1,)"),
+        header("None"),
+        header("[('a', '<f4')]"),
         "print('hello')",
         "\0" * 9,
         " " * 20_000,
     ],
+    ids=range(21),
 )
-def test_malformed_headers(tmp_path, header):
-    content = header.encode("latin1")
+def test_malformed_headers(tmp_path, text):
+    content = text.encode("latin1")
     content = b"\x93NUMPY\x02\x00" + len(content).to_bytes(4, "little") + content + bytes(16)
     store(tmp_path / "a.npz", {"x.npy": content})
     (tmp_path / "x.npy").write_bytes(content)
-    for read in (arrays.read_headers, arrays.read_arrays):
+    for read, name in ((arrays.read_headers, "a.npz"), (arrays.read_arrays, "a.npz"), (arrays.read_array, "x.npy")):
         with pytest.raises(ResultError, match=r"^x\.npy "):
-            read(tmp_path / "a.npz")
-    with pytest.raises(ResultError, match=r"^x\.npy "):
-        arrays.read_array(tmp_path / "x.npy")
-
-
-@pytest.mark.parametrize("version", [(0, 0), (3, 0), (9, 0), (255, 255)])
-def test_other_versions_of_the_array_format(tmp_path, version):
-    (tmp_path / "x.npy").write_bytes(b"\x93NUMPY" + bytes(version) + bytes(100))
-    with pytest.raises(ResultError, match="expected \\(1, 0\\) or"):
-        arrays.read_array(tmp_path / "x.npy")
-
-
-PARTS = [
-    "descr",
-    "shape",
-    "fortran_order",
-    "'",
-    "(",
-    ")",
-    "{",
-    "}",
-    ",",
-    "<f4",
-    "O",
-    "-1",
-    "9" * 30,
-    "True",
-    "[",
-    "é",
-    ":",
-]
-
-
-@given(st.lists(st.tuples(st.integers(0, 60), st.integers(0, 8), st.sampled_from(PARTS)), min_size=1, max_size=4))
-def test_changed_headers_are_refused_or_read(whole, changes):
-    header = "{'descr': '<f4', 'fortran_order': False, 'shape': (4,), }"
-    for place, length, part in changes:
-        header = header[:place] + part + header[place + length :]
-    content = header.encode("latin1")
-    content = b"\x93NUMPY\x01\x00" + len(content).to_bytes(2, "little") + content + bytes(16)
-    store(whole.with_name("changed.npz"), {"x.npy": content})
-    whole.with_name("x.npy").write_bytes(content)
-    for read, name in ((arrays.read_headers, "changed.npz"), (arrays.read_arrays, "changed.npz")):
-        with suppress(ResultError):
-            read(whole.with_name(name))
-    with suppress(ResultError):
-        assert arrays.read_array(whole.with_name("x.npy")).nbytes == 16
-
-
-def test_two_members_of_one_name(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
-        file.writestr("x.npy", npy(np.zeros(3)))
-        with pytest.warns(UserWarning, match="Duplicate name"):
-            file.writestr("x.npy", npy(np.ones(3)))
-    with pytest.raises(ResultError, match="same name"):
-        arrays.read_arrays(tmp_path / "a.npz")
-
-
-def test_compression_that_numpy_does_not_write(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.npz", "w", zipfile.ZIP_BZIP2) as file:
-        file.writestr("x.npy", npy(np.zeros(3)))
-    with pytest.raises(ResultError, match="compression type 12"):
-        arrays.read_arrays(tmp_path / "a.npz")
-
-
-def test_files_that_cannot_be_read(tmp_path):
-    (tmp_path / "text.npz").write_text("not a zip")
-    with pytest.raises(ResultError, match=r"not a whole \.npz"):
-        arrays.read_arrays(tmp_path / "text.npz")
-    with pytest.raises(ResultError, match="cannot be read"):
-        arrays.read_arrays(tmp_path)
-
-
-@given(cut=st.integers(0, 2000), position=st.integers(0, 5000), value=st.integers(0, 255))
-def test_damaged_files_are_refused_or_read(whole, cut, position, value):
-    data = bytearray(whole.read_bytes())
-    data[position % len(data)] = value
-    damaged = whole.with_name("damaged.npz")
-    damaged.write_bytes(data[: len(data) - max(0, cut - 1000)])
-    try:
-        read = arrays.read_arrays(damaged)
-    except ResultError:
-        return
-    assert sum(array.nbytes for array in read.values()) < 10_000
+            read(tmp_path / name)
 
 
 def test_a_small_archive_of_large_arrays_is_refused(tmp_path, monkeypatch):

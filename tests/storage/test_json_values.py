@@ -64,13 +64,11 @@ def test_valid_text_becomes_the_dataclass():
         ("[]", "plan a.json is []; expected an object with the fields of Plan"),
         ('{"nmae": "x"}', "plan a.json has unknown fields ['nmae']; expected some of ['name', "),
         ('{"phases": [{"steps": 1}, {"steps": 1, "stesp": 2}]}', "plan a.json: phases[1] has unknown fields ['stesp']"),
-        ('{"first": {"steps": 1, "x": 2}}', "plan a.json: first has unknown fields ['x']"),
         ('{"phases": [{}]}', "plan a.json: phases[0] lacks the field 'steps'"),
         ('{"phases": [{"steps": 0}]}', "phases[0].steps is 0; expected a whole number of at least 1"),
         ('{"phases": [{"steps": true}]}', "phases[0].steps is True; expected a whole number of at least 1"),
         ('{"phases": [{"steps": 13}]}', "plan a.json: phases[0]: steps is 13; expected any other number"),
         ('{"first": {"steps": 1, "frames": []}}', "first.frames is []; expected a list of at least 1 values"),
-        ('{"first": {"steps": 1, "frames": [1, -1]}}', "frames[1] is -1; expected a whole number of at least 0"),
         ('{"first": {"steps": 1, "share": 2}}', "first.share is 2; expected a number of at least 0 and at most 1"),
         ('{"first": {"steps": 1, "kind": "wide"}}', "first.kind is 'wide'; expected one of ('long', 'short')"),
         ('{"first": 3}', "first is 3; expected an object with the fields of Phase or null"),
@@ -78,11 +76,8 @@ def test_valid_text_becomes_the_dataclass():
         ('{"name": 3}', "name is 3; expected text"),
         ('{"scores": {"a": "b"}}', "scores[...] is invalid: Expected `float`, got `str`"),
         ('{"scores": {"a": NaN}}', "is not JSON that can be read"),
-        ('{"scores": {"a": 1e999}}', "is not JSON that can be read"),
         ('{"scores": {"a": 1' + "0" * 400 + "}}", "scores.a is a number of more than 64 bits"),
-        ('{"scores": {"a": 1' + "0" * 9000 + "}}", "is not JSON that can be read"),
         ('{"notes": {"a b": [1, 1' + "0" * 400 + "]}}", "notes['a b'][1] is a number of more than 64 bits"),
-        ('{"notes": ' + "[" * 100_000 + "}", "is not JSON that can be read"),
         ('{"notes": {"a": ' + "[" * 100 + "]" * 100 + "}}", f"is nested more than {MOST_LEVELS} levels deep"),
         (b'{"name": "\xff"}', "is not JSON that can be read"),
         ('{"name": "\\ud800"}', "is not JSON that can be read"),
@@ -110,11 +105,9 @@ def test_python_code_meets_the_same_constraints():
     first = Phase(1)
     assert Plan(first=first).first is first
     for changes, sentence in (
-        ({"steps": 0}, "phase.steps is 0; expected a whole number of at least 1"),
         ({"steps": 10**5000}, "phase.steps is a number of more than 64 bits"),
         ({"frames": ()}, "phase.frames is "),
         ({"share": math.nan}, "phase.share is nan; expected a finite number"),
-        ({"share": math.inf}, "phase.share is inf; expected a finite number"),
     ):
         with pytest.raises(InputError, match=sentence):
             Phase(**({"steps": 1} | changes))  # pyright: ignore[reportArgumentType]

@@ -5,8 +5,6 @@ import sys
 
 import pytest
 
-from vggtjax.storage.kept_memory import keep_freed_memory
-
 COUNT = """
 import ctypes
 import resource
@@ -55,8 +53,3 @@ def faults_of(code):
     made = subprocess.run([sys.executable, "-c", code + COUNT], capture_output=True, text=True, check=False)
     assert made.returncode == 0, made.stderr
     return int(made.stdout)
-
-
-def test_other_systems_are_left_alone(monkeypatch):
-    monkeypatch.setattr(sys, "platform", "darwin")
-    assert not keep_freed_memory()

@@ -12,9 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from filelock import FileLock
 
-import vggtjax.storage.writing
 from vggtjax.errors import OutputError
 from vggtjax.storage.writing import (
     _remove_leftovers,
@@ -102,86 +100,40 @@ def test_what_a_killed_writer_left_is_removed_by_the_next(tmp_path, kind):
             temporary.write_text("whole")
         assert len(halves(tmp_path)) == 1  # its writer lives
     assert len(halves(tmp_path)) == 1
+    (tmp_path / ".vggtjax-partial-0123456789abcdef.lock").touch()  # of a writer that was killed even earlier
     _remove_leftovers.cache_clear()  # as in the next process
     with writing(tmp_path / "b") as temporary:
         temporary.write_text("whole")
     assert [path.name for path in tmp_path.iterdir()] == ["b"]
 
 
-def test_writers_of_one_process_keep_their_files(tmp_path):
-    with staging(tmp_path) as one, staging(tmp_path) as other, ThreadPoolExecutor(1) as pool:
-        (one / "x").write_text("half")
-
-        def write() -> None:
-            with writing(tmp_path / "b") as temporary:
-                temporary.write_text("whole")
-
-        pool.submit(write).result()
-        assert one.is_dir()
-        assert other.is_dir()
-    assert [path.name for path in tmp_path.iterdir()] == ["b"]
-
-
 def test_only_our_old_leftovers_without_a_lock_are_removed(tmp_path):
     ours = tmp_path / ".vggtjax-partial-0123456789abcdef"
-    names = (".partial-abcd1234", ".partial-notes", ".clip.partial", f"{ours.name}0", ".vggtjax-partial-notes")
+    names = {".partial-abcd1234", ".clip.partial", f"{ours.name}0", ".vggtjax-partial-notes"}
     for path in (ours, *(tmp_path / name for name in names)):
         path.mkdir()
-        os.utime(path, (time.time() - 3600, time.time() - 3600))
-    for seconds, left in ((-15, {ours.name, *names}), (15, set(names))):  # beside a day
-        for name in names:
-            os.utime(tmp_path / name, (0, 0))
+    for seconds, left in ((-15, {ours.name, *names}), (15, names)):  # beside a day
         day_ago = time.time() - 24 * 3600
-        os.utime(ours, (day_ago - seconds, day_ago - seconds))
+        for path in tmp_path.iterdir():
+            os.utime(path, (day_ago - seconds, day_ago - seconds))
         _remove_leftovers.cache_clear()
         with staging(tmp_path):
             pass
         assert {path.name for path in tmp_path.iterdir()} == left
 
 
-def test_a_folder_that_is_gone_or_never_was_is_no_error(tmp_path):
-    with staging(tmp_path) as staged:
-        staged.rmdir()
-    (tmp_path / f"{staged.name}.lock").touch()  # of a writer that was killed before it made its folder
-    _remove_leftovers.cache_clear()
-    with staging(tmp_path):
-        pass
-    assert not list(tmp_path.iterdir())
-
-
-def test_locks_are_refused_at_once_and_released_by_any_thread(tmp_path, monkeypatch):
-    waits = []
-
-    class Recorded(FileLock):
-        def __init__(self, path, timeout, **options):
-            waits.append(timeout)
-            super().__init__(path, timeout, **options)
-
-    monkeypatch.setattr(vggtjax.storage.writing, "FileLock", Recorded)
-    (tmp_path / ".vggtjax-partial-0123456789abcdef.lock").touch()
-    _remove_leftovers.cache_clear()
-    with ThreadPoolExecutor(1) as pool, staging(tmp_path):
-        locked = locked_folder(tmp_path, "a batch")
+def test_writers_and_threads_of_one_process_keep_apart(tmp_path):
+    with staging(tmp_path) as one:
+        _remove_leftovers.cache_clear()
+        with staging(tmp_path) as other:
+            assert one.is_dir()
+            other.rmdir()  # a folder that is gone is no error
+    locked = locked_folder(tmp_path, "a batch")
+    with ThreadPoolExecutor(1) as pool:
         pool.submit(locked.__enter__).result()
-        locked.__exit__(None, None, None)
-        with locked_folder(tmp_path, "a batch"):
-            pass
-    assert waits == [0] * 5  # its own, both in the folder, and the batches
-
-
-def test_a_folder_is_scanned_once(tmp_path, monkeypatch):
-    scans, scandir = [], os.scandir
-
-    def counted(path):
-        scans.append(path)
-        return scandir(path)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "scandir", counted)
-        for number in range(3):
-            with writing(tmp_path / str(number)) as temporary:
-                temporary.write_text("x")
-    assert scans.count(tmp_path) == 1
+    locked.__exit__(None, None, None)  # by another thread
+    with locked_folder(tmp_path, "a batch"):
+        pass
 
 
 @pytest.mark.skipif(os.name != "posix", reason="flock")
@@ -217,31 +169,31 @@ def test_a_check_finds_files_that_may_not_be_replaced_and_leaves_nothing(tmp_pat
     assert {path.name for path in full.iterdir()} == {"x", "y"}
 
 
-@pytest.mark.parametrize(("text", "says"), [('{"format": "a"}', True), ('{"format": "b"}', False), ("[", False)])
-def test_a_file_says_its_format(tmp_path, text, says):
-    (tmp_path / "file.json").write_text(text)
-    assert says_format(tmp_path / "file.json", "a") == says
+def test_a_file_says_its_format(tmp_path):
+    for text, says in (('{"format": "a"}', True), ('{"format": "b"}', False), ("[", False)):
+        (tmp_path / "file.json").write_text(text)
+        assert says_format(tmp_path / "file.json", "a") == says
     assert not says_format(tmp_path / "missing.json", "a")
 
 
 def test_an_error_names_the_path_and_the_reason(tmp_path):
     (tmp_path / "file").write_text("x")
-    blocked = (FileExistsError(errno.EEXIST, "exists"), f"{tmp_path / 'file'} is a file")
-    for error, reason in (blocked, (OSError(errno.ENOSPC, "no space"), "no space"), (OSError("it broke"), "it broke")):
-        with pytest.raises(OutputError) as raised, write_errors(tmp_path / "file/a"):
-            raise error
-        assert str(raised.value).startswith(f"cannot write {tmp_path / 'file/a'}: {reason}; choose")
-    with pytest.raises(OutputError, match="exists"), write_errors(tmp_path / "folder"):
-        raise FileExistsError(errno.EEXIST, "exists")
     (tmp_path / "link").symlink_to(tmp_path / "missing")
     (tmp_path / "to-file").symlink_to(tmp_path / "file")
-    for path, reason in (
-        (tmp_path / "link", "is a link to .*missing, which does not exist"),
-        (tmp_path / "to-file", "to-file is a file"),
-        ("/dev/null", "not a folder"),
+    exists = FileExistsError(errno.EEXIST, "exists")
+    for path, error, reason in (
+        (tmp_path / "file/a", OSError(errno.ENOSPC, "no space"), "no space"),
+        (tmp_path / "file/a", OSError("it broke"), "it broke"),
+        (tmp_path / "file/a", exists, f"{tmp_path / 'file'} is a file"),
+        (tmp_path / "to-file", exists, f"{tmp_path / 'to-file'} is a file"),
+        (tmp_path / "link", exists, f"{tmp_path / 'link'} is a link to {tmp_path / 'missing'}, which does not exist"),
+        (tmp_path / "folder", exists, "exists"),
     ):
-        with pytest.raises(OutputError, match=reason), write_errors(Path(path)):
-            raise FileExistsError(errno.EEXIST, "exists")
+        with pytest.raises(OutputError) as raised, write_errors(path):
+            raise error
+        assert str(raised.value).startswith(f"cannot write {path}: {reason}; choose")
+    with pytest.raises(OutputError, match="not a folder"), write_errors(Path("/dev/null")):
+        raise exists
 
 
 def test_a_folder_that_another_run_fills_during_its_check_stays(tmp_path, monkeypatch):
@@ -258,45 +210,30 @@ def test_a_folder_that_another_run_fills_during_its_check_stays(tmp_path, monkey
 
 @pytest.mark.parametrize("context", [staging, lambda folder: locked_folder(folder, "a result")])
 def test_a_folder_that_another_check_removes_is_made_again(tmp_path, monkeypatch, context):
-    folder, open_file, removed = tmp_path / "out", os.open, []
+    folder, mkdir, open_file, often = tmp_path / "out", os.mkdir, os.open, 1
+    removed: list[str] = []
+
+    def beside(path, *arguments):  # another process has made the folder, and removed it by now
+        if Path(path) == folder and removed.count("made") < often:
+            removed.append("made")
+            raise FileExistsError(errno.EEXIST, "exists")
+        return mkdir(path, *arguments)
 
     def late(path, *arguments, **options):
-        if str(path).endswith(".lock") and len(removed) < often:
-            removed.append(path)
+        if str(path).endswith(".lock") and removed.count("locked") < often:
+            removed.append("locked")
             folder.rmdir()
         return open_file(path, *arguments, **options)
 
+    monkeypatch.setattr(os, "mkdir", beside)
     monkeypatch.setattr(os, "open", late)
-    often = 2
     with context(folder):
-        assert len(removed) == 2
         (folder / "file").touch()
+    assert sorted(removed) == ["locked", "made"]
     assert [path.name for path in folder.iterdir()] == ["file"]
     (folder / "file").unlink()
     often = 1000
     with pytest.raises(OutputError, match="another program removes it again and again"), context(folder):
-        pass
-
-
-def test_a_folder_that_is_removed_while_it_is_made_is_made_again(tmp_path, monkeypatch):
-    folder, mkdir, removed = tmp_path / "out", os.mkdir, []
-
-    def late(path, *arguments):
-        if Path(path) == folder and len(removed) < often:
-            removed.append(path)
-            raise FileExistsError(errno.EEXIST, "exists")  # it did: another process has removed it by now
-        return mkdir(path, *arguments)
-
-    monkeypatch.setattr(os, "mkdir", late)
-    often = 2
-    with staging(folder):
-        assert len(removed) == 2
-    folder.rmdir()
-    often = 1000
-    with pytest.raises(OutputError, match="another program removes it again and again"), staging(folder):
-        pass
-    folder.write_text("a file")
-    with pytest.raises(OutputError, match="out is a file"), staging(folder):
         pass
 
 
@@ -307,13 +244,10 @@ def test_a_locked_folder_has_one_writer(tmp_path):
         with pytest.raises(OutputError) as raised, locked_folder(folder, "the batch"):
             pass
         assert str(raised.value) == sentence
-    with locked_folder(folder, "the batch"):  # a killed process holds no lock
-        with pytest.raises(OutputError), locked_folder(folder, "the batch"):
-            pass
-        with locked_folder(tmp_path, "the batch"):
-            pass
-        with pytest.raises(OutputError), locked_folder(folder, "the batch"):
-            pass
+    with locked_folder(folder, "the batch"), locked_folder(tmp_path, "the batch"):  # a killed process holds no lock
+        for _ in range(2):
+            with pytest.raises(OutputError), locked_folder(folder, "the batch"):
+                pass
     assert not list(folder.iterdir())
     with pytest.raises(OutputError, match="cannot write"), locked_folder("/dev/null/x", "the batch"):
         pass

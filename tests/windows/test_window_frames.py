@@ -30,17 +30,11 @@ def test_frames_of_a_video_are_decoded_when_their_window_is_due(tmp_path):
     video = Watched(write_video(tmp_path / "clip.mp4", range(0, 2000, 100)))
     cut = plan_windows(20, 8, 2)
     Watched.decoded = 0
-    whole = [np.asarray(frame.image) for frame in video.frames(Sampling())]
-    Watched.decoded, names = 0, []
     for window, clip in zip(cut, window_clips(video, Sampling(), Fitter(size=64, patch=8), cut), strict=True):
         assert Watched.decoded == window.stop
-        names.append(clip.frame_names)
-        assert len(clip) == 8
-    assert names == [[f"{number:06d}" for number in window] for window in cut]
-    assert len(whole) == 20
+        assert clip.frame_names == [f"{number:06d}" for number in window]
     Watched.decoded = 0
-    assert count_frames(video, Sampling(), most=5) == 5
-    assert Watched.decoded == 5
+    assert count_frames(video, Sampling(), most=5) == Watched.decoded == 5
     assert count_frames(video, Sampling(stride=2)) == 10
 
 

@@ -14,6 +14,8 @@ def test_a_plan_by_hand():
     assert plan_windows(20, 8, 2) == [range(8), range(6, 14), range(12, 20)]
     assert plan_windows(9, 8, 2) == [range(8), range(1, 9)]  # the last window is as long as the first
     assert shared_frames(range(8), range(6, 14)) == range(6, 8)
+    windows = Windows(16)
+    assert (windows.shared, windows.cuts(16), windows.cuts(17)) == (4, False, True)
 
 
 @settings(deadline=None)  # a busy machine is slow
@@ -55,11 +57,3 @@ def test_weights_of_a_frame_sum_to_one_and_fall_towards_the_end_of_a_window(wind
 def test_windows_that_cannot_be(options, sentence):
     with pytest.raises(InputError, match=sentence):
         Windows(**options)
-
-
-def test_a_clip_of_a_window_or_less_is_not_cut():
-    windows = Windows(16)
-    assert windows.shared == 4
-    assert not windows.cuts(16)
-    assert windows.cuts(17)
-    assert not Windows().cuts(10_000)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.tiny import tiny_config, tiny_model
-from vggtjax import init_params, load_clip, reconstruct
-from vggtjax.checkpoint import Model
+from tests.tiny import tiny_model
+from vggtjax import load_clip, reconstruct
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.queries import Queries, check_queries, parse_queries
 from vggtjax.clips.sampling import Sampling
@@ -29,15 +28,14 @@ POINTS = Queries(
 )  # given in the first frame, in the middle and in the last one
 
 
+def truth(queries) -> np.ndarray:
+    """Return where points are in all frames [S, Q, 2]: each row of the picture moves at a speed of its own."""
+    return moved(queries.points, np.arange(FRAMES)[:, None] - queries.frames)
+
+
 def moved(points, frames):
-    """Return where points are so many frames later: each row of the picture moves at a speed of its own."""
-    x, y = points[..., 0], points[..., 1]
+    x, y = np.broadcast_to(points, (*frames.shape[:1], *points.shape)).transpose(2, 0, 1)
     return np.stack([x + frames * (0.5 + y / 100), y], axis=-1)
-
-
-def truth() -> np.ndarray:
-    later = np.arange(FRAMES)[:, None] - POINTS.frames
-    return moved(np.broadcast_to(POINTS.points, (FRAMES, *POINTS.points.shape)), later)
 
 
 def is_seen(positions):
@@ -55,7 +53,7 @@ class Tracker:
         for frame, places in starts:
             self.runs.append((first, frame, len(places)))
             later = np.arange(len(images))[:, None] - frame
-            positions = moved(np.broadcast_to(places, (len(images), *places.shape)), later)
+            positions = moved(places, later)
             lost = np.where(is_seen(places) | self.always, 0, 7)[:, None]
             seen = (is_seen(positions) | self.always).astype(np.float32)
             sure = np.ones_like(seen)
@@ -85,52 +83,35 @@ def followed(tracker, queries=POINTS):
 
 
 def test_points_of_any_frame_are_followed_through_all_windows_both_ways():
-    tracker = Tracker()
+    tracker, true = Tracker(), truth(POINTS)
     found = followed(tracker)
-    assert np.abs(found.positions - truth()).max() < 1e-4
-    assert (found.visibility == is_seen(truth())).mean() > 0.97  # windows differ only where rounding decides
+    assert np.abs(found.positions - true).max() < 1e-4
+    assert (found.visibility == is_seen(true)).mean() > 0.97  # windows differ only where rounding decides
     assert np.abs(found.confidence - 1).max() < 1e-6
     assert np.array_equal(found.positions[POINTS.frames, np.arange(5)], POINTS.points)
-    assert max(len([run for run in tracker.runs if run[0] == window.start]) for window in WINDOWS) <= 2 * 3 + 2
+
+
+def test_points_of_the_first_frame_cost_one_run_of_the_tracker_for_each_window():
+    tracker = Tracker(always=True)
+    followed(tracker, Queries(np.full((9, 2), 60.0), np.zeros(9, np.int64)))
+    assert tracker.runs == [(window.start, 0, 9) for window in WINDOWS]
 
 
 def test_points_are_taken_over_where_they_are_seen(monkeypatch):
     """The second point is behind the post in the first frame that two windows share; taken over there, it is lost."""
     behind = 44 - 0.6 * WINDOWS[1].start
     queries = Queries(np.array([[70, 10], [behind, 10]]), np.array([0, 0]))
-    later = np.arange(FRAMES)[:, None]
-    true = moved(np.broadcast_to(queries.points, (FRAMES, 2, 2)), later)
-    assert np.abs(followed(Tracker(), queries).positions - true).max() < 1e-4
+    assert np.abs(followed(Tracker(), queries).positions - truth(queries)).max() < 1e-4
     monkeypatch.setattr("vggtjax.windows.tracks._SEEN", -1.0)
-    assert np.abs(followed(Tracker(), queries).positions - true).max() > 1
-
-
-def test_points_of_the_first_frame_cost_one_run_of_the_tracker_for_each_window():
-    tracker = Tracker(always=True)
-    side = np.stack(np.meshgrid(np.arange(3.0), np.arange(60.0, 63)), axis=-1).reshape(-1, 2)[:, ::-1]
-    followed(tracker, Queries(side, np.zeros(9, np.int64)))
-    assert [start for start, _, _ in tracker.runs] == [window.start for window in WINDOWS]
-    assert {count for _, _, count in tracker.runs} == {9}
-
-
-@pytest.mark.parametrize("frame", range(0, FRAMES, 7))
-def test_a_point_of_any_frame_is_near_where_it_was_given(frame):
-    """In the frames before and after; in its own it is exactly there."""
-    queries = Queries(np.array([[60.0, 5.0]]), np.array([frame]))
-    found = followed(Tracker(always=True), queries).positions
-    assert found[frame, 0].tolist() == [60, 5]
-    true = moved(np.broadcast_to(queries.points, (FRAMES, 1, 2)), np.arange(FRAMES)[:, None] - frame)
-    assert np.abs(found - true).max() < 1e-4
+    assert np.abs(followed(Tracker(), queries).positions - truth(queries)).max() > 1
 
 
 def test_a_window_that_lost_its_points_has_no_say_in_shared_frames():
     """The second window is unsure after the frame in which it takes points over; frames of the first one stay right."""
     queries = Queries(np.array([[1.0, 5.0], [2.0, 30.0]]), np.array([0, 0]))
-    found = followed(Tracker(always=True, wrong=WINDOWS[1].start), queries).positions
-    true = moved(np.broadcast_to(queries.points, (FRAMES, 2, 2)), np.arange(FRAMES)[:, None])
-    first = WINDOWS[0].stop
-    assert np.abs(found[:first] - true[:first]).max() < 0.2  # 20 pixels apart, for a thousandth of the weight
-    assert np.abs(found[first] - true[first]).max() > 10
+    off = np.abs(followed(Tracker(always=True, wrong=WINDOWS[1].start), queries).positions - truth(queries))
+    assert off[: WINDOWS[0].stop].max() < 0.2  # 20 pixels apart, for a thousandth of the weight
+    assert off[WINDOWS[0].stop].max() > 10
 
 
 def test_a_window_that_sees_no_points_of_its_own_keeps_none():
@@ -143,35 +124,35 @@ def test_a_window_that_sees_no_points_of_its_own_keeps_none():
     assert peak < clip + 12 * window  # arrays of the clip, and of the window that is run
 
 
-def test_the_network_follows_points_as_in_a_clip_that_is_run_at_once(tmp_path):
-    config = tiny_config(track_corr_levels=2, track_corr_radius=1, track_features=8, track_hidden=16)
-    model = Model(config, init_params(0, config), "tiny")
-    images = np.random.default_rng(1).random((6, 56, 56, 3), np.float32)
-    clip = load_clip(images, size=56)
-    points = np.array([[10, 20], [40.5, 30]], np.float32)
+def test_the_network_follows_points_as_in_a_clip_that_is_run_at_once():
+    model, points = tiny_model(), np.array([[10, 20], [40.5, 30]], np.float32)
+    clip = load_clip(np.random.default_rng(1).random((4, 56, 56, 3), np.float32), size=56)
     at_once = reconstruct(model, clip, method="vggt", tracks=Queries(points, np.array([2, 2])))
     follow = tools_of(model, Options("vggt")).follow
     assert follow is not None
-    found = follow(clip.images, [Start(2, points)])[0]
     assert at_once.track_positions is not None
+    found = follow(clip.images, [Start(2, points)])[0]
     assert np.abs(found.positions - at_once.track_positions).max() < 1e-4
     assert np.abs(found.visibility - at_once.track_visibility).max() < 1e-5
 
+
+@pytest.mark.proof
+def test_points_of_a_file_are_followed_in_windows(tmp_path):
     (tmp_path / "points.csv").write_text("x,y,frame\n10,20,0\n40.5,30,8\n")
     run = LongRun(Windows(6, 2), fitter=Fitter(size=56), tracks=str(tmp_path / "points.csv"))
     run = run._replace(saving=Saving(only=("cameras",)))
-    longer = np.random.default_rng(2).random((9, 56, 56, 3), np.float32)
-    result = reconstruct_long(model, longer, tmp_path / "out", run.windows, long_run=run, method="vggt")
+    images = np.random.default_rng(2).random((9, 56, 56, 3), np.float32)
+    result = reconstruct_long(tiny_model(), images, tmp_path / "out", run.windows, long_run=run, method="vggt")
     assert result.track_positions is not None
-    assert result.track_positions.shape == (9, 2, 2)
     assert result.track_positions[[0, 8], [0, 1]].tolist() == [[10, 20], [40.5, 30]]
     assert (tmp_path / "out" / "tracks.npz").is_file()
 
 
 def test_frames_that_are_too_small_for_the_tracker_end_the_run_before_the_work(tmp_path):
     run, images = LongRun(Windows(4, 2), fitter=Fitter(size=56), tracks="grid:2"), np.zeros((6, 56, 56, 3), np.uint8)
+    model = tiny_model(track_corr_levels=7)
     with pytest.raises(InputError, match="tracks need frames of at least 128 pixels a side; these have 56 x 56"):
-        reconstruct_long(tiny_model(), images, tmp_path / "out", run.windows, long_run=run, method="vggt")
+        reconstruct_long(model, images, tmp_path / "out", run.windows, long_run=run, method="vggt")
     assert not (tmp_path / "out").exists()
 
 
