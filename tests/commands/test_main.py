@@ -93,7 +93,10 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     )  # fmt: skip
     assert code == 0, err
     assert "track head of this model is untrained" in out
+    assert "The model demo is a small demonstration model" in out
+    assert re.findall(r"(?m)^.*first pass", err) == ["first pass"]
     result = Reconstruction.load(tmp_path / "out")
+    assert result.settings["model_note"].startswith("small demonstration model")
     assert (result.settings["masks"], result.settings["refine_mask"]) == ("given", True)
     assert np.asarray(result.track_frames).tolist() == [0, 1]
     assert (tmp_path / "out/preview/tracks.png").stat().st_size > 1000
@@ -208,15 +211,6 @@ def test_interruption_while_modules_are_imported(monkeypatch, capsys):
     monkeypatch.setattr(sys, "meta_path", [type("Finder", (), {"find_spec": staticmethod(interrupted)})])
     assert __main__.run() == 130
     assert capsys.readouterr().err == "vggtjax: interrupted\n"
-
-
-def test_stages_and_the_kind_of_model_are_said_once(tmp_path, capsys, frames):
-    arguments = ("--model", "demo", "--out", tmp_path / "out", "--method", "vggt", "--max-frames", 2)
-    code, out, err = run(capsys, "reconstruct", frames, *arguments)
-    assert code == 0, err
-    assert re.findall(r"(?m)^.*first pass", err) == ["first pass"]
-    assert "The model demo is a small demonstration model" in out
-    assert Reconstruction.load(tmp_path / "out").settings["model_note"].startswith("small demonstration model")
 
 
 def test_a_mistyped_command_or_flag_names_the_one_that_was_meant(capsys):

@@ -75,7 +75,7 @@ def test_a_padded_clip_gives_the_same(model, method):
     assert jax.tree.map(np.shape, padded.passes) == jax.tree.map(np.shape, alone.passes)
 
 
-@pytest.mark.parametrize("suppress", ["zero", "drop"])
+@pytest.mark.parametrize("suppress", ["zero", pytest.param("drop", marks=pytest.mark.proof)])
 def test_frames_that_are_not_real_change_nothing(model, suppress):
     """Whatever they show, bit by bit; and the result is that of the shorter clip."""
     config, suppression = model.config, Suppression(suppress=suppress)
