@@ -4,13 +4,11 @@ import dataclasses
 import json
 from functools import partial
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.tiny import tiny_config
-from vggtjax import Model, MotionConfig, init_params, load_model, reconstruct, run_passes
+from vggtjax import Model, MotionConfig, init_params, load_model, reconstruct
 from vggtjax.calibration.choice import Choice, Rating
 from vggtjax.calibration.export import calibrated
 from vggtjax.calibration.second_pass import CameraErrors, SecondPassChoice, Setting, choose_second_pass
@@ -48,7 +46,7 @@ def test_errors_are_those_of_the_second_pass(model):
     found = choose_second_pass(model, clips, [2, 1])
     assert list(found.errors) == [(1, "otsu"), (2, "otsu"), (1, "multi-otsu"), (2, "multi-otsu")]
     assert len(set(found.errors.values())) == 4
-    for setting in found.errors:
+    for setting in (Setting(2, "otsu"), Setting(1, "multi-otsu")):
         motion = dataclasses.replace(model.config.motion, mask_pairs=setting.pairs, threshold=setting.threshold)
         asked = dataclasses.replace(model, config=dataclasses.replace(model.config, motion=motion))
         rows = [
@@ -71,7 +69,7 @@ def test_keys_are_suppressed_as_in_the_method_with_these_cues(model, monkeypatch
     assert choose_second_pass(model, [None], [1], gram=gram).best == (1, "otsu")  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize(("pairs", "found"), [([], r"\[\]"), ([3, 0], "is 0"), ([5], r"\[5\]; .* from 1 to 4")])
+@pytest.mark.parametrize(("pairs", "found"), [([], r"\[\]"), ([5], r"\[5\]; .* from 1 to 4")])
 def test_numbers_that_a_model_does_not_have(model, pairs, found):
     with pytest.raises(InputError, match=found):
         pairs_to_try(pairs, model.config.depth)
@@ -91,16 +89,6 @@ def test_a_model_recommends_its_threshold(model, tmp_path):
     assert np.array_equal(plain.dynamic_mask, otsu.dynamic_mask)
     assert not {"threshold"} & (plain.settings.keys() | otsu.settings.keys())
     assert not np.array_equal(made.dynamic_mask, plain.dynamic_mask)
-    asked = [(loaded, None), (model, "multi-otsu"), (model, None)]
-    images = jnp.asarray(clip[None])
-
-    @partial(jax.jit, static_argnums=(1, 2))
-    def mask(images, of, threshold):
-        return run_passes(of.params, images, of.config, threshold=threshold).dynamic_mask
-
-    masks = [mask(images, of, threshold) for of, threshold in asked]
-    assert np.array_equal(masks[0], masks[1])
-    assert not np.array_equal(masks[0], masks[2])
     assert ModelSource(loaded, ["4dvggt-d"]).settings["threshold"] == "multi-otsu"
     assert ModelSource(loaded, ["4dvggt-d"], Options(threshold="otsu")).settings["threshold"] == "otsu"
     assert "threshold" not in ModelSource(model, ["4dvggt-d"]).settings
@@ -133,8 +121,6 @@ def test_a_model_recommends_its_number(model, tmp_path):
     assert soft_masking(config).strength.sum() == 1
     assert soft_masking(model.config).strength.sum() == 4
     assert soft_masking(model.config, motion=config.motion).strength.sum() == 1
-    rows = ladder(loaded, next(generated_clips(1, FRAMES, SIZE, seed=0)), methods=["4dvggt-d"])
-    assert {row.mask_pairs for row in rows} == {1}
     assert made.settings["mask_pairs"] == one.settings["mask_pairs"] == 1
     assert np.array_equal(made.camera_from_world, one.camera_from_world)
     assert not np.array_equal(made.camera_from_world, five.camera_from_world)
@@ -143,21 +129,18 @@ def test_a_model_recommends_its_number(model, tmp_path):
 def test_the_command(model, tmp_path, capsys):
     path = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
     out = tmp_path / "out"
-    calibrate_cues(str(path), out, scenes=SCENES, frames=FRAMES, size=SIZE, max_terms=1, mask_pairs=(1, 2))
+    calibrate_cues(str(path), out, scenes=3, frames=FRAMES, size=SIZE, max_terms=1, mask_pairs=(1, 2))
     told = json.loads((out / "calibration.json").read_text())["second_pass"]
     assert [row["pairs"] for row in told["errors"]] == [1, 2, 1, 2]
     motion = load_model(out / "model.safetensors").config.motion
     assert json.loads((out / "calibration.json").read_text())["choice"]["motion"]["mask_pairs"] == motion.mask_pairs
     again = tmp_path / "again"  # without numbers to try, the model keeps its own
-    calibrate_cues(str(out / "model.safetensors"), again, scenes=SCENES, frames=FRAMES, size=SIZE, max_terms=1)
+    calibrate_cues(str(out / "model.safetensors"), again, scenes=3, frames=FRAMES, size=SIZE, max_terms=1)
     assert load_model(again / "model.safetensors").config.motion.mask_pairs == motion.mask_pairs != 5
     assert motion.mask_pairs == told["recommended"]["pairs"]
     assert (motion.threshold or "otsu") == told["recommended"]["threshold"]
     assert len(motion.cues) == 1
     assert "recommended" in capsys.readouterr().out
-    with pytest.raises(InputError, match="mask_pairs is"):
-        calibrate_cues(str(path), tmp_path / "other", mask_pairs=(9,))
-    for invalid in ((), (0, 3)):  # refused before the model is looked for
-        with pytest.raises(InputError, match=r"mask_pairs is (0|\[\]); expected"):
-            calibrate_cues("nowhere.safetensors", tmp_path / "other", mask_pairs=invalid)
+    with pytest.raises(InputError, match=r"mask_pairs is 0; expected"):  # before the model is looked for
+        calibrate_cues("nowhere.safetensors", tmp_path / "other", mask_pairs=(0, 3))
     assert not (tmp_path / "other").exists()

@@ -1,8 +1,6 @@
 """What `vggtjax doctor` prints, and the cache that it clears."""
 
 import json
-import tomllib
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,14 +8,11 @@ import pytest
 
 from vggtjax.commands import doctor
 from vggtjax.commands import main as cli
-from vggtjax.commands.doctor import EXTRAS
 from vggtjax.config import vggt_1b
 from vggtjax.pipeline import memory
 from vggtjax.pretrained.embedded import demo_model
 from vggtjax.storage.cache import CONVERTED, cache_parts, clear_cache
 from vggtjax.windows.choice import Planned
-
-_NOT_OF_THE_LIBRARY = {"docs", "dev"}
 
 
 @pytest.fixture
@@ -111,8 +106,3 @@ def test_a_link_in_the_cache_is_removed_and_not_followed(cache, tmp_path):
     assert link in cache_parts()[CONVERTED]
     clear_cache()
     assert (tmp_path / "kept" / "file").exists()
-
-
-def test_every_extra_is_named():
-    project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
-    assert set(EXTRAS) == set(project["optional-dependencies"]) - _NOT_OF_THE_LIBRARY

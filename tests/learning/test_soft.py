@@ -11,10 +11,9 @@ import pytest
 
 from tests.tiny import tiny_config
 from vggtjax import forward, infer, init_params
-from vggtjax.cameras import unproject
 from vggtjax.errors import InputError
 from vggtjax.learning.distances import pose_error
-from vggtjax.learning.soft import SoftMasking, reconstruct_softly, soft_masking, soft_pixels
+from vggtjax.learning.soft import SoftMasking, reconstruct_softly, soft_masking
 from vggtjax.method.fusion_family import identity
 
 CONFIG = tiny_config(patch_size=8, image_size=32, taps=(0, 1, 2, 3))
@@ -25,7 +24,7 @@ SHAPE = (1, 4, 16, 24, 3)
 def params():
     """Return weights under which blocks matter: LayerScale starts at 0.01 in training."""
     with jax.ensure_compile_time_eval():  # the first call may be inside a program
-        tree = init_params(0, CONFIG)
+        tree = jax.jit(init_params, static_argnums=(0, 1))(0, CONFIG)
         for blocks in ("frame_blocks", "global_blocks"):
             for name in ("scale1", "scale2"):
                 tree["aggregator"][blocks][name] = jnp.ones_like(tree["aggregator"][blocks][name])
@@ -52,16 +51,6 @@ def test_at_temperature_0_it_is_the_method(threshold):
     assert np.allclose(soft.depth, assembly.depth, rtol=2e-6)
     assert np.allclose(np.exp(soft.log_precision), assembly.confidence, rtol=1e-5)
     assert np.allclose(soft.cameras.camera_from_world, assembly.camera_from_world, atol=1e-6)
-
-
-def test_lower_temperatures_come_closer():
-    hard = softly(params(), images(), CONFIG, soft_masking(CONFIG))
-    apart = []
-    for temperature in (1e-1, 1e-2, 1e-3, 1e-5):
-        soft = softly(params(), images(), CONFIG, soft_masking(CONFIG, temperature=temperature))
-        apart.append(float(jnp.abs(soft.dynamic - hard.dynamic).mean()))
-    assert apart == sorted(apart, reverse=True)
-    assert apart[-1] < 1e-3
 
 
 @jax.jit
@@ -95,19 +84,6 @@ def test_bad_shares_are_one_sentence(options, sentence):
     options = {"dynamic_tokens": jnp.ones((1, 4, 2, 3))} | options
     with pytest.raises(InputError, match=sentence):
         jax.eval_shape(lambda: forward(params(), images(), CONFIG, **options))
-
-
-def test_constant_saliency_moves_nowhere():
-    masking = soft_masking(CONFIG, temperature=0.1)
-    assert (np.asarray(soft_pixels(jnp.ones((1, 2, 2, 3)), (16, 24), masking)) == 0).all()
-
-
-def test_points_are_lifted_from_pixel_centres():
-    camera = jnp.asarray([[1.0, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3]])
-    K = jnp.asarray([[2.0, 0, 1.5], [0, 4.0, 1.0], [0, 0, 1]])
-    points = unproject(jnp.full((2, 3), 2.0), K, camera, pixel_offset=0.5)
-    assert np.allclose(points[0, 0], [2 * (0.5 - 1.5) / 2 - 1, 2 * (0.5 - 1) / 4 - 2, 2 - 3])
-    assert np.allclose(points[1, 2], [2 * (2.5 - 1.5) / 2 - 1, 2 * (1.5 - 1) / 4 - 2, 2 - 3])
 
 
 def _in_float64(tree):
@@ -154,7 +130,8 @@ def test_every_gradient_by_finite_differences():
                 slopes = []
                 for sign in (1, -1):
                     changed = list(flat)
-                    changed[leaf] = flat[leaf].at[place].add(sign * 1e-6)
+                    changed[leaf] = np.array(flat[leaf])
+                    changed[leaf][place] += sign * 1e-6
                     slopes.append(loss(jax.tree.unflatten(structure, changed)))
                 slope = float(slopes[0][0] - slopes[1][0]) / 2e-6
                 found = float(jax.tree.leaves(gradient)[leaf][place])

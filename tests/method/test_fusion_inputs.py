@@ -62,14 +62,6 @@ def test_observations_of_passes():
     assert saliency.min() >= 0
 
 
-@pytest.mark.parametrize("full", [False, True])
-def test_masks_without_an_edge(full):
-    both = passes()
-    seen = observe(both._replace(dynamic_mask=jnp.full(both.dynamic_mask.shape, full)), 14)
-    assert ((np.asarray(seen.margin) >= 0) == full).all()
-    assert all(np.isfinite(x).all() for x in seen)
-
-
 def test_soft_masks_become_masks_that_were_given():
     """However they came about, and where the saliency says otherwise."""
     both = passes()

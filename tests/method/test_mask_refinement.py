@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from vggtjax.errors import InputError
 from vggtjax.method import mask_refinement
-from vggtjax.method.mask_refinement import refine_masks, statistical_outliers
+from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.scenes import load_textures
 from vggtjax.scenes.config import SceneConfig
 from vggtjax.scenes.render import generate
@@ -56,21 +56,6 @@ def test_empty_masks_and_single_frames_stay_as_they_are(clip):
     assert np.array_equal(refined(first, first.dynamic_mask), first.dynamic_mask)
 
 
-def test_masks_of_a_few_pixels_in_one_frame(clip):
-    few = np.zeros_like(clip.dynamic_mask)
-    few[2, 50, 50:53] = True
-    made = refined(clip, few)
-    assert not made[[0, 1, 3, 4, 5]].any()
-
-
-def test_depth_that_is_not_finite(clip):
-    depth = clip.depth.copy()
-    depth[0, :3] = np.inf
-    depth[1, 5, 5] = np.nan
-    made = refined(clip, clip.dynamic_mask, depth=depth)
-    assert made.shape == depth.shape
-
-
 def test_a_mask_of_outliers_alone_is_empty(clip):
     depth, one = clip.depth.copy(), np.zeros_like(clip.dynamic_mask)
     one[1, 40, 40] = True
@@ -92,6 +77,7 @@ def test_padding_is_no_witness(clip):
     assert np.array_equal(made, refined(clip, coarse, valid=valid))
 
 
+@pytest.mark.proof
 def test_large_masks_are_grouped_by_a_part_of_their_points(clip, monkeypatch):
     coarse = clip.dynamic_mask.copy()
     coarse[:, 8:60, 8:60] = True
@@ -104,19 +90,9 @@ def test_large_masks_are_grouped_by_a_part_of_their_points(clip, monkeypatch):
     assert (whole & part).sum() / (whole | part).sum() > 0.7
 
 
-@pytest.mark.parametrize("name", ["images", "depth", "camera_from_world", "mask"])
+@pytest.mark.parametrize("name", ["depth", "mask"])
 def test_arrays_that_do_not_fit(clip, name):
     mask = clip.dynamic_mask.astype(np.uint8) * 255 if name == "mask" else clip.dynamic_mask
     changes = {} if name == "mask" else {name: getattr(clip, name)[:2]}
     with pytest.raises(InputError, match="expected"):
         refined(clip, mask, **changes)
-
-
-def test_points_without_number_are_outliers():
-    points = np.random.default_rng(0).normal(size=(20, 20, 3))
-    points[3, 4] = np.nan
-    points[5, 6] = 1e3
-    found = statistical_outliers(points)
-    assert found[3, 4]
-    assert found[5, 6]
-    assert found.sum() < 20

@@ -3,11 +3,11 @@
 from contextlib import contextmanager
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from testing.seeded import seeded_images
+from tests.tiny import tiny_model
 from vggtjax import (
     METHODS,
     Model,
@@ -49,7 +49,8 @@ def test_the_mask_is_mined_from_the_first_pass(params, config, images, inferred)
     saliency = jax.jit(motion_saliency, static_argnames="config")(params, images, config)
     assert np.allclose(passes.saliency, saliency, atol=1e-4)
     assert saliency.shape == (1, FRAMES, 10, 10)
-    assert (np.asarray(passes.dynamic_mask) == np.asarray(dynamic_pixels(passes.saliency, SIZE))).all()
+    mask = jax.jit(dynamic_pixels, static_argnames="size")(passes.saliency, SIZE)
+    assert (np.asarray(passes.dynamic_mask) == np.asarray(mask)).all()
     assert 0 < np.asarray(passes.dynamic_mask).mean() < 1
 
 
@@ -98,7 +99,7 @@ def test_aligning_the_scale_moves_depth_and_cameras_together(inferred):
     assert np.allclose(aligned.camera_from_world[..., :3], plain.camera_from_world[..., :3])
 
 
-@pytest.mark.parametrize("method", list(METHODS))
+@pytest.mark.parametrize("method", ["vggt4d", "4dvggt-d"])
 def test_the_staged_pipeline_equals_the_single_jit(params, config, images, inferred, method):
     model = Model(config, params, "tiny")
     clip = load_clip(images[0], size=140)
@@ -112,8 +113,7 @@ def test_the_staged_pipeline_equals_the_single_jit(params, config, images, infer
         yield
 
     staged = reconstruct(model, clip, method=method, refine_mask=False, keep_passes=True, on_stage=on_stage)
-    stages = ["image features", "first pass", "dynamic mask", *["second pass"] * (method != "vggt"), "assemble"]
-    assert seen == ["compile programs", *stages]
+    assert seen == ["compile programs", "image features", "first pass", "dynamic mask", "second pass", "assemble"]
     for a, b in (
         (staged.depth, whole.depth[0]),
         (staged.depth_confidence, whole.confidence[0]),
@@ -122,18 +122,7 @@ def test_the_staged_pipeline_equals_the_single_jit(params, config, images, infer
     ):
         assert np.abs(a - np.asarray(b)).max() <= 1e-4 * np.asarray(b).std()
     assert (staged.dynamic_mask != np.asarray(passes.dynamic_mask[0])).mean() < 1e-3
-    assert (staged.passes.second is None) == (method == "vggt")
     assert (staged.method, staged.model_name) == (method, "tiny")
-
-
-def test_a_batch_of_clips_under_one_jit(params, config, images, inferred):
-    pair = jnp.concatenate([images, images[:, ::-1]])
-    batch, passes = infer(params, pair, config)
-    alone, alone_passes = inferred
-    assert np.abs(np.asarray(passes.saliency[:1] - alone_passes.saliency)).max() < 1e-4
-    same = np.asarray(passes.dynamic_mask[0] == alone_passes.dynamic_mask[0])
-    assert same.mean() > 0.999
-    assert np.abs(np.asarray(batch.depth[0] - alone.depth[0]))[same].max() < 1e-3 * np.asarray(alone.depth).std()
 
 
 def test_a_single_frame_is_all_static(params, config, images):
@@ -154,29 +143,28 @@ def test_a_clip_of_another_size_is_refitted(params, config, images):
     assert (refitted.depth == fitted.depth).all()
 
 
-def test_unknown_names(params, config, images, inferred):
+def test_unknown_names(inferred):
     with pytest.raises(InputError, match="method is 'vgtt'; expected one of vggt, vggt4d"):
         assemble(inferred[1], "vgtt")
     with pytest.raises(InputError, match="needs the second pass"):
         assemble(inferred[1]._replace(second=None), "4dvggt-d")
-    with pytest.raises(InputError, match="expected one of cosine, dot"):
-        motion_saliency(params, images, config, gram="sine")  # pyright: ignore[reportArgumentType]
 
 
-def test_passes_take_options_or_their_fields(params, config, images):
-    def shapes(**options):
-        return jax.eval_shape(lambda images: run_passes(params, images, config, **options), images)
+def test_passes_take_options_or_their_fields():
+    model, images = tiny_model(), np.zeros((1, 2, 28, 28, 3), np.float32)
 
-    assert shapes() == shapes(options=Options(gram="dot"), mask_pairs=2, clusters=8, threshold="multi-otsu")
+    def shapes(pairs=5, **options):
+        def passes(pairs):
+            return run_passes(model.params, images, model.config, mask_pairs=pairs, **options)
+
+        return jax.eval_shape(passes, np.int32(pairs)) if pairs > 0 else passes(pairs)
+
+    assert shapes() == shapes(options=Options(gram="dot"), clusters=8, threshold="multi-otsu")
     assert shapes(method="vggt").second is None
-    assert shapes(second=()).second is None
-    assert shapes(method="vggt4d").second == shapes(second=("camera",)).second
     with pytest.raises(TypeError, match="grams"):
         shapes(grams="dot")
     with pytest.raises(InputError, match="mask_pairs is -1"):
-        shapes(mask_pairs=-1)
-    traced = jax.jit(lambda images, pairs: run_passes(params, images, config, mask_pairs=pairs))
-    assert jax.eval_shape(traced, images, np.int32(3)) == shapes()
+        shapes(pairs=-1)
 
 
 def test_equal_programs_are_compiled_once(params, config, images, monkeypatch):
@@ -211,24 +199,11 @@ def test_the_row_of_vggt4d_is_what_is_run(params, config, images, inferred):
     saliency = jax.jit(motion_saliency, static_argnames=("config", "gram"))(params, images, config, gram="dot")
     assert np.allclose(passes.saliency, saliency, atol=1e-4)
     tokens = jax.jit(encode, static_argnames="config")(params, images, config)
-    mask = mine_mask(saliency, tokens, SIZE, clusters=64, threshold="multi-otsu")
+    mine = jax.jit(mine_mask, static_argnames=("size", "clusters", "threshold"))
+    mask = mine(saliency, tokens, SIZE, clusters=64, threshold="multi-otsu")
     assert (np.asarray(passes.dynamic_mask) == np.asarray(mask)).mean() > 0.99
     patches = dynamic_tokens(passes.dynamic_mask, config.patch_size)
     run = jax.jit(forward, static_argnames=("config", "suppress"))
     assert passes.second is not None
     made = run(params, images, config, dynamic_tokens=patches, suppress="drop")
     assert np.abs(np.asarray(passes.second.pose_encoding - made.pose_encoding)).max() < 1e-4
-
-
-def test_gradients_pass_by_the_mask_of_vggt4d():
-    """Clusters and thresholds have no gradient, and do not spoil that of what they choose."""
-    saliency, tokens = (jax.random.uniform(jax.random.key(0), (1, 3, 4, 4, n)) for n in (1, 8))
-
-    def loss(saliency, tokens):
-        row = METHODS["vggt4d"]
-        mask = mine_mask(saliency, tokens, (16, 16), clusters=row.clusters, threshold=row.threshold)
-        return jnp.where(mask[:, :, ::4, ::4], 3 * saliency, saliency).sum()
-
-    gradients = jax.grad(loss, argnums=(0, 1))(saliency[..., 0], tokens.reshape(1, 3, 16, 8))
-    assert set(np.unique(gradients[0]).tolist()) == {1, 3}
-    assert not np.asarray(gradients[1]).any()

@@ -16,9 +16,11 @@ def _formula(q, k, v, kept):
     return np.einsum("bntk,bknd->btnd", weights / weights.sum(-1, keepdims=True), v)
 
 
-@pytest.mark.parametrize("implementation", [attention._at_once, attention._in_chunks, attention.attention])
+@pytest.mark.parametrize(
+    ("implementation", "at_once"),
+    [(attention._at_once, 0), (attention._in_chunks, 0), (attention._in_chunks, 1000), (attention.attention, 1000)],
+)
 @pytest.mark.parametrize("masked", [False, True])
-@pytest.mark.parametrize("at_once", [0, 1000])
 def test_equals_the_formula(monkeypatch, implementation, masked, at_once):
     monkeypatch.setattr(attention, "QUERIES_AT_ONCE", 4)  # 11 queries: three chunks, one padded
     monkeypatch.setattr(attention, "LOGITS_AT_ONCE", at_once)
@@ -30,21 +32,10 @@ def test_equals_the_formula(monkeypatch, implementation, masked, at_once):
     assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
 
 
-def test_heads_and_tokens_are_not_swapped():
-    """A key far larger than the others takes all the weight in its own head, and in no other."""
-    q = np.ones((1, 5, 2, 4), np.float32)
-    k, v = np.zeros_like(q), np.zeros_like(q)
-    k[0, 3, 1], v[0, 3] = 100.0, 1.0
-    made = np.asarray(attention.attention(*map(jnp.asarray, (q, k, v))))
-    assert np.allclose(made[0, :, 1], 1)
-    assert np.allclose(made[0, :, 0], 0.2)
-
-
-@pytest.mark.parametrize("at_once", [0, 1000])
 @pytest.mark.parametrize("masked", [False, True])
-def test_the_gradient_is_that_of_jaxs_own_attention(monkeypatch, at_once, masked):
+def test_the_gradient_is_that_of_jaxs_own_attention(monkeypatch, masked):
     monkeypatch.setattr(attention, "QUERIES_AT_ONCE", 4)
-    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", at_once)
+    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", 0)
     generator = np.random.default_rng(1)
     q, k, v, weight = (generator.normal(size=(2, 11, 3, 8)).astype(np.float32) for _ in range(4))
     kept = generator.random((2, 11)) < 0.6 if masked else None
@@ -70,39 +61,25 @@ def test_packed_keys(masked):
     assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
 
 
-@pytest.mark.parametrize("masked", [False, True])
-def test_the_kernel_for_tpus_interpreted(masked):
+def test_the_kernel_for_tpus_interpreted():
     generator = np.random.default_rng(3)
     q, k, v = (jnp.asarray(generator.normal(size=(1, 140, 2, 64)), jnp.float32) for _ in range(3))
-    kept = generator.random((1, 140)) < 0.6 if masked else np.ones((1, 140), bool)
+    kept = generator.random((1, 140)) < 0.6
     with tpu.force_tpu_interpret_mode(), jax.default_matmul_precision("highest"):
-        made = attention._on_tpu(q, k, v, jnp.asarray(kept) if masked else None)
+        made = attention._on_tpu(q, k, v, jnp.asarray(kept))
     assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="there is an accelerator")
-def test_without_a_gpu_cudnn_does_not_work():
-    assert not attention.cudnn_works()
-
-
 @pytest.mark.parametrize("most", [10**6, 3 * 11 * 13 * 2, 100])  # all clips fit at once, two of four do, none does
-@pytest.mark.parametrize("masked", [False, True])
-def test_what_does_not_fit_at_once_is_cut(monkeypatch, most, masked):
+def test_what_does_not_fit_at_once_is_cut(monkeypatch, most):
     monkeypatch.setattr(attention, "LOGITS_ELSEWHERE", most)
     monkeypatch.setattr(attention, "LOGITS_AT_ONCE", 0)
     generator = np.random.default_rng(4)
     q, k, v = (jnp.asarray(generator.normal(size=(4, length, 3, 8)), jnp.float32) for length in (11, 13, 13))
-    kept = generator.random((4, 13)) < 0.6 if masked else np.ones((4, 13), bool)
+    kept = generator.random((4, 13)) < 0.6
     with jax.default_matmul_precision("highest"):
-        made = attention._at_once_or_in_chunks(q, k, v, jnp.asarray(kept) if masked else None)
+        made = attention._at_once_or_in_chunks(q, k, v, jnp.asarray(kept))
     assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
-
-
-def test_heads_of_any_size():
-    x = jnp.asarray(np.random.default_rng(5).normal(size=(1, 300, 1, 160)), jnp.float32)
-    with jax.default_matmul_precision("highest"):
-        made = attention.attention(x, x, x)
-    assert np.abs(np.asarray(made) - _formula(x, x, x, np.ones((1, 300), bool))).max() < 1e-5
 
 
 @pytest.mark.parametrize(("cores", "times"), [(1, 1), (2, 1), (4, 2), (16, 8), (128, 8)])

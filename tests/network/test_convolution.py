@@ -9,8 +9,9 @@ from vggtjax.network import convolution
 from vggtjax.network.convolution import same_convolution
 
 
-@pytest.mark.parametrize("at_once", [1, 300, 10**6])  # a row, a few rows, everything
-@pytest.mark.parametrize("size", [(3, 3), (5, 1)])
+@pytest.mark.parametrize(  # a row, a few rows, everything
+    ("at_once", "size"), [(1, (3, 3)), (300, (3, 3)), (10**6, (3, 3)), (300, (5, 1))]
+)
 def test_gradient_against_xlas_own(at_once, size, monkeypatch):
     monkeypatch.setattr(convolution, "_NUMBERS_AT_ONCE", at_once)
     generator = np.random.default_rng(0)

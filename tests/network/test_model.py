@@ -1,6 +1,5 @@
 """Properties of the whole network: batches, permutations, transformations, the branch on the per-layer flag."""
 
-import dataclasses
 from functools import partial
 
 import jax
@@ -9,7 +8,8 @@ import numpy as np
 import pytest
 
 from testing.seeded import seeded_images
-from vggtjax import VGGTConfig, encode, forward
+from tests.tiny import tiny_config
+from vggtjax import VGGTConfig, forward
 from vggtjax.errors import InputError
 from vggtjax.network.model import parameter_shapes
 from vggtjax.network.suppression import Suppression
@@ -53,15 +53,6 @@ def test_permuting_later_frames_permutes_the_outputs(params, config, images, mas
     assert not close(permuted.pose_encoding, plain.pose_encoding)
 
 
-def test_given_patch_tokens_are_used(params, config, images):
-    tokens = jax.jit(partial(encode, config=config))(params, images)
-    made = _forward(params, images, config, patch_tokens=tokens, outputs=("camera",))
-    assert close(made.pose_encoding, _forward(params, images, config, outputs=("camera",)).pose_encoding)
-    assert made.depth is None
-    other = _forward(params, images, config, patch_tokens=tokens[:, ::-1], outputs=("camera",))
-    assert not close(other.pose_encoding, made.pose_encoding)
-
-
 def _conds(jaxpr, inside_scan=False):
     """Yield (predicate's shape, whether inside a scan) of every cond but the choice of a platform."""
     for equation in jaxpr.eqns:
@@ -74,8 +65,7 @@ def _conds(jaxpr, inside_scan=False):
                     yield from _conds(inner, inside_scan or equation.primitive.name == "scan")
 
 
-@pytest.mark.parametrize("vmapped", [False, True])
-def test_the_flag_of_a_layer_is_a_branch_even_for_batches(config, images, mask, vmapped):
+def test_the_flag_of_a_layer_is_a_branch_even_for_batches(config, images, mask):
     params = parameter_shapes(config)
     run = partial(forward, config=config, outputs=("camera",))
 
@@ -83,14 +73,12 @@ def test_the_flag_of_a_layer_is_a_branch_even_for_batches(config, images, mask, 
         def call(params, images, dynamic):
             return run(params, images, dynamic_tokens=dynamic)
 
-        call = jax.vmap(call, in_axes=(None, 0, 0 if dynamic is not None else None)) if vmapped else call
-        shape = (lambda x: x[:, None]) if vmapped else (lambda x: x)
-        arguments = (params, shape(images), None if dynamic is None else shape(dynamic))
-        found = list(_conds(jax.make_jaxpr(call)(*arguments).jaxpr))
+        call = jax.vmap(call, in_axes=(None, 0, 0 if dynamic is not None else None))
+        found = list(_conds(jax.make_jaxpr(call)(params, images[:, None], dynamic).jaxpr))
         assert all(predicate == () for predicate, _ in found)
         return sum(inside for _, inside in found)
 
-    assert count(mask) == count(None) + 2  # one in the frame block, one in the global block
+    assert count(mask[:, None]) == count(None) + 2  # one in the frame block, one in the global block
 
 
 def _camera_loss(params, pixels, config, mask, stop):
@@ -125,38 +113,21 @@ def test_the_gradient_of_depth_reaches_every_frame_under_remat(params, config, i
     assert (np.abs(made).max(axis=(2, 3, 4)) > 0).all()
 
 
-def test_bfloat16_is_near_float32(params, config, images):
-    exact = _forward(params, images, config)
-    made = _forward(params, images, config, compute_dtype="bfloat16")
-    assert made.depth.dtype == made.pose_encoding.dtype == jnp.float32
-    for name in ("pose_encoding", "depth"):
-        error = np.abs(np.asarray(getattr(made, name)) - np.asarray(getattr(exact, name))).mean()
-        assert error < 0.2 * np.asarray(getattr(exact, name)).std()  # seeded weights amplify; measured: 0.03 to 0.09
-
-
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [
         ({"images": np.zeros((1, 2, 28, 41, 3))}, "multiples of the patch size 14"),
         ({"images": np.zeros((2, 28, 42, 3))}, r"expected \[B, S, H, W, 3\]"),
-        ({"images": np.zeros((1, 0, 28, 42, 3))}, "at least one frame"),
         ({"dynamic_tokens": np.zeros((1, 2, 3, 2), bool)}, r"expected \(1, 2, 2, 3\)"),
-        ({"outputs": ("camera", "tracks")}, "tracks"),
         ({"suppress": "forget"}, "expected one of zero, drop"),
         ({"suppression": Suppression(mask_pairs=-1)}, "at least 0"),
         ({"frame_count": np.array([2, 2])}, r"frame_count has shape \(2,\); expected \(1,\)"),
-        ({"compute_dtype": "float16"}, "bfloat16"),
     ],
 )
 def test_bad_arguments_are_named(params, config, change, sentence):
     arguments = {"images": np.zeros((1, 2, 28, 42, 3)), **change}
     with pytest.raises(InputError, match=sentence):
         forward(params, config=config, **arguments)
-
-
-def test_an_unknown_keyword_is_a_type_error(params, config):
-    with pytest.raises(TypeError, match="supress"):
-        forward(params, np.zeros((1, 2, 28, 42, 3)), config, supress="drop")  # pyright: ignore[reportCallIssue]
 
 
 def test_a_suppression_is_the_same_as_its_keywords(params, config, images, mask):
@@ -180,17 +151,10 @@ def test_full_size_parameters():
     assert count == 1_256_536_492  # all of VGGT-1B but the mask token of its backbone's pre-training
 
 
-@pytest.mark.parametrize("patch", [8, 14])
-def test_other_sizes(patch):
-    config = VGGTConfig(
-        image_size=4 * patch, patch_size=patch, embed_dim=16, depth=4, num_heads=2, dino_depth=1, dino_num_heads=2,
-        camera_depth=1, camera_num_heads=2, dpt_features=8, dpt_channels=(8, 8, 8, 8), taps=(0, 1, 2, 3),
-    )  # fmt: skip
-    shapes = jax.eval_shape(
-        partial(forward, config=dataclasses.replace(config), outputs=("camera", "depth", "points")),
-        parameter_shapes(config),
-        jax.ShapeDtypeStruct((2, 5, 3 * patch, 7 * patch, 3), jnp.float32),
-    )
-    assert shapes.depth.shape == (2, 5, 3 * patch, 7 * patch)
-    assert shapes.world_points.shape == (2, 5, 3 * patch, 7 * patch, 3)
+def test_another_size_of_patches():
+    config = tiny_config(image_size=32, patch_size=8)
+    run = partial(forward, config=config, outputs=("camera", "depth", "points"))
+    shapes = jax.eval_shape(run, parameter_shapes(config), jax.ShapeDtypeStruct((2, 5, 24, 56, 3), jnp.float32))
+    assert shapes.depth.shape == (2, 5, 24, 56)
+    assert shapes.world_points.shape == (2, 5, 24, 56, 3)
     assert shapes.pose_encoding.shape == (2, 5, 9)

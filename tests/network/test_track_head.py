@@ -97,6 +97,7 @@ def test_later_frames_can_be_permuted(head, config):
     assert np.abs(made.positions[:, order] - swapped.positions).max() < 1e-3
 
 
+@pytest.mark.proof
 def test_gradients_reach_parameters_and_taps(head, config):
     def loss(params, taps):
         tracks = predict_tracks(params, taps, jnp.asarray(QUERIES), config, (6, 5))
@@ -114,8 +115,6 @@ def test_gradients_reach_parameters_and_taps(head, config):
     ("outputs", "queries", "said"),
     [
         (("camera",), np.zeros((1, 3, 2)), "go together"),
-        (("tracks",), None, "go together"),
-        (("tracks",), np.zeros((3, 2)), "have shape"),
         (("tracks",), np.zeros((2, 3, 2)), "have shape"),
         (("tracks",), np.zeros((1, 0, 2)), "with at least one point"),
         (("tracks",), np.zeros((1, 3, 2)), "at least 32 pixels"),

@@ -176,29 +176,14 @@ def test_workers_of_other_code_and_other_files_are_refused(dispatcher):
         dispatcher.it._begin(slot, Refused("no such model"))
 
 
-def test_workers_that_never_begin_end_the_batch(dispatcher):
-    for slot in dispatcher.it._slots:
-        slot.ready = False
-    problem = RuntimeError("a stack\nno memory")
-    for _ in range(2):
-        dispatcher.it._lose(dispatcher.it._slots[0], None, problem)
-        dispatcher.it._grow()
-    with pytest.raises(ClusterError, match="3 workers in a row ended before they began: no memory"):
-        dispatcher.it._lose(dispatcher.it._slots[0], None, problem)
-
-
 @pytest.mark.parametrize(
     ("nodes", "asked", "share"),
     [
-        ([{"CPU": 8}], {}, (1, 8, 0)),
         ([{"CPU": 8}, {"CPU": 4}], {}, (3, 4, 0)),
         ([{"CPU": 8}], {"workers": 2}, (2, 4, 0)),
-        ([{"CPU": 2}], {"workers": 9}, (9, 1, 0)),
         ([{"CPU": 8}, {"CPU": 8}], {"cpus": 3}, (4, 3, 0)),
         ([{"CPU": 16, "GPU": 4}, {"CPU": 2}], {}, (4, 1, 1)),
         ([{"CPU": 16, "GPU": 4}], {"gpus": 0.5}, (8, 1, 0.5)),
-        ([{"CPU": 16, "GPU": 4}], {"gpus": 0.0}, (1, 16, 0)),
-        ([{"CPU": 2}], {"gpus": 1.0, "workers": 4}, (4, 1, 1)),
     ],
 )
 def test_the_share_of_a_worker(nodes, asked, share):
@@ -251,7 +236,6 @@ def test_what_is_wrong_is_said_before_anything_starts(tmp_path, capsys, monkeypa
     for arguments, sentence in (
         ([str(tmp_path / "o"), "--workers", "2"], "--workers needs --engine ray"),
         ([str(tmp_path / "o"), "--engine", "ray", "--shard", "1/1"], "--engine ray and --shard exclude each other"),
-        ([str(tmp_path / "o"), "--engine", "ray", "--workers", "0"], "--workers is 0; expected a whole number"),
         ([str(tmp_path / "o"), "--engine", "ray", "--address", "ray://h:1"], "run the command on a machine of the cl"),
         (["memory://o", "--engine", "ray"], "memory://o is in the memory of one process"),
     ):

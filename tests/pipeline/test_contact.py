@@ -22,9 +22,7 @@ def text_of(folder):
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("method", np.array(["a", "b"])),
         ("method", np.array(7)),
-        ("valid_box", np.full((3, 4), "x")),
         ("dynamic_mask", np.full((3, 28, 42), "x")),
     ],
 )

@@ -24,12 +24,8 @@ _HALF = Planned(vggt_1b(), 5_026_145_968 // 2)
 @pytest.mark.parametrize(
     ("config", "frames", "size", "counted"),  # temporary bytes of the first pass by XLA's count for a CPU
     [
-        (demo_model().config, 16, (64, 64), 16_779_952),
         (demo_model().config, 64, (64, 64), 67_111_600),
-        (vggt_1b(), 8, (294, 518), 493_673_248),
         (vggt_1b(), 32, (294, 518), 1_382_190_560),
-        (vggt_1b(), 8, (392, 518), 658_206_752),
-        (vggt_1b(), 8, (518, 518), 869_748_832),
         (vggt_1b(), 32, (518, 518), 2_610_586_656),
     ],
 )
@@ -53,29 +49,16 @@ def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
     assert needs[1] - needs[0] == pytest.approx(4 * keys * (rows[1] - rows[0]))
 
 
-@pytest.mark.parametrize(("devices", "counted"), [(2, 1055e6), (4, 753e6), (8, 526e6)])  # by XLA's analysis
-def test_so_are_those_of_each_device_that_shares_the_frames(two_cores, devices, counted):
-    assert memory.pass_bytes(vggt_1b(), 32, 294, 518, devices=devices) == pytest.approx(counted, rel=1 / 3)
-
-
 @pytest.mark.parametrize(
     ("frames", "height", "width", "method", "measured"),  # peaks in MB of processes, by benchmarks memory
     [
-        (8, 64, 64, "4dvggt-d", 579),
         (32, 64, 64, "vggt4d", 771),
-        (64, 64, 64, "vggt", 602),
         (32, 64, 64, "4dvggt-d", 586),
-        (8, 128, 128, "vggt", 556),
         (16, 128, 128, "4dvggt-d", 614),
-        (16, 128, 128, "vggt4d", 769),
         (32, 128, 128, "hard-replacement", 758),
-        (4, 256, 256, "4dvggt-d", 616),
         (4, 256, 256, "vggt", 589),
         (8, 256, 256, "vggt4d", 807),
-        (12, 192, 256, "vggt", 793),
         (32, 256, 256, "4dvggt-d", 1316),
-        (24, 192, 256, "vggt4d", 965),
-        (64, 128, 128, "4dvggt-d", 1040),
         (8, 512, 512, "4dvggt-d", 1253),
     ],
 )
@@ -89,14 +72,9 @@ def test_the_peaks_of_processes_are_predicted_within_the_error_that_is_promised(
 @pytest.mark.parametrize(
     ("frames", "height", "width", "method", "devices", "measured"),  # by --split
     [
-        (16, 64, 64, "4dvggt-d", 2, 596),
-        (32, 128, 128, "4dvggt-d", 2, 755),
         (24, 192, 256, "vggt4d", 2, 1201),
-        (32, 256, 256, "4dvggt-d", 2, 1342),
         (24, 192, 256, "vggt", 4, 1136),
-        (64, 128, 128, "4dvggt-d", 4, 1253),
         (32, 256, 256, "4dvggt-d", 4, 1771),
-        (32, 128, 128, "4dvggt-d", 8, 1116),
         (32, 256, 256, "4dvggt-d", 8, 2339),
     ],
 )

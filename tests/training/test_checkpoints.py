@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from tests.training_runs import SHORT, init_probes
-from vggtjax.errors import CheckpointError, OutputError
-from vggtjax.training.checkpoints import KEPT, _explaining, latest, restore, save
+from vggtjax.errors import CheckpointError
+from vggtjax.training.checkpoints import _explaining, latest, restore, save
 from vggtjax.training.recipe import OptimiserConfig
 from vggtjax.training.state import initial_state, state_shapes
 
@@ -52,48 +52,28 @@ def test_round_trip_is_exact(saved, state, shapes):
         np.testing.assert_array_equal(a, b)
 
 
-def test_another_schedule_may_go_on(saved, state, shapes):
-    later = dataclasses.replace(SHORT, optimiser=OptimiserConfig(learning_rate=1e-3, warmup_steps=0, decay_steps=1))
-    found = restore(saved, shapes, later)
-    assert found.recipe == SHORT
-    np.testing.assert_array_equal(found.state.step, state.step)
-
-
-def test_last_two_are_kept(tmp_path, state):
-    for step in (1, 5, 9):
-        save(tmp_path, state._replace(step=jnp.int32(step)), SHORT)
-    assert sorted(int(path.name) for path in tmp_path.iterdir() if path.name.isdigit()) == [5, 9]
-    assert KEPT == 2
-    assert latest(tmp_path) == 9
-    save(tmp_path, state._replace(step=jnp.int32(9)), SHORT)  # is there already
-    assert latest(tmp_path) == 9
-
-
-def test_the_next_save_removes_what_an_interrupted_one_left(tmp_path, saved, state):
+def test_the_last_two_are_kept_and_what_an_interrupted_save_left_is_removed(tmp_path, saved, state):
     save(tmp_path, state, SHORT)
     shutil.copytree(saved / "3", tmp_path / "9.orbax-checkpoint-tmp")
     assert latest(tmp_path) == 3
     assert (tmp_path / "9.orbax-checkpoint-tmp").exists()  # who reads removes nothing
     save(tmp_path, state._replace(step=jnp.int32(10)), SHORT)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["10", "3"]
+    save(tmp_path, state._replace(step=jnp.int32(12)), SHORT)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["10", "12"]
+    assert latest(tmp_path) == 12
 
 
-@pytest.mark.parametrize("name", ["none", "empty"])
-def test_folders_without_a_checkpoint(tmp_path, shapes, name):
-    folder = tmp_path / name
-    if name == "empty":
-        folder.mkdir()
-    assert latest(folder) is None
-    with pytest.raises(CheckpointError, match="holds no checkpoint"):
-        restore(folder, shapes, SHORT)
+def test_folders_without_a_checkpoint(tmp_path, shapes):
+    for folder in (tmp_path, tmp_path / "none"):
+        assert latest(folder) is None
+        with pytest.raises(CheckpointError, match="holds no checkpoint"):
+            restore(folder, shapes, SHORT)
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"model": dataclasses.replace(SHORT.model, embed_dim=32)}, "another model"),
         ({"trainable": "all"}, "another trainable"),
-        ({"untrained": ("track_head",)}, "another untrained"),
         ({"optimiser": OptimiserConfig(kind="muon", warmup_steps=0, decay_steps=0)}, r"another optimiser\.kind"),
     ],
 )
@@ -103,24 +83,14 @@ def test_checkpoint_of_another_recipe(saved, change, says):
         restore(saved, state_shapes(recipe, init_probes(0, recipe.model)), recipe)
 
 
-def test_other_shapes(saved, shapes):
-    probes = {"mean": {"kernel": jnp.zeros((3, 4)), "bias": jnp.zeros(3)}}
-    with pytest.raises(CheckpointError, match=r"4 arrays differ, such as .*kernel: \(3, 3\), expected \(3, 4\)"):
-        restore(saved, state_shapes(SHORT, probes), SHORT)
-
-
 def test_damaged_checkpoints(tmp_path, state, shapes):
     save(tmp_path / "whole", state, SHORT)
     run = json.loads((tmp_path / "whole/3/run/metadata").read_text())
     for number, (name, content) in enumerate(
         (
             ("run/metadata", b"{"),
-            ("run/metadata", b"{}"),
-            ("run/metadata", b"[1]"),
             ("run/metadata", json.dumps(run | {"recipe": {"name": "x"}}).encode()),
-            ("state/_METADATA", b"[]"),
             ("state/_METADATA", b"\x80\x04K\x01."),  # a pickle
-            ("_CHECKPOINT_METADATA", b"[1]"),
             ("state/manifest.ocdbt", b"\x00" * 99),
         )
     ):
@@ -151,9 +121,3 @@ def test_where_a_read_fails_the_others_end_before_orbax_closes_their_loop(tmp_pa
     with refused, _explaining(tmp_path), closing(asyncio.new_event_loop()) as loop:
         loop.run_until_complete(both())
     assert ended
-
-
-def test_folder_that_cannot_be_written(tmp_path, state):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"cannot write .*choose a folder"):
-        save(tmp_path / "file" / "checkpoints", state, SHORT)

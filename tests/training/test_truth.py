@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.generated import DYNAMIC, QUICK, STATIC, clips, scenes
+from tests.generated import DYNAMIC, QUICK, STATIC, clips
 from tests.training_runs import CONFIG
 from vggtjax.network.aggregator import aggregate
 from vggtjax.network.model import init_params
@@ -84,22 +84,6 @@ def test_targets(clip):
     np.testing.assert_allclose(world, world_points(clip), atol=1e-4)
 
 
-def test_walls_stay_where_they_are_from_frame_to_frame():
-    """Target points on the room's faces lie on the same planes in all frames of a clip."""
-    clip, scene = clips(STATIC, COUNT[STATIC]), scenes(STATIC, COUNT[STATIC])
-    truth = jax.device_get(quick_targets(jax.tree.map(jnp.asarray, clip)))
-    for b in range(COUNT[STATIC]):
-        scale = clip.depth[b].mean() / truth.depth[b].mean()
-        first = clip.camera_from_world[b, 0].astype(np.float64)
-        corners = np.stack([scene.room_low[b], scene.room_high[b]])
-        for s in range(STATIC.frames):
-            wall = clip.part_ids[b, s] == 0
-            assert wall.sum() > 100
-            points = (truth.points[b, s][wall] * scale - first[:, 3]) @ first[:, :3]
-            off = np.abs(points[:, None] - corners[None]).min(axis=(1, 2))
-            assert off.max() < 1e-3
-
-
 def passage():
     """A camera that stands, and a box that goes by, a patch further to the right in every frame.
 
@@ -140,13 +124,6 @@ def test_matches_by_hand():
         np.testing.assert_allclose(found.position[0, r, s, patch], expected, atol=1e-5)
 
 
-def test_every_patch_matches_itself(found):
-    S, P = found.patch.shape[2:]
-    for s in range(S):
-        assert found.visible[:, s, s].all()
-        np.testing.assert_array_equal(found.patch[:, s, s], np.broadcast_to(np.arange(P), found.patch[:, s, s].shape))
-
-
 def test_matches_of_what_stands_still_need_no_poses_of_parts(clip, found):
     """Rigid geometry alone: unproject, project, compare with the depth shown there."""
     clip = doubled(clip)
@@ -157,21 +134,6 @@ def test_matches_of_what_stands_still_need_no_poses_of_parts(clip, found):
         pixels, z = project(clip, np.repeat(points[:, r : r + 1], S, axis=1))
         check(clip, found, r, pixels, z, np.repeat(still[:, r : r + 1], S, axis=1))
     assert found.visible[:, 0, 1].mean() > 0.3
-
-
-def test_matches_of_what_moves_follow_the_scene_flow():
-    clip = clips(DYNAMIC, COUNT[DYNAMIC])
-    found = jax.device_get(quick_matches(jax.tree.map(jnp.asarray, clip), PATCH))
-    clip = doubled(clip)
-    B, S = clip.depth.shape[:2]
-    points = (world_points(clip) + clip.scene_flow)[:, :, CENTRE, CENTRE].reshape(B, S, -1, 3)
-    moving = clip.dynamic_mask[:, :, CENTRE, CENTRE].reshape(B, S, -1)
-    for r in range(S - 1):
-        pixels, z = project(clip, np.repeat(points[:, r : r + 1], S, axis=1))
-        later = np.zeros((B, S, 1), bool)
-        later[:, r + 1] = True
-        check(clip, found, r, pixels, z, moving[:, r : r + 1] & later)
-    assert (found.visible[:, 0, 1] & moving[:, 0]).sum() > 20
 
 
 def check(clip, found, r, pixels, z, chosen):
@@ -235,35 +197,17 @@ def log_softmax(x):
     return x - x.max() - np.log(np.exp(x - x.max()).sum())
 
 
-@pytest.mark.parametrize("heads", [2, 5])
-def test_match_loss_against_a_slow_one(heads):
-    generator = np.random.default_rng(heads)
-    B, S, P, D = 2, 3, 4, 8
+def test_match_loss_against_a_slow_one_and_of_nothing_that_is_seen():
+    generator = np.random.default_rng(5)
+    B, S, P, D, heads = 2, 3, 4, 8, 5
     q, k = (jnp.asarray(generator.normal(0, 2, (B, S, P, heads, D)), jnp.float32) for _ in range(2))
     found = random_matches(generator, B, S, P)
     loss, accuracy = match_loss(found, clip_counts(found), q, k)
     expected = slow_match_loss(found, q, k)
     assert (float(loss), float(accuracy)) == pytest.approx(expected, rel=1e-5)
     assert 0 < expected[1] < 1
-
-
-def test_perfect_attention_has_no_loss_and_nothing_seen_none_at_all():
-    P = 16
-    found = quick_matches(passage(), PATCH)
-    names = jnp.eye(3 * P).reshape(1, 3, P, 1, 3 * P)  # every patch of every frame by itself
-
-    def said(frame):
-        return jnp.take_along_axis(jnp.eye(3 * P)[None, None], P * frame + found.patch[:, :, frame, :, None], axis=2)
-
-    to_first, to_each = said(0), sum(said(s) for s in range(3))
-    sharp = 4000.0
-    q = sharp * jnp.stack([to_first, to_each], axis=3)
-    keys = jnp.concatenate([names, names], axis=3)
-    loss, accuracy = match_loss(found, clip_counts(found), q, keys)
-    assert float(loss) == pytest.approx(0, abs=1e-5)
-    assert float(accuracy) == 1
     unseen = found._replace(visible=jnp.zeros_like(found.visible))
-    assert [float(x) for x in match_loss(unseen, clip_counts(unseen), q, keys)] == [0, 0]
+    assert [float(x) for x in match_loss(unseen, clip_counts(unseen), q, k)] == [0, 0]
 
 
 class Watched:

@@ -88,21 +88,11 @@ def broken(trained, batch, config, weights, **_):
     raise ValueError("no such loss")
 
 
-def full(trained, batch, config, weights, **_):
-    raise RuntimeError("RESOURCE_EXHAUSTED: 1 GB")
-
-
 def test_an_error_in_a_worker_is_said(tmp_path):
     task = dataclasses.replace(TASK, objective=broken)
     with pytest.raises(VggtjaxError, match="a worker of the training run failed: ValueError: no such loss") as raised:
         train(RECIPE, tmp_path, options=RunOptions(workers=2), task=task)
     assert "in broken" in raised.value.__notes__[0]  # where in the objective
-
-
-@pytest.mark.proof
-def test_a_worker_without_memory(tmp_path):
-    with pytest.raises(MemoryError):
-        train(RECIPE, tmp_path, options=RunOptions(workers=2), task=dataclasses.replace(TASK, objective=full))
 
 
 def test_an_objective_that_cannot_be_sent(tmp_path):
