@@ -155,7 +155,7 @@ def test_passes_take_options_or_their_fields():
 
     def shapes(pairs=5, **options):
         def passes(pairs):
-            return run_passes(model.params, images, model.config, mask_pairs=pairs, **options)
+            return run_passes(model.params, jnp.asarray(images), model.config, mask_pairs=pairs, **options)
 
         return jax.eval_shape(passes, np.int32(pairs)) if pairs > 0 else passes(pairs)
 
