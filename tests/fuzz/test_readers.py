@@ -4,6 +4,7 @@ A found case becomes files in corpus/READER/CASE/, put over the sample: the long
 """
 
 import os
+import mmap
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -86,11 +87,12 @@ def test_what_the_harness_looks_for_is_found(folder, monkeypatch):
     for error in (InputError("x" * 6000), ClipError(""), KeyError("x"), odd()):
         assert read(raising(error), folder).kind == "found"
     assert read(raising(InputError("a sentence")), folder).kind == "refused"
-    taken: list[bytearray] = []
+    taken: list[mmap.mmap] = []  # not of malloc, which may have kept freed memory of other tests
 
     def greedy(path: Path) -> None:
         if path.read_bytes() != b"valid":
-            taken.append(bytearray(b"x") * 2**27)  # written, so that it is memory
+            taken.append(mmap.mmap(-1, 2**27))
+            taken[-1].write(bytes(2**27))
 
     (folder / "case").mkdir()
     (folder / "case/file").write_bytes(b"other")
