@@ -3,8 +3,8 @@
 A found case becomes files in corpus/READER/CASE/, put over the sample: the long test writes them, and says where.
 """
 
-import os
 import mmap
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
