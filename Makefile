@@ -42,8 +42,8 @@ test: lint
 
 # Numbers of the public code once more, with programs that are compiled well: --hasty is left out.
 proofs: $(VENV)/.development
-	$(BIN)/python -m pytest -n $(WORKERS) tests/parity -m ""
-	$(PYTEST) $(TESTS) -m proof
+	$(PYTEST) $(TESTS) -m proof --ignore tests/parity
+	$(if $(filter tests,$(TESTS)),$(BIN)/python -m pytest -n $(WORKERS) tests/parity -m "")
 
 mutants: $(VENV)/.development $(MUTANTS)/.installed
 	rm -rf build/mutants

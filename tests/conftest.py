@@ -5,6 +5,7 @@ import hashlib
 import os
 import platform
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from vggtjax.pretrained import embedded
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
 _MAPPINGS = 2**14  # Linux allows 65530
-_CACHE_BYTES = 2**31  # a larger cache of compiled programs is emptied
+_CACHE_BYTES = 2**31  # a larger cache of compiled programs is emptied; a whole run fills a tenth of it
 
 gc.set_threshold(50_000, 50, 100)  # tracing makes many small objects, which are not garbage
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -32,7 +33,7 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Compiling takes most of the time of the tests."""
+    """Set XLA's flags and the shared cache before anything is compiled, which takes most of the time of the tests."""
     if config.getoption("--hasty"):
         flags = ["--xla_backend_optimization_level=0"]
         if jax.__version_info__ < (0, 11):  # XLA ends a process for a flag that it does not know
@@ -56,7 +57,8 @@ def _share_compiled_programs(config) -> None:
         return
     try:
         folder = config.cache.mkdir(f"compiled-{_processor()}")
-        (folder / "writable").touch()
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(b"it can be written")
         if not hasattr(config, "workerinput") and sum(file.stat().st_size for file in folder.iterdir()) > _CACHE_BYTES:
             shutil.rmtree(folder)
     except OSError:

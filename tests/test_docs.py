@@ -22,6 +22,9 @@ from vggtjax.pretrained.embedded import demo_clip
 
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 TARGETS = re.findall(r"^([\w ]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+BENCHMARKS = re.findall(
+    r'^    "([\w-]+)": \w+,$', (ROOT / "benchmarks" / "__main__.py").read_text(), flags=re.MULTILINE
+)
 OTHERS = ("git", "hf", "ssh")  # programs that a reader has or does not have
 
 pytestmark = [
@@ -131,7 +134,9 @@ def _is_known(program: str, arguments: list[str]) -> bool:
     if program == "make":
         return {word for word in arguments if "=" not in word} <= {word for names in TARGETS for word in names.split()}
     if program.startswith("python"):
-        modules = ("benchmarks", "testing.make_checkpoint", "pytest", "venv")
+        if arguments[:2] == ["-m", "benchmarks"]:
+            return arguments[2] in BENCHMARKS
+        modules = ("testing.make_checkpoint", "pytest", "venv")
         return (arguments[0] == "-m" and arguments[1] in modules) or (ROOT / arguments[0]).is_file()
     return program in (*OTHERS, ".", "cd")
 
@@ -184,4 +189,12 @@ def test_an_unknown_extra_target_and_program_are_found():
     assert _is_known("pip", ["install", ".[hub,cuda]"])
     assert not _is_known("pip", ["install", ".[hubs]"])
     assert not _is_known("make", ["everything"])
+    assert not _is_known("python", ["-m", "benchmarks", "everything"])
     assert not _is_known("rm", ["-r"])
+
+
+def test_every_benchmark_has_its_line():
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    named = re.findall(r"(?m)^\| `([\w-]+)` \|[^|]+\|[^|]+\|$", page.partition("\n## ")[0])
+    assert sorted(named) == sorted(BENCHMARKS)
+    assert 1 < len(BENCHMARKS) <= 12

@@ -21,7 +21,7 @@ def repository(folder: Path, umask: int) -> Path:
     folder.mkdir()
     for name in ("pyproject.toml", "README.md", "LICENSE", "Makefile"):
         shutil.copyfile(ROOT / name, folder / name)
-    for name in ("vggtjax", "converters", "tests"):
+    for name in ("vggtjax", "converters", "testing", "tests"):
         skipped = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / name, folder / name, ignore=skipped, copy_function=shutil.copyfile)
     day = {f"GIT_{who}_DATE": "2026-01-01T00:00:00Z" for who in ("AUTHOR", "COMMITTER")}

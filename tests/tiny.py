@@ -1,4 +1,4 @@
-"""The smallest network with every part: what tests compile that need no real size."""
+"""The smallest network with every part, for tests that need no real size."""
 
 import dataclasses
 import functools

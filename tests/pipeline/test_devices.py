@@ -93,10 +93,15 @@ def check_equal(expected: dict[str, np.ndarray], found: dict[str, np.ndarray]) -
             assert np.abs(other - array).max() <= CLOSE * np.ptp(array), name
 
 
-@pytest.mark.parametrize("what", ["reconstruct", "infer", "gradient"])
-def test_several_devices_give_the_numbers_of_one(run, kept, what):
-    if what == "reconstruct" or run.gradient_of:
-        check_equal(kept[f"{what} {run.frames}"][1], kept[f"{what} {run.frames}"][run.devices])
+def test_several_devices_give_the_numbers_of_one(run, kept):
+    check_equal(kept[f"reconstruct {run.frames}"][1], kept[f"reconstruct {run.frames}"][run.devices])
+
+
+@pytest.mark.proof
+@pytest.mark.parametrize("run", [EIGHT], indirect=True, ids=str)
+@pytest.mark.parametrize("what", ["infer", "gradient"])
+def test_several_devices_give_the_outputs_and_gradients_of_one(run, kept, what):
+    check_equal(kept[f"{what} {run.frames}"][1], kept[f"{what} {run.frames}"][run.devices])
 
 
 def test_a_pass_has_only_the_collectives_that_the_docs_name(run, kept):
