@@ -3,7 +3,7 @@
 # The environment of the lock, every file by its hash: `make locked`, before the others. `make lock` makes the lock anew,
 # from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the last commit,
 # without what is not committed: the same wheel anywhere.
-# While you work: `make check`, which is lint, types and the tests that run no network, in two minutes.
+# While you work: `make check`, which is lint, types and the tests that run few networks, in four minutes.
 # `make coverage` counts the lines and branches that the tests run, and `make shuffled` runs them in a random order.
 # `make proofs` runs what takes long and rarely breaks; `make mutants` measures how many faults the tests notice.
 
