@@ -18,8 +18,8 @@ MUTANTS := $(VENV)/mutants
 COMPILE = $(SUPPLY)/bin/uv pip compile --no-config --quiet --upgrade --exclude-newer '7 days' --generate-hashes \
   --universal --python-version 3.11 --index-url https://pypi.org/simple --no-emit-index-url \
   --custom-compile-command 'make lock'
-# Workers share compiled programs in pytest's cache: CLEAR=--cache-clear empties it.
-PYTEST = $(BIN)/python -m pytest --hasty -n $(WORKERS) --dist worksteal $(CLEAR)
+# Workers share compiled programs in pytest's cache: PYTEST_ADDOPTS=--cache-clear empties it.
+PYTEST = $(BIN)/python -m pytest --hasty -n $(WORKERS) --dist worksteal
 RANDOM = -p randomly --randomly-seed=$(SEED) --randomly-dont-reset-seed
 
 # Tests that compile networks take nearly all of the time.

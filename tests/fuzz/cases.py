@@ -14,6 +14,7 @@ from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
 
+from testing.process_memory import process_bytes, reset_high_water
 from tests.fuzz.changes.text import NAMES
 from tests.fuzz.mutations import mutated
 from vggtjax.errors import VggtjaxError
@@ -96,7 +97,7 @@ def scratch_folder() -> Iterator[Path]:
 
 def read(function: Callable[[Path], object], path: Path, refusals: type[Exception] = VggtjaxError) -> Outcome:
     """Call a reader; every outcome but success and one good sentence is found."""
-    before = _peak(reset=True)
+    before = reset_high_water() or 0  # on other systems than Linux both are unknown
     try:
         with warnings.catch_warnings(), _limited():
             warnings.simplefilter("ignore")
@@ -110,7 +111,7 @@ def read(function: Callable[[Path], object], path: Path, refusals: type[Exceptio
         frame = (own or where)[-1]
         words = f"{type(error).__name__} at {Path(frame.filename).name}:{frame.lineno}: {str(error)[:200]!r}"
         kind = "found"
-    return Outcome(kind, words, max(0, _peak() - before))
+    return Outcome(kind, words, max(0, (process_bytes("VmHWM") or 0) - before))
 
 
 def change(folder: Path, random: Random) -> None:
@@ -188,15 +189,3 @@ def _limited() -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, earlier)
-
-
-def _peak(*, reset: bool = False) -> int:
-    """Return the process's peak of resident memory in bytes since the last reset; on other systems than Linux, 0."""
-    try:
-        if reset:
-            Path("/proc/self/clear_refs").write_text("5")
-        status = Path("/proc/self/status").read_text()
-    except OSError:
-        return 0
-    (line,) = [line for line in status.splitlines() if line.startswith("VmHWM")]
-    return int(line.split()[1]) * 1024
