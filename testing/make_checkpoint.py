@@ -15,6 +15,7 @@ from rich.progress import Progress
 
 from testing.seeded import seeded_tensor
 from vggtjax.errors import VggtjaxError
+from vggtjax.storage.json_values import read_json
 from vggtjax.storage.tensor_file import Spec, write_tensors
 from vggtjax.storage.writing import staging, writing
 
@@ -40,7 +41,7 @@ def main(
         shards: number of safetensors files, with an index.
         seed: of the weights.
     """
-    layout = json.loads(shapes.read_text())
+    layout = read_json(shapes, dict[str, list[int]], "shapes")
     with Progress() as progress:
         task = progress.add_task(str(out), total=len(layout))
         make_checkpoint(
