@@ -3,7 +3,7 @@
 # The environment of the lock, every file by its hash: `make locked`, before the others. `make lock` makes the lock anew,
 # from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the last commit,
 # without what is not committed: the same wheel anywhere.
-# While you work: `make check`, which is lint, types and the tests that run few networks, in four minutes.
+# While you work: `make check`, which is lint and types beside the tests that run few networks, in two minutes.
 # `make coverage` counts the lines and branches that the tests run, and `make shuffled` runs them in a random order.
 # `make proofs` runs what takes long and rarely breaks; `make mutants` measures how many faults the tests notice.
 
@@ -23,7 +23,11 @@ PYTEST = $(BIN)/python -m pytest --hasty -n $(WORKERS) --dist worksteal
 RANDOM = -p randomly --randomly-seed=$(SEED) --randomly-dont-reset-seed
 
 # Tests that compile networks take nearly all of the time.
-SLOW = parity network method pipeline training calibration learning commands benchmarks pretrained
+SLOW = parity network method pipeline training calibration learning commands benchmarks pretrained windows test_docs.py \
+  app proofs known test_packaging.py
+
+# Processes of the tests read compiled Python files rather than compile them anew, whatever the shell says.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: demo pictures docs test proofs mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
 
@@ -37,7 +41,7 @@ docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "open site/index.html"
 
-test: lint
+test: $(VENV)/.development
 	$(PYTEST) $(TESTS)
 
 # Numbers of the public code once more, with programs that are compiled well: --hasty is left out.
@@ -50,10 +54,11 @@ mutants: $(VENV)/.development $(MUTANTS)/.installed
 	git clone --quiet . build/mutants
 	PATH="$(abspath $(BIN)):$(abspath $(MUTANTS)/bin):$$PATH" MODULES="$(MODULES)" build/mutants/tests/proofs/mutants/run.sh
 
-check: lint fast
+check: $(VENV)/.development
+	$(MAKE) --jobs 2 --output-sync=target lint fast
 
 fast: $(VENV)/.development
-	$(PYTEST) tests $(SLOW:%=--ignore tests/%)
+	$(PYTEST) -q tests $(SLOW:%=--ignore tests/%)
 
 coverage: $(VENV)/.coverage
 	$(PYTEST) --cov --cov-report=term:skip-covered $(TESTS)

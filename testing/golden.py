@@ -5,6 +5,7 @@ They lie in tests/golden of the repository.
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,7 @@ def golden_config() -> VGGTConfig:
     return VGGTConfig(**json.loads((GOLDEN / "config.json").read_text()))
 
 
+@functools.cache
 def golden_params(seed: int) -> Params:
     """Return the tiny model's parameters for a seed."""
     shapes = json.loads((GOLDEN / "shapes.json").read_text())

@@ -8,7 +8,7 @@ from sklearn.cluster import KMeans
 
 from vggtjax.method.clustering import kmeans
 
-SEEDS = range(12)  # one run's inertia varies by 1.2 %
+SEEDS = range(8)  # one run's inertia varies by 1.2 %
 _kmeans = jax.jit(kmeans, static_argnames=("clusters", "restarts"))
 
 
@@ -16,14 +16,14 @@ def features(kind: str) -> np.ndarray:
     """Points as they come up here: patch features on a low-dimensional sheet, a cloud of 3-D points far away, blobs."""
     generator = np.random.default_rng(5)
     if kind == "features":
-        hidden = generator.normal(size=(1500, 6)) @ generator.normal(size=(6, 32))
+        hidden = generator.normal(size=(800, 6)) @ generator.normal(size=(6, 32))
         return np.tanh(hidden).astype(np.float32)
     if kind == "cloud":
-        return (generator.uniform(size=(2000, 3)) * [1, 2, 0.2] + [40, -30, 100]).astype(np.float32)
+        return (generator.uniform(size=(1000, 3)) * [1, 2, 0.2] + [40, -30, 100]).astype(np.float32)
     return (generator.integers(0, 12, size=(1000, 1)) + 0.05 * generator.normal(size=(1000, 4))).astype(np.float32)
 
 
-@pytest.mark.parametrize(("kind", "clusters"), [("features", 64), ("cloud", 30), ("blobs", 12)])
+@pytest.mark.parametrize(("kind", "clusters"), [("features", 32), ("cloud", 30), ("blobs", 12)])
 def test_inertia_is_scikit_learns(kind, clusters):
     points = features(kind)
     fitted = [KMeans(clusters, random_state=seed).fit(points) for seed in SEEDS]
@@ -46,12 +46,12 @@ def test_labels_centres_and_inertia_belong_together():
 def test_points_of_weight_zero_move_nothing():
     points = features("cloud")
     junk = np.concatenate([points, np.full((500, 3), 1e3, np.float32)])
-    weights = np.arange(2500) < 2000
+    weights = np.arange(1500) < 1000
     found = _kmeans(jax.random.key(1), junk, clusters=8, weights=weights)
     alone = _kmeans(jax.random.key(1), points, clusters=8)
     assert float(found.inertia) == pytest.approx(float(alone.inertia), rel=0.05)
     assert float(jnp.abs(found.centres).max()) < 110
-    nothing = _kmeans(jax.random.key(1), junk, clusters=8, weights=np.zeros(2500, bool))
+    nothing = _kmeans(jax.random.key(1), junk, clusters=8, weights=np.zeros(1500, bool))
     assert np.isfinite(nothing.centres).all()
     assert float(nothing.inertia) == 0
 

@@ -88,12 +88,13 @@ def test_eight_devices_have_the_sums_of_one():
 def test_clips_of_different_lengths_in_one_batch_have_the_sums_of_each_alone():
     """Frames of one clip lack sources that frames of the other have: weights are shared out among those of each."""
     cues, counts, frames = GramCues(MotionConfig(), 24), (9, 4), 9
+    add = jax.jit(cues.add)
     q, k = np.random.default_rng(1).normal(size=(2, 2, frames, PATCHES, 2, 4)).astype(np.float32)
     ones = jnp.ones(5, int)
-    both = cues.add(cues.zeros(2, frames, PATCHES), ones, jnp.asarray(q), jnp.asarray(k), jnp.array(counts))
+    both = add(cues.zeros(2, frames, PATCHES), ones, jnp.asarray(q), jnp.asarray(k), jnp.array(counts))
     for clip, count in enumerate(counts):
         one = [jnp.asarray(x[clip : clip + 1, :count]) for x in (q, k)]
-        alone = cues.add(cues.zeros(1, count, PATCHES), ones, *one)
+        alone = add(cues.zeros(1, count, PATCHES), ones, *one)
         for expected, found in zip(alone, both, strict=True):
             assert np.allclose(found[clip, :count], expected[0], atol=1e-5)
 

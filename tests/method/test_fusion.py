@@ -71,9 +71,14 @@ def test_an_optimiser_learns_which_pass_to_trust():
     value = jnp.asarray(0.0)
     state = optimiser.init(value)
     before = float(loss(value))
-    for _ in range(20):
+
+    @jax.jit
+    def step(value, state):
         updates, state = optimiser.update(jax.grad(loss)(value), state)
-        value = optax.apply_updates(value, updates)
+        return optax.apply_updates(value, updates), state
+
+    for _ in range(20):
+        value, state = step(value, state)
     assert float(loss(value)) < 0.05 * before
 
 

@@ -1,6 +1,7 @@
 """Two passes and every method made of them; the staged pipeline against the single jit."""
 
 from contextlib import contextmanager
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -100,12 +101,10 @@ def test_aligning_the_scale_moves_depth_and_cameras_together(inferred):
     assert np.allclose(aligned.camera_from_world[..., :3], plain.camera_from_world[..., :3])
 
 
-@pytest.mark.parametrize("method", ["vggt4d", "4dvggt-d"])
-def test_the_staged_pipeline_equals_the_single_jit(params, config, images, inferred, method):
+def test_the_staged_pipeline_equals_the_single_jit(params, config, images, inferred):
     model = Model(config, params, "tiny")
     clip = load_clip(images[0], size=140)
-    whole, passes = infer(params, images, config, method=method) if method == "vggt4d" else inferred
-    whole = assemble(passes, method)
+    whole, passes = inferred
     seen = []
 
     @contextmanager
@@ -113,7 +112,7 @@ def test_the_staged_pipeline_equals_the_single_jit(params, config, images, infer
         seen.append(name)
         yield
 
-    staged = reconstruct(model, clip, method=method, refine_mask=False, keep_passes=True, on_stage=on_stage)
+    staged = reconstruct(model, clip, on_stage=on_stage)
     assert seen == ["compile programs", "image features", "first pass", "dynamic mask", "second pass", "assemble"]
     for a, b in (
         (staged.depth, whole.depth[0]),
@@ -123,7 +122,7 @@ def test_the_staged_pipeline_equals_the_single_jit(params, config, images, infer
     ):
         assert np.abs(a - np.asarray(b)).max() <= 1e-4 * np.asarray(b).std()
     assert (staged.dynamic_mask != np.asarray(passes.dynamic_mask[0])).mean() < 1e-3
-    assert (staged.method, staged.model_name) == (method, "tiny")
+    assert (staged.method, staged.model_name) == ("4dvggt-d", "tiny")
 
 
 def test_a_single_frame_is_all_static(params, config, images):
@@ -136,6 +135,7 @@ def test_a_single_frame_is_all_static(params, config, images):
     assert np.isfinite(made.depth).all()
 
 
+@pytest.mark.proof
 def test_a_clip_of_another_size_is_refitted(params, config, images):
     model = Model(config, params, "tiny")
     fitted = reconstruct(model, load_clip(images[0], size=140))
@@ -144,28 +144,17 @@ def test_a_clip_of_another_size_is_refitted(params, config, images):
     assert (refitted.depth == fitted.depth).all()
 
 
-def test_unknown_names(inferred):
-    with pytest.raises(InputError, match="method is 'vgtt'; expected one of vggt, vggt4d"):
-        assemble(inferred[1], "vgtt")
-    with pytest.raises(InputError, match="needs the second pass"):
-        assemble(inferred[1]._replace(second=None), "4dvggt-d")
-
-
 def test_passes_take_options_or_their_fields():
-    model, images = tiny_model(), np.zeros((1, 2, 28, 28, 3), np.float32)
-
-    def shapes(pairs=5, **options):
-        def passes(pairs):
-            return run_passes(model.params, jnp.asarray(images), model.config, mask_pairs=pairs, **options)
-
-        return jax.eval_shape(passes, np.int32(pairs)) if pairs > 0 else passes(pairs)
-
-    assert shapes() == shapes(options=Options(gram="dot"), clusters=8, threshold="multi-otsu")
-    assert shapes(method="vggt").second is None
+    model, images = tiny_model(), jnp.zeros((1, 2, 28, 28, 3))
+    run = partial(run_passes, model.params, images, model.config)
+    for options in ({"method": "vggt"}, {"options": Options(method="vggt", gram="dot")}):
+        assert jax.eval_shape(partial(run, **options)).second is None
     with pytest.raises(TypeError, match="grams"):
-        shapes(grams="dot")
+        run(grams="dot")
     with pytest.raises(InputError, match="mask_pairs is -1"):
-        shapes(pairs=-1)
+        run(mask_pairs=-1)
+    with pytest.raises(InputError, match="method is 'vgtt'; expected one of vggt, vggt4d"):
+        run(method="vgtt")
 
 
 def test_equal_programs_are_compiled_once(params, config, images, monkeypatch):

@@ -41,9 +41,8 @@ def test_the_gradient_is_that_of_jaxs_own_attention(monkeypatch, masked):
     kept = generator.random((2, 11)) < 0.6 if masked else None
 
     def gradient(implementation):
-        return jax.grad(lambda *x: (implementation(*x, kept) * weight).sum(), argnums=(0, 1, 2))(
-            *map(jnp.asarray, (q, k, v))
-        )
+        slope = jax.grad(lambda *x: (implementation(*x, kept) * weight).sum(), argnums=(0, 1, 2))
+        return jax.jit(slope)(*map(jnp.asarray, (q, k, v)))
 
     with jax.default_matmul_precision("highest"):
         for made, expected in zip(gradient(attention._in_chunks), gradient(attention._at_once), strict=True):
@@ -61,6 +60,7 @@ def test_packed_keys(masked):
     assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
 
 
+@pytest.mark.proof
 def test_the_kernel_for_tpus_interpreted():
     generator = np.random.default_rng(3)
     q, k, v = (jnp.asarray(generator.normal(size=(1, 140, 2, 64)), jnp.float32) for _ in range(3))
@@ -82,7 +82,7 @@ def test_what_does_not_fit_at_once_is_cut(monkeypatch, most):
     assert np.abs(np.asarray(made) - _formula(q, k, v, kept)).max() < 1e-5
 
 
-@pytest.mark.parametrize(("cores", "times"), [(1, 1), (2, 1), (4, 2), (16, 8), (128, 8)])
+@pytest.mark.parametrize(("cores", "times"), [(2, 1), (4, 2), (128, 8)])
 def test_chunks_grow_with_the_cores_but_not_without_bound(monkeypatch, cores, times):
     monkeypatch.setattr("vggtjax.network.pieces.core_count", lambda: cores)
     queries = jnp.zeros((12_800, 1))

@@ -1,7 +1,5 @@
 """Kernels in 8 bits: the rounding by hand, what a model keeps of its predictions, and how it is loaded."""
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,7 +7,6 @@ from vggtjax import load_model
 from vggtjax.checkpoint import save_model
 from vggtjax.clips.clip import load_clip
 from vggtjax.errors import CheckpointError
-from vggtjax.network.model import forward
 from vggtjax.network.quantised import Quantised, dequantised, quantise
 from vggtjax.pipeline.run import reconstruct
 
@@ -35,15 +32,9 @@ def test_a_model_is_smaller_and_nearly_the_same(models):
     assert rounded.parameter_count == exact.parameter_count
     assert rounded.parameter_bytes < 0.4 * exact.parameter_bytes
     assert rounded.identity != exact.identity
-    images = jnp.asarray(np.random.default_rng(0).random((1, 2, 64, 64, 3), np.float32))
-    run = jax.jit(lambda params: forward(params, images, exact.config).depth)
-    off = np.asarray(run(rounded.params) / run(exact.params) - 1)
-    assert 0 < np.abs(off).mean() < 0.01
-
-
-def test_kept_programs_take_it(models):
-    clip = load_clip(np.random.default_rng(0).random((4, 64, 64, 3), np.float32), size=64, patch=8)
-    assert np.isfinite(reconstruct(models[1], clip, method="vggt").depth).all()
+    clip = load_clip(np.random.default_rng(0).random((2, 64, 64, 3), np.float32), size=64, patch=8)
+    depths = [reconstruct(model, clip, method="vggt").depth for model in (rounded, exact)]
+    assert 0 < np.abs(depths[0] / depths[1] - 1).mean() < 0.01
 
 
 def test_what_cannot_be_done_is_one_sentence(models, tmp_path):

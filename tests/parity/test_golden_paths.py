@@ -47,10 +47,12 @@ def assert_golden(case, made, suppress="drop", frames=slice(None)):
             assert_close(value[:, frames], case.arrays[f"{suppress}/{key}"])
 
 
+@pytest.mark.proof
 def test_attention_of_each_platform(case, implementation):
     assert_golden(case, masked_pass(case, outputs=("camera",)))
 
 
+@pytest.mark.proof
 def test_pieces(case, monkeypatch):
     monkeypatch.setattr(pieces, "NUMBERS_ON_CPU", 64 * case.config.embed_dim)
     assert_golden(case, masked_pass(case))

@@ -68,6 +68,7 @@ def site(tmp_path) -> Path:
     return folder
 
 
+@pytest.mark.proof
 def test_a_program_for_gpus_alone_has_their_precision_wherever_it_is_written(model, written, tmp_path):
     frames, height, width = SHAPE
     for_gpus = write_artefact(

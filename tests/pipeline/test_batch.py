@@ -47,14 +47,15 @@ def clips(tmp_path_factory):
 def test_every_good_clip_is_there_once_and_the_broken_one_is_named(model, clips, tmp_path):
     sources = clips_by_name([str(clips)])
     assert list(sources) == [f"clip{number}" for number in range(6)]
-    first = reconstruct_many(model, sources, tmp_path, options={"method": "vggt"})
+    run = partial(reconstruct_many, model, sources, tmp_path, saving={"only": ["depth"]})
+    first = run(options={"method": "vggt"})
     done = [next(first) for _ in range(2)]
     first.close()  # as an interruption does
     assert all(outcome.status in ("done", "failed") for outcome in done)
     finished = {path.parent.name: path.stat().st_mtime_ns for path in tmp_path.glob("*/reconstruction.npz")}
     assert finished
 
-    outcomes = {o.name: o for o in reconstruct_many(model, sources, tmp_path, options={"method": "vggt"})}
+    outcomes = {outcome.name: outcome for outcome in run(options={"method": "vggt"})}
     assert len(outcomes) == 6
     assert {name for name, outcome in outcomes.items() if outcome.status == "kept"} == set(finished)
     assert outcomes["clip2"].status == "failed"
@@ -69,7 +70,7 @@ def test_every_good_clip_is_there_once_and_the_broken_one_is_named(model, clips,
     assert not list(tmp_path.rglob(".*partial*"))
 
     with pytest.raises(InputError, match=rf"{SETTINGS_NAME} has other settings than this run"):
-        next(reconstruct_many(model, sources, tmp_path, options={"method": "4dvggt-d"}))
+        next(run(options={"method": "4dvggt-d"}))
 
 
 def write_video(path, frames, rows):
@@ -94,9 +95,8 @@ def test_progress_counts_frames(model, tmp_path):
     write_clip(root / "d", 2, 70)
     seen = []
     sources = clips_by_name([str(root)]) | {"nothing": str(tmp_path / "none")}
-    outcomes = reconstruct_many(
-        model, sources, tmp_path / "out", options={"method": "vggt"}, progress=lambda *count: seen.append(count)
-    )
+    run = partial(reconstruct_many, method="vggt", saving={"only": []}, progress=lambda *count: seen.append(count))
+    outcomes = run(model, sources, tmp_path / "out")
     assert sum(outcome.status == "failed" for outcome in outcomes) == 2
     assert seen == [(0, 16), (2, 16), (5, 15), (5, 7), (7, 7), (7, 7)]
 
@@ -171,31 +171,32 @@ def test_clips_from_urls_and_results_at_urls(model, clips, tmp_path, monkeypatch
 
 def test_two_batches_on_one_folder(model, clips, tmp_path):
     sources = {name: str(clips / name) for name in ("clip0", "clip1")}
-    first = reconstruct_many(model, sources, tmp_path, method="vggt")
+    run = partial(reconstruct_many, model, sources, tmp_path, method="vggt", saving={"only": []})
+    first = run()
     assert next(first).status == "done"
     with pytest.raises(OutputError, match="another run is writing a batch"):
-        next(reconstruct_many(model, sources, tmp_path, method="vggt"))
+        next(run())
     assert [outcome.status for outcome in first] == ["done"]
-    again = [outcome.status for outcome in reconstruct_many(model, sources, tmp_path, method="vggt")]
+    again = [outcome.status for outcome in run()]
     assert again == ["kept", "kept"]
 
 
 def test_shards_at_once_are_one_batch(model, clips, tmp_path):
     sources = clips_by_name([str(clips)])
-    list(reconstruct_many(model, sources, tmp_path / "one", method="vggt"))
-    out = tmp_path / "shards"
-    shards = [reconstruct_many(model, sources, out, method="vggt", shard=f"{k}/3") for k in (1, 2, 3)]
+    run, out = partial(reconstruct_many, model, sources, method="vggt", saving={"only": []}), tmp_path / "shards"
+    list(run(tmp_path / "one"))
+    shards = [run(out, shard=f"{k}/3") for k in (1, 2, 3)]
     outcomes = [next(shard) for shard in shards]
     for number in (1, 3):
         with pytest.raises(OutputError, match=f"another run is writing shard {number}/3 of the batch"):
-            next(reconstruct_many(model, sources, out, method="vggt", shard=f"{number}/3"))
+            next(run(out, shard=f"{number}/3"))
     with pytest.raises(OutputError, match="another run is writing shard 1/3 of the batch"):
-        next(reconstruct_many(model, sources, out, method="vggt"))
+        next(run(out))
     outcomes += [outcome for shard in shards for outcome in shard]
     assert sorted(outcome.name for outcome in outcomes) == list(sources)
     assert [outcome.name for outcome in outcomes if outcome.status != "done"] == ["clip2"]
     assert not (out / PAGE_NAME).exists()
-    again = list(reconstruct_many(model, sources, out, method="vggt"))
+    again = list(run(out))
     assert {outcome.name for outcome in again if outcome.status == "kept"} == set(sources) - {"clip2"}
     assert {path.name for path in out.iterdir()} == {path.name for path in (tmp_path / "one").iterdir()}
     for path in (tmp_path / "one").glob(f"*/{ARCHIVE_NAME}"):

@@ -85,7 +85,9 @@ def test_the_stages_of_a_method(lower, method):
     assert {"image features", "first pass", "dynamic mask", "assemble"} <= {stage for stage, *_ in lower.outputs}
 
 
-@pytest.mark.parametrize(("precision", "head"), [("tf32", "HIGH"), ("highest", "HIGHEST")])
+@pytest.mark.parametrize(
+    ("precision", "head"), [("tf32", "HIGH"), pytest.param("highest", "HIGHEST", marks=pytest.mark.proof)]
+)
 def test_the_precision_of_products(precision, head):
     """Those of a dense head have the given precision; all others are exact, as is the convolution of the patches."""
     run = partial(forward, config=CONFIG, outputs=("camera", "depth"), precision=precision)
@@ -134,6 +136,7 @@ def test_the_gradient_of_a_dense_head():
     lowered(jax.grad(loss), PARAMS["depth_head"], [array(1, FRAMES, h * w, width) for width in CONFIG.dpt_channels])
 
 
+@pytest.mark.proof
 def test_batches_that_are_drawn_on_the_device():
     run = partial(make_batch, phase=Phase(4, 1, (2,), *SIZE), frames=2)
     lowered(run, *shapes((jax.random.key(0), load_textures("training"))))
