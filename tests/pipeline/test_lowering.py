@@ -73,7 +73,12 @@ def lower():
     return Lower()
 
 
-@pytest.mark.parametrize("method", METHODS)
+OTHERS = [method for method in METHODS if method not in ("vggt4d", "4dvggt-d")]
+
+
+@pytest.mark.parametrize(
+    "method", ["vggt4d", "4dvggt-d", *(pytest.param(name, marks=pytest.mark.proof) for name in OTHERS)]
+)
 def test_the_stages_of_a_method(lower, method):
     """`vggt4d` in bfloat16, the others in float32; one of them with tracks, one with a fitted rule of fusion."""
     dtype = "bfloat16" if method == "vggt4d" else "float32"

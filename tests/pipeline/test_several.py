@@ -10,7 +10,7 @@ from tests.tiny import tiny_model
 from vggtjax import load_clip, reconstruct
 from vggtjax.pipeline.several import reconstruct_methods
 
-METHODS = ("4dvggt-d", "vggt", "vggt4d")
+METHODS = ("4dvggt-d", "vggt4d")
 
 
 @pytest.fixture(scope="module")
