@@ -1,7 +1,6 @@
 """Maps against every Gram matrix, sources of each frame, layers of other depths, and degenerate clips."""
 
 import dataclasses
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +9,6 @@ import pytest
 from jax.sharding import Mesh
 
 from tests import reference
-from tests.eight_devices import printed_by
 from vggtjax import MotionConfig
 from vggtjax.config import Cue
 from vggtjax.errors import InputError
@@ -76,13 +74,6 @@ def test_a_floor_keeps_a_patch_that_one_map_rules_out(floor, exponents, expected
     made = GramCues(MotionConfig(cues, reference_depth=1, floor=floor), 1)
     saliency = made.saliency(sums, None if exponents is None else jnp.array(exponents))
     assert np.allclose(saliency[0, 0], expected, atol=1e-5)
-
-
-@pytest.mark.proof
-def test_eight_devices_have_the_sums_of_one():
-    for frames, off in printed_by(Path(__file__).with_name("cues_on_devices.py")).items():
-        assert len(off) == 3, frames
-        assert max(off) < 1e-6, frames
 
 
 def test_clips_of_different_lengths_in_one_batch_have_the_sums_of_each_alone():
