@@ -41,7 +41,7 @@ def golden_config() -> VGGTConfig:
 def golden_params(seed: int) -> Params:
     """Return the tiny model's parameters for a seed."""
     shapes = json.loads((GOLDEN / "shapes.json").read_text())
-    return jax.tree.map(jax.numpy.asarray, convert_state_dict(seeded_state_dict(shapes, seed), golden_config()))
+    return jax.device_put(convert_state_dict(seeded_state_dict(shapes, seed), golden_config()))
 
 
 class GoldenPass:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from vggtjax import init_params
 from vggtjax.checkpoint import Model, save_model
@@ -40,7 +39,7 @@ def tiny_config(**changes: Any) -> VGGTConfig:
 def tiny_model(**changes: Any) -> Model:
     """Return the tiny network with seeded parameters; `changes` replace fields of its configuration."""
     config = tiny_config(**changes)
-    return Model(config, jax.tree.map(jnp.asarray, _params(config)), "tiny")
+    return Model(config, jax.device_put(_params(config)), "tiny")
 
 
 @functools.cache

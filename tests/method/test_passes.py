@@ -151,8 +151,6 @@ def test_passes_take_options_or_their_fields():
         assert jax.eval_shape(partial(run, **options)).second is None
     with pytest.raises(TypeError, match="grams"):
         run(grams="dot")
-    with pytest.raises(InputError, match="mask_pairs is -1"):
-        run(mask_pairs=-1)
     with pytest.raises(InputError, match="method is 'vgtt'; expected one of vggt, vggt4d"):
         run(method="vgtt")
 

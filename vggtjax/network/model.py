@@ -211,7 +211,7 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
             fan_in = leaf.shape[0] if "upsample" in names[-2] else np.prod(leaf.shape[stacked:-1])
             spread = fan_in**-0.5 if names[-1] == "kernel" else 0.02
             values = spread * generator.standard_normal(leaf.shape, np.float32)
-        return jnp.asarray(np.asarray(values, leaf.dtype))
+        return jax.device_put(np.asarray(values, leaf.dtype))
 
     params = jax.tree_util.tree_map_with_path(draw, parameter_shapes(config))
     if "camera" in config.heads:
