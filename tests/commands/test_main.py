@@ -92,6 +92,13 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     again = Reconstruction.load(tmp_path / "again")
     assert np.allclose(again.camera_from_world, result.camera_from_world, atol=1e-5)
 
+    arguments = ("--model", "demo", "--out", tmp_path / "still", "--no-masks", "--only", "cameras")
+    code, _, err = run(capsys, "reconstruct", frames, *arguments)
+    assert code == 0, err
+    still = Reconstruction.load(tmp_path / "still")
+    assert not still.dynamic_mask.any()
+    assert still.settings["refine_mask"] is False
+
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
