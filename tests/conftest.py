@@ -89,6 +89,12 @@ def short_films():
         yield
 
 
+@pytest.fixture
+def empty_reports(monkeypatch):
+    """Leave the report of a saved result empty: it takes a third of the time, and has tests of its own."""
+    monkeypatch.setattr("vggtjax.results.export.report_page", lambda *_: "")
+
+
 @pytest.fixture(scope="module", autouse=True)
 def few_programs():
     """Forget compiled programs before the kernel's limit on a process's mappings, of which each program takes some."""

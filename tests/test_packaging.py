@@ -69,6 +69,20 @@ def test_the_wheel_rebuilds_bit_by_bit(wheel, tmp_path):
     assert build_wheel(again, 0o077).read_bytes() == wheel.read_bytes()
 
 
+def test_every_file_of_the_package_goes_into_the_wheel():
+    package = ROOT / "vggtjax"
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]["package-data"]
+    files = [path.relative_to(package) for path in package.rglob("*") if path.is_file()]
+    data = [path for path in files if path.suffix not in (".py", ".pyc")]
+
+    def fits(path: Path, pattern: str) -> bool:
+        return path.match(pattern) and len(path.parts) == len(Path(pattern).parts)
+
+    assert Path("pretrained/model.safetensors") in data
+    assert [path for path in data if not any(fits(path, pattern) for pattern in patterns["vggtjax"])] == []
+
+
+@pytest.mark.proof
 def test_the_wheel_works_outside_the_repository(wheel, tmp_path):
     assert wheel.stat().st_size < _MOST_BYTES
     with zipfile.ZipFile(wheel) as archive:

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests import chromium
-from vggtjax.app.server import address, listening
+from vggtjax.app.server import listening
 from vggtjax.commands.main import main
 from vggtjax.errors import InputError
 
@@ -51,6 +51,7 @@ def browser():
         yield opened
 
 
+@pytest.mark.proof
 def test_the_demo_clip_in_a_browser(served, browser):
     page = browser.new_page(viewport={"width": 1280, "height": 900})
     requests: list[str] = []
@@ -95,9 +96,3 @@ def test_a_missing_extra_and_a_short_token_are_named(capsys, monkeypatch):
     monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: None)
     assert main(["app"]) == 2
     assert "pip install 'vggtjax[app]'" in capsys.readouterr().err
-
-
-def test_the_printed_address():
-    assert address("127.0.0.1", 7860, None) == "http://127.0.0.1:7860/"
-    assert address("::1", 1, "a") == "http://[::1]:1/?token=a"
-    assert address("0.0.0.0", 1, None) == f"http://{socket.gethostname()}:1/"

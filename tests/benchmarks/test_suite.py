@@ -7,11 +7,6 @@ import pytest
 
 from benchmarks import __main__ as benchmarks
 from benchmarks.suite import ceilings, measure, work, workloads
-from benchmarks.suite.cases import TINY, Case
-from benchmarks.suite.ceilings import Ceilings, Rounds
-from benchmarks.suite.command import measured_rows
-from benchmarks.suite.measure import Measured
-from benchmarks.suite.report import Row
 from benchmarks.suite.workloads import WORKLOADS
 from vggtjax.config import VGGTConfig
 from vggtjax.network.model import parameter_shapes
@@ -52,49 +47,10 @@ def test_work_against_known_figures():
     assert work.flop(work.cues(FULL, 3, LARGE)) == pytest.approx(3 * 6.6e9, rel=0.02)
 
 
-def test_a_run_is_compared_with_the_better_ceilings_around_it():
-    class Scripted(Ceilings):
-        def __init__(self):
-            self.rates = iter([4.0, 2.0, 1.0])
-
-        def measure(self):
-            return {"linear": next(self.rates)}
-
-    rounds = Rounds(2, Scripted())
-    assert list(rounds) == [0, 1]
-    assert rounds.rates == [{"linear": 4}, {"linear": 2}]
-    row = Row("pass", "tiny", 2, 56, 56, "float32", Measured((4.0, 10.0)), [{"linear": 8.0}], rounds.rates)
-    assert row.floor == {"linear": 3}
-    assert row.share_of_floor == pytest.approx((2 / 4 + 4 / 10) / 2)
-    computing, reading = {"linear": 30.0, "exp": 4.0, "weights": 4.0}, {"linear": 10.0, "weights": 3.0}
-    rates = {"linear": 10.0, "exp": 2.0, "weights": 1.0}
-    assert work.floor_by_kind([computing, reading], rates) == {"linear": 3.0, "exp": 2.0, "weights": 3.0}
-
-
-def test_memory_of_the_process_is_seen():
-    kept: list[bytes] = []
-    host, _ = measure.memory_of(lambda: kept.append(b"x" * 200_000_000))  # what others free meanwhile hardly counts
-    again, _ = measure.memory_of(lambda: None)
-    if host is None or again is None:
-        pytest.skip("this system does not tell")
-    assert 190e6 < host < 230e6
-    assert again < 5e6  # what is there already does not count
-
-
-def test_what_does_not_fit_is_a_row_and_not_the_end():
-    def fails(case, rounds):
-        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
-
-    case = Case("tiny", TINY, {}, 2, 56, 56, "float32")
-    (row,) = measured_rows("pass", workloads.Workload("fails", fails), case, 2)
-    assert row.measured.failure == "out of memory"
-
-
-@pytest.mark.parametrize(
-    "names", [("cues", "start-up"), pytest.param(sorted(set(WORKLOADS) - {"two-passes"}), marks=pytest.mark.proof)]
-)
-def test_workloads_run(tmp_path, capsys, monkeypatch, names):
+@pytest.mark.proof
+def test_workloads_run(tmp_path, capsys, monkeypatch):
     """Compiling is timed with a smaller program; fresh processes do nothing but to look for the cache of the first."""
+    names = sorted(set(WORKLOADS) - {"two-passes"})
     monkeypatch.setattr(workloads, "two_passes", workloads.cue_sums)
     look = "import os, pathlib; pathlib.Path(os.environ['VGGTJAX_CACHE']).mkdir(exist_ok=True)"
     monkeypatch.setattr(workloads, "DEMO", ("-c", look))

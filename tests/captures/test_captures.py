@@ -1,6 +1,5 @@
 """Captures of every kind: known points fall on the squares that the pictures have, and broken captures are refused."""
 
-import gc
 import json
 import shutil
 import zipfile
@@ -89,10 +88,8 @@ def test_a_file_of_record3d_is_its_folder(tmp_path):
     part, place = capture.for_frames(["2"]), capture.pictures[0].parent
     assert read(tmp_path / "walk.r3d").pictures[0].parent == place  # not unpacked again
     del capture
-    gc.collect()
     assert part.pictures[0].is_file()
     del part
-    gc.collect()
     assert not place.exists()
     K = json.loads((folder / "metadata").read_text())["K"]
     assert K[6:8] == [50, 33]  # column after column
@@ -264,35 +261,23 @@ IMAGES, CAMERAS, SCENE = "sparse/0/images.txt", "sparse/0/cameras.txt", "transfo
 CAMERA = "keyframes/corrected_cameras/638443502000.json"
 BROKEN = [
     ("nerfstudio", without("images/frame_9.png"), "frame_9.png is missing, but .*transforms.json names"),
-    ("nerfstudio", edit(SCENE, file_path="1" * 5000), "(name too long|is missing)"),
     ("nerfstudio", text("transforms.json", '{"frames": [3]}'), "has no list 'frames'"),
     ("nerfstudio", edit(SCENE, file_path="../secret.png"), "expected a path inside"),
-    ("nerfstudio", edit(SCENE, file_path=3), "without a 'file_path'"),
     ("nerfstudio", edit(SCENE, file_path="images/frame_9.png"), "names a picture twice"),
-    ("nerfstudio", edit(SCENE, transform_matrix=[[1]]), r"'transform_matrix' of shape \(1, 1\)"),
     ("nerfstudio", edit(SCENE, transform_matrix=np.ones((4, 4)).tolist()), "invalid poses"),
     ("nerfstudio", edit(SCENE, fl_x=0), "focal lengths above 0"),
-    ("nerfstudio", edit(SCENE, w=-4), "camera of -4 x 72 pixels"),
     ("nerfstudio", edit(SCENE, w=HEIGHT, h=WIDTH), "expected the same shape"),
     ("nerfstudio", edit(SCENE, camera_model="OPENCV_FISHEYE"), "undistort the pictures"),
     ("polycam", without("keyframes/corrected_images"), "cameras/.*json; export Polycam's raw data"),
-    ("polycam", without("keyframes/corrected_images/638443502000.jpg"), "and no picture for it"),
-    ("polycam", edit(CAMERA, width=0), "picture of 0 x 72"),
     ("record3d", without("rgbd/2.jpg"), "has 3 pictures and 4 poses"),
     ("record3d", edit("metadata", poses=[[0, 0, 0, 2, 0, 0, 0]] * 4), "quaternion of length 2.000"),
-    ("record3d", edit("metadata", perFrameIntrinsicCoeffs=[[1, 1, 1, 1]]), r"shape \(1, 4\)"),
     ("record3d", edit("metadata", dw=10**9), "has depth of 1000000000 x 36 pixels"),
-    ("colmap", without(IMAGES), "cannot read .*images.txt"),
-    ("colmap", without("images"), "no folder images; put the model's pictures there"),
     ("colmap", without("images/view_9.png"), "view_9.png is missing, but .*images.txt names it"),
-    ("colmap", text(IMAGES, ""), "has no image; expected a model"),
     ("colmap", text(IMAGES, "1 2 3"), "expected IMAGE_ID QW QX QY QZ"),
     ("colmap", text(IMAGES, "1 1 0 0 0 0 0 0 1 ../a.png"), "expected a path inside"),
     ("colmap", text(IMAGES, "1 1 0 0 0 0 0 0 9 a.png"), "no such camera"),
     ("colmap", text(CAMERAS, "1 PINHOLE 9 9 1 1"), "2 parameters of a PINHOLE"),
-    ("colmap", text(CAMERAS, "1 PINHOLE wide"), "expected CAMERA_ID MODEL"),
     ("colmap", text(CAMERAS, f"1 PINHOLE {'9' * 400} 9 1 1 1 1"), "expected sides of 1 to 1000000"),
-    ("tum", without("depth"), "is missing, but depth.txt names it"),
     ("tum", text("groundtruth.txt", "5 0 0 0 0 0 0 1"), "no picture of .* has a pose within 0.02 s"),
 ]
 

@@ -42,7 +42,6 @@ def test_a_gif_elsewhere_along_the_camera(result, tmp_path, capsys):
     ("arguments", "message"),
     [
         (["{tmp}"], "there is no {tmp}/reconstruction.npz; give the folder of a saved result or its"),
-        (["{result}", "--size", "huge"], "--size is 'huge'; expected width x height, such as 960x540"),
         (["{result}", "--out", "{tmp}/a.avi"], "{tmp}/a.avi has no known ending of a film; expected one of .mp4"),
         (["{result}", "--out", "{tmp}/no/a.gif"], "there is no folder {tmp}/no for the film; make it, or choose"),
     ],

@@ -26,17 +26,7 @@ def recipe(tmp_path, monkeypatch):
     return path
 
 
-def test_train(recipe, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(command, "_LINE_SECONDS", 0.0)
-    out = tmp_path / "out"
-    command.train(recipe, out, options=RunOptions(log_every=2))
-    said = capsys.readouterr().out
-    assert "step 2 of 6, phase 1, loss " in said
-    assert "6 of 6" in said
-    assert str(out / "model.safetensors") in said
-    assert len(read_metrics(out / "metrics.csv")) == 3
-
-
+@pytest.mark.proof
 def test_the_smoke_recipe_runs_in_seconds(tmp_path, capsys):
     command.train(SMOKE, tmp_path, options=RunOptions(log_every=5))
     captured = capsys.readouterr()
@@ -49,7 +39,8 @@ def test_the_smoke_recipe_runs_in_seconds(tmp_path, capsys):
     assert (model.config.heads, model.config.image_size) == (("camera",), 16)
 
 
-def test_fewer_steps_from_a_model(recipe, tmp_path, capsys):
+def test_fewer_steps_from_a_model_and_a_run_that_goes_on(recipe, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(command, "_LINE_SECONDS", 0.0)
     params = init_params(4, PROBES.model)
     labels = {"note": "first attempt", "untrained_heads": ["camera", "points"]}
     start = save_model(tmp_path / "start.safetensors", params, PROBES.model, **labels)
@@ -63,8 +54,13 @@ def test_fewer_steps_from_a_model(recipe, tmp_path, capsys):
         np.asarray(model.params["backbone"]["class_token"], np.float32), params["backbone"]["class_token"], rtol=0.01
     )
     assert json.loads((out / "recipe.json").read_text())["stages"][0]["steps"] == 2
-    command.train(recipe, out, steps=3, options=RunOptions(dtype="bfloat16"))  # without --init: resumed
+    command.train(recipe, out, steps=3, options=RunOptions(log_every=2, dtype="bfloat16"))  # without --init: resumed
+    said = capsys.readouterr().out
+    assert "step 2 of 3, phase 1, loss " in said
+    assert "3 of 3" in said
+    assert str(out / "model.safetensors") in said
     assert read_model(out / "model.safetensors").note == "first attempt"
+    assert [row["step"] for row in read_metrics(out / "metrics.csv")][-1] == 3
 
 
 def test_bad_input(recipe, tmp_path, monkeypatch):

@@ -6,7 +6,6 @@ import pytest
 
 from tests.room import make_room
 from vggtjax.commands import main as cli
-from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.viewer.page import viewer_page
 from vggtjax.viewer.server import PageServer
@@ -83,20 +82,6 @@ def test_over_ssh_the_tunnel_is_told_and_no_browser_opened(monkeypatch, capsys, 
     assert "The viewer has ended." in out
 
 
-def test_where_no_browser_opens_the_address_is_told(monkeypatch, capsys, folder):
-    ended = Ended(monkeypatch, ssh=False)
-    code, out, _ = run(capsys, folder, "--port", 0)  # the browser's opener says that it did not
-    assert code == 0
-    assert ended.opened == [f"http://127.0.0.1:{ended.port}/"]
-    assert "open the address in one" in out
-    assert "ssh -L" not in out
-    ended.opened.clear()
-    code, out, _ = run(capsys, folder, "--port", 0, "--no-browser")
-    assert code == 0
-    assert ended.opened == []
-    assert "No browser" not in out
-
-
 def test_a_notebook_shows_a_result():
     viewer = make_room(2).view(names=["<b>mine</b>"], height=300)
     cell = viewer._repr_html_()
@@ -105,12 +90,3 @@ def test_a_notebook_shows_a_result():
     assert "<b>" not in viewer.html
     with pytest.raises(InputError, match="2 names for 1 results"):
         viewer_page([make_room(2)], names=["one", "two"])
-
-
-def test_the_summary_tells_how_to_see_a_result(tmp_path, capsys):
-    room, folder = make_room(2), tmp_path / "my dog"
-    room.save(folder)
-    Report().summary(room, folder)
-    assert f"vggtjax view '{folder}'\n" in capsys.readouterr().out
-    Report().summary(room, tmp_path)  # a folder without the arrays
-    assert "vggtjax view" not in capsys.readouterr().out

@@ -117,13 +117,10 @@ def test_rerun_opens_the_recording_and_finds_every_frame(tmp_path, result):
     pytest.importorskip("rerun")
     export_result(result, tmp_path / "out.rrd", "rerun", exporting=Exporting(500))
 
-    def rerun(*arguments):
-        command = [sys.executable, "-m", "rerun", "rrd", *arguments, str(tmp_path / "out.rrd")]
-        environment = os.environ | {"XDG_CONFIG_HOME": str(tmp_path / "config")}  # of its own settings
-        return subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
-
-    assert rerun("verify").returncode == 0
-    chunks = re.findall(r"with (\d+) rows .*? - (/\S+) - data columns: \[(.*)\]", rerun("print", "-v").stdout)
+    command = [sys.executable, "-m", "rerun", "rrd", "print", "-v", str(tmp_path / "out.rrd")]
+    environment = os.environ | {"XDG_CONFIG_HOME": str(tmp_path / "config")}  # of its own settings
+    printed = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+    chunks = re.findall(r"with (\d+) rows .*? - (/\S+) - data columns: \[(.*)\]", printed)
     rows = Counter()
     for count, path, names in chunks:  # a column may lie in several
         rows.update({(column.split("@")[1], path): int(count) for column in names.split()})

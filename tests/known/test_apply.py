@@ -57,24 +57,6 @@ def test_a_capture_that_lacks_something_is_refused(name, message):
         apply_known(TRUE, read_known(KnownGeometry(**known), TRUE, capture=_capture()))
 
 
-def test_depth_in_a_unit_of_the_capture_is_not_in_metres():
-    maps = {Path(f"{frame}.npy"): 3 * TRUE.depth[frame] for frame in range(4)}
-    capture = _capture(metric=False, depth_files=tuple(maps), read_depth_file=maps.__getitem__)
-    found, unit = apply_known(TRUE, read_known(KnownGeometry(known_depths="source"), TRUE, capture=capture))
-    assert unit == pytest.approx(3, rel=1e-5)
-    assert found.length_unit == "unit of the capture"
-    assert found.known_facts["scale"].startswith("3 units of the capture per unit")
-
-
-def test_depth_maps_of_a_capture_are_read_before_the_work():
-    def broken(path):
-        raise InputError(f"{path} is broken")
-
-    capture = _capture(depth_files=(None, None, None, Path("3.png")), read_depth_file=broken)
-    with pytest.raises(InputError, match=r"3\.png is broken"):
-        read_known(KnownGeometry(known_depths="source"), TRUE, capture=capture)
-
-
 def test_pixels_left_out_have_no_points_and_do_not_move():
     sky = np.zeros(TRUE.depth.shape, bool)
     sky[:, :40] = True
@@ -89,13 +71,6 @@ def test_pixels_left_out_have_no_points_and_do_not_move():
     for clip, masks in ((TRUE, np.ones_like(sky)), (padded, inside)):
         with pytest.raises(InputError, match="covers every pixel"):
             read_known(KnownGeometry(), clip, leave_out=masks)
-
-
-def test_opposites_are_refused():
-    with pytest.raises(InputError, match="exclude each other"):
-        KnownGeometry(intrinsics="1,1,1,1", shared_focal=True)
-    with pytest.raises(InputError, match="--baseline and --camera-height each set the scale"):
-        KnownGeometry(baseline="0,1,1", camera_height=1.5)
 
 
 @pytest.mark.parametrize("name", ["intrinsics", "poses", "known_depths", "leave_out"])

@@ -66,11 +66,3 @@ def test_depths_that_do_not_fit_are_refused(tmp_path):
         (tmp_path / "depths.csv").write_text(text)
         with pytest.raises(InputError, match=message):
             apply_known(SMALL, read_known(KnownGeometry(known_depths=str(tmp_path / "depths.csv")), SMALL))
-
-
-@pytest.mark.parametrize(
-    ("baseline", "message"), [("0,7,1", "names frames 0 and 7"), ("1,1,2", "two different"), ("0,1,-2", "I,J,METRES")]
-)
-def test_baselines_that_do_not_fit_are_refused(baseline, message):
-    with pytest.raises(InputError, match=message):
-        apply_known(SMALL, read_known(KnownGeometry(baseline=baseline), SMALL))

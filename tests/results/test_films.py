@@ -1,10 +1,7 @@
-from typing import Any
-
 import numpy as np
 import pytest
 
 from tests.room import make_room
-from vggtjax.errors import InputError
 from vggtjax.results.films import due_frames, film_frames
 
 RED = np.array([220, 40, 30])
@@ -45,14 +42,3 @@ def test_frames_that_are_due(room):
     assert due_frames(times, 1.0, 4, loops=True).tolist() == [0, 1, 2, 3]  # no time to show all of them twice
     assert due_frames(make_room(4, timestamps=None), 1.2, 12, loops=True).tolist() == [0, 1, 2, 3] * 3
     assert due_frames(make_room(1), 1.0, 3, loops=True).tolist() == [0, 0, 0]
-
-
-def test_bad_options_are_found_before_drawing(room):
-    cases: Any = (
-        ({"path": "spiral"}, "path is 'spiral'; expected one of orbit, camera"),
-        ({"size": (8, 90)}, "width is 8; expected 16 to 4096 pixels"),
-        ({"seconds": 1e9}, "at most 10000 frames"),
-    )
-    for options, message in cases:
-        with pytest.raises(InputError, match=message):
-            film_frames(room, **options)

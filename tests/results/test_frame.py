@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from tests.room import make_room
 from vggtjax import Clip, Reconstruction, load_clip
-from vggtjax.errors import InputError
 from vggtjax.results.frame import SAME_SURFACE, enlarged_depth, frame_of
 
 
@@ -88,21 +87,3 @@ def test_valid_pixels_by_hand():
     expected[2, 5:27, 3:40] = True
     np.testing.assert_array_equal(room.valid_pixels, expected)
     np.testing.assert_array_equal(np.stack([frame_of(room, number).valid for number in range(3)]), expected)
-
-
-def test_pictures_are_those_of_the_source_or_else_enlarged():
-    picture = np.random.default_rng(0).integers(0, 256, (30, 40, 3), np.uint8).repeat(5, axis=0).repeat(5, axis=1)
-    result = result_of(load_clip(picture[None], size=112))
-    assert frame_of(result, 0, "original", picture=picture).image is picture
-    enlarged = frame_of(result, 0, "original").image.astype(float)
-    for shift in (-3, 3):  # where it belongs, to a pixel or so
-        assert abs(np.roll(enlarged, shift, axis=1) - picture).mean() > abs(enlarged - picture).mean()
-    with pytest.raises(InputError, match=r"frame 0 is uint8 \(30, 40, 3\); expected uint8 \(150, 200, 3\)"):
-        frame_of(result, 0, "original", picture=picture[::5, ::5])
-
-
-def test_a_frame_that_is_not_there():
-    with pytest.raises(InputError, match="frame is 2; expected 0 to 1"):
-        frame_of(make_room(2), 2)
-    with pytest.raises(InputError, match="resolution is 'full'; expected one of model, original"):
-        frame_of(make_room(2), 0, "full")  # pyright: ignore[reportArgumentType]

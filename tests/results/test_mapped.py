@@ -36,6 +36,7 @@ def room(monkeypatch):
     return make_room(FRAMES)
 
 
+@pytest.mark.usefixtures("empty_reports")
 def test_a_mapped_result_writes_the_files_of_one_in_memory_and_opens_lazily(room, tmp_path):
     room.save(tmp_path / "memory")
     found = mapped(tmp_path / "arrays", room)

@@ -25,11 +25,3 @@ def test_sheet_shows_frames_in_columns(frames):
     pure = (sheet == (255, 235, 60)).all(axis=-1).any(axis=0)  # columns of the outline of the moving box
     starts = np.flatnonzero(np.diff(pure.astype(int)) == 1)
     assert min(frames, 8) <= len(starts) <= 2 * min(frames, 8)
-
-
-def test_a_sheet_has_no_row_for_no_saliency():
-    heights = [
-        previews.contact_sheet(make_room(2, saliency=saliency)).shape[0]
-        for saliency in (None, np.zeros((2, 2, 3)), np.full((2, 2, 3), np.nan), np.full((2, 2, 3), 0.1))
-    ]
-    assert heights[0] == heights[1] == heights[2] < heights[3]

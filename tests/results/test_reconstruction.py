@@ -84,21 +84,17 @@ def nan_at(name, index):
     [
         ({"depth": np.ones((28, 42))}, r"depth has shape \(28, 42\); expected \(frames, rows, columns\)"),
         ({"depth": np.ones((0, 28, 42))}, "none of them 0"),
-        ({"depth_confidence": np.ones((3, 28, 41))}, r"depth_confidence has shape \(3, 28, 41\); expected"),
         ({"saliency": np.zeros((3, 5, 3))}, "5 x 3 patches, which do not divide 28 x 42 pixels"),
         ({"images": np.zeros((3, 28, 42, 3))}, "images has type float64; expected uint8"),
         ({"valid_box": np.array([[0, 0, 42, 28]] * 2 + [[0, 0, 43, 28]])}, r"valid_box of frame 2 is \[0, 0, 43, 28\]"),
         ({"camera_from_world": np.tile(np.diag([1, 1, -1, 1.0])[:3], (3, 1, 1))}, "camera_from_world of frame 0"),
-        (nan_at("camera_from_world", (1, 0, 3)), "camera_from_world of frame 1"),
         (nan_at("intrinsics", (1, 0, 0)), "field of view of frame 1"),
-        (nan_at("timestamps", 0), "timestamps holds nan"),
         (
             {"depth": np.where(np.arange(3)[:, None, None] == 1, np.nan, make_room().depth)},
             r"depth of frame 1 has no finite value, and 1176 of 3528 values .* are not finite; check the weights",
         ),
         ({"depth_confidence": np.full((3, 28, 42), np.inf)}, "depth_confidence of frame 0 has no finite value"),
         ({"settings": {"a": float("nan")}}, "settings cannot be written as JSON"),
-        ({"settings": [1]}, "settings is a list"),
     ],
 )
 def test_fields_that_do_not_fit(changes, message):
@@ -110,13 +106,10 @@ def test_fields_that_do_not_fit(changes, message):
     ("changes", "message"),
     [
         ({"depth": None}, "missing or unknown: depth"),
-        ({"format_version": np.array("1")}, "no format version"),
         ({"format_version": np.array(99)}, "format version 99; expected 1"),
         ({"depth": np.zeros((2, 28, 42))}, "depth has type float64; expected float32"),
-        ({"method": np.zeros(())}, "method has type float64; expected text"),
         ({"settings": np.array("[" * 100_000)}, "recursion"),
         ({"settings": np.array('{"a": ' + "7" * 5000 + "}")}, "settings are not JSON"),
-        ({"settings": np.array('{"a": 1e999}')}, "settings cannot be written as JSON"),
         ({"method": np.frombuffer(b"\xff" * 4, "<U1").reshape(())}, "text that is not Unicode"),
         ({"valid_box": np.zeros((2, 4), np.int64)}, "valid_box of frame 0"),
     ],

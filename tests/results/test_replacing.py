@@ -1,7 +1,6 @@
 """Results saved over earlier files: replaced as a whole, or left untouched."""
 
 import errno
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +10,8 @@ from tests.room import make_room
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results import export
 from vggtjax.results.folder import replacing
-from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.results.saving import GROUPS, Saving, parse_groups
+
+pytestmark = pytest.mark.usefixtures("empty_reports")
 
 
 @pytest.mark.parametrize("name", ["depth", "static.ply"])
@@ -32,8 +31,7 @@ def test_files_of_others_are_never_replaced(tmp_path, name):
         make_room(1).save(tmp_path)
 
 
-@pytest.mark.parametrize("writer", ["encode_depth", "build_scene", "write_page"])
-@pytest.mark.parametrize("earlier", [False, True])
+@pytest.mark.parametrize(("writer", "earlier"), [("encode_depth", False), ("build_scene", True), ("write_page", True)])
 def test_full_disk_leaves_the_earlier_result_untouched(tmp_path, monkeypatch, writer, earlier):
     folder = tmp_path / "result"
     if earlier:
@@ -80,24 +78,6 @@ def test_what_is_no_longer_written_goes_away_as_a_whole(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"reconstruction.npz", "preview", "mask", "notes.txt"}
 
 
-@pytest.mark.parametrize("group", list(GROUPS))
-def test_every_group_is_written_alone(tmp_path, group):
-    track = {"track_positions": np.zeros((2, 1, 2)), "track_visibility": np.ones((2, 1))}
-    room = make_room(2, **track, track_confidence=np.ones((2, 1)), track_frames=np.zeros(1, np.int64))
-    room.save(tmp_path, only=(group,))
-    written = {path.name for path in tmp_path.iterdir()}
-    assert written == {"reconstruction.npz", "tracks.npz", *GROUPS[group]}
-    assert len(Reconstruction.load(tmp_path).depth) == 2
-
-
-def test_groups_are_read_from_text():
-    assert parse_groups(" cameras,depth, depth,") == ("depth", "cameras")
-    with pytest.raises(InputError, match="only is 'nose'; expected one of depth, confidence, cameras, masks"):
-        parse_groups("depth,nose")
-    with pytest.raises(InputError, match="only"):
-        Saving(only="depth")  # pyright: ignore[reportArgumentType]
-
-
 def test_a_new_kind_of_file_is_not_lost(tmp_path):
     with pytest.raises(ValueError, match=r"\['notes.txt'\] would not be moved"), replacing(tmp_path, ()) as new:
         (new / "notes.txt").write_text("written by a new exporter")
@@ -115,11 +95,3 @@ def test_links_are_replaced_and_not_followed(tmp_path):
     make_room(2).save(tmp_path / "result")
     assert set(files(elsewhere)) == {"000000.ply"}
     assert set(files(tmp_path / "result")) == expected_files(2)
-
-
-def test_values_out_of_range():
-    for name, value in (("confidence_percentile", float("nan")), ("resolution", "full"), ("format", "cut3r")):
-        wrong: Any = {name: value}
-        with pytest.raises(InputError, match=f"{name} is .*; expected"):
-            Saving().changed(**wrong)
-    assert Saving(5).changed(layout="vggt4d", resolution="original") == Saving(5, "original", "vggt4d")

@@ -78,22 +78,12 @@ def test_texts_of_strangers_are_shown_and_not_run_and_nothing_is_loaded(tmp_path
     assert report(tmp_path, *hostile)[0] == text  # equal results give equal bytes
 
 
-def test_long_texts_are_cut(tmp_path):
-    settings = {"clip": "x" * 10_000} | {f"name {i} {'n' * 500}": "y" * 10_000 for i in range(300)}
-    text, _ = report(tmp_path, make_room(1, settings=settings))
-    shorter, _ = report(tmp_path, make_room(1))
-    assert len(text) < len(shorter) + 60_000
-    assert "240 more are in reconstruction.npz" in text
-
-
 @pytest.mark.parametrize(
     "changes",
     [
         {"dynamic_mask": np.ones((2, 28, 42), bool), "saliency": None, "timestamps": None},
         {"depth": np.zeros((2, 28, 42), np.float32)},
-        {"camera_from_world": np.tile(np.eye(3, 4, dtype=np.float32), (2, 1, 1))},
         {"camera_from_world": np.stack([np.eye(3, 4), np.c_[np.eye(3), [3e38] * 3]]).astype(np.float32)},
-        {"depth_confidence": np.where(np.arange(42) % 2, 1, 3e38) * np.ones((2, 28, 1), np.float32)},
         {"depth": np.full((2, 28, 42), 1e30, np.float32), "depth_confidence": np.full((2, 28, 42), 1e-30, np.float32)},
     ],
 )
@@ -106,7 +96,7 @@ def test_a_report_that_fails_costs_no_result(tmp_path, monkeypatch, caplog):
     def broken(*_):
         raise ValueError("a chart\nof nothing")
 
-    make_room().save(tmp_path)
+    make_room(1).save(tmp_path, only=("cameras",))
     monkeypatch.setattr(charts, "camera_views", broken)
     make_room(2).save(tmp_path)
     assert len(Reconstruction.load(tmp_path).depth) == 2
@@ -129,11 +119,11 @@ def test_the_path_by_hand():
 
 
 def test_chromium_shows_it(tmp_path, hostile):
-    make_room(settings={"clip": "dog"}).save(tmp_path / "plain", facts=RunFacts({"write": 1.0}))
-    report(tmp_path, *hostile)
     script = """() => [document.documentElement.scrollWidth, [...document.images].every(i => i.naturalWidth > 0),
                        document.querySelector("h1").textContent]"""
     with browser() as opened:
+        make_room(settings={"clip": "dog"}).save(tmp_path / "plain", facts=RunFacts({"write": 1.0}))
+        report(tmp_path, *hostile)
         for file, width in ((tmp_path / "plain" / REPORT_NAME, 1280), (tmp_path / REPORT_NAME, 400)):
             (wide, whole, _), events = look(opened, file, width, script)
             assert not events

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.room import make_room
-from vggtjax.errors import InputError
 from vggtjax.results.shown import shown_points
 from vggtjax.results.thinning import Candidates, EvenThinning, places_in_cube
 
@@ -74,14 +73,3 @@ def test_each_voxel_keeps_its_most_confident_point(seed, budget, chunks, ties):
     assert 1 <= len(kept.pixels) <= budget
     assert (np.diff(kept.pixels) > 0).all()
     assert (0 if ties else np.argmax(confidence)) in kept.pixels  # of equals the first
-
-
-def test_bad_options(room):
-    cases: Any = (
-        ({"static_percentile": 100}, "static_percentile is 100; expected at least 0 and less than 100"),
-        ({"edges": 0.0}, "edges is 0.0; expected a share above 0, or None"),
-        ({"most_static": -1}, "most_static is -1; expected a whole number of at least 0"),
-    )
-    for options, message in cases:
-        with pytest.raises(InputError, match=message):
-            shown_points(room, **options)

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from vggtjax.storage.cache import _say_how_to_keep, _show_warning, cache_folder, say_how_to_keep
+from vggtjax.storage.cache import _say_how_to_keep, _show_warning, say_how_to_keep
 
 PROGRAM = """
 import sys
@@ -28,13 +28,6 @@ jax.jit(lambda x: jnp.tanh(x @ x).sum())(jnp.ones((64, 64))).block_until_ready()
 """
 
 
-def test_the_folder_can_be_named(monkeypatch, tmp_path):
-    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path / "here"))
-    assert cache_folder() == tmp_path / "here"
-    monkeypatch.delenv("VGGTJAX_CACHE")
-    assert cache_folder().name == "vggtjax"
-
-
 def compiled(environment, folder: Path, *arguments: str) -> int:
     command = [sys.executable, "-c", PROGRAM, *arguments]
     made = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -43,29 +36,32 @@ def compiled(environment, folder: Path, *arguments: str) -> int:
     return len(list(folder.glob("*-cache"))) if folder.is_dir() else 0
 
 
-@pytest.mark.parametrize("when", [(), ("late",)])
-def test_compiled_programs_are_kept_where_the_user_says(tmp_path, when):
+@pytest.fixture(scope="module")
+def own(tmp_path_factory):
+    """The environment of a process that has compiled a program, and keeps it below VGGTJAX_CACHE."""
     own = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-    own |= {"VGGTJAX_CACHE": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    assert compiled(own, tmp_path / "compiled", *when) > 0
+    own |= {"VGGTJAX_CACHE": str(tmp_path_factory.mktemp("cache")), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    assert compiled(own, Path(own["VGGTJAX_CACHE"]) / "compiled") > 0
+    return own
+
+
+def test_compiled_programs_are_kept_where_the_user_says(own, tmp_path):
     elsewhere = own | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "elsewhere"), "VGGTJAX_CACHE": str(tmp_path / "b")}
-    assert compiled(elsewhere, tmp_path / "elsewhere", *when) > 0
+    assert compiled(elsewhere, tmp_path / "elsewhere", "late") > 0
     assert not (tmp_path / "b").exists()
 
 
-def test_damaged_entries_are_made_anew(tmp_path):
-    own = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-    own |= {"VGGTJAX_CACHE": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    compiled(own, tmp_path / "compiled")
-    contents = {path: path.read_bytes() for path in (tmp_path / "compiled").glob("*-cache")}
+def test_damaged_entries_are_made_anew(own):
+    folder = Path(own["VGGTJAX_CACHE"]) / "compiled"
+    contents = {path: path.read_bytes() for path in folder.glob("*-cache")}
     damaged = max(contents)
     damaged.write_bytes(contents[damaged][:100])
-    half_written, unused = tmp_path / "compiled" / "jit_other-0-cache", tmp_path / "compiled" / "jit_used-0-cache"
+    half_written, unused = folder / "jit_other-0-cache", folder / "jit_used-0-cache"
     half_written.write_bytes(b"no time of use beside it")
     for path in (unused, unused.with_name("jit_used-0-atime")):
         path.write_bytes(bytes(8))
-    compiled(own, tmp_path / "compiled")
-    assert set((tmp_path / "compiled").glob("*-cache")) == {*contents, unused}
+    compiled(own, folder)
+    assert set(folder.glob("*-cache")) == {*contents, unused}
     assert len(damaged.read_bytes()) > 1000
 
 

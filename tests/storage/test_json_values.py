@@ -7,8 +7,6 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from msgspec import Meta
 
 from vggtjax.errors import CheckpointError, InputError
@@ -61,26 +59,20 @@ def test_valid_text_becomes_the_dataclass():
     ("text", "sentence"),
     [
         ("", "plan a.json is not JSON that can be read: Input data was truncated"),
-        ("[]", "plan a.json is []; expected an object with the fields of Plan"),
         ('{"nmae": "x"}', "plan a.json has unknown fields ['nmae']; expected some of ['name', "),
         ('{"phases": [{"steps": 1}, {"steps": 1, "stesp": 2}]}', "plan a.json: phases[1] has unknown fields ['stesp']"),
         ('{"phases": [{}]}', "plan a.json: phases[0] lacks the field 'steps'"),
         ('{"phases": [{"steps": 0}]}', "phases[0].steps is 0; expected a whole number of at least 1"),
-        ('{"phases": [{"steps": true}]}', "phases[0].steps is True; expected a whole number of at least 1"),
         ('{"phases": [{"steps": 13}]}', "plan a.json: phases[0]: steps is 13; expected any other number"),
         ('{"first": {"steps": 1, "frames": []}}', "first.frames is []; expected a list of at least 1 values"),
-        ('{"first": {"steps": 1, "share": 2}}', "first.share is 2; expected a number of at least 0 and at most 1"),
         ('{"first": {"steps": 1, "kind": "wide"}}', "first.kind is 'wide'; expected one of ('long', 'short')"),
-        ('{"first": 3}', "first is 3; expected an object with the fields of Phase or null"),
         ('{"size": [1]}', "size is [1]; expected a list of 2 values"),
-        ('{"name": 3}', "name is 3; expected text"),
         ('{"scores": {"a": "b"}}', "scores[...] is invalid: Expected `float`, got `str`"),
         ('{"scores": {"a": NaN}}', "is not JSON that can be read"),
         ('{"scores": {"a": 1' + "0" * 400 + "}}", "scores.a is a number of more than 64 bits"),
         ('{"notes": {"a b": [1, 1' + "0" * 400 + "]}}", "notes['a b'][1] is a number of more than 64 bits"),
         ('{"notes": {"a": ' + "[" * 100 + "]" * 100 + "}}", f"is nested more than {MOST_LEVELS} levels deep"),
         (b'{"name": "\xff"}', "is not JSON that can be read"),
-        ('{"name": "\\ud800"}', "is not JSON that can be read"),
     ],
 )
 def test_a_problem_is_one_sentence(text, sentence):
@@ -115,23 +107,6 @@ def test_python_code_meets_the_same_constraints():
         Plan(scores={"a": -math.inf})
     with pytest.raises(InputError, match=r"^phases\[0\] has unknown fields \['x'\]"):
         Plan(phases=({"steps": 1, "x": 2},))  # pyright: ignore[reportArgumentType]
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.sampled_from(["name", "steps", "x"]), inner),
-    max_leaves=6,
-)
-
-
-@settings(suppress_health_check=[HealthCheck.too_slow])
-@given(st.dictionaries(st.sampled_from(["name", "phases", "size", "first", "notes", "scores"]), JSON))
-def test_any_value_is_taken_or_refused(values):
-    try:
-        plan = Plan(**values)
-    except InputError:
-        return
-    assert all(isinstance(phase, Phase) for phase in plan.phases)
 
 
 def test_more_values_than_can_be_looked_at_are_refused():

@@ -113,20 +113,6 @@ def test_the_oldest_go_first(folder, monkeypatch):
     assert not list(folder.iterdir())
 
 
-def test_a_gpu_keeps_text_but_not_programs(tmp_path, monkeypatch):
-    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path))
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    name, makes = "jax_compilation_cache_dir", []
-    earlier = jax.config.values[name]
-    jax.config.update(name, str(tmp_path / "compiled"))
-    try:
-        assert [kept_text("name", lambda: f"text {makes.append(1)}") for _ in range(2)] == ["text None"] * 2
-        assert counted()[0][0]._key((Pair(X), None), {"power": 2})[0] is None
-    finally:
-        jax.config.update(name, earlier)
-    assert len(makes) == 1
-
-
 @pytest.mark.parametrize("damage", [b"", b'{"a": [1,', b"\xff" * 99])
 def test_text_is_kept_and_made_anew_where_it_is_damaged(folder, damage):
     assert kept_text("name", lambda: "one") == "one"

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from tests.room import make_room
-from vggtjax.errors import InputError, ResultError
-from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory
+from vggtjax.errors import ResultError
+from vggtjax.storage.trajectories import Quaternion, read_trajectory, write_trajectory
 
 
 def test_by_hand(tmp_path):
@@ -65,10 +65,3 @@ def test_what_is_no_trajectory(tmp_path, content, message):
     (tmp_path / "t").write_bytes(content)
     with pytest.raises(ResultError, match=message):
         read_trajectory(tmp_path / "t")
-
-
-def test_wrong_arguments(tmp_path):
-    with pytest.raises(InputError, match="quaternion is 'wzyx'; expected one of xyzw, wxyz"):
-        read_trajectory(tmp_path / "t", "wzyx")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ResultError, match=r"cannot read .*: No such file"):
-        read_numbers(tmp_path / "t", 3)

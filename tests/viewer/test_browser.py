@@ -111,31 +111,6 @@ def test_the_page_opens_from_a_file_plays_and_shows_the_frame_that_is_due(page, 
     assert [url for url in page.asked if not url.startswith(("file:", "data:", "blob:"))] == []
 
 
-def test_every_slider_and_the_tracks_change_what_is_drawn(page, room, tmp_path):
-    near = 0.8 * room.depth.max(axis=(1, 2), keepdims=True)  # steps of depth that the slider reaches
-    depth = np.where(room.dynamic_mask, near, room.depth)
-    along = np.linspace(6, 30, FRAMES)[:, None, None] * [1.0, 0.5]
-    tracked = {
-        "track_positions": (along + np.arange(3)[:, None] * [3.0, 2.0]).astype(np.float32),
-        "track_visibility": np.ones((FRAMES, 3), np.float32),
-        "track_confidence": np.ones((FRAMES, 3), np.float32),
-        "track_frames": np.zeros(3, np.int32),
-    }
-    open_page(page, tmp_path, [make_room(FRAMES, HEIGHT, WIDTH, depth=depth, **tracked)])
-    assert page.locator("#steps").get_attribute("max") == "0.3"
-    set_slider(page, "#time", FRAMES - 1)
-    before = drawn(page)
-    sliders = {"steps": 0.3, "size": 3, "least-static": 70, "least-moving": 70, "trail": 4}
-    for name, value in sliders.items():
-        set_slider(page, f"#{name}", value)
-        after = drawn(page)
-        assert (after != before).any(axis=-1).mean() > 1e-3, name
-        before = after
-    page.locator("#tracks").evaluate("box => box.click()")
-    assert (drawn(page) != before).any(axis=-1).sum() > 20
-    assert page.complaints == []
-
-
 def test_two_results_side_by_side_and_swapped_by_a_key(page, room, tmp_path):
     theirs = make_room(FRAMES, HEIGHT, WIDTH, method="vggt")
     open_page(page, tmp_path, [room, theirs], names=["ours", "theirs"])

@@ -1,7 +1,5 @@
 """Points followed from window to window, with a double of the tracker that knows how all places move."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -112,16 +110,6 @@ def test_a_window_that_lost_its_points_has_no_say_in_shared_frames():
     off = np.abs(followed(Tracker(always=True, wrong=WINDOWS[1].start), queries).positions - truth(queries))
     assert off[: WINDOWS[0].stop].max() < 0.2  # 20 pixels apart, for a thousandth of the weight
     assert off[WINDOWS[0].stop].max() > 10
-
-
-def test_a_window_that_sees_no_points_of_its_own_keeps_none():
-    """What is kept of a long clip are the points in the window that they are given in, not all windows."""
-    tracemalloc.start()
-    followed(Tracker(always=True), Queries(np.full((2000, 2), 60.0), np.zeros(2000, np.int64)))
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    clip, window = FRAMES * 2000 * 20, len(WINDOWS[0]) * 2000 * 16
-    assert peak < clip + 12 * window  # arrays of the clip, and of the window that is run
 
 
 def test_the_network_follows_points_as_in_a_clip_that_is_run_at_once():

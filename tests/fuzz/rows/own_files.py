@@ -4,37 +4,27 @@ from __future__ import annotations
 
 import json
 import os
-from contextlib import suppress
-from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import jax
 import numpy as np
 
 from tests.dataset_files import npy
 from tests.fuzz.cases import Reader
 from tests.fuzz.rows.strangers import file
 from tests.room import make_room
-from tests.simulated import simulate
 from vggtjax.app.posted import cleaned
-from vggtjax.errors import InputError
 from vggtjax.evaluation.page import is_report
-from vggtjax.evaluation.records import Record, Records
-from vggtjax.learning.clip_passes import ClipPasses, kept_passes
-from vggtjax.learning.clip_passes import _read as read_passes
-from vggtjax.learning.fit import FitClips, FitConfig, fit_fusion
-from vggtjax.method.fusion_family import identity
 from vggtjax.pipeline.contact import _read as read_card
 from vggtjax.pipeline.destination import SETTINGS_NAME, LocalFolder, RemoteFolder
 from vggtjax.results.archive import saved_names
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.scenes.dataset import read_index
-from vggtjax.storage import arrays, programs
+from vggtjax.storage import arrays
 from vggtjax.training.metrics import read_metrics
 from vggtjax.windows.loops import find_loops
-from vggtjax.windows.store import WindowStore, unfinished_cut, write_cut
+from vggtjax.windows.store import WindowStore
 from vggtjax.windows.whole import window_name
 
 
@@ -62,45 +52,6 @@ def _read_npz(path: Path) -> None:
     arrays.read_headers(path)
     for array in arrays.read_arrays(path).values():
         array.tofile(os.devnull)  # pages of mapped arrays are read
-
-
-_RECORD = Record("a", "vggt", "ok", {"size": 28}, {"abs_rel": 0.1}, ("a note",), "", 3, {"depth": 0.5})
-
-
-def _record(folder: Path) -> Path:
-    Records(folder).keep(_RECORD, {"abs_rel": np.ones(3)})
-    return folder
-
-
-def _read_record(path: Path) -> None:
-    record = Records(path).kept("a", "vggt", {"size": 28})
-    if record is not None:
-        Records(path).curves(record)
-
-
-def _passes(folder: Path) -> Path:
-    maps: dict[str, Any] = dict.fromkeys(
-        ("depth1", "confidence1", "depth2", "confidence2", "truth"), np.ones((2, 4, 4), np.float32)
-    )
-    maps |= dict.fromkeys(("dynamic_mask", "true_dynamic"), np.zeros((2, 4, 4), bool))
-    maps |= {"saliency": np.ones((2, 2, 2), np.float32), "images": np.zeros((2, 4, 4, 3), np.uint8)}
-    maps |= {"camera_from_world": np.ones((2, 3, 4), np.float32), "intrinsics": np.ones((2, 3, 3), np.float32)}
-    kept_passes({}, lambda: ClipPasses(**maps), folder)
-    return next(folder.glob("*.npz"))
-
-
-def _program(folder: Path) -> Path:
-    programs._keep(folder / "program.bin", b"content" * 30)
-    return folder / "program.bin"
-
-
-def _read_program(path: Path) -> None:
-    assert programs._read_kept(path) in (None, b"content" * 30), "a damaged program is used"
-
-
-def _cut(folder: Path) -> Path:
-    write_cut(folder, 16, 4)
-    return folder
 
 
 _WINDOWS = {"model": "tiny", "window": 3}
@@ -138,32 +89,6 @@ def _read_remote_settings(path: Path) -> None:
         RemoteFolder("s3://bucket/results").begin(_SETTINGS)
 
 
-@cache
-def _fit() -> tuple[Any, ...]:
-    """Return clips to fit to, clips that are held out, and settings: two evaluations after the first."""
-    clips = [FitClips(*simulate(jax.random.key(seed), identity(), (2, 1, 1, 20))) for seed in (0, 1)]
-    return *clips, FitConfig(("scale",), steps=20, clips_at_once=1)
-
-
-def _state(folder: Path) -> Path:
-    """Write the state of a fit that was interrupted after ten of its twenty steps."""
-
-    def stop(_done: int, _total: int | None) -> None:
-        raise KeyboardInterrupt
-
-    with suppress(KeyboardInterrupt):
-        fit_fusion(*_fit(), checkpoint=folder / "state.npz", progress=stop)
-    return folder / "state.npz"
-
-
-def _go_on(path: Path) -> None:
-    blocked = patch("vggtjax.learning.fit._keep")  # a folder in place of the file
-    with blocked, suppress(InputError):  # parameters that give a loss without a value
-        outcome = fit_fusion(*_fit(), checkpoint=path)
-        assert len(outcome.losses) == 3
-        assert np.isfinite(outcome.losses).all(), "a damaged state is gone on from"
-
-
 _SCENES = {"format": "vggtjax scenes", "version": 1, "scenes": ["scene_0000"], "config": {"height": 4}}
 _METRICS = "step,stage,seconds,samples,loss\n1,0,0.5,4,2.5\n2,0,1.0,8,2.25\n"
 _POSTED = {"data": [[{"path": f"/tmp/{'0' * 64}/a.mp4"}], "demo", "vggt", 2, 0], "fn_index": 0, "session_hash": "x"}
@@ -184,12 +109,8 @@ ROWS = (
     Reader("npz", _npz, _read_npz, _ARCHIVE),
     Reader("npy", file("array.npy", npy(np.ones((8, 6), np.float32))), arrays.read_array),
     Reader("result", _archive, _read_archive, _ARCHIVE),
-    Reader("record", _record, _read_record, _ARCHIVE),
     Reader("metrics", file("metrics.csv", _METRICS), read_metrics),
-    Reader("kept passes", _passes, read_passes, _ARCHIVE),
-    Reader("cached program", _program, _read_program),
     Reader("index of scenes", _json("index.json", _SCENES), lambda path: read_index(path.parent)),
-    Reader("cut of windows", _cut, unfinished_cut),
     Reader("stored windows", _windows, _read_windows, _ARCHIVE),
     Reader("request of the app's page", _json("posted.json", _POSTED), _posted),
     Reader(
@@ -198,6 +119,5 @@ ROWS = (
         lambda path: LocalFolder(path.parent).begin(_SETTINGS),
     ),
     Reader("settings at a URL", _json(SETTINGS_NAME, _SETTINGS), _read_remote_settings),
-    Reader("state of a fit", _state, _go_on, _ARCHIVE),
     Reader("evaluation", _json("results.json", _EVALUATION), is_report),
 )

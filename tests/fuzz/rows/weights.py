@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import re
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +16,6 @@ import numpy as np
 from jax import export
 
 from converters.files import read_state_dict
-from converters.hub_record import HubFile, HubRecord, read_record, record_path, write_record
 from tests.dataset_files import write
 from tests.fuzz.cases import Reader
 from tests.fuzz.rows.strangers import file
@@ -139,22 +136,6 @@ def _digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-_HUB_ID = "facebook/VGGT-1B"
-
-
-def _hub_record(folder: Path) -> Path:
-    commit = "0123456789" * 4
-    files = {"model.safetensors": HubFile("a" * 64, "b" * 64), "model.safetensors.index.json": HubFile("c" * 40)}
-    with patch.dict(os.environ, VGGTJAX_CACHE=str(folder)):
-        write_record(_HUB_ID, HubRecord().with_files(commit, files, resolved=True))
-        return record_path(_HUB_ID)
-
-
-def _read_hub_record(path: Path) -> None:
-    with patch.dict(os.environ, VGGTJAX_CACHE=str(path.parents[2])):
-        read_record(_HUB_ID)
-
-
 ROWS = (
     Reader("safetensors", lambda folder: _tensors(folder / "model.safetensors"), _weights),
     Reader("shards with an index", _shards, _weights),
@@ -170,5 +151,4 @@ ROWS = (
     Reader("fusion file", _fusion, load_fusion),
     Reader("training checkpoint", _training_checkpoint, _read_training_checkpoint),
     Reader("artefact", _artefact, _read_artefact, refusals=serve.ArtefactError),
-    Reader("hub record", _hub_record, _read_hub_record),
 )
