@@ -1,14 +1,25 @@
-"""Commands of benchmarks: what one measures of another program, the files that one makes, and bad input."""
+"""A small run of each command in this process, with what its report must contain; and bad input."""
 
+import contextlib
 import json
+import logging
+from concurrent.futures import ThreadPoolExecutor
 
+import jax
 import numpy as np
 import pytest
 
 from benchmarks import __main__ as benchmarks
 from benchmarks import (
+    approximations,
     command_worker,
     embed,
+    known,
+    known_clips,
+    long_clips,
+    memory,
+    refine_cameras,
+    speed,
 )
 from tests.benchmarks.scenes import SIDE, drawn_scenes, tiny_file
 from vggtjax.checkpoint import read_model
@@ -16,6 +27,103 @@ from vggtjax.errors import InputError
 from vggtjax.pretrained.embedded import demo_clip
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    return str(tiny_file(tmp_path_factory.mktemp("model")))
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run a command in this process, on scenes that are not rendered; return what it prints."""
+    for module in (approximations, embed, known_clips, refine_cameras):
+        monkeypatch.setattr(module, "held_out_scenes", drawn_scenes)
+    for module in (known, refine_cameras):
+        monkeypatch.setattr(module, "ProcessPoolExecutor", lambda workers, context: ThreadPoolExecutor(workers))
+    level = logging.getLogger("vggtjax").level
+
+    def command(*arguments) -> str:
+        code = benchmarks.main([str(argument) for argument in arguments])
+        shown = capsys.readouterr()
+        assert code == 0, shown.err
+        return shown.out
+
+    yield command
+    logging.getLogger("vggtjax").setLevel(level)
+    logging.disable(logging.NOTSET)
+
+
+def cells(text: str) -> dict[str, list[str]]:
+    """Return the cells of the rows of markdown tables, by the first."""
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
+    return {first: others for first, *others in rows}
+
+
+@pytest.mark.proof
+def test_approximations(run, tiny, monkeypatch):
+    monkeypatch.setattr(approximations, "WAYS", {"exact": "exact", "merged, 2 x 2": "merged"})
+    monkeypatch.setattr(approximations, "_HEADS", 2)
+    monkeypatch.setattr(approximations, "_WIDTH", 16)
+    small = ["--scenes", "1", "--frames", "4", "--speed", "1", "--height", "28", "--width", "28", "--repeats", "1"]
+    rows = [line.split() for line in run("approximations", "--model", tiny, *small).splitlines() if line.strip()]
+    exact, timed = [row for row in rows if row[0] == "exact"]
+    assert exact[4:] == ["0.00%", "0.00°", "0.00%"]
+    assert timed[3::2] == ["1.00", "1.00"]
+    assert next(row for row in rows if row[0] == "merged,")[-3] != "0.00%"
+
+
+@pytest.mark.proof
+def test_known(run, tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(known_clips, "FRAMES", 4)
+    shown = cells(run("known", "--model", tiny, "--clips", 2, "--seeds", 0, "--folder", tmp_path))
+    assert set(known.ROWS) < set(shown)
+    assert shown["intrinsics"][0].startswith("0.0000, 100 %")
+    assert shown["poses"][1].startswith("0.0000") or "refused" in shown["poses"][-1]
+
+
+@pytest.mark.proof
+def test_refine_cameras(run, tiny, tmp_path):
+    pytest.importorskip("pycolmap")
+    counts = ("--static", 1, "--dynamic", 1, "--workers", 1)
+    shown = run("refine-cameras", "--model", tiny, "--out", tmp_path / "out", "--side", 56, *counts)
+    assert shown.strip() == (tmp_path / "out/report.md").read_text().strip()
+    rows = json.loads((tmp_path / "out/rows.json").read_text())
+    assert [row["kind"] + " " + row["masks"] for row in rows] == [
+        "static mined", "dynamic mined", "dynamic none", "dynamic true",
+    ]  # fmt: skip
+    assert [row["ate"][0] == row["ate"][1] for row in rows] == [not row["refined"] for row in rows]
+
+
+@pytest.mark.proof
+def test_long_clips(run, tiny, tmp_path, monkeypatch):
+    def walk(kind, count, frames, side, seed):
+        config = long_clips.SceneConfig(height=side, width=side, frames=frames)
+        yield jax.tree.map(lambda array: array[0], drawn_scenes(kind, 1, config))
+
+    taken = {"own": 1e6, "total": 2e6, "seconds": 3.0, "processor": 4.0}
+    monkeypatch.setattr(long_clips, "run_command", lambda words, cache, devices=1: taken)
+    monkeypatch.setattr(long_clips, "drawn_walks", walk)
+    small = ["--frames", "8", "--window", "5", "--overlaps", "2", "--walks", "1", "--memory", "6"]
+    shown = run("long-clips", "--model", tiny, "--out", tmp_path, *small)
+    assert len((tmp_path / "paths.csv").read_text().splitlines()) == 1 + 2 * 5
+    assert "6 frames in windows of 5: peak 1 MB of its own, 2 MB with mapped files, 3 s, 4 s of the processors" in shown
+
+
+@pytest.mark.proof
+def test_memory(run, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(
+        memory, "run_command", lambda words, cache, devices: asked.append(words) or {"total": 2e9, "own": 1e9}
+    )
+    monkeypatch.setattr(memory, "predicted_bytes", lambda model, *shape, **how: 2.1e9)
+    monkeypatch.setattr(memory, "EMBEDDED", memory.EMBEDDED[:1])
+    monkeypatch.setattr(memory, "SPLIT", ())
+    shown = run("memory", "--out", tmp_path / "rows.json")
+    assert "embedded, 8 x 64 x 64, float32, 4dvggt-d" in shown
+    assert "1 of 1 within 15 %" in shown
+    assert [words[-6:] for words in asked] == [["--dtype", "float32", "--method", "4dvggt-d", "--window", "0"]]
+    assert json.loads((tmp_path / "rows.json").read_text())[0]["measured"] == 2e9
 
 
 def test_what_a_command_takes(capfd, tmp_path):
@@ -29,18 +137,41 @@ def test_what_a_command_takes(capfd, tmp_path):
 
 
 @pytest.mark.proof
-def test_embed(tmp_path, monkeypatch, capsys):
+def test_embed(run, tiny, tmp_path, monkeypatch):
     for name in ("MODEL", "CLIP"):
         monkeypatch.setattr(embed, name, tmp_path / name)
-    monkeypatch.setattr(embed, "held_out_scenes", drawn_scenes)
     monkeypatch.setattr(embed, "demo_model", lambda: read_model(tmp_path / "MODEL"))
-    tiny, small = str(tiny_file(tmp_path)), f"--scenes 3 --frames 3 --image-size {2 * SIDE}"
-    assert benchmarks.main(["embed", tiny, *small.split()]) == 0
+    shown = run("embed", tiny, "--scenes", 3, "--frames", 3, "--image-size", 2 * SIDE)
     model = read_model(tmp_path / "MODEL")
     assert (model.name, model.config.image_size) == ("demo", 2 * SIDE)
-    assert f"{(tmp_path / 'CLIP').stat().st_size} bytes" in capsys.readouterr().out
+    assert f"{(tmp_path / 'CLIP').stat().st_size} bytes" in shown
     assert demo_clip(tmp_path / "CLIP").images.shape == (3, 2 * SIDE, 2 * SIDE, 3)
     assert embed._by_ranks(np.array([[3, 3], [1, 2], [2, 1.5]])).tolist() == [1, 2, 0]
+
+
+def test_speed(run, tmp_path, monkeypatch):
+    """Stand-ins answer: the public side takes twice the time, and more memory where it does not map its weights."""
+
+    class Answering(contextlib.nullcontext):
+        def __init__(self, side, *arguments):
+            super().__init__(self)
+            self.of = 1 if side == "ours" else 2
+            self.first = 8 if self.of == 2 and "mapped" not in arguments else self.of
+
+        def run(self, *, work, frames, keep=None, mask=None, **shape):
+            if keep:
+                np.savez(keep, pose=np.array([0.0, frames]), mask=np.array([True]))
+            return {"seconds": self.of * frames, "total": 1e9, "own": 0, "since start": self.first * 1e9, "reads": 0}
+
+    monkeypatch.setattr(speed, "Worker", Answering)
+    for name in ("a", "b", "vggt", "vggt4d"):
+        (tmp_path / name).mkdir()
+    files = ("--weights", tmp_path / "a", "--converted", tmp_path / "b", "--peer", tmp_path)
+    shown = run("speed", *files, "--frames", 3, "--both", 4, "--repeats", 2, "--out", tmp_path / "c.json")
+    rows = json.loads((tmp_path / "c.json").read_text())
+    assert [(row["work"], row["frames"]) for row in rows] == [("pass", 3), ("vggt4d", 4), ("4dvggt-d", 4)]
+    plain = next(line.split() for line in shown.splitlines() if line.split()[:1] == ["camera"])
+    assert " ".join(plain[3:]) == "3 3.00 6.00 0.50 1.00 1.00 1.00 0.00 0.00 - 1.00 8.00 0.12 0.0e+00 no"
 
 
 @pytest.mark.parametrize(
@@ -50,6 +181,8 @@ def test_embed(tmp_path, monkeypatch, capsys):
         ("gpu-day --out {tmp} --parts nothing", "parts is 'nothing'; expected one of parity"),
         ("gpu-day --out {tmp}", "is not empty; choose a new folder"),
         ("long-clips --out {tmp}/out --frames 16", "expected at least 0 walks, longer than a window"),
+        ("memory --no-embedded", "nothing is measured"),
+        ("refine-cameras --frames 2", "frames is 2; expected at least 3"),
         ("second-pass --pairs 99", "expected numbers from 1 to 12"),
         ("speed --weights {tmp}/a --converted {tmp}/b --peer {tmp}", "a does not exist"),
         ("suite --against {tmp}/file", "is not a run that --out wrote"),

@@ -1,5 +1,6 @@
 """The benchmark of a model: blind guesses by hand, filmed clips in windows, and a small run of everything."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,8 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from benchmarks import __main__ as benchmarks
+from benchmarks import demo_model
 from benchmarks.blind_guesses import (
     Prior,
     compare,
@@ -15,7 +18,7 @@ from benchmarks.blind_guesses import (
 )
 from benchmarks.real_clips import load_windows, window_starts
 from benchmarks.summaries import comparison_table
-from tests.benchmarks.scenes import SIDE, row
+from tests.benchmarks.scenes import SIDE, drawn_scenes, row, tiny_file
 from tests.tiny import tiny_config
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
@@ -93,3 +96,26 @@ def test_guesses_and_comparisons_by_hand():
     assert not replace(rotation, ratio=0.1).passed  # a clip failed
     assert (missing.model_error, missing.ratio, missing.failed, missing.passed) == (None, None, 3, False)
     assert "FAIL" in comparison_table([rotation])
+
+
+@pytest.mark.proof
+def test_a_small_run_of_everything(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(demo_model, "held_out_scenes", drawn_scenes)
+    monkeypatch.setattr(demo_model, "SUPPRESS", ("zero",))
+    prior = Prior(np.full((SIDE, SIDE), 2.0), np.array([0, 0.1, 0]))
+    monkeypatch.setattr(demo_model, "training_prior", lambda config, scenes, progress: prior)
+    write_clip(tmp_path / "clips/composite/one", frames=4)
+    out, small = tmp_path / "out", "--static 1 --dynamic 1 --seeds 1 --frames 3 --mask-pairs 2 --sweep 1"
+    files = ["--model", str(tiny_file(tmp_path)), "--out", str(out), "--clips", str(tmp_path / "clips")]
+    code = benchmarks.main(["demo-model", *files, *small.split()])
+    shown = capsys.readouterr()
+    assert code == 0, shown.err
+    assert (out / "report.md").read_text().strip() in shown.out
+    for heading in ("guesses: static, 1 clips", "Methods: dynamic", "better than vggt", "Pairs with suppressed"):
+        assert heading in shown.out
+    report = json.loads((out / "report.json").read_text())
+    assert report["composite"]["clips"] == ["one 00000-00002", "one 00001-00003"]
+    assert len(report["composite ladder"]["rows"][0]) == 2 * (1 + 3 * 2 * 2)
+    assert len(report["dynamic"]["summaries"]) == 1 + 3 * 2
+    for name in ("dynamic-zero", "dynamic-sweep-4dvggt-d", "composite-ladder-zero"):
+        assert (out / f"{name}.png").is_file()
