@@ -15,7 +15,7 @@ from tests.training_runs import SHORT, init_probes
 from vggtjax.errors import CheckpointError
 from vggtjax.training.checkpoints import _explaining, latest, restore, save
 from vggtjax.training.recipe import OptimiserConfig
-from vggtjax.training.state import initial_state, state_shapes
+from vggtjax.training.state import state_shapes
 
 
 @pytest.fixture(scope="module")
