@@ -6,7 +6,7 @@ import pytest
 
 from tests.scored_room import SETTINGS, Perfect, run, stage
 from vggtjax.commands.report import Report
-from vggtjax.errors import InputError, ResultError
+from vggtjax.errors import ResultError
 from vggtjax.evaluation.page import write_report
 from vggtjax.evaluation.records import Records
 from vggtjax.evaluation.run import Scoring, evaluate
@@ -47,7 +47,7 @@ def test_sequences_of_odd_names_are_scored_and_shown(tmp_path, three, capsys):
     assert not again.calls
 
 
-def test_a_sequence_that_raises_is_a_row(tmp_path, three):
+def test_a_sequence_that_raises_is_a_row(tmp_path, three, caplog):
     room, (sequence, *_) = three
 
     def broken(frame):
@@ -67,19 +67,10 @@ def test_a_sequence_that_raises_is_a_row(tmp_path, three):
     assert records[1].reason.startswith("ZeroDivisionError: [/x] zzz")
     assert records[2].reason == "IndexError: index 9 is out of bounds"
     assert all(record.reason.isprintable() and len(record.reason) <= 1000 for record in records)
+    assert "in results" in caplog.text  # the traceback of a mistake in the program
     write_report(tmp_path / "out", records, store, SETTINGS | {"root": "caf\udce9"})
     assert "IndexError" in (tmp_path / "out/index.html").read_text()
     assert "IndexError" in (tmp_path / "out/results.csv").read_text()
-
-
-def test_the_log_has_the_traceback_of_errors_of_the_program_alone(tmp_path, three, caplog):
-    room, (sequence, *_) = three
-    openers = {name: (lambda name=name: dataclasses.replace(sequence, name=name)) for name in ("program", "library")}
-    source = Picky(room, {"program": IndexError("index 9"), "library": InputError("no such result")})
-    evaluate(openers, source, Records(tmp_path), SETTINGS, Scoring(), on_stage=stage)
-    assert "in results" in caplog.text
-    assert "IndexError: index 9" in caplog.text
-    assert "no such result" not in caplog.text
 
 
 def test_broken_curves_are_named_and_made_again(tmp_path, three):

@@ -4,7 +4,6 @@ from functools import partial
 from pathlib import Path
 
 import jax
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -49,24 +48,16 @@ def test_other_numbers_of_steps_keep_the_shares(steps):
     [
         ("{", "is not JSON"),
         ("[" * 100_000, "not JSON"),
-        ("[]", "expected an object"),
-        (json.dumps({"name": "x"}), "lacks the field 'stages'"),
         (changed(model={"taps": [10**400] * 4}), r"model.taps\[0\] is a number of more than 64 bits"),
         (changed(optimiser={"kind": []}), r"optimiser.kind is \[\]; expected one of"),
         (changed(stages=[PHASE | {"speed": 2}]), r"stages\[0\] has unknown fields \['speed'\]"),
-        (changed(stages=[PHASE | {"steps": 0}]), r"stages\[0\].steps is 0; expected a whole number of at least 1"),
         (changed(stages=[PHASE | {"height": 30}]), "multiples of the model's patch_size 14"),
         (changed(stages=[PHASE | {"pitch": [0, 70]}]), r"stages\[0\]: pitch\[1\] is 70.0; expected a number"),
         (changed(stages=[PHASE | {"suppressed_pairs": [0.5, 0.2]}]), r"suppressed_pairs is \(0.5, 0.2\); expected"),
         (changed(stages=[PHASE | {"sizes": [[28, 42]]}]), r"sizes is .*; expected sizes other than \(28, 42\)"),
         (changed(optimiser={"learning_rate": float("nan")}), "is not JSON"),
-        (changed(optimiser={"warmup_steps": 7}), "warm-up and decay take"),
-        (changed(model={"depth": "4"}), "depth"),
-        (changed(losses={"depth": -1}), "losses.depth is -1"),
         (changed(trainable="camera"), "recipe: trainable is 'camera'"),
         (changed(untrained=["neck"]), r"recipe.untrained has \['neck'\]"),
-        (changed(remat=1), "recipe: remat is 1; expected true or false"),
-        (changed(name="a\nb"), "recipe.name"),
     ],
 )
 def test_bad_recipes_are_named(text, says):

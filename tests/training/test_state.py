@@ -16,7 +16,7 @@ from vggtjax.training.objective import LossWeights
 from vggtjax.training.objective import init_probes as scenes_probes
 from vggtjax.training.objective import objective as scenes_objective
 from vggtjax.training.recipe import OptimiserConfig, Phase
-from vggtjax.training.state import compute_dtype, initial_state
+from vggtjax.training.state import initial_state
 
 
 @pytest.fixture(scope="module")
@@ -98,9 +98,3 @@ def test_fine_tuning_on_generated_clips(tmp_path):
         losses.append(float(metrics["loss"]))
     assert losses[-1] < losses[0]
     assert same(state.trained["model"]["aggregator"], params["aggregator"])
-
-
-def test_compute_dtype_follows_the_device():
-    expected = "bfloat16" if jax.default_backend() == "gpu" else "float32"
-    assert compute_dtype(RECIPE) == expected
-    assert compute_dtype(dataclasses.replace(RECIPE, compute_dtype="bfloat16")) == "bfloat16"
