@@ -47,11 +47,8 @@ def test_errors_are_those_of_the_second_pass(model):
     assert list(found.errors) == [(1, "otsu"), (2, "otsu"), (1, "multi-otsu"), (2, "multi-otsu")]
     assert len(set(found.errors.values())) == 4
     setting = Setting(1, "multi-otsu")
-    motion = dataclasses.replace(model.config.motion, mask_pairs=setting.pairs, threshold=setting.threshold)
-    asked = dataclasses.replace(model, config=dataclasses.replace(model.config, motion=motion))
-    rows = [
-        [_errors(row) for row in ladder(asked, clip, methods=["vggt", "4dvggt-d"], masks=["mined"])] for clip in clips
-    ]
+    ways = {"masks": ["mined"], "mask_pairs": [setting.pairs], "threshold": setting.threshold}
+    rows = [[_errors(row) for row in ladder(model, clip, methods=["vggt", "4dvggt-d"], **ways)] for clip in clips]
     scored = [each for each in rows if np.isfinite(each).all()]
     assert found.scenes == len(scored) > 0
     np.testing.assert_allclose([found.first, found.errors[setting]], np.mean(scored, axis=0), rtol=1e-4)

@@ -19,7 +19,7 @@ POINTS = Queries(np.array([[10, 12], [40, 30], [5.5, 50], [33, 33]]), np.array([
 
 @pytest.fixture(scope="module")
 def config():
-    return tiny_config(track_features=16, track_hidden=48, track_corr_levels=4, track_corr_radius=2)
+    return tiny_config()
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,13 @@ import pytest
 from scipy import ndimage
 from skimage.measure import label
 
-from tests.generated import QUICK
+from tests.generated import QUICK, textures
 from tests.training_runs import CONFIG
 from vggtjax.network.aggregator import aggregate, identity
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.camera_head import predict_pose
 from vggtjax.network.model import init_params
 from vggtjax.network.suppression import Suppression
-from vggtjax.scenes import load_textures
 from vggtjax.training.data import make_batch
 from vggtjax.training.objective import LossWeights, init_probes, objective, with_counts
 from vggtjax.training.recipe import Phase
@@ -31,7 +30,7 @@ render = jax.jit(make_batch, static_argnums=(2, 3), compiler_options=QUICK)
 
 
 def drawn(phase, key=0):
-    return render(jax.random.key(key), load_textures("training"), phase, 2)
+    return render(jax.random.key(key), textures(), phase, 2)
 
 
 @pytest.fixture(scope="module")
