@@ -169,13 +169,14 @@ def test_a_soft_mask_is_recovered():
 
 
 def test_bad_settings_are_one_sentence():
-    for change, sentence in (
+    cases: Any = (
         ({"objective": "least squares"}, "objective is 'least squares'"),
         ({"decay": 1.5}, "decay is 1.5"),
         ({"family": "calibrated"}, "family is 'calibrated'; expected a list"),
         ({"family": ("scale", "nothing")}, "family has 'nothing'"),
         ({"family": ("temperature",), "objective": "joint"}, "does not see soft masks"),
-    ):
+    )
+    for change, sentence in cases:
         with pytest.raises(InputError, match=sentence):
             FitConfig(**change)
 

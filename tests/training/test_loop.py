@@ -87,7 +87,8 @@ def test_an_interrupted_run_gives_the_same_numbers(straight, tmp_path, undrawn):
 
         with pytest.raises(error) as raised:
             train(SHORT, tmp_path, options=RunOptions(log_every=2), progress=interrupt, task=TASK)
-        assert error is KeyboardInterrupt or raised.value.code == 143
+        if isinstance(raised.value, SystemExit):
+            assert raised.value.code == 143
         assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
         assert latest(tmp_path / "checkpoints") == step
         assert read_model(tmp_path / "model.safetensors").config == SHORT.model
