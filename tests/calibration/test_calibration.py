@@ -4,7 +4,7 @@ import dataclasses
 import json
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -258,11 +258,12 @@ def test_clips_and_models_that_do_not_fit(model, clips):
 
 
 def test_a_choice_that_cannot_be(swept):
-    for arguments, sentence in (
+    cases: Any = (
         ({"max_terms": 0}, "max_terms is 0"),
         ({"min_gain": -0.1}, "min_gain is -0.1"),
         ({"floor": 1.5}, "floor is 1.5"),
-    ):
+    )
+    for arguments, sentence in cases:
         with pytest.raises(InputError, match=sentence):
             choose(swept, **arguments)
 

@@ -43,7 +43,7 @@ def test_points_of_any_frame(params, config, clip, tracked):
     turned = dataclasses.replace(clip, images=np.roll(clip.images, -2, axis=0))
     first = Queries(POINTS.points[chosen], np.zeros(2, int))
     made = reconstruct(Model(config, params, "tiny"), turned, size=56, method="vggt", tracks=first)
-    back = np.roll(made.track_positions, 2, axis=0)
+    back = np.roll(np.asarray(made.track_positions), 2, axis=0)
     assert np.abs(tracked.track_positions[:, chosen] - back).max() < 2e-2  # sines of a thousand times the flow
     for frame in (0, 2):
         chosen = POINTS.frames == frame
