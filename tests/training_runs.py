@@ -6,11 +6,14 @@ import jax
 import jax.numpy as jnp
 
 from tests.tiny import tiny_config
+from tests.training_objective import objective
 from vggtjax.config import VGGTConfig
+from vggtjax.training import loop
+from vggtjax.training.devices import placement
 from vggtjax.training.loop import Task
 from vggtjax.training.metrics import read_metrics
 from vggtjax.training.recipe import OptimiserConfig, Phase, Recipe
-from vggtjax.training.state import Metrics, TrainingState, apply_gradient, loss_and_gradient
+from vggtjax.training.state import Metrics, TrainingState
 
 CONFIG = tiny_config(
     image_size=28,
@@ -22,7 +25,7 @@ CONFIG = tiny_config(
 )
 RECIPE = Recipe(
     name="tiny",
-    stages=(Phase(4, 2, (2, 3), 28, 28, sizes=((28, 42),)), Phase(2, 1, (2,), 28, 42)),
+    stages=(Phase(4, 2, (2, 3), 28, 28, sizes=((28, 42),)), Phase(2, 2, (2,), 28, 42)),
     model=CONFIG,
     optimiser=OptimiserConfig(learning_rate=1e-2, warmup_steps=2, decay_steps=2),
     untrained=("track_head", "depth_head", "point_head"),
@@ -46,22 +49,11 @@ def for_workers(batch, config: VGGTConfig):
     return batch
 
 
-def objective(trained, batch, config, weights, *, compute_dtype, remat):
-    """Pull the probes' colour and the camera head's pose to the clips."""
-    colour = batch.mean(axis=(1, 2, 3))
-    found = colour @ trained["probes"]["mean"]["kernel"] + trained["probes"]["mean"]["bias"][None]
-    colour_loss = jnp.mean(jnp.sum((found - colour) ** 2, axis=-1))
-    pose = trained["model"]["camera_head"]["pose_branch"]["fc2"]
-    distance = pose["kernel"][None] - colour.mean(axis=-1)[:, None, None]
-    pose_loss = jnp.mean(distance**2) + jnp.mean(pose["bias"] ** 2)
-    loss = weights.translation * colour_loss + weights.rotation * pose_loss
-    return loss, {"colour_loss": colour_loss, "pose_loss": pose_loss}
-
-
 def train_step(state: TrainingState, batch, recipe: Recipe, objective) -> tuple[TrainingState, Metrics]:
-    """Do one step of training."""
-    metrics, gradient = loss_and_gradient(state.trained, batch, recipe, objective)
-    return apply_gradient(state, gradient, metrics, recipe)
+    """Do one step of training by the programs of the loop, of which one consumes its state."""
+    state, batch = jax.device_put(jax.device_get((state, batch)), placement(recipe).whole)
+    metrics, gradient = loop._loss_and_gradient(state.trained, batch, recipe, objective)
+    return loop._apply_gradient(state, gradient, metrics, recipe)
 
 
 def measured(path):

@@ -4,7 +4,7 @@ import dataclasses
 import json
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -243,36 +243,29 @@ def test_another_model_is_not_replaced(tmp_path, model, swept, choice):
     assert (tmp_path / MODEL).read_text() == "weights"
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        (lambda images, masks: (images[:, :1], masks[:, :1]), "at least two frames"),
-        (lambda images, masks: (images, masks[:, :, :28]), "mask of shape"),
-        (lambda images, masks: ([images[0], images[1][:3]], [masks[0], masks[1][:3]]), "one shape"),
-    ],
-)
-def test_clips_that_do_not_fit(model, clips, change, sentence):
-    with pytest.raises(InputError, match=sentence):
-        sweep(model.params, zip(*change(*clips), strict=True), model.config)
-
-
-def test_a_model_without_numbers(model, clips):
+def test_clips_and_models_that_do_not_fit(model, clips):
+    images, masks = clips
+    for pictures, moving, sentence in (
+        (images[:, :1], masks[:, :1], "at least two frames"),
+        (images, masks[:, :, :28], "mask of shape"),
+        ([images[0], images[1][:3]], [masks[0], masks[1][:3]], "one shape"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            sweep(model.params, zip(pictures, moving, strict=True), model.config)
     broken = model.params | {"aggregator": model.params["aggregator"] | {"camera_token": np.full((2, 1, 16), np.nan)}}
     with pytest.raises(InputError, match="not finite"):
         sweep(broken, zip(*clips, strict=True), model.config)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
+def test_a_choice_that_cannot_be(swept):
+    cases: Any = (
         ({"max_terms": 0}, "max_terms is 0"),
         ({"min_gain": -0.1}, "min_gain is -0.1"),
         ({"floor": 1.5}, "floor is 1.5"),
-    ],
-)
-def test_a_choice_that_cannot_be(swept, arguments, sentence):
-    with pytest.raises(InputError, match=sentence):
-        choose(swept, **arguments)
+    )
+    for arguments, sentence in cases:
+        with pytest.raises(InputError, match=sentence):
+            choose(swept, **arguments)
 
 
 def test_nothing_to_tell_apart(swept):
@@ -309,9 +302,9 @@ def test_arguments_are_checked_before_the_model_is_loaded(tmp_path):
 
 
 def test_scenes_of_a_seed():
-    first, second = generated_clips(2, 2, 28, seed=3)
-    again, _ = generated_clips(2, 2, 28, seed=3)
-    assert first.images.shape == (2, 28, 28, 3)
-    assert first.dynamic_mask.shape == (2, 28, 28)
+    first, second = generated_clips(2, FRAMES, SIZE, seed=3)
+    again, _ = generated_clips(2, FRAMES, SIZE, seed=3)
+    assert first.images.shape == (FRAMES, SIZE, SIZE, 3)
+    assert first.dynamic_mask.shape == (FRAMES, SIZE, SIZE)
     assert (first.images == again.images).all()
     assert not (first.images == second.images).all()

@@ -21,7 +21,7 @@ from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.method.mask import upsample
 from vggtjax.options import LADDER
 
-CLIPS, FRAMES, SIZE = 3, 4, (42, 56)
+CLIPS, FRAMES, SIZE = 3, 4, (28, 42)
 SETTING = ("method", "mask_source", "mask_pairs", "suppress")
 
 
@@ -45,7 +45,7 @@ def truth() -> Truth:
     depth = np.exp(0.3 * generator.normal(size=(CLIPS, FRAMES, H, W))).astype(np.float32)
     depth[:, :, :3] = 0  # not measured
     mask = np.zeros((CLIPS, FRAMES, H, W), bool)
-    mask[:, :, 10:30, 20:40] = True
+    mask[:, :, 8:20, 14:30] = True
     rotation = Rotation.from_rotvec(0.1 * generator.normal(size=(CLIPS * FRAMES, 3))).as_matrix()
     poses = np.concatenate([rotation, generator.normal(size=(CLIPS * FRAMES, 3, 1))], axis=2)
     intrinsics = np.tile(np.array([[50, 0, W / 2], [0, 50, H / 2], [0, 0, 1]]), (CLIPS, FRAMES, 1, 1))

@@ -6,7 +6,7 @@ import pytest
 
 from tests.scored_room import SETTINGS, Perfect, run, stage
 from vggtjax.commands.report import Report
-from vggtjax.errors import InputError, ResultError
+from vggtjax.errors import ResultError
 from vggtjax.evaluation.page import write_report
 from vggtjax.evaluation.records import Records
 from vggtjax.evaluation.run import Scoring, evaluate
@@ -17,8 +17,8 @@ NAMES = ["n" * 300, "caf\udce9[/x]"]
 class Picky(Perfect):
     """Raises what no library raises on purpose, for the results of some sequences."""
 
-    def __init__(self, result, errors):
-        super().__init__(result, ["vggt"])
+    def __init__(self, result, errors, method):
+        super().__init__(result, [method])
         self.errors = errors
 
     def results(self, names, sequence, on_stage):
@@ -28,27 +28,10 @@ class Picky(Perfect):
 
 
 @pytest.mark.filterwarnings("ignore:the field of view")
-def test_sequences_of_odd_names_are_scored_and_shown(tmp_path, three, capsys):
+def test_sequences_of_odd_names_are_scored_and_those_that_raise_are_rows(tmp_path, three, capsys, caplog):
     room, (sequence, *_) = three
     less = dataclasses.replace(sequence, mask=None, world_from_camera=None, intrinsics=None)  # and so less to draw
     sequences = [dataclasses.replace(less, name=name) for name in NAMES]
-    out, report = tmp_path / "out", Report()
-    store = Records(out)
-    openers = {each.name: (lambda each=each: each) for each in sequences}
-    with report.running():
-        records = evaluate(openers, Perfect(room, ["[/y]"]), store, SETTINGS, Scoring(), on_stage=report.stage)
-    assert [record.status for record in records] == ["ok"] * len(NAMES)
-    assert all(record.name.isprintable() and len(record.name) < 120 for record in records)
-    write_report(out, records, store, SETTINGS)
-    report.means({"[/y]": records[0].metrics})
-    assert "[/y]" in capsys.readouterr().out
-    again = Perfect(room, ["[/y]"])
-    evaluate(openers, again, store, SETTINGS, Scoring(), on_stage=stage)
-    assert not again.calls
-
-
-def test_a_sequence_that_raises_is_a_row(tmp_path, three):
-    room, (sequence, *_) = three
 
     def broken(frame):
         raise ZeroDivisionError("[/x] " + 5000 * "z" + "\n")
@@ -56,30 +39,29 @@ def test_a_sequence_that_raises_is_a_row(tmp_path, three):
     def never():
         raise FileNotFoundError(2, "No such file", "caf\udce9")
 
-    unreadable = dataclasses.replace(sequence, name="unreadable", depth=broken)
-    second = dataclasses.replace(sequence, name="second")
-    openers = {"never": never, "unreadable": lambda: unreadable, "second": lambda: second, "a": lambda: sequence}
-    source = Picky(room, {"second": IndexError("index 9 is out of bounds")})
-    store = Records(tmp_path / "out")
-    records = evaluate(openers, source, store, SETTINGS, Scoring(), on_stage=stage)
-    assert [record.status for record in records] == ["failed"] * 3 + ["ok"]
-    assert "FileNotFoundError: " in records[0].reason
-    assert records[1].reason.startswith("ZeroDivisionError: [/x] zzz")
-    assert records[2].reason == "IndexError: index 9 is out of bounds"
+    sequences += [dataclasses.replace(sequence, name="unreadable", depth=broken)]
+    sequences += [dataclasses.replace(sequence, name=name) for name in ("second", "a")]
+    openers = {each.name: (lambda each=each: each) for each in sequences} | {"never": never}
+    source = Picky(room, {"second": IndexError("index 9 is out of bounds")}, method="[/y]")
+    out, report = tmp_path / "out", Report()
+    store = Records(out)
+    with report.running():
+        records = evaluate(openers, source, store, SETTINGS, Scoring(), on_stage=report.stage)
+    assert [record.status for record in records] == ["ok", "ok", "failed", "failed", "ok", "failed"]
+    assert all(record.name.isprintable() and len(record.name) < 120 for record in records)
+    assert records[2].reason.startswith("ZeroDivisionError: [/x] zzz")
+    assert records[3].reason == "IndexError: index 9 is out of bounds"
+    assert "FileNotFoundError: " in records[5].reason
     assert all(record.reason.isprintable() and len(record.reason) <= 1000 for record in records)
-    write_report(tmp_path / "out", records, store, SETTINGS | {"root": "caf\udce9"})
-    assert "IndexError" in (tmp_path / "out/index.html").read_text()
-    assert "IndexError" in (tmp_path / "out/results.csv").read_text()
-
-
-def test_the_log_has_the_traceback_of_errors_of_the_program_alone(tmp_path, three, caplog):
-    room, (sequence, *_) = three
-    openers = {name: (lambda name=name: dataclasses.replace(sequence, name=name)) for name in ("program", "library")}
-    source = Picky(room, {"program": IndexError("index 9"), "library": InputError("no such result")})
-    evaluate(openers, source, Records(tmp_path), SETTINGS, Scoring(), on_stage=stage)
-    assert "in results" in caplog.text
-    assert "IndexError: index 9" in caplog.text
-    assert "no such result" not in caplog.text
+    assert "in results" in caplog.text  # the traceback of a mistake in the program
+    write_report(out, records, store, SETTINGS | {"root": "caf\udce9"})
+    assert "IndexError" in (out / "index.html").read_text()
+    assert "IndexError" in (out / "results.csv").read_text()
+    report.means({"[/y]": records[0].metrics})
+    assert "[/y]" in capsys.readouterr().out
+    again = Perfect(room, ["[/y]"])
+    evaluate({name: openers[name] for name in NAMES}, again, store, SETTINGS, Scoring(), on_stage=stage)
+    assert not again.calls
 
 
 def test_broken_curves_are_named_and_made_again(tmp_path, three):

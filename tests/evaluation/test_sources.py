@@ -4,6 +4,7 @@ import dataclasses
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 
 from tests.tiny import tiny_model
@@ -22,7 +23,9 @@ def model():
 
 
 def retrained(model):
-    return dataclasses.replace(model, params=jax.tree.map(lambda leaf: leaf * 1.001, model.params))
+    return dataclasses.replace(
+        model, params=jax.tree.map(lambda leaf: np.asarray(leaf) * np.float32(1.001), model.params)
+    )
 
 
 def test_retrained_weights_are_another_model(tmp_path, model):

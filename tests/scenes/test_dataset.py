@@ -12,7 +12,7 @@ from tests.generated import QUICK, textures
 from vggtjax.commands.scenes import Images, scenes
 from vggtjax.errors import InputError, OutputError
 from vggtjax.evaluation.datasets import find_sequences
-from vggtjax.scenes import SceneConfig, dataset, generate
+from vggtjax.scenes import SceneConfig, dataset, generate, load_textures
 from vggtjax.scenes.dataset import read_index, write_scenes
 from vggtjax.scenes.sheet import color_flow, draw_sheet
 from vggtjax.storage.trajectories import read_trajectory
@@ -29,6 +29,11 @@ quick = jax.jit(generate, static_argnums=2, compiler_options=QUICK)
 @pytest.fixture(autouse=True)
 def quickly_compiled(monkeypatch):
     monkeypatch.setattr(dataset, "_draw", quick)
+    monkeypatch.setattr(dataset, "load_textures", kept_textures)
+
+
+def kept_textures(split):
+    return textures() if split == "training" else load_textures(split)
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +42,7 @@ def written(tmp_path_factory):
     out = tmp_path_factory.mktemp("sets") / "new" / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dataset, "_draw", quick)
+        patch.setattr(dataset, "load_textures", kept_textures)
         scenes(out, count=2, images=Images(frames=S, height=H, width=W), seed=3)
     return out
 

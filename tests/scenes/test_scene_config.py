@@ -9,11 +9,7 @@ from vggtjax.scenes import SceneConfig
 def test_bad_values_are_one_sentence():
     cases: Any = (
         ({"height": 7}, "height is 7; expected a whole number of at least 8 and at most 2048"),
-        ({"width": 64.0}, "width is 64.0"),
         ({"dynamic": 1.5}, "dynamic is 1.5; expected a number of at least 0 and at most 1"),
-        ({"shutter": float("nan")}, "shutter is nan"),
-        ({"motion": (1.0, 0.5)}, "the smaller first"),
-        ({"motion": 0.5}, "motion is 0.5; expected a list of 2 values"),
         ({"motion": (0.0, 3.0)}, r"motion\[1\] is 3.0; expected a number"),
         ({"pitch": (0.0, 90.0)}, r"pitch\[1\] is 90.0; expected a number of at least -60 and at most 60"),
         ({"motion": [[10**400], 1]}, r"motion\[0\]\[0\] is a number of more than 64 bits"),

@@ -1,4 +1,4 @@
-"""Random regions of suppressed keys: their shape, their share of the clips, and their effect on the network."""
+"""Batches: regions of suppressed keys, their share of the clips and effect on the network; shares of workers."""
 
 import dataclasses
 from functools import partial
@@ -10,34 +10,43 @@ import pytest
 from scipy import ndimage
 from skimage.measure import label
 
-from tests.generated import QUICK
+from tests.generated import QUICK, textures
 from tests.training_runs import CONFIG
 from vggtjax.network.aggregator import aggregate, identity
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.camera_head import predict_pose
 from vggtjax.network.model import init_params
 from vggtjax.network.suppression import Suppression
-from vggtjax.scenes import load_textures
 from vggtjax.training.data import make_batch
-from vggtjax.training.objective import LossWeights, init_probes, objective
+from vggtjax.training.objective import LossWeights, init_probes, objective, with_counts
 from vggtjax.training.recipe import Phase
 from vggtjax.training.regions import random_regions
 from vggtjax.training.truth import targets
 
-PHASE = Phase(1, 8, (3,), 28, 28)
-CAMERA = LossWeights(depth=0, points=0)
-
+PHASE = Phase(1, 4, (2,), 28, 28, motion=(0.5, 1.0))
+WEIGHTS = LossWeights(depth=0, points=0, match=1, match_layers=(1,), probe=1, moments=1)
 
 render = jax.jit(make_batch, static_argnums=(2, 3), compiler_options=QUICK)
 
 
 def drawn(phase, key=0):
-    return render(jax.random.key(key), load_textures("training"), phase, 3)
+    return render(jax.random.key(key), textures(), phase, 2)
 
 
 @pytest.fixture(scope="module")
 def batch():
-    return drawn(dataclasses.replace(PHASE, suppressed=0.5))
+    return drawn(dataclasses.replace(PHASE, suppressed=0.5, suppressed_pairs=(0.5, 0.75)))
+
+
+@pytest.fixture(scope="module")
+def trained():
+    probes = jax.tree.map(lambda leaf: leaf + 0.01, init_probes(0, CONFIG))
+    return {"model": init_params(0, CONFIG), "probes": probes}
+
+
+@partial(jax.jit, compiler_options=QUICK)
+def terms(trained, batch):
+    return objective(trained, batch, CONFIG, WEIGHTS)[1]
 
 
 def test_regions_are_compact_and_move():
@@ -63,41 +72,46 @@ def test_a_share_of_clips_has_regions_and_the_clips_stay_the_same(batch):
     assert plain.regions is None
     for one, other in zip(plain.clips, batch.clips, strict=True):  # two programs: a ray may pass an edge
         assert np.mean(np.isclose(one, other, atol=1e-4)) > 0.99
-    assert 1 <= int(batch.regions.any((1, 2, 3)).sum()) <= 7
-    assert float(batch.pairs.min()) == float(batch.pairs.max())
-
-
-def test_the_share_of_pairs_is_drawn_from_the_range(batch):
-    """The same draw, moved into the range: the whole one is the default."""
-    phase = dataclasses.replace(PHASE, suppressed=0.5, suppressed_pairs=(0.5, 0.75))
-    assert drawn(phase).pairs[0] == pytest.approx(0.5 + 0.25 * np.float64(batch.pairs[0]), abs=1e-6)
+    assert 1 <= int(batch.regions.any((1, 2, 3)).sum()) <= 3
+    assert 0.5 <= float(batch.pairs.min()) == float(batch.pairs.max()) <= 0.75
 
 
 @pytest.mark.parametrize("suppress", ["zero", pytest.param("drop", marks=pytest.mark.proof)])
-def test_the_objective_suppresses_keys_as_a_second_pass_does(batch, suppress):
-    """The camera loss is that of the network's own suppressed pass; without regions it is the plain pass's."""
+def test_the_objective_suppresses_keys_as_a_second_pass_does(batch, trained, suppress):
+    """The camera loss is that of the network's own suppressed pass."""
     batch = dataclasses.replace(batch, suppress=suppress)
-    model = init_params(0, CONFIG)
-    trained = {"model": model, "probes": init_probes(0, CONFIG)}
-    losses = jax.jit(lambda batch: objective(trained, batch, CONFIG, CAMERA)[1], compiler_options=QUICK)
-    clips = batch.clips
+    model, clips = trained["model"], batch.clips
     pairs = int(np.ceil(float(batch.pairs[0]) * CONFIG.depth))
     middle = slice(CONFIG.patch_size // 2, None, CONFIG.patch_size)
     tokens = jnp.asarray(np.asarray(batch.regions)[:, :, middle, middle])
     assert tokens.any()
 
     @partial(jax.jit, compiler_options=QUICK)
-    def translation_loss(suppression):
+    def translation_loss(tokens):
         patches = encode(model, clips.images, CONFIG)
         grid = patch_grid(clips.images, CONFIG)
+        suppression = Suppression(tokens, suppress, pairs)
         camera, _, _ = aggregate(
             model, patches, CONFIG, grid, captures=[identity] * len(CONFIG.taps), suppression=suppression
         )
         error = jnp.abs(predict_pose(model, camera, CONFIG) - targets(clips).pose_encoding)
         return error[..., :3].sum(axis=-1).mean()
 
-    found = float(losses(batch)["loss_translation"])
-    assert found == pytest.approx(float(translation_loss(Suppression(tokens, suppress, pairs))), rel=1e-5)
-    plain = float(losses(dataclasses.replace(batch, regions=None, pairs=None))["loss_translation"])
-    assert plain == pytest.approx(float(translation_loss(Suppression())), rel=1e-5)
-    assert abs(plain - found) > 1e-5
+    found = float(terms(trained, batch)["loss_translation"])
+    assert found == pytest.approx(float(translation_loss(tokens)), rel=1e-5)
+    assert abs(float(translation_loss(jnp.zeros_like(tokens))) - found) > 1e-5
+
+
+def test_the_loss_of_a_batch_is_the_mean_of_its_shares(batch, trained):
+    """The shares of two workers have different numbers of matches, which some terms are means over."""
+    count = jax.jit(with_counts, static_argnums=1, compiler_options=QUICK)
+
+    def shares(batch):
+        return [jax.tree.map(lambda leaf, i=i: leaf[i : i + 2], batch) for i in (0, 2)]
+
+    whole = jax.device_get(terms(trained, batch))
+    first, second = (jax.device_get(terms(trained, share)) for share in shares(count(batch, CONFIG)))
+    for name, value in whole.items():
+        assert np.mean([first[name], second[name]]) == pytest.approx(value, rel=1e-5), name
+    apart = [float(terms(trained, count(share, CONFIG))["loss_match"]) for share in shares(batch)]
+    assert abs(np.mean(apart) - whole["loss_match"]) > 1e-4 * whole["loss_match"]

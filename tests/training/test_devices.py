@@ -8,15 +8,18 @@ CODE = """
 import dataclasses, jax, numpy as np
 from tests.training_runs import RECIPE
 from vggtjax.training.devices import placement
-doubled = tuple(dataclasses.replace(stage, batch=2 * stage.batch) for stage in RECIPE.stages)
-where = placement(dataclasses.replace(RECIPE, stages=doubled))
-print(len(placement(RECIPE).whole.device_set), len(where.whole.mesh.devices))
+def placed(*sizes):
+    stages = tuple(dataclasses.replace(stage, batch=size) for stage, size in zip(RECIPE.stages, sizes))
+    return placement(dataclasses.replace(RECIPE, stages=stages))
+
+where = placed(4, 2)
+print(len(placed(2, 1).whole.device_set), len(where.whole.mesh.devices))
 print(jax.device_put(np.ones((4, 3)), where.by_clip).addressable_shards[0].data.shape)
 """
 
 
 def test_the_most_devices_that_divide_every_batch():
-    """The phases have batches of 2 and 1: one device. With batches of 4 and 2, two of three."""
+    """One for batches of 2 and 1; two of three for batches of 4 and 2."""
     environment = {"XLA_FLAGS": "--xla_force_host_platform_device_count=3", "PATH": ""}
     environment["PYTHONPATH"] = str(Path(__file__).parents[2])
     made = subprocess.run([sys.executable, "-c", CODE], env=environment, capture_output=True, text=True, check=False)

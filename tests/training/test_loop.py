@@ -1,23 +1,30 @@
+"""The loop of a training run: what it leaves, exact resume, signals, and worker processes that share the clips."""
+
 import dataclasses
+import multiprocessing
 import os
+import shutil
 import signal
+from multiprocessing.process import BaseProcess
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_runs import PROBES, SHORT, TASK, measured
+from tests.training_objective import broken
+from tests.training_runs import PROBES, SHORT, TASK, init_probes, measured
 from vggtjax.checkpoint import read_model
-from vggtjax.errors import CheckpointError, InputError, OutputError, VggtjaxError
+from vggtjax.errors import InputError, OutputError, VggtjaxError
 from vggtjax.network.model import init_params
 from vggtjax.training.checkpoints import latest
 from vggtjax.training.loop import draw_shape, train
 from vggtjax.training.metrics import read_metrics
 from vggtjax.training.options import RunOptions
-from vggtjax.training.recipe import OptimiserConfig, Phase, read_recipe
+from vggtjax.training.recipe import Phase, read_recipe
 from vggtjax.training.run import MOST_SKIPPED
-from vggtjax.training.state import exported
+from vggtjax.training.state import exported, initial_state
+from vggtjax.training.workers import Workers, check_workers
 
 NOW = 1e-9  # seconds: a run that ends after one step
 
@@ -34,6 +41,12 @@ def straight(tmp_path_factory):
     return train(SHORT, out, options=RunOptions(log_every=2), progress=seen.append, task=TASK), out, seen
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Leave out the picture of metrics, which takes half the time of a run as short as these."""
+    monkeypatch.setattr("vggtjax.training.run.plot", lambda *_: None)
+
+
 def test_what_a_run_leaves(straight):
     outcome, out, seen = straight
     assert outcome.finished
@@ -42,7 +55,7 @@ def test_what_a_run_leaves(straight):
         "checkpoints", "metrics.csv", "metrics.png", "model.safetensors", "recipe.json",
     }  # fmt: skip
     rows = read_metrics(out / "metrics.csv")
-    assert [(row["step"], row["stage"], row["samples"]) for row in rows] == [(2, 0, 4), (4, 0, 8), (6, 1, 10)]
+    assert [(row["step"], row["stage"], row["samples"]) for row in rows] == [(2, 0, 4), (4, 0, 8), (6, 1, 12)]
     assert rows[2]["loss"] < rows[0]["loss"]
     assert all(0 <= row["render_share"] < 1 for row in rows)
     assert read_recipe(out / "recipe.json") == SHORT
@@ -58,94 +71,51 @@ def test_what_a_run_leaves(straight):
     assert seen[-1].metrics == rows[-1]
 
 
-@pytest.mark.proof
-def test_interrupted_after_every_step_gives_the_same_numbers(straight, tmp_path):
-    """Also in the middle of an interval that a row averages over, and between stages."""
-    whole, out, _ = straight
-    part = whole
-    for step in range(1, 7):
-        part = train(SHORT, tmp_path, options=RunOptions(log_every=2, seconds=NOW), task=TASK)
-        assert int(part.state.step) == step
-        assert part.finished == (step == 6)
-    assert measured(tmp_path / "metrics.csv") == measured(out / "metrics.csv")
-    assert same(part.state, whole.state)
-    assert (tmp_path / "model.safetensors").read_bytes() == (out / "model.safetensors").read_bytes()
-
-
-def test_a_finished_run_stays(straight):
-    whole, out, _ = straight
-    before = (out / "model.safetensors").stat().st_mtime_ns
-    again = train(SHORT, out, options=RunOptions(log_every=2), task=TASK)
-    assert again.finished
-    assert same(again.state, whole.state)
-    assert (out / "model.safetensors").stat().st_mtime_ns == before
-
-
-@pytest.mark.proof
-def test_a_run_killed_before_its_model_is_written(straight, tmp_path, monkeypatch):
-    """The checkpoint of the last step exists, and the model of an earlier one."""
-
-    def killed(*args, **kwargs):
-        raise RuntimeError("killed")
-
+def test_an_interrupted_run_gives_the_same_numbers(straight, tmp_path, undrawn):
+    """Ended by its time within an interval of metrics, by SIGTERM, and by SIGINT between two stages."""
     whole, out, _ = straight
     train(SHORT, tmp_path, options=RunOptions(log_every=2, seconds=NOW), task=TASK)
-    with monkeypatch.context() as patch:
-        patch.setattr("vggtjax.training.run.save_model", killed)
-        with pytest.raises(RuntimeError, match="killed"):
-            train(SHORT, tmp_path, options=RunOptions(log_every=2), task=TASK)
-    assert latest(tmp_path / "checkpoints") == 6
-    assert train(SHORT, tmp_path, options=RunOptions(log_every=2), task=TASK).finished
-    assert same(read_model(tmp_path / "model.safetensors").params, exported(whole.state, SHORT))
+    assert latest(tmp_path / "checkpoints") == 1
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    for number, step, error in ((signal.SIGTERM, 2, SystemExit), (signal.SIGINT, 4, KeyboardInterrupt)):
+
+        def interrupt(status, number=number, step=step):
+            if status.step == step:
+                with pytest.raises(OutputError, match="another run is writing checkpoints and a model into"):
+                    train(SHORT, tmp_path, task=TASK)
+                os.kill(os.getpid(), number)
+
+        with pytest.raises(error) as raised:
+            train(SHORT, tmp_path, options=RunOptions(log_every=2), progress=interrupt, task=TASK)
+        if isinstance(raised.value, SystemExit):
+            assert raised.value.code == 143
+        assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+        assert latest(tmp_path / "checkpoints") == step
+        assert read_model(tmp_path / "model.safetensors").config == SHORT.model
+    other = init_params(3, SHORT.model)  # a start is read once
+    often = RunOptions(log_every=2, checkpoint_seconds=NOW)
+    assert same(train(SHORT, tmp_path, init=other, options=often, task=TASK).state, whole.state)
+    assert sorted(int(path.name) for path in (tmp_path / "checkpoints").iterdir()) == [5, 6]
+    assert measured(tmp_path / "metrics.csv") == measured(out / "metrics.csv")
     assert (tmp_path / "model.safetensors").read_bytes() == (out / "model.safetensors").read_bytes()
 
 
-def test_one_run_in_a_folder(tmp_path):
-    def again(status):
-        with pytest.raises(OutputError, match="another run is writing checkpoints and a model into"):
-            train(PROBES, tmp_path, task=TASK)
-
-    assert train(PROBES, tmp_path, options=RunOptions(seconds=NOW), progress=again, task=TASK).state.step == 1
-
-
-@pytest.mark.parametrize(
-    ("number", "error"),
-    [(signal.SIGTERM, SystemExit), pytest.param(signal.SIGINT, KeyboardInterrupt, marks=pytest.mark.proof)],
-)
-def test_signals_end_a_run_with_a_checkpoint(straight, tmp_path, number, error):
-    def interrupt(status):
-        if status.step == 4:
-            os.kill(os.getpid(), number)
-
-    handlers = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
-    with pytest.raises(error) as raised:
-        train(SHORT, tmp_path, options=RunOptions(log_every=2), progress=interrupt, task=TASK)
-    if error is SystemExit:
-        assert raised.value.code == 143
-    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == handlers
-    assert latest(tmp_path / "checkpoints") == 4
-    assert read_model(tmp_path / "model.safetensors").config == SHORT.model
-    train(SHORT, tmp_path, options=RunOptions(log_every=2), task=TASK)
-    assert measured(tmp_path / "metrics.csv") == measured(straight[1] / "metrics.csv")
-
-
-def test_checkpoints_are_written_on_the_way(tmp_path):
-    train(PROBES, tmp_path, options=RunOptions(checkpoint_seconds=NOW), task=TASK)
-    assert sorted(int(path.name) for path in (tmp_path / "checkpoints").iterdir()) == [5, 6]
+def test_a_finished_run_stays_and_says_that_its_recipe_has_changed(straight, tmp_path, undrawn, caplog):
+    whole, out, _ = straight
+    copy = shutil.copytree(out, tmp_path / "copy")
+    before = (copy / "model.safetensors").stat().st_mtime_ns
+    faster = dataclasses.replace(SHORT, optimiser=dataclasses.replace(SHORT.optimiser, learning_rate=0.1))
+    again = train(faster, copy, task=TASK)
+    assert again.finished
+    assert same(again.state, whole.state)
+    assert (copy / "model.safetensors").stat().st_mtime_ns == before
+    assert "resuming with the new recipe" in caplog.text
 
 
 def test_a_run_that_only_skips_ends(tmp_path):
     recipe = dataclasses.replace(PROBES, stages=(Phase(MOST_SKIPPED + 50, 1, (2,), 28, 28),))
     with pytest.raises(VggtjaxError, match="50 steps in a row up to step 50 had a loss or gradient"):
         train(recipe, tmp_path, task=dataclasses.replace(TASK, textures=jnp.float32(np.nan)))
-
-
-def test_a_start_is_read_once(tmp_path):
-    params = init_params(9, SHORT.model)
-    begun = train(SHORT, tmp_path, init=params, options=RunOptions(seconds=NOW), task=TASK)
-    assert same(begun.state.trained["model"]["backbone"], params["backbone"])
-    gone_on = train(SHORT, tmp_path, init=init_params(3, SHORT.model), options=RunOptions(seconds=NOW), task=TASK)
-    assert same(gone_on.state.trained["model"]["backbone"], params["backbone"])
 
 
 def test_frames_and_sizes_depend_on_seed_and_step_alone():
@@ -167,19 +137,81 @@ def test_frames_and_sizes_depend_on_seed_and_step_alone():
     assert [frames for frames, *_ in alone] == [frames for frames, *_ in shapes]
 
 
-def test_another_recipe_in_the_folder(tmp_path, caplog):
-    train(PROBES, tmp_path, options=RunOptions(seconds=NOW), task=TASK)
-    muon = OptimiserConfig(kind="muon", warmup_steps=0, decay_steps=0)
-    with pytest.raises(CheckpointError, match=r"another optimiser\.kind"):
-        train(dataclasses.replace(PROBES, optimiser=muon), tmp_path, task=TASK)
-    faster = dataclasses.replace(PROBES.optimiser, learning_rate=0.1)
-    train(dataclasses.replace(PROBES, optimiser=faster), tmp_path, options=RunOptions(seconds=NOW), task=TASK)
-    assert "resuming with the new recipe" in caplog.text
-
-
 def test_bad_arguments(tmp_path):
     with pytest.raises(InputError, match="dtype is 'float16'"):
         RunOptions(dtype="float16")  # type: ignore[arg-type]
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         train(SHORT, tmp_path / "file", task=TASK)
+    task = dataclasses.replace(TASK, objective=lambda *_, **__: (jnp.float32(0), {}))
+    with pytest.raises(InputError, match="cannot be sent to other processes; define it at the top of a module"):
+        train(SHORT, tmp_path, options=RunOptions(workers=2), task=task)
+
+
+def test_two_workers_give_the_numbers_of_one_process(straight, tmp_path, undrawn, monkeypatch):
+    """Where a run begins with one process and resumes with two.
+
+    A terminal's Ctrl-C, which every process gets, does not end the workers: neither at their start nor later.
+    """
+    start = BaseProcess.start
+
+    def interrupt_workers(status):
+        for process in multiprocessing.active_children():
+            assert process.pid is not None
+            os.kill(process.pid, signal.SIGINT)
+
+    def start_and_interrupt(process):
+        start(process)
+        interrupt_workers(None)
+
+    monkeypatch.setattr(BaseProcess, "start", start_and_interrupt)
+
+    whole, out, _ = straight
+    train(SHORT, tmp_path, options=RunOptions(log_every=2, seconds=NOW), task=TASK)
+    options = RunOptions(log_every=2, workers=2)
+    shared = train(SHORT, tmp_path, options=options, progress=interrupt_workers, task=TASK)
+    assert shared.finished
+    found, expected = (
+        [[row[name] for name in sorted(row)] for row in measured(folder / "metrics.csv")] for folder in (tmp_path, out)
+    )
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), shared.state, whole.state)
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.proof
+def test_a_worker_that_ends_is_said_and_the_run_resumes(tmp_path):
+    def kill(status):
+        if status.step == 2:
+            multiprocessing.active_children()[0].kill()
+
+    options = RunOptions(log_every=2, checkpoint_seconds=NOW, workers=2)
+    with pytest.raises(VggtjaxError, match="ended with exit code -9, perhaps for lack of memory; take fewer workers"):
+        train(SHORT, tmp_path, options=options, progress=kill, task=TASK)
+    assert not multiprocessing.active_children()
+    assert latest(tmp_path / "checkpoints") == 2
+    assert train(SHORT, tmp_path, options=RunOptions(), task=TASK).finished
+
+
+def test_an_error_in_a_worker_is_said():
+    trained = initial_state(SHORT, init_probes(0, SHORT.model)).trained
+    with (
+        Workers(SHORT, broken, trained, 1) as workers,
+        pytest.raises(VggtjaxError, match="a worker of the training run failed: ValueError: no such loss") as raised,
+    ):
+        workers.loss_and_gradient(trained, jnp.zeros((2, 2, 28, 28, 3)))
+    assert "in broken" in raised.value.__notes__[0]  # where in the objective
+
+
+def test_workers_that_cannot_share(monkeypatch):
+    with pytest.raises(
+        InputError, match="workers is 3; expected a divisor of the batch of every phase; one is 2 clips"
+    ):
+        check_workers(SHORT, 3)
+    monkeypatch.setattr(jax, "local_device_count", lambda: 8)
+    with pytest.raises(InputError, match="workers is 2, and the CPU is split into 8 devices"):
+        check_workers(SHORT, 2)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with pytest.raises(InputError, match="workers is 2, and jax computes on a gpu; expected 1, or a CPU"):
+        check_workers(SHORT, 2)
+    check_workers(SHORT, 1)

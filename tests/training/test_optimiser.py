@@ -70,13 +70,6 @@ def test_schedules_by_hand():
     np.testing.assert_array_equal(rates(constant, 10, (0, 5, 10)), 0.5)
 
 
-def test_first_adam_step_is_the_sign_of_the_gradient():
-    params = tree()
-    updates = first_updates(recipe_with(), params, params)
-    for update, gradient in zip(jax.tree.leaves(updates), jax.tree.leaves(params), strict=True):
-        np.testing.assert_allclose(update, -0.1 * np.sign(gradient), rtol=1e-3)
-
-
 def test_gradients_are_clipped_together():
     params = {"a": {"bias": jnp.array([3.0])}, "b": {"bias": jnp.array([4.0])}}
     optimiser = make_optimiser(recipe_with(clip_norm=0.5))

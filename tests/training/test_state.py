@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective, train_step
+from tests.training_objective import objective
+from tests.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, train_step
 from vggtjax.checkpoint import read_model, save_model
 from vggtjax.errors import CheckpointError
 from vggtjax.network.model import init_params
@@ -15,17 +16,7 @@ from vggtjax.training.objective import LossWeights
 from vggtjax.training.objective import init_probes as scenes_probes
 from vggtjax.training.objective import objective as scenes_objective
 from vggtjax.training.recipe import OptimiserConfig, Phase
-from vggtjax.training.state import compute_dtype, initial_state
-
-
-@pytest.fixture(scope="module")
-def textures():
-    return load_textures("training")
-
-
-@pytest.fixture(scope="module")
-def step():
-    return jax.jit(train_step, static_argnums=(2, 3))
+from vggtjax.training.state import initial_state
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +33,8 @@ def same(a, b) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
-def test_a_step_moves_heads_and_probes_alone(step, start, batch):
-    state, metrics = step(start, batch, SHORT, objective)
+def test_a_step_moves_heads_and_probes_alone(start, batch):
+    state, metrics = train_step(start, batch, SHORT, objective)
     assert int(state.step) == 1
     assert int(state.skipped) == 0
     for name, module in state.trained["model"].items():
@@ -55,24 +46,24 @@ def test_a_step_moves_heads_and_probes_alone(step, start, batch):
     np.testing.assert_allclose(metrics["learning_rate"], 1e-2 / 3, rtol=1e-6)  # first of two steps of warm-up
 
 
-def test_average_leaves_its_start_behind_early(step, start, batch):
+def test_average_leaves_its_start_behind_early(start, batch):
     state, expected = start, np.asarray(start.trained["probes"]["mean"]["kernel"])
     for done in range(3):
-        state, _ = step(state, batch, SHORT, objective)
+        state, _ = train_step(state, batch, SHORT, objective)
         decay = (1 + done) / (10 + done)  # 0.1, 2/11, 3/12: below ema_decay
         expected = decay * expected + (1 - decay) * np.asarray(state.trained["probes"]["mean"]["kernel"])
     np.testing.assert_allclose(state.ema["probes"]["mean"]["kernel"], expected, rtol=1e-5)
 
 
-def test_steps_that_are_not_finite_change_nothing(step, start, batch):
-    before, _ = step(start, batch, SHORT, objective)
-    after, metrics = step(before, batch * np.nan, SHORT, objective)
+def test_steps_that_are_not_finite_change_nothing(start, batch):
+    before, _ = train_step(start, batch, SHORT, objective)
+    after, metrics = train_step(before, batch * np.nan, SHORT, objective)
     assert same(after[1:4], before[1:4])
     assert (int(after.step), int(after.skipped)) == (2, 1)
-    again, metrics = step(after, batch, SHORT, objective)
+    again, metrics = train_step(after, batch, SHORT, objective)
     # The schedule counts updates: this is the second one.
     np.testing.assert_allclose(metrics["learning_rate"], 2e-2 / 3, rtol=1e-6)
-    straight, _ = step(before, batch, SHORT, objective)
+    straight, _ = train_step(before, batch, SHORT, objective)
     assert same(again.trained, straight.trained)
 
 
@@ -85,7 +76,8 @@ def test_weights_of_another_model_are_refused():
         initial_state(SHORT, init_probes(0, SHORT.model), params)
 
 
-def test_fine_tuning_on_generated_clips(tmp_path, textures):
+@pytest.mark.proof
+def test_fine_tuning_on_generated_clips(tmp_path):
     """The camera head of a saved model takes steps that lower the real objective on one batch of clips."""
     recipe = dataclasses.replace(
         SHORT,
@@ -97,17 +89,12 @@ def test_fine_tuning_on_generated_clips(tmp_path, textures):
     path = save_model(tmp_path / "model.safetensors", params, recipe.model)
     state = initial_state(recipe, scenes_probes(0, recipe.model), read_model(path).params)
     assert same(state.trained["model"], params)
-    batch = jax.jit(scenes_batch, static_argnums=(2, 3))(jax.random.key(1), textures, recipe.stages[0], 3)
-    step = jax.jit(train_step, static_argnums=(2, 3))
+    batch = jax.jit(scenes_batch, static_argnums=(2, 3))(
+        jax.random.key(1), load_textures("training"), recipe.stages[0], 3
+    )
     losses = []
     for _ in range(5):
-        state, metrics = step(state, batch, recipe, scenes_objective)
+        state, metrics = train_step(state, batch, recipe, scenes_objective)
         losses.append(float(metrics["loss"]))
     assert losses[-1] < losses[0]
     assert same(state.trained["model"]["aggregator"], params["aggregator"])
-
-
-def test_compute_dtype_follows_the_device():
-    expected = "bfloat16" if jax.default_backend() == "gpu" else "float32"
-    assert compute_dtype(RECIPE) == expected
-    assert compute_dtype(dataclasses.replace(RECIPE, compute_dtype="bfloat16")) == "bfloat16"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
@@ -174,6 +174,11 @@ def predict(
 
 def parameter_shapes(config: VGGTConfig) -> Params:
     """Return the parameter tree's shapes and dtypes (`jax.ShapeDtypeStruct` leaves) without allocating arrays."""
+    return jax.tree.map(lambda leaf: leaf, _declared(config))  # a copy of the tree: callers may change it
+
+
+@lru_cache(maxsize=16)  # a second for each configuration; a run and its checkpoints ask for one many times
+def _declared(config: VGGTConfig) -> Params:
     declarations = {
         "camera": declare_camera_head,
         "depth": partial(declare_dense_head, kind="depth"),

@@ -61,25 +61,6 @@ def test_easi3r(tmp_path):
     assert sequence.notes[1:] == ("apple: its ground truth is easi3r",)
 
 
-def test_the_cut_of_easi3r_is_the_lower_median_over_all_frames(tmp_path):
-    dycheck_folder(tmp_path / "apple", frames=12)  # six frames of 2 metres at most, six of 4
-    folder = tmp_path / "apple" / "flow3d_preprocessed" / "aligned_depth_anything_colmap" / "1x"
-
-    def depth(frame, **disparities):
-        for name, value in disparities.items():
-            write(folder / f"0_000{name[1:]}.npy", npy(np.full((3, 4), value, np.float32)))
-        return opened("dycheck", tmp_path)[0].depth(frame)
-
-    assert np.allclose(depth(0, f00=-1), 2.5 * 4)  # 1 / 1e-3, so the order is 2 2 2 2 2 4 4 4 4 4 4 1000
-    assert np.allclose(depth(1, f00=1, f10=0), 2.5 * 4)  # 1 2 2 2 2 | 4 4 ... 1000
-    assert np.allclose(depth(1, f01=1), 2.5 * 2)  # 1 1 2 2 2 2 | 4 4 4 4 4 1000
-    with pytest.raises(InputError, match=r"0_00000\.npy has values that are not finite"):
-        depth(1, f00=np.nan)  # the cut is over all frames
-    write(folder / "0_00000.npy", npy(np.ones((4, 3), np.float32)))
-    with pytest.raises(InputError, match=r"0_00000\.npy has shape \(4, 3\)"):
-        depth(0)
-
-
 def test_lidar(tmp_path):
     dycheck_folder(tmp_path / "apple")
     (sequence,) = opened("dycheck", tmp_path, gt="lidar", stride=12)
@@ -130,19 +111,13 @@ SPLIT, CAMERA = "splits/train.json", "camera/0_00000.json"
     ("file", "content", "message"),
     [
         (SPLIT, "{", "is not JSON"),
-        (SPLIT, "[]", r"is \[\]; expected an object"),
         (SPLIT, '{"frame_names": ["a"], "time_ids": ' + "[" * 70 + "]" * 70 + "}", "nested more than 64 levels"),
-        (SPLIT, '{"frame_names": [1, 2]}', "has no list of names"),
-        (SPLIT, '{"frame_names": ["a", "a"]}', "names a frame twice"),
         (SPLIT, '{"frame_names": ["../camera"]}', "expected a path inside"),
         (SPLIT, '{"frame_names": ["0_99999"]}', "names its frame; get the sequence whole"),
-        (CAMERA, "{}", "no numbers under 'orientation'"),
         (CAMERA, camera_json(orientation=[1, 2, 3]), r"'orientation' of shape \(3,\)"),
         (CAMERA, camera_json(orientation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "invalid poses"),
-        (CAMERA, camera_json(position=[float("nan"), 0, 0]), "is not JSON that can be read"),
         (CAMERA, camera_json(position=[10**400, 0, 0]), "is not JSON that can be read|more than 64 bits"),
         (CAMERA, camera_json(focal_length=0.0), "focal lengths above 0"),
-        (CAMERA, camera_json(image_size=[0, 3]), "image_size of 0 x 3"),
     ],
 )
 def test_broken_files_are_refused(tmp_path, file, content, message):

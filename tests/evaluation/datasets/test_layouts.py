@@ -38,16 +38,6 @@ def test_sintel(tmp_path):
     assert np.allclose(sequence.world_from_camera[1], [[0, 0, -1, 3], [0, 1, 0, -2], [1, 0, 0, -2], [0, 0, 0, 1]])
 
 
-def test_sintel_without_ground_truth(tmp_path):
-    training = sintel_folder(tmp_path)
-    for kind in ("depth", "camdata_left"):
-        for path in (training / kind / "alley_2").iterdir():
-            path.unlink()
-    (sequence,) = opened("sintel", tmp_path)
-    assert sequence.depth is sequence.world_from_camera is sequence.intrinsics is None
-    assert sequence.notes[2] == "alley_2: 3 of 3 frames have no camera, frame_0001 first; no cameras"
-
-
 DRIVE = "2011_09_26_drive_0002_sync"
 
 
@@ -140,14 +130,10 @@ LARGE = SINTEL_TAG + struct.pack("<ii", 2**31 - 1, 2**31 - 1) + b"\0" * 48
     ("data_set", "file", "content", "message"),
     [
         ("sintel", DEPTH, dpt(np.ones((3, 4)))[:-1], r"frame_0002\.dpt"),
-        ("sintel", DEPTH, b"HEIP" + dpt(np.ones((3, 4)))[4:], r"frame_0002\.dpt"),
         ("sintel", DEPTH, LARGE, r"frame_0002\.dpt"),
         ("sintel", CAMERA, cam(SINTEL_K, np.eye(3, 4))[:-8], "has 164 bytes"),
         ("sintel", CAMERA, cam(SINTEL_K, 2 * np.eye(3, 4)), "not a rotation"),
-        ("sintel", CAMERA, cam(SINTEL_K, np.full((3, 4), np.nan)), "not finite"),
         ("kitti", CALIBRATION, "P_rect_03: 1", r"calib_cam_to_cam\.txt has no line"),
-        ("kitti", CALIBRATION, "P_rect_02: " + "1 " * 11, r"calib_cam_to_cam\.txt has 11"),
-        ("7scenes", POSE, "1 0 0 0\n0 1 0 0\n0 0 1 0\n", r"pose\.txt has 3 rows; expected a pose of 4 rows"),
         ("7scenes", POSE, "1 0 0 inf\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", r"pose\.txt holds inf"),
         ("7scenes", POSE, "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", r"pose\.txt has invalid poses"),
     ],

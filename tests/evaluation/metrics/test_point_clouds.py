@@ -7,11 +7,9 @@ from sklearn.neighbors import NearestNeighbors
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics import point_clouds
 from vggtjax.evaluation.metrics.point_clouds import (
-    nearest_distances,
     normals_of,
     paired_distance,
     point_cloud_errors,
-    statistics,
 )
 
 TRUTH = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0.0]])
@@ -25,15 +23,6 @@ def test_accuracy_completeness_and_distance_by_hand():
     assert errors.distance_chamfer == pytest.approx((np.mean([errors.accuracy[0], errors.completeness[0]]), 0.875))
     assert errors.normal_consistency is None
     assert paired_distance(PREDICTED[:3], TRUTH) == pytest.approx(((1 + np.sqrt(26) + 0) / 3, 1))
-
-
-def test_the_distances_behind_accuracy_by_hand(monkeypatch):
-    monkeypatch.setattr(point_clouds, "_CHUNK", 3)
-    told = []
-    distances = nearest_distances(PREDICTED, TRUTH, progress=lambda *done: told.append(done))
-    assert distances.tolist() == [1, 5, 0, 0.5]
-    assert told == [(3, 4), (4, 4)]
-    assert statistics(distances) == (1.625, 0.75)
 
 
 def test_normal_consistency_by_hand():
@@ -103,13 +92,9 @@ def test_normals_are_undefined_next_to_holes_and_on_lines():
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda: statistics(TRUTH[:0, 0]), "no distances"),
-        (lambda: nearest_distances(TRUTH, TRUTH[:0]), "second cloud has no points"),
         (lambda: paired_distance(PREDICTED, TRUTH), "4 predicted points and 3 true ones; expected pairs"),
         (lambda: normals_of(TRUTH), r"shape \(3, 3\); expected one for each pixel"),
         (lambda: point_cloud_errors(TRUTH[:0], TRUTH), "predicted cloud has no points"),
-        (lambda: point_cloud_errors(TRUTH[:, :2], TRUTH), r"predicted points have shape \(3, 2\); expected \[N, 3\]"),
-        (lambda: point_cloud_errors(TRUTH, TRUTH * [[1], [1], [np.nan]]), "1 of 3 true points are not finite"),
         (lambda: with_normals(np.ones((2, 3))), r"predicted normals have shape \(2, 3\); expected \(3, 3\)"),
         (lambda: with_normals(np.diag([1, 1, 2.0])), "normal of point 2 has length 2; expected 1"),
         (lambda: with_normals(np.full((3, 3), np.nan)), "no nearest neighbours both have a normal"),

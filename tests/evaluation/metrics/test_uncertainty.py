@@ -89,10 +89,8 @@ ONES = np.ones((1, 2, 2))
 def test_depth_without_uncertainty_is_one_sentence():
     for predicted, truth, precision, sentence in (
         (ONES, ONES, ONES, "all errors are 0"),
-        (ONES, 0 * ONES, ONES, "no errors to compare"),
         (ONES, ONES, ONES[0], r"shapes \(1, 2, 2\), \(1, 2, 2\) and \(2, 2\)"),
         (2 * ONES, ONES, 0 * ONES, "4 of 4 precisions are not above 0"),
-        (2 * ONES, ONES, np.inf * ONES, "4 values of the precision are not finite"),
     ):
         with pytest.raises(InputError, match=sentence):
             uncertainty_scores(predicted, truth, precision)

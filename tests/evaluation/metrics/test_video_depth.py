@@ -74,19 +74,9 @@ def test_scale_and_shift_have_the_least_absolute_error_of_a_linear_program(seed)
     assert found.rmse == pytest.approx(exact.rmse, rel=2e-3)
 
 
-def test_all_frames_share_one_alignment():
-    predicted = np.stack([np.full((2, 2), 1.0), np.full((2, 2), 1.0)])
-    truth = np.stack([np.full((2, 2), 1.0), np.full((2, 2), 99.0)])
-    for align in ("scale", "median"):
-        assert video_depth_errors(predicted, truth, align).delta3 == 0  # 50 is close to neither 1 nor 99
-
-
 def test_depth_that_cannot_be_compared_is_one_sentence():
     cases: Any = (
         (np.ones((2, 1, 3)), TRUTH, {}, "resize the prediction first"),
-        (np.ones((1, 2)), TRUTH[0], {}, r"expected a sequence \[S, H, W\]"),
-        (np.ones((2, 1, 2)), 0 * TRUTH, {}, "no pixel has a true depth above 0 to compare with"),
-        (np.full((2, 1, 2), np.inf), TRUTH, {}, "3 predicted depths are not finite"),
         (np.ones((2, 1, 2)), TRUTH, {"align": "affine"}, "align is 'affine'; expected one of metric, median, scale,"),
         (-np.ones((2, 1, 2)), TRUTH, {}, "the mean of the predicted depth is -1; expected it above 0"),
         (np.zeros((2, 1, 2)), TRUTH, {"align": "scale-shift"}, "is 0 in all valid pixels"),
