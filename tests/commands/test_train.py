@@ -26,7 +26,6 @@ def recipe(tmp_path, monkeypatch):
     return path
 
 
-@pytest.mark.proof
 def test_the_smoke_recipe_runs_in_seconds(tmp_path, capsys):
     command.train(SMOKE, tmp_path, options=RunOptions(log_every=5))
     captured = capsys.readouterr()
