@@ -9,15 +9,9 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gradio", reason="the app needs the extra app")
-pytest.importorskip("httpx", reason="the test client needs httpx")
-
-from starlette.testclient import TestClient
-
 from vggtjax.app.jobs import Desk, Job
 from vggtjax.app.limits import Limits
 from vggtjax.app.models import Models
-from vggtjax.app.server import build_application
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of pandas, which gradio uses
@@ -46,6 +40,12 @@ class Server:
     def __init__(self, folder):
         self.sent: list[bytes] = []
         self.desk = Desk(folder / "app", Models(()), Limits(max_upload_mb=1), self._note)
+        pytest.importorskip("gradio", reason="the app needs the extra app")  # which takes seconds to import
+        pytest.importorskip("httpx", reason="the test client needs httpx")
+        from starlette.testclient import TestClient
+
+        from vggtjax.app.server import build_application
+
         self.app = build_application(self.desk, None, 7860)
         self.client = TestClient(self.app, base_url="http://127.0.0.1:7860")
 

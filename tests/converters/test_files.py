@@ -10,7 +10,6 @@ import jax
 import ml_dtypes
 import numpy as np
 import pytest
-import torch
 from safetensors.numpy import save_file
 
 from converters import convert, convert_state_dict
@@ -25,6 +24,11 @@ from vggtjax.errors import CheckpointError, MissingExtraError
 INDEX = "model.safetensors.index.json"
 SHARDS = [f"model-0000{number}-of-00003.safetensors" for number in (1, 2, 3)]
 KEY = "camera_head.pose_branch.fc1.bias"
+
+
+@pytest.fixture(scope="module")
+def torch():
+    return pytest.importorskip("torch")  # where it is used: it takes seconds to import
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +47,7 @@ def expected(state_dict, config):
 
 
 @pytest.fixture(scope="module")
-def tensors(state_dict):
+def tensors(torch, state_dict):
     return {name: torch.from_numpy(value) for name, value in state_dict.items()}
 
 
@@ -110,14 +114,14 @@ def test_shards(shapes, config, expected, tmp_path):
     assert weight_files(folder / INDEX) == [folder / INDEX, *(folder / shard for shard in SHARDS)]
 
 
-def test_old_training_checkpoint_is_read_into_memory(tensors, config, expected, tmp_path, caplog):
+def test_old_training_checkpoint_is_read_into_memory(torch, tensors, config, expected, tmp_path, caplog):
     wrapped = {"state_dict": {"model": tensors, "optimizer": {"lr": 0.1}}, "epoch": 3}
     torch.save(wrapped, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
     assert_converts(tmp_path / "old.pt", config, expected, tmp_path)
     assert "read into memory" in caplog.text
 
 
-def test_torch_types_and_views(tmp_path):
+def test_torch_types_and_views(torch, tmp_path):
     x = torch.arange(12.0).reshape(3, 4)
     content = {"half": x.half(), "brain": x.bfloat16(), "view": x.T[1:], "parameter": torch.nn.Parameter(x)}
     torch.save(content, tmp_path / "types.pt")
@@ -127,7 +131,7 @@ def test_torch_types_and_views(tmp_path):
         assert np.array_equal(np.asarray(read[name]).astype(np.float32), value.detach().float().numpy())
 
 
-def test_tensors_are_mapped_not_read(small, tmp_path):
+def test_tensors_are_mapped_not_read(torch, small, tmp_path):
     small |= {"scalar": np.array(3.0), "empty": np.zeros((0, 3), np.float32)}
     save_file(small, tmp_path / "model.safetensors")
     torch.save({name: torch.from_numpy(value) for name, value in small.items()}, tmp_path / "model.pt")
@@ -137,7 +141,7 @@ def test_tensors_are_mapped_not_read(small, tmp_path):
         assert not np.asarray(read["a"]).flags.owndata
 
 
-def test_torch_file_by_another_name(tmp_path):
+def test_torch_file_by_another_name(torch, tmp_path):
     (tmp_path / "number.pt").write_bytes(b"\x80\x04K\x01.")
     assert "is not a whole torch file" in refusal(tmp_path / "number.pt")
     torch.save({"a": torch.ones(1)}, tmp_path / "model.safetensors")
@@ -213,7 +217,7 @@ class Code:
 
 
 @pytest.mark.parametrize("archive", [True, False])
-def test_pickled_code_never_runs(tmp_path, monkeypatch, archive):
+def test_pickled_code_never_runs(torch, tmp_path, monkeypatch, archive):
     monkeypatch.chdir(tmp_path)
     torch.save({"a": torch.ones(2), "b": Code()}, "evil.pt", _use_new_zipfile_serialization=archive)
     assert "could run code, and is not opened" in refusal(tmp_path / "evil.pt")
@@ -222,7 +226,7 @@ def test_pickled_code_never_runs(tmp_path, monkeypatch, archive):
     assert not (tmp_path / "ran").exists()
 
 
-def test_compressed_archive(tmp_path):
+def test_compressed_archive(torch, tmp_path):
     torch.save({"a": torch.zeros(1000)}, tmp_path / "model.pt")
     source = zipfile.ZipFile(tmp_path / "model.pt")
     with source, zipfile.ZipFile(tmp_path / "bomb.pt", "w", zipfile.ZIP_DEFLATED) as target:
@@ -231,13 +235,13 @@ def test_compressed_archive(tmp_path):
     assert "is a compressed archive" in refusal(tmp_path / "bomb.pt")
 
 
-@pytest.mark.parametrize("content", [[torch.ones(1)], {}, {"model": {}}])
-def test_torch_file_without_state_dict(tmp_path, content):
+@pytest.mark.parametrize("content", [[1.0], {}, {"model": {}}])
+def test_torch_file_without_state_dict(torch, tmp_path, content):
     torch.save(content, tmp_path / "model.pt")
     assert "expected a state dict" in refusal(tmp_path / "model.pt")
 
 
-def test_entries_that_are_not_tensors(tensors, config, tmp_path):
+def test_entries_that_are_not_tensors(torch, tensors, config, tmp_path):
     strange = {"number": 3, 5: torch.ones(1), "sparse": torch.eye(2).to_sparse(), "meta": torch.ones(1, device="meta")}
     torch.save(tensors | strange, tmp_path / "model.pt")
     message = refusal(tmp_path / "model.pt", lambda path: convert(path, tmp_path / "x.safetensors", config=config))
@@ -251,7 +255,7 @@ def test_own_checkpoint_is_not_converted_again(expected, config, tmp_path):
     assert "is already a checkpoint of this library" in refusal(tmp_path / "ours.safetensors")
 
 
-def test_torch_is_an_extra(tmp_path, monkeypatch):
+def test_torch_is_an_extra(torch, tmp_path, monkeypatch):
     torch.save({"a": torch.ones(1)}, tmp_path / "model.pt")
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'vggtjax\[convert\]'"):

@@ -88,7 +88,7 @@ def test_keeping_all_tokens_is_exact(tokens, suppress, active):
 def test_one_frame_is_exact(tokens):
     """All tokens of the first frame are kept."""
     q, k, v = (x[:, :T] for x in tokens[:3])
-    made, expected = merged_attention(1, GRID, SPECIAL)(q, k, v, None), suppressed_attention(q, k, v, None)
+    made, expected = merged_attention(1, GRID, SPECIAL)(q, k, v, None, None), suppressed_attention(q, k, v, None)
     assert np.abs(np.asarray(made) - np.asarray(expected)).max() < 2e-6
 
 

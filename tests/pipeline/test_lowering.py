@@ -29,7 +29,6 @@ from vggtjax.training.recipe import Phase
 PLATFORMS = ("cuda", "tpu")
 SIZE, FRAMES = (56, 56), 4
 CONFIG = tiny_config(track_features=8, track_hidden=16, track_corr_levels=3, track_corr_radius=1)
-PARAMS = parameter_shapes(CONFIG)
 CUDNN = ("__cudnn$fmhaSoftmax", "__cudnn$fmhaSoftmaxBackward")
 CALLS = [export.DisabledSafetyCheck.custom_call(name) for name in CUDNN]
 
@@ -86,7 +85,7 @@ def test_the_stages_of_a_method(lower, method):
     fusion = shapes(start(tuple(PARTS))) if method == "4dvggt-d" else None
     stages = Stages(CONFIG, Options(method=method, compute_dtype=dtype), FRAMES, SIZE, run=lower)
     clip = ClipInputs(array(1, FRAMES, *SIZE, 3), query_points=points)
-    run_stages(stages, PARAMS, clip, fusion=fusion, all_outputs=method != "vggt4d")
+    run_stages(stages, parameter_shapes(CONFIG), clip, fusion=fusion, all_outputs=method != "vggt4d")
     assert {"image features", "first pass", "dynamic mask", "assemble"} <= {stage for stage, *_ in lower.outputs}
 
 
@@ -96,7 +95,7 @@ def test_the_stages_of_a_method(lower, method):
 def test_the_precision_of_products(precision, head):
     """Those of a dense head have the given precision; all others are exact, as is the convolution of the patches."""
     run = partial(forward, config=CONFIG, outputs=("camera", "depth"), precision=precision)
-    lines = text(run, PARAMS, array(1, 2, *SIZE, 3), platforms=["cuda"]).splitlines()
+    lines = text(run, parameter_shapes(CONFIG), array(1, 2, *SIZE, 3), platforms=["cuda"]).splitlines()
     found = {}
     for name in ("convolution", "dot_general"):
         products = [line for line in lines if f"stablehlo.{name}" in line]
@@ -111,7 +110,7 @@ def test_merged_attention(lower):
     stages = Stages(CONFIG, Options(attention="merged"), FRAMES, SIZE, run=lower)
     grid = [side // CONFIG.patch_size for side in SIZE]
     features = array(1, FRAMES, grid[0] * grid[1], CONFIG.embed_dim)
-    stages.first_pass(PARAMS, ClipBatch(array(1, FRAMES, *SIZE, 3), features))
+    stages.first_pass(parameter_shapes(CONFIG), ClipBatch(array(1, FRAMES, *SIZE, 3), features))
 
 
 def test_mask_refinement():
@@ -128,7 +127,7 @@ def test_the_gradient_of_the_blocks():
     def loss(params, tokens):
         return aggregate(params, tokens, CONFIG, (h, w), captures=(), compute=Compute(remat=True))[0].sum()
 
-    lowered(jax.grad(loss), PARAMS, array(1, FRAMES, h * w, CONFIG.embed_dim))
+    lowered(jax.grad(loss), parameter_shapes(CONFIG), array(1, FRAMES, h * w, CONFIG.embed_dim))
 
 
 def test_the_gradient_of_a_dense_head():
@@ -138,7 +137,11 @@ def test_the_gradient_of_a_dense_head():
     def loss(params, taps):
         return predict_dense(params, taps, CONFIG, (h, w), "depth")[0].sum()
 
-    lowered(jax.grad(loss), PARAMS["depth_head"], [array(1, FRAMES, h * w, width) for width in CONFIG.dpt_channels])
+    lowered(
+        jax.grad(loss),
+        parameter_shapes(CONFIG)["depth_head"],
+        [array(1, FRAMES, h * w, width) for width in CONFIG.dpt_channels],
+    )
 
 
 @pytest.mark.proof
