@@ -76,7 +76,12 @@ def _with(language: str, rule: str = "") -> list[Path]:
     ]
 
 
-@pytest.mark.parametrize("page", _with("python"), ids=page_name)
+def _notes_are_proofs(pages: list[Path]) -> list:
+    notes = ROOT / "docs" / "research-notes"
+    return [pytest.param(page, marks=pytest.mark.proof) if notes in page.parents else page for page in pages]
+
+
+@pytest.mark.parametrize("page", _notes_are_proofs(_with("python")), ids=page_name)
 def test_python_runs(page, workplace):
     names: dict = {"__name__": "__main__"}
     for block in blocks(page):

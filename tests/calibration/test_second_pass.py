@@ -108,6 +108,7 @@ def test_the_chosen_setting_is_written(model, gram, threshold, written):
     assert (found.mask_pairs, found.threshold) == (3, written)
 
 
+@pytest.mark.proof
 def test_the_command(model, tmp_path, capsys):
     path = save_model(tmp_path / "tiny.safetensors", model.params, model.config)
     out = tmp_path / "out"

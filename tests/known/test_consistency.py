@@ -26,6 +26,7 @@ def test_one_scale_and_a_smooth_distortion_are_undone():
     assert made.cost[1] < made.cost[0]
 
 
+@pytest.mark.proof
 def test_a_wrong_focal_length_is_found():
     wrong = textured_room().intrinsics.copy()
     wrong[:, [0, 1], [0, 1]] *= 1.2

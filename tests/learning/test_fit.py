@@ -130,6 +130,7 @@ def test_a_fit_ends_where_held_out_clips_gain_nothing():
     assert np.asarray(fit.params["power"]).tolist() == [1, 1]
 
 
+@pytest.mark.proof
 def test_a_gate_learns_what_the_table_cannot():
     """Pass 2 is bad where one of two features is high and the other low: no sum of a slope for each says so."""
     generator = np.random.default_rng(0)

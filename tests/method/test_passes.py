@@ -182,6 +182,7 @@ def test_fields_of_view_beyond_a_full_turn_are_clamped_and_named(params, config,
     assert np.allclose(2 * np.arctan(70 / made.intrinsics[:, [0, 1], [0, 1]]), 3.1, atol=1e-4)
 
 
+@pytest.mark.proof
 def test_the_row_of_vggt4d_is_what_is_run(params, config, images, inferred):
     _, passes = infer(params, images, config, method="vggt4d")
     saliency = jax.jit(motion_saliency, static_argnames=("config", "gram"))(params, images, config, gram="dot")

@@ -163,6 +163,7 @@ def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
     assert room() == (pytest.approx(100 + 400150 - stacks), "within ulimit -v", True)
 
 
+@pytest.mark.proof
 def test_a_limit_too_low_for_the_libraries_is_met_by_a_sentence(tmp_path):
     """Without the sentence a library that cannot start a thread ends the process."""
     limit = "import resource; resource.setrlimit(resource.RLIMIT_AS, (800_000_000,) * 2)"

@@ -112,6 +112,7 @@ def test_a_window_that_lost_its_points_has_no_say_in_shared_frames():
     assert off[WINDOWS[0].stop].max() > 10
 
 
+@pytest.mark.proof
 def test_the_network_follows_points_as_in_a_clip_that_is_run_at_once():
     model, points = tiny_model(), np.array([[10, 20], [40.5, 30]], np.float32)
     clip = load_clip(np.random.default_rng(1).random((4, 56, 56, 3), np.float32), size=56)
