@@ -163,15 +163,6 @@ def test_free_memory_is_the_least_of_the_host_and_the_control_groups(tmp_path):
     assert room() == (pytest.approx(100 + 400150 - stacks), "within ulimit -v", True)
 
 
-def test_a_limit_too_low_for_the_libraries_is_met_by_a_sentence(tmp_path):
-    """Without the sentence a library that cannot start a thread ends the process."""
-    limit = "import resource; resource.setrlimit(resource.RLIMIT_AS, (800_000_000,) * 2)"
-    code = f"{limit}; from vggtjax.commands.main import main; raise SystemExit(main(['info', 'demo']))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    assert re.fullmatch(r"vggtjax: ulimit -v leaves this process 0\.\d\d GB, .* ulimit -v unlimited\n", done.stderr)
-
-
 def test_a_limit_too_low_for_a_clip_is_met_by_a_sentence(tmp_path):
     for number in range(8):
         Image.new("RGB", (1024, 1024), (number, 0, 0)).save(tmp_path / f"{number}.png")
