@@ -21,7 +21,7 @@ from testing.make_checkpoint import make_checkpoint
 from testing.seeded import seeded_state_dict
 from vggtjax import load_model
 from vggtjax.checkpoint import Model, is_checkpoint, read_model, save_model
-from vggtjax.errors import CheckpointError, InputError, OutputError
+from vggtjax.errors import CheckpointError, OutputError
 
 
 @pytest.fixture(scope="module")
@@ -101,8 +101,6 @@ def test_type_on_loading(saved_once, tree):
     model = load_model(saved_once, dtype="bfloat16")
     same = jax.tree.map(lambda a, b: np.array_equal(a, b.astype(ml_dtypes.bfloat16)), model.params, tree)
     assert jax.tree.all(same)
-    with pytest.raises(InputError, match="dtype is 'int4'; expected one of"):
-        load_model(saved_once, dtype="int4")  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.skipif(
@@ -194,35 +192,14 @@ def test_file_is_checked_against_its_configuration(saved_once, tmp_path):
     ("metadata", "reason"),
     [
         ({"version": "2"}, "has version '2' of the format; this vggtjax reads '1'"),
-        ({"config": ""}, "x.safetensors is not JSON"),
-        ({"config": "[]"}, "x.safetensors is []; expected an object"),
-        ({"config": '{"depht": 1}'}, "unknown fields ['depht']"),
         ({"config": '{"embed_dim": 1000000, "num_heads": 10, "dino_num_heads": 10}'}, "mis-shaped parameter"),
         ({"config": " " * 70_000}, "more than 65536 bytes"),
-        ({"note": "\u001b"}, "expected up to 200 printable letters"),
-        ({"untrained": '["nose"]'}, "names the untrained heads ['nose']"),
         ({"origin": '{"a": "b"}'}, "Expected `str` matching regex"),
         ({"origin": '{"\\u001b": "' + "0" * 64 + '"}'}, "unprintable letters"),
-        ({"revision": "main"}, "expected a commit of 40 hexadecimal letters"),
     ],
 )
 def test_metadata_is_not_trusted(saved_once, tmp_path, metadata, reason):
     assert reason in refusal(rewritten(saved_once, tmp_path / "x.safetensors", metadata))
-
-
-@pytest.mark.parametrize("name", ["\x1b[31mred", "", "x" * 1000])
-def test_unprintable_name_is_replaced_by_the_files(saved_once, tmp_path, name):
-    assert load_model(rewritten(saved_once, tmp_path / "file.safetensors", {"name": name})).name == "file"
-
-
-def test_configuration_given_must_be_the_files(saved_once, config):
-    assert "another configuration" in refusal(saved_once, config=dataclasses.replace(config, num_heads=1))
-
-
-def test_reading_torch_layout_as_own_is_refused(tmp_path):
-    make_checkpoint(tmp_path / "torch.safetensors", {"a": [2]})
-    with pytest.raises(CheckpointError, match="is not a checkpoint of this library; load_model converts"):
-        read_model(tmp_path / "torch.safetensors")
 
 
 # The demo

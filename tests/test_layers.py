@@ -105,26 +105,6 @@ def test_an_upward_import_and_a_circle_are_found(graph, layer):
     assert "vggtjax.errors" in circle(graph | {"vggtjax.errors": {"vggtjax.cameras"}})
 
 
-@pytest.mark.parametrize(
-    ("file", "text"),
-    [
-        ("rope.py", "import vggtjax.method.mask"),
-        ("rope.py", "from vggtjax.method import mask"),
-        ("rope.py", "from ..method import mask"),
-        ("rope.py", "from ..method.mask import upsample"),
-        ("rope.py", 'def late():\n    return importlib.import_module("vggtjax.method.mask")'),
-        ("rope.py", 'importlib.import_module("..method.mask", __package__)'),
-        ("rope.pyi", "from vggtjax.method.mask import upsample as upsample"),
-        ("rope.pyi", "from ..method.mask import upsample as upsample"),
-    ],
-)
-def test_every_kind_of_import_is_found(tmp_path, layer, file, text):
-    for path, content in (("network/__init__.py", ""), (f"network/{file}", text), ("method/mask.py", "")):
-        (tmp_path / "vggtjax" / path).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / "vggtjax" / path).write_text(content)
-    assert upward(imports(tmp_path), layer) == ["vggtjax.network.rope -> vggtjax.method.mask"]
-
-
 @pytest.mark.parametrize(("folder", "other"), [("tests", "benchmarks"), ("benchmarks", "tests"), ("testing", "tests")])
 def test_tests_and_benchmarks_share_testing_alone(folder, other):
     """But for tests/benchmarks, which tests the benchmarks' own code."""

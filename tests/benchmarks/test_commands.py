@@ -1,6 +1,5 @@
 """A small run of each command in this process, with what its report must contain; and bad input."""
 
-import contextlib
 import json
 import logging
 from concurrent.futures import ThreadPoolExecutor
@@ -17,9 +16,7 @@ from benchmarks import (
     known,
     known_clips,
     long_clips,
-    memory,
     refine_cameras,
-    speed,
 )
 from tests.benchmarks.scenes import SIDE, drawn_scenes, tiny_file
 from vggtjax.checkpoint import read_model
@@ -110,22 +107,6 @@ def test_long_clips(run, tiny, tmp_path, monkeypatch):
     assert "6 frames in windows of 5: peak 1 MB of its own, 2 MB with mapped files, 3 s, 4 s of the processors" in shown
 
 
-@pytest.mark.proof
-def test_memory(run, tmp_path, monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        memory, "run_command", lambda words, cache, devices: asked.append(words) or {"total": 2e9, "own": 1e9}
-    )
-    monkeypatch.setattr(memory, "predicted_bytes", lambda model, *shape, **how: 2.1e9)
-    monkeypatch.setattr(memory, "EMBEDDED", memory.EMBEDDED[:1])
-    monkeypatch.setattr(memory, "SPLIT", ())
-    shown = run("memory", "--out", tmp_path / "rows.json")
-    assert "embedded, 8 x 64 x 64, float32, 4dvggt-d" in shown
-    assert "1 of 1 within 15 %" in shown
-    assert [words[-6:] for words in asked] == [["--dtype", "float32", "--method", "4dvggt-d", "--window", "0"]]
-    assert json.loads((tmp_path / "rows.json").read_text())[0]["measured"] == 2e9
-
-
 def test_what_a_command_takes(capfd, tmp_path):
     command_worker.main(["--version"])
     answer = json.loads(capfd.readouterr().out.splitlines()[-1])
@@ -149,41 +130,13 @@ def test_embed(run, tiny, tmp_path, monkeypatch):
     assert embed._by_ranks(np.array([[3, 3], [1, 2], [2, 1.5]])).tolist() == [1, 2, 0]
 
 
-def test_speed(run, tmp_path, monkeypatch):
-    """Stand-ins answer: the public side takes twice the time, and more memory where it does not map its weights."""
-
-    class Answering(contextlib.nullcontext):
-        def __init__(self, side, *arguments):
-            super().__init__(self)
-            self.of = 1 if side == "ours" else 2
-            self.first = 8 if self.of == 2 and "mapped" not in arguments else self.of
-
-        def run(self, *, work, frames, keep=None, mask=None, **shape):
-            if keep:
-                np.savez(keep, pose=np.array([0.0, frames]), mask=np.array([True]))
-            return {"seconds": self.of * frames, "total": 1e9, "own": 0, "since start": self.first * 1e9, "reads": 0}
-
-    monkeypatch.setattr(speed, "Worker", Answering)
-    for name in ("a", "b", "vggt", "vggt4d"):
-        (tmp_path / name).mkdir()
-    files = ("--weights", tmp_path / "a", "--converted", tmp_path / "b", "--peer", tmp_path)
-    shown = run("speed", *files, "--frames", 3, "--both", 4, "--repeats", 2, "--out", tmp_path / "c.json")
-    rows = json.loads((tmp_path / "c.json").read_text())
-    assert [(row["work"], row["frames"]) for row in rows] == [("pass", 3), ("vggt4d", 4), ("4dvggt-d", 4)]
-    plain = next(line.split() for line in shown.splitlines() if line.split()[:1] == ["camera"])
-    assert " ".join(plain[3:]) == "3 3.00 6.00 0.50 1.00 1.00 1.00 0.00 0.00 - 1.00 8.00 0.12 0.0e+00 no"
-
-
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ("demo-model --frames 2", "frames is 2; expected at least 3"),
         ("gpu-day --out {tmp} --parts nothing", "parts is 'nothing'; expected one of parity"),
         ("gpu-day --out {tmp}", "is not empty; choose a new folder"),
         ("long-clips --out {tmp}/out --frames 16", "expected at least 0 walks, longer than a window"),
-        ("memory --no-embedded", "nothing is measured"),
         ("refine-cameras --frames 2", "frames is 2; expected at least 3"),
-        ("second-pass --pairs 99", "expected numbers from 1 to 12"),
         ("speed --weights {tmp}/a --converted {tmp}/b --peer {tmp}", "a does not exist"),
         ("suite --against {tmp}/file", "is not a run that --out wrote"),
     ],

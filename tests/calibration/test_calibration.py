@@ -3,14 +3,11 @@
 import dataclasses
 import json
 from functools import partial
-from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from PIL import Image
 
 from tests.tiny import tiny_config
@@ -31,7 +28,7 @@ from vggtjax.calibration.sweep import (
 )
 from vggtjax.checkpoint import save_model
 from vggtjax.commands import calibrate_cues as command
-from vggtjax.commands.calibrate_cues import calibrate_cues, generated_clips
+from vggtjax.commands.calibrate_cues import calibrate_cues
 from vggtjax.errors import InputError, OutputError
 from vggtjax.method.cues import GramCues
 
@@ -144,46 +141,6 @@ def test_a_planted_map_is_chosen_first():
     assert choose(planted, gram="dot").motion.cues[0].name != "layer1_kk_std"
 
 
-def test_a_signal_that_neighbours_share_is_chosen_as_a_range():
-    truth = random_truth(2, (4, 4, 40))
-    planted = make_sweep(3, truth, depth=4)
-    noise = np.random.default_rng(4).normal(size=truth.shape)
-    for layer, sign in ((1, 1), (2, -1)):  # noise that cancels in the mean
-        planted.maps[0, 0, layer] = (truth == DYNAMIC) + 3 * sign * noise
-    assert choose(planted).motion.cues[0] == Cue("layers1to2_qq_mean", "q", "q", (1, 2), "mean")
-
-
-@settings(max_examples=15)
-@given(seed=st.integers(0, 10**6), min_gain=st.sampled_from([0.0, 0.002, 0.05]), terms=st.integers(1, 4))
-def test_every_cue_gains_on_one_half_and_all_on_the_other(seed, min_gain, terms):
-    made = make_sweep(seed, random_truth(seed + 1))
-    chosen = choose(made, min_gain=min_gain, max_terms=terms)
-    assert 1 <= len(chosen.steps) <= terms
-    for before, after in pairwise(chosen.steps):
-        assert after.rating.calibration > before.rating.calibration
-    held_out = [step.rating.held_out for step in chosen.steps]
-    for count, before in enumerate(held_out[:-1], 1):  # the last ones together are worth their number
-        assert held_out[-1] > before
-        assert held_out[-1] - before >= min_gain * (len(held_out) - count) - 1e-12
-    if chosen.refused is not None:
-        assert chosen.refused.rating.held_out - held_out[-1] <= min_gain + 1e-12
-    assert len({cue.name for cue in chosen.motion.cues}) == len(chosen.motion.cues)
-
-
-def test_the_choice_by_hand_on_one_half():
-    truth = np.array([[[DYNAMIC, DYNAMIC, STATIC, STATIC]], [[DYNAMIC, STATIC, STATIC, STATIC]]], np.int8)
-    made = make_sweep(0, truth, depth=1)._replace(maps=np.zeros((2, 6, 1, 2, 1, 4), np.float32))
-    made.maps[0, 0, 0, 0, 0], made.maps[0, 0, 0, 1, 0] = (3, 1, 2, 0), (9, 1, 2, 0)
-    made.maps[0, 1, 0, 0, 0], made.maps[0, 1, 0, 1, 0] = (2, 2, 1, 2), (0, 9, 9, 0)
-    # Of four pairs the first map orders three; times the second, 1 1 0 1, all four. The held-out clip loses.
-    chosen = choose(made)
-    assert [step.cue.name for step in chosen.steps] == ["layer0_qq_mean"]
-    assert chosen.steps[0].rating == (0.75, 1)
-    assert chosen.refused is not None
-    assert chosen.refused.cue.name == "layer0_qq_std"
-    assert chosen.refused.rating == pytest.approx((1, 1 / 6))
-
-
 def test_a_cue_that_brings_nothing_stays_for_the_cue_after_it():
     """Three moving tokens of six, of which one is the question: the second map settles it on one clip only."""
     truth = np.array([[[1, 1, 1, 0, 0, 0]], [[1, 1, 1, 0, 0, 0]]], np.int8)
@@ -257,26 +214,6 @@ def test_clips_and_models_that_do_not_fit(model, clips):
         sweep(broken, zip(*clips, strict=True), model.config)
 
 
-def test_a_choice_that_cannot_be(swept):
-    cases: Any = (
-        ({"max_terms": 0}, "max_terms is 0"),
-        ({"min_gain": -0.1}, "min_gain is -0.1"),
-        ({"floor": 1.5}, "floor is 1.5"),
-    )
-    for arguments, sentence in cases:
-        with pytest.raises(InputError, match=sentence):
-            choose(swept, **arguments)
-
-
-def test_nothing_to_tell_apart(swept):
-    truth = swept.truth.copy()
-    truth[1::2] = STATIC
-    with pytest.raises(InputError, match="held-out half have no dynamic token"):
-        choose(swept._replace(truth=truth))
-    with pytest.raises(InputError):
-        swept._replace(truth=np.full_like(truth, DYNAMIC)).auc()
-
-
 def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
     wanted = []
     monkeypatch.setattr(command, "generated_clips", lambda *a: wanted.append(a) or map(Moving, *clips))
@@ -294,17 +231,3 @@ def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
     with pytest.raises(InputError, match="size is 50"):
         calibrate_cues(str(source), tmp_path / "other", size=50)
     assert not (tmp_path / "other").exists()
-
-
-def test_arguments_are_checked_before_the_model_is_loaded(tmp_path):
-    with pytest.raises(InputError, match="scenes is 1"):
-        calibrate_cues("nowhere.safetensors", tmp_path, scenes=1)
-
-
-def test_scenes_of_a_seed():
-    first, second = generated_clips(2, FRAMES, SIZE, seed=3)
-    again, _ = generated_clips(2, FRAMES, SIZE, seed=3)
-    assert first.images.shape == (FRAMES, SIZE, SIZE, 3)
-    assert first.dynamic_mask.shape == (FRAMES, SIZE, SIZE)
-    assert (first.images == again.images).all()
-    assert not (first.images == second.images).all()

@@ -100,8 +100,6 @@ def test_results_of_a_folder(sequences, tmp_path, capsys):
         (["plain", "{data}", "--sequences", "third"], "sequence 'third'"),
         (["plain", "{data}", "--results", "{data}", "--methods", "vggt"], "exclude each other"),
         (["plain", "{data}", "--results", "{data}", "--format", "da3", "--quaternion", "wxyz"], "none for others"),
-        (["plain", "{data}", "--results", "a={data}", "a={tmp}"], "two folders named a"),
-        (["plain", "{data}", "--results", "{data}", "--config", "{tmp}/c.json"], "--config and --results exclude"),
     ],
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(sequences, tmp_path, capsys, arguments, sentence):

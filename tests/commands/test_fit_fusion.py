@@ -111,7 +111,6 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(
         (["--data", "scenes"], "expected generated=N or DATASET=FOLDER"),
         (["--data", "generated=2"], "2 clips with a true depth; expected at least three"),
         (["--data", "generated=3", "plain={tmp}"], "no model is named; give --model"),
-        (["--max-frames", "8", "--data", "generated=3"], "generated scenes have at least 12 frames"),
     ],
 )
 def test_bad_input_is_one_sentence(arguments, sentence, tmp_path, capsys):

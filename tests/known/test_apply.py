@@ -10,7 +10,7 @@ from tests.textured_room import textured_room
 from vggtjax.captures.capture import Capture
 from vggtjax.errors import InputError
 from vggtjax.known.apply import apply_known, scaled
-from vggtjax.known.given import check_readable, read_known
+from vggtjax.known.given import read_known
 from vggtjax.known.options import KnownGeometry
 
 TRUE = textured_room(4)
@@ -71,15 +71,3 @@ def test_pixels_left_out_have_no_points_and_do_not_move():
     for clip, masks in ((TRUE, np.ones_like(sky)), (padded, inside)):
         with pytest.raises(InputError, match="covers every pixel"):
             read_known(KnownGeometry(), clip, leave_out=masks)
-
-
-@pytest.mark.parametrize("name", ["intrinsics", "poses", "known_depths", "leave_out"])
-def test_missing_and_unreadable_files_are_found_before_the_work(tmp_path, name):
-    value: Any = Path("nothing") if name == "leave_out" else "nothing"
-    with pytest.raises(InputError, match=f"{name} is 'nothing'"):
-        KnownGeometry(**{name: value}).check_files()
-    if name in ("intrinsics", "poses"):
-        known: dict[str, Any] = {name: str(tmp_path / "numbers.txt")}
-        (tmp_path / "numbers.txt").write_text("1 2 nan\n")
-        with pytest.raises(InputError, match=r"numbers\.txt"):
-            check_readable(KnownGeometry(**known))

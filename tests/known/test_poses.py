@@ -88,12 +88,3 @@ def test_poses_that_do_not_fit_are_refused(tmp_path, part, change, message):
     poses[part] = change(poses[part])
     with pytest.raises(InputError, match=message):
         apply_known(room, read_known(KnownGeometry(poses=_kitti(tmp_path / "poses.txt", poses)), room))
-
-
-@pytest.mark.parametrize(
-    ("frames", "poses", "words"), [(5, 6, "expected a pose for every frame"), (2, 2, "at least 3")]
-)
-def test_another_number_of_poses_and_too_few_are_refused(tmp_path, frames, poses, words):
-    path = _kitti(tmp_path / "poses.txt", make_room(poses).world_from_camera)
-    with pytest.raises(InputError, match=f"{poses} poses.*{words}"):
-        apply_known(make_room(frames), read_known(KnownGeometry(poses=path), make_room(frames)))

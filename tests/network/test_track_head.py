@@ -1,7 +1,5 @@
 """The track head: golden numbers of the public code are in parity/; here chunks, edges, gradients and bad input."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,48 +11,6 @@ from vggtjax.network import track_head
 from vggtjax.network.dpt_head import project_tap
 from vggtjax.network.model import init_params
 from vggtjax.network.track_head import VIRTUAL_TRACKS, Tracks, predict_tracks
-
-
-def sampled(image: np.ndarray, x: float, y: float) -> np.ndarray:
-    """Bilinear value of an image [H, W, F] at x, y, as slowly as possible; 0 outside."""
-    total = np.zeros(image.shape[2])
-    H, W = image.shape[:2]
-    for j in (int(np.floor(y)), int(np.floor(y)) + 1):
-        for i in (int(np.floor(x)), int(np.floor(x)) + 1):
-            if 0 <= j < H and 0 <= i < W:
-                total += image[j, i] * (1 - abs(x - i)) * (1 - abs(y - j))
-    return total
-
-
-def test_correlations_against_samples_written_out(config, monkeypatch):
-    generator = np.random.default_rng(0)
-    S, Q, F, r = 2, 7, config.track_features, config.track_corr_radius
-    size = (37, 18)  # down to 2 x 1: an axis of one pixel
-    maps = generator.normal(size=(S, *size, F)).astype(np.float32)
-    features = generator.normal(size=(S, Q, F)).astype(np.float32)
-    positions = (generator.uniform(-0.3, 1.3, size=(S, Q, 2)) * [size[1], size[0]]).astype(np.float32)
-    positions[0, 0], positions[1, 1] = (1e7, -1e7), (3.0, 5.0)
-    levels, level = [], maps
-    for _ in range(config.track_corr_levels):
-        levels.append(level)
-        h, w = level.shape[1] // 2, level.shape[2] // 2
-        level = level[:, : 2 * h, : 2 * w].reshape(S, h, 2, w, 2, F).mean(axis=(2, 4))
-    expected = np.zeros((S, Q, len(levels), 2 * r + 1, 2 * r + 1))
-    for s, q, k in np.ndindex(S, Q, len(levels)):
-        image = levels[k][s]
-        for i, j in np.ndindex(2 * r + 1, 2 * r + 1):
-            x, y = positions[s, q] / 2.0**k + [i - r, j - r]
-            x, y = (0 if side == 1 else at for side, at in ((image.shape[1], x), (image.shape[0], y)))
-            if abs(x) < 1000 and abs(y) < 1000:
-                expected[s, q, k, i, j] = sampled(image, x, y) @ features[s, q] / F**0.5
-    run: Any = jax.jit(track_head._correlations, static_argnums=(3, 4))
-    for floats in (1 << 24, 3 * S * (2 * r + 2) ** 2 * F):  # all at once; three queries at a time, of seven
-        monkeypatch.setattr(track_head, "FLOATS_AT_ONCE", floats)
-        run.clear_cache()
-        pyramid = track_head._pyramid(jnp.asarray(maps)[None], config.track_corr_levels, r)
-        with jax.default_matmul_precision("highest"):
-            made = run([p[0] for p in pyramid], features, positions, size, config)
-        assert np.abs(np.asarray(made).reshape(expected.shape) - expected).max() < 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +44,15 @@ def test_the_order_of_queries_and_clips_does_not_matter(head, config):
     swapped = run((head[0], [tap[::-1] for tap in head[1]]), config, QUERIES[::-1, ::-1])
     for one, other in zip(made, swapped, strict=True):
         assert np.abs(one - other[::-1, :, ::-1]).max() < 1e-3
+
+
+def test_queries_whose_correlations_are_taken_in_turns_have_the_same_numbers(head, config, monkeypatch):
+    window = 2 * config.track_corr_radius + 2
+    monkeypatch.setattr(track_head, "FLOATS_AT_ONCE", 2 * 3 * window**2 * config.track_features)  # two, then one
+    params, taps = head
+    in_turns = jax.jit(lambda *given: predict_tracks(*given, config, (6, 5)))(params, taps, jnp.asarray(QUERIES))
+    for one, other in zip(run(head, config, QUERIES), in_turns, strict=True):
+        assert np.abs(one - other).max() < 1e-3
 
 
 def test_later_frames_can_be_permuted(head, config):

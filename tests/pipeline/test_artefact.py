@@ -15,7 +15,6 @@ import pytest
 from testing.seeded import seeded_images
 from tests.tiny import tiny_model
 from vggtjax import infer, write_artefact
-from vggtjax.commands import main as cli
 from vggtjax.pipeline import serve
 
 SHAPE = (4, 28, 42)  # frames, height, width
@@ -107,19 +106,6 @@ def test_jax_alone_gives_the_numbers_of_infer(written, site, tmp_path, model):
     assert passes.dynamic_mask.any()
 
 
-def test_the_manifest_tells_what_is_in_it(written, model):
-    manifest = serve.read_manifest(written)
-    assert manifest["platforms"] == ["cpu", "cuda"]
-    assert manifest["inputs"]["images"]["shape"] == [*SHAPE, 3]
-    assert manifest["outputs"]["dynamic_mask"] | {"about": ""} == {"shape": [*SHAPE], "dtype": "bool", "about": ""}
-    assert manifest["model"] == model.identity.to_json()
-    assert manifest["options"]["mask_pairs"] == 2
-    weights = serve._read_weights(written / serve.WEIGHTS)
-    assert {name.split(".")[0] for name in weights} == {"backbone", "aggregator", "camera_head", "depth_head"}
-    kernel = model.params["aggregator"]["global_blocks"]["mlp"]["fc1"]["kernel"]
-    assert np.array_equal(weights["aggregator.global_blocks.mlp.fc1.kernel"], kernel)
-
-
 def changed(artefact: Path, **fields) -> None:
     path = artefact / serve.MANIFEST
     path.write_text(json.dumps(json.loads(path.read_text()) | fields))
@@ -188,21 +174,3 @@ def test_names_of_files_send_the_terminal_no_control_characters(tmp_path, monkey
     )
     assert printed(path, "--out", path) == ("", f"serve: cannot write {tmp_path}/{shown}.npy: File exists\n")
     assert shown in printed(path, "--out", tmp_path, f"--{path.name}")[1]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--size", "518"), "size is '518'; expected width and height"),
-        (("--platforms", "gpu"), "platforms is 'gpu'; expected one of cpu, cuda, rocm, tpu"),
-        (("--method", "vggt4d"), "--no-refine-mask"),
-        (("--out", "."), "exists and is not replaced"),
-        (("--size", "63x64"), "expected multiples of the patch size"),
-    ],
-)
-def test_the_command_refuses(tmp_path, monkeypatch, capsys, arguments, message):
-    monkeypatch.chdir(tmp_path)
-    given = {"--frames": "2", "--size": "64x64", "--out": "new"} | dict([arguments])
-    assert cli.main(["export-model", "demo", *(text for pair in given.items() for text in pair)]) == 2
-    assert message in capsys.readouterr().err
-    assert not (tmp_path / "new").exists()

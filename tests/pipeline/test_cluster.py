@@ -17,12 +17,10 @@ from tests.pipeline import dying_driver
 from tests.room import make_room
 from tests.tiny import tiny_model
 from vggtjax.checkpoint import save_model
-from vggtjax.commands.main import main
 from vggtjax.errors import ClusterError, InputError
 from vggtjax.options import Options
-from vggtjax.pipeline.cluster import _messages, reconstruct_on_cluster
+from vggtjax.pipeline.cluster import _messages
 from vggtjax.pipeline.cluster_driver import Dispatcher, Note, Plan, _Slot, shared
-from vggtjax.pipeline.cluster_options import Cluster
 from vggtjax.pipeline.cluster_worker import Job, Place, Refused, Started, Worker
 from vggtjax.pipeline.destination import SETTINGS_NAME, LocalFolder
 from vggtjax.pipeline.recipe import ClipOutcome, Recipe
@@ -180,8 +178,6 @@ def test_workers_of_other_code_and_other_files_are_refused(dispatcher):
     ("nodes", "asked", "share"),
     [
         ([{"CPU": 8}, {"CPU": 4}], {}, (3, 4, 0)),
-        ([{"CPU": 8}], {"workers": 2}, (2, 4, 0)),
-        ([{"CPU": 8}, {"CPU": 8}], {"cpus": 3}, (4, 3, 0)),
         ([{"CPU": 16, "GPU": 4}, {"CPU": 2}], {}, (4, 1, 1)),
         ([{"CPU": 16, "GPU": 4}], {"gpus": 0.5}, (8, 1, 0.5)),
     ],
@@ -189,12 +185,6 @@ def test_workers_of_other_code_and_other_files_are_refused(dispatcher):
 def test_the_share_of_a_worker(nodes, asked, share):
     plan = Plan(Job(lambda: 1 / 0, RECIPE, LocalFolder("/"), "."), {}, **asked)  # type: ignore[arg-type]
     assert shared(nodes, plan) == share
-
-
-def test_a_cluster_without_room(dispatcher):
-    for nodes, cpus, gpus in (([{"CPU": 2}], None, 1.0), ([{"CPU": 2}], 4, None), ([], None, None)):
-        with pytest.raises(ClusterError, match="no machine of the cluster has room for a worker, which takes "):
-            shared(nodes, Plan(dispatcher.it._job, {}, cpus=cpus, gpus=gpus))
 
 
 def test_a_worker_does_a_clip_once(tmp_path, monkeypatch):
@@ -227,21 +217,3 @@ def test_a_driver_that_dies_is_one_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr("vggtjax.pipeline.cluster.drive", dying_driver.die)
     with pytest.raises(ClusterError, match=r"the cluster has died \(Ray's last words: GCS is gone\); finished clips"):
         list(_messages(Plan(job, {})))
-
-
-def test_what_is_wrong_is_said_before_anything_starts(tmp_path, capsys, monkeypatch):
-    (tmp_path / "a").mkdir()
-    Image.fromarray(np.zeros((70, 98, 3), np.uint8)).save(tmp_path / "a/a.png")
-    common = ["batch", str(tmp_path / "a"), "--model", "demo", "--out"]
-    for arguments, sentence in (
-        ([str(tmp_path / "o"), "--workers", "2"], "--workers needs --engine ray"),
-        ([str(tmp_path / "o"), "--engine", "ray", "--shard", "1/1"], "--engine ray and --shard exclude each other"),
-        ([str(tmp_path / "o"), "--engine", "ray", "--address", "ray://h:1"], "run the command on a machine of the cl"),
-        (["memory://o", "--engine", "ray"], "memory://o is in the memory of one process"),
-    ):
-        assert main([*common, *arguments]) == 2
-        assert sentence in capsys.readouterr().err
-    assert not (tmp_path / "o").exists()
-    monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"--engine ray needs the extra 'cluster'"):
-        next(reconstruct_on_cluster(tiny_model, {}, tmp_path, Cluster("ray"), RECIPE))  # type: ignore[arg-type]

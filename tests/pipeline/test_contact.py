@@ -3,37 +3,18 @@
 import shutil
 
 import numpy as np
-import pytest
 
 from tests.chromium import browser, look
 from tests.results.test_report import Reader
 from tests.room import make_room
 from vggtjax.pipeline.contact import ContactPage
 from vggtjax.pipeline.destination import PAGE_NAME
-from vggtjax.results.saving import Saving
 
 NAMES = ["dog", "<script>alert(1)<", "a#b?c%20 é"]
 
 
 def text_of(folder):
     return (folder / PAGE_NAME).read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("method", np.array(7)),
-        ("dynamic_mask", np.full((3, 28, 42), "x")),
-    ],
-)
-def test_an_odd_archive_of_another_clip_is_told_on_its_card(tmp_path, name, value):
-    make_room().save(tmp_path / "odd", saving=Saving(only=()))
-    archive = tmp_path / "odd" / "reconstruction.npz"
-    with np.load(archive) as arrays:
-        changed = dict(arrays) | {name: value}
-    np.savez(archive, **changed)
-    ContactPage(tmp_path, 1)
-    assert f"cannot be read: its {name} is " in text_of(tmp_path)
 
 
 def test_every_clip_has_a_card_and_every_failure_a_sentence(tmp_path):

@@ -8,9 +8,7 @@ pytest.importorskip("pycolmap", reason="needs the extra colmap")
 from tests.corner import make_corner, paint
 from tests.tiny import tiny_model
 from vggtjax import KnownGeometry, load_clip, reconstruct
-from vggtjax.errors import InputError
 from vggtjax.options import Options
-from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.progress import StageSeconds
 
 
@@ -35,12 +33,3 @@ def test_the_option_and_its_outcome_reach_the_result(model, tmp_path):
     result.save(tmp_path / "out", only=("report",))
     assert outcome["sentence"] in (tmp_path / "out" / "report.html").read_text().replace("-&gt;", "->")
     assert "refine_cameras" not in Options().to_json()
-
-
-def test_known_poses_and_several_methods_are_not_refined(model, tmp_path):
-    (tmp_path / "poses.txt").write_text("")
-    clip = load_clip(paint(make_corner(2, 0.5)), size=56)
-    with pytest.raises(InputError, match="refine_cameras and known poses exclude each other"):
-        reconstruct(model, clip, refine_cameras=True, known=KnownGeometry(poses=str(tmp_path / "poses.txt")))
-    with pytest.raises(InputError, match="refine_cameras is for one method"):
-        reconstruct_methods(model, clip, ["vggt"], refine_cameras=True)

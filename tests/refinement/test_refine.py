@@ -8,12 +8,10 @@ import pytest
 pytest.importorskip("pycolmap", reason="needs the extra colmap")
 
 from tests.corner import FOCAL, HEIGHT, SCALE, WIDTH, corner_result, exact_tracks, make_corner, paint
-from vggtjax import errors
 from vggtjax.cameras import world_from_camera
-from vggtjax.errors import ClipError, MissingExtraError
 from vggtjax.evaluation.metrics.trajectory import rotation_error, trajectory_errors
 from vggtjax.refinement.matches import frame_pairs
-from vggtjax.refinement.refine import adjust_to_tracks, check_refinement, refine_cameras
+from vggtjax.refinement.refine import adjust_to_tracks, refine_cameras
 from vggtjax.refinement.tracks import join_matches
 
 
@@ -102,18 +100,6 @@ def test_two_frames_and_one():
     np.testing.assert_allclose(refined.intrinsics, result.intrinsics, rtol=1e-6)  # two frames do not hold it
     single = corner_result(make_corner(1))
     assert not refine_cameras(single, paint(make_corner(1)))[1].refined
-
-
-def test_missing_pictures_other_sizes_and_a_missing_extra(monkeypatch):
-    corner = make_corner(3)
-    result, pictures = corner_result(corner), paint(corner)
-    with pytest.raises(ClipError, match="the source gives 2 pictures of the 3 frames"):
-        refine_cameras(result, pictures[:2])
-    with pytest.raises(ClipError, match="picture 0 has 96 x 144 pixels; the result was made from 192 x 144"):
-        refine_cameras(result, pictures[:, :, ::2])
-    monkeypatch.setattr(errors, "find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match="colmap"):
-        check_refinement(True)
 
 
 def test_pairs_and_tracks_by_hand():

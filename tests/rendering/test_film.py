@@ -60,10 +60,7 @@ def test_bad_films(tmp_path):
     for name, shown, fps, message in (
         ("film.avi", frames(), 12, r"film.avi has no known ending of a film; expected one of .mp4, .gif, .webp"),
         ("film.mp4", frames(), 0, "fps is 0; expected a number above 0, at most 120"),
-        ("film.gif", frames(), 60, "fps is 60; expected a number above 0, at most 50 for .gif"),
-        ("film.mp4", [], 12, "a film needs at least one frame"),
         ("film.mp4", [*frames(1), *frames(1, 20)], 12, "all of one size"),
-        ("film.mp4", [np.zeros((4, 4, 3))], 12, "float64"),
     ):
         with pytest.raises(InputError, match=message):
             write_film(tmp_path / name, shown, fps)

@@ -122,10 +122,8 @@ def test_pictures_that_do_not_fit(tmp_path):
     cases: Any = (
         ({}, options | {"pictures": [picture] * 2}, "there are 2 pictures for 3 frames"),
         ({}, options | {"pictures": [picture] * 4}, "there are more pictures than the 3 frames"),
-        ({}, {"pictures": [picture] * 3}, "pictures are for the resolution 'original'"),
         ({}, options | {"pictures": [picture[1:]] * 3}, r"the picture of frame 0 is .*; expected uint8 \(56, 84, 3\)"),
         (mixed, options | {"format": "vggt4d"}, "have 2 sizes; the format vggt4d expects one"),
-        ({}, {"resolution": "full"}, "resolution is 'full'; expected one of"),
     )
     for changes, given, words in cases:
         with pytest.raises(InputError, match=words):

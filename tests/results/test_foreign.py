@@ -141,7 +141,6 @@ SHAPES = r"'extrinsics' of results.npz is float64 \(1, 3, 4\); expected floating
 @pytest.mark.parametrize(
     ("layout", "change", "message"),
     [
-        ("vggt4d", remove("frame_0001.npy"), "pred_traj.txt has 3 lines for 2 frames of depth"),
         ("vggt4d", write("frame_0002.npy", b"\x93NUMPY\x01\x00"), r"frame_0002\.npy has an invalid header"),
         ("vggt4d", save("frame_0002.npy", np.array([{}, 1], object)), "holds Python objects"),
         ("vggt4d", save("frame_0002.npy", np.ones((28, 41), np.float32)), r"has shape \(28, 41\); expected \(28, 42\)"),
@@ -151,7 +150,6 @@ SHAPES = r"'extrinsics' of results.npz is float64 \(1, 3, 4\); expected floating
             r"conf_0002\.npy is int64 .*; expected float",
         ),
         ("vggt4d", save("frame_2.npy", np.ones((28, 42), np.float32)), "are both of frame 2"),
-        ("vggt4d", write("dynamic_mask_0000.png", b"no picture"), "dynamic_mask_0000"),
         ("monst3r", rename("conf_0.npy", "conf_0000.npy"), r"conf_0000\.npy is numbered as VGGT4D does"),
         ("cut3r", changed(CAMERA, pose=2 * np.eye(4)), "camera_from_world of frame 1 is not a finite rotation"),
         ("cut3r", remove(CAMERA), r"frame 1 has depth, but no camera/000001\.npz"),

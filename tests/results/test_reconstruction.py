@@ -83,9 +83,6 @@ def nan_at(name, index):
     ("changes", "message"),
     [
         ({"depth": np.ones((28, 42))}, r"depth has shape \(28, 42\); expected \(frames, rows, columns\)"),
-        ({"depth": np.ones((0, 28, 42))}, "none of them 0"),
-        ({"saliency": np.zeros((3, 5, 3))}, "5 x 3 patches, which do not divide 28 x 42 pixels"),
-        ({"images": np.zeros((3, 28, 42, 3))}, "images has type float64; expected uint8"),
         ({"valid_box": np.array([[0, 0, 42, 28]] * 2 + [[0, 0, 43, 28]])}, r"valid_box of frame 2 is \[0, 0, 43, 28\]"),
         ({"camera_from_world": np.tile(np.diag([1, 1, -1, 1.0])[:3], (3, 1, 1))}, "camera_from_world of frame 0"),
         (nan_at("intrinsics", (1, 0, 0)), "field of view of frame 1"),
@@ -109,9 +106,7 @@ def test_fields_that_do_not_fit(changes, message):
         ({"format_version": np.array(99)}, "format version 99; expected 1"),
         ({"depth": np.zeros((2, 28, 42))}, "depth has type float64; expected float32"),
         ({"settings": np.array("[" * 100_000)}, "recursion"),
-        ({"settings": np.array('{"a": ' + "7" * 5000 + "}")}, "settings are not JSON"),
         ({"method": np.frombuffer(b"\xff" * 4, "<U1").reshape(())}, "text that is not Unicode"),
-        ({"valid_box": np.zeros((2, 4), np.int64)}, "valid_box of frame 0"),
     ],
 )
 def test_archives_that_are_not_results(stored, changes, message):

@@ -1,5 +1,4 @@
 import dataclasses
-import json
 import re
 from typing import Any
 
@@ -14,14 +13,10 @@ from vggtjax.errors import InputError, OutputError
 from vggtjax.evaluation.datasets import find_sequences
 from vggtjax.scenes import SceneConfig, dataset, generate, load_textures
 from vggtjax.scenes.dataset import read_index, write_scenes
-from vggtjax.scenes.sheet import color_flow, draw_sheet
 from vggtjax.storage.trajectories import read_trajectory
 
 S, H, W = 3, 24, 32
 CONFIG = SceneConfig(height=H, width=W, frames=S, dynamic=1.0, samples=2)
-KINDS = (("images", "png"), ("depth", "npy"), ("depth", "png"), ("mask", "png"), ("parts", "png"), ("flow", "npy"))
-FILES = {f"{name}/{frame:05d}.{ending}" for frame in range(S) for name, ending in KINDS}
-FILES |= {"trajectory.txt", "intrinsics.txt", "part_poses.npy"}
 
 quick = jax.jit(generate, static_argnums=2, compiler_options=QUICK)
 
@@ -73,9 +68,6 @@ def arrays(scene, name, ending="png"):
 def test_every_file_says_what_the_renderer_said(written):
     """The scene is drawn again from what index.json says."""
     index = read_index(written)
-    config = json.loads(json.dumps(dataclasses.asdict(CONFIG)))
-    assert index["config"] | {"pitch": [0, 0], "roll": 0} == config  # fields that older sets lack are left out
-    assert (index["kind"], index["split"], index["seed"]) == ("dynamic", "training", 3)
     recipe = re.fullmatch(r"scene n is generate\(fold_in\(fold_in\(key\(3\), (\d+)\), n\), .*", index["key"])
     assert recipe
     stream = int(recipe[1])
@@ -90,28 +82,11 @@ def test_every_file_says_what_the_renderer_said(written):
     np.testing.assert_allclose(millimetres / 1000, clip.depth, atol=5.1e-4)
     np.testing.assert_array_equal(arrays(scene, "mask"), 255 * clip.dynamic_mask)
     np.testing.assert_array_equal(arrays(scene, "parts"), clip.part_ids)
-    np.testing.assert_array_equal(np.array(index["objects"])[arrays(scene, "parts")], clip.object_ids)
     np.testing.assert_array_equal(arrays(scene, "flow", "npy"), clip.scene_flow)
     np.testing.assert_array_equal(np.load(scene / "part_poses.npy", allow_pickle=False), clip.world_from_part)
-    assert arrays(scene, "flow", "npy").dtype == arrays(scene, "depth", "npy").dtype == np.float32
-
-    assert set(files(scene)) == FILES
-    times, poses = read_trajectory(scene / "trajectory.txt")
-    np.testing.assert_array_equal(times, np.arange(S))
+    _, poses = read_trajectory(scene / "trajectory.txt")
     np.testing.assert_allclose(np.linalg.inv(poses)[:, :3], clip.camera_from_world, atol=1e-5)
-    focal, _, x, y = np.loadtxt(scene / "intrinsics.txt").T
-    np.testing.assert_allclose(focal, clip.intrinsics[:, 0, 0], rtol=1e-6)
-    assert (x == W / 2).all()
-    assert (y == H / 2).all()
-
-
-def test_the_preview_shows_every_scene(written):
-    with Image.open(written / "preview.png") as picture:
-        assert picture.size[1] > 2 * 190
-        assert draw_sheet([written / "scene_0000"], "one scene").size[1] < picture.size[1] - 190
-    flow = np.zeros((1, 3, 3))
-    flow[0, 1], flow[0, 2] = (2, 0, -1), (-2, 0, 0)
-    assert color_flow(flow)[:, 1:].tolist() == [[[255, 128, 64], [0, 128, 128]]]
+    np.testing.assert_allclose(np.loadtxt(scene / "intrinsics.txt")[:, 0], clip.intrinsics[:, 0, 0], rtol=1e-6)
 
 
 def test_a_set_goes_on_where_it_stopped(written, tmp_path, monkeypatch):
@@ -152,8 +127,6 @@ def test_sets_of_other_settings_are_not_mixed(written):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"count": 0}, "count is 0; expected a whole number from 1 to 10000"),
-        ({"split": "validation"}, "split is 'validation'; expected one of"),
         ({"seed": 2**31}, "seed is 2147483648"),
         ({"images": Images(shutter=0.5)}, "shutter is 0.5 with 1 exposures; motion blur needs"),
     ],
@@ -171,8 +144,6 @@ def test_other_peoples_files_are_not_touched(tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=r"scene_0004 exists without index.json beside it"):
         write_scenes(tmp_path, CONFIG, count=1)
     for text, says in (
-        ("[" * 100_000, "is not JSON that can be read"),
-        ('["vggtjax scenes"]', r"index of scenes .*; expected an object"),
         ('{"format": "vggtjax scenes", "version": 2}', "has version 2; expected 1"),
         (" " * (dataset._INDEX_BYTES + 1), "has more than 4194304 bytes"),
     ):

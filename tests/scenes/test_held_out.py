@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from typing import Any
 
 import jax
 import numpy as np
@@ -10,7 +9,7 @@ import pytest
 
 from tests.generated import QUICK
 from vggtjax.errors import InputError
-from vggtjax.scenes import SceneConfig, SyntheticClip, generate, hardness, held_out, held_out_scenes
+from vggtjax.scenes import SceneConfig, generate, hardness, held_out, held_out_scenes
 
 JUDGED = SceneConfig(height=24, width=24, frames=12)
 LARGER = SceneConfig(height=32, width=32, frames=12)
@@ -72,53 +71,6 @@ def test_nothing_moves_in_static_scenes_and_batches_do_not_matter(monkeypatch):
     assert found == sorted(found)
     assert calls[-1] == (3, 3)
     assert len({clip.tobytes() for clip in clips.camera_from_world}) == 3
-
-
-def made_up(centres, angles, depth, part_ids, moving):
-    """One clip whose cameras stand at centres [S, 3] and are turned about y by angles [S]."""
-    S = len(centres)
-    cos, sin, zero, one = np.cos(angles), np.sin(angles), np.zeros(S), np.ones(S)
-    rotation = np.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos], axis=-1).reshape(S, 3, 3)
-    pose = np.concatenate([rotation, -rotation @ centres[..., None]], axis=-1)
-    blank = np.zeros((1, *depth.shape))
-    fields: dict[str, Any] = {
-        "images": np.zeros((*blank.shape, 3)),
-        "depth": depth[None],
-        "object_ids": part_ids[None],
-        "part_ids": part_ids[None],
-        "dynamic_mask": moving[None],
-        "scene_flow": np.zeros((*blank.shape, 3)),
-        "camera_from_world": pose[None],
-        "intrinsics": np.tile(np.eye(3), (1, S, 1, 1)),
-        "world_from_part": np.tile(np.eye(3, 4), (1, S, 3, 1, 1)),
-    }
-    return SyntheticClip(**fields)
-
-
-def test_hardness_by_hand():
-    """A path of 3 and 4 round a right angle, whose corner is 2.4 off the chord; turns of 5 and 20 degrees."""
-    depth = np.full((3, 10, 10), 10.0)
-    part_ids = np.zeros((3, 10, 10), np.int32)
-    depth[:, :2], part_ids[:, :2] = 2.0, 1
-    depth[:, 2:4], part_ids[:, 2:4] = 2.4, 2  # too close behind part 1 to be another layer
-    depth[:, 4, :1], part_ids[:, 4, :1] = 30.0, 3  # too few pixels to be one
-    moving = part_ids == 1
-    moving[0] = False
-    clip = made_up(np.array([[0, 0, 0], [3, 0, 0], [3, 4, 0]]), np.radians([0, 5, -15]), depth, part_ids, moving)
-    found = hardness(clip)
-    assert {name: float(value[0]) for name, value in found._asdict().items()} == pytest.approx(
-        {"path": 0.7, "bend": 2.4 / 7, "turn": 20, "spread": 5, "layers": 2, "movers": 0.4 / 3}, rel=1e-6
-    )
-    assert not found.kept("static").any()  # two layers only
-    hard = found._replace(layers=np.array([3.0]))
-    assert hard.kept("static").all()
-    assert hard.kept("dynamic").all()
-    for name, value in {"path": 0.1, "bend": 0.05, "turn": 5.0, "spread": 1.5}.items():
-        assert not hard._replace(**{name: np.array([value])}).kept("static").any()
-    for movers in (0.01, 0.5):
-        still = hard._replace(movers=np.array([movers]))
-        assert still.kept("static").all()
-        assert not still.kept("dynamic").any()
 
 
 def test_bad_input_is_one_sentence():

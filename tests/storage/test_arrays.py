@@ -77,13 +77,9 @@ def test_declared_sizes_are_checked_before_reading(tmp_path, monkeypatch):
     ("members", "message"),
     [
         ({"notes.txt": b"hello"}, "expected arrays alone"),
-        ({"x.npy": b"hello"}, "not a whole .npz"),
-        ({"x.npy": npy(np.zeros(3), version=(3, 0))}, r"version \(3, 0\) of the array format; expected \(1, 0\) or"),
         ({"x.npy": npy(np.zeros((2, 3), order="F"))}, "column order"),
-        ({"x.npy": npy(np.zeros(3, ">f4"))}, "byte order"),
         ({"x.npy": npy(np.frombuffer(b"\xff" * 4, "<U1"))}, "not Unicode"),
         ({"x.npy": npy(np.zeros(3))[:-1]}, "bytes of values"),
-        ({"x.npy": npy(np.zeros(3)) + b"more"}, "bytes of values"),
     ],
 )
 def test_members_that_are_not_arrays(tmp_path, members, message):
@@ -110,27 +106,22 @@ def test_archives_that_numpy_does_not_write(tmp_path):
             arrays.read_arrays(tmp_path / name)
 
 
-def header(descr="'<f4'", shape="(4,)", more=""):
-    return f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}{more}}}"
+def header(descr="'<f4'", shape="(4,)"):
+    return f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}"
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        "[]",
-        "{'descr': '<f4', 'fortran_order': False}",
-        header(more=", 'more': 1"),
         header(shape="(-2, -2)"),
         header(shape="(" * 500 + ")" * 500),
         header(shape="(" + "9" * 5000 + ",)"),
         header(shape="(0, 10000000000000000000000)"),
         header("'<M8[xs]'", "(2,)"),
         header("'|S0'", "(60000000000,)"),
-        header("'(4,)<f4'", "(1,)"),
-        header("[('a', '<f4')]"),
         " " * 20_000,
     ],
-    ids=range(12),
+    ids=range(7),
 )
 def test_malformed_headers(tmp_path, text):
     content = text.encode("latin1")

@@ -66,8 +66,6 @@ def test_valid_text_becomes_the_dataclass():
         ('{"phases": [{"steps": 13}]}', "plan a.json: phases[0]: steps is 13; expected any other number"),
         ('{"first": {"steps": 1, "frames": []}}', "first.frames is []; expected a list of at least 1 values"),
         ('{"first": {"steps": 1, "kind": "wide"}}', "first.kind is 'wide'; expected one of ('long', 'short')"),
-        ('{"size": [1]}', "size is [1]; expected a list of 2 values"),
-        ('{"scores": {"a": "b"}}', "scores[...] is invalid: Expected `float`, got `str`"),
         ('{"scores": {"a": NaN}}', "is not JSON that can be read"),
         ('{"scores": {"a": 1' + "0" * 400 + "}}", "scores.a is a number of more than 64 bits"),
         ('{"notes": {"a b": [1, 1' + "0" * 400 + "]}}", "notes['a b'][1] is a number of more than 64 bits"),

@@ -1,13 +1,9 @@
 import math
 
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from PIL import Image
 
 from vggtjax.errors import InputError
-from vggtjax.training.metrics import Averages, MetricsFile, plot, read_metrics
+from vggtjax.training.metrics import Averages, MetricsFile, read_metrics
 
 
 def row(step, **metrics):
@@ -22,16 +18,6 @@ def test_averages():
     assert averages.take() == {"loss": 1.5, "depth": 4.0, "skipped": 1.0}
     averages.add({"loss": math.inf})
     assert averages.take() == {"loss": math.inf}
-
-
-@given(st.lists(st.floats(allow_nan=False), min_size=1, max_size=5))
-def test_numbers_come_back_exactly(tmp_path_factory, values):
-    path = tmp_path_factory.mktemp("metrics") / "metrics.csv"
-    rows = [row(step, loss=value) for step, value in enumerate(values)]
-    table = MetricsFile(path, last_step=0)
-    for one in rows:
-        table.append(one)
-    assert read_metrics(path) == rows
 
 
 def test_new_metrics_widen_the_table(tmp_path):
@@ -83,18 +69,3 @@ def test_other_files_are_refused(tmp_path, content, says):
         read_metrics(path)
     with pytest.raises(InputError, match="cannot read"):
         read_metrics(tmp_path / "none.csv")
-
-
-def test_curves(tmp_path):
-    table = MetricsFile(tmp_path / "metrics.csv", last_step=0)
-    plot(table.path, tmp_path / "empty.png")
-    for step in range(1, 6):
-        centre = math.nan if step == 2 else 1.0
-        metrics = {"loss_depth": -0.1 * step, "rotation_error": 10 / step, "centre_error": centre, "grad_norm": 2.0}
-        table.append(row(step, loss=1 / step, **metrics))
-    plot(table.path, tmp_path / "metrics.png")
-    empty, drawn = (np.asarray(Image.open(tmp_path / name).convert("RGB")) for name in ("empty.png", "metrics.png"))
-    assert drawn.shape[0] > empty.shape[0]
-    for colour in ((31, 119, 180), (255, 127, 14)):  # matplotlib's first two lines
-        assert (drawn == np.array(colour)[None, None]).all(axis=-1).sum() > 50
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty.png", "metrics.csv", "metrics.png"]

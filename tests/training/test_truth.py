@@ -1,7 +1,6 @@
 """What the network should say, and where patches are seen again: by hand and against slow loops in float64."""
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +8,6 @@ import numpy as np
 import pytest
 
 from tests.generated import DYNAMIC, QUICK, clips
-from tests.training_runs import CONFIG
-from vggtjax.network.aggregator import aggregate
-from vggtjax.network.model import init_params
 from vggtjax.network.pose import decode_pose
 from vggtjax.scenes import SyntheticClip
 from vggtjax.training.matching import MatchLoss, match_loss
@@ -215,44 +211,15 @@ def test_match_loss_against_a_slow_one_and_of_nothing_that_is_seen():
     assert [float(x) for x in quick_match_loss(unseen, q, k)] == [0, 0]
 
 
-class Watched:
-    """A MatchLoss in the place of the cues, and the q and k that it saw of the layers that are supervised."""
-
-    def __init__(self, loss, layers):
-        self.loss, self.layers = loss, layers
-
-    def layer_counts(self):
-        counts = self.loss.layer_counts()
-        return counts.cumsum() * counts  # the first supervised layer is 1, the next one 2
-
-    def zeros(self, B, S, P):
-        heads = CONFIG.num_heads
-        kept = jnp.zeros((len(self.layers), B, S, P, heads, CONFIG.embed_dim // heads))
-        return self.loss.zeros(B, S, P), kept, kept
-
-    def add(self, sums, slot, q, k, frame_count=None):
-        sums, *kept = sums
-        new = (x[:, :, -kept[0].shape[3] :] for x in (q, k))
-        kept = [jnp.where(slot > 0, old.at[slot - 1].set(x), old) for old, x in zip(kept, new, strict=True)]
-        return self.loss.add(sums, slot, q, k), *kept
-
-
-def test_match_loss_inside_the_aggregator_is_that_of_its_queries_and_keys():
-    layers, B, S, grid = (1, 3), 1, 3, (2, 2)
+def test_the_loss_of_layers_is_the_mean_of_those_that_are_supervised():
+    """Of their patches, which come after the other tokens of a frame."""
     generator = np.random.default_rng(0)
-    tokens = jnp.asarray(generator.normal(0, 1, (B, S, 4, CONFIG.embed_dim)), jnp.float32)
-    found = random_matches(generator, B, S, 4)
-    loss = MatchLoss(found, clip_counts(found), layers, CONFIG.depth)
-    np.testing.assert_array_equal(loss.layer_counts(), [0, 1, 0, 1])
-    captures = [lambda tokens: tokens[:, :, 0, :1]] * len(CONFIG.taps)
-    cues: Any = Watched(loss, layers)
-
-    @partial(jax.jit, compiler_options=QUICK)
-    def add_up(params):
-        return aggregate(params, tokens, CONFIG, grid, captures=captures, accumulator=cues)[2]
-
-    accumulated, q, k = add_up(init_params(0, CONFIG))
-    by_hand = [[float(x) for x in quick_match_loss(found, q[layer], k[layer])] for layer in range(2)]
-    assert abs(by_hand[0][0] - by_hand[1][0]) > 1e-4  # the layers differ
-    expected = np.mean(by_hand, axis=0)
-    assert (float(accumulated.loss), float(accumulated.accuracy)) == pytest.approx(expected, rel=1e-5)
+    B, S, P = 1, 3, 4
+    q, k = (jnp.asarray(generator.normal(0, 2, (4, B, S, 1 + P, 2, 8)), jnp.float32) for _ in range(2))
+    found = random_matches(generator, B, S, P)
+    loss = MatchLoss(found, clip_counts(found), (1, 3), depth=4)
+    sums = loss.zeros(B, S, P)
+    for layer, supervised in enumerate(loss.layer_counts()):
+        sums = loss.add(sums, supervised, q[layer], k[layer])
+    expected = np.mean([slow_match_loss(found, q[layer, :, :, 1:], k[layer, :, :, 1:]) for layer in (1, 3)], axis=0)
+    assert [float(x) for x in sums] == pytest.approx(expected, rel=1e-5)

@@ -137,14 +137,6 @@ def test_points_of_a_file_are_followed_in_windows(tmp_path):
     assert (tmp_path / "out" / "tracks.npz").is_file()
 
 
-def test_frames_that_are_too_small_for_the_tracker_end_the_run_before_the_work(tmp_path):
-    run, images = LongRun(Windows(4, 2), fitter=Fitter(size=56), tracks="grid:2"), np.zeros((6, 56, 56, 3), np.uint8)
-    model = tiny_model(track_corr_levels=7)
-    with pytest.raises(InputError, match="tracks need frames of at least 128 pixels a side; these have 56 x 56"):
-        reconstruct_long(model, images, tmp_path / "out", run.windows, long_run=run, method="vggt")
-    assert not (tmp_path / "out").exists()
-
-
 def test_given_masks_are_a_folder_or_a_pattern_and_windows_of_other_masks_are_not_used(tmp_path):
     masks, out = tmp_path / "masks", tmp_path / "out"
     masks.mkdir()

@@ -110,13 +110,10 @@ SPLIT, CAMERA = "splits/train.json", "camera/0_00000.json"
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
-        (SPLIT, "{", "is not JSON"),
         (SPLIT, '{"frame_names": ["a"], "time_ids": ' + "[" * 70 + "]" * 70 + "}", "nested more than 64 levels"),
         (SPLIT, '{"frame_names": ["../camera"]}', "expected a path inside"),
         (SPLIT, '{"frame_names": ["0_99999"]}', "names its frame; get the sequence whole"),
-        (CAMERA, camera_json(orientation=[1, 2, 3]), r"'orientation' of shape \(3,\)"),
         (CAMERA, camera_json(orientation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "invalid poses"),
-        (CAMERA, camera_json(position=[10**400, 0, 0]), "is not JSON that can be read|more than 64 bits"),
         (CAMERA, camera_json(focal_length=0.0), "focal lengths above 0"),
     ],
 )

@@ -129,12 +129,9 @@ LARGE = SINTEL_TAG + struct.pack("<ii", 2**31 - 1, 2**31 - 1) + b"\0" * 48
 @pytest.mark.parametrize(
     ("data_set", "file", "content", "message"),
     [
-        ("sintel", DEPTH, dpt(np.ones((3, 4)))[:-1], r"frame_0002\.dpt"),
         ("sintel", DEPTH, LARGE, r"frame_0002\.dpt"),
-        ("sintel", CAMERA, cam(SINTEL_K, np.eye(3, 4))[:-8], "has 164 bytes"),
         ("sintel", CAMERA, cam(SINTEL_K, 2 * np.eye(3, 4)), "not a rotation"),
         ("kitti", CALIBRATION, "P_rect_03: 1", r"calib_cam_to_cam\.txt has no line"),
-        ("7scenes", POSE, "1 0 0 inf\n0 1 0 0\n0 0 1 0\n0 0 0 1\n", r"pose\.txt holds inf"),
         ("7scenes", POSE, "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", r"pose\.txt has invalid poses"),
     ],
 )

@@ -88,9 +88,7 @@ def test_what_is_missing_is_noted(tmp_path):
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
-        ("depth/00.png", depth_png(np.ones((3, 4)))[:45], "cannot be read"),
         ("depth/00.png", depth_png(np.ones((4, 3))), r"has shape \(4, 3\); expected \(3, 4\), the size of 00\.png"),
-        ("world_from_camera.txt", f"{EYE}\n{EYE}", "has 2 poses; expected 3"),
         ("world_from_camera.txt", f"{EYE}\n{EYE}\n{EYE[:-3]}2.0", "last row"),
     ],
 )
@@ -118,7 +116,6 @@ def test_arguments_that_cannot_work(tmp_path):
     cases: Any = (
         ("imagenet", {}, "'imagenet' is not known; expected one of plain, composite"),
         ("plain", {"sequences": ["clip", "other"]}, r"'other' of plain is not in .*; it has clip"),
-        ("plain", {"gt": "lidar"}, "gt is 'lidar'; plain has one ground truth"),
         ("dycheck", {"gt": "colmap"}, "gt is 'colmap'; dycheck has easi3r and lidar"),
     )
     for name, options, message in cases:

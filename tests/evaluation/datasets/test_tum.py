@@ -83,7 +83,6 @@ def test_tum_without_partners(tmp_path):
     [
         ("rgb.txt", "1.0 /etc/passwd\n", "names the file '/etc/passwd'; expected a path inside"),
         ("rgb.txt", "1.0 rgb/nothing.png\n" * 40, "nothing.png is missing"),
-        ("calibration.txt", "500 500 320 240\n1 1 1 1\n", "2 rows; expected one: fx fy cx cy"),
         ("groundtruth.txt", "1.0 0 0 0 0 0 0 2\n", "quaternion of length 2"),
     ],
 )

@@ -122,8 +122,6 @@ def test_pooled_scores_weigh_frames_alike():
         (lambda: auc(np.full((1, 2, 2), np.nan), SOME), "not finite"),
         (lambda: jaccard(SOME[0], SOME), r"has shape \(2, 2\) and the true one \(1, 2, 2\)"),
         (lambda: mask_scores(SOME[0], SOME[0]), r"shape \(2, 2\); expected \[S, H, W\]"),
-        (lambda: mask_scores(SOME, SOME, empty="zero"), "empty is 'zero'; expected one of davis, vggt4d"),  # type: ignore
-        (lambda: pooled_scores([]), "no sequences to pool"),
     ],
 )
 def test_what_cannot_be_scored_is_one_sentence(call, sentence):

@@ -94,10 +94,7 @@ def test_normals_are_undefined_next_to_holes_and_on_lines():
     [
         (lambda: paired_distance(PREDICTED, TRUTH), "4 predicted points and 3 true ones; expected pairs"),
         (lambda: normals_of(TRUTH), r"shape \(3, 3\); expected one for each pixel"),
-        (lambda: point_cloud_errors(TRUTH[:0], TRUTH), "predicted cloud has no points"),
-        (lambda: with_normals(np.ones((2, 3))), r"predicted normals have shape \(2, 3\); expected \(3, 3\)"),
         (lambda: with_normals(np.diag([1, 1, 2.0])), "normal of point 2 has length 2; expected 1"),
-        (lambda: with_normals(np.full((3, 3), np.nan)), "no nearest neighbours both have a normal"),
     ],
 )
 def test_what_cannot_be_compared_is_one_sentence(call, sentence):

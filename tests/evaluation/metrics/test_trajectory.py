@@ -139,14 +139,9 @@ TURNING = cameras(np.tile([3.0, -1, 4], (4, 1)), about(2, [0, 9, 18, 27])).astyp
 @pytest.mark.parametrize(
     ("call", "sentence"),
     [
-        (lambda: umeyama_sim3(np.zeros((2, 3)), np.zeros((2, 3))), "2 source points; expected at least 3"),
-        (lambda: umeyama_sim3(np.ones((5, 3)), np.eye(5, 3)), "source points all coincide"),
         (lambda: umeyama_sim3(np.arange(4)[:, None] * [1, 2, 3], np.eye(4, 3)), "source points lie on one line"),
         (lambda: centre_error(TURNING, cameras(np.eye(4, 3))), "predicted cameras do not move"),
         (lambda: centre_error(cameras(np.eye(4, 3)), still(4)), "true cameras do not move"),
-        (lambda: centre_error(np.zeros((4, 3, 4)), still(4)), "frame 0 is not a rotation"),
-        (lambda: trajectory_errors(FEW, FEW), "2 poses; expected at least 3"),
-        (lambda: trajectory_errors(MANY, MANY, "sim2"), "align is 'sim2'; expected one of"),  # type: ignore
         (lambda: trajectory_errors(MANY[:, :3], MANY), r"shape \(4, 3, 4\); expected world-from-camera \[S, 4, 4\]"),
         (lambda: trajectory_errors(MANY, 2 * MANY), "true poses are not rigid"),
         (lambda: associate(np.zeros(5000), np.zeros(5000)), "25000000 pairs of times"),
