@@ -19,7 +19,7 @@ from vggtjax import VGGTConfig
 from vggtjax.pretrained import embedded
 
 CLIPS = Path(__file__).parents[2] / "shared" / "clips"
-_MAPPINGS = 20_000  # Linux allows 65530; so many take 3 GB
+_MAPPINGS = 40_000  # Linux allows 65530; so many programs take 5 GB
 _CACHE_BYTES = 2**31  # a larger cache of compiled programs is emptied; a whole run fills a tenth of it
 
 gc.set_threshold(50_000, 50, 100)  # tracing makes many small objects, which are not garbage
