@@ -116,6 +116,10 @@ def test_files_that_are_no_images(tmp_path):
 
 
 def test_an_absurdly_large_image(tmp_path, monkeypatch):
+    path = save(tmp_path / "cut.png", Image.new("1", (4000, 3000)))
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ClipError, match=r"bytes and says it has 4000 x 3000 pixels; get it whole"):
+        read_image(path)
     path = save(tmp_path / "bomb.png", Image.new("1", (400, 400)))
     monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 400 * 400 // 3)
     with pytest.raises(ClipError, match=r"cannot read image .*bomb.png.*exceeds limit"):

@@ -1,9 +1,10 @@
 """Many clips in one call: all of them, in spite of a broken one, and after an interruption."""
 
+import dataclasses
 import tempfile
-import time
 from functools import partial
 
+import jax
 import numpy as np
 import pytest
 from PIL import Image
@@ -13,7 +14,6 @@ from tests.servers import empty_memory, served
 from tests.tiny import tiny_model
 from vggtjax import Reconstruction
 from vggtjax.clips.sources import clips_by_name
-from vggtjax.commands.batch import _Clock
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.pipeline.batch import reconstruct_many
 from vggtjax.pipeline.destination import PAGE_NAME, SETTINGS_NAME
@@ -99,21 +99,6 @@ def test_progress_counts_frames(model, tmp_path):
     outcomes = run(model, sources, tmp_path / "out")
     assert sum(outcome.status == "failed" for outcome in outcomes) == 2
     assert seen == [(0, 16), (2, 16), (5, 15), (5, 7), (7, 7), (7, 7)]
-
-
-def test_the_time_that_is_left_goes_by_frames(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    shown = []
-    clock = _Clock(lambda *count: shown.append(count))
-    clock.progress(0, 40)
-    assert clock.left() == ""
-    now[0] += 100
-    clock.progress(1, 40)
-    assert clock.left() == ", 1:05:00 left"
-    clock.progress(40, 40)
-    assert clock.left() == ""
-    assert shown == [(0, 40), (1, 40), (40, 40)]
 
 
 def test_results_are_those_of_single_runs(model, clips, tmp_path):
@@ -226,6 +211,13 @@ def test_only_settings_that_change_results_are_compared_and_they_are_named(model
     assert list(run(gram="cosine", suppress="zero", refine_mask=False, sampling={"stride": 1})) == []
     with pytest.raises(InputError, match=r"\(gram 'cosine', now 'dot'; mask_pairs 5, now 3\)"):
         list(run(gram="dot", mask_pairs=3))
+
+
+def test_a_batch_knows_a_model_by_its_weights(model, tmp_path):
+    assert list(reconstruct_many(model, {}, tmp_path)) == []
+    other = dataclasses.replace(model, params=jax.tree.map(lambda leaf: leaf + 1, model.params))
+    with pytest.raises(InputError, match=r"has other settings than this run \(model"):
+        list(reconstruct_many(other, {}, tmp_path))
 
 
 def test_unknown_options_are_named(model, tmp_path):

@@ -210,3 +210,12 @@ def test_percentile_is_taken_over_the_clip_and_ties_stay():
     assert not kept[0, 0, :2].any()
     assert confident(room, 0).all()
     assert confident(room, 50).sum() == 388  # all the ones tie with the median
+
+
+def test_what_moves_has_a_percentile_of_its_own():
+    """One pass vouches for it, two for what stands still: a common percentile would remove it."""
+    moving = np.zeros((2, 14, 14), bool)
+    moving[:, :5] = True
+    confidence = np.where(moving, 1, 2) + np.linspace(0, 0.5, moving.size, dtype=np.float32).reshape(moving.shape)
+    kept = confident(make_room(2, 14, 14, depth_confidence=confidence.astype(np.float32), dynamic_mask=moving), 20)
+    assert [round(float(kept[pixels].mean()), 2) for pixels in (moving, ~moving)] == [0.8, 0.8]
