@@ -55,7 +55,7 @@ mutants: $(VENV)/.development $(MUTANTS)/.installed
 	PATH="$(abspath $(BIN)):$(abspath $(MUTANTS)/bin):$$PATH" MODULES="$(MODULES)" build/mutants/tests/proofs/mutants/run.sh
 
 check: $(VENV)/.development
-	$(MAKE) --jobs 2 --output-sync=target lint fast
+	$(MAKE) --jobs 2 lint fast
 
 fast: $(VENV)/.development
 	$(PYTEST) -q tests $(SLOW:%=--ignore tests/%)

@@ -19,7 +19,7 @@ from vggtjax.errors import ClipError, InputError, VggtjaxError
 CASES, MANY = 4, 2000
 PATIENCE = 60.0  # seconds of a case; a busy machine is no fault of the reader
 CORPUS = Path(__file__).parent / "corpus"
-# Readers of our own caches and kept results: what is damaged is made anew, without a word.
+# Readers of our own kept results: what is damaged is made anew, without a word.
 SILENT = {"evaluation"}
 
 
