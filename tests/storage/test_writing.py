@@ -18,7 +18,9 @@ from vggtjax.storage.writing import (
     _remove_leftovers,
     check_free,
     locked_folder,
+    says_format,
     staging,
+    write_errors,
     writing,
 )
 
@@ -149,6 +151,45 @@ def test_a_file_system_without_locks_is_written_without_one(tmp_path, monkeypatc
                 path.write_text("whole")
     assert [str(warning.message)[:28] for warning in warned] == ["the file system has no locks"]
     assert {path.name for path in tmp_path.iterdir()} == {"a", "b"}
+
+
+@pytest.mark.skipif(os.name != "posix", reason="named pipes")
+def test_an_error_names_what_is_in_the_way(tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "link").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "pipe")
+    for name, kind in (
+        ("file", "a file"),
+        ("link", "a link to nowhere, which does not exist"),
+        ("pipe", "not a folder"),
+    ):
+        with (
+            pytest.raises(OutputError, match=f"{name}/new: .*/{name} is {kind}; choose"),
+            staging(tmp_path / name / "new"),
+        ):
+            pass
+    for error in (OSError(errno.ENOSPC, "No space left"), OSError("No space left")):  # with and without a number
+        with pytest.raises(OutputError, match=f"cannot write {tmp_path}: No space left; "), write_errors(tmp_path):
+            raise error
+
+
+def test_a_folder_that_another_program_removes_is_made_again(tmp_path, monkeypatch):
+    folder, mkdir = tmp_path / "new", Path.mkdir
+
+    def removed_once(path, *arguments, **options):
+        mkdir(path, *arguments, **options)
+        monkeypatch.undo()
+        path.rmdir()
+
+    monkeypatch.setattr(Path, "mkdir", removed_once)
+    with locked_folder(folder, "a batch"):
+        assert folder.is_dir()
+
+
+@pytest.mark.parametrize(("text", "says"), [('{"format": "clip"}', True), ('{"format": "mask"}', False), ("[", False)])
+def test_a_file_says_its_format(tmp_path, text, says):
+    (tmp_path / "a.json").write_text(text)
+    assert says_format(tmp_path / "a.json", "clip") is says
 
 
 def test_a_check_finds_files_that_may_not_be_replaced_and_leaves_nothing(tmp_path):

@@ -150,7 +150,7 @@ def _staged(folder: Path) -> Iterator[Path]:
             _release(lock)
 
 
-@lru_cache(maxsize=256)  # once in a process: a scan of 20,000 files takes as long as writing 50
+@lru_cache  # once in a process: a scan of 20,000 files takes as long as writing 50
 def _remove_leftovers(folder: Path) -> None:
     remove_leftovers(folder)
 
