@@ -76,6 +76,17 @@ def test_a_floor_keeps_a_patch_that_one_map_rules_out(floor, exponents, expected
     assert np.allclose(saliency[0, 0], expected, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("statistic", "expected"), [("mean", [[3, 9], [4, 8]]), ("std", [[2**0.5, 18**0.5], [8**0.5, 32**0.5]])]
+)
+def test_similarities_with_the_other_frame_by_hand(statistic, expected):
+    """Patches 1 and 3 of one frame and 2 and 4 of the other, in two heads: a head's similarities are products."""
+    cues = GramCues(MotionConfig((Cue("a", "q", "q", (0,), statistic),), reference_depth=1), 1, "dot")
+    q = jnp.array([[[1.0, 3.0], [2.0, 4.0]]])[..., None, None].repeat(2, axis=3)
+    (sums,) = cues.add(cues.zeros(1, 2, 2), jnp.ones(1, int), q, q)
+    assert np.allclose(sums[0], expected)
+
+
 def test_clips_of_different_lengths_in_one_batch_have_the_sums_of_each_alone():
     """Frames of one clip lack sources that frames of the other have: weights are shared out among those of each."""
     cues, counts, frames = GramCues(MotionConfig(), 24), (9, 4), 9
@@ -146,5 +157,5 @@ def test_layers_of_another_depth():
 
 
 def test_normalise_by_hand():
-    made = normalise(jnp.asarray([[[1.0, 2.0, 3.0], [4.0, 4.0, 4.0]]]))
-    assert np.allclose(made, [[[0, 0.5, 1], [0, 0, 0]]], atol=1e-6)
+    made = normalise(jnp.asarray([[[1.0, 2.0, 3.0], [4.0, 4.0, 4.0], [0, 1e-6, 1e-6]]]))
+    assert np.allclose(made, [[[0, 0.5, 1], [0, 0, 0], [0, 0.5, 0.5]]], atol=1e-5)
