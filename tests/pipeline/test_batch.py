@@ -12,6 +12,7 @@ from PIL import Image
 from tests.moving_ball import moving_ball
 from tests.servers import empty_memory, served
 from tests.tiny import tiny_model
+from tests.videos import write_video
 from vggtjax import Reconstruction
 from vggtjax.clips.sources import clips_by_name
 from vggtjax.errors import ClipError, InputError, OutputError
@@ -73,23 +74,11 @@ def test_every_good_clip_is_there_once_and_the_broken_one_is_named(model, clips,
         next(run(options={"method": "4dvggt-d"}))
 
 
-def write_video(path, frames, rows):
-    import av
-
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=10)
-        stream.height, stream.width = rows, moving_ball(1).shape[2]
-        stream.pix_fmt = "yuv420p"
-        for picture in (255 * moving_ball(frames)).astype(np.uint8):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture[:rows], format="rgb24")))
-        container.mux(stream.encode())
-
-
 def test_progress_counts_frames(model, tmp_path):
     """A video counts as the mean of the others until it is read, and a clip that fails not at all."""
     root = tmp_path / "clips"
     write_clip(root / "a", 2, 70)
-    write_video(root / "b.mp4", 3, 70)
+    write_video(root / "b.mp4", range(0, 300, 100), size=(140, 70))
     write_clip(root / "c", 8, 70)
     (root / "c/7.png").write_bytes(b"broken")
     write_clip(root / "d", 2, 70)
