@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
+from vggtjax.cameras import world_from_camera
 from vggtjax.clips.sampling import Sampling
+from vggtjax.clips.truth import Truth
 from vggtjax.evaluation.datasets import find_sequences
 
 SINTEL_TAG = struct.pack("<f", 202021.25)
@@ -20,6 +23,19 @@ def opened(name: str, root: Path, *, stride: int | None = None, max_frames: int 
     """Open all sequences, of no type: a test knows which ground truth there is."""
     sampling = Sampling(stride=stride, max_frames=max_frames)
     return [opener() for opener in find_sequences(name, root, sampling=sampling, **options).values()]
+
+
+def write_plain(folder: Path, clip: Truth, *, first: int = 0) -> None:
+    """Write a clip with its truth in the plain layout, its frames numbered from `first`; depth in millimetres."""
+    for name in ("rgb", "depth", "mask"):
+        (folder / name).mkdir(parents=True)
+    for i, (image, depth, mask) in enumerate(zip(clip.images, clip.depth, clip.dynamic_mask, strict=True), first):
+        Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(folder / f"rgb/{i:05d}.png")
+        Image.fromarray(np.rint(1000 * depth).astype(np.uint16)).save(folder / f"depth/{i:05d}.png")
+        Image.fromarray(mask.astype(np.uint8) * 255).save(folder / f"mask/{i:05d}.png")
+    poses = world_from_camera(np.asarray(clip.camera_from_world))
+    np.savetxt(folder / "K.txt", clip.intrinsics[0])
+    np.savetxt(folder / "world_from_camera.txt", poses.reshape(-1, 16))
 
 
 def write(path: Path, content: bytes | str) -> Path:

@@ -43,6 +43,7 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     named = fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters"}
     assert set(key) == named - {"attention", "precision"}
     assert set(Options(attention="merged").passes_settings(MOTION)) == named - {"precision"}
+    assert "attention" not in Options().to_json()
     assert all(Options(**{name: value}).passes_settings(MOTION) != key for name, value in other.items())
     assert Options(align_scale=True, refine_mask=True, refine_cameras=True).passes_settings(MOTION) == key
     same = {name for name in METHODS if Options(name).passes_settings(MOTION) == key}  # pyright: ignore[reportArgumentType]

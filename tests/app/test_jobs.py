@@ -6,12 +6,11 @@ import time
 import zipfile
 from pathlib import Path
 
-import av
-import numpy as np
 import pytest
 from PIL import Image
 
 from tests.room import make_room
+from tests.videos import write_video
 from vggtjax.app import outputs
 from vggtjax.app.jobs import Desk, Job, Request
 from vggtjax.app.limits import Limits
@@ -19,18 +18,6 @@ from vggtjax.app.models import Models
 from vggtjax.app.space import Space
 from vggtjax.app.uploads import check_clip, keep, safe_stem
 from vggtjax.errors import InputError, ResultError
-
-
-def write_video(path: Path) -> Path:
-    """Write sixteen frames, four a second."""
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=4)
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        for number in range(16):
-            picture = np.full((48, 64, 3), 15 * number, np.uint8)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture)))
-        container.mux(stream.encode())
-    return path
 
 
 @pytest.fixture
@@ -174,7 +161,7 @@ def test_a_file_that_is_no_video_fails_without_the_machines_paths(tmp_path):
 
 
 def test_a_long_video_is_refused_and_a_short_one_is_sampled_evenly(tmp_path):
-    video = write_video(tmp_path / "a.mp4")
+    video = write_video(tmp_path / "a.mp4", range(0, 4000, 250))
     with pytest.raises(InputError, match="the video is 4 s long; send at most 3 s"):
         check_clip(video, 8, None, Limits(max_seconds=3))
     for rate, times in ((None, [0, 1, 2, 3]), (2.0, [0, 0.5, 1, 1.5])):

@@ -19,6 +19,8 @@ from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import clips_by_name, open_source
 from vggtjax.errors import ClipError, InputError, MissingExtraError
 
+read: Any = read_capture  # of no type: a test knows what there is
+find: Any = find_capture
 TRUTH = make_truth()
 SHARED = make_truth(shared=True)
 NAMES = {
@@ -28,15 +30,6 @@ NAMES = {
     "colmap": [f"view_{8 + frame}" for frame in range(FRAMES)],
     "tum": [f"{100 + frame / 10:.6f}" for frame in range(FRAMES)],
 }
-
-
-def read(*arguments: Any) -> Any:
-    """Read a capture, of no type: a test knows what there is."""
-    return read_capture(*arguments)
-
-
-def find(path) -> Any:
-    return find_capture(path)
 
 
 def write(kind, folder):

@@ -2,18 +2,16 @@
 
 import gc
 import struct
-from fractions import Fraction
 
 import av
 import numpy as np
 import pytest
 from av.stream import Disposition
 
+from tests.videos import HEIGHT, WIDTH, picture, write_video
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.video import VideoFile, upright
 from vggtjax.errors import ClipError
-
-WIDTH, HEIGHT = 64, 48
 
 # Upper left (a, b, c, d) of a display matrix, x' = a x + c y and y' = b x + d y with y down, and what FFmpeg's filters
 # of the same names make of the rows abc and def.
@@ -27,30 +25,6 @@ ORIENTATIONS = {
     (0, 1, 1, 0): ["ad", "be", "cf"],  # transposed
     (0, -1, -1, 0): ["fc", "eb", "da"],
 }
-
-
-def picture(index):
-    """A red left half, a blue upper half over it, and the index as green."""
-    pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    pixels[:, : WIDTH // 2, 0] = 200
-    pixels[: HEIGHT // 2, :, 2] = 200
-    pixels[..., 1] = 10 * index
-    return pixels
-
-
-def write_video(path, times, size=(WIDTH, HEIGHT), **options):
-    """Write one picture per time in milliseconds."""
-    with av.open(str(path), "w", options=options) as container:
-        stream = container.add_stream("mpeg4", rate=30)
-        stream.width, stream.height = size
-        stream.pix_fmt, stream.bit_rate = "yuv420p", 2_000_000
-        stream.codec_context.time_base = Fraction(1, 1000)
-        for index, time in enumerate(times):
-            frame = av.VideoFrame.from_ndarray(picture(index), format="rgb24").reformat(*size)
-            frame.pts, frame.time_base = time, Fraction(1, 1000)
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
-    return path
 
 
 def orient(path, matrix):

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from vggtjax import cameras as geometry
+from tests.dataset_files import write_plain
+from vggtjax.clips.truth import Truth
 from vggtjax.learning.export import PICTURES
 from vggtjax.pretrained.embedded import demo_clip
 
@@ -20,19 +20,12 @@ def sequences(tmp_path_factory) -> Path:
     So few points are enough to score, and soon looked up.
     """
     root, clip = tmp_path_factory.mktemp("sequences"), demo_clip()
-    depth = np.zeros(clip.depth.shape, np.uint16)
-    depth[:, ::4, ::4] = np.rint(1000 * clip.depth[:, ::4, ::4])
-    poses = geometry.world_from_camera(np.asarray(clip.camera_from_world))
-    for start in range(0, len(clip.images), FRAMES):
-        folder = root / f"clip{start // FRAMES}"
-        for below in ("rgb", "depth", "mask"):
-            (folder / below).mkdir(parents=True)
-        for i in range(start, start + FRAMES):
-            Image.fromarray(np.rint(255 * clip.images[i]).astype(np.uint8)).save(folder / f"rgb/{i:05d}.png")
-            Image.fromarray(depth[i]).save(folder / f"depth/{i:05d}.png")
-            Image.fromarray(clip.dynamic_mask[i].astype(np.uint8) * 255).save(folder / f"mask/{i:05d}.png")
-        np.savetxt(folder / "K.txt", clip.intrinsics[0])
-        np.savetxt(folder / "world_from_camera.txt", poses[start : start + FRAMES].reshape(FRAMES, 16))
+    depth = np.zeros_like(clip.depth)
+    depth[:, ::4, ::4] = clip.depth[:, ::4, ::4]
+    clip = clip._replace(depth=depth)
+    for start in range(0, len(depth), FRAMES):
+        frames = slice(start, start + FRAMES)
+        write_plain(root / f"clip{start // FRAMES}", Truth(*(array[frames] for array in clip)), first=start)
     return root
 
 

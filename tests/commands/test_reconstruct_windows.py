@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.clips.test_video import write_video
+from tests.videos import write_video
 from vggtjax import Reconstruction, load_model
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sampling import Sampling

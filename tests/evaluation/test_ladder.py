@@ -12,7 +12,6 @@ from testing.seeded import seeded_images
 from tests.tiny import tiny_config
 from vggtjax import Model, Passes, assemble, infer, init_params
 from vggtjax.clips.truth import Truth
-from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import LadderRow, error_table, ladder, second_pass_in_words
 from vggtjax.evaluation.metrics.depth import depth_errors, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
@@ -170,12 +169,3 @@ def test_words_follow_the_numbers(rows, rotation, centre, abs_rel, expected):
     assert re.match(f"Mined masks: the second pass {expected}", words)
     assert second_pass_in_words([first]) == second_pass_in_words([first, replace(second, abs_rel=None)]) == ""
     assert error_table([first, second]).note.startswith(words)
-
-
-def test_bad_input_is_one_sentence(model, truth):
-    for options, sentence in (
-        ({"methods": ["vgtt"]}, "method is 'vgtt'; expected one of vggt, vggt4d"),
-        ({"mask_pairs": [-1]}, "mask_pairs is -1"),
-    ):
-        with pytest.raises(InputError, match=sentence):
-            ladder(model, truth, **{"batch_size": 2, **options})

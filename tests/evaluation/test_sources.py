@@ -37,12 +37,6 @@ def test_retrained_weights_are_another_model(tmp_path, model):
         assert ModelSource(other, ["vggt"]).settings["model"]["sha256"] != before["model"]["sha256"]
 
 
-def test_the_note_of_a_model_is_a_warning_and_a_setting(model):
-    source = ModelSource(dataclasses.replace(model, note="first attempt"), ["vggt"])
-    assert source.warnings == ("The model tiny is a first attempt.",)
-    assert source.settings["model_note"] == "first attempt"
-
-
 def test_methods_that_do_not_fuse_run_beside_those_that_do(monkeypatch, model):
     fusion, calls = identity(), []
 

@@ -24,7 +24,7 @@ from vggtjax import (
     reconstruct,
     run_passes,
 )
-from vggtjax.errors import DeviceMemoryError, InputError
+from vggtjax.errors import InputError
 from vggtjax.method.fusion import scale_between
 from vggtjax.method.mask import dynamic_pixels, dynamic_tokens, mine_mask
 from vggtjax.options import Options
@@ -161,15 +161,6 @@ def test_equal_programs_are_compiled_once(params, config, images, monkeypatch):
     options = infer(params, images, config, method="vggt4d")
     assert infer(params, images, config, method="vggt4d", gram="dot", refine_mask=True) == options
     assert infer(params, images, config, method="vggt4d", align_scale=True) != options
-
-
-def test_running_out_of_memory_is_one_sentence(params, config, images, monkeypatch):
-    def exhausted(*_, **__):
-        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
-
-    monkeypatch.setattr("vggtjax.pipeline.run.run_stages", exhausted)
-    with pytest.raises(DeviceMemoryError, match="4 frames of 140 x 140 pixels do not fit"):
-        reconstruct(Model(config, params, "tiny"), load_clip(images[0], size=140))
 
 
 def test_fields_of_view_beyond_a_full_turn_are_clamped_and_named(params, config, images):

@@ -8,13 +8,10 @@ import numpy as np
 import pytest
 
 from tests.tiny import tiny_config
-from vggtjax.config import MotionConfig
-from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
 from vggtjax.network.merging import kept_tokens, merged_attention
 from vggtjax.network.model import forward, init_params
 from vggtjax.network.suppression import SuppressedKeys, suppressed_attention
-from vggtjax.options import Options
 
 S, GRID, SPECIAL, N, D = 4, (3, 5), 2, 2, 8
 T = SPECIAL + GRID[0] * GRID[1]
@@ -85,13 +82,6 @@ def test_keeping_all_tokens_is_exact(tokens, suppress, active):
     assert np.abs(np.asarray(out) - np.asarray(expected))[real].max() < 2e-6
 
 
-def test_one_frame_is_exact(tokens):
-    """All tokens of the first frame are kept."""
-    q, k, v = (x[:, :T] for x in tokens[:3])
-    made, expected = merged_attention(1, GRID, SPECIAL)(q, k, v, None, None), suppressed_attention(q, k, v, None)
-    assert np.abs(np.asarray(made) - np.asarray(expected)).max() < 2e-6
-
-
 def test_the_tokens_that_are_kept():
     kept = np.zeros(5 * 40, bool)
     kept[kept_tokens(5, (5, 7), 5, stride=None)] = True
@@ -125,16 +115,3 @@ def test_what_is_exact_stays_exact(model):
         same = np.abs(np.asarray(a - b)).max() <= 1e-6 * np.abs(np.asarray(a)).max()
         assert same == name.startswith("shallow"), name
     assert np.abs(np.asarray(exact.pose_encoding - merged.pose_encoding)).max() > 1e-4
-
-
-def test_an_unknown_attention_is_refused(model):
-    config, params, images = model
-    with pytest.raises(InputError, match="attention"):
-        forward(params, images, config, attention="sparse")
-
-
-def test_results_of_exact_attention_have_the_settings_that_they_had():
-    assert "attention" not in Options().to_json()
-    assert Options(attention="merged").to_json()["attention"] == "merged"
-    motion = MotionConfig()
-    assert Options(attention="merged").passes_settings(motion) != Options().passes_settings(motion)

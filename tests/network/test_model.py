@@ -121,21 +121,6 @@ def test_bad_arguments_are_named(params, config, change, sentence):
         forward(params, config=config, **arguments)
 
 
-def test_a_suppression_is_the_same_as_its_keywords(params, config, images, mask):
-    """Also where it is traced: one compilation serves all numbers of pairs."""
-    traces = []
-
-    @jax.jit
-    def run(suppression):
-        traces.append(suppression)
-        return forward(params, images, config, outputs=("camera",), suppression=suppression)
-
-    for pairs in (1, 3):
-        flat = _forward(params, images, config, dynamic_tokens=mask, mask_pairs=pairs, outputs=("camera",))
-        assert close(run(Suppression(mask, mask_pairs=pairs)).pose_encoding, flat.pose_encoding)
-    assert len(traces) == 1
-
-
 def test_full_size_parameters():
     shapes = parameter_shapes(VGGTConfig())
     count = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(shapes))

@@ -55,13 +55,6 @@ def test_queries_whose_correlations_are_taken_in_turns_have_the_same_numbers(hea
         assert np.abs(one - other).max() < 1e-3
 
 
-def test_later_frames_can_be_permuted(head, config):
-    made = run(head, config, QUERIES)
-    order = np.array([0, 2, 1])
-    swapped = run((head[0], [tap[:, order] for tap in head[1]]), config, QUERIES)
-    assert np.abs(made.positions[:, order] - swapped.positions).max() < 1e-3
-
-
 @pytest.mark.proof
 def test_gradients_reach_parameters_and_taps(head, config):
     def loss(params, taps):

@@ -12,6 +12,7 @@ from PIL import Image
 from tests.moving_ball import moving_ball
 from tests.servers import empty_memory, served
 from tests.tiny import tiny_model
+from tests.videos import write_video
 from vggtjax import Reconstruction
 from vggtjax.clips.sources import clips_by_name
 from vggtjax.errors import ClipError, InputError, OutputError
@@ -73,23 +74,11 @@ def test_every_good_clip_is_there_once_and_the_broken_one_is_named(model, clips,
         next(run(options={"method": "4dvggt-d"}))
 
 
-def write_video(path, frames, rows):
-    import av
-
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=10)
-        stream.height, stream.width = rows, moving_ball(1).shape[2]
-        stream.pix_fmt = "yuv420p"
-        for picture in (255 * moving_ball(frames)).astype(np.uint8):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture[:rows], format="rgb24")))
-        container.mux(stream.encode())
-
-
 def test_progress_counts_frames(model, tmp_path):
     """A video counts as the mean of the others until it is read, and a clip that fails not at all."""
     root = tmp_path / "clips"
     write_clip(root / "a", 2, 70)
-    write_video(root / "b.mp4", 3, 70)
+    write_video(root / "b.mp4", range(0, 300, 100), size=(140, 70))
     write_clip(root / "c", 8, 70)
     (root / "c/7.png").write_bytes(b"broken")
     write_clip(root / "d", 2, 70)
@@ -220,11 +209,6 @@ def test_a_batch_knows_a_model_by_its_weights(model, tmp_path):
         list(reconstruct_many(other, {}, tmp_path))
 
 
-def test_unknown_options_are_named(model, tmp_path):
-    with pytest.raises(TypeError, match=r"no option is named keep_passes; expected .*mask_pairs"):
-        next(reconstruct_many(model, {}, tmp_path, options={"keep_passes": True}))
-
-
 def test_what_is_wrong_for_all_clips_is_said_once(model, clips, tmp_path):
     with pytest.raises(InputError, match="size is 50"):
         next(reconstruct_many(model, {"a": str(clips / "clip0")}, tmp_path, size=50))
@@ -234,8 +218,6 @@ def test_what_is_wrong_for_all_clips_is_said_once(model, clips, tmp_path):
 def test_what_is_no_clip(clips, tmp_path):
     with pytest.raises(ClipError, match="is not a clip and holds no clips"):
         clips_by_name([str(tmp_path)])
-    with pytest.raises(ClipError, match="'nope' does not exist"):
-        clips_by_name(["nope"])
     with pytest.raises(ClipError, match="two clips are named clip0"):
         clips_by_name([str(clips), str(clips / "clip0")])
     with pytest.raises(ClipError, match="no clips"):

@@ -19,12 +19,13 @@ from safetensors.numpy import save_file
 from testing.golden import GOLDEN
 from testing.make_checkpoint import make_checkpoint
 from testing.seeded import seeded_images
+from tests.dataset_files import write_plain
 from tests.proofs.contents import BROKEN, Files, files_below
 from tests.proofs.killed import Ended, Run, changes_of
 from tests.room import make_room
 from tests.tiny import tiny_config, tiny_model
-from vggtjax.cameras import world_from_camera
 from vggtjax.checkpoint import save_model
+from vggtjax.clips.truth import Truth
 from vggtjax.commands.main import main
 from vggtjax.pretrained.embedded import demo_clip
 from vggtjax.storage.cache import enable_compilation_cache
@@ -80,28 +81,15 @@ def inputs(weights) -> Path:
     shutil.copy(ROOT / "docs/recipes/smoke.json", folder / "recipe.json")
     save_model(folder / "model.safetensors", tiny_model().params, tiny_config())
     make_room(FRAMES).save(folder / "result")
-    for number, clip in enumerate("ab"):
-        (folder / "clips" / clip).mkdir(parents=True)
+    for number, name in enumerate("ab"):
+        (folder / "clips" / name).mkdir(parents=True)
         for frame, image in enumerate(seeded_images(FRAMES, SIDE, SIDE, number).transpose(0, 2, 3, 1)):
-            Image.fromarray(np.round(255 * image).astype(np.uint8)).save(folder / "clips" / clip / f"{frame}.png")
-    write_sequences(folder / "data")
-    return folder
-
-
-def write_sequences(root: Path) -> None:
-    """Write four sequences in the plain layout: three frames each of the embedded clip."""
+            Image.fromarray(np.round(255 * image).astype(np.uint8)).save(folder / "clips" / name / f"{frame}.png")
     clip = demo_clip()
-    poses = world_from_camera(np.asarray(clip.camera_from_world))
     for part in range(CLIPS):
-        folder, frames = root / f"clip{part}", range(FRAMES * part, FRAMES * (part + 1))
-        for below in ("rgb", "depth", "mask"):
-            (folder / below).mkdir(parents=True)
-        for i in frames:
-            Image.fromarray(np.rint(255 * clip.images[i]).astype(np.uint8)).save(folder / f"rgb/{i:05d}.png")
-            Image.fromarray(np.rint(1000 * clip.depth[i]).astype(np.uint16)).save(folder / f"depth/{i:05d}.png")
-            Image.fromarray(clip.dynamic_mask[i].astype(np.uint8) * 255).save(folder / f"mask/{i:05d}.png")
-        np.savetxt(folder / "K.txt", clip.intrinsics[0])
-        np.savetxt(folder / "world_from_camera.txt", poses[frames.start : frames.stop].reshape(FRAMES, 16))
+        frames = slice(FRAMES * part, FRAMES * (part + 1))
+        write_plain(folder / f"data/clip{part}", Truth(*(array[frames] for array in clip)))
+    return folder
 
 
 def command(words: list[str]) -> int:

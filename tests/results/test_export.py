@@ -9,7 +9,7 @@ from tests.room import make_room
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results import export
 from vggtjax.results.frame import frame_of
-from vggtjax.results.point_cloud import PlyWriter, PointCloud, least_confidence
+from vggtjax.results.point_cloud import least_confidence
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
 from vggtjax.storage.trajectories import read_trajectory
@@ -152,17 +152,6 @@ def test_format_of_vggt4d(tmp_path):
     (tmp_path / "vggt4d/frame_0000.npy").write_text("mine")
     with pytest.raises(OutputError, match="vggt4d exists and is not part of an earlier result"):
         room.save(tmp_path, layout="vggt4d")
-
-
-def test_ply_by_hand(tmp_path):
-    cloud = PointCloud(np.array([[1, 2, 3]], np.float32), np.array([[4, 5, 6]], np.uint8))
-    with PlyWriter(tmp_path / "one.ply") as ply:
-        ply.add(cloud)
-        ply.add(cloud)
-    header, _, body = (tmp_path / "one.ply").read_bytes().partition(b"end_header\n")
-    assert b"element vertex 2\n" in header
-    assert body == 2 * (np.array([1, 2, 3], "<f4").tobytes() + bytes([4, 5, 6, 255]))
-    assert [path.name for path in tmp_path.iterdir()] == ["one.ply"]
 
 
 @pytest.mark.parametrize(

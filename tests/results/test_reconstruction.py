@@ -1,12 +1,10 @@
 import dataclasses
-import zipfile
 
 import numpy as np
 import pytest
 
 from tests.room import make_room
 from vggtjax.errors import ResultError
-from vggtjax.results.archive import is_result
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
 from vggtjax.storage import arrays as archive
@@ -114,29 +112,3 @@ def test_archives_that_are_not_results(stored, changes, message):
     with pytest.raises(ResultError, match=message) as error:
         Reconstruction.load(path)
     assert str(path) in str(error.value)
-
-
-def test_pickles_are_refused(stored, tmp_path):
-    path = stored()
-    ran = tmp_path / "ran"
-
-    class Trap:
-        def __reduce__(self):
-            return (ran.touch, ())
-
-    with zipfile.ZipFile(path, "a") as file, file.open("trap.npy", "w") as member:
-        np.lib.format.write_array(member, np.array([Trap()], object), allow_pickle=True)
-    with pytest.raises(ResultError, match=r"holds Python objects .*, which are never loaded"):
-        Reconstruction.load(path)
-    assert not ran.exists()
-
-
-def test_files_that_are_cut_off_or_absent(stored, tmp_path):
-    path = stored()
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ResultError, match=r"not a whole \.npz file"):
-        Reconstruction.load(path)
-    path.unlink()
-    with pytest.raises(ResultError, match=r"there is no .*reconstruction\.npz; give the folder"):
-        Reconstruction.load(tmp_path)
-    assert not is_result(path)

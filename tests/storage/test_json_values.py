@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -39,14 +40,6 @@ class Plan:
         check_fields(self)
 
 
-def refusal(text: str | bytes, kind: Any = Plan) -> str:
-    with pytest.raises(InputError) as raised:
-        parse_json(text, kind, "plan a.json")
-    assert "\n" not in str(raised.value)
-    assert len(str(raised.value)) < 400
-    return str(raised.value)
-
-
 def test_valid_text_becomes_the_dataclass():
     text = '{"phases": [{"steps": 3, "frames": [1, 2], "share": 1}], "first": null, "notes": {"a": [true]}}'
     plan = parse_json(text, Plan, "plan")
@@ -74,7 +67,8 @@ def test_valid_text_becomes_the_dataclass():
     ],
 )
 def test_a_problem_is_one_sentence(text, sentence):
-    assert sentence in refusal(text)
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        parse_json(text, Plan, "plan a.json")
 
 
 def test_sizes_are_bounded(tmp_path):

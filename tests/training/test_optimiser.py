@@ -13,6 +13,8 @@ from vggtjax.training.optimiser import make_optimiser as make_typed_optimiser
 from vggtjax.training.optimiser import make_schedule
 from vggtjax.training.recipe import OptimiserConfig, Recipe
 
+make_optimiser: Any = make_typed_optimiser  # optax's types know no dictionaries
+
 
 def recipe_with(**optimiser: Any) -> Recipe:
     values: dict[str, Any] = {
@@ -28,11 +30,6 @@ def recipe_with(**optimiser: Any) -> Recipe:
 def rates(config: OptimiserConfig, total_steps: int, updates: Iterable[int]) -> np.ndarray:
     schedule: Any = make_schedule(config, total_steps)
     return np.array([schedule(update) for update in updates])
-
-
-def make_optimiser(recipe: Recipe) -> Any:
-    """Return the optimiser without optax's types, which know no dictionaries."""
-    return make_typed_optimiser(recipe)
 
 
 def first_updates(recipe: Recipe, gradient: Any, params: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from tests.clips.test_video import write_video
+from tests.videos import write_video
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.clips.video import VideoFile

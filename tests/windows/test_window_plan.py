@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vggtjax.errors import InputError
 from vggtjax.windows.plan import Windows, blend_weights, plan_windows, shared_frames
 
 
@@ -40,18 +39,3 @@ def test_weights_of_a_frame_sum_to_one_and_fall_towards_the_end_of_a_window(wind
     for a, b in zip(range(len(windows)), range(1, len(windows)), strict=False):
         both = [weights[a] - weights[b] for weights in table if set(weights) == {a, b}]
         assert both == sorted(both, reverse=True)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (
-            {"window": 15, "overlap": 8},
-            "window is 15 and overlap is 8; expected a window of at least twice the overlap",
-        ),
-        ({"overlap": 4}, "overlap is 4, but there are no windows; give window too"),
-    ],
-)
-def test_windows_that_cannot_be(options, sentence):
-    with pytest.raises(InputError, match=sentence):
-        Windows(**options)

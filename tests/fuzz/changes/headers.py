@@ -1,4 +1,4 @@
-"""Changes of headers whose fields stand at fixed places, and of OpenEXR files."""
+"""Changes of the headers of pixmaps and of OpenEXR files."""
 
 from __future__ import annotations
 
@@ -8,19 +8,6 @@ from random import Random
 
 from tests.fuzz.changes.plain import INTEGERS, change_word
 from tests.fuzz.changes.records import Layout, Record, change_records
-
-# Places and widths of fields: sizes of the picture, of its palette, bits of a pixel, where the pixels begin.
-BMP = ((10, 4), (14, 4), (18, 4), (22, 4), (26, 2), (28, 2), (30, 4), (34, 4), (46, 4), (50, 4))
-TGA = ((0, 1), (1, 1), (2, 1), (3, 2), (5, 2), (7, 1), (8, 2), (10, 2), (12, 2), (14, 2), (16, 1), (17, 1))
-DPT = ((4, 4), (8, 4), *((at, 4) for at in range(12, 44, 4)))  # the sides, and some of the values
-
-
-def change_fields(content: bytes, random: Random, *, fields: tuple[tuple[int, int], ...]) -> bytes:
-    """Put another number into one of the fields: an extreme one, or one near that which is there."""
-    at, width = random.choice(fields)
-    value = int.from_bytes(content[at : at + width], "little")
-    value = random.choice((*INTEGERS, *range(33), value + 1, value - 1, 2 * value, value // 2, 1000 * value))
-    return content[:at] + (value % 256**width).to_bytes(width, "little") + content[at + width :]
 
 
 def change_pixmap(content: bytes, random: Random) -> bytes:
