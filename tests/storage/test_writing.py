@@ -141,6 +141,8 @@ def test_a_file_system_without_locks_is_written_without_one(tmp_path, monkeypatc
     import fcntl
 
     def flock(file, operation):
+        for lock in tmp_path.glob(".vggtjax*.lock"):  # another program removes it
+            lock.unlink()
         raise OSError(errno.ENOLCK, "no locks available")
 
     monkeypatch.setattr(fcntl, "flock", flock)
@@ -157,9 +159,11 @@ def test_a_file_system_without_locks_is_written_without_one(tmp_path, monkeypatc
 def test_an_error_names_what_is_in_the_way(tmp_path):
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to("nowhere")
+    (tmp_path / "there").symlink_to("file")
     os.mkfifo(tmp_path / "pipe")
     for name, kind in (
         ("file", "a file"),
+        ("there", "a file"),
         ("link", "a link to nowhere, which does not exist"),
         ("pipe", "not a folder"),
     ):
@@ -177,9 +181,8 @@ def test_a_folder_that_another_program_removes_is_made_again(tmp_path, monkeypat
     folder, mkdir = tmp_path / "new", Path.mkdir
 
     def removed_once(path, *arguments, **options):
-        mkdir(path, *arguments, **options)
-        monkeypatch.undo()
-        path.rmdir()
+        monkeypatch.setattr(Path, "mkdir", mkdir)
+        raise FileNotFoundError
 
     monkeypatch.setattr(Path, "mkdir", removed_once)
     with locked_folder(folder, "a batch"):
