@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
@@ -27,7 +27,7 @@ from benchmarks.summaries import (
 from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth, batched_truth
 from vggtjax.errors import InputError, check_extra
-from vggtjax.evaluation.ladder import LadderRow, ladder
+from vggtjax.evaluation.ladder import LadderRow, MaskSource, ladder
 from vggtjax.pretrained.load import load_model
 from vggtjax.progress import Progress
 from vggtjax.scenes import SceneConfig, held_out_scenes
@@ -194,6 +194,7 @@ class _Bench:
         for seed, truth in enumerate(truths):
             pairs = {self.pairs, *(settings.sweep if seed == 0 else ())}
             how: dict[str, Any] = {"mask_pairs": sorted(pairs), "suppress": SUPPRESS, "batch_size": _AT_ONCE}
+            how["masks"] = get_args(MaskSource)
             rows.append(ladder(self.model, truth, **how, progress=self.stage(f"ladder, {name} {seed}")))
         main = [[row for row in found if row.mask_pairs in (None, self.pairs)] for found in rows]
         swept = rows[:1] if settings.sweep else []

@@ -36,24 +36,26 @@ def test_numbers_of_numpy_become_plain_numbers():
 def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     """A new option is one of them unless it is named there."""
     other = {"gram": "dot", "suppress": "drop", "mask_pairs": 2, "smooth_frames": 3, "compute_dtype": "bfloat16"}
-    other |= {"threshold": "multi-otsu"}
-    other |= {"attention": "merged"}  # absent where it is exact, as is the precision where it is the highest
+    other |= {"threshold": "multi-otsu", "mask": "matches"}
+    # Absent where it is exact, as are the precision where it is the highest, and the mask where it is the papers'.
+    other |= {"attention": "merged"}
     fields = {field.name for field in dataclasses.fields(Options)}
     key = Options().passes_settings(MOTION)
     named = fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters"}
-    assert set(key) == named - {"attention", "precision"}
-    assert set(Options(attention="merged").passes_settings(MOTION)) == named - {"precision"}
+    assert set(key) == named - {"attention", "precision", "mask"}
+    assert set(Options(attention="merged").passes_settings(MOTION)) == named - {"precision", "mask"}
+    assert Options("4dvggt-m").passes_settings(MOTION) == Options(mask="matches").passes_settings(MOTION)
     assert "attention" not in Options().to_json()
     assert all(Options(**{name: value}).passes_settings(MOTION) != key for name, value in other.items())
     assert Options(align_scale=True, refine_mask=True, refine_cameras=True).passes_settings(MOTION) == key
     same = {name for name in METHODS if Options(name).passes_settings(MOTION) == key}  # pyright: ignore[reportArgumentType]
-    assert same == set(METHODS) - {"vggt4d"}
+    assert same == set(METHODS) - {"vggt4d", "4dvggt-m"}
 
 
 def test_the_method_fills_in_what_is_not_given():
     cpu = Options(compute_dtype="float32", precision="highest")
     made = Options("vggt4d").resolved(MOTION)
-    mining = {"gram": "dot", "threshold": "multi-otsu", "refine_mask": True}
+    mining = {"gram": "dot", "threshold": "multi-otsu", "refine_mask": True, "mask": "gram"}
     wanted = cpu.changed(method="vggt4d", suppress="drop", mask_pairs=5, **mining)
     assert made == wanted
     assert Options("vggt4d", gram="cosine", refine_mask=False).resolved(MOTION).gram == "cosine"

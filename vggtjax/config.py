@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -17,6 +18,8 @@ Size = Annotated[int, Meta(ge=1, le=LARGEST)]
 Gram = Literal["cosine", "dot"]
 Suppress = Literal["zero", "drop"]
 Threshold = Literal["otsu", "multi-otsu"]
+Witness = Literal["gram", "matches"]  # of motion
+_MATCHING = (0.5, 0.65)  # relative depths of the pairs that match, where no others are named
 HEAD_NAMES = ("camera", "depth", "points", "tracks")
 
 
@@ -51,6 +54,9 @@ class MotionConfig:
     (L_mask) where the options leave it open. The default is that of the papers for VGGT-1B.
 
     `threshold` cuts the saliency of every method where the options leave it open; None leaves it to the method.
+
+    `matching` are the pairs of blocks whose global attention matches surfaces between frames, as 0-based indices of a
+    model with `reference_depth` pairs; None takes those from the middle to two thirds of the depth.
     """
 
     cues: Annotated[tuple[Cue, ...], Meta(min_length=1)] = (
@@ -65,9 +71,12 @@ class MotionConfig:
     floor: Share = 0.0
     mask_pairs: Annotated[int, Meta(ge=0, le=LARGEST)] = 5
     threshold: Threshold | None = None
+    matching: Annotated[tuple[Natural, ...], Meta(min_length=1)] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self, "motion")
+        if self.matching is not None and max(self.matching) >= self.reference_depth:
+            raise InputError(f"motion.matching is {self.matching}; expected indices in [0, {self.reference_depth})")
         if 0 in self.offsets:
             raise InputError(f"motion.offsets is {self.offsets}; expected frame offsets other than 0")
         for cue in self.cues:
@@ -86,6 +95,18 @@ class MotionConfig:
         scale = (depth - 1) / max(self.reference_depth - 1, 1)
         return tuple(round(layer * scale) for layer in cue.layers)
 
+    def matching_layers(self, depth: int) -> tuple[int, ...]:
+        """Return the pairs of blocks that match in a model with `depth` pairs, at least one.
+
+        By default those of a relative depth from 0.5 to 0.65: 6 and 7 of 12, 12 to 14 of 24. There VGGT's camera poses
+        and correspondences form (arXiv 2512.11508, 2512.02541); for VGGT-1B this is an assumption.
+        """
+        if self.matching is not None:
+            scale = (depth - 1) / max(self.reference_depth - 1, 1)
+            return tuple(sorted({round(layer * scale) for layer in self.matching}))
+        first, last = (share * (depth - 1) for share in _MATCHING)
+        return tuple(range(math.ceil(first), int(last) + 1)) or (round(first),)
+
     def masked_pairs(self, given: int | None) -> int:
         """Return `given`, or the recommended number of pairs if it is None."""
         return self.mask_pairs if given is None else given
@@ -95,7 +116,7 @@ class MotionConfig:
         return given or self.threshold or own
 
 
-_LATER = {name: getattr(MotionConfig, name) for name in ("floor", "mask_pairs", "threshold")}
+_LATER = {name: getattr(MotionConfig, name) for name in ("floor", "mask_pairs", "threshold", "matching")}
 
 
 @dataclass(frozen=True)
@@ -159,8 +180,8 @@ class VGGTConfig:
     def to_json(self) -> str:
         """Return the configuration as a JSON object; `from_json` reads it back.
 
-        A floor of 0, the papers' number of pairs and no threshold are left out, as in files before them: digests and
-        cached conversions stay the same.
+        A floor of 0, the papers' number of pairs, no threshold and no matching pairs are left out, as in files before
+        them: digests and cached conversions stay the same.
         """
         values = dataclasses.asdict(self)
         values["motion"] = without_defaults(values["motion"], _LATER)

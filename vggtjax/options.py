@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from vggtjax.config import LARGEST, Gram, MotionConfig, Suppress, Threshold
+from vggtjax.config import LARGEST, Gram, MotionConfig, Suppress, Threshold, Witness
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields, without_defaults
@@ -19,7 +19,7 @@ _ShownDType = Literal["float32", "bfloat16"]  # on the command line
 Attention = Literal["exact", "merged"]
 ComputeDType = Literal["float32", "bfloat16", "float64"]
 Precision = Literal["highest", "tf32"]
-MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d"]
+MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d", "4dvggt-m"]
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class Method:
 
     `clusters` is the number of clusters of patch features: the saliency is averaged within each cluster before the
     `threshold` is applied; 0 for no clusters. `refine` tells whether the method's depth and cameras refine the mask.
+    `mask` is what tells motion: the Gram saliency of the papers, or matches between frames together with it.
     """
 
     depth: Literal["first", "second", "replaced", "fused"]
@@ -38,6 +39,7 @@ class Method:
     clusters: int = 0
     threshold: Threshold = "otsu"
     refine: bool = False
+    mask: Witness = "gram"
 
     @property
     def needs_second_pass(self) -> bool:
@@ -48,13 +50,14 @@ class Method:
         return ("camera", "depth") if self.depth != "first" or align_scale else ("camera",)
 
 
-# 4DVGGT-D, table 2, and VGGT4D
+# 4DVGGT-D, table 2, and VGGT4D; and 4DVGGT-D with masks from matches, which is not in the papers
 METHODS: dict[str, Method] = {
     "vggt": Method("first", "first", "first"),
     "vggt4d": Method("first", "second", "first", "dot", "drop", clusters=64, threshold="multi-otsu", refine=True),
     "pose-decoupling": Method("second", "second", "second"),
     "hard-replacement": Method("replaced", "second", "second"),
     "4dvggt-d": Method("fused", "second", "second"),
+    "4dvggt-m": Method("fused", "second", "second", mask="matches"),
 }
 
 LADDER = ("vggt", "pose-decoupling", "hard-replacement", "4dvggt-d")  # one run of both passes serves all four
@@ -119,7 +122,8 @@ class Options:
     method: MethodName = "4dvggt-d"
     """which passes give depth and cameras: vggt, the first pass; vggt4d, depth of the first and cameras of the second;
     pose-decoupling, the second pass; hard-replacement, the second pass, with depth of the first where things move;
-    4dvggt-d, the same, with the depth of both passes fused where nothing moves"""
+    4dvggt-d, the same, with the depth of both passes fused where nothing moves; 4dvggt-m, as 4dvggt-d, with masks from
+    matches"""
     gram: InWords[Gram | None] = None
     """similarity of the motion cues; by default dot for vggt4d, else cosine"""
     suppress: InWords[Suppress | None] = None
@@ -130,6 +134,9 @@ class Options:
     threshold: InWords[Threshold | None] = None
     """where the saliency is cut: otsu, one threshold; multi-otsu, the highest of up to three, usually with a smaller
     mask; by default what the model recommends, else multi-otsu for vggt4d and otsu for the others"""
+    mask: InWords[Witness | None] = None
+    """what tells motion: gram, the similarity of tokens, as in the papers; matches, the same and the matches between
+    frames that do not fit a static world (not in the papers); by default matches for 4dvggt-m, else gram"""
     align_scale: Switch = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1
@@ -166,6 +173,8 @@ class Options:
             raise InputError(f"smooth_frames is {self.smooth_frames}; leave it out, as given masks are not smoothed")
         if self.threshold is not None:
             raise InputError(f"threshold is {self.threshold!r}; leave it out, as given masks are not mined")
+        if self.mask is not None:
+            raise InputError(f"mask is {self.mask!r}; leave it out, as given masks are not mined")
 
     @property
     def row(self) -> Method:
@@ -177,6 +186,7 @@ class Options:
             suppress=self.suppress or method.suppress,
             threshold=self.threshold or method.threshold,
             refine=method.refine if self.refine_mask is None else self.refine_mask,
+            mask=self.mask or method.mask,
         )
 
     def resolved(self, motion: MotionConfig, on_accelerator: bool | None = None) -> Options:
@@ -192,6 +202,7 @@ class Options:
             refine_mask=row.refine,
             mask_pairs=motion.masked_pairs(self.mask_pairs),
             threshold=motion.cut_by(self.threshold, row.threshold),
+            mask=row.mask,
         )
 
     def computed(self, on_accelerator: bool | None = None) -> Options:
@@ -210,6 +221,7 @@ class Options:
         """What the two passes of a model depend on, as JSON values; methods with equal values share one run of them."""
         options = self.resolved(motion)
         settings = options.to_json() | {"clusters": options.row.clusters, "threshold": options.threshold}
+        settings |= {} if options.mask == "gram" else {"mask": options.mask}
         return {name: value for name, value in settings.items() if name not in _READ_AFTER_THE_PASSES}
 
     def changed(self, **changes: Any) -> Options:
@@ -228,6 +240,8 @@ class Options:
         values = without_defaults(dataclasses.asdict(self), _LATER)
         if self.threshold in (None, METHODS[self.method].threshold):
             del values["threshold"]
+        if self.mask in (None, METHODS[self.method].mask):
+            del values["mask"]
         return values
 
 

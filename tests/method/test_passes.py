@@ -79,6 +79,7 @@ def test_every_method_takes_what_the_table_says(inferred):
         "pose-decoupling": ((second.depth, second.depth_confidence), "second"),
         "hard-replacement": (replaced, "second"),
         "4dvggt-d": (fused, "second"),
+        "4dvggt-m": (fused, "second"),
     }
     assert set(expected) == set(METHODS)
     for method, ((depth, confidence), camera) in expected.items():

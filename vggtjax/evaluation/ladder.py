@@ -22,7 +22,8 @@ from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.evaluation.truth_at_pixels import known_points
 from vggtjax.geometry.similarity import Similarity, centres, umeyama_sim3
 from vggtjax.method.mask import upsample
-from vggtjax.method.passes import Assembly, Passes, assemble
+from vggtjax.method.matched_mask import motion_pixels
+from vggtjax.method.passes import Assembly, Passes, Seen, assemble
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.options import LADDER, ComputeDType, Options, find_method
 from vggtjax.pipeline.stages import Stages
@@ -30,7 +31,7 @@ from vggtjax.progress import Progress
 from vggtjax.results.report import ErrorTable
 from vggtjax.storage.programs import Program
 
-MaskSource = Literal["mined", "true"]
+MaskSource = Literal["mined", "matches", "true"]
 
 
 @dataclass(frozen=True)
@@ -56,13 +57,13 @@ class LadderRow:
     centre_error_ratio: float | None  # centre error over the clip's median true depth
     point_distance: float | None  # mean over pixels, after Sim(3) of the centres, in the truth's unit
     point_distance_first: float | None  # the same, after alignment of the first camera and one median scale
-    saliency_auc: float | None  # of the first pass, over pixels
+    saliency_auc: float | None  # of the first pass, over pixels; of the motion by matches where these give the mask
     mask_jaccard: float | None  # of the mask of the second pass
     failure: str = ""
 
 
 class _Scene(NamedTuple):
-    """The truth of one clip, and the motion saliency of the first pass."""
+    """The truth of one clip, and the motion saliency of the first pass, or the motion by its matches."""
 
     clip: int
     truth: Truth
@@ -84,6 +85,7 @@ def _assemble_all(passes: Passes, methods: tuple[str, ...]) -> list[Assembly]:
 
 _assemble = Program(_assemble_all, static=("methods",))
 _upsample = Program(upsample, static=("size",))
+_motion_pixels = Program(motion_pixels)
 
 
 def ladder(
@@ -107,7 +109,8 @@ def ladder(
         truth: clips with exact truth, [S, ...] or [B, S, ...]; height and width are multiples of the patch size.
         methods: names of `LADDER`. A method without a second pass has one row per clip, any other method one row for
             each combination of the three arguments that follow.
-        masks: "mined" from the first pass, or the "true" masks, an upper bound for any mining.
+        masks: "mined" from the first pass by the Gram saliency, as in the papers; by "matches" too; or the "true"
+            masks, an upper bound for any mining.
         mask_pairs: numbers of pairs in which the keys of dynamic tokens are suppressed; the model's own if None.
         suppress: ways to suppress them, in place of the methods' own.
         gram, threshold, compute_dtype: as in `Options`.
@@ -125,7 +128,7 @@ def ladder(
     if foreign := [method for method in methods if find_method(method) and method not in LADDER]:
         raise InputError(f"methods has {foreign}, which mine their masks in another way; expected some of {LADDER}")
     if unknown := [source for source in masks if source not in get_args(MaskSource)]:
-        raise InputError(f"masks has {unknown}; expected 'mined' or 'true'")
+        raise InputError(f"masks has {unknown}; expected 'mined', 'matches' or 'true'")
     if batch_size < 1:
         raise InputError(f"batch_size is {batch_size}; expected at least 1")
     masked = tuple(name for name in methods if find_method(name).needs_second_pass)
@@ -133,7 +136,8 @@ def ladder(
     pairs = (model.config.motion.mask_pairs,) if mask_pairs is None else mask_pairs
     settings = [_Setting(*values) for values in product(masks, pairs, suppress)]
     frames, *size = truth.images.shape[1:4]
-    options = Options(gram=gram, threshold=threshold, compute_dtype=compute_dtype)
+    witness = "matches" if "matches" in masks else "gram"
+    options = Options(gram=gram, mask=witness, threshold=threshold, compute_dtype=compute_dtype)
     shared = Stages(model.config, options, frames, (size[0], size[1]))
     second_stages = [
         replace(shared, options=options.changed(mask_pairs=setting.mask_pairs, suppress=setting.suppress))
@@ -148,16 +152,22 @@ def ladder(
         images = jax.device_put(truth.images[padded].astype(np.float32, copy=False))
         patch_tokens = shared.image_features(model.params, images)
         batch = ClipBatch(images, patch_tokens)
-        first, saliency = shared.first_pass(model.params, batch, second_follows=bool(masked))
-        mined = shared.dynamic_mask(saliency, patch_tokens)
+        first, seen = shared.first_pass(model.params, batch, second_follows=bool(masked))
+        saliency, mined = seen.saliency, shared.dynamic_mask(Seen(seen.saliency), first, batch).dynamic_mask
         pixels = np.asarray(_upsample(saliency, size=tuple(size)))
         scenes = [_scene(int(clip), truth, pixels[i]) for i, clip in enumerate(clips)]
+        by_source = {"mined": (mined, scenes), "true": (jax.device_put(truth.dynamic_mask[padded]), scenes)}
+        if seen.matches is not None:
+            matched = shared.dynamic_mask(seen, first, batch)
+            pixels = np.asarray(_motion_pixels(matched.motion, images))
+            moving = [scene._replace(saliency=pixels[i]) for i, scene in enumerate(scenes)]
+            by_source["matches"] = (matched.dynamic_mask, moving)
         rows += _scored(Passes(first, None, saliency, mined), plain, scenes, _Setting())
         advance()
         for setting, stages in zip(settings, second_stages, strict=True) if masked else ():
-            mask = mined if setting.mask_source == "mined" else jax.device_put(truth.dynamic_mask[padded])
+            mask, scored_by = by_source[setting.mask_source or "mined"]
             second = stages.second_pass(model.params, batch, mask, first)
-            rows += _scored(Passes(first, second, saliency, mask), masked, scenes, setting)
+            rows += _scored(Passes(first, second, saliency, mask), masked, scored_by, setting)
             advance()
     return sorted(rows, key=lambda row: row.clip)
 

@@ -96,7 +96,7 @@ def reconstruct_softly(
     clips = ClipBatch(images, encode(params, images, config, compute_dtype=compute_dtype, remat=remat))
     compute = Compute(compute_dtype, remat=remat)
     mining = {"gram": gram, "motion": motion, "exponents": masking.exponents}
-    first, saliency = first_pass(params, clips, config, compute=compute, **mining)
+    first, (saliency, _) = first_pass(params, clips, config, compute=compute, **mining)
     threshold = (motion or config.motion).threshold or "otsu"
     dynamic = soft_pixels(saliency, (images.shape[2], images.shape[3]), masking, threshold)
     compute = dataclasses.replace(compute, stop_camera_gradient=stop_camera_gradient)

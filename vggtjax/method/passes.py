@@ -11,11 +11,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.cameras import Cameras
-from vggtjax.config import Gram, MotionConfig, VGGTConfig
+from vggtjax.config import Gram, MotionConfig, Threshold, VGGTConfig, Witness
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues
 from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
 from vggtjax.method.mask import dynamic_tokens, mine_mask
+from vggtjax.method.matched_mask import Mined, mine_matched_mask
+from vggtjax.method.matches import DenseMatches, Matches
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import Frames
@@ -24,6 +26,7 @@ from vggtjax.network.model import Predictions, predict
 from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
+from vggtjax.network.together import Together
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options, find_method
 
@@ -37,6 +40,15 @@ class Passes(NamedTuple):
     second: Predictions | None
     saliency: Float[Array, "B S h w"]
     dynamic_mask: Bool[Array, "B S H W"]
+    motion: Float[Array, "B S h w"] | None = None  # as in `Mined`
+    is_matched: Bool[Array, "B S"] | None = None  # as in `Mined`
+
+
+class Seen(NamedTuple):
+    """What the first pass sees of motion."""
+
+    saliency: Float[Array, "B S h w"]  # of the Gram similarities
+    matches: Matches | None = None  # None where none were asked for, and for a single frame
 
 
 class Assembly(NamedTuple):
@@ -61,27 +73,31 @@ def first_pass(
     config: VGGTConfig,
     *,
     gram: Gram = "cosine",
+    witness: Witness = "gram",
     motion: MotionConfig | None = None,
     exponents: Float[Array, " cues"] | None = None,
     outputs: tuple[str, ...] = ("camera", "depth"),
     query_points: Float[Array, "B Q 2"] | None = None,
     compute: Compute = Compute(),
-) -> tuple[Predictions, Float[Array, "B S h w"]]:
+) -> tuple[Predictions, Seen]:
     """Run the plain pass and mine the motion saliency inside it; with `query_points`, track them too.
 
-    Predictions of padded frames are meaningless. `exponents` has one power per cue, applied before their product.
+    Predictions of padded frames are meaningless. `exponents` has one power per cue, applied before their product. With
+    the `witness` "matches", what is seen has the matches too.
     """
-    cues = GramCues(motion or config.motion, config.depth, gram, compute.frames)
+    motion = motion or config.motion
+    cues = GramCues(motion, config.depth, gram, compute.frames)
+    witnesses = _witnesses(cues, witness, patch_grid(clips.images, config))
     predictions = predict(
         params,
         clips,
         config,
         outputs=outputs if query_points is None else (*outputs, "tracks"),
         query_points=query_points,
-        accumulator=None if compute.frames.counted(clips.images.shape[1]) == 1 else cues,
+        accumulator=None if compute.frames.counted(clips.images.shape[1]) == 1 else witnesses,
         compute=compute,
     )
-    return _with_saliency(predictions, cues, clips, config, exponents)
+    return _with_seen(predictions, cues, clips, config, exponents)
 
 
 def either_pass(
@@ -92,20 +108,22 @@ def either_pass(
     config: VGGTConfig,
     *,
     gram: Gram = "cosine",
+    witness: Witness = "gram",
     suppression: Suppression = Suppression(),
     outputs: tuple[str, ...] = ("camera", "depth"),
     compute: Compute = Compute(),
-) -> tuple[Predictions, Float[Array, "B S h w"]]:
+) -> tuple[Predictions, Seen]:
     """Run the first pass or the second: one program serves both, and is compiled once.
 
     Args:
         params: the model's parameter tree.
         clips: images, patch tokens and numbers of real frames.
         dynamic_mask: dynamic pixels; none for the first pass.
-        is_first: whether this is the first pass, in which motion cues are added up. The saliency of the second pass is
+        is_first: whether this is the first pass, in which motion cues are added up. What the second pass sees is
             meaningless.
         config: the model's configuration.
         gram: similarity of the motion cues.
+        witness: as for `first_pass`.
         suppression: how keys of dynamic tokens are suppressed, and in which pairs; 0 pairs for the first pass.
         outputs: what to predict, as for `forward`.
         compute: as for `predict`.
@@ -113,15 +131,23 @@ def either_pass(
     cues = GramCues(config.motion, config.depth, gram, compute.frames)
     masking = dataclasses.replace(suppression, dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size))
     options = {"outputs": outputs, "suppression": masking, "compute": compute}
-    predictions = predict(params, clips, config, accumulator=_Sometimes(cues, is_first), **options)
-    return _with_saliency(predictions, cues, clips, config)
+    witnesses = _Sometimes(_witnesses(cues, witness, patch_grid(clips.images, config)), is_first)
+    return _with_seen(predict(params, clips, config, accumulator=witnesses, **options), cues, clips, config)
+
+
+def _witnesses(cues: GramCues, witness: Witness, grid: tuple[int, int]) -> GramCues | Together:
+    """Return what is accumulated of the motion cues, with matches if requested."""
+    if witness == "gram":
+        return cues
+    layers = cues.motion.matching_layers(cues.depth)
+    return Together((cues, DenseMatches(layers, cues.depth, grid, cues.frames)))
 
 
 @dataclass(frozen=True)
 class _Sometimes:
     """Motion cues that are added up in some calls of a program."""
 
-    cues: GramCues
+    cues: GramCues | Together
     is_read: Bool[Array, ""]
 
     def layer_counts(self) -> Int[Array, "depth cues"]:
@@ -134,19 +160,51 @@ class _Sometimes:
         return self.cues.add(*arguments)
 
 
-def _with_saliency(
+def _with_seen(
     predictions: Predictions,
     cues: GramCues,
     clips: ClipBatch,
     config: VGGTConfig,
     exponents: Float[Array, " cues"] | None = None,
-) -> tuple[Predictions, Float[Array, "B S h w"]]:
-    """Return the predictions without sums of cues, and the saliency that these sums give; 0 without them."""
+) -> tuple[Predictions, Seen]:
+    """Return the predictions without sums of cues, and what these sums show; a saliency of 0 without them."""
     B, S, h, w = (*clips.images.shape[:2], *patch_grid(clips.images, config))
     if predictions.cue_sums is None:  # a single frame
-        return predictions, jnp.zeros((B, S, h, w))
-    saliency = cues.saliency(predictions.cue_sums, exponents).reshape(B, S, h, w)
-    return predictions._replace(cue_sums=None), saliency
+        return predictions, Seen(jnp.zeros((B, S, h, w)))
+    sums, matches = predictions.cue_sums, None
+    if isinstance(sums[-1], Matches):
+        sums, matches = sums
+    return predictions._replace(cue_sums=None), Seen(cues.saliency(sums, exponents).reshape(B, S, h, w), matches)
+
+
+def mine(
+    seen: Seen,
+    first: Predictions,
+    clips: ClipBatch,
+    *,
+    clusters: int,
+    threshold: Threshold,
+    smooth_frames: int = 1,
+    frames: Frames = Frames(),
+) -> Mined:
+    """Return the dynamic pixels, by matches if there are any, and what matches say.
+
+    Args:
+        seen: what the first pass sees of motion.
+        first: its predictions, with camera and depth where there are matches.
+        clips: images and patch tokens.
+        clusters: as for `mine_mask`, and so are `threshold`, `smooth_frames` and `frames`.
+        threshold: of the Gram saliency.
+        smooth_frames: of the Gram saliency.
+        frames: where the frames are.
+    """
+    images = clips.images
+    how = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames, "frames": frames}
+    mask = mine_mask(seen.saliency, _present(clips.patch_tokens), (images.shape[2], images.shape[3]), **how)
+    if seen.matches is None:
+        return Mined(mask)
+    depth, pose_encoding = _present(first.depth), _present(first.pose_encoding)
+    return mine_matched_mask(seen.matches, mask, seen.saliency, images, depth, pose_encoding, frames=frames)
 
 
 def second_pass(
@@ -237,7 +295,7 @@ def motion_saliency(
         gram: "cosine" (rows of q and k normalised per head, 4DVGGT-D) or "dot" (VGGT4D).
         motion: the table of cues; the configuration's own if None.
     """
-    return first_pass(params, ClipBatch(images), config, gram=gram, motion=motion, outputs=())[1]
+    return first_pass(params, ClipBatch(images), config, gram=gram, motion=motion, outputs=())[1].saliency
 
 
 def run_passes(
@@ -275,20 +333,22 @@ def run_passes(
         second = method.second_outputs(options.align_scale) if method.needs_second_pass else ()
     patch_tokens = encode(params, images, config, compute_dtype=compute.compute_dtype)
     clips = ClipBatch(images, patch_tokens)
-    first, saliency = first_pass(params, clips, config, gram=method.gram, motion=motion, compute=compute)
-    mask = mine_mask(
-        saliency,
-        patch_tokens,
-        (images.shape[2], images.shape[3]),
+    mining = {"gram": method.gram, "witness": method.mask, "motion": motion, "compute": compute}
+    first, seen = first_pass(params, clips, config, **mining)
+    mined = mine(
+        seen,
+        first,
+        clips,
         clusters=method.clusters if clusters is None else clusters,
         threshold=recommended.cut_by(options.threshold, method.threshold),
         smooth_frames=options.smooth_frames,
     )
     if not second:
-        return Passes(first, None, saliency, mask)
+        return Passes(first, None, seen.saliency, *mined)
     suppression = Suppression(suppress=method.suppress, mask_pairs=mask_pairs)
     masking = {"plain": first, "suppression": suppression, "outputs": second, "compute": compute}
-    return Passes(first, second_pass(params, clips, mask, config, **masking), saliency, mask)
+    second_one = second_pass(params, clips, mined.dynamic_mask, config, **masking)
+    return Passes(first, second_one, seen.saliency, *mined)
 
 
 def assemble(

@@ -41,6 +41,8 @@ from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import versions
 from vggtjax.storage.cache import say_how_to_keep
 
+_MATCHED = "mined: matches between frames and Gram similarities"
+_NOT_MATCHED = "mined: Gram similarities, as too few matches between frames come back"
 _LESS_MEMORY = (
     "fewer frames at once (window, max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
 )
@@ -138,6 +140,8 @@ def reconstruct(
         say_how_to_keep(time.perf_counter() - started)
         outputs = run(dataclasses.replace(stages, run=Execute(on_stage)))
     passes, assembly, by_frame = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
+    if passes.is_matched is not None:
+        mask_source = _MATCHED if passes.is_matched.all() else _NOT_MATCHED
     fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, frames))
     try:
         result = Reconstruction(

@@ -19,8 +19,20 @@ from vggtjax.clips.still import same_picture
 from vggtjax.config import VGGTConfig
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_inputs import apply_fusion
-from vggtjax.method.mask import mine_mask
-from vggtjax.method.passes import Assembly, Passes, assemble, either_pass, first_pass, only, second_pass, track_from
+from vggtjax.method.matched_mask import Mined
+from vggtjax.method.matches import Matches
+from vggtjax.method.passes import (
+    Assembly,
+    Passes,
+    Seen,
+    assemble,
+    either_pass,
+    first_pass,
+    mine,
+    only,
+    second_pass,
+    track_from,
+)
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
@@ -79,15 +91,14 @@ def _track(params, clips, query_points, frame, *, config, compute: Compute):
     return compute.frames.on_devices(track, WHOLE, _CLIPS, WHOLE, WHOLE)(params, clips, query_points, frame)
 
 
-def _mine(
-    saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"], *, frames: Frames, **options
-) -> Bool[Array, "B F H W"]:
+def _mine(seen: Seen, first: Predictions | None, clips: ClipBatch, *, frames: Frames, **options) -> Mined:
     """Mine the mask of the first `frames.count` frames; padded frames get an empty mask."""
     if frames.mesh is not None:
-        mine = partial(mine_mask, frames=frames, **options)
-        return frames.on_devices(mine, BY_FRAME, BY_FRAME)(saliency, patch_tokens)
-    mask = mine_mask(saliency[:, : frames.count], patch_tokens[:, : frames.count], **options)
-    return jnp.pad(mask, ((0, 0), (0, saliency.shape[1] - mask.shape[1]), (0, 0), (0, 0)))
+        mine_here = partial(mine, frames=frames, **options)
+        return frames.on_devices(mine_here, BY_FRAME, BY_FRAME, BY_FRAME)(seen, first, clips)
+    added = clips.images.shape[1] - (frames.count or 0)
+    mined = mine(*jax.tree.map(lambda x: x[:, : frames.count], (seen, first, clips)), **options)
+    return jax.tree.map(lambda x: jnp.pad(x, ((0, 0), (0, added), *((0, 0),) * (x.ndim - 2))), mined)
 
 
 def _assemble(
@@ -113,14 +124,14 @@ def _still(images: Float[Array, "B S H W 3"]) -> Bool[Array, " B"]:
 _FIRST_OUTPUTS = ("camera", "depth")  # of the first pass
 _CLIPS = ClipBatch(BY_FRAME, BY_FRAME, WHOLE)  # type: ignore[arg-type]
 _encode = Program(_image_features, static=("config", "compute_dtype", "frames"))
-_first_pass = Program(_first, static=("config", "gram", "compute"))
-_mine_mask = Program(_mine, static=("frames", "size", "clusters", "threshold", "smooth_frames"))
+_first_pass = Program(_first, static=("config", "gram", "witness", "compute"))
+_mine_mask = Program(_mine, static=("frames", "clusters", "threshold", "smooth_frames"))
 _SECOND_STATIC = ("config", "suppress", "outputs", "compute")  # mask_pairs is traced
 _second_pass = Program(_second, static=_SECOND_STATIC)
-_either_pass = Program(_either, static=(*_SECOND_STATIC, "gram"))
+_either_pass = Program(_either, static=(*_SECOND_STATIC, "gram", "witness"))
 _track_from = Program(_track, static=("config", "compute"))
 _assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
-for _kind in (ClipBatch, Predictions, Passes, Cameras, Assembly, Tracks, Quantised):
+for _kind in (ClipBatch, Predictions, Passes, Seen, Matches, Mined, Cameras, Assembly, Tracks, Quantised):
     keep_type(_kind)
 
 
@@ -160,7 +171,11 @@ class Stages:
 
     @property
     def _either(self) -> dict[str, Any]:
-        return self._passes | {"gram": self.options.row.gram, "suppress": self.options.row.suppress}
+        return self._passes | self._mining | {"suppress": self.options.row.suppress}
+
+    @property
+    def _mining(self) -> dict[str, Any]:
+        return {"gram": self.options.row.gram, "witness": self.options.row.mask}
 
     def _shared(self, outputs: tuple[str, ...]) -> bool:
         """Return whether one program serves both passes, where the second pass has these outputs."""
@@ -177,8 +192,8 @@ class Stages:
         *,
         second_follows: bool = False,
         all_outputs: bool = False,
-    ) -> tuple[Predictions, Float[Array, "B F h w"]]:
-        """Return what the plain pass predicts, and the motion saliency.
+    ) -> tuple[Predictions, Seen]:
+        """Return what the plain pass predicts, and what it sees of motion.
 
         If `second_pass` follows with these `all_outputs`, both are one program wherever they can be.
         """
@@ -187,15 +202,15 @@ class Stages:
             none = {"mask_pairs": 0, "outputs": _FIRST_OUTPUTS}
             return self.run("first pass", _either_pass, params, clips, nothing, np.True_, **self._either, **none)
         points = () if query_points is None else (query_points,)
-        return self.run("first pass", _first_pass, params, clips, *points, gram=self.options.row.gram, **self._passes)
+        return self.run("first pass", _first_pass, params, clips, *points, **self._mining, **self._passes)
 
-    def dynamic_mask(
-        self, saliency: Float[Array, "B F h w"], patch_tokens: Float[Array, "B F P C"]
-    ) -> Bool[Array, "B F H W"]:
+    def dynamic_mask(self, seen: Seen, first: Predictions, clips: ClipBatch) -> Mined:
+        """Return the dynamic pixels, and what matches say, if any were asked for."""
         method = self.options.row
         options = {"clusters": method.clusters, "threshold": method.threshold}
-        options |= {"smooth_frames": self.options.smooth_frames, "frames": self._real, "size": self.size}
-        return self.run("dynamic mask", _mine_mask, saliency, patch_tokens, **options)
+        options |= {"smooth_frames": self.options.smooth_frames, "frames": self._real}
+        read = None if seen.matches is None else only(first, _FIRST_OUTPUTS)
+        return self.run("dynamic mask", _mine_mask, seen, read, clips._replace(frame_count=None), **options)
 
     def second_pass(
         self,
@@ -271,16 +286,17 @@ def run_stages(
     clips = ClipBatch(inputs.images, patch_tokens, inputs.frame_count)
     runs_second = stages.options.row.needs_second_pass and inputs.moves
     plans = {"second_follows": runs_second, "all_outputs": all_outputs}
-    first, saliency = stages.first_pass(params, clips, points.pop(0, None), **plans)
+    first, seen = stages.first_pass(params, clips, points.pop(0, None), **plans)
     mask = inputs.dynamic_mask
+    mined = stages.dynamic_mask(seen, first, clips) if mask is None else Mined(mask)
     if mask is None:
-        mask = stages.dynamic_mask(saliency, patch_tokens)
+        mask = mined.dynamic_mask
         if stages.run is inline:  # else whoever calls this has looked at the frames
             mask = mask & ~_still(inputs.images[:, : stages.frames])[:, None, None, None]
     second = first if stages.options.row.needs_second_pass else None
     if runs_second:
         second = stages.second_pass(params, clips, mask, first, all_outputs=all_outputs)
-    passes = Passes(first, second, saliency, mask)
+    passes = Passes(first, second, seen.saliency, mask, mined.motion, mined.is_matched)
     assembly = stages.assemble(passes, fusion)
     tracks = {
         frame: stages.tracks(params, clips, frame_points, np.asarray(frame, np.int32))

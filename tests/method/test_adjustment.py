@@ -1,0 +1,52 @@
+"""The adjustment on matches of generated scenes: exact, and with moving parts."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+from tests.static_world import GRID, StaticWorld
+from vggtjax.cameras import Cameras
+from vggtjax.method.adjustment import Adjustment, adjust
+
+FREE = Adjustment(depth_prior=100.0, rotation_prior=100.0, translation_prior=100.0)
+fast = jax.jit(adjust, static_argnames=("grid", "how"))
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return StaticWorld()
+
+
+def turned(poses, true):
+    """Return the angles in degrees between the rotations of two sets of cameras."""
+    return np.degrees(2 * np.arcsin(np.linalg.norm(poses[..., :3] - true[..., :3], axis=(1, 2)) / 8**0.5))
+
+
+def test_matches_without_noise_give_the_exact_cameras_and_depths(clip):
+    depth, poses = clip.disturbed()
+    how = dataclasses.replace(FREE, annealed=(1.0,) * 20)
+    made = fast(depth, Cameras(poses, clip.K), clip.matched, clip.weight, GRID, how)
+    error = np.linalg.norm(made.position - clip.matched, axis=-1)[clip.weight > 0]
+    assert error.max() < 1e-4
+    scale = np.median(clip.depth / made.depth)
+    assert turned(made.camera_from_world, clip.poses).max() < 1e-3
+    relative = clip.poses[:, :, 3] - np.einsum(
+        "sij,j->si", clip.poses[:, :, :3] @ clip.poses[0, :, :3].T, clip.poses[0, :, 3]
+    )
+    own = made.camera_from_world
+    own = own[:, :, 3] - np.einsum("sij,j->si", own[:, :, :3] @ own[0, :, :3].T, own[0, :, 3])
+    assert np.abs(scale * own - relative).max() < 1e-3 * np.median(clip.depth)
+
+
+def test_two_fifths_of_movers_do_not_turn_the_cameras(clip):
+    depth, poses = clip.disturbed()
+    moves = np.random.default_rng(1).random(clip.depth.shape) < 0.4
+    matched = clip.matches(moves).position
+    made = fast(depth, Cameras(poses, clip.K), matched, clip.weight, GRID)
+    before, after = turned(poses, clip.poses)[1:], turned(made.camera_from_world, clip.poses)[1:]
+    assert after.mean() < 0.35 * before.mean()
+    error = np.linalg.norm(made.position - matched, axis=-1)
+    still, moving = (np.median(error[(clip.weight > 0) & which[:, None]]) for which in (~moves, moves))
+    assert moving > 10 * still

@@ -1,0 +1,91 @@
+"""Dynamic pixels from matches: where patches differ from a static world, cut at edges (not in the papers)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from vggtjax.cameras import Cameras
+from vggtjax.method.edges import follow_edges
+from vggtjax.method.mask import otsu_threshold, upsample
+from vggtjax.method.matches import Matches
+from vggtjax.method.motion import FEWEST_FRAMES, motion
+from vggtjax.network.frames import Frames
+from vggtjax.network.pose import decode_pose
+
+_TIMES_MEDIAN = 2.75  # Otsu's threshold alone would find something in static clips
+
+
+class Mined(NamedTuple):
+    """Dynamic pixels of clips, and what matches say; None where no matches were asked for, and for a single frame."""
+
+    dynamic_mask: Bool[Array, "B S H W"]
+    motion: Float[Array, "B S h w"] | None = None  # how far a patch differs from a static world; about 1 if it does not
+    is_matched: Bool[Array, "B S"] | None = None  # whether matches gave the frame's mask; else the Gram saliency did
+
+
+def mine_matched_mask(
+    matches: Matches,
+    gram_mask: Bool[Array, "B S H W"],
+    saliency: Float[Array, "B S h w"],
+    images: Float[Array, "B S H W 3"],
+    depth: Float[Array, "B S H W"],
+    pose_encoding: Float[Array, "B S 9"],
+    *,
+    frames: Frames = Frames(),
+) -> Mined:
+    """Return dynamic pixels by matches. No gradient passes: a mask is a decision.
+
+    A clip of fewer than three frames, or whose matches do not come back, has its mask by the Gram saliency.
+
+    Args:
+        matches: of the first pass.
+        gram_mask: the mask by the Gram saliency.
+        saliency: the Gram saliency of every patch, in [0, 1].
+        images: RGB in [0, 1].
+        depth: of the first pass.
+        pose_encoding: of the first pass.
+        frames: where the frames are; those that make shares equal change nothing and have no dynamic pixels.
+    """
+    S, counted = images.shape[1], frames.counted(images.shape[1])
+    if counted < FEWEST_FRAMES:
+        return Mined(gram_mask, jnp.ones_like(saliency), jnp.zeros(gram_mask.shape[:2], bool))
+    grid = (saliency.shape[2], saliency.shape[3])
+    inputs = jax.lax.stop_gradient((matches, saliency, *_at_patches(depth, pose_encoding, grid)))
+    whole = jax.tree.map(lambda x: frames.gather(x)[:, :counted], inputs)
+    found = jax.lax.map(lambda clip: motion(clip[0], clip[1].reshape(counted, -1), clip[2], clip[3], grid), whole)
+    score = jnp.nan_to_num(found.score).reshape(-1, counted, *grid)
+    score = jnp.pad(score, ((0, 0), (0, frames.total(S) - counted), (0, 0), (0, 0)))
+    score = frames.share(score, S)
+    pixels = motion_pixels(score, images)
+
+    def is_dynamic(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
+        median = jnp.median(frames.gather(pixels, axis=0)[:counted])
+        return pixels >= jnp.maximum(otsu_threshold(pixels, frames=frames), _TIMES_MEDIAN * median)
+
+    mask = jax.vmap(is_dynamic)(pixels)
+    if (is_counted := frames.are_counted(S)) is not None:
+        mask = mask & is_counted[None, :, None, None]
+    mask = jnp.where(found.is_matched[:, None, None, None], mask, gram_mask)
+    return Mined(mask, score, jnp.broadcast_to(found.is_matched[:, None], mask.shape[:2]))
+
+
+def motion_pixels(motion: Float[Array, "B S h w"], images: Float[Array, "B S H W 3"]) -> Float[Array, "B S H W"]:
+    """Return the motion of patches at pixels, ending where colours change. A mask is where it is above a threshold."""
+    H, W = images.shape[2:4]
+    return follow_edges(upsample(motion, (H, W)), images, H // motion.shape[2])
+
+
+def _at_patches(
+    depth: Float[Array, "B S H W"], pose_encoding: Float[Array, "B S 9"], grid: tuple[int, int]
+) -> tuple[Float[Array, "B S P"], Cameras]:
+    """Return the depth at the centres of patches, and cameras with intrinsics in patches."""
+    B, S, H, _ = depth.shape
+    h, w = grid
+    side = H // h
+    middle = slice((side - 1) // 2, side // 2 + 1)
+    centres = depth.reshape(B, S, h, side, w, side)[:, :, :, middle, :, middle].mean(axis=(3, 5))
+    return centres.reshape(B, S, h * w), Cameras(*decode_pose(pose_encoding, grid))

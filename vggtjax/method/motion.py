@@ -1,0 +1,101 @@
+"""What moves, by matches that do not fit a static world, together with the Gram saliency (not in the papers)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from vggtjax.cameras import Cameras
+from vggtjax.method.adjustment import Static, adjust
+from vggtjax.method.matches import FramePairs, Matches, frame_pairs
+from vggtjax.network.precision import full_precision
+
+FEWEST_FRAMES = 3  # two views of a point that moves along its ray or against the camera fit a static world
+_SMALLEST_SCALE = 0.1875  # patches; a soft-argmax is no more precise, so smaller differences are no motion
+_LARGEST = 8.0  # differences beyond this many scales count as this
+_OUTSIDE = 0.2  # weight of matches whose static position is outside the other frame
+_MARGIN = 0.25  # patches by which it may be outside
+_OFFSET, _EXPONENT, _FLOOR = 0.35, 0.7, 0.1  # score = log(difference + offset) + exponent x log(Gram + floor)
+_STILL, _STEEPNESS = float(np.log(0.8)), 4.0  # of the weights in the second round
+_VOTES, _VOTE, _VOTE_CYCLE, _VOTE_FRAMES = 2, 0.3, 0.625, 6.0
+_MATCHED_SHARE = 0.25  # of the matches with the next frames that come back, below which nothing is matched
+
+
+class Motion(NamedTuple):
+    """What a clip's matches say of motion."""
+
+    score: Float[Array, "*B S P"]  # positive; about 1 for the median patch of a static clip, more for patches that move
+    is_matched: Bool[Array, "*B"]  # whether enough matches come back; else the score says nothing
+    world: Static  # the static world that fits best
+
+
+@full_precision
+def motion(
+    matches: Matches,
+    saliency: Float[Array, "S P"],
+    depth: Float[Array, "S P"],
+    cameras: Cameras,
+    grid: tuple[int, int],
+) -> Motion:
+    """Return how far every patch of a clip differs from a static world. Pure and differentiable.
+
+    Cameras and depths are adjusted to the matches first, so that their errors are not taken for motion.
+
+    Args:
+        matches: of the clip's S frames.
+        saliency: the Gram saliency of every patch, in [0, 1].
+        depth: of the centre of every patch, by the first pass.
+        cameras: of the first pass; intrinsics in patches.
+        grid: rows and columns of patches.
+    """
+    pairs = frame_pairs(len(depth))
+    weight = matches.weight
+
+    def fitted(trust: Float[Array, "S P"]) -> tuple[Static, Float[Array, "S P"]]:
+        world = adjust(depth, cameras, matches.position, weight * trust[:, None], grid)
+        difference = _difference(matches.position, weight, world, pairs, grid)
+        score = jnp.log(difference + _OFFSET) + _EXPONENT * jnp.log(saliency + _FLOOR)
+        return world, _voted(score, matches, pairs, grid)
+
+    _, score = fitted(1.05 - saliency)
+    world, score = fitted(jax.nn.sigmoid(_STEEPNESS * (_STILL - score)))
+    next_ones = np.abs(pairs.offsets) == min(map(abs, pairs.offsets))
+    comes_back = jnp.sum((matches.cycle < 0.75) & (matches.confidence > 0), axis=(0, 2)) @ next_ones
+    is_matched = comes_back > _MATCHED_SHARE * pairs.exist[:, next_ones].sum() * depth.shape[1]
+    return Motion(jnp.exp(score), is_matched & jnp.isfinite(score).all(), world)
+
+
+def _difference(
+    matched: Float[Array, "S M P 2"],
+    weight: Float[Array, "S M P"],
+    world: Static,
+    pairs: FramePairs,
+    grid: tuple[int, int],
+) -> Float[Array, "S P"]:
+    """Return the mean distance between matches and static positions, over the clip's median."""
+    distance = jnp.sqrt(jnp.sum((world.position - matched) ** 2, axis=-1) + 1e-12)
+    scale = jnp.maximum(jnp.median(distance[np.nonzero(pairs.exist)]), _SMALLEST_SCALE)
+    size = np.array(grid[::-1], np.float32)
+    from_middle = jnp.abs(world.position - size[None, None, None] / 2)
+    inside = (from_middle < size[None, None, None] / 2 + _MARGIN).all(axis=-1) & (world.in_front > 0)
+    weight = weight * jnp.where(inside, 1, _OUTSIDE)
+    total = jnp.sum(weight * jnp.minimum(distance / scale, _LARGEST), axis=1)
+    return total / jnp.maximum(weight.sum(axis=1), 1e-6)
+
+
+def _voted(
+    score: Float[Array, "S P"], matches: Matches, pairs: FramePairs, grid: tuple[int, int]
+) -> Float[Array, "S P"]:
+    """Return scores averaged along matches: the same surface moves in the other frames too."""
+    place = jnp.floor(matches.position).astype(int)
+    column, row = (jnp.clip(place[..., i], 0, grid[1 - i] - 1) for i in range(2))
+    near_in_time = np.exp(-((np.array(pairs.offsets) / _VOTE_FRAMES) ** 2)).astype(np.float32)[None, :, None]
+    votes = _VOTE * matches.confidence * jnp.exp(-((matches.cycle / _VOTE_CYCLE) ** 2)) * near_in_time
+    for _ in range(_VOTES):
+        theirs = jnp.take_along_axis(score[pairs.others], row * grid[1] + column, axis=2)
+        score = (score + jnp.sum(votes * theirs, axis=1)) / (1 + votes.sum(axis=1))
+    return score
