@@ -57,21 +57,6 @@ def test_other_files_are_one_sentence(tmp_path):
         load_fusion(tmp_path / "other.safetensors")
 
 
-@pytest.mark.parametrize(
-    ("about", "sentence"),
-    [
-        ('{"mask_pairs": ' + "9" * 5000 + "}", "out of range"),
-        ('{"align_scale": ' + "[" * 5000 + "]" * 5000 + "}", "origin of the fusion"),
-    ],
-)
-def test_a_malformed_origin_is_one_sentence(tmp_path, about, sentence):
-    path = tmp_path / "a.safetensors"
-    save_fusion(path, start(()))
-    save_file(load_file(path), path, read_tensors(path).metadata | {"about": about})
-    with pytest.raises(InputError, match=sentence):
-        warn_if_fitted_otherwise(path, Model(tiny_config(), {}, "mine"), Options())
-
-
 def test_other_models_and_settings_are_warned_of(tmp_path, caplog):
     """By digest; by the name of the model where an older file has no digest. And by every option of the passes."""
     path = tmp_path / "a.safetensors"

@@ -37,14 +37,6 @@ def test_patches_that_move_differ_from_a_static_world(world):
     assert np.abs(still.world.position - world.matched)[world.weight > 0].max() < 0.02
 
 
-def test_a_salient_patch_moves_more_at_equal_differences(world):
-    S, P = world.depth.shape
-    saliency = np.full((S, P), 0.2, np.float32)
-    saliency[2, 7] = 1
-    found = find(world.matches(), jnp.asarray(saliency), jnp.asarray(world.depth, jnp.float32), world.cameras, GRID)
-    assert np.argmax(found.score) == 2 * P + 7
-
-
 def test_the_gradient_of_motion_agrees_with_differences(world):
     """The score by the matches' positions, through both rounds of the adjustment."""
     matches, depth = (jax.tree.map(lambda x: np.asarray(x, np.float64), x) for x in (world.matches(), world.depth))
