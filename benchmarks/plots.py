@@ -12,8 +12,8 @@ from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.storage.writing import writing
 
 SHOWN = ("abs_rel", "rotation_error", "centre_error", "point_distance_first")  # of those compared with the plain pass
-_COLOURS: dict[str | None, str] = {"mined": "tab:blue", "true": "tab:orange"}
-_NAMES: dict[str | None, str] = {"mined": "mined mask", "true": "true mask"}
+_COLOURS: dict[str | None, str] = {"mined": "tab:blue", "matches": "tab:green", "true": "tab:orange"}
+_NAMES: dict[str | None, str] = {"mined": "mined mask", "matches": "mask with matches", "true": "true mask"}
 
 
 def plot_ladder(path: Path, summaries: Sequence[Summary], title: str) -> None:
@@ -27,12 +27,12 @@ def plot_ladder(path: Path, summaries: Sequence[Summary], title: str) -> None:
     methods = list(dict.fromkeys(s.method for s in chosen))
     figure = Figure(figsize=(4 * len(SHOWN), 4), layout="constrained")
     for axes, metric in zip(figure.subplots(1, len(SHOWN)), SHOWN, strict=True):
-        for offset, source in ((-0.2, "mined"), (0.2, "true")):
+        for offset, source in ((-0.27, "mined"), (0, "matches"), (0.27, "true")):
             found = [(s.method, s.ratios[metric]) for s in chosen if s.mask_source == source and metric in s.ratios]
             axes.bar(
                 [methods.index(method) + offset for method, _ in found],
                 [spread.mean for _, spread in found],
-                width=0.4,
+                width=0.27,
                 yerr=[spread.deviation or 0 for _, spread in found],
                 capsize=3,
                 color=_COLOURS[source],
@@ -44,7 +44,7 @@ def plot_ladder(path: Path, summaries: Sequence[Summary], title: str) -> None:
         reach = max([0.05, *(abs(spread.mean - 1) + (spread.deviation or 0) for spread in spreads)])
         axes.set_ylim(max(1 - 1.1 * reach, 0), 1 + 1.1 * reach)
         axes.set_xticks(range(len(methods)), methods, rotation=20, ha="right")
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     figure.suptitle(title)
     _save(figure, path)
 

@@ -45,6 +45,7 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     assert set(key) == named - {"attention", "precision", "mask"}
     assert set(Options(attention="merged").passes_settings(MOTION)) == named - {"precision", "mask"}
     assert Options("4dvggt-m").passes_settings(MOTION) == Options(mask="matches").passes_settings(MOTION)
+    assert Options("4dvggt-m", mask="gram").passes_settings(MOTION) == key
     assert "attention" not in Options().to_json()
     assert all(Options(**{name: value}).passes_settings(MOTION) != key for name, value in other.items())
     assert Options(align_scale=True, refine_mask=True, refine_cameras=True).passes_settings(MOTION) == key

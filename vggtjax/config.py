@@ -56,7 +56,7 @@ class MotionConfig:
     `threshold` cuts the saliency of every method where the options leave it open; None leaves it to the method.
 
     `matching` are the pairs of blocks whose global attention matches surfaces between frames, as 0-based indices of a
-    model with `reference_depth` pairs; None takes those from the middle to two thirds of the depth.
+    model with `reference_depth` pairs; None takes those at 0.5 to 0.65 of the depth.
     """
 
     cues: Annotated[tuple[Cue, ...], Meta(min_length=1)] = (

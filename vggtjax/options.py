@@ -221,6 +221,7 @@ class Options:
         """What the two passes of a model depend on, as JSON values; methods with equal values share one run of them."""
         options = self.resolved(motion)
         settings = options.to_json() | {"clusters": options.row.clusters, "threshold": options.threshold}
+        settings.pop("mask", None)  # absent where it is the papers', whatever the method
         settings |= {} if options.mask == "gram" else {"mask": options.mask}
         return {name: value for name, value in settings.items() if name not in _READ_AFTER_THE_PASSES}
 

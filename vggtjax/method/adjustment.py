@@ -127,7 +127,8 @@ def adjust(
         log_inverse += jnp.clip(deeper, -_LARGEST_STEP, _LARGEST_STEP)
         return (turned @ rotation, translation, log_inverse, moved + change), None
 
-    state = (rotation, translation, start, jnp.zeros((S, 6), depth.dtype))
+    still = jnp.concatenate([0 * translation, 0 * translation], axis=-1)  # on several devices, as the others are
+    state = (rotation, translation, start, still)
     (rotation, translation, log_inverse, _), _ = jax.lax.scan(step, state, how.sigma * jnp.array(how.annealed))
     points, _, _ = seen(rotation, translation, jnp.exp(log_inverse))
     poses = jnp.concatenate([rotation, unit * translation[..., None]], axis=-1)

@@ -36,7 +36,7 @@ def follow_edges(
         weight = jnp.exp(-jnp.sum((colour - images) ** 2, axis=-1) / (2 * _COLOUR**2) - far)
         return (sums[0] + weight * value, sums[1] + weight), None
 
-    zeros = jnp.zeros(values.shape)
+    zeros = 0 * values  # on several devices, as the values are
     taps = (jnp.asarray(near + patch_size), jnp.asarray(distance, jnp.float32))
     (total, weight), _ = jax.lax.scan(add, (zeros, zeros), taps)
     return total / weight

@@ -55,7 +55,8 @@ def mine_matched_mask(
         return Mined(gram_mask, jnp.ones_like(saliency), jnp.zeros(gram_mask.shape[:2], bool))
     grid = (saliency.shape[2], saliency.shape[3])
     inputs = jax.lax.stop_gradient((matches, saliency, *_at_patches(depth, pose_encoding, grid)))
-    whole = jax.tree.map(lambda x: frames.gather(x)[:, :counted], inputs)
+    # On several devices the communications of the other mask come first.
+    whole = jax.tree.map(lambda x: frames.gather(frames.after(x, gram_mask))[:, :counted], inputs)
     found = jax.lax.map(lambda clip: motion(clip[0], clip[1].reshape(counted, -1), clip[2], clip[3], grid), whole)
     score = jnp.nan_to_num(found.score).reshape(-1, counted, *grid)
     score = jnp.pad(score, ((0, 0), (0, frames.total(S) - counted), (0, 0), (0, 0)))

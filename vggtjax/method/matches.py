@@ -121,13 +121,14 @@ class DenseMatches:
 
         def one_clip(clip: tuple[Array, Array, Array]) -> Matches:
             q, k, exist = clip
-            rows, columns = (widened(x[:, -P:]).reshape(S, P, N * D) for x in (q, k))
+            rows, columns = (x[:, -P:].reshape(S, P, N * D) for x in (q, k))
             near, first_near = self.frames.around(columns, reach, axis=0)
             others = jnp.asarray(pairs.others) - first_near
             numbers = jnp.stack([jnp.arange(S)[:, None].repeat(len(back), 1), others], axis=-1).reshape(-1, 2)
 
             def of_frames(pair):
-                return _soft_argmax(rows[pair[0]] @ near[pair[1]].T / (N * D**0.5), self.grid)
+                row, column = widened(rows[pair[0]]), widened(near[pair[1]])
+                return _soft_argmax(row @ column.T / (N * D**0.5), self.grid)
 
             found = jax.lax.map(of_frames, numbers, batch_size=_AT_ONCE)
             position, confidence, best = (x.reshape(S, len(back), *x.shape[1:]) for x in found)

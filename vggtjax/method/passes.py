@@ -140,7 +140,7 @@ def _witnesses(cues: GramCues, witness: Witness, grid: tuple[int, int]) -> GramC
     if witness == "gram":
         return cues
     layers = cues.motion.matching_layers(cues.depth)
-    return Together((cues, DenseMatches(layers, cues.depth, grid, cues.frames)))
+    return Together((cues, DenseMatches(layers, cues.depth, grid, cues.frames)), cues.frames)
 
 
 @dataclass(frozen=True)
@@ -311,7 +311,7 @@ def run_passes(
 ) -> Passes:
     """Run both passes once with shared backbone features, for `assemble`.
 
-    The passes of the default options serve all methods of `LADDER`; "vggt4d" needs its own (`method="vggt4d"`).
+    The passes of the default options serve all methods of `LADDER`; "vggt4d" and "4dvggt-m" need their own.
 
     Args:
         params: the model's parameter tree.

@@ -5,18 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from vggtjax.network.aggregator import Accumulator
+from vggtjax.network.frames import Frames
 
 
 @dataclass(frozen=True)
 class Together:
-    """An `Accumulator` of several, whose sums are the tuple of theirs."""
+    """An `Accumulator` of several, whose sums are the tuple of theirs. Where devices share the frames, one by one."""
 
     parts: tuple[Accumulator, ...]
+    frames: Frames = Frames()
 
     def layer_counts(self) -> Int[np.ndarray, "depth parts"]:
         """Return the counts of all parts, side by side."""
@@ -36,10 +39,14 @@ class Together:
     ) -> tuple[Any, ...]:
         """Return the sums of every part with one pair of blocks added."""
         ends = np.cumsum([part.shape[1] for part in self._counts()])[:-1]
-        own = jnp.split(counts, ends)
-        return tuple(
-            part.add(total, count, q, k, frame_count) for part, total, count in zip(self.parts, sums, own, strict=True)
-        )
+        totals = []
+        for part, total, count in zip(self.parts, sums, jnp.split(counts, ends), strict=True):
+            count_after = self.frames.after(count, totals[-1]) if totals else count
+            added = part.add(total, count_after, q, k, frame_count)
+            first, *others = jax.tree.leaves(added)
+            first, (q, k) = self.frames.in_order(first, (q, k))  # in the gradient, the last part communicates first
+            totals.append(jax.tree.unflatten(jax.tree.structure(added), [first, *others]))
+        return tuple(totals)
 
     def _counts(self) -> list[np.ndarray]:
         counts = [np.asarray(part.layer_counts()) for part in self.parts]

@@ -42,7 +42,7 @@ from vggtjax.results.report import versions
 from vggtjax.storage.cache import say_how_to_keep
 
 _MATCHED = "mined: matches between frames and Gram similarities"
-_NOT_MATCHED = "mined: Gram similarities, as too few matches between frames come back"
+_NOT_MATCHED = "mined: Gram similarities, as matches between frames cannot be used"
 _LESS_MEMORY = (
     "fewer frames at once (window, max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
 )

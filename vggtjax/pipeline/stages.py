@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -21,6 +22,7 @@ from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_inputs import apply_fusion
 from vggtjax.method.matched_mask import Mined
 from vggtjax.method.matches import Matches
+from vggtjax.method.motion import FEWEST_FRAMES
 from vggtjax.method.passes import (
     Assembly,
     Passes,
@@ -96,7 +98,7 @@ def _mine(seen: Seen, first: Predictions | None, clips: ClipBatch, *, frames: Fr
     if frames.mesh is not None:
         mine_here = partial(mine, frames=frames, **options)
         return frames.on_devices(mine_here, BY_FRAME, BY_FRAME, BY_FRAME)(seen, first, clips)
-    added = clips.images.shape[1] - (frames.count or 0)
+    added = 0 if frames.count is None else clips.images.shape[1] - frames.count
     mined = mine(*jax.tree.map(lambda x: x[:, : frames.count], (seen, first, clips)), **options)
     return jax.tree.map(lambda x: jnp.pad(x, ((0, 0), (0, added), *((0, 0),) * (x.ndim - 2))), mined)
 
@@ -281,6 +283,8 @@ def run_stages(
         fusion: a fitted rule of fusion; the method's own rule if None.
         all_outputs: run the second pass with depth even if the method does not need it.
     """
+    if inputs.dynamic_mask is not None or stages.frames < FEWEST_FRAMES:  # nobody would read the matches
+        stages = dataclasses.replace(stages, options=stages.options.changed(mask="gram"))
     points = dict(inputs.query_points)
     patch_tokens = stages.image_features(params, inputs.images)
     clips = ClipBatch(inputs.images, patch_tokens, inputs.frame_count)
