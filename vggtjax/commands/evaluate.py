@@ -49,7 +49,7 @@ class Candidates(ModelFiles):
         None
     )
     methods: Annotated[str | None, tyro.conf.arg(metavar="METHOD,METHOD", help_behavior_hint="")] = None
-    """names, with commas: vggt, vggt4d, pose-decoupling, hard-replacement, 4dvggt-d, 4dvggt-m; all by default"""
+    """methods, with commas: vggt, vggt4d, pose-decoupling, hard-replacement, 4dvggt-d, 4dvggt-m; all by default"""
 
     def source(self, report: Report, options: Options, framing: Framing) -> ModelSource:
         """Return the results of the model, loaded as a stage of the report."""
