@@ -23,7 +23,8 @@ from vggtjax.evaluation.truth_at_pixels import known_points
 from vggtjax.geometry.similarity import Similarity, centres, umeyama_sim3
 from vggtjax.method.mask import upsample
 from vggtjax.method.matched_mask import motion_pixels
-from vggtjax.method.passes import Assembly, Passes, Seen, assemble
+from vggtjax.method.passes import Assembly, Passes, assemble
+from vggtjax.method.witnesses import Seen
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.options import LADDER, ComputeDType, Options, find_method
 from vggtjax.pipeline.stages import Stages

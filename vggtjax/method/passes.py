@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeVar
 
 import jax
@@ -13,11 +12,10 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtjax.cameras import Cameras
 from vggtjax.config import Gram, MotionConfig, Threshold, VGGTConfig, Witness
 from vggtjax.errors import InputError
-from vggtjax.method.cues import GramCues
 from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
 from vggtjax.method.mask import dynamic_tokens, mine_mask
 from vggtjax.method.matched_mask import Mined, mine_matched_mask
-from vggtjax.method.matches import DenseMatches, Matches
+from vggtjax.method.witnesses import Seen, Sometimes, Witnesses
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import Frames
@@ -26,7 +24,6 @@ from vggtjax.network.model import Predictions, predict
 from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
-from vggtjax.network.together import Together
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options, find_method
 
@@ -42,13 +39,6 @@ class Passes(NamedTuple):
     dynamic_mask: Bool[Array, "B S H W"]
     motion: Float[Array, "B S h w"] | None = None  # as in `Mined`
     is_matched: Bool[Array, "B S"] | None = None  # as in `Mined`
-
-
-class Seen(NamedTuple):
-    """What the first pass sees of motion."""
-
-    saliency: Float[Array, "B S h w"]  # of the Gram similarities
-    matches: Matches | None = None  # None where none were asked for, and for a single frame
 
 
 class Assembly(NamedTuple):
@@ -85,19 +75,19 @@ def first_pass(
     Predictions of padded frames are meaningless. `exponents` has one power per cue, applied before their product. With
     the `witness` "matches", what is seen has the matches too.
     """
-    motion = motion or config.motion
-    cues = GramCues(motion, config.depth, gram, compute.frames)
-    witnesses = _witnesses(cues, witness, patch_grid(clips.images, config))
+    B, S = clips.images.shape[:2]
+    grid = patch_grid(clips.images, config)
+    witnesses = Witnesses(motion or config.motion, config.depth, grid, gram, witness, compute.frames)
     predictions = predict(
         params,
         clips,
         config,
         outputs=outputs if query_points is None else (*outputs, "tracks"),
         query_points=query_points,
-        accumulator=None if compute.frames.counted(clips.images.shape[1]) == 1 else witnesses,
+        accumulator=None if compute.frames.counted(S) == 1 else witnesses.accumulator,
         compute=compute,
     )
-    return _with_seen(predictions, cues, clips, config, exponents)
+    return predictions._replace(cue_sums=None), witnesses.seen(predictions.cue_sums, B, S, exponents)
 
 
 def either_pass(
@@ -128,53 +118,13 @@ def either_pass(
         outputs: what to predict, as for `forward`.
         compute: as for `predict`.
     """
-    cues = GramCues(config.motion, config.depth, gram, compute.frames)
+    B, S = clips.images.shape[:2]
+    witnesses = Witnesses(config.motion, config.depth, patch_grid(clips.images, config), gram, witness, compute.frames)
     masking = dataclasses.replace(suppression, dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size))
     options = {"outputs": outputs, "suppression": masking, "compute": compute}
-    witnesses = _Sometimes(_witnesses(cues, witness, patch_grid(clips.images, config)), is_first)
-    return _with_seen(predict(params, clips, config, accumulator=witnesses, **options), cues, clips, config)
-
-
-def _witnesses(cues: GramCues, witness: Witness, grid: tuple[int, int]) -> GramCues | Together:
-    """Return what is accumulated of the motion cues, with matches if requested."""
-    if witness == "gram":
-        return cues
-    layers = cues.motion.matching_layers(cues.depth)
-    return Together((cues, DenseMatches(layers, cues.depth, grid, cues.frames)), cues.frames)
-
-
-@dataclass(frozen=True)
-class _Sometimes:
-    """Motion cues that are added up in some calls of a program."""
-
-    cues: GramCues | Together
-    is_read: Bool[Array, ""]
-
-    def layer_counts(self) -> Int[Array, "depth cues"]:
-        return self.is_read * jnp.asarray(self.cues.layer_counts())
-
-    def zeros(self, B: int, S: int, P: int) -> Any:
-        return self.cues.zeros(B, S, P)
-
-    def add(self, *arguments: Any) -> Any:
-        return self.cues.add(*arguments)
-
-
-def _with_seen(
-    predictions: Predictions,
-    cues: GramCues,
-    clips: ClipBatch,
-    config: VGGTConfig,
-    exponents: Float[Array, " cues"] | None = None,
-) -> tuple[Predictions, Seen]:
-    """Return the predictions without sums of cues, and what these sums show; a saliency of 0 without them."""
-    B, S, h, w = (*clips.images.shape[:2], *patch_grid(clips.images, config))
-    if predictions.cue_sums is None:  # a single frame
-        return predictions, Seen(jnp.zeros((B, S, h, w)))
-    sums, matches = predictions.cue_sums, None
-    if isinstance(sums[-1], Matches):
-        sums, matches = sums
-    return predictions._replace(cue_sums=None), Seen(cues.saliency(sums, exponents).reshape(B, S, h, w), matches)
+    accumulator = Sometimes(witnesses.accumulator, is_first)
+    predictions = predict(params, clips, config, accumulator=accumulator, **options)
+    return predictions._replace(cue_sums=None), witnesses.seen(predictions.cue_sums, B, S)
 
 
 def mine(

@@ -26,7 +26,6 @@ from vggtjax.method.motion import FEWEST_FRAMES
 from vggtjax.method.passes import (
     Assembly,
     Passes,
-    Seen,
     assemble,
     either_pass,
     first_pass,
@@ -35,6 +34,7 @@ from vggtjax.method.passes import (
     second_pass,
     track_from,
 )
+from vggtjax.method.witnesses import Seen
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
