@@ -78,7 +78,8 @@ def choice(swept):
 
 def make_sweep(seed, truth, depth=3):
     maps = np.random.default_rng(seed).normal(size=(len(GRAMS), len(KINDS), depth, *truth.shape)).astype(np.float32)
-    return Sweep(maps, truth, MotionConfig(), np.random.default_rng(seed).random((2, *truth.shape), np.float32))
+    saliency = np.random.default_rng(seed).random((2, *truth.shape), np.float32)
+    return Sweep(maps, truth, MotionConfig(), saliency, np.zeros((depth, len(truth)), np.float32))
 
 
 def random_truth(seed, shape=(4, 3, 20)):
@@ -105,9 +106,8 @@ def queries_and_keys():
 def test_maps_and_table_are_those_of_the_cues(queries_and_keys, gram):
     default = MotionConfig()
     every, saliency = SweepCues(default, 4).measured(add_all(SweepCues(default, 4), *queries_and_keys))
-    made = Sweep(
-        np.asarray(every[..., 0, :, :])[:, :, :, None], np.zeros((1, 4, 6), np.int8), default, np.asarray(saliency)
-    )
+    every_map, truth = np.asarray(every[..., 0, :, :])[:, :, :, None], np.zeros((1, 4, 6), np.int8)
+    made = Sweep(every_map, truth, default, np.asarray(saliency), np.zeros((4, 1)))
     cues = (*(candidates(4)[i] for i in (0, 5, 10, 15, 23)), Cue("range", "k", "k", (1, 2, 3), "mean"))
     expected = GramCues(MotionConfig(cues, reference_depth=4), 4, gram)
     for name, values in expected.maps(add_all(expected, *queries_and_keys)).items():

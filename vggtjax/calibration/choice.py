@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float32, Int8
 
+from vggtjax.calibration.matching import matching_pairs
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Sweep, token_auc
 from vggtjax.config import Cue, Gram, MotionConfig
 from vggtjax.errors import InputError, check_choice, share, whole_number
@@ -63,7 +64,7 @@ def choose(
     half, up to `max_terms` of them, while it grows. The held-out half decides how many are kept: those with the largest
     area on it, where each cue has to bring at least `min_gain` on average. A cue that brings little stays if the cues
     after it bring more. The rating on that half is slightly optimistic. Candidates are all maps of one pair, and the
-    means over two or three neighbouring pairs.
+    means over two or three neighbouring pairs. The pairs that match are chosen by `matching_pairs` on all clips.
 
     Args:
         sweep: result of `sweep`.
@@ -103,7 +104,8 @@ def choose(
     kept = 1 + int(np.argmax(worth))  # of equal ones the fewest cues
     steps, refused = path[:kept], path[kept] if kept < len(path) else None
     cues = tuple(step.cue for step in steps)
-    motion = dataclasses.replace(sweep.table, cues=cues, reference_depth=sweep.depth, floor=floor)
+    chosen = {"cues": cues, "reference_depth": sweep.depth, "floor": floor}
+    motion = dataclasses.replace(sweep.table, **chosen, matching=matching_pairs(sweep.came_back))
     table = Rating(*(token_auc(half.table_saliency[GRAMS.index(gram)], half.truth) for half in (calibration, held_out)))
     return Choice(motion, gram, tuple(steps), refused, table)
 
@@ -117,6 +119,7 @@ def halves(sweep: Sweep) -> tuple[Sweep, Sweep]:
             maps=sweep.maps[:, :, :, every_second],
             truth=sweep.truth[every_second],
             table_saliency=sweep.table_saliency[:, every_second],
+            came_back=sweep.came_back[:, every_second],
         )
 
     return part(0), part(1)

@@ -1,4 +1,4 @@
-"""Motion maps of every pair on clips with known moving pixels, and the quality of each map."""
+"""Motion maps of every pair on clips with known moving pixels, the quality of each map, and which pairs match."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Float32, Float64, Int, Int8
 
+from vggtjax.calibration.matching import CameBack
 from vggtjax.config import Cue, Gram, MotionConfig, VGGTConfig
 from vggtjax.errors import InputError, device_memory_errors
 from vggtjax.evaluation.metrics.masks import auc
 from vggtjax.method.cues import GramCues, Sums, normalise
+from vggtjax.network.backbone import patch_grid
 from vggtjax.network.layers import Params
 from vggtjax.network.model import forward
+from vggtjax.network.together import Together
 from vggtjax.progress import Progress, no_progress
 
 GRAMS: tuple[Gram, ...] = ("cosine", "dot")
@@ -40,6 +43,7 @@ class Sweep(NamedTuple):
     truth: Int8[np.ndarray, "N S P"]  # STATIC, DYNAMIC or UNCLEAR
     table: MotionConfig  # for comparison with the chosen one: the default cues and floor, the model's own offsets
     table_saliency: Float32[np.ndarray, "G N S P"]
+    came_back: Float32[np.ndarray, "L N"]  # share of each pair's matches that come back: see `CameBack`
 
     @property
     def depth(self) -> int:
@@ -145,21 +149,24 @@ def sweep(
     kept = {name: getattr(config.motion, name) for name in ("offsets", "mask_pairs", "threshold")}
     table = dataclasses.replace(default, **kept)
     cues = SweepCues(table, config.depth)
-    maps, saliencies, truths, first_shape = [], [], [], None
+    maps, saliencies, truths, shares, first_shape = [], [], [], [], None
     for done, (images, mask) in enumerate(clips, 1):
         first_shape = first_shape or images.shape
         _check_clip(images.shape, mask.shape, first_shape)
         truths.append(token_truth(np.asarray(mask), config.patch_size))
         with device_memory_errors("fewer frames or a smaller size", *mask.shape):
-            clip_maps, saliency = jax.device_get(_measure(params, jnp.asarray(images)[None], config, cues))
+            measured = jax.device_get(_measure(params, jnp.asarray(images)[None], config, cues))
+        clip_maps, saliency, came_back = measured
         if not np.isfinite(clip_maps).all():
             raise InputError("the model's motion maps are not finite; its weights cannot be calibrated")
         maps.append(clip_maps[..., 0, :, :])
         saliencies.append(saliency[:, 0])
+        shares.append(came_back[:, 0])
         (progress or no_progress)(done, total)
     if len(maps) < 2:
         raise InputError(f"{len(maps)} clips; expected at least two, one to choose cues and one to confirm them")
-    return Sweep(np.stack(maps, axis=3), np.stack(truths), table, np.stack(saliencies, axis=1))
+    saliency, came_back = np.stack(saliencies, axis=1), np.stack(shares, axis=1)
+    return Sweep(np.stack(maps, axis=3), np.stack(truths), table, saliency, came_back)
 
 
 def kind_index(cue: Cue) -> int:
@@ -188,8 +195,10 @@ def token_auc(values: Float[np.ndarray, "N S P"], truth: Int8[np.ndarray, "N S P
 @partial(jax.jit, static_argnames=("config", "cues"))
 def _measure(
     params: Params, images: Float[Array, "B S H W 3"], config: VGGTConfig, cues: SweepCues
-) -> tuple[Float[Array, "G C L B S P"], Float[Array, "G B S P"]]:
-    return cues.measured(forward(params, images, config, outputs=(), cues=cues).cue_sums)
+) -> tuple[Float[Array, "G C L B S P"], Float[Array, "G B S P"], Float[Array, "L B"]]:
+    together = Together((cues, CameBack(config.depth, patch_grid(images, config))))
+    of_cues, came_back = forward(params, images, config, outputs=(), cues=together).cue_sums
+    return *cues.measured(of_cues), came_back
 
 
 def _check_clip(shape: tuple[int, ...], mask_shape: tuple[int, ...], first_shape: tuple[int, ...]) -> None:

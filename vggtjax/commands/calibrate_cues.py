@@ -15,6 +15,8 @@ from vggtjax.options import pairs_to_try
 from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from vggtjax.scenes import SyntheticClip
 
 _Pairs = Annotated[tuple[int, ...] | None, tyro.conf.arg(help_behavior_hint="", metavar="INT [INT ...]")]
@@ -34,7 +36,7 @@ def calibrate_cues(
     mask_pairs: _Pairs = None,
     seed: int = 0,
 ) -> None:
-    """Choose a model's motion cues on generated scenes, and save the model with them.
+    """Choose a model's motion cues and the pairs of blocks that match frames, and save the model with them.
 
     With --mask-pairs, also choose the threshold of the masks, and in how many pairs of blocks the second pass ignores
     keys.
@@ -101,6 +103,7 @@ def calibrate_cues(
     }
     report.line("AUC of the product up to each cue, on the calibration half and on the held-out half:")
     report.table(rows | {"default table": "{:.3f}   {:.3f}".format(*choice.table), "model": path})
+    report.line(_matching_line(choice.motion.matching, swept.came_back.mean(axis=1)))
     if choice.steps[-1].rating.held_out < choice.table.held_out:
         report.line("On the held-out half the default table is better than the chosen table; try more scenes.")
     if second is not None:
@@ -115,6 +118,15 @@ def calibrate_cues(
         )
     if loaded.note:
         report.line(loaded.warning)
+
+
+def _matching_line(pairs: tuple[int, ...] | None, shares: np.ndarray) -> str:
+    """Return which pairs of blocks match frames, and how many of the others' matches come back."""
+    if pairs is None:
+        return f"No pair of blocks matches frames: at most {shares.max():.0%} of its matches come back."
+    found = ", ".join(f"{pair} ({shares[pair]:.0%} of the matches come back)" for pair in pairs)
+    others = [share for pair, share in enumerate(shares) if pair not in pairs]
+    return f"Pairs of blocks that match frames: {found}" + (f"; others at most {max(others):.0%}." if others else ".")
 
 
 def generated_clips(scenes: int, frames: int, size: int, seed: int) -> Iterator[SyntheticClip]:

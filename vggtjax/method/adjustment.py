@@ -135,6 +135,15 @@ def adjust(
     return Static(poses, unit * jnp.exp(-log_inverse), projected(points), points[..., 2])
 
 
+def at_patches(depth: Float[Array, "B S H W"], grid: tuple[int, int]) -> Float[Array, "B S P"]:
+    """Return the depth of the centre of every patch."""
+    B, S, H, _ = depth.shape
+    h, w = grid
+    side = H // h
+    middle = slice((side - 1) // 2, side // 2 + 1)
+    return depth.reshape(B, S, h, side, w, side)[:, :, :, middle, :, middle].mean(axis=(3, 5)).reshape(B, S, h * w)
+
+
 def _local_blocks(
     own: Float[Array, "S 6 6"], between: Float[Array, "S M 6 6"], other: Float[Array, "S M 6 6"]
 ) -> Float[Array, "S N N 6 6"]:

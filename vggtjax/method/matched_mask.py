@@ -6,17 +6,22 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.cameras import Cameras
+from vggtjax.method.adjustment import at_patches
 from vggtjax.method.edges import follow_edges
 from vggtjax.method.mask import otsu_threshold, upsample
-from vggtjax.method.matches import Matches
+from vggtjax.method.matches import STEPS, Matches
 from vggtjax.method.motion import FEWEST_FRAMES, motion
 from vggtjax.network.frames import Frames
 from vggtjax.network.pose import decode_pose
 
-_TIMES_MEDIAN = 2.75  # Otsu's threshold alone would find something in static clips
+_TIMES_MEDIAN = 2.5  # Otsu's threshold alone would find something in static clips
+_STANDS_OUT = 3.3  # times the median; where hardly a pixel is above it, nothing moves
+_LEAST_SHARE = 0.005  # of such pixels in the frames around
+_AROUND = max(STEPS)  # frames
 
 
 class Mined(NamedTuple):
@@ -39,7 +44,8 @@ def mine_matched_mask(
 ) -> Mined:
     """Return dynamic pixels by matches. No gradient passes: a mask is a decision.
 
-    A clip of fewer than three frames, or whose matches do not come back, has its mask by the Gram saliency.
+    A clip of fewer than three frames, or whose matches do not come back, has its mask by the Gram saliency. Where
+    hardly a pixel stands out in the frames around, nothing moves.
 
     Args:
         matches: of the first pass.
@@ -54,7 +60,8 @@ def mine_matched_mask(
     if counted < FEWEST_FRAMES:
         return Mined(gram_mask, jnp.ones_like(saliency), jnp.zeros(gram_mask.shape[:2], bool))
     grid = (saliency.shape[2], saliency.shape[3])
-    inputs = jax.lax.stop_gradient((matches, saliency, *_at_patches(depth, pose_encoding, grid)))
+    cameras = Cameras(*decode_pose(pose_encoding, grid))  # intrinsics in patches
+    inputs = jax.lax.stop_gradient((matches, saliency, at_patches(depth, grid), cameras))
     # On several devices the communications of the other mask come first.
     whole = jax.tree.map(lambda x: frames.gather(frames.after(x, gram_mask))[:, :counted], inputs)
     found = jax.lax.map(lambda clip: motion(clip[0], clip[1].reshape(counted, -1), clip[2], clip[3], grid), whole)
@@ -63,9 +70,17 @@ def mine_matched_mask(
     score = frames.share(score, S)
     pixels = motion_pixels(score, images)
 
+    numbers = np.arange(counted)
+    around = np.abs(numbers[:, None] - numbers) <= _AROUND
+
     def is_dynamic(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
-        median = jnp.median(frames.gather(pixels, axis=0)[:counted])
-        return pixels >= jnp.maximum(otsu_threshold(pixels, frames=frames), _TIMES_MEDIAN * median)
+        whole = frames.gather(pixels, axis=0)[:counted]
+        median = jnp.median(whole)
+        shares = (whole >= _STANDS_OUT * median).mean(axis=(1, 2))
+        something_moves = (around @ shares >= _LEAST_SHARE * around.sum(axis=1)) & (median > 0)
+        open_frames = frames.share(jnp.pad(something_moves, (0, frames.total(S) - counted)), S, axis=0)
+        above = pixels >= jnp.maximum(otsu_threshold(pixels, frames=frames), _TIMES_MEDIAN * median)
+        return above & open_frames[:, None, None]
 
     mask = jax.vmap(is_dynamic)(pixels)
     if (is_counted := frames.are_counted(S)) is not None:
@@ -78,15 +93,3 @@ def motion_pixels(motion: Float[Array, "B S h w"], images: Float[Array, "B S H W
     """Return the motion of patches at pixels, ending where colours change. A mask is where it is above a threshold."""
     H, W = images.shape[2:4]
     return follow_edges(upsample(motion, (H, W)), images, H // motion.shape[2])
-
-
-def _at_patches(
-    depth: Float[Array, "B S H W"], pose_encoding: Float[Array, "B S 9"], grid: tuple[int, int]
-) -> tuple[Float[Array, "B S P"], Cameras]:
-    """Return the depth at the centres of patches, and cameras with intrinsics in patches."""
-    B, S, H, _ = depth.shape
-    h, w = grid
-    side = H // h
-    middle = slice((side - 1) // 2, side // 2 + 1)
-    centres = depth.reshape(B, S, h, side, w, side)[:, :, :, middle, :, middle].mean(axis=(3, 5))
-    return centres.reshape(B, S, h * w), Cameras(*decode_pose(pose_encoding, grid))

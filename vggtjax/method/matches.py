@@ -20,7 +20,8 @@ from vggtjax.network.precision import widened
 
 STEPS = (1, 2, 3, 4, 6, 8)  # offsets between frames that are matched, both ways
 _AT_ONCE = 4  # pairs of frames whose attention is in memory
-_CYCLE = 0.75  # patches; matches that come back further away count little
+CYCLE = 0.75  # patches; matches that come back further away count little, and are counted as lost
+MATCHED_SHARE = 0.25  # of the matches with the next frames that come back, below which nothing is matched
 _EPSILON = 1e-12
 
 
@@ -34,7 +35,7 @@ class Matches(NamedTuple):
     @property
     def weight(self) -> Float[Array, "*B S M P"]:
         """How far a match can be trusted, in [0, 1]: confidence x exp(-(cycle / 0.75)^2)."""
-        return self.confidence * jnp.exp(-((self.cycle / _CYCLE) ** 2))
+        return self.confidence * jnp.exp(-((self.cycle / CYCLE) ** 2))
 
 
 class FramePairs(NamedTuple):
@@ -52,6 +53,13 @@ def frame_pairs(S: int, steps: tuple[int, ...] = STEPS) -> FramePairs:
     others = frames + np.array(offsets, int)[None]
     exist = (others >= 0) & (others < S)
     return FramePairs(offsets, np.where(exist, others, frames), exist)
+
+
+def come_back(matches: Matches, pairs: FramePairs) -> Bool[Array, ""]:
+    """Return whether enough of a clip's matches with the next frames come back; else matches say nothing."""
+    next_ones = np.abs(pairs.offsets) == min(map(abs, pairs.offsets))
+    number = jnp.sum((matches.cycle < CYCLE) & (matches.confidence > 0), axis=(0, 2)) @ next_ones
+    return number > MATCHED_SHARE * pairs.exist[:, next_ones].sum() * matches.cycle.shape[2]
 
 
 def patch_centres(grid: tuple[int, int]) -> Float[np.ndarray, "P 2"]:

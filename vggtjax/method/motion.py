@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtjax.cameras import Cameras
 from vggtjax.method.adjustment import Static, adjust
-from vggtjax.method.matches import FramePairs, Matches, frame_pairs
+from vggtjax.method.matches import FramePairs, Matches, come_back, frame_pairs
 from vggtjax.network.precision import full_precision
 
 FEWEST_FRAMES = 3  # two views of a point that moves along its ray or against the camera fit a static world
@@ -19,10 +19,9 @@ _SMALLEST_SCALE = 0.1875  # patches; a soft-argmax is no more precise, so smalle
 _LARGEST = 8.0  # differences beyond this many scales count as this
 _OUTSIDE = 0.2  # weight of matches whose static position is outside the other frame
 _MARGIN = 0.25  # patches by which it may be outside
-_OFFSET, _EXPONENT, _FLOOR = 0.35, 0.7, 0.1  # score = log(difference + offset) + exponent x log(Gram + floor)
+_OFFSET, _EXPONENT, _FLOOR = 0.25, 0.6, 0.1  # score = log(difference + offset) + exponent x log(Gram + floor)
 _STILL, _STEEPNESS = float(np.log(0.8)), 4.0  # of the weights in the second round
 _VOTES, _VOTE, _VOTE_CYCLE, _VOTE_FRAMES = 2, 0.3, 0.625, 6.0
-_MATCHED_SHARE = 0.25  # of the matches with the next frames that come back, below which nothing is matched
 
 
 class Motion(NamedTuple):
@@ -63,10 +62,7 @@ def motion(
 
     _, score = fitted(1.05 - saliency)
     world, score = fitted(jax.nn.sigmoid(_STEEPNESS * (_STILL - score)))
-    next_ones = np.abs(pairs.offsets) == min(map(abs, pairs.offsets))
-    comes_back = jnp.sum((matches.cycle < 0.75) & (matches.confidence > 0), axis=(0, 2)) @ next_ones
-    is_matched = comes_back > _MATCHED_SHARE * pairs.exist[:, next_ones].sum() * depth.shape[1]
-    return Motion(jnp.exp(score), is_matched & jnp.isfinite(score).all(), world)
+    return Motion(jnp.exp(score), come_back(matches, pairs) & jnp.isfinite(score).all(), world)
 
 
 def _difference(

@@ -12,9 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtjax.cameras import Cameras
 from vggtjax.config import Gram, MotionConfig, Threshold, VGGTConfig, Witness
 from vggtjax.errors import InputError
+from vggtjax.method.adjusted_cameras import adjusted_cameras
 from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
 from vggtjax.method.mask import dynamic_tokens, mine_mask
 from vggtjax.method.matched_mask import Mined, mine_matched_mask
+from vggtjax.method.matches import Matches
 from vggtjax.method.witnesses import Seen, Sometimes, Witnesses
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.clip_batch import ClipBatch
@@ -25,7 +27,7 @@ from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
-from vggtjax.options import Options, find_method
+from vggtjax.options import CamerasFrom, Options, find_method
 
 _Value = TypeVar("_Value")
 
@@ -39,6 +41,7 @@ class Passes(NamedTuple):
     dynamic_mask: Bool[Array, "B S H W"]
     motion: Float[Array, "B S h w"] | None = None  # as in `Mined`
     is_matched: Bool[Array, "B S"] | None = None  # as in `Mined`
+    matches: Matches | None = None  # of the first pass, where cameras are adjusted to them
 
 
 class Assembly(NamedTuple):
@@ -283,10 +286,11 @@ def run_passes(
         second = method.second_outputs(options.align_scale) if method.needs_second_pass else ()
     patch_tokens = encode(params, images, config, compute_dtype=compute.compute_dtype)
     clips = ClipBatch(images, patch_tokens)
-    mining = {"gram": method.gram, "witness": method.mask, "motion": motion, "compute": compute}
+    mining = {"gram": method.gram, "witness": options.witness, "motion": motion, "compute": compute}
     first, seen = first_pass(params, clips, config, **mining)
+    matches = seen.matches if options.cameras == "adjusted" else None
     mined = mine(
-        seen,
+        seen if method.mask == "matches" else Seen(seen.saliency),
         first,
         clips,
         clusters=method.clusters if clusters is None else clusters,
@@ -294,15 +298,20 @@ def run_passes(
         smooth_frames=options.smooth_frames,
     )
     if not second:
-        return Passes(first, None, seen.saliency, *mined)
+        return Passes(first, None, seen.saliency, *mined, matches)
     suppression = Suppression(suppress=method.suppress, mask_pairs=mask_pairs)
     masking = {"plain": first, "suppression": suppression, "outputs": second, "compute": compute}
     second_one = second_pass(params, clips, mined.dynamic_mask, config, **masking)
-    return Passes(first, second_one, seen.saliency, *mined)
+    return Passes(first, second_one, seen.saliency, *mined, matches)
 
 
 def assemble(
-    passes: Passes, method: str = "4dvggt-d", *, align_scale: bool = False, frames: Frames = Frames()
+    passes: Passes,
+    method: str = "4dvggt-d",
+    *,
+    align_scale: bool = False,
+    cameras: CamerasFrom = "predicted",
+    frames: Frames = Frames(),
 ) -> Assembly:
     """Return a method's depth, confidence and cameras from two passes; the methods of `LADDER` share one run of them.
 
@@ -311,6 +320,7 @@ def assemble(
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
             pixels before it is used. Not in the paper.
+        cameras: adjust the cameras to the matches of static pixels, if the passes have any. Not in the paper.
         frames: where the frames of the passes are.
     """
     row = find_method(method)
@@ -335,11 +345,14 @@ def assemble(
     }[row.depth]()
     size = (depth.shape[2], depth.shape[3])
     extrinsics, intrinsics = decode_pose(_present(second.pose_encoding), size)
-    cameras = {
+    of_pass = {
         "first": Cameras(*decode_pose(_present(first.pose_encoding), size)),
         "second": Cameras(extrinsics.at[..., 3].multiply(scale[:, None, None]), intrinsics),
     }
-    chosen = Cameras(cameras[row.extrinsics].camera_from_world, cameras[row.intrinsics].intrinsics)
+    chosen = Cameras(of_pass[row.extrinsics].camera_from_world, of_pass[row.intrinsics].intrinsics)
+    if cameras == "adjusted" and passes.matches is not None:
+        grid = (passes.saliency.shape[2], passes.saliency.shape[3])
+        chosen = adjusted_cameras(chosen, depth, passes.matches, passes.dynamic_mask, grid, frames=frames)
     return Assembly(depth, confidence, chosen)
 
 

@@ -104,14 +104,15 @@ def _mine(seen: Seen, first: Predictions | None, clips: ClipBatch, *, frames: Fr
 
 
 def _assemble(
-    passes: Passes, fusion: FusionParams | None, *, frames: Frames, method: str, align_scale: bool, patch_size: int
+    passes: Passes, fusion: FusionParams | None, *, frames: Frames, patch_size: int, **changes: Any
 ) -> Assembly:
     """Assemble the first `frames.count` frames; on several devices the padded ones follow."""
 
     def run(passes, fusion):
-        changes = {"align_scale": align_scale, "frames": frames}
-        assembly = assemble(passes, method, **changes)
-        return assembly if fusion is None else apply_fusion(assembly, passes, fusion, patch_size, **changes)
+        assembly = assemble(passes, frames=frames, **changes)
+        if fusion is None:
+            return assembly
+        return apply_fusion(assembly, passes, fusion, patch_size, align_scale=changes["align_scale"], frames=frames)
 
     if frames.mesh is None:
         passes = jax.tree.map(lambda x: x[:, : frames.count], passes)
@@ -132,7 +133,7 @@ _SECOND_STATIC = ("config", "suppress", "outputs", "compute")  # mask_pairs is t
 _second_pass = Program(_second, static=_SECOND_STATIC)
 _either_pass = Program(_either, static=(*_SECOND_STATIC, "gram", "witness"))
 _track_from = Program(_track, static=("config", "compute"))
-_assembled = Program(_assemble, static=("frames", "method", "align_scale", "patch_size"))
+_assembled = Program(_assemble, static=("frames", "patch_size", "method", "align_scale", "cameras"))
 for _kind in (ClipBatch, Predictions, Passes, Seen, Matches, Mined, Cameras, Assembly, Tracks, Quantised):
     keep_type(_kind)
 
@@ -177,7 +178,7 @@ class Stages:
 
     @property
     def _mining(self) -> dict[str, Any]:
-        return {"gram": self.options.row.gram, "witness": self.options.row.mask}
+        return {"gram": self.options.row.gram, "witness": self.options.witness}
 
     def _shared(self, outputs: tuple[str, ...]) -> bool:
         """Return whether one program serves both passes, where the second pass has these outputs."""
@@ -211,6 +212,8 @@ class Stages:
         method = self.options.row
         options = {"clusters": method.clusters, "threshold": method.threshold}
         options |= {"smooth_frames": self.options.smooth_frames, "frames": self._real}
+        if method.mask == "gram":
+            seen = Seen(seen.saliency)
         read = None if seen.matches is None else only(first, _FIRST_OUTPUTS)
         return self.run("dynamic mask", _mine_mask, seen, read, clips._replace(frame_count=None), **options)
 
@@ -237,7 +240,7 @@ class Stages:
 
     def assemble(self, passes: Passes, fusion: FusionParams | None = None) -> Assembly:
         """Return the method's depth, confidence and cameras of the real frames, fused by `fusion` if given."""
-        options = {"method": self.options.method, "align_scale": self.options.align_scale}
+        options = {name: getattr(self.options, name) for name in ("method", "align_scale", "cameras")}
         options |= {"frames": self._real, "patch_size": self.config.patch_size}
         return self.run("assemble", _assembled, passes, fusion, **options)
 
@@ -300,7 +303,8 @@ def run_stages(
     second = first if stages.options.row.needs_second_pass else None
     if runs_second:
         second = stages.second_pass(params, clips, mask, first, all_outputs=all_outputs)
-    passes = Passes(first, second, seen.saliency, mask, mined.motion, mined.is_matched)
+    matches = seen.matches if stages.options.cameras == "adjusted" else None
+    passes = Passes(first, second, seen.saliency, mask, mined.motion, mined.is_matched, matches)
     assembly = stages.assemble(passes, fusion)
     tracks = {
         frame: stages.tracks(params, clips, frame_points, np.asarray(frame, np.int32))
