@@ -11,14 +11,14 @@ from vggtjax.method.matches import Matches, frame_pairs, patch_centres
 from vggtjax.scenes import SceneConfig
 
 PATCH, GRID = 8, (6, 6)
-_CONFIG = SceneConfig(height=GRID[0] * PATCH, width=GRID[1] * PATCH, frames=6, dynamic=0.0)
 
 
 class StaticWorld:
     """Depths, cameras, and where every patch is in the other frames."""
 
-    def __init__(self):
-        clip = generated.clips(_CONFIG, 1)
+    def __init__(self, frames=6):
+        height, width = (side * PATCH for side in GRID)
+        clip = generated.clips(SceneConfig(height=height, width=width, frames=frames, dynamic=0.0), 1)
         depth = np.asarray(clip.depth[0], np.float64)
         middle = slice(PATCH // 2 - 1, PATCH // 2 + 1)
         S, h, w = len(depth), *GRID

@@ -14,6 +14,7 @@ from tests.tiny import tiny_config
 from vggtjax import Cue, Model, MotionConfig, init_params, load_model, motion_saliency
 from vggtjax.calibration.choice import candidates, choose, halves
 from vggtjax.calibration.export import MODEL, NUMBERS, PICTURE, check_folder, save_calibration
+from vggtjax.calibration.matching import CameBack, matching_pairs
 from vggtjax.calibration.sweep import (
     DYNAMIC,
     GRAMS,
@@ -115,6 +116,18 @@ def test_maps_and_table_are_those_of_the_cues(queries_and_keys, gram):
         assert np.allclose(made.map(gram, cue)[0], values[0], atol=1e-5), name
     table = GramCues(default, 4, gram)
     assert np.allclose(saliency[GRAMS.index(gram)], table.saliency(add_all(table, *queries_and_keys)), atol=1e-5)
+
+
+def test_pairs_match_whose_matches_come_back(queries_and_keys):
+    """Two of four pairs match: keys are the queries of the other frames, moved by one patch."""
+    q, k = (np.array(x) for x in queries_and_keys)
+    q[1:3] *= 3
+    k[1:3] = q[1:3] = q[1:3, :, :1]  # the same tokens in all frames
+    shares = add_all(CameBack(4, (2, 3)), q, k)
+    assert np.allclose(shares[1:3], 1)
+    assert (shares[::3] < 0.7).all()
+    assert matching_pairs(np.asarray(shares)) == (1, 2)
+    assert matching_pairs(np.full((4, 2), 0.2)) is None
 
 
 def test_truth_of_tokens_by_hand():
@@ -227,6 +240,7 @@ def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
     printed = capsys.readouterr()
     assert loaded.config.motion.cues[0].name in printed.out
     assert "default table" in printed.out
+    assert "of blocks match" in printed.out
     assert "sweep" in printed.err
     with pytest.raises(InputError, match="size is 50"):
         calibrate_cues(str(source), tmp_path / "other", size=50)

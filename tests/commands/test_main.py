@@ -42,7 +42,9 @@ def test_demo(tmp_path, capsys, monkeypatch):
     assert str(page) in out
     assert page.stat().st_size > 100_000
     result = Reconstruction.load(tmp_path / "result")
-    assert result.method == "4dvggt-d"
+    assert result.method == "4dvggt-m"
+    assert result.motion.shape == (4, 12, 12)
+    assert "Masks by matches: the second pass" in out
     assert (tmp_path / "result" / "scene.glb").stat().st_size > 1000
 
 

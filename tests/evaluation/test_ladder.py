@@ -166,6 +166,6 @@ def test_words_follow_the_numbers(rows, rotation, centre, abs_rel, expected):
     second = replace(first, method="4dvggt-d", mask_source="mined", abs_rel=abs_rel)
     second = replace(second, rotation_error=rotation, centre_error_ratio=centre)
     words = second_pass_in_words([first, second])
-    assert re.match(f"Mined masks: the second pass {expected}", words)
+    assert re.match(f"Masks as in the paper: the second pass {expected}", words)
     assert second_pass_in_words([first]) == second_pass_in_words([first, replace(second, abs_rel=None)]) == ""
     assert error_table([first, second]).note.startswith(words)

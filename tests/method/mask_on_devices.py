@@ -1,6 +1,7 @@
 """What tests/method/test_mask.py runs in a process with several devices: masks, here and on eight devices.
 
-It prints JSON: for each method, the share of dynamic pixels, and whether the masks are equal.
+It prints JSON: for each method, the share of dynamic pixels, and whether the masks are equal; for "4dvggt-m" the
+cameras that are adjusted to matches too.
 """
 
 import json
@@ -10,8 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from tests.static_world import GRID, PATCH, StaticWorld
+from vggtjax.method.adjusted_cameras import adjusted_cameras
 from vggtjax.method.mask import mine_mask
+from vggtjax.method.matched_mask import mine_matched_mask
 from vggtjax.network.frames import BY_FRAME, Frames
+from vggtjax.network.pose import encode_pose
 from vggtjax.pipeline.devices import frames_mesh, shared_length
 
 COUNT, SIZE = 13, (6, 8)  # frames, which eight devices pad to 16
@@ -37,4 +42,28 @@ for method, options in METHODS.items():
     shared = np.asarray(jax.jit(mine)(jnp.asarray(saliency), jnp.asarray(tokens)))
     is_equal = np.array_equal(shared[:, :COUNT], alone) and not shared[:, COUNT:].any()
     found[method] = float(np.mean(alone)), bool(is_equal)
+
+
+def by_matches(frames, depth, cameras, matches, gram_mask, saliency, images):
+    pose_encoding = encode_pose(*cameras, (GRID[0] * PATCH, GRID[1] * PATCH))
+    mined = mine_matched_mask(matches, gram_mask, saliency, images, depth, pose_encoding, frames=frames)
+    return mined, adjusted_cameras(cameras, depth, matches, mined.dynamic_mask, GRID, frames=frames)
+
+
+world = StaticWorld(COUNT)
+moves = np.zeros((COUNT, *GRID), bool)
+moves[:, 2:4, 1:3] = True
+depth, moving = (np.kron(x.reshape(-1, *GRID), np.ones((1, PATCH, PATCH), x.dtype)) for x in (world.depth, moves))
+cameras = world.cameras._replace(intrinsics=world.cameras.intrinsics * np.float32([[PATCH], [PATCH], [1]]))
+images = np.random.default_rng(0).random((COUNT, *depth.shape[1:], 3)).astype(np.float32) / 20 + moving[..., None] / 2
+inputs = (depth.astype(np.float32), cameras, world.matches(moves.reshape(COUNT, -1)), moving & False)
+inputs += (np.full(moves.shape, 0.5, np.float32), images.astype(np.float32))
+alone = jax.jit(partial(by_matches, Frames()))(*jax.tree.map(lambda x: jnp.asarray(x)[None], inputs))
+frames, added = Frames(mesh, COUNT), shared_length(COUNT, mesh) - COUNT
+padded = jax.tree.map(lambda x: np.pad(x, ((0, added), *((0, 0),) * (x.ndim - 1)), mode="edge")[None], inputs)
+shared = jax.jit(frames.on_devices(partial(by_matches, frames), *(BY_FRAME,) * 6))(*padded)
+is_equal = all(
+    np.allclose(a, b[:, :COUNT], atol=1e-4) for a, b in zip(*map(jax.tree.leaves, (alone, shared)), strict=True)
+)
+found["4dvggt-m"] = float(np.mean(alone[0].dynamic_mask)), is_equal and bool(alone[0].is_matched.all())
 print(json.dumps(found))  # noqa: T201

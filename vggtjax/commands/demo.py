@@ -15,7 +15,7 @@ from vggtjax.storage.flags import Switch
 def demo(
     *,
     out: Path = Path("demo-output"),
-    method: MethodName = "4dvggt-d",
+    method: MethodName = "4dvggt-m",
     view: Switch = False,
 ) -> None:
     """Reconstruct the embedded clip with the embedded model, and measure the ladder of methods against its truth.
@@ -45,7 +45,7 @@ def demo(
         with report.stage("measure") as progress:
             from vggtjax.evaluation.ladder import error_table, ladder
 
-            errors = error_table(ladder(model, truth, progress=progress))
+            errors = error_table(ladder(model, truth, masks=("mined", "matches", "true"), progress=progress))
         with report.stage("write") as progress:
             from PIL import Image
 

@@ -26,7 +26,7 @@ from vggtjax.method.matched_mask import motion_pixels
 from vggtjax.method.passes import Assembly, Passes, assemble
 from vggtjax.method.witnesses import Seen
 from vggtjax.network.clip_batch import ClipBatch
-from vggtjax.options import LADDER, ComputeDType, Options, find_method
+from vggtjax.options import LADDER, CamerasFrom, ComputeDType, Options, find_method
 from vggtjax.pipeline.stages import Stages
 from vggtjax.progress import Progress
 from vggtjax.results.report import ErrorTable
@@ -80,11 +80,11 @@ class _Setting(NamedTuple):
     suppress: Suppress | None = None
 
 
-def _assemble_all(passes: Passes, methods: tuple[str, ...]) -> list[Assembly]:
-    return [assemble(passes, method) for method in methods]
+def _assemble_all(passes: Passes, methods: tuple[str, ...], cameras: CamerasFrom) -> list[Assembly]:
+    return [assemble(passes, method, cameras=cameras) for method in methods]
 
 
-_assemble = Program(_assemble_all, static=("methods",))
+_assemble = Program(_assemble_all, static=("methods", "cameras"))
 _upsample = Program(upsample, static=("size",))
 _motion_pixels = Program(motion_pixels)
 
@@ -99,6 +99,7 @@ def ladder(
     suppress: Sequence[Suppress] = ("zero",),
     gram: Gram = "cosine",
     threshold: Threshold | None = None,
+    cameras: CamerasFrom = "predicted",
     compute_dtype: ComputeDType = "float32",
     batch_size: int = 4,
     progress: Progress | None = None,
@@ -114,7 +115,7 @@ def ladder(
             masks, an upper bound for any mining.
         mask_pairs: numbers of pairs in which the keys of dynamic tokens are suppressed; the model's own if None.
         suppress: ways to suppress them, in place of the methods' own.
-        gram, threshold, compute_dtype: as in `Options`.
+        gram, threshold, cameras, compute_dtype: as in `Options`.
         batch_size: number of clips that go through the network together.
         progress: called with the number of passes done and of all passes.
 
@@ -138,7 +139,7 @@ def ladder(
     settings = [_Setting(*values) for values in product(masks, pairs, suppress)]
     frames, *size = truth.images.shape[1:4]
     witness = "matches" if "matches" in masks else "gram"
-    options = Options(gram=gram, mask=witness, threshold=threshold, compute_dtype=compute_dtype)
+    options = Options(gram=gram, mask=witness, threshold=threshold, cameras=cameras, compute_dtype=compute_dtype)
     shared = Stages(model.config, options, frames, (size[0], size[1]))
     second_stages = [
         replace(shared, options=options.changed(mask_pairs=setting.mask_pairs, suppress=setting.suppress))
@@ -158,17 +159,18 @@ def ladder(
         pixels = np.asarray(_upsample(saliency, size=tuple(size)))
         scenes = [_scene(int(clip), truth, pixels[i]) for i, clip in enumerate(clips)]
         by_source = {"mined": (mined, scenes), "true": (jax.device_put(truth.dynamic_mask[padded]), scenes)}
-        if seen.matches is not None:
+        if "matches" in masks and seen.matches is not None:
             matched = shared.dynamic_mask(seen, first, batch)
             pixels = np.asarray(_motion_pixels(matched.motion, images))
             moving = [scene._replace(saliency=pixels[i]) for i, scene in enumerate(scenes)]
             by_source["matches"] = (matched.dynamic_mask, moving)
-        rows += _scored(Passes(first, None, saliency, mined), plain, scenes, _Setting())
+        passes = Passes(first, None, saliency, mined, matches=seen.matches)
+        rows += _scored(passes, plain, scenes, _Setting(), cameras)
         advance()
         for setting, stages in zip(settings, second_stages, strict=True) if masked else ():
             mask, scored_by = by_source[setting.mask_source or "mined"]
             second = stages.second_pass(model.params, batch, mask, first)
-            rows += _scored(Passes(first, second, saliency, mask), masked, scored_by, setting)
+            rows += _scored(passes._replace(second=second, dynamic_mask=mask), masked, scored_by, setting, cameras)
             advance()
     return sorted(rows, key=lambda row: row.clip)
 
@@ -198,7 +200,8 @@ def error_table(rows: Sequence[LadderRow]) -> ErrorTable:
     ]
     note = (
         f"{second_pass_in_words(rows)} AbsRel: of depth after one median scale. Rotation: mean, relative to the first "
-        "frame. Centres: RMSE after Sim(3), in median depths. Mask: mined from the first pass, or the true one."
+        "frame. Centres: RMSE after Sim(3), in median depths. Mask: mined from the first pass as in the paper, by "
+        "matches between its frames too, or the true one."
     )
     return ErrorTable(("method", "mask", *(heading for heading, _ in _COLUMNS.values())), cells, note.lstrip())
 
@@ -210,7 +213,7 @@ def second_pass_in_words(rows: Sequence[LadderRow]) -> str:
     """
     first = next((row for row in rows if row.method == "vggt"), None)
     return " ".join(
-        f"{source.capitalize()} masks: {_change_in_words(first, row)}."
+        f"{_WORDS[source]}: {_change_in_words(first, row)}."
         for source in get_args(MaskSource)
         for row in rows
         if first is not None and row.method == "4dvggt-d" and row.mask_source == source
@@ -218,6 +221,7 @@ def second_pass_in_words(rows: Sequence[LadderRow]) -> str:
     )
 
 
+_WORDS: dict[MaskSource, str] = {"mined": "Masks as in the paper", "matches": "Masks by matches", "true": "True masks"}
 _CAMERA_SCORES = ("rotation_error", "centre_error_ratio")
 
 
@@ -250,9 +254,11 @@ def _scene(clip: int, truth: Truth, saliency: Float[np.ndarray, "S H W"]) -> _Sc
     return _Scene(clip, own, points, saliency)
 
 
-def _scored(passes: Passes, methods: tuple[str, ...], scenes: list[_Scene], setting: _Setting) -> Iterator[LadderRow]:
+def _scored(
+    passes: Passes, methods: tuple[str, ...], scenes: list[_Scene], setting: _Setting, cameras_from: CamerasFrom
+) -> Iterator[LadderRow]:
     mask = np.asarray(passes.dynamic_mask)
-    for method, assembly in zip(methods, _assemble(passes, methods=methods), strict=True):
+    for method, assembly in zip(methods, _assemble(passes, methods=methods, cameras=cameras_from), strict=True):
         depth, intrinsics = np.asarray(assembly.depth), np.asarray(assembly.intrinsics)
         cameras = np.asarray(assembly.camera_from_world)
         for i, scene in enumerate(scenes):

@@ -139,9 +139,10 @@ def _masks(result: Result, truth: TruthAtPixels, *, empty: Empty) -> _Outputs:
     window = np.s_[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]  # without padding
     frames = frame_scores(predicted[window], true[window], empty=empty)
     metrics = dict(mask_statistics(frames)._asdict())
-    if result.saliency is not None and true.any() and not true[inside].all():
-        factors = (1, *(big // small for big, small in zip(true.shape[1:], result.saliency.shape[1:], strict=True)))
-        saliency = np.kron(result.saliency, np.ones(factors, np.float32))
+    of_patches = result.saliency if result.motion is None else result.motion  # what the mask was cut from
+    if of_patches is not None and true.any() and not true[inside].all():
+        factors = (1, *(big // small for big, small in zip(true.shape[1:], of_patches.shape[1:], strict=True)))
+        saliency = np.kron(of_patches, np.ones(factors, np.float32))
         metrics["saliency_auc"] = auc(saliency[inside], true[inside])
     shown = _pictured(len(true))
     pictures = {"masks": predicted[shown], "true_masks": true[shown]}

@@ -91,6 +91,7 @@ def warn_if_fitted_otherwise(path: Path, model: Model, options: Options) -> None
     """
     _, about = _read(path)
     settings: dict[str, Any] = options.passes_settings(model.config.motion) | {"align_scale": options.align_scale}
+    settings, about = {"mask": "gram"} | settings, {"mask": "gram"} | about  # absent where it is the papers'
     digest, fitted = about.get("model_sha256"), str(about.get("model"))
     if isinstance(digest, str):
         digests = (digest, about.get("weights_sha256"))

@@ -6,22 +6,18 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.cameras import Cameras
 from vggtjax.method.adjustment import at_patches
 from vggtjax.method.edges import follow_edges
 from vggtjax.method.mask import otsu_threshold, upsample
-from vggtjax.method.matches import STEPS, Matches
+from vggtjax.method.matches import Matches
 from vggtjax.method.motion import FEWEST_FRAMES, motion
 from vggtjax.network.frames import Frames
 from vggtjax.network.pose import decode_pose
 
 _TIMES_MEDIAN = 2.5  # Otsu's threshold alone would find something in static clips
-_STANDS_OUT = 3.3  # times the median; where hardly a pixel is above it, nothing moves
-_LEAST_SHARE = 0.005  # of such pixels in the frames around
-_AROUND = max(STEPS)  # frames
 
 
 class Mined(NamedTuple):
@@ -44,8 +40,7 @@ def mine_matched_mask(
 ) -> Mined:
     """Return dynamic pixels by matches. No gradient passes: a mask is a decision.
 
-    A clip of fewer than three frames, or whose matches do not come back, has its mask by the Gram saliency. Where
-    hardly a pixel stands out in the frames around, nothing moves.
+    A clip of fewer than three frames, or whose matches do not come back, has its mask by the Gram saliency.
 
     Args:
         matches: of the first pass.
@@ -70,17 +65,9 @@ def mine_matched_mask(
     score = frames.share(score, S)
     pixels = motion_pixels(score, images)
 
-    numbers = np.arange(counted)
-    around = np.abs(numbers[:, None] - numbers) <= _AROUND
-
     def is_dynamic(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
-        whole = frames.gather(pixels, axis=0)[:counted]
-        median = jnp.median(whole)
-        shares = (whole >= _STANDS_OUT * median).mean(axis=(1, 2))
-        something_moves = (around @ shares >= _LEAST_SHARE * around.sum(axis=1)) & (median > 0)
-        open_frames = frames.share(jnp.pad(something_moves, (0, frames.total(S) - counted)), S, axis=0)
-        above = pixels >= jnp.maximum(otsu_threshold(pixels, frames=frames), _TIMES_MEDIAN * median)
-        return above & open_frames[:, None, None]
+        median = jnp.median(frames.gather(pixels, axis=0)[:counted])
+        return pixels >= jnp.maximum(otsu_threshold(pixels, frames=frames), _TIMES_MEDIAN * median)
 
     mask = jax.vmap(is_dynamic)(pixels)
     if (is_counted := frames.are_counted(S)) is not None:

@@ -148,6 +148,7 @@ def reconstruct(
             **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
             **fields,
             saliency=passes.saliency[0],
+            motion=None if passes.motion is None else np.where(passes.is_matched.all(), passes.motion[0], 1),
             dynamic_mask=passes.dynamic_mask[0],
             method=options.method,
             model_name=model.name,

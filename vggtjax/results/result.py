@@ -57,6 +57,7 @@ class Result:
     track_visibility: Float32[np.ndarray, "S Q"] | None = None  # probabilities
     track_confidence: Float32[np.ndarray, "S Q"] | None = None
     track_frames: Int64[np.ndarray, " Q"] | None = None  # of the queries
+    motion: Float32[np.ndarray, "S h w"] | None = None  # of each patch, by matches; about 1 where nothing moves
     passes: Any = None  # outputs of the network; in memory only, never saved
 
     def __post_init__(self) -> None:
@@ -232,7 +233,7 @@ def _arrays() -> dict[str, tuple[np.dtype, tuple[str | int, ...]]]:
 
 ARRAYS = _arrays()  # S, H, W are those of depth, h, w of saliency, Q of track_frames; all others must match
 TRACKS = frozenset(name for name in ARRAYS if name.startswith("track_"))  # all are given, or none
-OPTIONAL = TRACKS | {"timestamps", "saliency"}
+OPTIONAL = TRACKS | {"timestamps", "saliency", "motion"}
 STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": (), "model_name": (), "settings": ()}
 
 

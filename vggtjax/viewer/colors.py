@@ -10,7 +10,7 @@ from cmap import Colormap
 from jaxtyping import Bool, Float, UInt8
 
 from vggtjax.options import METHODS
-from vggtjax.results.previews import INSTANCE_COLORS, inverse_depth_range, moving_ids
+from vggtjax.results.previews import INSTANCE_COLORS, MOST_MOTION, inverse_depth_range, moving_ids
 from vggtjax.results.result import Result, missing_fields
 from vggtjax.results.shown import ShownPoints
 
@@ -86,12 +86,21 @@ def _precision(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
     return _levels(np.log(values), low, high)
 
 
+def _of_patches(values: Float[np.ndarray, "S h w"], points: ShownPoints, H: int, W: int) -> Float[np.ndarray, " N"]:
+    _, h, w = values.shape
+    rows, columns = np.divmod(points.pixels, W)
+    return values[points.frames, rows * h // H, columns * w // W]
+
+
 def _saliency(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
     assert result.saliency is not None
-    _, H, W = result.depth.shape
-    _, h, w = result.saliency.shape
-    rows, columns = np.divmod(points.pixels, W)
-    return _levels(result.saliency[points.frames, rows * h // H, columns * w // W], 0, 1)
+    return _levels(_of_patches(result.saliency, points, *result.depth.shape[1:]), 0, 1)
+
+
+def _motion(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
+    assert result.motion is not None
+    median = float(np.median(result.motion))
+    return _levels(_of_patches(result.motion, points, *result.depth.shape[1:]), median, MOST_MOTION * median)
 
 
 def _objects(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
@@ -171,6 +180,13 @@ _MODES = (
         _object_names,
     ),
     ColorMode("saliency", lambda result: result.saliency is not None, _saliency, _ramp("inferno"), _ends("0", "1")),
+    ColorMode(
+        "motion by matches",
+        lambda result: result.motion is not None,
+        _motion,
+        _ramp("inferno"),
+        _ends("as the median patch", f"{MOST_MOTION} times it"),
+    ),
     ColorMode(
         "pass",
         lambda result: result.method in METHODS and METHODS[result.method].depth in ("replaced", "fused"),

@@ -33,6 +33,7 @@ class BlendedFrame(NamedTuple):
     depth: Float32[np.ndarray, "H W"]
     depth_confidence: Float32[np.ndarray, "H W"]
     saliency: Float32[np.ndarray, "h w"] | None
+    motion: Float32[np.ndarray, "h w"] | None
     dynamic_mask: Bool[np.ndarray, "H W"]
     camera_from_world: Float64[np.ndarray, "3 4"]
     intrinsics: Float64[np.ndarray, "3 3"]
@@ -51,14 +52,19 @@ def blend_frame(views: Sequence[View]) -> BlendedFrame:
     blended = np.where(valid, depths, 0) * precision
     depth = np.divide(blended.sum(axis=0), total, out=np.zeros(total.shape), where=total > 0)
     said = np.stack([view.result.dynamic_mask[view.number] for view in views])
-    saliency = None
-    if all(view.result.saliency is not None for view in views):
-        maps = np.stack([view.result.saliency[view.number] for view in views])  # type: ignore[index]
-        saliency = (maps * shares).sum(axis=0).astype(np.float32)
+
+    def of_patches(name: str) -> Float32[np.ndarray, "h w"] | None:
+        maps = [getattr(view.result, name) for view in views]
+        if any(values is None for values in maps):
+            return None
+        each = np.stack([values[view.number] for values, view in zip(maps, views, strict=True)])
+        return (each * shares).sum(axis=0).astype(np.float32)
+
     return BlendedFrame(
         depth=depth.astype(np.float32),
         depth_confidence=(confidence * shares).sum(axis=0).astype(np.float32),
-        saliency=saliency,
+        saliency=of_patches("saliency"),
+        motion=of_patches("motion"),
         dynamic_mask=(said * shares).sum(axis=0) >= 0.5,
         camera_from_world=blend_cameras(views),
         intrinsics=np.einsum("v,vij->ij", weights, [view.result.intrinsics[view.number] for view in views]),

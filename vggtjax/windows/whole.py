@@ -6,6 +6,7 @@ One or two windows are in memory at a time; the arrays of the whole clip are map
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -38,7 +39,7 @@ NO_TRACKS: Mapping[str, np.ndarray] = MappingProxyType({})
 
 logger = logging.getLogger(__name__)
 
-_BLENDED = ("depth", "depth_confidence", "saliency", "dynamic_mask", "camera_from_world", "intrinsics")
+_BLENDED = ("depth", "depth_confidence", "saliency", "motion", "dynamic_mask", "camera_from_world", "intrinsics")
 _COPIED = ("images", "timestamps", "source_size", "source_scale", "source_offset", "valid_box")
 
 
@@ -186,10 +187,12 @@ class Whole:
         arrays: dict[str, np.ndarray] = dict(self.store.arrays(shapes))
         names: list[str] = []
         held: dict[int, Reconstruction] = {}
+        masked_by: dict[int, str] = {}
         with self.on_stage("blend windows") as progress:
             for frame in range(total):
                 weights = blend_weights(frame, self.windows)
                 held = {n: held[n] if n in held else self.store.load(window_name(n)) for n in weights}
+                masked_by |= {n: str(window.settings.get("masks")) for n, window in held.items()}
                 views = [View(held[n], frame - self.windows[n].start, worlds[n], w) for n, w in weights.items()]
                 blended = blend_frame(views)
                 for name in _BLENDED:
@@ -204,6 +207,8 @@ class Whole:
                     progress(frame + 1, total)
         fields: dict[str, Any] = {"saliency": None, "timestamps": None, **arrays, **tracks}
         settings = first.settings | {"windows": self.facts()}
+        if len(ways := Counter(masked_by.values())) > 1:
+            settings["masks"] = "; ".join(f"{way} ({n} of {len(masked_by)} windows)" for way, n in ways.most_common())
         return Reconstruction(
             **fields, frame_names=tuple(names), method=first.method, model_name=first.model_name, settings=settings
         )
