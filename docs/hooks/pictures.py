@@ -25,6 +25,7 @@ logger = logging.getLogger("mkdocs.hooks.pictures")
 
 FOLDER = Path(__file__).resolve().parents[1] / "pictures" / "made"
 SCENES, SCENE_SEED = 4, 200  # of the gallery: the first of the seed, whatever came out
+MATCHED_SCENE = 1  # of the gallery, whose matches are shown
 SCENE_FRAMES, SCENE_SIDE = 12, 96
 _TURNTABLE: dict[str, Any] = {"seconds": 5.0, "fps": 10.0, "size": (480, 300)}
 _BACKGROUND, _TEXT, _FAINT = "#14141a", "#ececf0", "#9696a0"
@@ -43,6 +44,7 @@ class Clip(NamedTuple):
     truth: Truth
     result: Reconstruction
     cues: dict[str, np.ndarray]
+    by_matches: Reconstruction | None = None  # the result with masks by matches
 
 
 def on_pre_build(config: Any) -> None:
@@ -74,7 +76,9 @@ def make(folder: Path = FOLDER) -> None:
     with matplotlib.rc_context(_STYLE):
         for name, draw in {"passes": passes, "cues": cues, "mask": mask, "fusion": fusion}.items():
             _save(draw(clip), folder / f"{name}.webp")
-        for number, scene in enumerate(_generated(model)):
+        scenes = _generated(model)
+        _save(matches(model, scenes[MATCHED_SCENE]), folder / "matches.webp")
+        for number, scene in enumerate(scenes):
             _save(gallery_sheet(scene, number), folder / f"scene-{number}.webp")
             write_film(folder / f"turntable-{number}.webp", film_frames(scene.result, **_TURNTABLE), _TURNTABLE["fps"])
     stamp.write_text(made_of.hexdigest())
@@ -117,7 +121,8 @@ def _generated(model: Model) -> list[Clip]:
     for number in range(SCENES):
         truth = Truth(*(getattr(scenes, name)[number] for name in Truth._fields))
         clip = vggtjax.load_clip(truth.images, size=SCENE_SIDE, patch=model.config.patch_size)
-        found.append(Clip(truth, vggtjax.reconstruct(model, clip), {}))
+        paper, by_matches = (vggtjax.reconstruct(model, clip, method=name) for name in ("4dvggt-d", "4dvggt-m"))
+        found.append(Clip(truth, paper, {}, by_matches))
     return found
 
 
@@ -237,22 +242,90 @@ def fusion(clip: Clip) -> Figure:
     return figure
 
 
+def matches(model: Model, clip: Clip) -> Figure:
+    """Each step from the matches of three frames to their mask, and the truth."""
+    import dataclasses
+
+    import jax
+    from matplotlib import pyplot
+
+    from vggtjax.cameras import Cameras
+    from vggtjax.method.adjustment import Adjustment, adjust, at_patches
+    from vggtjax.method.matched_mask import motion_pixels
+    from vggtjax.method.matches import frame_pairs, patch_centres
+    from vggtjax.method.motion import motion
+    from vggtjax.method.passes import first_pass
+    from vggtjax.network.clip_batch import ClipBatch
+    from vggtjax.network.pose import decode_pose
+    from vggtjax.results.previews import overlay
+
+    truth, result = clip.truth, clip.by_matches
+    assert result is not None
+    images = jax.numpy.asarray(result.images[None] / np.float32(255))
+    first, seen = jax.jit(first_pass, static_argnames=("config", "witness"))(
+        model.params, ClipBatch(images), model.config, witness="matches"
+    )
+    grid = seen.saliency.shape[2:]
+    found = jax.tree.map(lambda x: x[0], seen.matches)
+    depth, cameras = at_patches(first.depth, grid)[0], Cameras(*(x[0] for x in decode_pose(first.pose_encoding, grid)))
+    saliency = seen.saliency[0].reshape(depth.shape)
+    as_it_is = dataclasses.replace(Adjustment(), annealed=())  # no iteration
+    before = adjust(depth, cameras, found.position, found.weight, grid, as_it_is)
+    scored = motion(found, saliency, depth, cameras, grid)
+
+    def difference(world: Any) -> np.ndarray:
+        """Return the mean distance between matches and a static world, in patches."""
+        distance = np.linalg.norm(np.asarray(world.position - found.position), axis=-1)
+        weight = np.asarray(found.weight)
+        return ((weight * distance).sum(axis=1) / weight.sum(axis=1).clip(1e-6)).reshape(-1, *grid)
+
+    score = np.asarray(scored.score).reshape(-1, *grid)
+    pixels = np.asarray(motion_pixels(jax.numpy.asarray(score[None]), images))[0]
+    median, patch = float(np.median(score)), model.config.patch_size
+    far = {"cmap": "inferno", "vmin": 0, "vmax": 2}
+    above = {"cmap": "inferno", "vmin": median, "vmax": 5 * median}
+    columns: tuple[tuple[str, Any, dict[str, Any]], ...] = (
+        ("1  matches,\n2 frames later", result.images, {}),
+        ("cues alone:\nthe saliency", saliency.reshape(-1, *grid), {"cmap": "inferno", "vmin": 0, "vmax": 1}),
+        ("difference, cameras\nof the first pass", difference(before), far),
+        ("2, 3  difference,\nadjusted cameras", difference(scored.world), far),
+        ("4, 5  score,\nafter votes", score, above),
+        ("6  at pixels", pixels, above),
+        ("mask", result.dynamic_mask, {}),
+        ("truth", truth.dynamic_mask, {}),
+    )
+    frames = (2, 5, 8)
+    figure, axes = pyplot.subplots(len(frames), len(columns), figsize=(11.5, 4.9), layout="constrained")
+    later = frame_pairs(len(depth)).offsets.index(2)
+    for row, frame in zip(axes, frames, strict=True):
+        for cell, (title, values, how) in zip(row, columns, strict=True):
+            shown = overlay(result.images[frame], values[frame]) if values.dtype == bool else values[frame]
+            _image(cell, shown, title if frame == frames[0] else "", f"frame {frame}" if cell is row[0] else "", **how)
+        start, end = patch * patch_centres(grid), patch * np.asarray(found.position[frame, later])
+        sure = np.asarray(found.weight[frame, later]) > 0.3
+        lines = np.stack([start[sure], end[sure]], axis=1).transpose(2, 1, 0)
+        row[0].plot(*(lines - 0.5), color="#ffe94a", linewidth=0.8)
+    return figure
+
+
 def gallery_sheet(clip: Clip, number: int) -> Figure:
-    """Six frames of a generated scene: picture, depth, objects found, what truly moves."""
+    """Six frames of a generated scene: picture, depth, objects found by cues and by matches, what truly moves."""
     from matplotlib import pyplot
 
     from vggtjax.results.previews import moving_ids, overlay
 
     result, truth = clip.result, clip.truth
     frames = np.linspace(0, len(result.depth) - 1, 6).round().astype(int)
-    figure, axes = pyplot.subplots(4, len(frames), figsize=(9.2, 6.3), layout="constrained")
-    objects = int(result.instances.max())
-    figure.suptitle(f"scene {number}: {objects} object{'' if objects == 1 else 's'} found", fontsize=11)
+    assert clip.by_matches is not None
+    figure, axes = pyplot.subplots(5, len(frames), figsize=(9.2, 7.8), layout="constrained")
+    both = (result, clip.by_matches)
+    counts = [int(of.instances.max()) for of in both]
+    figure.suptitle(f"scene {number}: objects found by cues {counts[0]}, by matches {counts[1]}", fontsize=11)
     for column, frame in enumerate(frames):
         picture = result.images[frame]
-        moving = moving_ids(result.dynamic_mask[frame], result.instances[frame])
-        rows = {"picture": picture, "depth": _depth(result.depth[frame], result.depth),
-                "objects": overlay(picture, moving), "truth": overlay(picture, truth.dynamic_mask[frame])}  # fmt: skip
+        by_cues, by_matches = (overlay(picture, moving_ids(of.dynamic_mask[frame], of.instances[frame])) for of in both)
+        rows = {"picture": picture, "depth": _depth(result.depth[frame], result.depth), "by cues": by_cues,
+                "by matches": by_matches, "truth": overlay(picture, truth.dynamic_mask[frame])}  # fmt: skip
         for row, (name, values) in enumerate(rows.items()):
             _image(axes[row, column], values, f"frame {frame}" if row == 0 else "", name if column == 0 else "")
     return figure

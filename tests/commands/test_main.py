@@ -43,6 +43,7 @@ def test_demo(tmp_path, capsys, monkeypatch):
     assert page.stat().st_size > 100_000
     result = Reconstruction.load(tmp_path / "result")
     assert result.method == "4dvggt-m"
+    assert result.motion is not None
     assert result.motion.shape == (4, 12, 12)
     assert "Masks by matches: the second pass" in out
     assert (tmp_path / "result" / "scene.glb").stat().st_size > 1000

@@ -45,7 +45,7 @@ for method, options in METHODS.items():
 
 
 def by_matches(frames, depth, cameras, matches, gram_mask, saliency, images):
-    pose_encoding = encode_pose(*cameras, (GRID[0] * PATCH, GRID[1] * PATCH))
+    pose_encoding = encode_pose(cameras.camera_from_world, cameras.intrinsics, (GRID[0] * PATCH, GRID[1] * PATCH))
     mined = mine_matched_mask(matches, gram_mask, saliency, images, depth, pose_encoding, frames=frames)
     return mined, adjusted_cameras(cameras, depth, matches, mined.dynamic_mask, GRID, frames=frames)
 
@@ -54,7 +54,7 @@ world = StaticWorld(COUNT)
 moves = np.zeros((COUNT, *GRID), bool)
 moves[:, 2:4, 1:3] = True
 depth, moving = (np.kron(x.reshape(-1, *GRID), np.ones((1, PATCH, PATCH), x.dtype)) for x in (world.depth, moves))
-cameras = world.cameras._replace(intrinsics=world.cameras.intrinsics * np.float32([[PATCH], [PATCH], [1]]))
+cameras = world.cameras._replace(intrinsics=world.cameras.intrinsics * np.array([[PATCH], [PATCH], [1]], np.float32))
 images = np.random.default_rng(0).random((COUNT, *depth.shape[1:], 3)).astype(np.float32) / 20 + moving[..., None] / 2
 inputs = (depth.astype(np.float32), cameras, world.matches(moves.reshape(COUNT, -1)), moving & False)
 inputs += (np.full(moves.shape, 0.5, np.float32), images.astype(np.float32))

@@ -75,7 +75,10 @@ def build_page(desk: Desk) -> gr.Blocks:
                     info="“demo” is small and knows generated scenes only; real footage needs VGGT-1B.",
                 )
                 method = gr.Dropdown(
-                    list(METHODS), value="4dvggt-d", label="Method", info="4dvggt-d is the best; vggt the fastest."
+                    list(METHODS),
+                    value="4dvggt-d",
+                    label="Method",
+                    info="4dvggt-d is the paper's; 4dvggt-m has other masks; vggt is the fastest.",
                 )
                 frames = gr.Slider(
                     min(_LEAST_FRAMES, limits.max_frames - 1),  # below its greatest

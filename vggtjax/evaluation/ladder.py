@@ -199,7 +199,7 @@ def error_table(rows: Sequence[LadderRow]) -> ErrorTable:
         for row in rows
     ]
     note = (
-        f"{second_pass_in_words(rows)} AbsRel: of depth after one median scale. Rotation: mean, relative to the first "
+        f"{second_pass_in_words(rows)}\nAbsRel: of depth after one median scale. Rotation: mean, relative to the first "
         "frame. Centres: RMSE after Sim(3), in median depths. Mask: mined from the first pass as in the paper, by "
         "matches between its frames too, or the true one."
     )
@@ -212,7 +212,7 @@ def second_pass_in_words(rows: Sequence[LadderRow]) -> str:
     The rows are those of one clip; rows of the other methods, and rows without scores, are not read.
     """
     first = next((row for row in rows if row.method == "vggt"), None)
-    return " ".join(
+    return "\n".join(
         f"{_WORDS[source]}: {_change_in_words(first, row)}."
         for source in get_args(MaskSource)
         for row in rows

@@ -140,15 +140,17 @@ def reconstruct(
         say_how_to_keep(time.perf_counter() - started)
         outputs = run(dataclasses.replace(stages, run=Execute(on_stage)))
     passes, assembly, by_frame = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
-    if passes.is_matched is not None:
+    motion = None
+    if passes.motion is not None and passes.is_matched is not None:
         mask_source = _MATCHED if passes.is_matched.all() else _NOT_MATCHED
+        motion = np.where(passes.is_matched[0][:, None, None], passes.motion[0], np.float32(1))
     fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, frames))
     try:
         result = Reconstruction(
             **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
             **fields,
             saliency=passes.saliency[0],
-            motion=None if passes.motion is None else np.where(passes.is_matched.all(), passes.motion[0], 1),
+            motion=motion,
             dynamic_mask=passes.dynamic_mask[0],
             method=options.method,
             model_name=model.name,

@@ -279,7 +279,7 @@ def _errors(facts: RunFacts) -> Element | None:
     return _section(
         "Errors against the truth",
         element("div", element("table", head, *rows, class_="grid"), class_="scroll"),
-        element("p", one_line(facts.errors.note, 600), class_="note"),
+        *(element("p", one_line(line, 600), class_="note") for line in facts.errors.note.splitlines()),
         None if drawn is None else element("div", drawn, class_="scroll"),
     )
 
