@@ -157,8 +157,18 @@ def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):
 @pytest.mark.parametrize(
     ("rotation", "centre", "abs_rel", "expected"),
     [
-        (1.5, 0.01, 0.1, "steadies the cameras .* centres 0.020 -> 0.010., and depth is better .AbsRel 0.200 -> 0.100"),
-        (2.5, 0.03, 0.2, "does not steady the cameras .rotation 2.00° -> 2.50°, .* and depth is no better"),
+        (
+            1.5,
+            0.01,
+            0.1,
+            "steadies the cameras .rotation better, .*; centres better, 0.020 -> 0.010; AbsRel better, 0.200",
+        ),
+        (
+            2.5,
+            0.02,
+            0.3,
+            "does not steady the cameras .rotation worse, 2.00° -> 2.50°; centres unchanged, .* worse, 0.200",
+        ),
     ],
 )
 def test_words_follow_the_numbers(rows, rotation, centre, abs_rel, expected):

@@ -52,6 +52,19 @@ def test_likelihoods_are_scipys(kind, density):
     assert wanted(float(factor)) == pytest.approx(best.fun, rel=1e-5)
 
 
+def test_clips_have_no_unit_in_common():
+    depth, precision, truth = (jnp.asarray(np.stack([x, x + x[:, ::-1]]), jnp.float32) for x in example())
+    fused = fused_of(depth, jnp.log(precision))
+    each = [negative_log_likelihood(jax.tree.map(lambda x: x[i], fused), truth[i]) for i in range(2)]  # noqa: B023
+    assert np.isclose(negative_log_likelihood(fused, truth), np.mean(each))
+    clip = clips(STATIC, 2)
+    fused = fused_of(clip.depth * np.array([1, 3], np.float32).reshape(2, 1, 1, 1), 0.0)
+    views = View(clip.images, Cameras(clip.camera_from_world, clip.intrinsics))
+    for loss in (photometric_loss, geometric_loss):
+        each = [loss(*jax.tree.map(lambda x: x[i], (fused, views))) for i in range(2)]  # noqa: B023
+        assert np.isclose(loss(fused, views), np.mean(each))
+
+
 @pytest.mark.parametrize("kind", ["gaussian", "laplace"])
 def test_gradients_of_likelihoods_have_the_factor_inside(kind):
     """The factor's own gradient is left out; finite differences, which have it, agree."""

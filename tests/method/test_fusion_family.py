@@ -206,6 +206,20 @@ def test_families_are_sets_of_free_leaves():
         parse_family("scale+nothing")
 
 
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ({"scal": jnp.zeros(2)}, "the rule has scal; expected the parts scale, power"),
+        ({"power": None}, "the rule lacks power"),
+        ({"correlation": jnp.zeros(2)}, r"part correlation of the rule has shape \(2,\); expected \(\)"),
+    ],
+)
+def test_a_misspelt_rule_is_refused(change, sentence):
+    rule = {name: value for name, value in (identity() | change).items() if value is not None}
+    with pytest.raises(InputError, match=sentence):
+        family.fuse(rule, seen(1, 1, 1, 1, np.zeros(SHAPE)))
+
+
 def test_projection_keeps_ranges():
     params = projected({name: jnp.full(part.shape, 1e9) for name, part in PARTS.items()})
     assert all((np.asarray(params[name]) <= part.high).all() for name, part in PARTS.items())

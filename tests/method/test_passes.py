@@ -156,6 +156,13 @@ def test_passes_take_options_or_their_fields():
         run(method="vgtt")
 
 
+def test_pictures_of_another_range_are_refused(params, config, images):
+    with pytest.raises(InputError, match=r"values from 0.* to 2[0-9.]*; expected RGB in \[0, 1\]: divide bytes by 255"):
+        infer(params, 255 * images, config)
+    with pytest.raises(InputError, match="images have type uint8"):
+        infer(params, (255 * images).astype(np.uint8), config)
+
+
 def test_equal_programs_are_compiled_once(params, config, images, monkeypatch):
     static = "vggtjax.pipeline.infer._infer"  # its options are static under jit
     monkeypatch.setattr(static, lambda *arguments: arguments[3])

@@ -1,5 +1,6 @@
 """Properties of the whole network: batches, permutations, transformations, the branch on the per-layer flag."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -41,6 +42,14 @@ def test_a_batch_of_clips_equals_clip_by_clip(params, config, images, mask):
         alone = _forward(params, images[b : b + 1], config, dynamic_tokens=mask[b : b + 1])
         for name in ("pose_encoding", "depth", "depth_confidence"):
             assert close(getattr(batch, name)[b], getattr(alone, name)[0]), name
+
+
+def test_keys_are_suppressed_in_the_pairs_that_the_model_recommends(params, config, images, mask):
+    other = dataclasses.replace(config, motion=dataclasses.replace(config.motion, mask_pairs=1))
+    made = [_forward(params, images[:1], c, dynamic_tokens=mask[:1], **given).pose_encoding
+            for c, given in ((other, {}), (config, {"mask_pairs": 1}), (config, {}))]  # fmt: skip
+    assert close(made[0], made[1])
+    assert not close(made[0], made[2])
 
 
 def test_permuting_later_frames_permutes_the_outputs(params, config, images, mask):
@@ -109,6 +118,7 @@ def test_the_gradient_is_the_slope_under_remat(params, config, images, mask):
     ("change", "sentence"),
     [
         ({"images": np.zeros((1, 2, 28, 41, 3))}, "multiples of the patch size 14"),
+        ({"images": np.zeros((1, 2, 28, 42, 3), np.uint8)}, "images have type uint8; expected floats in .0, 1."),
         ({"dynamic_tokens": np.zeros((1, 2, 3, 2), bool)}, r"expected \(1, 2, 2, 3\)"),
         ({"suppress": "forget"}, "expected one of zero, drop"),
         ({"suppression": Suppression(mask_pairs=-1)}, "at least 0"),

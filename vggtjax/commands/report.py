@@ -110,7 +110,8 @@ class Report:
         for row in errors.rows:
             table.add_row(*row)
         self._out.print(table, soft_wrap=True)
-        self.line(errors.note)
+        for line in errors.note.splitlines():
+            self.line(line)
 
     def means(self, means: Mapping[str, Mapping[str, float]]) -> None:
         """Print the means of an evaluation as a table, a row for every metric and a column for every method."""

@@ -228,16 +228,13 @@ _CAMERA_SCORES = ("rotation_error", "centre_error_ratio")
 def _change_in_words(first: LadderRow, second: LadderRow) -> str:
     def change(name: str) -> str:
         heading, form = _COLUMNS[name]
-        return f"{heading} {form.format(getattr(first, name))} -> {form.format(getattr(second, name))}"
+        before, after = getattr(first, name), getattr(second, name)
+        word = "unchanged" if after == before else "better" if after < before else "worse"
+        return f"{heading} {word}, {form.format(before)} -> {form.format(after)}"
 
-    better = [getattr(second, name) < getattr(first, name) for name in _CAMERA_SCORES]
-    effect = "steadies the cameras" if all(better) else "does not steady the cameras"
-    if any(better) and not all(better):
-        improved = _COLUMNS[_CAMERA_SCORES[better.index(True)]][0]
-        effect = f"steadies the {improved} of the cameras only"
-    cameras = ", ".join(map(change, _CAMERA_SCORES))
-    depth = "better" if second.abs_rel < first.abs_rel else "no better"  # type: ignore[operator]
-    return f"the second pass {effect} ({cameras}), and depth is {depth} ({change('abs_rel')})"
+    is_steadier = all(getattr(second, name) < getattr(first, name) for name in _CAMERA_SCORES)
+    effect = "steadies the cameras" if is_steadier else "does not steady the cameras"
+    return f"the second pass {effect} ({'; '.join(map(change, (*_CAMERA_SCORES, 'abs_rel')))})"
 
 
 def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -1,7 +1,12 @@
-"""Objectives of fits: likelihoods of true depth, and the agreement of frames where the truth is unknown."""
+"""Objectives of fits: likelihoods of true depth, and the agreement of frames where the truth is unknown.
+
+Each is of one clip, [S, H, W] or [H, W]. With one axis more, the first one is that of clips, each with a unit of its
+own, and the objective is the mean over them.
+"""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import jax
@@ -42,6 +47,8 @@ def negative_log_likelihood(
         truth: depth; at most 0, or not finite, where it is unknown.
         kind: "gaussian", or "laplace" with the same variance.
     """
+    if fused.depth.ndim > 3:
+        return jnp.mean(jax.vmap(partial(negative_log_likelihood, kind=kind))(fused, truth))
     known = (truth > 0) & jnp.isfinite(truth)
     truth = jnp.where(known, truth, 1)
     factor = unit_factor(fused, truth, known, kind)
@@ -64,6 +71,8 @@ def joint_negative_log_likelihood(
     through the fused precision alone. On dynamic pixels only pass 1 counts. Soft masks and robust parts (inflation,
     distrust) do not enter. Arguments as for `fuse`, alignment as for `negative_log_likelihood`.
     """
+    if seen.depth1.ndim > 3:
+        return jnp.mean(jax.vmap(partial(joint_negative_log_likelihood, params))(seen, truth))
     known = (truth > 0) & jnp.isfinite(truth)
     truth = jnp.where(known, truth, 1)
     fused = fuse(params, seen)
@@ -111,6 +120,9 @@ def photometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""
     pixels that both frames see.
     """
 
+    if fused.depth.ndim > 3:
+        return jnp.mean(jax.vmap(partial(photometric_loss, step=step))(fused, view))
+
     def pair(depth, static, image, other, here, there):
         position, z = _reproject(depth, here, there)
         colour, inside = _sample(other, position)
@@ -130,6 +142,9 @@ def geometric_loss(fused: Fused, view: View, step: int = 1) -> Float[Array, ""]:
     pixels that both frames see and that are not far behind the depth of the other frame. The unit of depth has no
     effect, nor have errors that all frames share.
     """
+
+    if fused.depth.ndim > 3:
+        return jnp.mean(jax.vmap(partial(geometric_loss, step=step))(fused, view))
 
     def pair(depth, static, image, other, here, there):
         del image

@@ -146,6 +146,18 @@ def is_free(params: FusionParams, family: tuple[str, ...]) -> FusionParams:
     return {name: jax.tree.map(lambda _, name=name: name in family, leaf) for name, leaf in params.items()}
 
 
+def check_rule(params: FusionParams) -> None:
+    """Raise InputError for a tree with unknown, missing or misshapen parts."""
+    names = set(params) - {"gate"}
+    if unknown := sorted(names - set(PARTS)):
+        raise InputError(f"the rule has {', '.join(unknown)}; expected the parts {', '.join((*PARTS, 'gate'))}")
+    if missing := sorted(set(PARTS) - names):
+        raise InputError(f"the rule lacks {', '.join(missing)}; start from the parts of identity() or start(family)")
+    for name, part in PARTS.items():
+        if jnp.shape(params[name]) != part.shape:
+            raise InputError(f"part {name} of the rule has shape {jnp.shape(params[name])}; expected {part.shape}")
+
+
 def fuse(params: FusionParams, seen: Observations) -> Fused:
     """Fuse two passes by a rule of the family, vmapped over frames; any number of leading axes."""
     return _over_frames(_fuse_frame, params, seen)
@@ -163,6 +175,7 @@ def _over_frames(function: Callable[[FusionParams, Observations], Any], params: 
 
 
 def _claims(params: FusionParams, seen: Observations) -> tuple[Float[Array, "H W"], Float[Array, "H W"]]:
+    check_rule(params)
     slopes = jnp.stack([params[name] for name in FEATURES])  # [K, 2]
     shifts = jnp.einsum("hwk,ki->hwi", seen.features, slopes, precision="highest")
     claims = []

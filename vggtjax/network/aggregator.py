@@ -129,7 +129,7 @@ def aggregate(
     layers = (
         params["frame_blocks"],
         params["global_blocks"],
-        suppression.active(config.depth),
+        suppression.active(config.depth, config.motion.mask_pairs),
         jnp.asarray(np.arange(config.depth)[:, None] == np.asarray(config.taps)[None]),
         None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
     )

@@ -48,7 +48,7 @@ class ForwardChanges(TypedDict, total=False):
 
     dynamic_tokens: Bool[Array, "B S h w"] | Float[Array, "B S h w"] | None
     suppress: Suppress
-    mask_pairs: int | Int[Array, ""]
+    mask_pairs: int | Int[Array, ""] | None
     strength: Float[Array, " depth"] | None
     stop_camera_gradient: bool
     compute_dtype: str
@@ -231,6 +231,8 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
 
 
 def _check(grid: tuple[int, int], clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str]) -> None:
+    if not jnp.issubdtype(clips.images.dtype, jnp.floating):
+        raise InputError(f"images have type {clips.images.dtype}; expected floats in [0, 1]: divide bytes by 255")
     tokens_shape = (*clips.images.shape[:2], grid[0] * grid[1], config.embed_dim)
     if clips.patch_tokens is not None and tuple(clips.patch_tokens.shape) != tokens_shape:
         raise InputError(f"patch_tokens have shape {tuple(clips.patch_tokens.shape)}; expected {tokens_shape}")

@@ -28,20 +28,20 @@ class Suppression:
     """The keys that a pass suppresses: a pytree whose leaves are arrays; `suppress` is static under jit.
 
     Attributes:
-        dynamic_tokens: patches whose keys are suppressed; None for the plain pass. Shares m in [0, 1] in place of
-            booleans scale a key by 1 - m, with a gradient with respect to m.
+        dynamic_tokens: patches whose keys are suppressed, [B, S, H / patch, W / patch]; None for the plain pass. Shares
+            m in [0, 1] in place of booleans scale a key by 1 - m, with a gradient with respect to m.
         suppress: "zero" (the key becomes 0, 4DVGGT-D) or "drop" (key and value are excluded from the softmax, VGGT4D;
             not with shares or a strength).
-        mask_pairs: number of pairs of blocks, from the first, in which keys are suppressed (L_mask of the paper; the
-            default is VGGT-1B's, another model may recommend its own: `MotionConfig.mask_pairs`). It can be traced:
-            one compilation serves all numbers.
+        mask_pairs: number of pairs of blocks, from the first, in which keys are suppressed (L_mask of the paper); the
+            number that the model's configuration recommends if None. It can be traced: one compilation serves all
+            numbers.
         strength: share of the suppression in every pair, in [0, 1], in place of `mask_pairs`: a key is scaled by
             1 - strength m.
     """
 
     dynamic_tokens: Bool[Array, "B S h w"] | Float[Array, "B S h w"] | None = None
     suppress: Suppress = "zero"
-    mask_pairs: int | Int[Array, ""] = 5
+    mask_pairs: int | Int[Array, ""] | None = None
     strength: Float[Array, " depth"] | None = None
 
     def check(self, shape: tuple[int, ...], depth: int) -> None:
@@ -52,7 +52,7 @@ class Suppression:
         shares = tokens is not None and jnp.issubdtype(tokens.dtype, jnp.floating)
         if tokens is not None and tokens.dtype != bool and not shares:
             raise InputError(f"dynamic_tokens have type {tokens.dtype}; expected bool, or shares as floats")
-        if not isinstance(self.mask_pairs, Tracer):
+        if self.mask_pairs is not None and not isinstance(self.mask_pairs, Tracer):
             whole_number("mask_pairs", self.mask_pairs, 0)
         check_choice("suppress", self.suppress, get_args(Suppress))
         if self.suppress != "zero" and (shares or strength is not None):
@@ -72,11 +72,14 @@ class Suppression:
             tokens = tokens.astype(jnp.promote_types(tokens.dtype, self.strength.dtype))
         return jnp.pad(tokens.reshape(*tokens.shape[:2], -1), ((0, 0), (0, 0), (special_tokens, 0)))
 
-    def active(self, depth: int) -> Bool[Array, " depth"] | Float[Array, " depth"]:
-        """Return in which pairs keys are suppressed: flags for boolean tokens, the share of each pair for shares."""
+    def active(self, depth: int, recommended: int) -> Bool[Array, " depth"] | Float[Array, " depth"]:
+        """Return in which pairs keys are suppressed: flags for boolean tokens, the share of each pair for shares.
+
+        `recommended` is the number of pairs where none is given.
+        """
         if self.strength is not None:
             return self.strength
-        pairs = jnp.arange(depth) < self.mask_pairs
+        pairs = jnp.arange(depth) < (recommended if self.mask_pairs is None else self.mask_pairs)
         tokens = self.dynamic_tokens
         return pairs if tokens is None or tokens.dtype == bool else pairs.astype(tokens.dtype)
 
