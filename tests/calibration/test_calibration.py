@@ -240,7 +240,7 @@ def test_the_command(tmp_path, model, clips, capsys, monkeypatch):
     printed = capsys.readouterr()
     assert loaded.config.motion.cues[0].name in printed.out
     assert "default table" in printed.out
-    assert "of blocks match" in printed.out
+    assert "air of blocks matches frames" in printed.out or "airs of blocks that match frames" in printed.out
     assert "sweep" in printed.err
     with pytest.raises(InputError, match="size is 50"):
         calibrate_cues(str(source), tmp_path / "other", size=50)

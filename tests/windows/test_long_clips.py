@@ -1,5 +1,6 @@
 """Long clips end to end, with a double of the network that knows the truth: exact paths, movers, kills, bad input."""
 
+import dataclasses
 import logging
 import signal
 import subprocess
@@ -61,6 +62,25 @@ def test_movers_spoil_the_path_unless_the_masks_leave_them_out(tmp_path, share, 
     assert np.array_equal(masked.dynamic_mask, moving)
     assert np.array_equal(np.unique(masked.instances), [0, 1])  # one object, with one number in all windows
     assert path_error(reconstructed(tmp_path / "none", run, masks=False)) > worse
+
+
+def test_windows_without_matches_leave_motion_to_the_others(tmp_path):
+    """In the first window matches cannot be used: its frames have the motion of their other window, or none, 1."""
+    runs = []
+
+    def run(clip):
+        window = window_result(clip, 0, NOTHING)
+        patches = np.ones((len(clip), 2, 2), np.float32)
+        runs.append(window)
+        masks, motion = ("cues", None) if len(runs) == 1 else ("matches", 3 * patches)
+        settings = window.settings | {"masks": masks}
+        return dataclasses.replace(window, saliency=patches, motion=motion, settings=settings)
+
+    result = reconstructed(tmp_path, run)
+    assert result.motion is not None
+    assert np.array_equal(result.motion[:, 0, 0], np.where(np.arange(FRAMES) < 11, 1, 3))  # the second begins there
+    number = len(runs)
+    assert result.settings["masks"] == f"matches ({number - 1} of {number} windows); cues (1 of {number} windows)"
 
 
 def test_windows_without_shared_static_pixels_are_joined_by_their_cameras(tmp_path, caplog):

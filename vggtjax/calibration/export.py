@@ -103,7 +103,7 @@ def calibration_numbers(
             "steps": [_step(step) for step in choice.steps],
             "refused": None if choice.refused is None else _step(choice.refused),
         },
-        "matches_that_come_back": sweep.came_back.mean(axis=1).round(6).tolist(),  # of every pair
+        "matches_that_come_back": sweep.came_back.mean(axis=1, dtype=float).round(6).tolist(),  # of every pair
         "default_table": {"motion": dataclasses.asdict(sweep.table), "auc": _rating(choice.table)},
         "sweep": [
             {"gram": gram, "rows": kind.rows, "columns": kind.columns, "statistic": kind.statistic}

@@ -123,7 +123,8 @@ def calibrate_cues(
 def _matching_line(pairs: tuple[int, ...] | None, shares: np.ndarray) -> str:
     """Return which pairs of blocks match frames, and how many of the others' matches come back."""
     if pairs is None:
-        return f"No pair of blocks matches frames: at most {shares.max():.0%} of its matches come back."
+        most = f"{shares.max():.0%} of its matches come back"
+        return f"No pair of blocks matches frames (at most {most}): the model names none, and those by rule are taken."
     found = ", ".join(f"{pair} ({shares[pair]:.0%} of the matches come back)" for pair in pairs)
     others = [share for pair, share in enumerate(shares) if pair not in pairs]
     return f"Pairs of blocks that match frames: {found}" + (f"; others at most {max(others):.0%}." if others else ".")

@@ -1,4 +1,4 @@
-"""The ladder of methods on clips with exact truth: each method with the mined masks and with the true masks."""
+"""The ladder of methods on clips with exact truth: each method with masks by cues, by matches, and true ones."""
 
 from __future__ import annotations
 

@@ -88,6 +88,8 @@ class ModelSource:
         settings["mask_pairs"] = self.options.resolved(self.model.config.motion).mask_pairs
         if (threshold := self.options.threshold or self.model.config.motion.threshold) is not None:
             settings["threshold"] = threshold  # `to_json` leaves out a method's own
+        if self.options.mask is not None:
+            settings["mask"] = self.options.mask
         if self.fusion is not None:
             from vggtjax.method.fusion_file import fusion_digest
 

@@ -1,7 +1,7 @@
 """Objectives of fits: likelihoods of true depth, and the agreement of frames where the truth is unknown.
 
-Each is of one clip, [S, H, W] or [H, W]. With one axis more, the first one is that of clips, each with a unit of its
-own, and the objective is the mean over them.
+Each is of one clip, [S, H, W]. Of a batch [B, S, H, W] every clip has a unit of its own, and the objective is the mean
+over clips.
 """
 
 from __future__ import annotations

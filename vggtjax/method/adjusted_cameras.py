@@ -33,7 +33,7 @@ def adjusted_cameras(
 
     Args:
         cameras: of the clips; intrinsics in pixels.
-        depth: in the unit of the cameras.
+        depth: in the unit of the cameras, nearly.
         matches: of the first pass.
         dynamic_mask: pixels that move; the static share of a patch is the weight of its matches.
         grid: rows and columns of patches.
@@ -53,8 +53,8 @@ def adjusted_cameras(
         poses, intrinsics, depth, matches, static = clip
         weight = trust * matches.weight * static[:, None]
         world = adjust(depth, Cameras(poses, intrinsics), matches.position, weight, grid, _HOW)
-        is_better = come_back(matches, frame_pairs(counted)) & jnp.isfinite(world.camera_from_world).all()
-        return jnp.where(is_better, world.camera_from_world, poses)
+        is_usable = come_back(matches, frame_pairs(counted)) & jnp.isfinite(world.camera_from_world).all()
+        return jnp.where(is_usable, world.camera_from_world, poses)
 
     poses = jnp.pad(jax.lax.map(of_clip, whole), ((0, 0), (0, frames.total(S) - counted), (0, 0), (0, 0)))
     return Cameras(frames.share(poses, S), cameras.intrinsics)

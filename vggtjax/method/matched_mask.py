@@ -24,7 +24,7 @@ class Mined(NamedTuple):
     """Dynamic pixels of clips, and what matches say; None where no matches were asked for, and for a single frame."""
 
     dynamic_mask: Bool[Array, "B S H W"]
-    motion: Float[Array, "B S h w"] | None = None  # how far a patch differs from a static world; about 1 if it does not
+    motion: Float[Array, "B S h w"] | None = None  # how far a patch differs from a static world
     is_matched: Bool[Array, "B S"] | None = None  # whether matches gave the frame's mask; else the Gram saliency did
 
 

@@ -27,7 +27,7 @@ _VOTES, _VOTE, _VOTE_CYCLE, _VOTE_FRAMES = 2, 0.3, 0.625, 6.0
 class Motion(NamedTuple):
     """What a clip's matches say of motion."""
 
-    score: Float[Array, "*B S P"]  # positive; about 1 for the median patch of a static clip, more for patches that move
+    score: Float[Array, "*B S P"]  # positive, and larger for patches that move; the clip's median is its scale
     is_matched: Bool[Array, "*B"]  # whether enough matches come back; else the score says nothing
     world: Static  # the static world that fits best
 

@@ -320,7 +320,7 @@ def assemble(
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
             pixels before it is used. Not in the paper.
-        cameras: adjust the cameras to the matches of static pixels, if the passes have any. Not in the paper.
+        cameras: adjust the cameras to the matches of static pixels, which the passes must have. Not in the paper.
         frames: where the frames of the passes are.
     """
     row = find_method(method)
@@ -350,10 +350,17 @@ def assemble(
         "second": Cameras(extrinsics.at[..., 3].multiply(scale[:, None, None]), intrinsics),
     }
     chosen = Cameras(of_pass[row.extrinsics].camera_from_world, of_pass[row.intrinsics].intrinsics)
-    if cameras == "adjusted" and passes.matches is not None:
-        grid = (passes.saliency.shape[2], passes.saliency.shape[3])
-        chosen = adjusted_cameras(chosen, depth, passes.matches, passes.dynamic_mask, grid, frames=frames)
-    return Assembly(depth, confidence, chosen)
+    assembly = Assembly(depth, confidence, chosen)
+    return assembly if cameras == "predicted" else with_adjusted_cameras(assembly, passes, frames)
+
+
+def with_adjusted_cameras(assembly: Assembly, passes: Passes, frames: Frames = Frames()) -> Assembly:
+    """Return the assembly with cameras for which static pixels are seen where they are matched. Not in the papers."""
+    if passes.matches is None:
+        raise InputError("the passes have no matches to adjust cameras to; run them with cameras='adjusted'")
+    grid = (passes.saliency.shape[2], passes.saliency.shape[3])
+    given = (assembly.cameras, assembly.depth, passes.matches, passes.dynamic_mask, grid)
+    return assembly._replace(cameras=adjusted_cameras(*given, frames=frames))
 
 
 def _present(value: _Value | None) -> _Value:

@@ -26,7 +26,8 @@ from vggtjax.known.options import KnownGeometry
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.mask_refinement import refine_masks
-from vggtjax.method.passes import Assembly
+from vggtjax.method.matches import come_back, frame_pairs
+from vggtjax.method.passes import Assembly, Passes
 from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
 from vggtjax.network.model import Predictions
 from vggtjax.network.track_head import Tracks
@@ -105,7 +106,10 @@ def reconstruct(
     if mesh is not None and tracks is not None:
         raise InputError(f"devices is {devices} and points are to be tracked, which takes one device; leave one out")
     check_fuses(fusion, options.method)
-    check_refinement(options.refine_cameras, known is not None and known.poses is not None)
+    poses_are_known = known is not None and known.poses is not None
+    check_refinement(options.refine_cameras, poses_are_known)
+    if options.cameras == "adjusted" and poses_are_known:
+        raise InputError("cameras is 'adjusted' and poses are given, which would replace them; leave one of them out")
     if known is not None:
         check_readable(known)
     source, (clip, tracks) = clip, _fitted(model, clip, size, tracks, on_stage)
@@ -143,7 +147,7 @@ def reconstruct(
     motion = None
     if passes.motion is not None and passes.is_matched is not None:
         mask_source = _MATCHED if passes.is_matched.all() else _NOT_MATCHED
-        motion = np.where(passes.is_matched[0][:, None, None], passes.motion[0], np.float32(1))
+        motion = passes.motion[0] / np.median(passes.motion[0]) if passes.is_matched.all() else None
     fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, frames))
     try:
         result = Reconstruction(
@@ -154,7 +158,7 @@ def reconstruct(
             dynamic_mask=passes.dynamic_mask[0],
             method=options.method,
             model_name=model.name,
-            settings=_settings(model, clip, options, mask_source, fusion),
+            settings=_settings(model, clip, options, mask_source, fusion) | _camera_source(options, passes),
             passes=passes if keep_passes else None,
         )
     except ResultError:
@@ -308,6 +312,17 @@ def _settings(
     settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
     settings |= {"clip": clip.source.name} if clip.source.name else {}
     return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}
+
+
+def _camera_source(options: Options, passes: Passes) -> dict[str, str]:
+    """Return the setting of adjusted cameras; it tells where matches could not be used, and the cameras stayed."""
+    if options.cameras == "predicted":
+        return {}
+    used = False
+    if passes.matches is not None:
+        matches = jax.tree.map(lambda x: x[0], passes.matches)
+        used = bool(come_back(matches, frame_pairs(len(matches.cycle))))
+    return {} if used else {"cameras": "predicted, as matches between frames cannot be used"}
 
 
 def _points_by_frame(queries: Queries) -> dict[int, Float[Array, "1 Q 2"]]:

@@ -33,6 +33,7 @@ from vggtjax.method.passes import (
     only,
     second_pass,
     track_from,
+    with_adjusted_cameras,
 )
 from vggtjax.method.witnesses import Seen
 from vggtjax.network.backbone import encode
@@ -44,7 +45,7 @@ from vggtjax.network.precision import Compute
 from vggtjax.network.quantised import Quantised
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
-from vggtjax.options import Options
+from vggtjax.options import CamerasFrom, Options
 from vggtjax.pipeline.stage_runners import Execute, inline
 from vggtjax.storage.programs import Program, keep_type
 
@@ -104,15 +105,22 @@ def _mine(seen: Seen, first: Predictions | None, clips: ClipBatch, *, frames: Fr
 
 
 def _assemble(
-    passes: Passes, fusion: FusionParams | None, *, frames: Frames, patch_size: int, **changes: Any
+    passes: Passes,
+    fusion: FusionParams | None,
+    *,
+    frames: Frames,
+    patch_size: int,
+    cameras: CamerasFrom,
+    **changes: Any,
 ) -> Assembly:
     """Assemble the first `frames.count` frames; on several devices the padded ones follow."""
 
     def run(passes, fusion):
         assembly = assemble(passes, frames=frames, **changes)
-        if fusion is None:
-            return assembly
-        return apply_fusion(assembly, passes, fusion, patch_size, align_scale=changes["align_scale"], frames=frames)
+        if fusion is not None:
+            scaling = {"align_scale": changes["align_scale"], "frames": frames}
+            assembly = apply_fusion(assembly, passes, fusion, patch_size, **scaling)
+        return assembly if cameras == "predicted" else with_adjusted_cameras(assembly, passes, frames)
 
     if frames.mesh is None:
         passes = jax.tree.map(lambda x: x[:, : frames.count], passes)
@@ -288,6 +296,8 @@ def run_stages(
     """
     if inputs.dynamic_mask is not None or stages.frames < FEWEST_FRAMES:  # nobody would read the matches
         stages = dataclasses.replace(stages, options=stages.options.changed(mask="gram"))
+    if stages.frames == 1:
+        stages = dataclasses.replace(stages, options=stages.options.changed(cameras="predicted"))
     points = dict(inputs.query_points)
     patch_tokens = stages.image_features(params, inputs.images)
     clips = ClipBatch(inputs.images, patch_tokens, inputs.frame_count)

@@ -134,7 +134,7 @@ def card(result: Result) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw up to eight frames, evenly spread: columns of picture, depth, saliency if any, and moving objects."""
+    """Draw up to eight frames, evenly spread: columns of picture, depth, what tells motion, moving objects."""
     frames, height, width = result.depth.shape
     shown = np.linspace(0, frames - 1, min(frames, _SHEET_FRAMES)).round().astype(int)
     scale = min(_THUMBNAIL[0] / width, _THUMBNAIL[1] / height, _SHEET_WIDTH / len(shown) / width)
@@ -156,7 +156,7 @@ def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
     objects = int(result.instances.max())
     notes = (f"{result.dynamic_share:.1%} of pixels", f"{objects} object{'' if objects == 1 else 's'}")
     legends = {"Depth": (DEPTH_COLORS, "far", "near"), "Saliency": (_SALIENCY_COLORS, "0", "1")}
-    legends["By matches"] = (_SALIENCY_COLORS, "1 x", f"{MOST_MOTION} x")
+    legends["By matches"] = (_SALIENCY_COLORS, "median", f"{MOST_MOTION} x")
     for row, label in enumerate(labels):
         y = top + row * step_y
         draw.text((_MARGIN, y), label, TEXT, small)
@@ -191,7 +191,7 @@ def _thumbnails(
         saliency = np.asarray(Image.fromarray(saliency).resize(size, Image.Resampling.BILINEAR))
         column["Saliency"] = Image.fromarray(_SALIENCY_COLORS[(saliency * 255).round().astype(np.uint8)])
     if result.motion is not None:
-        above = (result.motion[frame] / np.median(result.motion) - 1) / (MOST_MOTION - 1)
+        above = (result.motion[frame] - 1) / (MOST_MOTION - 1)
         motion = Image.fromarray(np.nan_to_num(above).clip(0, 1).astype(np.float32))
         motion = np.asarray(motion.resize(size, Image.Resampling.BILINEAR))
         column["By matches"] = Image.fromarray(_SALIENCY_COLORS[(motion * 255).round().astype(np.uint8)])

@@ -57,7 +57,7 @@ class Result:
     track_visibility: Float32[np.ndarray, "S Q"] | None = None  # probabilities
     track_confidence: Float32[np.ndarray, "S Q"] | None = None
     track_frames: Int64[np.ndarray, " Q"] | None = None  # of the queries
-    motion: Float32[np.ndarray, "S h w"] | None = None  # of each patch, by matches; about 1 where nothing moves
+    motion: Float32[np.ndarray, "S h w"] | None = None  # of each patch, by matches, over the clip's median
     passes: Any = None  # outputs of the network; in memory only, never saved
 
     def __post_init__(self) -> None:

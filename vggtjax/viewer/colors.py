@@ -99,8 +99,7 @@ def _saliency(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
 
 def _motion(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
     assert result.motion is not None
-    median = float(np.median(result.motion))
-    return _levels(_of_patches(result.motion, points, *result.depth.shape[1:]), median, MOST_MOTION * median)
+    return _levels(_of_patches(result.motion, points, *result.depth.shape[1:]), 1, MOST_MOTION)
 
 
 def _objects(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:

@@ -54,11 +54,11 @@ def blend_frame(views: Sequence[View]) -> BlendedFrame:
     said = np.stack([view.result.dynamic_mask[view.number] for view in views])
 
     def of_patches(name: str) -> Float32[np.ndarray, "h w"] | None:
-        maps = [getattr(view.result, name) for view in views]
-        if any(values is None for values in maps):
+        seen = [view for view in views if getattr(view.result, name) is not None]
+        if not seen:
             return None
-        each = np.stack([values[view.number] for values, view in zip(maps, views, strict=True)])
-        return (each * shares).sum(axis=0).astype(np.float32)
+        maps = np.stack([getattr(view.result, name)[view.number] for view in seen])
+        return np.average(maps, axis=0, weights=[view.weight for view in seen]).astype(np.float32)
 
     return BlendedFrame(
         depth=depth.astype(np.float32),

@@ -184,10 +184,13 @@ class Whole:
             for name in (*_BLENDED, *_COPIED)
             if getattr(first, name) is not None
         }
+        if first.saliency is not None:  # windows whose matches cannot be used have no motion
+            shapes["motion"] = shapes["saliency"]
         arrays: dict[str, np.ndarray] = dict(self.store.arrays(shapes))
         names: list[str] = []
         held: dict[int, Reconstruction] = {}
         masked_by: dict[int, str] = {}
+        is_matched = False
         with self.on_stage("blend windows") as progress:
             for frame in range(total):
                 weights = blend_weights(frame, self.windows)
@@ -197,7 +200,9 @@ class Whole:
                 blended = blend_frame(views)
                 for name in _BLENDED:
                     if name in arrays:
-                        arrays[name][frame] = getattr(blended, name)
+                        value = getattr(blended, name)
+                        arrays[name][frame] = 1 if value is None else value
+                is_matched |= blended.motion is not None
                 source, number = views[0].result, views[0].number
                 for name in _COPIED:
                     if name in arrays:
@@ -205,6 +210,8 @@ class Whole:
                 names.append(source.frame_names[number])
                 if progress is not None:
                     progress(frame + 1, total)
+        if not is_matched:
+            arrays.pop("motion", None)
         fields: dict[str, Any] = {"saliency": None, "timestamps": None, **arrays, **tracks}
         settings = first.settings | {"windows": self.facts()}
         if len(ways := Counter(masked_by.values())) > 1:
