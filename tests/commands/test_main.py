@@ -43,8 +43,8 @@ def test_demo(tmp_path, capsys, monkeypatch):
     assert page.stat().st_size > 100_000
     result = Reconstruction.load(tmp_path / "result")
     assert result.method == "4dvggt-m"
-    assert result.motion is not None
-    assert result.motion.shape == (4, 12, 12)
+    is_matched = result.settings["masks"] == "mined: matches between frames and Gram similarities"
+    assert is_matched == (result.motion is not None)  # those of a tiny network need not come back
     assert "Masks by matches: the second pass" in out
     assert (tmp_path / "result" / "scene.glb").stat().st_size > 1000
 
