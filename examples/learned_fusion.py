@@ -47,7 +47,6 @@ def main() -> None:
         clips = [clip for _, clip in made]
         outcomes = ablate(
             clips,
-            model.config.patch_size,
             options.families,
             FitConfig(steps=options.steps),
             seeds=range(options.seeds),
@@ -57,7 +56,7 @@ def main() -> None:
     with writing(options.out / "table.md") as path:
         path.write_text(markdown(rows), encoding="utf-8")
     shown = min((rule for rule in rows if rule in options.families), key=lambda rule: rows[rule]["nll"][0])
-    draw_fits(options.out, outcomes, clips, model.config.patch_size, shown)
+    draw_fits(options.out, outcomes, clips, shown)
     console.print(Markdown(markdown(rows)))
     console.print("Minus the paper's rule, on the same scenes: mean, standard deviation, seeds of which it is lower")
     for rule, row in gains(outcomes).items():

@@ -5,7 +5,6 @@
 # compiled function; `assemble` makes each method of the ladder from the same two passes.
 
 # %%
-import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -21,7 +20,7 @@ _, passes = vggtjax.infer(model.params, images, model.config)
 # `passes.first` and `passes.second` are what the network predicted, `passes.dynamic_mask` is the mask between them.
 
 # %%
-ladder = {name: vggtjax.assemble(passes, name) for name in vggtjax.LADDER}
+ladder = {name: vggtjax.assemble(passes, method=name) for name in vggtjax.LADDER}
 
 # %% [markdown]
 # ## Depth, by region
@@ -59,24 +58,19 @@ axes.legend(frameon=False, ncols=4)
 #
 # ## Is it the mask?
 #
-# Give the second pass the true mask instead of the mined one. `run_passes` mines its own; `reconstruct` takes masks.
+# Give the second pass the true mask instead of the mined one.
 
 # %%
-given = vggtjax.reconstruct(model, truth.images, masks=truth.dynamic_mask)
+given, _ = vggtjax.infer(model.params, images, model.config, masks=truth.dynamic_mask[None])
 print("4dvggt-d with the mined mask:", round(scores["4dvggt-d"][0], 3))
-print("4dvggt-d with the true mask: ", round(abs_rel(given.depth, regions["all"]), 3))
+print("4dvggt-d with the true mask: ", round(abs_rel(np.asarray(given.depth[0]), regions["all"]), 3))
 
 # %% [markdown]
 # ## How many pairs?
 #
-# `mask_pairs` can be traced: one compiled function serves all numbers of pairs in which keys are suppressed.
-
+# The programs that `reconstruct` compiles serve all numbers of pairs in which keys are suppressed.
 
 # %%
-@jax.jit
-def depth_with(pairs):
-    return vggtjax.assemble(vggtjax.run_passes(model.params, images, model.config, mask_pairs=pairs)).depth
-
-
 for pairs in (0, 1, 3, 5, 8):
-    print(pairs, "pairs:", round(abs_rel(np.asarray(depth_with(pairs)[0]), regions["all"]), 3))
+    result = vggtjax.reconstruct(model, truth.images, mask_pairs=pairs)
+    print(pairs, "pairs:", round(abs_rel(result.depth, regions["all"]), 3))

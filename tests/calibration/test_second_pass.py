@@ -18,7 +18,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import LadderRow, ladder
 from vggtjax.evaluation.sources import ModelSource
-from vggtjax.learning.soft import soft_masking
+from vggtjax.method.soft_mask import soft_masking
 from vggtjax.options import METHODS, Options, pairs_to_try
 
 FRAMES, SIZE, SCENES = 4, 56, 2  # of 16 patches, which the two thresholds cut differently

@@ -137,7 +137,7 @@ def clip_of(frames: int, size: int, seed: int) -> ClipPasses:
 
 def test_clips_of_several_sizes_are_stacked():
     clips = [clip_of(2, 28, 0), clip_of(3, 42, 1)]
-    seen = [observations(clip, 14) for clip in clips]
+    seen = [observations(clip) for clip in clips]
     scattered = fit_clips(clips, seen, pixels=100)
     assert scattered.truth.shape == (2, 1, 1, 100)
     assert (np.asarray(scattered.truth) > 0).all()

@@ -20,7 +20,7 @@ from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
 from vggtjax.pipeline import memory
 from vggtjax.pipeline.batch import reconstruct_many
-from vggtjax.pipeline.stage_runners import Compile
+from vggtjax.pipeline.steps import Compile
 from vggtjax.results.saving import Saving
 from vggtjax.storage.free_memory import Room, in_gigabytes
 from vggtjax.windows.plan import Windows

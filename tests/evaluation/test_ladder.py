@@ -91,7 +91,7 @@ def test_every_setting_has_a_row(rows):
 def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
     settings = {} if method == "vggt" else {"mask_source": "mined", "mask_pairs": 2}
     row = only(rows, clip=1, method=method, **settings)
-    made = assemble(passes, method)
+    made = assemble(passes, method=method)
     depth, poses, clip = np.asarray(made.depth[1]), np.asarray(made.camera_from_world[1]), Truth(*(a[1] for a in truth))
     scale = median_scale(depth, clip.depth)
     assert row.abs_rel == pytest.approx(depth_errors(depth, clip.depth).abs_rel, rel=1e-4)

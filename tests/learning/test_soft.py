@@ -13,8 +13,9 @@ from tests.tiny import tiny_config
 from vggtjax import forward, infer, init_params
 from vggtjax.errors import InputError
 from vggtjax.learning.distances import pose_error
-from vggtjax.learning.soft import SoftMasking, reconstruct_softly, soft_masking
+from vggtjax.learning.soft import reconstruct_softly
 from vggtjax.method.fusion_family import identity
+from vggtjax.method.soft_mask import SoftMasking, soft_masking
 
 CONFIG = tiny_config(patch_size=8, image_size=32, taps=(0, 1, 2, 3))
 SHAPE = (1, 4, 16, 24, 3)

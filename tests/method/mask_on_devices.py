@@ -17,7 +17,8 @@ from vggtjax.method.mask import mine_mask
 from vggtjax.method.matched_mask import mine_matched_mask
 from vggtjax.network.frames import BY_FRAME, Frames
 from vggtjax.network.pose import encode_pose
-from vggtjax.pipeline.devices import frames_mesh, shared_length
+from vggtjax.pipeline.devices import frames_mesh
+from vggtjax.pipeline.lengths import shared_length
 
 COUNT, SIZE = 13, (6, 8)  # frames, which eight devices pad to 16
 METHODS = {

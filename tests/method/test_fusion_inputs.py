@@ -52,7 +52,7 @@ def passes(second: bool = True) -> Passes:
 
 def test_observations_of_passes():
     both = passes()
-    seen = observe(both, 14, scale=jnp.asarray([2.0]))
+    seen = observe(both, scale=jnp.asarray([2.0]))
     assert np.allclose(seen.depth2, 2 * seen.depth1)
     assert np.allclose(np.exp(seen.log_confidence1), np.asarray(both.first.depth_confidence), rtol=1e-6)
     assert ((np.asarray(seen.margin) >= 0) == np.asarray(both.dynamic_mask)).all()  # cut where the mask was
@@ -67,12 +67,12 @@ def test_soft_masks_become_masks_that_were_given():
     both = passes()
     given = jnp.asarray(np.random.default_rng(5).random(both.dynamic_mask.shape) < 0.3)
     for mask in (given, jnp.zeros_like(given), jnp.ones_like(given)):
-        seen = observe(both._replace(dynamic_mask=mask), 14)
+        seen = observe(both._replace(dynamic_mask=mask))
         assert ((np.asarray(seen.margin) >= 0) == np.asarray(mask)).all()
-    nothing = observe(both._replace(dynamic_mask=jnp.zeros_like(given)), 14)
+    nothing = observe(both._replace(dynamic_mask=jnp.zeros_like(given)))
     assert np.asarray(soft_mask(nothing.margin, jnp.asarray(5.0))).max() < 1e-6
 
 
 def test_a_missing_pass_is_one_sentence():
     with pytest.raises(InputError, match="both passes"):
-        observe(passes(second=False), 14)
+        observe(passes(second=False))

@@ -84,7 +84,7 @@ def test_every_method_takes_what_the_table_says(inferred):
     assert set(expected) == set(METHODS)
     for method, ((depth, confidence), camera) in expected.items():
         extrinsics, intrinsics = (camera, camera) if isinstance(camera, str) else camera
-        made = assemble(passes, method)
+        made = assemble(passes, method=method)
         assert np.allclose(made.depth, depth, rtol=1e-6), method
         assert np.allclose(made.confidence, confidence, rtol=1e-6), method
         assert np.allclose(made.camera_from_world, cameras[extrinsics][0]), method
@@ -94,7 +94,7 @@ def test_every_method_takes_what_the_table_says(inferred):
 def test_aligning_the_scale_moves_depth_and_cameras_together(inferred):
     _, passes = inferred
     scale = np.asarray(scale_between(passes.first.depth, passes.second.depth, passes.dynamic_mask))
-    plain, aligned = (assemble(passes, "pose-decoupling", align_scale=on) for on in (False, True))
+    plain, aligned = (assemble(passes, method="pose-decoupling", align_scale=on) for on in (False, True))
     assert np.allclose(aligned.depth, plain.depth * scale[:, None, None, None], rtol=1e-5)
     assert np.allclose(
         aligned.camera_from_world[..., 3], plain.camera_from_world[..., 3] * scale[:, None, None], rtol=1e-5
@@ -145,15 +145,15 @@ def test_a_clip_of_another_size_is_refitted(params, config, images):
     assert (refitted.depth == fitted.depth).all()
 
 
-def test_passes_take_options_or_their_fields():
-    model, images = tiny_model(), jnp.zeros((1, 2, 28, 28, 3))
+def test_options_and_masks_decide_what_the_passes_are():
+    model, images = tiny_model(), jnp.zeros((1, 3, 28, 28, 3))
     run = partial(run_passes, model.params, images, model.config)
-    for options in ({"method": "vggt"}, {"options": Options(method="vggt", gram="dot")}):
-        assert jax.eval_shape(partial(run, **options)).second is None
-    with pytest.raises(TypeError, match="grams"):
-        run(grams="dot")
+    assert jax.eval_shape(partial(run, Options(method="vggt"))).second is None
+    unmoved = run(masks=False)
+    assert unmoved.second is unmoved.first
+    assert not unmoved.dynamic_mask.any()
     with pytest.raises(InputError, match="method is 'vgtt'; expected one of vggt, vggt4d"):
-        run(method="vgtt")
+        infer(model.params, images, model.config, method="vgtt")
 
 
 def test_pictures_of_another_range_are_refused(params, config, images):
@@ -170,7 +170,7 @@ def test_adjusted_cameras_reach_the_result(params, config, images, monkeypatch):
         assert matches.position.shape[:2] == depth.shape[:2]
         return cameras._replace(camera_from_world=cameras.camera_from_world + 1)
 
-    monkeypatch.setattr("vggtjax.method.passes.adjusted_cameras", shifted)
+    monkeypatch.setattr("vggtjax.method.assembly.adjusted_cameras", shifted)
     run = partial(infer, params, images, config)
     (plain, _), (made, passes) = run(method="4dvggt-m"), run(method="4dvggt-m", cameras="adjusted")
     assert np.allclose(made.camera_from_world, plain.camera_from_world + 1, atol=1e-4)
@@ -190,7 +190,7 @@ def test_a_result_says_where_cameras_stayed(params, config, images, frames):
 
 def test_equal_programs_are_compiled_once(params, config, images, monkeypatch):
     static = "vggtjax.pipeline.infer._infer"  # its options are static under jit
-    monkeypatch.setattr(static, lambda *arguments: arguments[3])
+    monkeypatch.setattr(static, lambda *arguments: arguments[5])
     options = infer(params, images, config, method="vggt4d")
     assert infer(params, images, config, method="vggt4d", gram="dot", refine_mask=True) == options
     assert infer(params, images, config, method="vggt4d", align_scale=True) != options

@@ -12,16 +12,15 @@ from jax import export
 from jax._src.cudnn import fused_attention_stablehlo as cudnn
 
 from tests.tiny import tiny_config
+from vggtjax.method.algorithm import Clips, run_method, run_passes
 from vggtjax.method.fusion_family import PARTS, start
 from vggtjax.method.mask_refinement import cluster_losses, cluster_points
 from vggtjax.network import attention
 from vggtjax.network.aggregator import aggregate
-from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.dpt_head import predict_dense
 from vggtjax.network.model import forward, parameter_shapes
 from vggtjax.network.precision import Compute
 from vggtjax.options import METHODS, Options
-from vggtjax.pipeline.stages import ClipInputs, Stages, run_stages
 from vggtjax.scenes.textures import load_textures
 from vggtjax.training.data import make_batch
 from vggtjax.training.recipe import Phase
@@ -51,20 +50,21 @@ def text(*arguments, **options):
 
 
 class Lower:
-    """Lowers each program of the stages in place of running it, once for equal options and shapes."""
+    """Lowers each step in place of running it, once for equal keywords and shapes."""
 
     def __init__(self):
         self.outputs = {}
 
-    def __call__(self, stage, program, *arguments, **options):
-        fixed = {name: value for name, value in options.items() if name in program._static}
-        traced = shapes({name: value for name, value in options.items() if name not in fixed})
-        leaves, structure = jax.tree.flatten(shapes(arguments))
-        key = (stage, str(fixed), tuple(leaves), structure)
-        if key not in self.outputs:
-            exported = lowered(partial(program.function, **fixed), *shapes(arguments), **traced)
-            self.outputs[key] = jax.tree.unflatten(exported.out_tree, exported.out_avals)
-        return self.outputs[key]
+    def __call__(self, name, function):
+        def lower(*arguments, **static):
+            leaves, structure = jax.tree.flatten(shapes(arguments))
+            key = (name, str(static), tuple(leaves), structure)
+            if key not in self.outputs:
+                exported = lowered(partial(function, **static), *shapes(arguments))
+                self.outputs[key] = jax.tree.unflatten(exported.out_tree, exported.out_avals)
+            return self.outputs[key]
+
+        return lower
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +83,10 @@ def test_the_stages_of_a_method(lower, method):
     dtype = "bfloat16" if method == "vggt4d" else "float32"
     points = {3: array(1, 2, 2)} if method == "vggt" else {}
     fusion = shapes(start(tuple(PARTS))) if method == "4dvggt-d" else None
-    stages = Stages(CONFIG, Options(method=method, compute_dtype=dtype), FRAMES, SIZE, run=lower)
-    clip = ClipInputs(array(1, FRAMES, *SIZE, 3), query_points=points)
-    run_stages(stages, parameter_shapes(CONFIG), clip, fusion=fusion, all_outputs=method != "vggt4d")
+    options = Options(method=method, compute_dtype=dtype)
+    clips = Clips(array(1, FRAMES, *SIZE, 3), query_points=points)
+    how = {"fusion": fusion, "both_outputs": method != "vggt4d", "step": lower}
+    run_method(parameter_shapes(CONFIG), clips, CONFIG, options, **how)
     assert {"image features", "first pass", "dynamic mask", "assemble"} <= {stage for stage, *_ in lower.outputs}
 
 
@@ -107,10 +108,8 @@ def test_the_precision_of_products(precision, head):
 
 
 def test_merged_attention(lower):
-    stages = Stages(CONFIG, Options(attention="merged"), FRAMES, SIZE, run=lower)
-    grid = [side // CONFIG.patch_size for side in SIZE]
-    features = array(1, FRAMES, grid[0] * grid[1], CONFIG.embed_dim)
-    stages.first_pass(parameter_shapes(CONFIG), ClipBatch(array(1, FRAMES, *SIZE, 3), features))
+    options = Options(attention="merged", method="vggt")
+    run_passes(parameter_shapes(CONFIG), array(1, FRAMES, *SIZE, 3), CONFIG, options, step=lower)
 
 
 def test_mask_refinement():

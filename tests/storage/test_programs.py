@@ -31,11 +31,11 @@ def counted():
     """Return a function that counts how often it is traced, three times over: as three processes have it."""
     traced = []
 
-    def weighed(pair: Pair, extra, *, power: int, factor: float = 1.0):
+    def weighed(pair: Pair, extra, factor=1.0, *, power: int):
         traced.append(power)
         return Pair(factor * pair.one**power, extra), jnp.sum(pair.one)
 
-    return [Program(weighed, static=("power",)) for _ in range(3)], traced
+    return [Program(weighed) for _ in range(3)], traced
 
 
 X = jnp.arange(6.0).reshape(2, 3)
@@ -43,17 +43,17 @@ X = jnp.arange(6.0).reshape(2, 3)
 
 def test_a_second_process_does_not_trace(folder):
     (first, second, _), traced = counted()
-    first(Pair(X), None, power=2, factor=3.0)
-    again, _ = second(Pair(X), None, power=2, factor=3.0)
+    first(Pair(X), None, 3.0, power=2)
+    again, _ = second(Pair(X), None, 3.0, power=2)
     assert traced == [2]
     assert isinstance(again, Pair)
     assert np.array_equal(again.one, 3 * X**2)
     assert again.other is None
-    # A traced option is an argument; static ones, shapes, types and structure make another program.
-    assert np.array_equal(second(Pair(X), None, power=2, factor=5.0)[0].one, 5 * X**2)
+    # Keywords, shapes, types and structure make another program.
+    assert np.array_equal(second(Pair(X), None, 5.0, power=2)[0].one, 5 * X**2)
     assert traced == [2]
     for number, (x, extra, power) in enumerate(((X, None, 3), (X[:1], None, 2), (X.astype(int), None, 2), (X, X, 2))):
-        second(Pair(x), extra, power=power)
+        second(Pair(x), extra, 3.0, power=power)
         assert len(traced) == 2 + number
 
 
@@ -61,10 +61,10 @@ def test_calls_use_compiled_programs(folder):
     (first, second, _), traced = counted()
     shape = jax.ShapeDtypeStruct((2, 3), jnp.float32)
     for program in (first, second):
-        compiling, made = program.compile(Pair(shape), None, power=2, factor=3.0)
+        compiling, made = program.compile(Pair(shape), None, 3.0, power=2)
         assert compiling.result().memory_analysis() is not None
         assert made[0].one.shape == (2, 3)
-        assert np.array_equal(program(Pair(X), None, power=2, factor=3.0)[0].one, 3 * X**2)
+        assert np.array_equal(program(Pair(X), None, 3.0, power=2)[0].one, 3 * X**2)
     assert traced == [2]
 
 

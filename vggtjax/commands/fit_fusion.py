@@ -160,17 +160,14 @@ def fit_fusion(
         is_generated = all(text.startswith(f"{GENERATED}=") for text in clips.data)
         network = load(report, "demo" if model is None and is_generated else model)
         passes = clips.passes(report, network, options)
-        patch = network.config.patch_size
         sampling: dict[str, Any] = {"held_out": held_out, "pixels": pixels}
         with report.stage("fit") as progress:
             states, every = begin(out), list(passes.values())
-            scores = ablate(
-                every, patch, family, config, seeds=range(seeds), folder=states, progress=progress, **sampling
-            )
+            scores = ablate(every, family, config, seeds=range(seeds), folder=states, progress=progress, **sampling)
         with report.stage("write"):
             about = origin_of_fit(network, options) | sampling
             about |= {"data": list(clips.data), "max_frames": clips.max_frames, "size": clips.size}
-            chosen = save_fits(out, scores, passes, patch, config, about=about)
+            chosen = save_fits(out, scores, passes, config, about=about)
     _say(report, scores, chosen, out)
     if network.note:
         report.line(network.warning)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from itertools import count, product
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -21,16 +22,15 @@ from vggtjax.evaluation.metrics.point_clouds import paired_distance
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.evaluation.truth_at_pixels import known_points
 from vggtjax.geometry.similarity import Similarity, centres, umeyama_sim3
+from vggtjax.method.algorithm import Clips, run_passes
+from vggtjax.method.assembly import Assembly, assemble
 from vggtjax.method.mask import upsample
 from vggtjax.method.matched_mask import motion_pixels
-from vggtjax.method.passes import Assembly, Passes, assemble
-from vggtjax.method.witnesses import Seen
-from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.method.passes import Passes
 from vggtjax.options import LADDER, CamerasFrom, ComputeDType, Options, find_method
-from vggtjax.pipeline.stages import Stages
+from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import Progress
 from vggtjax.results.report import ErrorTable
-from vggtjax.storage.programs import Program
 
 MaskSource = Literal["mined", "matches", "true"]
 
@@ -80,13 +80,8 @@ class _Setting(NamedTuple):
     suppress: Suppress | None = None
 
 
-def _assemble_all(passes: Passes, methods: tuple[str, ...], cameras: CamerasFrom) -> list[Assembly]:
-    return [assemble(passes, method, cameras=cameras) for method in methods]
-
-
-_assemble = Program(_assemble_all, static=("methods", "cameras"))
-_upsample = Program(upsample, static=("size",))
-_motion_pixels = Program(motion_pixels)
+def _assemble(passes: Passes, *, methods: tuple[str, ...], cameras: CamerasFrom) -> list[Assembly]:
+    return [assemble(passes, method=method, cameras=cameras) for method in methods]
 
 
 def ladder(
@@ -136,41 +131,36 @@ def ladder(
     masked = tuple(name for name in methods if find_method(name).needs_second_pass)
     plain = tuple(name for name in methods if name not in masked)
     pairs = (model.config.motion.mask_pairs,) if mask_pairs is None else mask_pairs
-    settings = [_Setting(*values) for values in product(masks, pairs, suppress)]
-    frames, *size = truth.images.shape[1:4]
+    settings = [_Setting(*values) for values in product(masks, pairs, suppress)] if masked else []
     witness = "matches" if "matches" in masks else "gram"
     options = Options(gram=gram, mask=witness, threshold=threshold, cameras=cameras, compute_dtype=compute_dtype)
-    shared = Stages(model.config, options, frames, (size[0], size[1]))
-    second_stages = [
-        replace(shared, options=options.changed(mask_pairs=setting.mask_pairs, suppress=setting.suppress))
-        for setting in settings
-    ]
     batches = list(_batches(len(truth.images), batch_size))
-    total, steps = len(batches) * (1 + bool(masked) * len(settings)), count(1)
+    total, steps = len(batches) * (1 + len(settings)), count(1)
     advance = (lambda: None) if progress is None else (lambda: progress(next(steps), total))
+    execute = Execute()
+
+    run = partial(run_passes, model.params, config=model.config, step=execute)
 
     rows: list[LadderRow] = []
     for clips, padded in batches:
-        images = jax.device_put(truth.images[padded].astype(np.float32, copy=False))
-        patch_tokens = shared.image_features(model.params, images)
-        batch = ClipBatch(images, patch_tokens)
-        first, seen = shared.first_pass(model.params, batch, second_follows=bool(masked))
-        saliency, mined = seen.saliency, shared.dynamic_mask(Seen(seen.saliency), first, batch).dynamic_mask
-        pixels = np.asarray(_upsample(saliency, size=tuple(size)))
+        batch = Clips(jax.device_put(truth.images[padded].astype(np.float32, copy=False)))
+        shared = run(batch, options=options.changed(method="vggt"))
+        pixels = np.asarray(execute("saliency", upsample)(shared.saliency, size=truth.images.shape[2:4]))
         scenes = [_scene(int(clip), truth, pixels[i]) for i, clip in enumerate(clips)]
-        by_source = {"mined": (mined, scenes), "true": (jax.device_put(truth.dynamic_mask[padded]), scenes)}
-        if "matches" in masks and seen.matches is not None:
-            matched = shared.dynamic_mask(seen, first, batch)
-            pixels = np.asarray(_motion_pixels(matched.motion, images))
-            moving = [scene._replace(saliency=pixels[i]) for i, scene in enumerate(scenes)]
-            by_source["matches"] = (matched.dynamic_mask, moving)
-        passes = Passes(first, None, saliency, mined, matches=seen.matches)
-        rows += _scored(passes, plain, scenes, _Setting(), cameras)
+        rows += _scored(shared, plain, scenes, _Setting(), cameras)
         advance()
-        for setting, stages in zip(settings, second_stages, strict=True) if masked else ():
-            mask, scored_by = by_source[setting.mask_source or "mined"]
-            second = stages.second_pass(model.params, batch, mask, first)
-            rows += _scored(passes._replace(second=second, dynamic_mask=mask), masked, scored_by, setting, cameras)
+        for setting in settings:
+            given = jax.device_put(truth.dynamic_mask[padded]) if setting.mask_source == "true" else None
+            own = options.changed(
+                mask="matches" if setting.mask_source == "matches" else "gram",
+                mask_pairs=setting.mask_pairs,
+                suppress=setting.suppress,
+            )
+            passes, scored_by = run(batch, options=own, masks=given, shared=shared), scenes
+            if setting.mask_source == "matches" and passes.motion is not None:
+                pixels = np.asarray(execute("motion", motion_pixels)(passes.motion, batch.images))
+                scored_by = [scene._replace(saliency=pixels[i]) for i, scene in enumerate(scenes)]
+            rows += _scored(passes, masked, scored_by, setting, cameras)
             advance()
     return sorted(rows, key=lambda row: row.clip)
 
@@ -255,7 +245,9 @@ def _scored(
     passes: Passes, methods: tuple[str, ...], scenes: list[_Scene], setting: _Setting, cameras_from: CamerasFrom
 ) -> Iterator[LadderRow]:
     mask = np.asarray(passes.dynamic_mask)
-    for method, assembly in zip(methods, _assemble(passes, methods=methods, cameras=cameras_from), strict=True):
+    join = Execute()("assemble", _assemble)
+    read = passes._replace(patch_tokens=None)
+    for method, assembly in zip(methods, join(read, methods=methods, cameras=cameras_from), strict=True):
         depth, intrinsics = np.asarray(assembly.depth), np.asarray(assembly.intrinsics)
         cameras = np.asarray(assembly.camera_from_world)
         for i, scene in enumerate(scenes):

@@ -18,13 +18,13 @@ from .objectives import photometric_loss as photometric_loss
 from .rules import PARTS as PARTS
 from .rules import Fused as Fused
 from .rules import Observations as Observations
+from .rules import SoftMasking as SoftMasking
 from .rules import fuse as fuse
 from .rules import identity as identity
 from .rules import load_fusion as load_fusion
 from .rules import observe as observe
 from .rules import parse_family as parse_family
 from .rules import save_fusion as save_fusion
-from .soft import SoftMasking as SoftMasking
+from .rules import soft_masking as soft_masking
 from .soft import SoftReconstruction as SoftReconstruction
 from .soft import reconstruct_softly as reconstruct_softly
-from .soft import soft_masking as soft_masking

@@ -95,7 +95,6 @@ def baselines() -> dict[str, Rule]:
 
 def ablate(
     clips: Sequence[ClipPasses],
-    patch_size: int,
     families: Sequence[str],
     config: FitConfig,
     *,
@@ -109,7 +108,6 @@ def ablate(
 
     Args:
         clips: at least three, with true depth.
-        patch_size: of the model.
         families: names for `parse_family`.
         config: of the fits; family and seed are filled in.
         seeds: each seed splits the clips and draws pixels anew.
@@ -124,7 +122,7 @@ def ablate(
     """
     parts = {name: family for name in families if (family := parse_family(name))}  # the paper's rule is a baseline
     scores: list[RuleScore] = []
-    seen = [observations(clip, patch_size) for clip in clips]
+    seen = [observations(clip) for clip in clips]
     total, done = len(seeds) * len(parts), 0
     for seed in seeds:
         split = split_clips(len(clips), seed, held_out)

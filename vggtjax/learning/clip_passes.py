@@ -243,15 +243,15 @@ def sequence_digest(sequence: LabelledSequence) -> str:
     return digest.hexdigest()
 
 
-def observations(clip: ClipPasses, patch_size: int) -> Observations:
+def observations(clip: ClipPasses) -> Observations:
     """Return the inputs of a fusion rule for a clip, [S, H, W], on the host."""
     first = Predictions(depth=jnp.asarray(clip.depth1)[None], depth_confidence=jnp.asarray(clip.confidence1)[None])
     second = Predictions(depth=jnp.asarray(clip.depth2)[None], depth_confidence=jnp.asarray(clip.confidence2)[None])
     passes = Passes(first, second, jnp.asarray(clip.saliency)[None], jnp.asarray(clip.dynamic_mask)[None])
-    return jax.tree.map(lambda x: np.asarray(x)[0], _observe(passes, patch_size))
+    return jax.tree.map(lambda x: np.asarray(x)[0], _observe(passes))
 
 
-_observe = jax.jit(observe, static_argnums=1)
+_observe = jax.jit(observe)
 
 
 def fit_clips(

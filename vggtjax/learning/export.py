@@ -47,7 +47,6 @@ def save_fits(
     folder: Path,
     scores: Sequence[RuleScore],
     clips: Mapping[str, ClipPasses],
-    patch_size: int,
     config: FitConfig,
     *,
     about: Mapping[str, Any],
@@ -64,7 +63,7 @@ def save_fits(
     split = split_clips(len(clips), 0, float(about["held_out"]))
     split = split._replace(fitted=sorted([*split.fitted, *split.test]))
     all_clips = list(clips.values())
-    seen = [observations(clip, patch_size) for clip in all_clips]
+    seen = [observations(clip) for clip in all_clips]
     trees = {PAPER: identity()}
     for name in families:
         whole = dataclasses.replace(config, family=parse_family(name))
@@ -87,7 +86,7 @@ def save_fits(
             save_fusion(staged / FAMILIES / f"{name.replace('+', '_')}.safetensors", tree, facts | {"family": name})
         save_fusion(staged / FUSION, trees[chosen], facts | {"family": chosen})
         (staged / TABLE).write_text(markdown(table(scores)), encoding="utf-8")
-        draw_fits(staged, scores, all_clips, patch_size, chosen)
+        draw_fits(staged, scores, all_clips, chosen)
         (staged / NUMBERS).write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         (folder / NUMBERS).unlink(missing_ok=True)
         shutil.rmtree(folder / FAMILIES, ignore_errors=True)

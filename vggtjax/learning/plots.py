@@ -26,12 +26,10 @@ _COLUMNS = 4
 _claims = jax.jit(log_precisions)
 
 
-def draw_fits(
-    folder: Path, scores: Sequence[RuleScore], clips: Sequence[ClipPasses], patch_size: int, shown: str
-) -> None:
+def draw_fits(folder: Path, scores: Sequence[RuleScore], clips: Sequence[ClipPasses], shown: str) -> None:
     """Draw all pictures into a folder, precision and calibration of the family `shown`."""
     figures = {
-        "precision.png": _precision(scores, clips, patch_size, shown),
+        "precision.png": _precision(scores, clips, shown),
         "calibration.png": _calibration(scores, shown),
         "scores.png": _scores(scores),
         "losses.png": _losses(scores),
@@ -42,7 +40,7 @@ def draw_fits(
 
 
 def precision_by_confidence(
-    clips: Sequence[ClipPasses], which: int, patch_size: int, trees: Sequence[FusionParams]
+    clips: Sequence[ClipPasses], which: int, trees: Sequence[FusionParams]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return bins of a pass's confidence, the precision observed in each bin, and the precision that trees claim there.
 
@@ -56,7 +54,7 @@ def precision_by_confidence(
         truth = clip.truth[known] / depth_alignment(depth, clip.truth[known], "scale")[0]
         confidences.append((clip.confidence1, clip.confidence2)[which][known])
         squares.append((depth - truth) ** 2)
-        seen = observations(clip, patch_size)
+        seen = observations(clip)
         claims = [np.asarray(_claims(tree, seen)[which], np.float64)[known] for tree in trees]
         variances.append(np.exp(-np.asarray(claims).reshape(len(trees), -1)))
     confidence, square, variance = np.concatenate(confidences), np.concatenate(squares), np.concatenate(variances, 1)
@@ -66,12 +64,12 @@ def precision_by_confidence(
     return middles, observed, np.stack([1 / variance[:, part].mean(axis=1) for part in parts], axis=1)
 
 
-def _precision(scores: Sequence[RuleScore], clips: Sequence[ClipPasses], patch_size: int, shown: str) -> Figure:
+def _precision(scores: Sequence[RuleScore], clips: Sequence[ClipPasses], shown: str) -> Figure:
     figure = new_figure(9, 4)
     fits = [score.fit for score in scores if score.rule == shown and score.fit is not None]
     for which in (0, 1):
         axis = figure.add_subplot(1, 2, which + 1)
-        middles, observed, claimed = precision_by_confidence(clips, which, patch_size, [fit.params for fit in fits])
+        middles, observed, claimed = precision_by_confidence(clips, which, [fit.params for fit in fits])
         axis.plot(middles, observed, "o", color="black", label="observed: 1 / mean squared error")
         axis.plot(middles, middles, color="tab:orange", label="paper: the confidence itself")
         for i, line in enumerate(claimed):

@@ -9,3 +9,5 @@ from vggtjax.method.fusion_family import parse_family as parse_family
 from vggtjax.method.fusion_file import load_fusion as load_fusion
 from vggtjax.method.fusion_file import save_fusion as save_fusion
 from vggtjax.method.fusion_inputs import observe as observe
+from vggtjax.method.soft_mask import SoftMasking as SoftMasking
+from vggtjax.method.soft_mask import soft_masking as soft_masking

@@ -5,31 +5,19 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from vggtjax.cameras import Cameras, unproject
-from vggtjax.config import Gram, MotionConfig, Threshold, VGGTConfig
-from vggtjax.method.fusion_family import FusionParams, fuse, identity, soft_mask
+from vggtjax.config import Gram, MotionConfig, VGGTConfig
+from vggtjax.method.algorithm import run_passes
+from vggtjax.method.fusion_family import FusionParams, fuse, identity
 from vggtjax.method.fusion_inputs import observe
-from vggtjax.method.mask import CONSTANT, find_threshold, upsample
-from vggtjax.method.passes import Passes, first_pass, second_pass
-from vggtjax.network.backbone import encode
-from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.method.passes import Passes, present
+from vggtjax.method.soft_mask import SoftMasking
 from vggtjax.network.layers import Params
 from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import Compute, full_precision
-from vggtjax.network.suppression import Suppression
-
-
-class SoftMasking(NamedTuple):
-    """Differentiable parameters of the masks; `soft_masking` returns the paper's values."""
-
-    offset: Float[Array, ""]  # added to the threshold tau of the saliency
-    temperature: Float[Array, ""]  # T of sigmoid((saliency - tau) / T); 0 for the hard mask
-    strength: Float[Array, " depth"]  # of the suppression in every pair, in [0, 1]
-    exponents: Float[Array, " cues"]  # of the cues in their product
+from vggtjax.options import Options
 
 
 class SoftReconstruction(NamedTuple):
@@ -41,23 +29,6 @@ class SoftReconstruction(NamedTuple):
     points: Float[Array, "B S H W 3"]  # in the world, of pixel centres
     dynamic: Float[Array, "B S H W"]  # dynamic share of each pixel
     passes: Passes
-
-
-def soft_masking(
-    config: VGGTConfig, *, temperature: float = 0.0, mask_pairs: int | None = None, motion: MotionConfig | None = None
-) -> SoftMasking:
-    """Return the paper's values: no offset to the threshold, suppression in the first pairs, the plain product of cues.
-
-    `motion` is the table of cues, the configuration's own if None. `mask_pairs` is the number of pairs, the table's if
-    None.
-    """
-    motion = motion or config.motion
-    return SoftMasking(
-        jnp.zeros(()),
-        jnp.asarray(temperature, float),
-        (jnp.arange(config.depth) < motion.masked_pairs(mask_pairs)).astype(float),
-        jnp.ones(len(motion.cues)),
-    )
 
 
 @full_precision
@@ -93,31 +64,11 @@ def reconstruct_softly(
         stop_camera_gradient: as for `forward`.
         remat: compute activations again on the way back, which takes less memory.
     """
-    clips = ClipBatch(images, encode(params, images, config, compute_dtype=compute_dtype, remat=remat))
-    compute = Compute(compute_dtype, remat=remat)
-    mining = {"gram": gram, "motion": motion, "exponents": masking.exponents}
-    first, (saliency, _) = first_pass(params, clips, config, compute=compute, **mining)
-    threshold = (motion or config.motion).threshold or "otsu"
-    dynamic = soft_pixels(saliency, (images.shape[2], images.shape[3]), masking, threshold)
-    compute = dataclasses.replace(compute, stop_camera_gradient=stop_camera_gradient)
-    suppression = Suppression(strength=masking.strength)
-    second = second_pass(params, clips, dynamic, config, suppression=suppression, compute=compute)
-    passes = Passes(first, second, saliency, dynamic)  # pyright: ignore[reportArgumentType]
-    fused = fuse(identity() if fusion is None else fusion, observe(passes, config.patch_size))
-    cameras = Cameras(*decode_pose(second.pose_encoding, (images.shape[2], images.shape[3])))  # pyright: ignore
+    config = config if motion is None else dataclasses.replace(config, motion=motion)
+    compute = Compute(compute_dtype, remat=remat, stop_camera_gradient=stop_camera_gradient)
+    passes = run_passes(params, images, config, Options(gram=gram), masks=masking, compute=compute)
+    fused = fuse(identity() if fusion is None else fusion, observe(passes))
+    second = present(passes.second)
+    cameras = Cameras(*decode_pose(present(second.pose_encoding), (images.shape[2], images.shape[3])))
     points = unproject(fused.depth, cameras.intrinsics, cameras.camera_from_world, pixel_offset=0.5)
     return SoftReconstruction(fused.depth, fused.log_precision, cameras, points, fused.dynamic, passes)
-
-
-def soft_pixels(
-    saliency: Float[Array, "B S h w"], size: tuple[int, int], masking: SoftMasking, threshold: Threshold = "otsu"
-) -> Float[Array, "B S H W"]:
-    """Return the dynamic share of every pixel; 0 in a clip of constant saliency. `threshold` is the model's."""
-
-    def one_clip(pixels: Float[Array, "S H W"]) -> Float[Array, "S H W"]:
-        varies = pixels.max() - pixels.min() >= CONSTANT
-        margin = pixels - find_threshold(pixels, threshold) - masking.offset
-        is_dynamic = margin >= 0 if threshold == "otsu" else margin > 0  # as `dynamic_pixels`
-        return jnp.where(varies, soft_mask(margin, masking.temperature, is_dynamic.astype(margin.dtype)), 0)
-
-    return jax.vmap(one_clip)(upsample(saliency, size))

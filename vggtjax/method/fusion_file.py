@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 
 from vggtjax.checkpoint import Model
 from vggtjax.errors import CheckpointError, InputError
@@ -65,7 +66,7 @@ def load_fusion(path: str | Path) -> FusionParams:
     return params
 
 
-def check_fuses(fusion: FusionParams | None, *methods: str) -> None:
+def check_fuses(fusion: Any, *methods: str) -> None:
     """Raise InputError if a fusion is given and none of the methods fuses both passes."""
     if fusion is not None and all(find_method(method).depth != "fused" for method in methods):
         names = ", ".join(name for name, row in METHODS.items() if row.depth == "fused")
@@ -105,14 +106,16 @@ def warn_if_fitted_otherwise(path: Path, model: Model, options: Options) -> None
             logger.warning("%s was fitted with %s %s, and is used with %s", path, name, about[name], value)
 
 
-def fusion_digest(fusion: FusionParams | None) -> str | None:
-    """Return the digest of a tree's values, for the settings of a result."""
+def fusion_digest(fusion: Any) -> str | None:
+    """Return the digest of a rule's values, after the name of a function, for the settings of a result."""
     if fusion is None:
         return None
     digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(fusion):
+    for leaf in jax.tree.leaves(fusion) if not callable(fusion) or isinstance(fusion, Partial) else ():
         digest.update(np.asarray(leaf, np.float32).tobytes())
-    return digest.hexdigest()[:16]
+    function = getattr(fusion, "func", fusion)
+    name = f"{getattr(function, '__qualname__', 'function')} " if callable(fusion) else ""
+    return name + digest.hexdigest()[:16]
 
 
 def _read(path: str | Path) -> tuple[Mapping[str, StoredTensor], dict[str, Any]]:

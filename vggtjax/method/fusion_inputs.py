@@ -1,4 +1,4 @@
-"""Two passes over a clip -> the inputs of a fusion rule; and a method's result with its depth fused by a rule."""
+"""Two passes over a clip -> the inputs of a fusion rule."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.errors import InputError
-from vggtjax.method.fusion import scale_between
-from vggtjax.method.fusion_family import FusionParams, Observations, fuse
+from vggtjax.method.fusion_family import Observations
 from vggtjax.method.mask import upsample
 from vggtjax.method.median import median_over_frames
-from vggtjax.method.passes import Assembly, Passes
+from vggtjax.method.passes import Passes
 from vggtjax.network.frames import Frames
 
 REACH = 64  # pixels; larger distances to the mask's edge are infinite
@@ -19,26 +18,7 @@ _SMALLEST = 1e-6
 _STILL = -1e3  # margin of pixels that are static at any temperature
 
 
-def apply_fusion(
-    assembly: Assembly,
-    passes: Passes,
-    fusion: FusionParams,
-    patch_size: int,
-    *,
-    align_scale: bool = False,
-    frames: Frames = Frames(),
-) -> Assembly:
-    """Return an assembly with depth and confidence by a fitted rule; the confidence is the fused precision."""
-    scale = None
-    if align_scale and passes.second is not None:
-        scale = scale_between(passes.first.depth, passes.second.depth, passes.dynamic_mask, frames)  # pyright: ignore
-    fused = fuse(fusion, observe(passes, patch_size, scale=scale, frames=frames))
-    return assembly._replace(depth=fused.depth, confidence=fused.precision)
-
-
-def observe(
-    passes: Passes, patch_size: int, *, scale: Float[Array, " B"] | None = None, frames: Frames = Frames()
-) -> Observations:
+def observe(passes: Passes, *, scale: Float[Array, " B"] | None = None, frames: Frames = Frames()) -> Observations:
     """Return the inputs of `fuse` for two passes.
 
     The features are the saliency; log depth of pass 1 over the clip's median; exp(-d / patch size) with the distance
@@ -46,7 +26,6 @@ def observe(
 
     Args:
         passes: both, with depth; the mask is boolean or of shares in [0, 1].
-        patch_size: of the model, in pixels.
         scale: factor on the depth of the second pass, as from `scale_between`; 1 if None.
         frames: where the frames of the passes are.
 
@@ -65,6 +44,7 @@ def observe(
     waiting = depth1 if scale is None else frames.after(depth1, scale)  # another median
     median = median_over_frames(waiting, frames)[:, None, None, None]
     log_depth = jnp.log(jnp.maximum(depth1, _SMALLEST)) - jnp.log(jnp.maximum(median, _SMALLEST))
+    patch_size = depth1.shape[2] // passes.saliency.shape[2]
     features = [saliency, log_depth, jax.vmap(jax.vmap(lambda frame: edge_proximity(frame, patch_size)))(hard), dynamic]
     return Observations(
         depth1,

@@ -1,76 +1,61 @@
-"""The two passes and the methods assembled from them: the stages of 4DVGGT-D as pure functions (arXiv 2605.12027)."""
+"""The steps of the two passes: each a pure function of arrays, with static keywords (4DVGGT-D, arXiv 2605.12027)."""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtjax.cameras import Cameras
-from vggtjax.config import Gram, MotionConfig, Threshold, VGGTConfig, Witness
+from vggtjax.clips.still import same_picture
+from vggtjax.config import Gram, MotionConfig, Suppress, Threshold, VGGTConfig, Witness
 from vggtjax.errors import InputError
-from vggtjax.method.adjusted_cameras import adjusted_cameras
-from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
 from vggtjax.method.mask import dynamic_tokens, mine_mask
 from vggtjax.method.matched_mask import Mined, mine_matched_mask
 from vggtjax.method.matches import Matches
-from vggtjax.method.witnesses import Seen, Sometimes, Witnesses
-from vggtjax.network.backbone import encode, patch_grid
+from vggtjax.method.soft_mask import SoftMasking, soft_pixels
+from vggtjax.method.witnesses import Seen, Witnesses
+from vggtjax.network.backbone import patch_grid
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions, predict
-from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
-from vggtjax.options import CamerasFrom, Options, find_method
 
 _Value = TypeVar("_Value")
 
 
 class Passes(NamedTuple):
-    """Both passes over clips, and the mask between them. `second` is None without a second pass."""
+    """Both passes over clips, and the mask between them.
+
+    `second` is None without a second pass, and equal to `first` where nothing moves.
+    """
 
     first: Predictions
     second: Predictions | None
     saliency: Float[Array, "B S h w"]
-    dynamic_mask: Bool[Array, "B S H W"]
+    dynamic_mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"]
     motion: Float[Array, "B S h w"] | None = None  # as in `Mined`
     is_matched: Bool[Array, "B S"] | None = None  # as in `Mined`
-    matches: Matches | None = None  # of the first pass, where cameras are adjusted to them
-
-
-class Assembly(NamedTuple):
-    """A method's result: depth up to scale, its confidence, and the cameras."""
-
-    depth: Float[Array, "B S H W"]
-    confidence: Float[Array, "B S H W"]
-    cameras: Cameras
-
-    @property
-    def camera_from_world(self) -> Float[Array, "B S 3 4"]:
-        return self.cameras.camera_from_world
-
-    @property
-    def intrinsics(self) -> Float[Array, "B S 3 3"]:
-        return self.cameras.intrinsics
+    matches: Matches | None = None  # of the first pass, where it gathered them
+    patch_tokens: Float[Array, "B S P C"] | None = None  # of the backbone, which both passes share
 
 
 def first_pass(
     params: Params,
     clips: ClipBatch,
-    config: VGGTConfig,
+    query_points: Float[Array, "B Q 2"] | None = None,
+    exponents: Float[Array, " cues"] | None = None,
     *,
+    config: VGGTConfig,
     gram: Gram = "cosine",
     witness: Witness = "gram",
-    motion: MotionConfig | None = None,
-    exponents: Float[Array, " cues"] | None = None,
     outputs: tuple[str, ...] = ("camera", "depth"),
-    query_points: Float[Array, "B Q 2"] | None = None,
     compute: Compute = Compute(),
 ) -> tuple[Predictions, Seen]:
     """Run the plain pass and mine the motion saliency inside it; with `query_points`, track them too.
@@ -79,8 +64,7 @@ def first_pass(
     the `witness` "matches", what is seen has the matches too.
     """
     B, S = clips.images.shape[:2]
-    grid = patch_grid(clips.images, config)
-    witnesses = Witnesses(motion or config.motion, config.depth, grid, gram, witness, compute.frames)
+    witnesses = Witnesses(config.motion, config.depth, patch_grid(clips.images, config), gram, witness, compute.frames)
     predictions = predict(
         params,
         clips,
@@ -93,46 +77,9 @@ def first_pass(
     return predictions._replace(cue_sums=None), witnesses.seen(predictions.cue_sums, B, S, exponents)
 
 
-def either_pass(
-    params: Params,
-    clips: ClipBatch,
-    dynamic_mask: Bool[Array, "B S H W"],
-    is_first: Bool[Array, ""],
-    config: VGGTConfig,
-    *,
-    gram: Gram = "cosine",
-    witness: Witness = "gram",
-    suppression: Suppression = Suppression(),
-    outputs: tuple[str, ...] = ("camera", "depth"),
-    compute: Compute = Compute(),
-) -> tuple[Predictions, Seen]:
-    """Run the first pass or the second: one program serves both, and is compiled once.
-
-    Args:
-        params: the model's parameter tree.
-        clips: images, patch tokens and numbers of real frames.
-        dynamic_mask: dynamic pixels; none for the first pass.
-        is_first: whether this is the first pass, in which motion cues are added up. What the second pass sees is
-            meaningless.
-        config: the model's configuration.
-        gram: similarity of the motion cues.
-        witness: as for `first_pass`.
-        suppression: how keys of dynamic tokens are suppressed, and in which pairs; 0 pairs for the first pass.
-        outputs: what to predict, as for `forward`.
-        compute: as for `predict`.
-    """
-    B, S = clips.images.shape[:2]
-    witnesses = Witnesses(config.motion, config.depth, patch_grid(clips.images, config), gram, witness, compute.frames)
-    masking = dataclasses.replace(suppression, dynamic_tokens=dynamic_tokens(dynamic_mask, config.patch_size))
-    options = {"outputs": outputs, "suppression": masking, "compute": compute}
-    accumulator = Sometimes(witnesses.accumulator, is_first)
-    predictions = predict(params, clips, config, accumulator=accumulator, **options)
-    return predictions._replace(cue_sums=None), witnesses.seen(predictions.cue_sums, B, S)
-
-
 def mine(
     seen: Seen,
-    first: Predictions,
+    first: Predictions | None,
     clips: ClipBatch,
     *,
     clusters: int,
@@ -140,34 +87,61 @@ def mine(
     smooth_frames: int = 1,
     frames: Frames = Frames(),
 ) -> Mined:
-    """Return the dynamic pixels, by matches if there are any, and what matches say.
+    """Return the dynamic pixels, by matches if there are any, and what matches say; none where all frames are equal.
 
     Args:
         seen: what the first pass sees of motion.
-        first: its predictions, with camera and depth where there are matches.
+        first: its predictions, which are read where there are matches.
         clips: images and patch tokens.
-        clusters: as for `mine_mask`, and so are `threshold`, `smooth_frames` and `frames`.
+        clusters: as for `mine_mask`, and so is `smooth_frames`.
         threshold: of the Gram saliency.
         smooth_frames: of the Gram saliency.
-        frames: where the frames are.
+        frames: where the frames are; those after `frames.count` are not read and have no dynamic pixels.
     """
-    images = clips.images
+    S = clips.images.shape[1]
+    seen, first, clips = frames.cut((seen, first, clips._replace(frame_count=None)))
+    images, size = clips.images, (clips.images.shape[2], clips.images.shape[3])
     how = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames, "frames": frames}
-    mask = mine_mask(seen.saliency, _present(clips.patch_tokens), (images.shape[2], images.shape[3]), **how)
-    if seen.matches is None:
-        return Mined(mask)
-    depth, pose_encoding = _present(first.depth), _present(first.pose_encoding)
-    return mine_matched_mask(seen.matches, mask, seen.saliency, images, depth, pose_encoding, frames=frames)
+    mined = Mined(mine_mask(seen.saliency, present(clips.patch_tokens), size, **how))
+    if seen.matches is not None:
+        first = present(first)
+        of_first = (present(first.depth), present(first.pose_encoding))
+        mined = mine_matched_mask(seen.matches, mined.dynamic_mask, seen.saliency, images, *of_first, frames=frames)
+    images = frames.after(images, mined)  # communications come one after another
+    moves = ~are_equal(images, frames)[:, None, None, None]
+    return frames.pad(mined._replace(dynamic_mask=mined.dynamic_mask & moves), S)
+
+
+def mine_softly(
+    saliency: Float[Array, "B S h w"],
+    images: Float[Array, "B S H W 3"],
+    masking: SoftMasking,
+    *,
+    threshold: Threshold,
+) -> Float[Array, "B S H W"]:
+    """Return the dynamic share of every pixel by the Gram saliency, with gradients; 0 where all frames are equal."""
+    shares = soft_pixels(saliency, masking, size=(images.shape[2], images.shape[3]), threshold=threshold)
+    return jnp.where(are_equal(images)[:, None, None, None], 0, shares)
+
+
+def are_equal(images: Float[Array, "B S H W 3"], frames: Frames = Frames()) -> Bool[Array, " B"]:
+    """Return the clips whose frames are all one picture, up to the noise of a codec."""
+    differ = ~same_picture(images, frames.of_first(images[:, :1]))
+    if (is_counted := frames.are_counted(images.shape[1])) is not None:
+        differ = differ & is_counted[None]
+    return ~frames.any(differ.any(axis=1))
 
 
 def second_pass(
     params: Params,
     clips: ClipBatch,
     dynamic_mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"],
-    config: VGGTConfig,
-    *,
     plain: Predictions | None = None,
-    suppression: Suppression = Suppression(),
+    mask_pairs: int | Int[Array, ""] | None = None,
+    strength: Float[Array, " depth"] | None = None,
+    *,
+    config: VGGTConfig,
+    suppress: Suppress = "zero",
     outputs: tuple[str, ...] = ("camera", "depth"),
     compute: Compute = Compute(),
 ) -> Predictions:
@@ -180,16 +154,17 @@ def second_pass(
         params: the model's parameter tree.
         clips: images, patch tokens and numbers of real frames.
         dynamic_mask: dynamic pixels, or their shares in [0, 1]. They become the dynamic tokens of the suppression.
-        config: the model's configuration.
         plain: predictions of the first pass.
-        suppression: how keys are suppressed, and in which pairs.
+        mask_pairs, strength: in which pairs keys are suppressed, or how much in each; see `Suppression`.
+        config: the model's configuration.
+        suppress: how keys are suppressed.
         outputs: what to predict, as for `forward`.
         compute: as for `predict`.
     """
 
     def masked() -> Predictions:
         tokens = dynamic_tokens(dynamic_mask, config.patch_size)
-        masking = dataclasses.replace(suppression, dynamic_tokens=tokens)
+        masking = Suppression(tokens, suppress, mask_pairs, strength)
         return predict(params, clips, config, suppression=masking, outputs=outputs, compute=compute)
 
     unchanged = None if plain is None else only(plain, outputs)
@@ -209,9 +184,9 @@ def track_from(
     params: Params,
     clips: ClipBatch,
     query_points: Float[Array, "B Q 2"],
-    frame: Int[Array, ""],
-    config: VGGTConfig,
+    frame: Int[Array, ""] | Int[np.ndarray, ""],
     *,
+    config: VGGTConfig,
     compute: Compute = Compute(),
 ) -> Tracks:
     """Track points of any frame: the clip is rolled so that the frame comes first, and its tracks are rolled back.
@@ -228,7 +203,7 @@ def track_from(
     rolled = jax.tree.map(lambda x: frames.roll(x, -frame), clips)
     predictions = predict(params, rolled, config, outputs=("tracks",), query_points=query_points, compute=compute)
     tracks = (predictions.tracks, predictions.track_visibility, predictions.track_confidence)
-    return Tracks(*(frames.roll(_present(value), frame) for value in tracks))
+    return Tracks(*(frames.roll(present(value), frame) for value in tracks))
 
 
 def motion_saliency(
@@ -248,122 +223,12 @@ def motion_saliency(
         gram: "cosine" (rows of q and k normalised per head, 4DVGGT-D) or "dot" (VGGT4D).
         motion: the table of cues; the configuration's own if None.
     """
-    return first_pass(params, ClipBatch(images), config, gram=gram, motion=motion, outputs=())[1].saliency
+    config = config if motion is None else dataclasses.replace(config, motion=motion)
+    return first_pass(params, ClipBatch(images), config=config, gram=gram, outputs=())[1].saliency
 
 
-def run_passes(
-    params: Params,
-    images: Float[Array, "B S H W 3"],
-    config: VGGTConfig,
-    *,
-    options: Options = Options(),
-    motion: MotionConfig | None = None,
-    clusters: int | None = None,
-    second: tuple[str, ...] | None = None,
-    **changes: Any,
-) -> Passes:
-    """Run both passes once with shared backbone features, for `assemble`.
-
-    The passes of the default options serve all methods of `LADDER`; "vggt4d" and "4dvggt-m" need their own.
-
-    Args:
-        params: the model's parameter tree.
-        images: RGB in [0, 1]; any batch and any number of frames.
-        config: the model's configuration.
-        options: how motion is mined and keys are suppressed; masks are not refined.
-        motion: the table of cues, with the number of pairs and the threshold unless the options have one; the
-            configuration's own if None.
-        clusters: number of clusters that the saliency is averaged in, 0 for none; the method's own if None.
-        second: outputs of the second pass, () for no second pass; the outputs that the method needs if None.
-        changes: fields of `options` by name, such as `gram="dot"`; `mask_pairs` can be traced.
-    """
-    given: Any = changes.pop("mask_pairs", options.mask_pairs)  # not in the options: the number can be traced
-    recommended = motion or config.motion
-    mask_pairs = recommended.masked_pairs(given)
-    options = options.changed(**changes)
-    method, compute = options.row, Compute.of(options)
-    if second is None:
-        second = method.second_outputs(options.align_scale) if method.needs_second_pass else ()
-    patch_tokens = encode(params, images, config, compute_dtype=compute.compute_dtype)
-    clips = ClipBatch(images, patch_tokens)
-    mining = {"gram": method.gram, "witness": options.witness, "motion": motion, "compute": compute}
-    first, seen = first_pass(params, clips, config, **mining)
-    matches = seen.matches if options.cameras == "adjusted" else None
-    mined = mine(
-        seen if method.mask == "matches" else Seen(seen.saliency),
-        first,
-        clips,
-        clusters=method.clusters if clusters is None else clusters,
-        threshold=recommended.cut_by(options.threshold, method.threshold),
-        smooth_frames=options.smooth_frames,
-    )
-    if not second:
-        return Passes(first, None, seen.saliency, *mined, matches)
-    suppression = Suppression(suppress=method.suppress, mask_pairs=mask_pairs)
-    masking = {"plain": first, "suppression": suppression, "outputs": second, "compute": compute}
-    second_one = second_pass(params, clips, mined.dynamic_mask, config, **masking)
-    return Passes(first, second_one, seen.saliency, *mined, matches)
-
-
-def assemble(
-    passes: Passes,
-    method: str = "4dvggt-d",
-    *,
-    align_scale: bool = False,
-    cameras: CamerasFrom = "predicted",
-    frames: Frames = Frames(),
-) -> Assembly:
-    """Return a method's depth, confidence and cameras from two passes; the methods of `LADDER` share one run of them.
-
-    Args:
-        passes: of `run_passes` with this method's options; passes of another method give a wrong result, not an error.
-        method: a name of `METHODS`.
-        align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
-            pixels before it is used. Not in the paper.
-        cameras: adjust the cameras to the matches of static pixels, which the passes must have. Not in the paper.
-        frames: where the frames of the passes are.
-    """
-    row = find_method(method)
-    if passes.second is None and row.needs_second_pass:
-        raise InputError(f"method {method!r} needs the second pass, which was not run")
-    first, second = passes.first, passes.second or passes.first
-    scale = jnp.ones(passes.dynamic_mask.shape[0])
-    if align_scale and passes.second is not None:
-        scale = scale_between(_present(first.depth), _present(second.depth), passes.dynamic_mask, frames)
-
-    def of_first() -> tuple[Array, Array]:
-        return _present(first.depth), _present(first.depth_confidence)
-
-    def of_second() -> tuple[Array, Array]:
-        return _present(second.depth) * scale[:, None, None, None], _present(second.depth_confidence)
-
-    depth, confidence = {
-        "first": of_first,
-        "second": of_second,
-        "replaced": lambda: replace_depth(*of_first(), *of_second(), passes.dynamic_mask),
-        "fused": lambda: fuse_depth(*of_first(), *of_second(), passes.dynamic_mask),
-    }[row.depth]()
-    size = (depth.shape[2], depth.shape[3])
-    extrinsics, intrinsics = decode_pose(_present(second.pose_encoding), size)
-    of_pass = {
-        "first": Cameras(*decode_pose(_present(first.pose_encoding), size)),
-        "second": Cameras(extrinsics.at[..., 3].multiply(scale[:, None, None]), intrinsics),
-    }
-    chosen = Cameras(of_pass[row.extrinsics].camera_from_world, of_pass[row.intrinsics].intrinsics)
-    assembly = Assembly(depth, confidence, chosen)
-    return assembly if cameras == "predicted" else with_adjusted_cameras(assembly, passes, frames)
-
-
-def with_adjusted_cameras(assembly: Assembly, passes: Passes, frames: Frames = Frames()) -> Assembly:
-    """Return the assembly with cameras for which static pixels are seen where they are matched. Not in the papers."""
-    if passes.matches is None:
-        raise InputError("the passes have no matches to adjust cameras to; run them with cameras='adjusted'")
-    grid = (passes.saliency.shape[2], passes.saliency.shape[3])
-    given = (assembly.cameras, assembly.depth, passes.matches, passes.dynamic_mask, grid)
-    return assembly._replace(cameras=adjusted_cameras(*given, frames=frames))
-
-
-def _present(value: _Value | None) -> _Value:
+def present(value: _Value | None) -> _Value:
+    """Return what a pass predicted. Raises InputError where it did not."""
     if value is None:
         raise InputError("the passes lack depth or cameras; run them with outputs=('camera', 'depth')")
     return value

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
 from vggtjax.config import Gram, MotionConfig, Witness
 from vggtjax.method.cues import GramCues
@@ -52,23 +52,3 @@ class Witnesses:
     @property
     def _cues(self) -> GramCues:
         return GramCues(self.motion, self.depth, self.gram, self.frames)
-
-
-@dataclass(frozen=True)
-class Sometimes:
-    """An `Accumulator` that reads pairs in some calls of a program only."""
-
-    part: Accumulator
-    is_read: Bool[Array, ""]
-
-    def layer_counts(self) -> Int[Array, "depth ..."]:
-        """Return the counts of the part, or 0."""
-        return self.is_read * jnp.asarray(self.part.layer_counts())
-
-    def zeros(self, B: int, S: int, P: int) -> Any:
-        """Return empty sums of the part."""
-        return self.part.zeros(B, S, P)
-
-    def add(self, *arguments: Any) -> Any:
-        """Return the sums of the part with one pair of blocks added."""
-        return self.part.add(*arguments)

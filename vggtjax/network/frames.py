@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ WHOLE = PartitionSpec()  # on every device
 BY_FRAME = PartitionSpec(None, AXIS)  # arrays [B, S, ...]
 
 _Tree = TypeVar("_Tree")
+_Parameters = ParamSpec("_Parameters")
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Frames:
     Attributes:
         mesh: devices along an axis named "frames"; None for frames that are all here.
         count: frames of each clip on all devices together; the frames after them make the shares equal, and do not
-            change them. None: all. Read only with a mesh.
+            change them. None: all. Without a mesh, only `cut` and `pad` read it.
     """
 
     mesh: Mesh | None = None
@@ -41,20 +42,13 @@ class Frames:
         """The number of devices along the axis of frames."""
         return 1 if self.mesh is None else self.mesh.shape[AXIS]
 
-    def on_devices(self, function: Callable[..., _Tree], *specs: Any) -> Callable[..., _Tree]:
+    def on_devices(self, function: Callable[_Parameters, _Tree], *specs: Any) -> Callable[_Parameters, _Tree]:
         """Return a function of whole arrays [B, S, ...] that runs `function` on the share of each device.
 
-        `specs` say where the arguments are, WHOLE or BY_FRAME; the outputs are by frame. The gradient by an argument
-        that is WHOLE is summed over the devices at the end, not in every loop and conditional that reads it.
+        `specs` say where its positional arguments are, WHOLE or BY_FRAME; the outputs are by frame. The gradient by an
+        argument that is WHOLE is summed over the devices at the end, not in every loop and conditional that reads it.
         """
-        if self.mesh is None:
-            return function
-
-        def share(*arguments: Any) -> _Tree:
-            pairs = zip(specs, arguments, strict=True)
-            return function(*(self.varying(x) if spec == WHOLE else x for spec, x in pairs))
-
-        return jax.shard_map(share, mesh=self.mesh, in_specs=specs, out_specs=BY_FRAME)
+        return function if self.mesh is None else OnDevices(function, self.mesh, specs)
 
     def sharding(self, spec: PartitionSpec) -> NamedSharding | None:
         """Return where an array with this spec is; None without a mesh."""
@@ -91,6 +85,19 @@ class Frames:
         real = self.are_real(None, 1, S)
         return None if real is None else real[0]
 
+    def cut(self, tree: _Tree) -> _Tree:
+        """Return arrays [B, S, ...] without the frames after `count`, where all frames are here."""
+        is_whole = self.mesh is not None or self.count is None
+        return tree if is_whole else jax.tree.map(lambda x: x[:, : self.count], tree)
+
+    def pad(self, tree: _Tree, S: int) -> _Tree:
+        """Return arrays that `cut` made shorter with zeros after their frames, S in all."""
+
+        def padded(x: Array) -> Array:
+            return jnp.pad(x, ((0, 0), (0, S - x.shape[1]), *((0, 0),) * (x.ndim - 2)))
+
+        return tree if self.mesh is not None or self.count is None else jax.tree.map(padded, tree)
+
     def gather(self, x: Array, axis: int = 1) -> Array:
         """Return the frames of all devices, along `axis`."""
         return x if self.mesh is None else jax.lax.all_gather(x, AXIS, axis=axis, tiled=True)
@@ -110,7 +117,7 @@ class Frames:
         is_here = ((here >= 0) & (here < len(x))).reshape(-1, *(1,) * (x.ndim - 1))
         return self.sum(jnp.where(is_here, found, 0))
 
-    def roll(self, x: Array, shift: Int[Array, ""]) -> Array:
+    def roll(self, x: Array, shift: Int[Array, ""] | Int[np.ndarray, ""]) -> Array:
         """Return [B, S, ...] rolled by `shift` frames around the counted frames of each clip."""
         if self.mesh is None:
             return jnp.roll(x, shift, axis=1)
@@ -183,6 +190,27 @@ class Frames:
     def varying(self, x: _Tree) -> _Tree:
         """Return arrays that are equal on all devices with the type of arrays that differ, for the start of a loop."""
         return x if self.mesh is None else jax.tree.map(lambda leaf: jax.lax.pcast(leaf, AXIS, to="varying"), x)
+
+
+@dataclass(frozen=True)
+class OnDevices(Generic[_Parameters, _Tree]):
+    """A function that runs on the share of each device; equal ones share compiled programs."""
+
+    function: Callable[_Parameters, _Tree]
+    mesh: Mesh
+    specs: tuple[Any, ...]
+
+    def __call__(self, *arguments: _Parameters.args, **options: _Parameters.kwargs) -> _Tree:
+        """Return what the function makes of the shares, by frame."""
+
+        function: Callable[..., _Tree] = self.function
+
+        def share(*arguments: Any) -> _Tree:
+            pairs = zip(self.specs, arguments, strict=True)
+            varying = Frames(self.mesh).varying
+            return function(*(varying(x) if spec == WHOLE else x for spec, x in pairs), **options)
+
+        return jax.shard_map(share, mesh=self.mesh, in_specs=self.specs, out_specs=BY_FRAME)(*arguments)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -21,13 +21,13 @@ from jax import export
 
 from vggtjax.checkpoint import Model, check_finite
 from vggtjax.errors import InputError, OutputError, check_choice, whole_number
-from vggtjax.method.fusion_family import FusionParams
+from vggtjax.method.algorithm import run_method
+from vggtjax.method.assembly import FusionRule
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.network.model import HEADS
+from vggtjax.network.precision import Compute
 from vggtjax.options import Options
 from vggtjax.pipeline import serve
-from vggtjax.pipeline.stage_runners import inline
-from vggtjax.pipeline.stages import ClipInputs, Stages, run_stages
 from vggtjax.progress import OnStage, Progress, no_progress, no_stage
 from vggtjax.results.report import versions
 from vggtjax.storage.tensor_file import Spec, write_tensors
@@ -83,7 +83,7 @@ def write_artefact(
     width: int,
     platforms: Sequence[str] = ("cpu", "cuda"),
     options: Options = Options(),
-    fusion: FusionParams | None = None,
+    fusion: FusionRule | None = None,
     on_stage: OnStage | None = None,
     **changes: Any,
 ) -> Path:
@@ -153,17 +153,16 @@ def _lowered(
     shape: tuple[int, int, int],
     platforms: Sequence[str],
     options: Options,
-    fusion: FusionParams | None,
+    fusion: FusionRule | None,
 ) -> export.Exported:
-    frames, height, width = shape
     on_accelerator = _on_accelerator(platforms)
-    stages = Stages(model.config, options, frames, (height, width), run=inline, on_accelerator=on_accelerator)
-
+    compute = Compute.of(options, on_accelerator=on_accelerator)
     names = list(weights)  # in the order of the structure; jax sorts those of a dictionary
 
     def reconstruction(weights, images):
         params = jax.tree.unflatten(structure, [weights[name] for name in names])
-        passes, assembly, _ = run_stages(stages, params, ClipInputs(images[None]), fusion=fusion)
+        made = run_method(params, images[None], model.config, options, fusion=fusion, compute=compute)
+        passes, assembly, _ = made
         outputs = (assembly.depth, assembly.confidence, *assembly.cameras, passes.dynamic_mask, passes.saliency)
         return {name: output[0] for name, output in zip(_ABOUT, outputs, strict=True)}
 
@@ -191,7 +190,7 @@ def _write_weights(path: Path, weights: dict[str, Any], progress: Progress) -> N
     write_tensors(path, specs, pieces)
 
 
-def _manifest(model: Model, exported: export.Exported, options: Options, fusion: FusionParams | None) -> dict[str, Any]:
+def _manifest(model: Model, exported: export.Exported, options: Options, fusion: FusionRule | None) -> dict[str, Any]:
     (_, images), _ = jax.tree.unflatten(exported.in_tree, exported.in_avals)
     outputs = jax.tree.unflatten(exported.out_tree, exported.out_avals)
     return {

@@ -18,7 +18,7 @@ from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import VggtjaxError
 from vggtjax.known.given import check_readable
 from vggtjax.known.options import KnownGeometry
-from vggtjax.method.fusion_family import FusionParams
+from vggtjax.method.assembly import FusionRule
 from vggtjax.method.fusion_file import check_fuses
 from vggtjax.options import Options
 from vggtjax.pipeline.clip_work import ClipWork, LongClip
@@ -43,7 +43,7 @@ def reconstruct_many(
     framing: Framing | None = None,
     sampling: Sampling | Mapping[str, Any] | None = None,
     saving: Saving | Mapping[str, Any] | None = None,
-    fusion: FusionParams | None = None,
+    fusion: FusionRule | None = None,
     known: KnownGeometry | None = None,
     pad_frames: bool = False,
     shard: str | None = None,

@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from vggtjax.errors import InputError, whole_number
 from vggtjax.network.frames import AXIS, BY_FRAME, WHOLE, Frames
-from vggtjax.network.layers import Params
+from vggtjax.pipeline.lengths import shared_length
 
 
 def frames_mesh(devices: int) -> Mesh | None:
@@ -29,23 +29,15 @@ def frames_mesh(devices: int) -> Mesh | None:
     return None if count == 1 else Mesh(np.array(present[:count]), (AXIS,))
 
 
-def shared_length(frames: int, mesh: Mesh | None) -> int:
-    """Return the number of frames rounded up, so that every device has a share of equal length."""
-    devices = Frames(mesh).devices
-    return -(-frames // devices) * devices
-
-
-def placed(params: Params, images: Float[Array, "B S H W 3"], mesh: Mesh) -> tuple[Params, Float[Array, "B F H W 3"]]:
-    """Return parameters on every device, and images shared by the devices, with black frames that make shares equal.
+def by_frame_padded(x: Array, mesh: Mesh) -> Array:
+    """Return an array [B, S, ...] shared by the devices, with zeros after its frames that make shares equal.
 
     Raises InputError for a mesh without an axis of frames.
     """
     if AXIS not in mesh.axis_names:
         raise InputError(f"mesh has the axes {mesh.axis_names}; expected one named {AXIS!r}, as frames_mesh makes it")
-    padding = shared_length(images.shape[1], mesh) - images.shape[1]
-    if padding:
-        images = jnp.pad(images, ((0, 0), (0, padding), (0, 0), (0, 0), (0, 0)))
-    return whole_on(params, mesh), by_frame_on(images, mesh)
+    padding = shared_length(x.shape[1], mesh) - x.shape[1]
+    return by_frame_on(jnp.pad(x, ((0, 0), (0, padding), *((0, 0),) * (x.ndim - 2))) if padding else x, mesh)
 
 
 def whole_on(tree: Any, mesh: Mesh | None) -> Any:
@@ -58,9 +50,9 @@ def by_frame_on(tree: Any, mesh: Mesh | None) -> Any:
     return jax.device_put(tree, Frames(mesh).sharding(BY_FRAME))
 
 
-def on_host(x: Array) -> np.ndarray:
+def on_host(x: Array | np.ndarray) -> np.ndarray:
     """Return an array of all devices, of those of other processes too."""
-    if not x.is_fully_addressable:
+    if isinstance(x, Array) and not x.is_fully_addressable:
         from jax.experimental import multihost_utils
 
         return np.asarray(multihost_utils.process_allgather(x, tiled=True))

@@ -15,12 +15,16 @@ from jaxtyping import Array, Float
 
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.method.passes import Assembly, Passes
+from vggtjax.method.algorithm import Clips, Masks, run_method
+from vggtjax.method.assembly import Assembly, FusionRule, as_tree
+from vggtjax.method.fusion_file import check_fuses
+from vggtjax.method.passes import Passes
+from vggtjax.method.soft_mask import SoftMasking
+from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
+from vggtjax.network.precision import Compute
 from vggtjax.options import Options
-from vggtjax.pipeline.devices import placed
-from vggtjax.pipeline.stage_runners import inline
-from vggtjax.pipeline.stages import ClipInputs, Stages, run_stages
+from vggtjax.pipeline.devices import by_frame_padded, whole_on
 
 _SLACK = 1e-3  # largest distance of a value from [0, 1] that counts as rounding
 
@@ -31,11 +35,13 @@ def infer(
     config: VGGTConfig,
     *,
     options: Options = Options(),
+    masks: Masks = None,
+    fusion: FusionRule | None = None,
     motion: MotionConfig | None = None,
     mesh: Mesh | None = None,
     **changes: Any,
 ) -> tuple[Assembly, Passes]:
-    """Run a method on a batch of clips as one compiled function.
+    """Run a method on a batch of clips as one compiled function: `run_method` under jit.
 
     Args:
         params: the model's parameter tree.
@@ -43,23 +49,30 @@ def infer(
             call is traced by jit.
         config: the model's configuration.
         options: how the clips are reconstructed; masks are not refined.
+        masks: what moves in each clip, as for `run_method`; mined if None.
+        fusion: a rule of fusion, as for `assemble`. A function is compiled anew each time that another one is given:
+            bind its weights by `jax.tree_util.Partial(rule, weights)`.
         motion: the table of motion cues; the configuration's own if None.
         mesh: devices along an axis "frames" that share the frames (`frames_mesh`); None for one device.
         changes: fields of `options` by name, such as `method="vggt4d"`.
 
     Returns:
-        The method's depth, confidence and cameras, and the passes they were made of. The mask of a clip whose frames
-        are all one picture is empty.
+        The method's depth, confidence and cameras, and the passes they were made of. The mined mask of a clip whose
+        frames are all one picture is empty.
     """
     _check_range(images)
     config = config if motion is None else dataclasses.replace(config, motion=motion)
     # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.
     options = dataclasses.replace(options.changed(**changes).resolved(config.motion), refine_mask=False)
-    if mesh is None:
-        return _infer(params, images, config, options, images.shape[1], None)
-    frames = images.shape[1]
-    params, images = placed(params, images, mesh)
-    outputs = _infer(params, images, config, options, frames, mesh)
+    check_fuses(fusion, options.method)
+    frames, rule = images.shape[1], as_tree(fusion)
+    if mesh is not None:
+        if isinstance(masks, SoftMasking):
+            raise InputError("masks are soft and mesh is given; soft masks take one device: leave mesh out")
+        masks = masks if masks is None or masks is False else by_frame_padded(masks, mesh)
+        params, images, rule = whole_on(params, mesh), by_frame_padded(images, mesh), whole_on(rule, mesh)
+    given, moves = (None, False) if masks is False else (masks, True)
+    outputs = _infer(params, images, given, rule, config, options, frames, mesh, moves)
     return outputs if images.shape[1] == frames else jax.tree.map(lambda x: x[:, :frames], outputs)
 
 
@@ -68,15 +81,26 @@ def _check_range(images: Float[Array, "B S H W 3"]) -> None:
     if isinstance(images, Tracer) or not images.size or not jnp.issubdtype(images.dtype, jnp.floating):
         return
     library = np if isinstance(images, np.ndarray) else jnp
-    low, high = float(library.min(images)), float(library.max(images))
+    with jax.ensure_compile_time_eval():  # also where a caller's jit has closed over them
+        low, high = float(library.min(images)), float(library.max(images))
     if not (low >= -_SLACK and high <= 1 + _SLACK):  # so NaN, too, is refused
         raise InputError(f"images have values from {low:g} to {high:g}; expected RGB in [0, 1]: divide bytes by 255")
 
 
-@partial(jax.jit, static_argnames=("config", "options", "frames", "mesh"))
+@partial(jax.jit, static_argnames=("config", "options", "frames", "mesh", "moves"))
 def _infer(
-    params: Params, images: Array, config: VGGTConfig, options: Options, frames: int, mesh: Mesh | None
+    params: Params,
+    images: Array,
+    masks: Masks,
+    fusion: FusionRule | None,
+    config: VGGTConfig,
+    options: Options,
+    frames: int,
+    mesh: Mesh | None,
+    moves: bool,
 ) -> tuple[Assembly, Passes]:
-    stages = Stages(config, options, frames, (images.shape[2], images.shape[3]), run=inline, mesh=mesh)
-    passes, assembly, _ = run_stages(stages, params, ClipInputs(images))
-    return assembly, passes
+    compute = Compute.of(options, Frames(mesh, None if mesh is None else frames))
+    how = {"masks": masks if moves else False, "fusion": fusion, "compute": compute}
+    passes, assembly, _ = run_method(params, Clips(images, frames=frames), config, options, **how)
+    matches = passes.matches if options.cameras == "adjusted" else None
+    return assembly, passes._replace(matches=matches, patch_tokens=None)

@@ -23,18 +23,20 @@ from vggtjax.errors import InputError, ResultError, device_memory_errors
 from vggtjax.known.apply import apply_known, scaled
 from vggtjax.known.given import Given, check_readable, read_known
 from vggtjax.known.options import KnownGeometry
-from vggtjax.method.fusion_family import FusionParams
+from vggtjax.method.algorithm import Clips, run_method
+from vggtjax.method.assembly import Assembly, FusionRule, as_tree
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.matches import come_back, frame_pairs
-from vggtjax.method.passes import Assembly, Passes
+from vggtjax.method.passes import Passes
 from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
 from vggtjax.network.model import Predictions
+from vggtjax.network.precision import Compute
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
-from vggtjax.pipeline.devices import by_frame_on, frames_mesh, on_host, shared_length, whole_on
-from vggtjax.pipeline.stage_runners import Compile, Execute, StageMemory
-from vggtjax.pipeline.stages import ClipInputs, Stages, padded_frames, run_stages
+from vggtjax.pipeline.devices import by_frame_on, frames_mesh, on_host, whole_on
+from vggtjax.pipeline.lengths import padded_frames, shared_length
+from vggtjax.pipeline.steps import Compile, Execute, StageMemory
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.refinement.refine import check_refinement, refine_cameras
 from vggtjax.results.not_finite import warn_of_not_finite
@@ -57,7 +59,7 @@ def reconstruct(
     size: int | None = None,
     masks: Bool[np.ndarray, "S h w"] | str | Path | None = None,
     tracks: Queries | None = None,
-    fusion: FusionParams | None = None,
+    fusion: FusionRule | None = None,
     known: KnownGeometry | None = None,
     pad_frames: bool = False,
     devices: int = 1,
@@ -77,7 +79,8 @@ def reconstruct(
             fitted, or of the source's pictures, or a folder of pictures. If no pixel moves, the second pass is not run;
             so it is, without masks, where all frames are one picture.
         tracks: points to follow, in pixels of the frames; points of a later frame than the first cost one more pass.
-        fusion: a fitted rule (`load_fusion`), whose confidence is the fused precision; None: the paper's rule.
+        fusion: a fitted rule (`load_fusion`) or a function, as for `assemble`, whose precision is the confidence; None:
+            the paper's rule.
         known: intrinsics, poses or lengths that are known, and pixels without depth: the prediction is brought to them.
         pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs; the
             result is the same to rounding. Not for clips with tracks.
@@ -120,29 +123,40 @@ def reconstruct(
     geometry = _given_geometry(known, clip) if known else None
     frames, height, width = clip.images.shape[:3]
     length = padded_frames(frames, model.config.motion.offsets) if pad_frames and tracks is None else frames
-    stages = Stages(model.config, options, frames, (height, width), mesh=mesh, padded=length)
     padding = shared_length(length, mesh) - frames
 
     def padded(x: np.ndarray) -> Array:
         return by_frame_on(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None], mesh)
 
-    inputs = ClipInputs(
+    inputs = Clips(
         images=padded(clip.images),
         frame_count=whole_on(np.array([frames], np.int32), mesh) if length > frames else None,
-        dynamic_mask=None if given is None else padded(given),
-        moves=given is None or bool(given.any()),
         query_points={} if tracks is None else whole_on(_points_by_frame(tracks), mesh),
+        frames=frames,
     )
-    params, rule = (model.params, fusion) if mesh is None else whole_on((model.params, fusion), mesh)
-    run = partial(run_stages, params=params, inputs=inputs, fusion=rule, all_outputs=keep_passes)
+    params, rule = model.params, as_tree(fusion)
+    if mesh is not None:
+        params, rule = whole_on((params, rule), mesh)
+    run = partial(
+        run_method,
+        params,
+        inputs,
+        model.config,
+        options,
+        masks=None if given is None else padded(given) if given.any() else False,
+        fusion=rule,
+        both_outputs=keep_passes,
+        compute=Compute.of(options, Frames(mesh, None if mesh is None else length)),
+    )
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
         started = time.perf_counter()
         with on_stage("compile programs") as progress:
             compiler = Compile()
-            run(dataclasses.replace(stages, run=compiler))
+            run(step=compiler)
             compiler.wait(progress)
         say_how_to_keep(time.perf_counter() - started)
-        outputs = run(dataclasses.replace(stages, run=Execute(on_stage)))
+        outputs = run(step=Execute(on_stage))
+    outputs = outputs._replace(passes=outputs.passes._replace(patch_tokens=None))
     passes, assembly, by_frame = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
     motion = None
     if passes.motion is not None and passes.is_matched is not None:
@@ -159,7 +173,7 @@ def reconstruct(
             method=options.method,
             model_name=model.name,
             settings=_settings(model, clip, options, mask_source, fusion) | _camera_source(options, passes),
-            passes=passes if keep_passes else None,
+            passes=_kept(passes, options) if keep_passes else None,
         )
     except ResultError:
         check_finite(model)  # they may be the reason
@@ -204,24 +218,28 @@ def compile_ahead(
             f"{frames} frames of {width} x {height} pixels; expected at least one frame, with sides that are multiples "
             f"of the patch size {patch}"
         )
-    options, mesh = options.changed(**changes), frames_mesh(devices)
+    options, mesh = options.changed(**changes).resolved(model.config.motion), frames_mesh(devices)
     length = padded_frames(frames, model.config.motion.offsets) if pad_frames else frames
-    total, alone = shared_length(length, mesh), frames == 1  # in a single frame nothing moves
     by_frame, whole = (Frames(mesh).sharding(spec) for spec in (BY_FRAME, WHOLE))
-    inputs = ClipInputs(
-        images=jax.ShapeDtypeStruct((1, total, height, width, 3), jnp.float32, sharding=by_frame),  # type: ignore
+    shape = (1, shared_length(length, mesh), height, width, 3)
+    clips = Clips(
+        images=jax.ShapeDtypeStruct(shape, jnp.float32, sharding=by_frame),  # type: ignore
         frame_count=None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32, sharding=whole),  # type: ignore
-        dynamic_mask=jax.ShapeDtypeStruct((1, total, height, width), bool, sharding=by_frame) if alone else None,  # type: ignore
-        moves=not alone,
+        frames=frames,
     )
     params = model.params
     if mesh is not None:
         params = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole), params)
     compiler = Compile()
-    stages = Stages(model.config, options, frames, (height, width), run=compiler, mesh=mesh, padded=length)
+    how = {"compute": Compute.of(options, Frames(mesh, None if mesh is None else length)), "step": compiler}
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
-        run_stages(stages, params, inputs, all_outputs=keep_passes)
+        run_method(params, clips, model.config, options, both_outputs=keep_passes, **how)
         return compiler.wait()
+
+
+def _kept(passes: Passes, options: Options) -> Passes:
+    """Return passes without matches that nothing reads any more."""
+    return passes if options.cameras == "adjusted" else passes._replace(matches=None)
 
 
 def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:
@@ -303,7 +321,7 @@ def _clip_fields(clip: Clip) -> dict[str, Any]:
 
 
 def _settings(
-    model: Model, clip: Clip, options: Options, mask_source: str, fusion: FusionParams | None
+    model: Model, clip: Clip, options: Options, mask_source: str, fusion: FusionRule | None
 ) -> dict[str, Any]:
     """Return the settings that a result depends on besides the method, as JSON values."""
     settings = {name: value for name, value in options.to_json().items() if name != "method"}

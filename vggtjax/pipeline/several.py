@@ -11,11 +11,11 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
-from vggtjax.method.fusion_family import FusionParams
+from vggtjax.method.assembly import FusionRule, as_tree, assemble
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
 from vggtjax.options import Options
 from vggtjax.pipeline.run import assembled_fields, reconstruct, refined
-from vggtjax.pipeline.stages import Stages
+from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, no_stage
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
@@ -28,7 +28,7 @@ def reconstruct_methods(
     *,
     options: Options = Options(),
     size: int | None = None,
-    fusion: FusionParams | None = None,
+    fusion: FusionRule | None = None,
     on_stage: OnStage | None = None,
     **changes: Any,
 ) -> dict[str, Reconstruction]:
@@ -54,7 +54,7 @@ def reconstruct_methods(
         shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(refine_mask=False)
         result = reconstruct(model, clip, options=shared, size=size, keep_passes=True, on_stage=on_stage)
         for each in group:
-            results[each.method] = _as_method(result, model, each, fusion, on_stage or no_stage)
+            results[each.method] = _as_method(result, each, fusion, on_stage or no_stage)
     return {name: results[name] for name in methods}
 
 
@@ -68,13 +68,13 @@ def groups_of_methods(methods: Sequence[str], options: Options, motion: MotionCo
 
 
 def _as_method(
-    result: Reconstruction, model: Model, options: Options, fusion: FusionParams | None, on_stage: OnStage
+    result: Reconstruction, options: Options, fusion: FusionRule | None, on_stage: OnStage
 ) -> Reconstruction:
     """Return what another method makes of the passes that a result keeps."""
     method, passes = options.row, result.passes
-    frames, height, width = result.depth.shape
     fusion = fusion if method.depth == "fused" else None
-    assembly = Stages(model.config, options, frames, (height, width)).assemble(passes, fusion)
+    how = {name: getattr(options, name) for name in ("method", "align_scale", "cameras")}
+    assembly = Execute()("assemble", assemble)(passes, as_tree(fusion), **how)
     settings = result.settings | {"refine_mask": method.refine}
     with warnings.catch_warnings():
         if result.method == options.method:  # the warning about clamped cameras has been given already

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from functools import cache, cached_property, partial
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -39,45 +39,38 @@ _OPTIONS_ON_CPU = {"xla_backend_optimization_level": 1}
 
 
 class Program:
-    """A function under `jax.jit` whose lowered form is kept on disk if compiled programs are."""
+    """A function under `jax.jit` whose lowered form is kept on disk if compiled programs are.
 
-    def __init__(self, function: Callable[..., Any], static: Sequence[str] = ()) -> None:
-        self.__name__ = function.__name__
-        self.function, self._static = function, tuple(static)
+    Its positional arguments are trees of arrays; its keyword arguments are static.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
         self._ready: dict[Any, Callable[..., Any]] = {}
 
-    @cached_property
-    def _jitted(self) -> Any:
-        return jax.jit(self.function, static_argnames=self._static, compiler_options=_compiler_options())
-
-    @cached_property
-    def _inside(self) -> Any:
-        """The function as a part of another program, which has the compiler options."""
-        return jax.jit(self.function, static_argnames=self._static)
-
-    def __call__(self, *arguments: Any, **options: Any) -> Any:
+    def __call__(self, *arguments: Any, **static: Any) -> Any:
         """Run the function."""
-        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((arguments, options))):
-            return self._inside(*arguments, **options)
-        ready, options = self._find(arguments, options)
-        return ready(*arguments, **options)
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments)):
+            return jax.jit(self.function, static_argnames=tuple(static))(*arguments, **static)
+        return self._find(arguments, static)(*arguments)
 
-    def compile(self, *arguments: Any, **options: Any) -> tuple[Future[Any], Any]:
+    def compile(self, *arguments: Any, **static: Any) -> tuple[Future[Any], Any]:
         """Trace the function for arguments, or for their shapes and types, and compile it in another thread.
 
         Later calls with such arguments use the program; they wait for nothing, so wait for the future before.
 
         Returns the future of the compiled program, and the shapes and types of its output.
         """
-        key, _ = self._key(arguments, options)
-        self._ready.pop(key, None)
-        ready, options = self._find(arguments, options)
-        lowered = ready.lower(*arguments, **options)
+        key = self.signature(arguments, static)
+        if _keeps(arguments):
+            self._ready.pop(key, None)
+        ready = self._find(arguments, static)
+        lowered = ready.lower(*arguments)
 
         def compile_lowered() -> Any:
             compiled = lowered.compile()
             return_freed_memory()
-            if key is not None and ready is not self._jitted:
+            if _keeps(arguments):
                 self._ready[key] = compiled
             return compiled
 
@@ -87,55 +80,52 @@ class Program:
             outputs = jax.tree.map(_placed, outputs, compiling.result().output_shardings)
         return compiling, outputs
 
-    def signature(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, ...]:
-        """Return what tells this program for these arguments, or for their shapes and types, from others."""
-        static = tuple(sorted((name, repr(value)) for name, value in options.items() if name in self._static))
-        traced = {name: value for name, value in options.items() if name not in self._static}
-        leaves, structure = jax.tree.flatten((arguments, traced))
-        return self, static, structure, tuple((jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)
+    def signature(self, arguments: tuple, static: dict[str, Any]) -> tuple[Any, ...]:
+        """Return what tells this program for these arguments, or for their shapes and types, from its others."""
+        leaves, structure = jax.tree.flatten(arguments)
+        shapes = tuple((jnp.shape(leaf), str(jnp.result_type(leaf))) for leaf in leaves)
+        return tuple(sorted((name, repr(value)) for name, value in static.items())), structure, shapes
 
-    def _key(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return the key of a program on disk, None if it cannot be kept; and the traced options."""
-        traced = {name: value for name, value in options.items() if name not in self._static}
-        if not _keeping() or jax.default_backend() != "cpu":
-            return None, traced
-        if _on_several_devices((arguments, traced)):
-            return None, traced
-        return self.signature(arguments, options)[1:], traced
-
-    def _find(self, arguments: tuple, options: dict[str, Any]) -> tuple[Any, dict[str, Any]]:
-        """Return the function to call, and its options: the traced options, or all."""
-        key, traced = self._key(arguments, options)
-        if key is None:
-            return self._jitted, options
+    def _find(self, arguments: tuple, static: dict[str, Any]) -> Any:
+        """Return the jitted function of the arguments alone, or a program that was kept."""
+        if not _keeps(arguments):
+            return _jitted(self.function, tuple(static.items()))
+        key = self.signature(arguments, static)
         if key not in self._ready:
-            fixed = {name: value for name, value in options.items() if name in self._static}
-            self._ready[key] = self._load_or_trace(key, fixed, arguments, traced)
-        ready = self._ready[key]
-        return ready, options if ready is self._jitted else traced
+            self._ready[key] = self._load_or_trace(key, static, arguments)
+        return self._ready[key]
 
-    def _load_or_trace(
-        self, key: tuple, fixed: dict[str, Any], arguments: tuple, traced: dict[str, Any]
-    ) -> Callable[..., Any]:
+    def _load_or_trace(self, key: tuple, static: dict[str, Any], arguments: tuple) -> Callable[..., Any]:
         """Return the program of a file, or trace the function and write the file; on failure, the jitted function."""
-        name = f"{self.function.__module__}.{self.function.__qualname__}"
+        function: Any = self.function
+        name = f"{function.__module__}.{function.__qualname__}"
         precision = jax.config.values["jax_default_matmul_precision"]
         path = _kept_path("\n".join((source_digest(), name, *map(str, key), str(precision))))
         if (content := _read_kept(path)) is not None:
             return jax.jit(export.deserialize(bytearray(content)).call, compiler_options=_compiler_options())
-        shapes, named = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), (arguments, traced)
-        )
+        jitted = _jitted(function, tuple(static.items()))
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), arguments)
         try:
-            exported = export.export(jax.jit(partial(self.function, **fixed)))(*shapes, **named)
+            exported = export.export(jax.jit(partial(function, **static)))(*shapes)
             content = bytes(exported.serialize())
         except (ValueError, NotImplementedError):  # calls back to the host
-            return self._jitted
+            return jitted
         try:
             _keep(path, content)
         except OutputError:  # the cache cannot be written
-            return self._jitted
+            return jitted
         return jax.jit(exported.call, compiler_options=_compiler_options())
+
+
+@cache
+def program(function: Callable[..., Any]) -> Program:
+    """Return the one program of a function."""
+    return Program(function)
+
+
+@cache
+def _jitted(function: Callable[..., Any], static: tuple[tuple[str, Any], ...]) -> Any:
+    return jax.jit(partial(function, **dict(static)), compiler_options=_compiler_options())
 
 
 @cache
@@ -156,6 +146,13 @@ def keep_type(kind: type) -> type:
     """Decorate a NamedTuple that kept programs take or return: register how it is stored."""
     export.register_namedtuple_serialization(kind, serialized_name=f"{kind.__module__}.{kind.__qualname__}")
     return kind
+
+
+def _keeps(arguments: Any) -> bool:
+    """Return whether a program for these arguments is kept: not on several devices, nor with a caller's function."""
+    functions = jax.tree.leaves(arguments, is_leaf=lambda x: isinstance(x, jax.tree_util.Partial))
+    is_own = not any(isinstance(leaf, jax.tree_util.Partial) for leaf in functions)
+    return _keeping() and jax.default_backend() == "cpu" and is_own and not _on_several_devices(arguments)
 
 
 def _on_several_devices(arguments: Any) -> bool:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Array, Float32
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
@@ -22,13 +22,16 @@ from vggtjax.clips.queries import Queries, check_queries, check_words, parse_que
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import ClipError, InputError, reading
-from vggtjax.method.fusion_family import FusionParams
+from vggtjax.method.assembly import FusionRule
 from vggtjax.method.fusion_file import check_fuses, fusion_digest
+from vggtjax.method.passes import track_from
+from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.precision import Compute
 from vggtjax.network.track_head import check_track_size
 from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct
-from vggtjax.pipeline.stages import Stages
+from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, StageSeconds, no_stage
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
@@ -77,7 +80,7 @@ def reconstruct_long(
     *,
     options: Options = Options(),
     long_run: LongRun | None = None,
-    fusion: FusionParams | None = None,
+    fusion: FusionRule | None = None,
     masks: str | Path | bool | None = None,
     **changes: Any,
 ) -> Reconstruction:
@@ -136,7 +139,7 @@ def tools_of(
     options: Options = Options(),
     size: int | None = None,
     *,
-    fusion: FusionParams | None = None,
+    fusion: FusionRule | None = None,
     masks: str | Path | bool | None = None,
 ) -> Tools:
     """Return what runs a window by `reconstruct`, and describes frames by the means of their patch tokens."""
@@ -148,18 +151,23 @@ def tools_of(
             moving = load_masks(str(masks), clip) if masks is not False else np.zeros(clip.images.shape[:3], bool)
         return reconstruct(model, clip, options=options, size=size, masks=moving, fusion=fusion)
 
+    execute, compute = Execute(), Compute.of(options)
+
+    def features(images: Array) -> Array:
+        return execute("image features", encode)(
+            model.params, images, config=config, compute_dtype=compute.compute_dtype, remat=compute.remat
+        )
+
     def describe(images: Float32[np.ndarray, "F H W 3"]) -> Float32[np.ndarray, "F C"]:
-        stages = Stages(config, options, len(images), (images.shape[1], images.shape[2]))
-        tokens = stages.image_features(model.params, jax.device_put(images[None]))
-        return np.asarray(tokens[0], np.float32).mean(axis=1)
+        return np.asarray(features(jax.device_put(images[None]))[0], np.float32).mean(axis=1)
 
     def follow(images: Images, starts: Sequence[Start]) -> list[Tracked]:
-        stages = Stages(config, options, len(images), (images.shape[1], images.shape[2]))
         frames = jax.device_put(images[None])
-        clips = ClipBatch(frames, stages.image_features(model.params, frames))
-        found = []
+        clips, found = ClipBatch(frames, features(frames)), []
         for frame, places in starts:
-            tracks = stages.tracks(model.params, clips, jax.device_put(places[None]), np.asarray(frame, np.int32))
+            points = jax.device_put(places[None])
+            track = execute("tracks", track_from)
+            tracks = track(model.params, clips, points, np.asarray(frame, np.int32), config=config, compute=compute)
             found.append(Tracked(*(np.asarray(value)[0] for value in tracks)))
         return found
 
