@@ -1,5 +1,7 @@
 """The page that all reconstructions call: who calls it, given masks, rules of one's own, and equal frames."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,8 +20,8 @@ from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.windows.plan import Windows
 
 SIDE, FRAMES = 28, 4
-IMAGES = np.random.default_rng(0).random((2, FRAMES, SIDE, SIDE, 3), np.float32)
-MASKS = np.zeros(IMAGES.shape[:4], bool)
+IMAGES: Any = np.random.default_rng(0).random((2, FRAMES, SIDE, SIDE, 3), np.float32)
+MASKS: Any = np.zeros(IMAGES.shape[:4], bool)
 MASKS[0, :, :14, :14] = True
 
 
@@ -92,21 +94,23 @@ def test_a_function_is_a_rule_of_fusion(model):
     @jax.jit
     def depth(weight):
         made, passes = infer(model.params, images, model.config, fusion=Partial(rule, weight))
-        return made.depth.mean(), (passes.first.depth - passes.second.depth).mean()
+        depths: Any = passes.first.depth, passes.second.depth  # type: ignore[union-attr]
+        return made.depth.mean(), (depths[0] - depths[1]).mean()
 
     gradient, difference = jax.grad(depth, has_aux=True)(0.25)
     assert gradient == pytest.approx(float(difference), rel=1e-3)
+    one_map: Any = lambda seen: seen.depth1  # noqa: E731
     made = reconstruct(model, load_clip(IMAGES[0], size=SIDE), fusion=lambda seen: (seen.depth1, 3 + 0 * seen.depth2))
     assert (made.depth_confidence == 3).all()
     assert "lambda" in made.settings["fusion"]
     with pytest.raises(InputError, match=r"arrays of shape \[\(2, 4, 28, 28\)\]; expected depth and"):
-        infer(model.params, IMAGES, model.config, fusion=lambda seen: seen.depth1)
+        infer(model.params, IMAGES, model.config, fusion=one_map)
     with pytest.raises(InputError, match="method 'vggt' does not fuse"):
-        infer(model.params, IMAGES, model.config, fusion=rule, method="vggt")
+        infer(model.params, IMAGES, model.config, fusion=one_map, method="vggt")
 
 
 def test_equal_frames_have_an_empty_mask_for_every_caller(model):
-    images = np.stack([np.repeat(IMAGES[0, :1], FRAMES, axis=0), IMAGES[1]])
+    images: Any = np.stack([np.repeat(IMAGES[0, :1], FRAMES, axis=0), IMAGES[1]])
     config = model.config
     for passes in (
         infer(model.params, images, config)[1],

@@ -14,7 +14,9 @@ from tests.servers import empty_memory, served
 from tests.tiny import tiny_model
 from tests.videos import write_video
 from vggtjax import Reconstruction
+from vggtjax.checkpoint import save_model
 from vggtjax.clips.sources import clips_by_name
+from vggtjax.commands import main as cli
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.pipeline.batch import reconstruct_many
 from vggtjax.pipeline.destination import PAGE_NAME, SETTINGS_NAME
@@ -207,6 +209,44 @@ def test_a_batch_knows_a_model_by_its_weights(model, tmp_path):
     other = dataclasses.replace(model, params=jax.tree.map(lambda leaf: leaf + 1, model.params))
     with pytest.raises(InputError, match=r"has other settings than this run \(model"):
         list(reconstruct_many(other, {}, tmp_path))
+
+
+def test_masks_by_clip(model, clips, tmp_path):
+    sources = {name: str(clips / name) for name in ("clip0", "clip1", "clip3", "clip4")}
+    masks = np.zeros((2, 70, 140), bool)
+    masks[:, :30, :30] = True
+    for number, mask in enumerate(masks):
+        folder = tmp_path / "masks/clip4"
+        folder.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(mask).save(folder / f"{number}.png")
+    by_clip = {"clip0": masks, "clip1": False, "clip4": tmp_path / "masks/clip4"}
+    run = partial(reconstruct_many, model, sources, tmp_path / "out", saving={"only": ["depth"]})
+    assert [outcome.status for outcome in run(masks=by_clip)] == ["done"] * 4
+    made = {name: Reconstruction.load(tmp_path / "out" / name) for name in sources}
+    assert [made[name].settings["masks"] for name in sources] == ["given", "given", "mined", "given"]
+    assert (made["clip0"].dynamic_mask == made["clip4"].dynamic_mask).all()
+    assert made["clip0"].dynamic_mask.any()
+    assert not made["clip1"].dynamic_mask.any()
+    with pytest.raises(InputError, match=r"has other settings than this run \(masks"):
+        list(run(masks=by_clip | {"clip0": ~masks}))
+    with pytest.raises(InputError, match="masks has 'clip9', which is no clip of the batch"):
+        list(run(masks={"clip9": False}))
+    with pytest.raises(InputError, match="expected a folder with a folder of pictures named like a clip"):
+        list(run(masks=tmp_path / "out" / "clip0"))
+    with pytest.raises(InputError, match="given masks are not mined"):
+        list(run(masks=by_clip, threshold="otsu"))
+    words = [
+        "batch",
+        *sources.values(),
+        "--masks",
+        str(tmp_path / "masks"),
+        "--only",
+        "depth",
+        "--out",
+        str(tmp_path / "b"),
+    ]
+    assert cli.main([*words, "--model", str(save_model(tmp_path / "m.safetensors", model.params, model.config))]) == 0
+    assert (Reconstruction.load(tmp_path / "b/clip4").dynamic_mask == made["clip4"].dynamic_mask).all()
 
 
 def test_what_is_wrong_for_all_clips_is_said_once(model, clips, tmp_path):

@@ -12,7 +12,7 @@ from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import whole_number
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
-from vggtjax.storage.flags import Switch
+from vggtjax.storage.flags import InWords, Switch
 
 _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(required)")
 
@@ -98,6 +98,16 @@ def _no_memory_check(no_memory_check: Switch = False) -> bool:
     return no_memory_check
 
 
+def _batch_masks(masks: InWords[Path | None] = None) -> Path | None:
+    """Return the folder.
+
+    Args:
+        masks: folder with a folder of pictures for each clip, named like it, as --masks of vggtjax reconstruct takes
+            them; masks of other clips are mined
+    """
+    return masks
+
+
 # The name puts a flag into the group of that name.
 ResultFolder = Annotated[Path, tyro.conf.arg(constructor=_result_folder, name="output", prefix_name=False, help="")]
 BatchFolder = Annotated[str, tyro.conf.arg(constructor=_batch_folder, name="output", prefix_name=False, help="")]
@@ -106,6 +116,7 @@ EvaluationFolder = Annotated[
 ]
 View = Annotated[bool, tyro.conf.arg(constructor=_view, name="output", prefix_name=False, help="")]
 Shards = Annotated[str | None, tyro.conf.arg(constructor=_shard, name="output", prefix_name=False, help="")]
+BatchMasks = Annotated[Path | None, tyro.conf.arg(constructor=_batch_masks, name="method", prefix_name=False, help="")]
 Devices = Annotated[int, tyro.conf.arg(constructor=_devices, name="method", prefix_name=False, help="")]
 PadFrames = Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="method", prefix_name=False, help="")]
 Unchecked = Annotated[bool, tyro.conf.arg(constructor=_no_memory_check, name="long clip", prefix_name=False, help="")]

@@ -13,6 +13,7 @@ from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
 from vggtjax.commands.arguments import (
     BatchFolder,
+    BatchMasks,
     Devices,
     Frames,
     Method,
@@ -50,6 +51,7 @@ def batch(
     pad_frames: PadFrames = False,
     known: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = _NOTHING_KNOWN,
     unchecked: Unchecked = False,
+    masks: BatchMasks = None,
     out: BatchFolder,
     saving: Output = Saving(),
     shard: Shards = None,
@@ -70,6 +72,7 @@ def batch(
         pad_frames: whether clips are padded to one of a few lengths
         known: cameras and lengths that all clips share, or that "source" names
         unchecked: whether the memory is left unchecked
+        masks: what moves in each clip
         out: folder for the results
         saving: how the result is written
         shard: which part of the clips is done
@@ -104,7 +107,7 @@ def batch(
             from vggtjax.pipeline.recipe import Recipe
 
             check_named(files.model)
-            recipe = Recipe(options, framing, sampling, saving, known or None, pad_frames, devices, unchecked)
+            recipe = Recipe(options, framing, sampling, saving, known or None, pad_frames, devices, unchecked, masks)
             load = partial(load_on_worker, files, options)
             with report.stage("clips") as show:
                 clock = _Clock(show)
@@ -132,6 +135,7 @@ def batch(
                     fusion=fitted,
                     known=known,
                     pad_frames=pad_frames,
+                    masks=masks,
                     shard=shard,
                     devices=devices,
                     unchecked=unchecked,

@@ -246,7 +246,8 @@ def _scored(
 ) -> Iterator[LadderRow]:
     mask = np.asarray(passes.dynamic_mask)
     join = Execute()("assemble", _assemble)
-    read = passes._replace(patch_tokens=None)
+    matches = passes.matches if cameras_from == "adjusted" else None
+    read = passes._replace(patch_tokens=None, motion=None, is_matched=None, matches=matches)
     for method, assembly in zip(methods, join(read, methods=methods, cameras=cameras_from), strict=True):
         depth, intrinsics = np.asarray(assembly.depth), np.asarray(assembly.intrinsics)
         cameras = np.asarray(assembly.camera_from_world)

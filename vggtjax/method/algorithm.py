@@ -68,6 +68,10 @@ class Clips(NamedTuple):
         """The number of real frames."""
         return self.images.shape[1] if self.frames is None else self.frames
 
+    def real(self, frames: Frames) -> Frames:
+        """Return where the real frames are, for `frames` of the passes."""
+        return Frames(frames.mesh, None if self.counted == self.images.shape[1] else self.counted)
+
 
 class Outputs(NamedTuple):
     """What a method makes of clips."""
@@ -106,7 +110,7 @@ def run_method(
     clips = clips if isinstance(clips, Clips) else Clips(clips)
     compute = compute or Compute.of(options)
     passes, tracks = _passes(params, clips, config, options, masks, None, both_outputs, compute, step)
-    frames = Frames(compute.frames.mesh, clips.frames)
+    frames = clips.real(compute.frames)
     cameras = "adjusted" if _adjusts(options, clips.counted) else "predicted"
     how = {"method": options.method, "align_scale": options.align_scale, "cameras": cameras, "frames": frames}
     join = step("assemble", frames.on_devices(assemble, BY_FRAME, WHOLE))
@@ -154,7 +158,7 @@ def _passes(
     """Features, first pass, mask, second pass; and the tracks of the query points."""
     method, images, on_devices = options.row, clips.images, compute.frames.on_devices
     _check_masks(masks, images)
-    real, counted = Frames(compute.frames.mesh, clips.frames), clips.counted
+    real, counted = clips.real(compute.frames), clips.counted
     if masks is None and counted == 1:
         masks = False  # nothing moves in a single frame
     mines_by_matches = masks is None and method.mask == "matches" and counted >= FEWEST_FRAMES

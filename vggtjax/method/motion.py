@@ -20,6 +20,7 @@ _LARGEST = 8.0  # differences beyond this many scales count as this
 _OUTSIDE = 0.2  # weight of matches whose static position is outside the other frame
 _MARGIN = 0.25  # patches by which it may be outside
 _OFFSET, _EXPONENT, _FLOOR = 0.25, 0.6, 0.1  # score = log(difference + offset) + exponent x log(Gram + floor)
+_ROUNDS = 2  # what moves by the first counts less in the second
 _STILL, _STEEPNESS = float(np.log(0.8)), 4.0  # of the weights in the second round
 _VOTES, _VOTE, _VOTE_CYCLE, _VOTE_FRAMES = 2, 0.3, 0.625, 6.0
 
@@ -54,14 +55,15 @@ def motion(
     pairs = frame_pairs(len(depth))
     weight = matches.weight
 
-    def fitted(trust: Float[Array, "S P"]) -> tuple[Static, Float[Array, "S P"]]:
+    def fitted(trust: Float[Array, "S P"], _: None) -> tuple[Float[Array, "S P"], tuple[Static, Float[Array, "S P"]]]:
         world = adjust(depth, cameras, matches.position, weight * trust[:, None], grid)
         difference = _difference(matches.position, weight, world, pairs, grid)
         score = jnp.log(difference + _OFFSET) + _EXPONENT * jnp.log(saliency + _FLOOR)
-        return world, _voted(score, matches, pairs, grid)
+        score = _voted(score, matches, pairs, grid)
+        return jax.nn.sigmoid(_STEEPNESS * (_STILL - score)), (world, score)
 
-    _, score = fitted(1.05 - saliency)
-    world, score = fitted(jax.nn.sigmoid(_STEEPNESS * (_STILL - score)))
+    _, rounds = jax.lax.scan(fitted, 1.05 - saliency, length=_ROUNDS)  # a loop: it is compiled once
+    world, score = jax.tree.map(lambda x: x[-1], rounds)
     return Motion(jnp.exp(score), come_back(matches, pairs) & jnp.isfinite(score).all(), world)
 
 

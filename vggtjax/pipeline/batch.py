@@ -24,7 +24,7 @@ from vggtjax.options import Options
 from vggtjax.pipeline.clip_work import ClipWork, LongClip
 from vggtjax.pipeline.contact import contact_page
 from vggtjax.pipeline.destination import Destination, destination
-from vggtjax.pipeline.recipe import ClipOutcome, Recipe, failed, odd_name
+from vggtjax.pipeline.recipe import BatchMasks, ClipOutcome, Recipe, failed, odd_name
 from vggtjax.pipeline.shards import parse_shard
 from vggtjax.progress import Progress, StageSeconds, no_progress
 from vggtjax.refinement.refine import check_refinement
@@ -44,6 +44,7 @@ def reconstruct_many(
     sampling: Sampling | Mapping[str, Any] | None = None,
     saving: Saving | Mapping[str, Any] | None = None,
     fusion: FusionRule | None = None,
+    masks: BatchMasks | str = None,
     known: KnownGeometry | None = None,
     pad_frames: bool = False,
     shard: str | None = None,
@@ -66,6 +67,8 @@ def reconstruct_many(
         out: the folder of these folders, or a URL such as "s3://bucket/results".
         options: as for `reconstruct`; a mapping of the names in `changes`, of fusion and of pad_frames serves, too.
         fusion: as for `reconstruct`.
+        masks: what moves in each clip, by its name: an array or a folder of pictures as for `reconstruct`, or False for
+            nothing; or a folder of such folders, named like the clips. Masks of other clips are mined.
         known: as for `reconstruct`, as far as all clips share it: intrinsics, a shared focal length, the height of the
             cameras, and what "source" names.
         pad_frames: as for `reconstruct`.
@@ -107,7 +110,9 @@ def reconstruct_many(
         pad_frames=pad_frames,
         devices=devices,
         unchecked=unchecked,
+        masks=Path(masks) if isinstance(masks, str) else masks,
     )
+    recipe.check_masks(sources)
     place = destination(out)
     work = ClipWork(model, fusion, recipe, place)
     progress = progress or no_progress

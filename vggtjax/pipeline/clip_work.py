@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sources import ClipSource, open_source
-from vggtjax.errors import one_line
+from vggtjax.errors import InputError, one_line
 from vggtjax.known.intrinsics import known_values
 from vggtjax.method.assembly import FusionRule
 from vggtjax.method.fusion_file import fusion_digest
@@ -64,6 +66,7 @@ class ClipWork:
             "fusion": fusion_digest(self._fusion),
             **({} if recipe.known is None else {"known": known_values(recipe.known)}),
             "pad_frames": recipe.pad_frames,
+            **recipe.masks_setting(),
         }
 
     @property
@@ -97,6 +100,11 @@ class ClipWork:
 
         def run(folder: Path) -> None:
             how: dict[str, Any] = {"options": recipe.options, "long_run": plan, "fusion": self._fusion}
+            how["masks"] = recipe.masks_of(name)
+            if isinstance(how["masks"], np.ndarray):
+                raise InputError(
+                    f"masks of {name} is an array, and the clip is run in windows; give a folder of pictures"
+                )
             reconstruct_long(self._model, source, folder, clip.windows, **how)
 
         self._out.write(name, run)
@@ -111,6 +119,7 @@ class ClipWork:
             clip,
             options=self._recipe.options,
             size=self._fitter.size,
+            masks=self._recipe.masks_of(name),
             fusion=self._fusion,
             known=self._recipe.known,
             pad_frames=self._recipe.pad_frames,

@@ -60,6 +60,7 @@ def reconstruct_on_cluster(
         OutputError: the folder cannot be written, or another run is writing it.
     """
     check_extra("--engine ray", "cluster", "ray")
+    recipe.check_masks(sources)
     place = destination(out)
     for url in (*sources.values(), *([place.url] if isinstance(place, RemoteFolder) else [])):
         if is_url(url) and is_in_process(url):

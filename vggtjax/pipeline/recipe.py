@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
+from vggtjax.errors import InputError
 from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
 from vggtjax.pipeline.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.results.saving import Saving
 
 _TAKEN = ("", "..", SETTINGS_NAME, PAGE_NAME)
+
+
+# Of every clip by name: an array, a folder of pictures, or False where nothing moves; or the folder of such folders.
+# Masks of other clips are mined.
+BatchMasks = Mapping[str, np.ndarray | str | Path | Literal[False] | None] | Path | None
 
 
 class ClipOutcome(NamedTuple):
@@ -37,6 +47,32 @@ class Recipe:
     pad_frames: bool = False
     devices: int = 1
     unchecked: bool = False  # do not compare the memory that a clip needs with what is free
+    masks: BatchMasks = None
+
+    def masks_of(self, name: str) -> Any:
+        """Return the masks of a clip, as `reconstruct` takes them; None where they are mined."""
+        if isinstance(self.masks, Path):
+            return folder if (folder := self.masks / name).is_dir() else None
+        return None if self.masks is None else self.masks.get(name)
+
+    def check_masks(self, names: Collection[str]) -> None:
+        """Raise InputError for masks of no clip, and for options of mined masks beside given ones."""
+        if self.masks is None:
+            return
+        self.options.check_given_masks()
+        if isinstance(self.masks, Path):
+            if not any(self.masks_of(name) for name in names):
+                raise InputError(
+                    f"masks is {self.masks}; expected a folder with a folder of pictures named like a clip"
+                )
+        elif unknown := sorted(self.masks.keys() - set(names)):
+            raise InputError(f"masks has {unknown[0]!r}, which is no clip of the batch; expected names of clips")
+
+    def masks_setting(self) -> dict[str, Any]:
+        """Return what tells the masks of a batch from others, as JSON values; nothing where all are mined."""
+        if self.masks is None or isinstance(self.masks, Path):
+            return {} if self.masks is None else {"masks": str(self.masks)}
+        return {"masks": {name: _masks_text(masks) for name, masks in sorted(self.masks.items())}}
 
 
 def failed(name: str, error: BaseException) -> ClipOutcome:
@@ -49,3 +85,9 @@ def odd_name(name: str) -> ClipOutcome | None:
     if name not in _TAKEN and Path(name).name == name and name.isprintable():
         return None
     return ClipOutcome(name, "failed", f"a clip is named {name!r}; expected a plain name, which becomes its folder")
+
+
+def _masks_text(masks: np.ndarray | str | Path | bool | None) -> str:
+    if isinstance(masks, np.ndarray):
+        return hashlib.sha256(f"{masks.dtype} {masks.shape}".encode() + masks.tobytes()).hexdigest()[:16]
+    return str(masks)

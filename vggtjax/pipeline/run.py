@@ -6,7 +6,7 @@ import dataclasses
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,7 @@ def reconstruct(
     *,
     options: Options = Options(),
     size: int | None = None,
-    masks: Bool[np.ndarray, "S h w"] | str | Path | None = None,
+    masks: Bool[np.ndarray, "S h w"] | str | Path | Literal[False] | None = None,
     tracks: Queries | None = None,
     fusion: FusionRule | None = None,
     known: KnownGeometry | None = None,
@@ -76,8 +76,8 @@ def reconstruct(
         options: the method and its settings.
         size: side in pixels to run at, a multiple of the patch size; the model's own if None.
         masks: what moves, instead of the mined masks: boolean at the size of the clip's frames, as given or as
-            fitted, or of the source's pictures, or a folder of pictures. If no pixel moves, the second pass is not run;
-            so it is, without masks, where all frames are one picture.
+            fitted, or of the source's pictures, or a folder of pictures; False: nothing moves. If no pixel moves, the
+            second pass is skipped. It is also skipped if masks are mined and all frames are identical.
         tracks: points to follow, in pixels of the frames; points of a later frame than the first cost one more pass.
         fusion: a fitted rule (`load_fusion`) or a function, as for `assemble`, whose precision is the confidence; None:
             the paper's rule.
@@ -116,7 +116,11 @@ def reconstruct(
     if known is not None:
         check_readable(known)
     source, (clip, tracks) = clip, _fitted(model, clip, size, tracks, on_stage)
-    given = None if masks is None else masks_at_clip_pixels(masks, clip, source if isinstance(source, Clip) else clip)
+    given = None
+    if masks is False:
+        given = np.zeros(clip.images.shape[:3], bool)
+    elif masks is not None:
+        given = masks_at_clip_pixels(masks, clip, source if isinstance(source, Clip) else clip)
     mask_source = "mined" if masks is None else "given"
     if masks is None and clip.is_still:
         given, mask_source = np.zeros(clip.images.shape[:3], bool), "none: all frames are equal"

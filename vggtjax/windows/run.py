@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -81,7 +81,7 @@ def reconstruct_long(
     options: Options = Options(),
     long_run: LongRun | None = None,
     fusion: FusionRule | None = None,
-    masks: str | Path | bool | None = None,
+    masks: str | Path | Literal[False] | None = None,
     **changes: Any,
 ) -> Reconstruction:
     """Reconstruct a clip in windows, which are joined, and write the result: memory does not depend on the length.
@@ -140,15 +140,13 @@ def tools_of(
     size: int | None = None,
     *,
     fusion: FusionRule | None = None,
-    masks: str | Path | bool | None = None,
+    masks: str | Path | Literal[False] | None = None,
 ) -> Tools:
     """Return what runs a window by `reconstruct`, and describes frames by the means of their patch tokens."""
     config = model.config
 
     def run(clip: Clip) -> Reconstruction:
-        moving = None
-        if masks is not None:
-            moving = load_masks(str(masks), clip) if masks is not False else np.zeros(clip.images.shape[:3], bool)
+        moving = load_masks(str(masks), clip) if isinstance(masks, str | Path) else masks
         return reconstruct(model, clip, options=options, size=size, masks=moving, fusion=fusion)
 
     execute, compute = Execute(), Compute.of(options)
