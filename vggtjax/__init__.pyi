@@ -14,6 +14,7 @@ from .method.algorithm import run_passes as run_passes
 from .method.assembly import Assembly as Assembly
 from .method.assembly import assemble as assemble
 from .method.fusion import fuse_depth as fuse_depth
+from .method.fusion_file import load_fusion as load_fusion
 from .method.instances import find_instances as find_instances
 from .method.mask_refinement import refine_masks as refine_masks
 from .method.passes import Passes as Passes
@@ -26,6 +27,7 @@ from .network.pose import decode_pose as decode_pose
 from .network.pose import encode_pose as encode_pose
 from .options import LADDER as LADDER
 from .options import METHODS as METHODS
+from .options import Options as Options
 from .pipeline.artefact import write_artefact as write_artefact
 from .pipeline.batch import reconstruct_many as reconstruct_many
 from .pipeline.infer import infer as infer
