@@ -263,7 +263,7 @@ def matches(model: Model, clip: Clip) -> Figure:
     assert result is not None
     images = jax.numpy.asarray(result.images[None] / np.float32(255))
     first, seen = jax.jit(first_pass, static_argnames=("config", "witness"))(
-        model.params, ClipBatch(images), model.config, witness="matches"
+        model.params, ClipBatch(images), config=model.config, witness="matches"
     )
     grid = seen.saliency.shape[2:]
     found = jax.tree.map(lambda x: x[0], seen.matches)
