@@ -12,8 +12,8 @@ from vggtjax.checkpoint import read_model, save_model
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.sources import FolderSource, ModelSource
+from vggtjax.method.assembly import check_fuses
 from vggtjax.method.fusion_family import identity
-from vggtjax.method.fusion_file import check_fuses
 from vggtjax.progress import no_stage
 
 

@@ -1,20 +1,33 @@
 """The page that all reconstructions call: who calls it, given masks, rules of one's own, and equal frames."""
 
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh
 from jax.tree_util import Partial
 
 from tests.tiny import tiny_model
-from vggtjax import Clips, Model, compile_ahead, infer, load_clip, reconstruct, reconstruct_long, write_artefact
+from vggtjax import (
+    Clips,
+    Model,
+    Options,
+    assemble,
+    compile_ahead,
+    infer,
+    load_clip,
+    reconstruct,
+    reconstruct_long,
+    write_artefact,
+)
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
-from vggtjax.learning import reconstruct_softly, soft_masking
-from vggtjax.method.algorithm import run_method
+from vggtjax.learning import identity, reconstruct_softly, soft_masking
+from vggtjax.method.algorithm import run_method, run_passes
 from vggtjax.pipeline.batch import reconstruct_many
 from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.windows.plan import Windows
@@ -33,6 +46,10 @@ def model() -> Model:
         for name in ("scale1", "scale2"):
             made.params["aggregator"][blocks][name] = jnp.ones_like(made.params["aggregator"][blocks][name])
     return made
+
+
+def _mean(seen):
+    return (seen.depth1 + seen.depth2) / 2, jnp.full_like(seen.depth1, 2)
 
 
 class ReachedError(Exception):
@@ -81,7 +98,7 @@ def test_masks_of_a_batch_are_those_of_its_clips(model):
     assert np.allclose(unmoved.depth[1], made.depth[1], rtol=1e-5)
     assert not np.allclose(unmoved.camera_from_world[0], made.camera_from_world[0], atol=1e-5)
     for masks in (MASKS[:1], MASKS.astype(np.uint8)):
-        with pytest.raises(InputError, match=r"expected bool, or shares as floats, of shape \(2, 4, 28, 28\)"):
+        with pytest.raises(InputError, match=r"or of shares as floats, of shape \(2, 4, 28, 28\)"):
             infer(model.params, IMAGES, model.config, masks=masks)
 
 
@@ -107,6 +124,98 @@ def test_a_function_is_a_rule_of_fusion(model):
         infer(model.params, IMAGES, model.config, fusion=one_map)
     with pytest.raises(InputError, match="method 'vggt' does not fuse"):
         infer(model.params, IMAGES, model.config, fusion=one_map, method="vggt")
+
+
+def test_a_rule_is_for_methods_that_fuse(model):
+    passes = run_passes(model.params, jnp.asarray(IMAGES), model.config)
+    with pytest.raises(InputError, match="method 'vggt' does not fuse"):
+        assemble(passes, identity(), method="vggt")
+    with pytest.raises(
+        InputError, match="fusion is 'vggt'; expected a rule of fusion; a method's name is given as met"
+    ):
+        assemble(passes, "vggt")  # type: ignore[arg-type]
+
+
+def test_soft_masks_of_any_caller_are_those_of_the_soft_method(model):
+    images = jnp.asarray(IMAGES)
+    masking = soft_masking(model.config, temperature=0.1)
+    soft = jax.jit(reconstruct_softly, static_argnames="config")(model.params, images, model.config, masking)
+    made, passes = infer(model.params, images, model.config, masks=masking)
+    assert np.allclose(passes.dynamic_mask, soft.passes.dynamic_mask, atol=1e-5)
+    assert np.allclose(made.depth, soft.depth, rtol=1e-5)
+
+    def depth(masking, method):
+        return (infer(model.params, images, model.config, masks=masking, method=method)[0].depth * images[..., 0]).sum()
+
+    for method in ("4dvggt-d", "hard-replacement"):
+        gradient = jax.grad(depth)(masking, method)
+        assert all(np.abs(leaf).max() > 0 for leaf in gradient), method
+
+
+def test_small_shares_are_nearly_static(model):
+    for method in ("4dvggt-d", "hard-replacement"):
+        run: Any = partial(infer, model.params, IMAGES, model.config, method=method, align_scale=True)
+        (small, _), (none, _) = run(masks=np.full(MASKS.shape, 1e-4, np.float32)), run(masks=MASKS & False)
+        assert np.allclose(small.depth, none.depth, rtol=1e-3), method
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_padded_frames_change_nothing(model, soft):
+    """Of clips that jit traces; whatever the padded frames show, also where all real frames are equal."""
+    masks = soft_masking(model.config, temperature=0.1) if soft else None
+    images = np.stack([np.repeat(IMAGES[0, :1], FRAMES, axis=0), IMAGES[1]])
+    padded: Any = np.concatenate([images, np.random.default_rng(1).random((2, 2, SIDE, SIDE, 3), np.float32)], axis=1)
+
+    @partial(jax.jit, static_argnames="config")
+    def run(params, clips, masks, config):
+        return run_method(params, clips, config, masks=masks)
+
+    made = run(model.params, Clips(jnp.asarray(padded), frames=FRAMES), masks, model.config)
+    alone = run(model.params, Clips(jnp.asarray(images)), masks, model.config)
+    assert np.allclose(made.assembly.depth, alone.assembly.depth, rtol=1e-4)
+    mask = np.asarray(made.passes.dynamic_mask)[:, :FRAMES]
+    assert not mask[0].any()
+    assert np.allclose(mask, alone.passes.dynamic_mask, atol=1e-4)
+    for frames in (0, 7):
+        with pytest.raises(InputError, match=f"frames is {frames}; expected a number from 1 to 6"):
+            run_method(model.params, Clips(padded, frames=frames), model.config)
+    with pytest.raises(InputError, match="clips are padded and have query_points"):
+        run_method(model.params, Clips(padded, {0: jnp.ones((2, 1, 2))}, FRAMES), model.config)
+
+
+def test_masks_and_rules_on_a_mesh(model):
+    mesh = Mesh(np.array(jax.devices()[:1]), ("frames",))
+    run: Any = partial(infer, model.params, IMAGES, model.config, fusion=_mean)
+    for masks in (MASKS, False):
+        (made, passes), (alone, _) = run(masks=masks, mesh=mesh), run(masks=masks)
+        assert (np.asarray(passes.dynamic_mask) == (MASKS & (masks is not False))).all()
+        assert np.allclose(made.depth, alone.depth, rtol=1e-4)
+        assert (np.asarray(made.confidence) == 2).all()
+    for masks, sentence in (
+        (
+            np.concatenate([MASKS, MASKS], axis=1),
+            r"masks are bool of shape \(2, 8, 28, 28\); expected an array of bool",
+        ),
+        (True, r"masks are bool of shape \(\); expected an array of bool"),
+        (soft_masking(model.config), "masks are soft and frames are on several devices"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            run(masks=masks, mesh=mesh)
+
+
+def test_shared_passes_need_what_is_read(model):
+    run: Any = partial(run_passes, model.params, jnp.asarray(IMAGES), model.config)
+    shared = run()
+    again = run(masks=jnp.asarray(MASKS), shared=shared)
+    assert again.first is shared.first
+    assert np.allclose(again.second.pose_encoding, run(masks=jnp.asarray(MASKS)).second.pose_encoding, atol=1e-5)
+    for changed, options, masks, sentence in (
+        (shared._replace(patch_tokens=None), Options(), None, "shared has no patch tokens"),
+        (shared, Options(mask="matches"), None, "shared has no matches between frames"),
+        (shared, Options(), soft_masking(model.config), "masks are soft and change the first pass"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            run(options=options, masks=masks, shared=changed)
 
 
 def test_equal_frames_have_an_empty_mask_for_every_caller(model):

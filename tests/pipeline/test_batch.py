@@ -3,6 +3,7 @@
 import dataclasses
 import tempfile
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -220,7 +221,7 @@ def test_masks_by_clip(model, clips, tmp_path):
         folder.mkdir(parents=True, exist_ok=True)
         Image.fromarray(mask).save(folder / f"{number}.png")
     by_clip = {"clip0": masks, "clip1": False, "clip4": tmp_path / "masks/clip4"}
-    run = partial(reconstruct_many, model, sources, tmp_path / "out", saving={"only": ["depth"]})
+    run: Any = partial(reconstruct_many, model, sources, tmp_path / "out", saving={"only": ["depth"]})
     assert [outcome.status for outcome in run(masks=by_clip)] == ["done"] * 4
     made = {name: Reconstruction.load(tmp_path / "out" / name) for name in sources}
     assert [made[name].settings["masks"] for name in sources] == ["given", "given", "mined", "given"]
@@ -233,6 +234,10 @@ def test_masks_by_clip(model, clips, tmp_path):
         list(run(masks={"clip9": False}))
     with pytest.raises(InputError, match="expected a folder with a folder of pictures named like a clip"):
         list(run(masks=tmp_path / "out" / "clip0"))
+    with pytest.raises(InputError, match="masks is of type ndarray; expected masks by the name of the clip"):
+        list(run(masks=masks))
+    with pytest.raises(InputError, match="fusion is a function, and a later run could not tell"):
+        list(run(fusion=lambda seen: (seen.depth1, seen.depth2)))
     with pytest.raises(InputError, match="given masks are not mined"):
         list(run(masks=by_clip, threshold="otsu"))
     words = [
@@ -245,8 +250,11 @@ def test_masks_by_clip(model, clips, tmp_path):
         "--out",
         str(tmp_path / "b"),
     ]
-    assert cli.main([*words, "--model", str(save_model(tmp_path / "m.safetensors", model.params, model.config))]) == 0
+    words += ["--model", str(save_model(tmp_path / "m.safetensors", model.params, model.config))]
+    assert cli.main(words) == 0
     assert (Reconstruction.load(tmp_path / "b/clip4").dynamic_mask == made["clip4"].dynamic_mask).all()
+    Image.fromarray(~masks[0]).save(tmp_path / "masks/clip4/0.png")
+    assert cli.main(words) == 2
 
 
 def test_what_is_wrong_for_all_clips_is_said_once(model, clips, tmp_path):

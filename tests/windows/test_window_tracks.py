@@ -6,6 +6,7 @@ from PIL import Image
 
 from tests.tiny import tiny_model
 from vggtjax import load_clip, reconstruct
+from vggtjax.clips.masks import masks_digest
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.queries import Queries, check_queries, parse_queries
 from vggtjax.clips.sampling import Sampling
@@ -15,7 +16,7 @@ from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 from vggtjax.windows.frames import SeenFrames, window_clips
 from vggtjax.windows.plan import Windows, plan_windows
-from vggtjax.windows.run import LongRun, masks_digest, reconstruct_long, tools_of
+from vggtjax.windows.run import LongRun, reconstruct_long, tools_of
 from vggtjax.windows.tracks import Start, Tracked, follow_points
 
 FRAMES = 50

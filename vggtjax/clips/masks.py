@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +16,8 @@ from vggtjax.clips.clip import Clip
 from vggtjax.clips.images import ImageFiles, has_transparency, known_formats, read_image
 from vggtjax.clips.sources import open_source
 from vggtjax.clips.truth import at_clip_pixels
-from vggtjax.errors import ClipError, InputError
+from vggtjax.errors import ClipError, InputError, reading
+from vggtjax.storage.file_digest import file_digest
 
 _WHITE = 127  # above it, a pixel of a picture in grey or colour moves
 _LABELS = ("P", "1")  # modes whose values are numbers of objects, not brightness
@@ -124,3 +126,17 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
             f"mask {path.name} is {bright.max()} of 255 at its brightest; expected black and white, or a palette"
         )
     return bright > _WHITE
+
+
+def masks_digest(masks: np.ndarray | str | Path | bool | None) -> str:
+    """Return text that changes when the given masks do. Raises ClipError for masks that are not there."""
+    if masks is None or isinstance(masks, bool):
+        return str(masks)
+    if not isinstance(masks, str | Path):
+        masks = np.asarray(masks)
+        return hashlib.sha256(f"{masks.dtype} {masks.shape}".encode() + masks.tobytes()).hexdigest()
+    source = open_source(str(masks))
+    if not isinstance(source, ImageFiles):
+        raise ClipError(f"{masks} is not a folder of pictures; masks need one picture per frame")
+    with reading(masks, ClipError):
+        return f"{masks} {file_digest(source.paths)}"

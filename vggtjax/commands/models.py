@@ -71,7 +71,8 @@ class ModelFiles:
         name = at_revision(check_named(self.model), self.revision)
         if self.fusion is None:
             return load(report, name, self.config), None
-        from vggtjax.method.fusion_file import check_fuses, load_fusion, warn_if_fitted_otherwise
+        from vggtjax.method.assembly import check_fuses
+        from vggtjax.method.fusion_file import load_fusion, warn_if_fitted_otherwise
 
         params = load_fusion(self.fusion)
         check_fuses(params, *methods)

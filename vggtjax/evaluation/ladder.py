@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import count, product
+from itertools import chain, count, product
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -64,12 +64,11 @@ class LadderRow:
 
 
 class _Scene(NamedTuple):
-    """The truth of one clip, and the motion saliency of the first pass, or the motion by its matches."""
+    """The truth of one clip."""
 
     clip: int
     truth: Truth
     points: Float[np.ndarray, "N 3"]  # of the pixels with a true depth
-    saliency: Float[np.ndarray, "S H W"]
 
 
 class _Setting(NamedTuple):
@@ -144,25 +143,32 @@ def ladder(
     rows: list[LadderRow] = []
     for clips, padded in batches:
         batch = Clips(jax.device_put(truth.images[padded].astype(np.float32, copy=False)))
-        shared = run(batch, options=options.changed(method="vggt"))
-        pixels = np.asarray(execute("saliency", upsample)(shared.saliency, size=truth.images.shape[2:4]))
-        scenes = [_scene(int(clip), truth, pixels[i]) for i, clip in enumerate(clips)]
-        rows += _scored(shared, plain, scenes, _Setting(), cameras)
-        advance()
-        for setting in settings:
-            given = jax.device_put(truth.dynamic_mask[padded]) if setting.mask_source == "true" else None
+        scenes = [_scene(int(clip), truth) for clip in clips]
+        true_masks = jax.device_put(truth.dynamic_mask[padded])
+        shared, by_setting = None, {}
+        for setting in sorted(settings, key=lambda setting: setting.mask_source != "matches"):  # others share its pass
             own = options.changed(
                 mask="matches" if setting.mask_source == "matches" else "gram",
                 mask_pairs=setting.mask_pairs,
                 suppress=setting.suppress,
             )
-            passes, scored_by = run(batch, options=own, masks=given, shared=shared), scenes
-            if setting.mask_source == "matches" and passes.motion is not None:
-                pixels = np.asarray(execute("motion", motion_pixels)(passes.motion, batch.images))
-                scored_by = [scene._replace(saliency=pixels[i]) for i, scene in enumerate(scenes)]
-            rows += _scored(passes, masked, scored_by, setting, cameras)
+            passes = run(batch, options=own, masks=true_masks if setting.mask_source == "true" else None, shared=shared)
+            shared = shared or passes
+            pixels = _seen_motion(execute, passes, batch.images)
+            by_setting[setting] = list(_scored(passes, masked, scenes, pixels, setting, cameras))
             advance()
+        passes = run(batch, options=options.changed(method="vggt", mask="gram"), shared=shared)
+        rows += _scored(passes, plain, scenes, _seen_motion(execute, passes, batch.images), _Setting(), cameras)
+        advance()
+        rows += chain.from_iterable(by_setting[setting] for setting in settings)
     return sorted(rows, key=lambda row: row.clip)
+
+
+def _seen_motion(execute: Execute, passes: Passes, images: Any) -> Float[np.ndarray, "B S H W"]:
+    """Return what the mask was cut from: the motion by matches if there is one, else the Gram saliency."""
+    if passes.motion is not None:
+        return np.asarray(execute("motion", motion_pixels)(passes.motion, images))
+    return np.asarray(execute("saliency", upsample)(passes.saliency, size=images.shape[2:4]))
 
 
 _COLUMNS = {
@@ -235,14 +241,19 @@ def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         yield indices[indices < count], np.minimum(indices, count - 1)
 
 
-def _scene(clip: int, truth: Truth, saliency: Float[np.ndarray, "S H W"]) -> _Scene:
+def _scene(clip: int, truth: Truth) -> _Scene:
     own = Truth(*(array[clip] for array in truth))
     points = known_points(own.depth, own.intrinsics, own.camera_from_world, measured(own.depth))
-    return _Scene(clip, own, points, saliency)
+    return _Scene(clip, own, points)
 
 
 def _scored(
-    passes: Passes, methods: tuple[str, ...], scenes: list[_Scene], setting: _Setting, cameras_from: CamerasFrom
+    passes: Passes,
+    methods: tuple[str, ...],
+    scenes: list[_Scene],
+    motion: Float[np.ndarray, "B S H W"],
+    setting: _Setting,
+    cameras_from: CamerasFrom,
 ) -> Iterator[LadderRow]:
     mask = np.asarray(passes.dynamic_mask)
     join = Execute()("assemble", _assemble)
@@ -252,7 +263,7 @@ def _scored(
         depth, intrinsics = np.asarray(assembly.depth), np.asarray(assembly.intrinsics)
         cameras = np.asarray(assembly.camera_from_world)
         for i, scene in enumerate(scenes):
-            yield _row(scene, method, setting, depth[i], intrinsics[i], cameras[i], mask[i])
+            yield _row(scene, method, setting, depth[i], intrinsics[i], cameras[i], mask[i], motion[i])
 
 
 def _row(
@@ -263,6 +274,7 @@ def _row(
     intrinsics: Float[np.ndarray, "S 3 3"],
     camera_from_world: Float[np.ndarray, "S 3 4"],
     mask: Bool[np.ndarray, "S H W"],
+    motion: Float[np.ndarray, "S H W"],
 ) -> LadderRow:
     truth, failures = scene.truth, []
 
@@ -297,7 +309,7 @@ def _row(
         centre_error_ratio=None if off_centre is None or distance is None else off_centre / distance,
         point_distance=None if off_centre is None else attempt(distance_after, all_cameras),
         point_distance_first=attempt(distance_after, first_camera),
-        saliency_auc=attempt(auc, scene.saliency, dynamic) if dynamic.any() and not dynamic.all() else None,
+        saliency_auc=attempt(auc, motion, dynamic) if dynamic.any() and not dynamic.all() else None,
         mask_jaccard=None if setting.mask_source is None else jaccard(mask, dynamic),
         failure="; ".join(dict.fromkeys(failures)),
     )

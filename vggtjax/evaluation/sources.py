@@ -70,7 +70,7 @@ class ModelSource:
     _last: tuple[LabelledSequence, Clip] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        from vggtjax.method.fusion_file import check_fuses
+        from vggtjax.method.assembly import check_fuses
         from vggtjax.pipeline.several import groups_of_methods
 
         check_fuses(self.fusion, *self.names)

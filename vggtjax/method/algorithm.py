@@ -7,16 +7,18 @@ backbone features -> first pass, with motion cues -> dynamic mask -> second pass
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from types import MappingProxyType
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal, NamedTuple, ParamSpec, Protocol, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from vggtjax.config import VGGTConfig
+from vggtjax.config import VGGTConfig, Witness
 from vggtjax.errors import InputError
-from vggtjax.method.assembly import Assembly, FusionRule, as_tree, assemble
+from vggtjax.method.assembly import Assembly, FusionRule, as_tree, assemble, check_fuses
 from vggtjax.method.matched_mask import Mined
 from vggtjax.method.motion import FEWEST_FRAMES
 from vggtjax.method.passes import Passes, first_pass, mine, mine_softly, only, second_pass, track_from
@@ -55,13 +57,21 @@ def inline(name: str, function: Callable[_Parameters, _Result], /) -> Callable[_
     return function
 
 
-class Clips(NamedTuple):
-    """A batch of clips to reconstruct."""
+@partial(jax.tree_util.register_dataclass, data_fields=("images", "query_points"), meta_fields=("frames",))
+@dataclass(frozen=True)
+class Clips:
+    """A batch of clips to reconstruct: a pytree, whose `frames` is static under jit.
 
-    images: Images  # RGB in [0, 1]; H and W are multiples of the patch size
-    frame_count: Int[Array, " B"] | None = None  # real frames of each clip, its first ones; None: all
-    query_points: Mapping[int, Float[Array, "B Q 2"]] = MappingProxyType({})  # points to track, by frame
-    frames: int | None = None  # real frames of all clips, where shares of devices or padding have more; None: all
+    Attributes:
+        images: RGB in [0, 1]; H and W are multiples of the patch size.
+        query_points: x, y in pixels of points to track, by the frame in which they are given.
+        frames: number of real frames, the first ones. The others change nothing: they make clips of similar length
+            share compiled programs, or shares of devices equal. None: all are real.
+    """
+
+    images: Images
+    query_points: Mapping[int, Float[Array, "B Q 2"]] = field(default_factory=dict)
+    frames: int | None = None
 
     @property
     def counted(self) -> int:
@@ -72,13 +82,26 @@ class Clips(NamedTuple):
         """Return where the real frames are, for `frames` of the passes."""
         return Frames(frames.mesh, None if self.counted == self.images.shape[1] else self.counted)
 
+    def padding(self, frames: Frames) -> Int[Array, " B"] | None:
+        """Return the number of real frames of each clip where `frames` of the passes has more; it is traced."""
+        B, S = self.images.shape[:2]
+        passed = S if frames.mesh is None or frames.count is None else frames.count
+        return None if self.counted == passed else np.full(B, self.counted, np.int32)  # type: ignore[return-value]
+
+    def check(self, frames: Frames) -> None:
+        """Raise InputError for an invalid number of frames, and for points to track in padded clips."""
+        S = self.images.shape[1]
+        if not 1 <= self.counted <= S:
+            raise InputError(f"frames is {self.counted}; expected a number from 1 to {S}, the frames of the images")
+        if self.query_points and self.padding(frames) is not None:
+            raise InputError("clips are padded and have query_points; tracking requires that all frames are real")
+
 
 class Outputs(NamedTuple):
     """What a method makes of clips."""
 
     passes: Passes
     assembly: Assembly
-    tracks: dict[int, Tracks]  # by the frame of their query points
 
 
 def run_method(
@@ -101,7 +124,7 @@ def run_method(
         config: the model's configuration.
         options: the method and its settings; masks are not refined, as that is done on the host.
         masks: what moves: boolean or shares in [0, 1]; False: nothing; `SoftMasking`: mined with gradients; None:
-            mined by the options. Masks are empty in clips whose frames are all one picture.
+            mined by the options. Mined and soft masks are empty in clips whose frames are all one picture.
         fusion: a rule of fusion in place of the paper's, as for `assemble`.
         both_outputs: predict depth in the second pass even if the method does not read it.
         compute: how the network is computed; by the options and the platform if None.
@@ -109,13 +132,16 @@ def run_method(
     """
     clips = clips if isinstance(clips, Clips) else Clips(clips)
     compute = compute or Compute.of(options)
-    passes, tracks = _passes(params, clips, config, options, masks, None, both_outputs, compute, step)
+    check_fuses(fusion, options.method)
+    passes = run_passes(
+        params, clips, config, options, masks=masks, both_outputs=both_outputs, compute=compute, step=step
+    )
     frames = clips.real(compute.frames)
     cameras = "adjusted" if _adjusts(options, clips.counted) else "predicted"
     how = {"method": options.method, "align_scale": options.align_scale, "cameras": cameras, "frames": frames}
     join = step("assemble", frames.on_devices(assemble, BY_FRAME, WHOLE))
-    assembly = join(passes._replace(patch_tokens=None), as_tree(fusion), **how)
-    return Outputs(passes, assembly, tracks)
+    read = passes._replace(patch_tokens=None, tracks=None)
+    return Outputs(passes, join(read, as_tree(fusion), **how))
 
 
 def run_passes(
@@ -141,44 +167,28 @@ def run_passes(
     """
     clips = clips if isinstance(clips, Clips) else Clips(clips)
     compute = compute or Compute.of(options)
-    return _passes(params, clips, config, options, masks, shared, both_outputs, compute, step)[0]
-
-
-def _passes(
-    params: Params,
-    clips: Clips,
-    config: VGGTConfig,
-    options: Options,
-    masks: Masks,
-    shared: Passes | None,
-    both_outputs: bool,
-    compute: Compute,
-    step: Step,
-) -> tuple[Passes, dict[int, Tracks]]:
-    """Features, first pass, mask, second pass; and the tracks of the query points."""
     method, images, on_devices = options.row, clips.images, compute.frames.on_devices
-    _check_masks(masks, images)
+    clips.check(compute.frames)
+    check_masks(masks, images, compute.frames)
     real, counted = clips.real(compute.frames), clips.counted
     if masks is None and counted == 1:
         masks = False  # nothing moves in a single frame
     mines_by_matches = masks is None and method.mask == "matches" and counted >= FEWEST_FRAMES
     witness = "matches" if mines_by_matches or _adjusts(options, counted) else "gram"
 
-    # Features of the backbone, which both passes share.
     if shared is None:
+        # Features of the backbone, which both passes share.
         features = step("image features", on_devices(encode, WHOLE, BY_FRAME))
         tokens = features(params, images, config=config, compute_dtype=compute.compute_dtype, remat=compute.remat)
-    else:
-        tokens = shared.patch_tokens
-    batch = ClipBatch(images, tokens, clips.frame_count)
-
-    # Stage 1: a plain pass, which adds up the similarities of q and k that tell motion.
-    if shared is None:
+        batch = ClipBatch(images, tokens, clips.padding(compute.frames))
+        # Stage 1: a plain pass, which adds up the similarities of q and k that tell motion.
         exponents = masks.exponents if isinstance(masks, SoftMasking) else None
         plain = step("first pass", on_devices(first_pass, WHOLE, _CLIPS, WHOLE, WHOLE))
         how = {"gram": method.gram, "witness": witness, "compute": compute}
         first, seen = plain(params, batch, clips.query_points.get(0), exponents, config=config, **how)
     else:
+        _check_shared(shared, masks, witness)
+        batch = ClipBatch(images, shared.patch_tokens, clips.padding(compute.frames))
         first, seen = shared.first, Seen(shared.saliency, shared.matches)
 
     # What moves.
@@ -191,14 +201,13 @@ def _passes(
         mined = mining(*read, batch._replace(frame_count=None), **how, frames=real)
     elif isinstance(masks, SoftMasking):
         shares = step("dynamic mask", mine_softly)
-        mined = Mined(shares(seen.saliency, images, masks, threshold=config.motion.threshold or "otsu"))
+        how = {"threshold": config.motion.threshold or "otsu", "frames": real}
+        mined = Mined(shares(seen.saliency, images, masks, **how))
     elif masks is False:
         mined = Mined(np.zeros(images.shape[:4], bool))  # type: ignore[arg-type]
 
     # Stage 2: the keys of what moves are suppressed.
-    second = None
-    if method.needs_second_pass:
-        second = first
+    second = first if method.needs_second_pass else None
     if second is not None and masks is not False:
         outputs = FIRST_OUTPUTS if both_outputs else method.second_outputs(options.align_scale)
         strength = masks.strength if isinstance(masks, SoftMasking) else None
@@ -208,14 +217,17 @@ def _passes(
         how = {"suppress": method.suppress, "outputs": outputs, "compute": compute}
         second = masked(params, batch, mined.dynamic_mask, unchanged, pairs, strength, config=config, **how)
 
-    tracks = {}
-    for frame, points in clips.query_points.items():
-        if frame == 0:
+    tracks = None
+    if clips.query_points:
+        follow = partial(step("tracks", on_devices(track_from, WHOLE, _CLIPS, WHOLE, WHOLE)), params, batch)
+        tracks = {
+            frame: follow(points, np.asarray(frame, np.int32), config=config, compute=compute)
+            for frame, points in clips.query_points.items()
+            if frame != 0
+        }
+        if 0 in clips.query_points:  # the first pass has followed them
             tracks[0] = Tracks(first.tracks, first.track_visibility, first.track_confidence)  # type: ignore[arg-type]
-        else:
-            follow = step("tracks", on_devices(track_from, WHOLE, _CLIPS, WHOLE, WHOLE))
-            tracks[frame] = follow(params, batch, points, np.asarray(frame, np.int32), config=config, compute=compute)
-    return Passes(first, second, seen.saliency, *mined, seen.matches, tokens), tracks
+    return Passes(first, second, seen.saliency, *mined, seen.matches, batch.patch_tokens, tracks)
 
 
 def _adjusts(options: Options, frames: int) -> bool:
@@ -223,13 +235,28 @@ def _adjusts(options: Options, frames: int) -> bool:
     return options.cameras == "adjusted" and frames > 1
 
 
-def _check_masks(masks: Masks, images: Images) -> None:
-    """Raise InputError for masks of another shape or type."""
-    if masks is None or masks is False or isinstance(masks, SoftMasking):
+def check_masks(masks: Masks, images: Images, frames: Frames = Frames()) -> None:
+    """Raise InputError for masks of another shape or type, and for soft ones on several devices."""
+    if isinstance(masks, SoftMasking):
+        if frames.mesh is not None:
+            raise InputError("masks are soft and frames are on several devices; soft masks take one device")
         return
-    is_mask = masks.dtype == bool or jnp.issubdtype(masks.dtype, jnp.floating)
-    if tuple(masks.shape) != tuple(images.shape[:4]) or not is_mask:
+    if masks is None or masks is False:
+        return
+    shape, dtype = tuple(np.shape(masks)), getattr(masks, "dtype", type(masks).__name__)
+    is_mask = hasattr(masks, "dtype") and any(jnp.issubdtype(dtype, kind) for kind in (jnp.bool_, jnp.floating))
+    if shape != tuple(images.shape[:4]) or not is_mask:
         raise InputError(
-            f"masks are {masks.dtype} of shape {tuple(masks.shape)}; expected bool, or shares as floats, of shape "
-            f"{tuple(images.shape[:4])}: one value for each pixel of the images"
+            f"masks are {dtype} of shape {shape}; expected an array of bool, or of shares as floats, of shape "
+            f"{tuple(images.shape[:4])}: one value for each pixel of the images; or False where nothing moves"
         )
+
+
+def _check_shared(shared: Passes, masks: Masks, witness: Witness) -> None:
+    """Raise InputError for passes that lack what is read of them."""
+    if shared.patch_tokens is None:
+        raise InputError("shared has no patch tokens; expected what run_passes returned")
+    if witness == "matches" and shared.matches is None:
+        raise InputError("shared has no matches between frames; run its passes with the same mask and cameras")
+    if isinstance(masks, SoftMasking):
+        raise InputError("masks are soft and change the first pass; leave shared out")

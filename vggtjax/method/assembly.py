@@ -14,12 +14,12 @@ from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError
 from vggtjax.method.adjusted_cameras import adjusted_cameras
 from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
-from vggtjax.method.fusion_family import FusionParams, Observations, fuse
+from vggtjax.method.fusion_family import FusionParams, Observations, fuse, identity
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.passes import Passes, present
 from vggtjax.network.frames import Frames
 from vggtjax.network.pose import decode_pose
-from vggtjax.options import CamerasFrom, find_method
+from vggtjax.options import METHODS, CamerasFrom, find_method
 
 Depth = Float[Array, "B S H W"]
 
@@ -31,6 +31,15 @@ FusionRule = FusionParams | Callable[[Observations], tuple[Depth, Depth]]
 def as_tree(fusion: FusionRule | None) -> FusionParams | Partial | None:
     """Return a rule of fusion as a tree of arrays: a function becomes a `Partial` without any."""
     return Partial(fusion) if callable(fusion) and not isinstance(fusion, Partial) else fusion  # type: ignore[return-value]
+
+
+def check_fuses(fusion: FusionRule | None, *methods: str) -> None:
+    """Raise InputError if a rule of fusion is given and none of the methods fuses both passes."""
+    if isinstance(fusion, str):
+        raise InputError(f"fusion is {fusion!r}; expected a rule of fusion; a method's name is given as method=")
+    if fusion is not None and all(find_method(method).depth != "fused" for method in methods):
+        names = ", ".join(name for name, row in METHODS.items() if row.depth == "fused")
+        raise InputError(f"a fusion is given, and method {methods[0]!r} does not fuse; expected {names}")
 
 
 class Assembly(NamedTuple):
@@ -71,6 +80,7 @@ def assemble(
         frames: where the frames of the passes are; those after `frames.count` are left out, or meaningless.
     """
     row = find_method(method)
+    check_fuses(fusion, method)
     if passes.second is None and row.needs_second_pass:
         raise InputError(f"method {method!r} needs the second pass, which was not run")
     passes = frames.cut(passes)
@@ -79,6 +89,8 @@ def assemble(
     if align_scale and passes.second is not None:
         scale = scale_between(present(first.depth), present(second.depth), passes.dynamic_mask, frames)
     depth, confidence = _depth(passes, row.depth, scale)
+    if fusion is None and row.depth == "fused" and passes.dynamic_mask.dtype != bool:
+        fusion = identity()  # the paper's rule, which blends by shares
     if fusion is not None:
         depth, confidence = _by_rule(fusion, observe(passes, scale=scale, frames=frames))
     size = (depth.shape[2], depth.shape[3])

@@ -16,9 +16,16 @@ def replace_depth(
     confidence1: Float[Array, "*F H W"],
     depth2: Float[Array, "*F H W"],
     confidence2: Float[Array, "*F H W"],
-    dynamic_mask: Bool[Array, "*F H W"],
+    dynamic_mask: Bool[Array, "*F H W"] | Float[Array, "*F H W"],
 ) -> tuple[Float[Array, "*F H W"], Float[Array, "*F H W"]]:
-    """Hard replacement (D_3a): depth and confidence of pass 1 on dynamic pixels, of pass 2 on static ones."""
+    """Hard replacement (D_3a): depth and confidence of pass 1 on dynamic pixels, of pass 2 on static ones.
+
+    Shares in place of booleans blend the passes.
+    """
+    if dynamic_mask.dtype != bool:
+        pairs = ((depth1, depth2), (confidence1, confidence2))
+        depth, confidence = (dynamic_mask * a + (1 - dynamic_mask) * b for a, b in pairs)
+        return depth, confidence
     return jnp.where(dynamic_mask, depth1, depth2), jnp.where(dynamic_mask, confidence1, confidence2)
 
 
@@ -55,10 +62,13 @@ def fuse_depth(
 def scale_between(
     depth1: Float[Array, "B S H W"],
     depth2: Float[Array, "B S H W"],
-    dynamic_mask: Bool[Array, "B S H W"],
+    dynamic_mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"],
     frames: Frames = Frames(),
 ) -> Float[Array, " B"]:
-    """Return the factor from depth2 to depth1 of each clip: the median ratio over static pixels, 1 without any."""
-    ratio = jnp.where(dynamic_mask, jnp.nan, depth1 / depth2)
+    """Return the factor from depth2 to depth1 of each clip: the median ratio over static pixels, 1 without any.
+
+    A pixel is static where its share is below 1/2, if the mask has shares.
+    """
+    ratio = jnp.where(dynamic_mask >= 0.5, jnp.nan, depth1 / depth2)
     median = median_over_frames(ratio, frames)
     return jnp.where(jnp.isfinite(median), median, 1.0)

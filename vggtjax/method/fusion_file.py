@@ -13,12 +13,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 
 from vggtjax.checkpoint import Model
 from vggtjax.errors import CheckpointError, InputError
+from vggtjax.method.assembly import FusionRule
 from vggtjax.method.fusion_family import PARTS, FusionParams, projected, start
-from vggtjax.options import METHODS, Options, find_method
+from vggtjax.options import Options
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.tensor_file import Spec, StoredTensor, read_tensors, write_tensors
 
@@ -66,13 +66,6 @@ def load_fusion(path: str | Path) -> FusionParams:
     return params
 
 
-def check_fuses(fusion: Any, *methods: str) -> None:
-    """Raise InputError if a fusion is given and none of the methods fuses both passes."""
-    if fusion is not None and all(find_method(method).depth != "fused" for method in methods):
-        names = ", ".join(name for name, row in METHODS.items() if row.depth == "fused")
-        raise InputError(f"a fusion is given, and method {methods[0]!r} does not fuse; expected {names}")
-
-
 def origin_of_fit(model: Model, options: Options) -> dict[str, Any]:
     """Return what a fit depends on that `warn_if_fitted_otherwise` compares, as JSON values."""
     digests = {"model_sha256": model.identity.sha256, "weights_sha256": _weights_digest(model)}
@@ -106,16 +99,25 @@ def warn_if_fitted_otherwise(path: Path, model: Model, options: Options) -> None
             logger.warning("%s was fitted with %s %s, and is used with %s", path, name, about[name], value)
 
 
-def fusion_digest(fusion: Any) -> str | None:
-    """Return the digest of a rule's values, after the name of a function, for the settings of a result."""
+def fusion_digest(fusion: FusionRule | None) -> str | None:
+    """Return what tells a rule in the settings of a result: the digest of a tree's values, the name of a function."""
     if fusion is None:
         return None
+    if callable(fusion):
+        return f"function {getattr(getattr(fusion, 'func', fusion), '__qualname__', type(fusion).__name__)}"
     digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(fusion) if not callable(fusion) or isinstance(fusion, Partial) else ():
+    for leaf in jax.tree.leaves(fusion):
         digest.update(np.asarray(leaf, np.float32).tobytes())
-    function = getattr(fusion, "func", fusion)
-    name = f"{getattr(function, '__qualname__', 'function')} " if callable(fusion) else ""
-    return name + digest.hexdigest()[:16]
+    return digest.hexdigest()[:16]
+
+
+def check_kept(fusion: FusionRule | None) -> None:
+    """Raise InputError for a function where results are kept by their settings, which cannot tell functions apart."""
+    if callable(fusion):
+        raise InputError(
+            "fusion is a function, and a later run could not tell whose results it keeps; expected a fitted rule "
+            "(load_fusion), or call reconstruct for each clip"
+        )
 
 
 def _read(path: str | Path) -> tuple[Mapping[str, StoredTensor], dict[str, Any]]:

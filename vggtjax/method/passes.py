@@ -44,6 +44,7 @@ class Passes(NamedTuple):
     is_matched: Bool[Array, "B S"] | None = None  # as in `Mined`
     matches: Matches | None = None  # of the first pass, where it gathered them
     patch_tokens: Float[Array, "B S P C"] | None = None  # of the backbone, which both passes share
+    tracks: dict[int, Tracks] | None = None  # by the frame of their query points
 
 
 def first_pass(
@@ -118,10 +119,16 @@ def mine_softly(
     masking: SoftMasking,
     *,
     threshold: Threshold,
+    frames: Frames = Frames(),
 ) -> Float[Array, "B S H W"]:
-    """Return the dynamic share of every pixel by the Gram saliency, with gradients; 0 where all frames are equal."""
+    """Return the dynamic share of every pixel by the Gram saliency, with gradients; 0 where all frames are equal.
+
+    Frames after `frames.count` are not read, and have shares of 0. All frames are on one device.
+    """
+    S = images.shape[1]
+    saliency, images = frames.cut((saliency, images))
     shares = soft_pixels(saliency, masking, size=(images.shape[2], images.shape[3]), threshold=threshold)
-    return jnp.where(are_equal(images)[:, None, None, None], 0, shares)
+    return frames.pad(jnp.where(are_equal(images)[:, None, None, None], 0, shares), S)
 
 
 def are_equal(images: Float[Array, "B S H W 3"], frames: Frames = Frames()) -> Bool[Array, " B"]:

@@ -22,8 +22,8 @@ from jax import export
 from vggtjax.checkpoint import Model, check_finite
 from vggtjax.errors import InputError, OutputError, check_choice, whole_number
 from vggtjax.method.algorithm import run_method
-from vggtjax.method.assembly import FusionRule
-from vggtjax.method.fusion_file import check_fuses, fusion_digest
+from vggtjax.method.assembly import FusionRule, check_fuses
+from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.network.model import HEADS
 from vggtjax.network.precision import Compute
 from vggtjax.options import Options
@@ -161,8 +161,7 @@ def _lowered(
 
     def reconstruction(weights, images):
         params = jax.tree.unflatten(structure, [weights[name] for name in names])
-        made = run_method(params, images[None], model.config, options, fusion=fusion, compute=compute)
-        passes, assembly, _ = made
+        passes, assembly = run_method(params, images[None], model.config, options, fusion=fusion, compute=compute)
         outputs = (assembly.depth, assembly.confidence, *assembly.cameras, passes.dynamic_mask, passes.saliency)
         return {name: output[0] for name, output in zip(_ABOUT, outputs, strict=True)}
 

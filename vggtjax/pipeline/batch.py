@@ -18,8 +18,9 @@ from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import VggtjaxError
 from vggtjax.known.given import check_readable
 from vggtjax.known.options import KnownGeometry
-from vggtjax.method.assembly import FusionRule
-from vggtjax.method.fusion_file import check_fuses
+from vggtjax.method.assembly import check_fuses
+from vggtjax.method.fusion_family import FusionParams
+from vggtjax.method.fusion_file import check_kept
 from vggtjax.options import Options
 from vggtjax.pipeline.clip_work import ClipWork, LongClip
 from vggtjax.pipeline.contact import contact_page
@@ -43,7 +44,7 @@ def reconstruct_many(
     framing: Framing | None = None,
     sampling: Sampling | Mapping[str, Any] | None = None,
     saving: Saving | Mapping[str, Any] | None = None,
-    fusion: FusionRule | None = None,
+    fusion: FusionParams | None = None,
     masks: BatchMasks | str = None,
     known: KnownGeometry | None = None,
     pad_frames: bool = False,
@@ -68,7 +69,8 @@ def reconstruct_many(
         options: as for `reconstruct`; a mapping of the names in `changes`, of fusion and of pad_frames serves, too.
         fusion: as for `reconstruct`.
         masks: what moves in each clip, by its name: an array or a folder of pictures as for `reconstruct`, or False for
-            nothing; or a folder of such folders, named like the clips. Masks of other clips are mined.
+            nothing; or a folder of such folders, named like the clips. Masks of other clips are mined. False: nothing
+            moves in any clip. Options of mined masks are then refused. A later run with other masks is refused, too.
         known: as for `reconstruct`, as far as all clips share it: intrinsics, a shared focal length, the height of the
             cameras, and what "source" names.
         pad_frames: as for `reconstruct`.
@@ -89,6 +91,8 @@ def reconstruct_many(
         TypeError: a name that is no option.
     """
     part = None if shard is None else parse_shard(shard)
+    if isinstance(masks, str | Mapping):
+        masks = Path(masks) if isinstance(masks, str) else masks or None
     words: dict[str, Any] = dict(changes)
     if isinstance(options, Mapping):
         words, options = words | dict(options), None
@@ -97,6 +101,7 @@ def reconstruct_many(
     framing = dataclasses.replace(framing or Framing(), **of_framing)
     options = (options or Options()).changed(**words)
     check_fuses(fusion, options.method)
+    check_kept(fusion)
     if known is not None:
         known.check_many()
         check_readable(known)
@@ -110,7 +115,7 @@ def reconstruct_many(
         pad_frames=pad_frames,
         devices=devices,
         unchecked=unchecked,
-        masks=Path(masks) if isinstance(masks, str) else masks,
+        masks=masks,
     )
     recipe.check_masks(sources)
     place = destination(out)

@@ -15,7 +15,7 @@ from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, one_line
 from vggtjax.known.intrinsics import known_values
-from vggtjax.method.assembly import FusionRule
+from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.pipeline.destination import Destination
 from vggtjax.pipeline.devices import frames_mesh, whole_on
@@ -42,7 +42,7 @@ class LongClip(NamedTuple):
 class ClipWork:
     """A model and a recipe, ready for one clip after another."""
 
-    def __init__(self, model: Model, fusion: FusionRule | None, recipe: Recipe, out: Destination) -> None:
+    def __init__(self, model: Model, fusion: FusionParams | None, recipe: Recipe, out: Destination) -> None:
         mesh = frames_mesh(recipe.devices)
         self._model, self._fusion, self._recipe, self._out = model, fusion, recipe, out
         self._placed = model  # with its weights on every device

@@ -15,11 +15,9 @@ from jaxtyping import Array, Float
 
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.method.algorithm import Clips, Masks, run_method
+from vggtjax.method.algorithm import Clips, Masks, check_masks, run_method
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree
-from vggtjax.method.fusion_file import check_fuses
 from vggtjax.method.passes import Passes
-from vggtjax.method.soft_mask import SoftMasking
 from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute
@@ -64,12 +62,10 @@ def infer(
     config = config if motion is None else dataclasses.replace(config, motion=motion)
     # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.
     options = dataclasses.replace(options.changed(**changes).resolved(config.motion), refine_mask=False)
-    check_fuses(fusion, options.method)
+    check_masks(masks, images, Frames(mesh))  # before frames are added
     frames, rule = images.shape[1], as_tree(fusion)
     if mesh is not None:
-        if isinstance(masks, SoftMasking):
-            raise InputError("masks are soft and mesh is given; soft masks take one device: leave mesh out")
-        masks = masks if masks is None or masks is False else by_frame_padded(masks, mesh)
+        masks = masks if masks is None or masks is False else by_frame_padded(masks, mesh)  # type: ignore[arg-type]
         params, images, rule = whole_on(params, mesh), by_frame_padded(images, mesh), whole_on(rule, mesh)
     given, moves = (None, False) if masks is False else (masks, True)
     outputs = _infer(params, images, given, rule, config, options, frames, mesh, moves)
@@ -101,6 +97,6 @@ def _infer(
 ) -> tuple[Assembly, Passes]:
     compute = Compute.of(options, Frames(mesh, None if mesh is None else frames))
     how = {"masks": masks if moves else False, "fusion": fusion, "compute": compute}
-    passes, assembly, _ = run_method(params, Clips(images, frames=frames), config, options, **how)
+    passes, assembly = run_method(params, Clips(images, frames=frames), config, options, **how)
     matches = passes.matches if options.cameras == "adjusted" else None
     return assembly, passes._replace(matches=matches, patch_tokens=None)

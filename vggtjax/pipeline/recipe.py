@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from vggtjax.clips.masks import masks_digest
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import InputError
@@ -17,13 +17,13 @@ from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
 from vggtjax.pipeline.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.results.saving import Saving
+from vggtjax.storage.file_digest import file_digest
 
 _TAKEN = ("", "..", SETTINGS_NAME, PAGE_NAME)
 
-
-# Of every clip by name: an array, a folder of pictures, or False where nothing moves; or the folder of such folders.
-# Masks of other clips are mined.
-BatchMasks = Mapping[str, np.ndarray | str | Path | Literal[False] | None] | Path | None
+# By the name of a clip: an array, a folder of pictures, or False where nothing moves; or the folder of such folders.
+# Masks of other clips are mined. False: nothing moves in any clip.
+BatchMasks = Mapping[str, np.ndarray | str | Path | Literal[False] | None] | Path | Literal[False] | None
 
 
 class ClipOutcome(NamedTuple):
@@ -51,9 +51,11 @@ class Recipe:
 
     def masks_of(self, name: str) -> Any:
         """Return the masks of a clip, as `reconstruct` takes them; None where they are mined."""
-        if isinstance(self.masks, Path):
-            return folder if (folder := self.masks / name).is_dir() else None
-        return None if self.masks is None else self.masks.get(name)
+        if not isinstance(self.masks, Path):
+            return self.masks.get(name) if isinstance(self.masks, Mapping) else self.masks
+        if not self.masks.is_dir():  # so it is on a worker that does not see the folder
+            raise InputError(f"masks is {self.masks}, which is no folder here; expected a folder that all workers see")
+        return folder if (folder := self.masks / name).is_dir() else None
 
     def check_masks(self, names: Collection[str]) -> None:
         """Raise InputError for masks of no clip, and for options of mined masks beside given ones."""
@@ -65,14 +67,24 @@ class Recipe:
                 raise InputError(
                     f"masks is {self.masks}; expected a folder with a folder of pictures named like a clip"
                 )
-        elif unknown := sorted(self.masks.keys() - set(names)):
-            raise InputError(f"masks has {unknown[0]!r}, which is no clip of the batch; expected names of clips")
+        elif isinstance(self.masks, Mapping):
+            if unknown := sorted(self.masks.keys() - set(names)):
+                raise InputError(f"masks has {unknown[0]!r}, which is no clip of the batch; expected names of clips")
+        elif self.masks is not False:
+            raise InputError(
+                f"masks is of type {type(self.masks).__name__}; expected masks by the name of the clip, a folder of "
+                "folders, or False where nothing moves in any clip"
+            )
 
     def masks_setting(self) -> dict[str, Any]:
         """Return what tells the masks of a batch from others, as JSON values; nothing where all are mined."""
-        if self.masks is None or isinstance(self.masks, Path):
-            return {} if self.masks is None else {"masks": str(self.masks)}
-        return {"masks": {name: _masks_text(masks) for name, masks in sorted(self.masks.items())}}
+        if self.masks is None:
+            return {}
+        if isinstance(self.masks, Path):
+            return {"masks": f"{self.masks} {file_digest(sorted(self.masks.rglob('*')))}"}
+        if isinstance(self.masks, Mapping):
+            return {"masks": {name: masks_digest(masks) for name, masks in sorted(self.masks.items())}}
+        return {"masks": "nothing moves"}
 
 
 def failed(name: str, error: BaseException) -> ClipOutcome:
@@ -85,9 +97,3 @@ def odd_name(name: str) -> ClipOutcome | None:
     if name not in _TAKEN and Path(name).name == name and name.isprintable():
         return None
     return ClipOutcome(name, "failed", f"a clip is named {name!r}; expected a plain name, which becomes its folder")
-
-
-def _masks_text(masks: np.ndarray | str | Path | bool | None) -> str:
-    if isinstance(masks, np.ndarray):
-        return hashlib.sha256(f"{masks.dtype} {masks.shape}".encode() + masks.tobytes()).hexdigest()[:16]
-    return str(masks)

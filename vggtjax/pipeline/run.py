@@ -24,8 +24,8 @@ from vggtjax.known.apply import apply_known, scaled
 from vggtjax.known.given import Given, check_readable, read_known
 from vggtjax.known.options import KnownGeometry
 from vggtjax.method.algorithm import Clips, run_method
-from vggtjax.method.assembly import Assembly, FusionRule, as_tree
-from vggtjax.method.fusion_file import check_fuses, fusion_digest
+from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
+from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.matches import come_back, frame_pairs
 from vggtjax.method.passes import Passes
@@ -134,7 +134,6 @@ def reconstruct(
 
     inputs = Clips(
         images=padded(clip.images),
-        frame_count=whole_on(np.array([frames], np.int32), mesh) if length > frames else None,
         query_points={} if tracks is None else whole_on(_points_by_frame(tracks), mesh),
         frames=frames,
     )
@@ -161,12 +160,12 @@ def reconstruct(
         say_how_to_keep(time.perf_counter() - started)
         outputs = run(step=Execute(on_stage))
     outputs = outputs._replace(passes=outputs.passes._replace(patch_tokens=None))
-    passes, assembly, by_frame = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
+    passes, assembly = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
     motion = None
     if passes.motion is not None and passes.is_matched is not None:
         mask_source = _MATCHED if passes.is_matched.all() else _NOT_MATCHED
         motion = passes.motion[0] / np.median(passes.motion[0]) if passes.is_matched.all() else None
-    fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, by_frame, frames))
+    fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, passes.tracks, frames))
     try:
         result = Reconstruction(
             **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
@@ -228,7 +227,6 @@ def compile_ahead(
     shape = (1, shared_length(length, mesh), height, width, 3)
     clips = Clips(
         images=jax.ShapeDtypeStruct(shape, jnp.float32, sharding=by_frame),  # type: ignore
-        frame_count=None if length == frames else jax.ShapeDtypeStruct((1,), jnp.int32, sharding=whole),  # type: ignore
         frames=frames,
     )
     params = model.params
@@ -242,8 +240,8 @@ def compile_ahead(
 
 
 def _kept(passes: Passes, options: Options) -> Passes:
-    """Return passes without matches that nothing reads any more."""
-    return passes if options.cameras == "adjusted" else passes._replace(matches=None)
+    """Return passes without what the result has, and without matches that nothing reads any more."""
+    return passes._replace(tracks=None, matches=passes.matches if options.cameras == "adjusted" else None)
 
 
 def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:

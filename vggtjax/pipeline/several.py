@@ -11,8 +11,8 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
-from vggtjax.method.assembly import FusionRule, as_tree, assemble
-from vggtjax.method.fusion_file import check_fuses, fusion_digest
+from vggtjax.method.assembly import FusionRule, as_tree, assemble, check_fuses
+from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.options import Options
 from vggtjax.pipeline.run import assembled_fields, reconstruct, refined
 from vggtjax.pipeline.steps import Execute

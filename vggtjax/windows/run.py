@@ -15,15 +15,15 @@ from jaxtyping import Array, Float32
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
-from vggtjax.clips.images import ImageFiles
-from vggtjax.clips.masks import load_masks
+from vggtjax.clips.masks import load_masks, masks_digest
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.queries import Queries, check_queries, check_words, parse_queries
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
-from vggtjax.errors import ClipError, InputError, reading
-from vggtjax.method.assembly import FusionRule
-from vggtjax.method.fusion_file import check_fuses, fusion_digest
+from vggtjax.errors import InputError
+from vggtjax.method.assembly import check_fuses
+from vggtjax.method.fusion_family import FusionParams
+from vggtjax.method.fusion_file import check_kept, fusion_digest
 from vggtjax.method.passes import track_from
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
@@ -38,7 +38,6 @@ from vggtjax.results.folder import check_folder
 from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import RunFacts, versions
 from vggtjax.results.saving import Saving
-from vggtjax.storage.file_digest import file_digest
 from vggtjax.storage.writing import locked_folder
 from vggtjax.windows.frames import SeenFrames, count_frames, window_clips
 from vggtjax.windows.join import JoinRule
@@ -80,7 +79,7 @@ def reconstruct_long(
     *,
     options: Options = Options(),
     long_run: LongRun | None = None,
-    fusion: FusionRule | None = None,
+    fusion: FusionParams | None = None,
     masks: str | Path | Literal[False] | None = None,
     **changes: Any,
 ) -> Reconstruction:
@@ -114,6 +113,7 @@ def reconstruct_long(
         asked.check_given_masks()
     options = asked.resolved(model.config.motion)
     check_fuses(fusion, options.method)
+    check_kept(fusion)
     if long_run is not None and isinstance(long_run.tracks, str):
         check_words(long_run.tracks)
     if options.refine_cameras:
@@ -139,7 +139,7 @@ def tools_of(
     options: Options = Options(),
     size: int | None = None,
     *,
-    fusion: FusionRule | None = None,
+    fusion: FusionParams | None = None,
     masks: str | Path | Literal[False] | None = None,
 ) -> Tools:
     """Return what runs a window by `reconstruct`, and describes frames by the means of their patch tokens."""
@@ -233,14 +233,3 @@ def run_windows(source: ClipSource, out: Path, plan: LongRun, tools: Tools, sett
         del result
         store.remove()
     return Reconstruction.load(out)
-
-
-def masks_digest(masks: str | Path | bool | None) -> str:
-    """Return text that changes when the given masks do. Raises ClipError for masks that are not there."""
-    if masks is None or isinstance(masks, bool):
-        return str(masks)
-    source = open_source(str(masks))
-    if not isinstance(source, ImageFiles):
-        raise ClipError(f"{masks} is not a folder of pictures; masks need one picture per frame")
-    with reading(masks, ClipError):
-        return f"{masks} {file_digest(source.paths)}"
