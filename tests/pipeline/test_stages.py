@@ -14,8 +14,8 @@ from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.passes import first_pass, second_pass
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.model import init_params, parameter_shapes
+from vggtjax.pipeline.fields import assembled_fields
 from vggtjax.pipeline.lengths import padded_frames
-from vggtjax.pipeline.run import assembled_fields
 from vggtjax.results.not_finite import NotFiniteWarning, warn_of_not_finite
 
 SIDE, OFFSETS = 70, MotionConfig().offsets

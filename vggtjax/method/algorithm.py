@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal, NamedTuple, ParamSpec, Protocol, TypeVar
+from typing import Literal, ParamSpec, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -97,13 +97,6 @@ class Clips:
             raise InputError("clips are padded and have query_points; tracking requires that all frames are real")
 
 
-class Outputs(NamedTuple):
-    """What a method makes of clips."""
-
-    passes: Passes
-    assembly: Assembly
-
-
 def run_method(
     params: Params,
     clips: Clips | Images,
@@ -115,7 +108,7 @@ def run_method(
     both_outputs: bool = False,
     compute: Compute | None = None,
     step: Step = inline,
-) -> Outputs:
+) -> tuple[Assembly, Passes]:
     """Reconstruct clips by a method. Pure: works under jit, grad and vmap; `infer` is its jit.
 
     Args:
@@ -129,6 +122,8 @@ def run_method(
         both_outputs: predict depth in the second pass even if the method does not read it.
         compute: how the network is computed; by the options and the platform if None.
         step: what becomes of every step.
+
+    Returns depth, confidence and cameras, and the passes they were made of.
     """
     clips = clips if isinstance(clips, Clips) else Clips(clips)
     compute = compute or Compute.of(options)
@@ -141,7 +136,7 @@ def run_method(
     how = {"method": options.method, "align_scale": options.align_scale, "cameras": cameras, "frames": frames}
     join = step("assemble", frames.on_devices(assemble, BY_FRAME, WHOLE))
     read = passes._replace(patch_tokens=None, tracks=None)
-    return Outputs(passes, join(read, as_tree(fusion), **how))
+    return join(read, as_tree(fusion), **how), passes
 
 
 def run_passes(

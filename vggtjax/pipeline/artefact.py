@@ -161,7 +161,7 @@ def _lowered(
 
     def reconstruction(weights, images):
         params = jax.tree.unflatten(structure, [weights[name] for name in names])
-        passes, assembly = run_method(params, images[None], model.config, options, fusion=fusion, compute=compute)
+        assembly, passes = run_method(params, images[None], model.config, options, fusion=fusion, compute=compute)
         outputs = (assembly.depth, assembly.confidence, *assembly.cameras, passes.dynamic_mask, passes.saliency)
         return {name: output[0] for name, output in zip(_ABOUT, outputs, strict=True)}
 

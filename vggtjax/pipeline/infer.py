@@ -97,6 +97,6 @@ def _infer(
 ) -> tuple[Assembly, Passes]:
     compute = Compute.of(options, Frames(mesh, None if mesh is None else frames))
     how = {"masks": masks if moves else False, "fusion": fusion, "compute": compute}
-    passes, assembly = run_method(params, Clips(images, frames=frames), config, options, **how)
+    assembly, passes = run_method(params, Clips(images, frames=frames), config, options, **how)
     matches = passes.matches if options.cameras == "adjusted" else None
     return assembly, passes._replace(matches=matches, patch_tokens=None)

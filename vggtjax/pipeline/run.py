@@ -24,28 +24,29 @@ from vggtjax.known.apply import apply_known, scaled
 from vggtjax.known.given import Given, check_readable, read_known
 from vggtjax.known.options import KnownGeometry
 from vggtjax.method.algorithm import Clips, run_method
-from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
-from vggtjax.method.fusion_file import fusion_digest
+from vggtjax.method.assembly import FusionRule, as_tree, check_fuses
 from vggtjax.method.mask_refinement import refine_masks
-from vggtjax.method.matches import come_back, frame_pairs
-from vggtjax.method.passes import Passes
 from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
-from vggtjax.network.model import Predictions
 from vggtjax.network.precision import Compute
-from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
 from vggtjax.pipeline.devices import by_frame_on, frames_mesh, on_host, whole_on
+from vggtjax.pipeline.fields import (
+    assembled_fields,
+    camera_source,
+    clip_fields,
+    kept_passes,
+    motion_by_matches,
+    settings_of,
+    track_fields,
+)
 from vggtjax.pipeline.lengths import padded_frames, shared_length
 from vggtjax.pipeline.steps import Compile, Execute, StageMemory
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.refinement.refine import check_refinement, refine_cameras
 from vggtjax.results.not_finite import warn_of_not_finite
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.results.report import versions
 from vggtjax.storage.cache import say_how_to_keep
 
-_MATCHED = "mined: matches between frames and Gram similarities"
-_NOT_MATCHED = "mined: Gram similarities, as matches between frames cannot be used"
 _LESS_MEMORY = (
     "fewer frames at once (window, max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
 )
@@ -158,25 +159,23 @@ def reconstruct(
             run(step=compiler)
             compiler.wait(progress)
         say_how_to_keep(time.perf_counter() - started)
-        outputs = run(step=Execute(on_stage))
-    outputs = outputs._replace(passes=outputs.passes._replace(patch_tokens=None))
-    passes, assembly = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
-    motion = None
-    if passes.motion is not None and passes.is_matched is not None:
-        mask_source = _MATCHED if passes.is_matched.all() else _NOT_MATCHED
-        motion = passes.motion[0] / np.median(passes.motion[0]) if passes.is_matched.all() else None
-    fields = _clip_fields(clip) | ({} if tracks is None else _track_fields(tracks, passes.tracks, frames))
+        assembly, passes = run(step=Execute(on_stage))
+    outputs = (assembly, passes._replace(patch_tokens=None))
+    assembly, passes = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
+    motion, mask_source = motion_by_matches(passes, mask_source)
+    tracked = {} if tracks is None else track_fields(tracks, passes.tracks, frames)
     try:
         result = Reconstruction(
             **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
-            **fields,
+            **clip_fields(clip),
+            **tracked,
             saliency=passes.saliency[0],
             motion=motion,
             dynamic_mask=passes.dynamic_mask[0],
             method=options.method,
             model_name=model.name,
-            settings=_settings(model, clip, options, mask_source, fusion) | _camera_source(options, passes),
-            passes=_kept(passes, options) if keep_passes else None,
+            settings=settings_of(model, clip, options, mask_source, fusion) | camera_source(options, passes),
+            passes=kept_passes(passes, options) if keep_passes else None,
         )
     except ResultError:
         check_finite(model)  # they may be the reason
@@ -239,26 +238,6 @@ def compile_ahead(
         return compiler.wait()
 
 
-def _kept(passes: Passes, options: Options) -> Passes:
-    """Return passes without what the result has, and without matches that nothing reads any more."""
-    return passes._replace(tracks=None, matches=passes.matches if options.cameras == "adjusted" else None)
-
-
-def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:
-    """Return a method's depth, confidence and cameras of the first clip; the pass `source` gave the intrinsics."""
-    depth, confidence, camera_from_world, intrinsics = (np.array(x)[0] for x in jax.tree.leaves(assembly))
-    fields_of_view = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
-    focal = intrinsics[:, [0, 1], [0, 1]]
-    # tan(fov / 2) has period 2 pi: a field of view above pi gets a negative focal length, which Reconstruction clamps.
-    intrinsics[:, [0, 1], [0, 1]] = np.where(fields_of_view > np.pi, -np.abs(focal), focal)
-    return {
-        "depth": depth,
-        "depth_confidence": confidence,
-        "camera_from_world": camera_from_world,
-        "intrinsics": intrinsics,
-    }
-
-
 def refined(result: Reconstruction, progress: Progress | None, unit: float = 1.0) -> Reconstruction:
     """Return the result without the mask's pixels that agree with other frames, by the result's depth and cameras.
 
@@ -314,54 +293,9 @@ def _given_geometry(known: KnownGeometry, clip: Clip) -> Given:
     return read_known(known, clip, leave_out=masks, capture=capture)
 
 
-def _clip_fields(clip: Clip) -> dict[str, Any]:
-    """Return the fields of a Reconstruction that the clip gives."""
-    names = ("timestamps", "source_size", "source_scale", "source_offset", "valid_box")
-    fields: dict[str, Any] = {name: getattr(clip, name) for name in names}
-    images = np.round(clip.images * 255).astype(np.uint8)
-    return {**fields, "images": images, "frame_names": tuple(clip.frame_names)}
-
-
-def _settings(
-    model: Model, clip: Clip, options: Options, mask_source: str, fusion: FusionRule | None
-) -> dict[str, Any]:
-    """Return the settings that a result depends on besides the method, as JSON values."""
-    settings = {name: value for name, value in options.to_json().items() if name != "method"}
-    settings |= {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
-    settings |= {"masks": mask_source}
-    settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
-    settings |= {"clip": clip.source.name} if clip.source.name else {}
-    return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}
-
-
-def _camera_source(options: Options, passes: Passes) -> dict[str, str]:
-    """Return the setting of adjusted cameras; it tells where matches could not be used, and the cameras stayed."""
-    if options.cameras == "predicted":
-        return {}
-    used = False
-    if passes.matches is not None:
-        matches = jax.tree.map(lambda x: x[0], passes.matches)
-        used = bool(come_back(matches, frame_pairs(len(matches.cycle))))
-    return {} if used else {"cameras": "predicted, as matches between frames cannot be used"}
-
-
 def _points_by_frame(queries: Queries) -> dict[int, Float[Array, "1 Q 2"]]:
     """Return the points to track by the frame in which they are given."""
     return {
         frame: jnp.asarray(queries.points[queries.frames == frame])[None]
         for frame in np.unique(queries.frames).tolist()
     }
-
-
-def _track_fields(queries: Queries, by_frame: dict[int, Tracks], frames: int) -> dict[str, Any]:
-    """Return the tracks of all query frames in the order of the queries, as fields of a Reconstruction."""
-    Q = len(queries.frames)
-    fields = {
-        "track_positions": np.zeros((frames, Q, 2), np.float32),
-        "track_visibility": np.zeros((frames, Q), np.float32),
-        "track_confidence": np.zeros((frames, Q), np.float32),
-    }
-    for frame, tracks in by_frame.items():
-        for values, of_frame in zip(fields.values(), tracks, strict=True):
-            values[:, queries.frames == frame] = of_frame[0]
-    return fields | {"track_frames": queries.frames}

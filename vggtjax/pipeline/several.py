@@ -14,7 +14,8 @@ from vggtjax.errors import InputError
 from vggtjax.method.assembly import FusionRule, as_tree, assemble, check_fuses
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.options import Options
-from vggtjax.pipeline.run import assembled_fields, reconstruct, refined
+from vggtjax.pipeline.fields import assembled_fields
+from vggtjax.pipeline.run import reconstruct, refined
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, no_stage
 from vggtjax.results.reconstruction import Reconstruction

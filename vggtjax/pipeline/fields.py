@@ -1,0 +1,98 @@
+"""What a method makes of a clip -> the fields of a Reconstruction."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from vggtjax.checkpoint import Model
+from vggtjax.clips.clip import Clip
+from vggtjax.clips.queries import Queries
+from vggtjax.method.assembly import Assembly, FusionRule
+from vggtjax.method.fusion_file import fusion_digest
+from vggtjax.method.matches import come_back, frame_pairs
+from vggtjax.method.passes import Passes
+from vggtjax.network.model import Predictions
+from vggtjax.network.track_head import Tracks
+from vggtjax.options import Options
+from vggtjax.results.report import versions
+
+_MATCHED = "mined: matches between frames and Gram similarities"
+_NOT_MATCHED = "mined: Gram similarities, as matches between frames cannot be used"
+
+
+def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:
+    """Return a method's depth, confidence and cameras of the first clip; the pass `source` gave the intrinsics."""
+    depth, confidence, camera_from_world, intrinsics = (np.array(x)[0] for x in jax.tree.leaves(assembly))
+    fields_of_view = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
+    focal = intrinsics[:, [0, 1], [0, 1]]
+    # tan(fov / 2) has period 2 pi: a field of view above pi gets a negative focal length, which Reconstruction clamps.
+    intrinsics[:, [0, 1], [0, 1]] = np.where(fields_of_view > np.pi, -np.abs(focal), focal)
+    return {
+        "depth": depth,
+        "depth_confidence": confidence,
+        "camera_from_world": camera_from_world,
+        "intrinsics": intrinsics,
+    }
+
+
+def motion_by_matches(passes: Passes, mask_source: str) -> tuple[Float[np.ndarray, "S h w"] | None, str]:
+    """Return the motion by matches over its median, None where they gave no mask, and the source of the mask."""
+    if passes.motion is None or passes.is_matched is None:
+        return None, mask_source
+    if not passes.is_matched.all():
+        return None, _NOT_MATCHED
+    return np.asarray(passes.motion[0] / np.median(passes.motion[0])), _MATCHED
+
+
+def clip_fields(clip: Clip) -> dict[str, Any]:
+    """Return the fields of a Reconstruction that the clip gives."""
+    names = ("timestamps", "source_size", "source_scale", "source_offset", "valid_box")
+    fields: dict[str, Any] = {name: getattr(clip, name) for name in names}
+    images = np.round(clip.images * 255).astype(np.uint8)
+    return {**fields, "images": images, "frame_names": tuple(clip.frame_names)}
+
+
+def track_fields(queries: Queries, by_frame: dict[int, Tracks], frames: int) -> dict[str, Any]:
+    """Return the tracks of all query frames in the order of the queries, as fields of a Reconstruction."""
+    Q = len(queries.frames)
+    fields = {
+        "track_positions": np.zeros((frames, Q, 2), np.float32),
+        "track_visibility": np.zeros((frames, Q), np.float32),
+        "track_confidence": np.zeros((frames, Q), np.float32),
+    }
+    for frame, tracks in by_frame.items():
+        for values, of_frame in zip(fields.values(), tracks, strict=True):
+            values[:, queries.frames == frame] = of_frame[0]
+    return fields | {"track_frames": queries.frames}
+
+
+def settings_of(
+    model: Model, clip: Clip, options: Options, mask_source: str, fusion: FusionRule | None
+) -> dict[str, Any]:
+    """Return the settings that a result depends on besides the method, as JSON values."""
+    settings = {name: value for name, value in options.to_json().items() if name != "method"}
+    settings |= {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
+    settings |= {"masks": mask_source}
+    settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
+    settings |= {"clip": clip.source.name} if clip.source.name else {}
+    return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}
+
+
+def camera_source(options: Options, passes: Passes) -> dict[str, str]:
+    """Return the setting of adjusted cameras; it tells where matches could not be used, and the cameras stayed."""
+    if options.cameras == "predicted":
+        return {}
+    used = False
+    if passes.matches is not None:
+        matches = jax.tree.map(lambda x: x[0], passes.matches)
+        used = bool(come_back(matches, frame_pairs(len(matches.cycle))))
+    return {} if used else {"cameras": "predicted, as matches between frames cannot be used"}
+
+
+def kept_passes(passes: Passes, options: Options) -> Passes:
+    """Return passes without what the result has, and without matches that nothing reads any more."""
+    return passes._replace(tracks=None, matches=passes.matches if options.cameras == "adjusted" else None)
