@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable
 from functools import partial
@@ -22,7 +21,7 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.depth import median_scale
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.network.aggregator import SPECIAL_TOKENS
-from vggtjax.network.block import Block
+from vggtjax.network.block import Block, apply_block
 from vggtjax.network.layers import Params
 from vggtjax.network.merging import merged_attention
 from vggtjax.network.model import forward
@@ -150,7 +149,7 @@ def _times(frames: int, grid: tuple[int, int], repeats: int) -> Table:
     tokens = SPECIAL_TOKENS + grid[0] * grid[1]
     generator = np.random.default_rng(0)
     block = Block(_HEADS, qk_norm=True)
-    shapes = jax.eval_shape(lambda: block.declare(_WIDTH))
+    shapes = jax.eval_shape(block.init, jax.random.key(0), jnp.zeros((1, 1, _WIDTH)))["params"]
     params = jax.tree.map(lambda leaf: jnp.asarray(0.03 * generator.standard_normal(leaf.shape, np.float32)), shapes)
     x = jnp.asarray(generator.standard_normal((frames, tokens, _WIDTH), np.float32))
     rope = rope_table(grid, SPECIAL_TOKENS, _WIDTH // _HEADS)
@@ -158,9 +157,9 @@ def _times(frames: int, grid: tuple[int, int], repeats: int) -> Table:
     def compiled(name: str, way: Callable | None) -> Callable[[], Any]:
         def run(params, x):
             if way is None:
-                return block(params, x, rope)[0]
+                return apply_block(block, params, x, rope)[0]
             attend = way(frames, grid, SPECIAL_TOKENS)
-            return dataclasses.replace(block, attend=attend)(params, x.reshape(1, -1, _WIDTH), rope)[0]
+            return apply_block(block.clone(attend=attend), params, x.reshape(1, -1, _WIDTH), rope)[0]
 
         inputs = _weights(name, params, "aggregator.global_blocks."), x
         return partial(jax.jit(full_precision(run)).lower(*inputs).compile(), *inputs)

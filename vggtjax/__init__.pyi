@@ -25,7 +25,7 @@ from .network.model import forward as forward
 from .network.model import init_params as init_params
 from .network.pose import decode_pose as decode_pose
 from .network.pose import encode_pose as encode_pose
-from .options import LADDER as LADDER
+from .options import ABLATION as ABLATION
 from .options import METHODS as METHODS
 from .options import Options as Options
 from .pipeline.artefact import write_artefact as write_artefact

@@ -61,7 +61,7 @@ METHODS: dict[str, Method] = {
     "4dvggt-m": Method("fused", "second", "second", mask="matches"),
 }
 
-LADDER = ("vggt", "pose-decoupling", "hard-replacement", "4dvggt-d")  # one run of both passes serves all four
+ABLATION = ("vggt", "pose-decoupling", "hard-replacement", "4dvggt-d")  # one run of both passes serves all four
 
 
 def find_method(name: str) -> Method:

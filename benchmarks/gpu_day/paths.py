@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.gpu_day.lines import Lines
 from benchmarks.suite.cases import Size
 from benchmarks.suite.measure import timed
-from vggtjax.network import attention
+from vggtjax.network import attention, cpu_attention
 
 Path = Callable[..., jax.Array]  # queries, keys, values, visible keys or None
 
@@ -37,8 +37,8 @@ def attention_paths(size: Size, lines: Lines) -> None:
             q32, k32, v32 = (np.asarray(x, np.float32) for x in inputs)
             for mask in (None, visible):
                 with jax.default_device(cpu):
-                    expected = np.asarray(_run(attention._in_chunks, q32, k32, v32, mask))
-                    gradient = np.asarray(_run(_gradient(attention._in_chunks), q32, k32, v32, mask))
+                    expected = np.asarray(_run(cpu_attention.attention_in_chunks, q32, k32, v32, mask))
+                    gradient = np.asarray(_run(_gradient(cpu_attention.attention_in_chunks), q32, k32, v32, mask))
                 for path, function in _paths(dtype).items():
                     wanted = gradient if "gradient" in path else expected
                     row = {"shape": name, "path": path, "mask": "no" if mask is None else "yes"}
@@ -54,7 +54,7 @@ def _paths(dtype: str) -> dict[str, Path | None]:
         "chosen here, gradient": _gradient(attention.attention),
         "at once": attention._at_once,
         "as many clips as fit": _cut,
-        "in chunks": attention._in_chunks,
+        "in chunks": cpu_attention.attention_in_chunks,
         "cuDNN": partial(attention._packed, implementation="cudnn") if cudnn else None,
         "kernel for TPUs": attention._on_tpu if jax.default_backend() == "tpu" else None,
     }
@@ -62,7 +62,7 @@ def _paths(dtype: str) -> dict[str, Path | None]:
 
 def _cut(q, k, v, visible):
     """Compute one clip at a time, as where the logits of all do not fit."""
-    with mock.patch.object(attention, "LOGITS_ELSEWHERE", q.shape[2] * q.shape[1] * k.shape[1]):
+    with mock.patch.object(attention, "LOGITS_AT_ONCE", q.shape[2] * q.shape[1] * k.shape[1]):
         return attention._at_once_or_in_chunks(q, k, v, visible)
 
 

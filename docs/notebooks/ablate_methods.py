@@ -20,7 +20,7 @@ _, passes = vggtjax.infer(model.params, images, model.config)
 # `passes.first` and `passes.second` are what the network predicted, `passes.dynamic_mask` is the mask between them.
 
 # %%
-ladder = {name: vggtjax.assemble(passes, method=name) for name in vggtjax.LADDER}
+ladder = {name: vggtjax.assemble(passes, method=name) for name in vggtjax.ABLATION}
 
 # %% [markdown]
 # ## Depth, by region

@@ -12,7 +12,7 @@ from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import open_source
 from vggtjax.commands import main as cli
-from vggtjax.commands.clip_options import Known
+from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.one_clip import OneClip
 from vggtjax.commands.report import Report
 from vggtjax.errors import DeviceMemoryError
@@ -168,7 +168,7 @@ def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, mon
             fusion=None,
             options=Options(**options),
             devices=devices,
-            known=Known(),
+            known=GivenInputs(),
             geometry=KnownGeometry(),
             out=tmp_path,
             saving=Saving(),

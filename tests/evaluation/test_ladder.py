@@ -20,7 +20,7 @@ from vggtjax.evaluation.metrics.masks import auc, jaccard
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.method.mask import upsample
-from vggtjax.options import LADDER
+from vggtjax.options import ABLATION
 
 CLIPS, FRAMES, SIZE = 3, 4, (28, 42)
 SETTING = ("method", "mask_source", "mask_pairs", "suppress")
@@ -81,7 +81,9 @@ def only(rows, **wanted) -> LadderRow:
 
 
 def test_every_setting_has_a_row(rows):
-    masked = [(name, source, pairs, "zero") for source in ("mined", "true") for pairs in (0, 2) for name in LADDER[1:]]
+    masked = [
+        (name, source, pairs, "zero") for source in ("mined", "true") for pairs in (0, 2) for name in ABLATION[1:]
+    ]
     settings = [("vggt", None, None, None), *masked]
     assert [(row.clip, *(getattr(row, name) for name in SETTING)) for row in rows] == [
         (clip, *setting) for clip in range(CLIPS) for setting in settings
@@ -89,7 +91,7 @@ def test_every_setting_has_a_row(rows):
     assert not any(row.failure for row in rows)
 
 
-@pytest.mark.parametrize("method", LADDER)
+@pytest.mark.parametrize("method", ABLATION)
 def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
     settings = {} if method == "vggt" else {"mask_source": "mined", "mask_pairs": 2}
     row = only(rows, clip=1, method=method, **settings)

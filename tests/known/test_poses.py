@@ -64,7 +64,7 @@ def test_as_many_poses_as_frames_at_other_times_go_by_their_order(tmp_path, capl
 
 
 TURNING = Rotation.from_rotvec(np.arange(6)[:, None] * [0, 0, np.pi / 3]).as_matrix()
-PLACE, ROTATION, WHOLE = np.s_[:, :3, 3], np.s_[:, :3, :3], np.s_[:]
+PLACE, ROTATION, REPLICATED = np.s_[:, :3, 3], np.s_[:, :3, :3], np.s_[:]
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ PLACE, ROTATION, WHOLE = np.s_[:, :3, 3], np.s_[:, :3, :3], np.s_[:]
         ),
         (ROTATION, lambda turns: TURNING @ turns, r"differ from the predicted ones by \d+ degrees"),
         (ROTATION, lambda turns: turns * [1, -1, -1], "by 14 degrees .* 0.0 if read in OpenGL's axes"),
-        (WHOLE, np.linalg.inv, r"by \d+ degrees .* 0.0 if read as camera-from-world"),
+        (REPLICATED, np.linalg.inv, r"by \d+ degrees .* 0.0 if read as camera-from-world"),
     ],
 )
 def test_poses_that_do_not_fit_are_refused(tmp_path, part, change, message):

@@ -13,7 +13,7 @@ from tests.tiny import tiny_config
 from vggtjax import forward, infer, init_params
 from vggtjax.errors import InputError
 from vggtjax.learning.distances import pose_error
-from vggtjax.learning.soft import reconstruct_softly
+from vggtjax.learning.soft import reconstruct_soft
 from vggtjax.method.fusion_family import identity
 from vggtjax.method.soft_mask import SoftMasking, soft_masking
 
@@ -36,7 +36,7 @@ def images(seed: int = 0) -> jax.Array:
 
 
 softly = jax.jit(
-    reconstruct_softly,
+    reconstruct_soft,
     static_argnames=("config", "gram", "motion", "stop_camera_gradient", "compute_dtype", "remat"),
 )
 
@@ -107,7 +107,7 @@ def test_every_gradient_by_finite_differences():
         def loss(knobs):
             masking, fusion, bias = knobs
             tree = weights | {"aggregator": weights["aggregator"] | {"camera_token": bias}}
-            made = reconstruct_softly(
+            made = reconstruct_soft(
                 tree, pictures, CONFIG, masking, fusion, stop_camera_gradient=False, compute_dtype="float64", remat=True
             )
             outputs = {

@@ -26,7 +26,7 @@ from vggtjax import (
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
-from vggtjax.learning import identity, reconstruct_softly, soft_masking
+from vggtjax.learning import identity, reconstruct_soft, soft_masking
 from vggtjax.method.algorithm import run_method, run_passes
 from vggtjax.pipeline.batch import reconstruct_many
 from vggtjax.pipeline.several import reconstruct_methods
@@ -65,7 +65,7 @@ def _callers(model, clip, folder):
         "compile_ahead": lambda: compile_ahead(model, FRAMES, SIDE, SIDE),
         "several methods": lambda: reconstruct_methods(model, clip, ["vggt", "4dvggt-d"]),
         "ladder": lambda: ladder(model, truth),
-        "soft masks": lambda: reconstruct_softly(model.params, IMAGES, config, soft_masking(config)),
+        "soft masks": lambda: reconstruct_soft(model.params, IMAGES, config, soft_masking(config)),
         "artefact": lambda: write_artefact(model, folder / "a", frames=FRAMES, height=SIDE, width=SIDE),
         "batch": lambda: next(reconstruct_many(model, {"clip": IMAGES[0]}, folder / "b")),
         "windows": lambda: reconstruct_long(model, np.concatenate(IMAGES), folder / "c", Windows(4, 2)),
@@ -139,7 +139,7 @@ def test_a_rule_is_for_methods_that_fuse(model):
 def test_soft_masks_of_any_caller_are_those_of_the_soft_method(model):
     images = jnp.asarray(IMAGES)
     masking = soft_masking(model.config, temperature=0.1)
-    soft = jax.jit(reconstruct_softly, static_argnames="config")(model.params, images, model.config, masking)
+    soft = jax.jit(reconstruct_soft, static_argnames="config")(model.params, images, model.config, masking)
     made, passes = infer(model.params, images, model.config, masks=masking)
     assert np.allclose(passes.dynamic_mask, soft.passes.dynamic_mask, atol=1e-5)
     assert np.allclose(made.depth, soft.depth, rtol=1e-5)
@@ -223,7 +223,7 @@ def test_equal_frames_have_an_empty_mask_for_every_caller(model):
     config = model.config
     for passes in (
         infer(model.params, images, config)[1],
-        reconstruct_softly(model.params, jnp.asarray(images), config, soft_masking(config)).passes,
+        reconstruct_soft(model.params, jnp.asarray(images), config, soft_masking(config)).passes,
         run_method(model.params, Clips(jnp.asarray(images)), config)[1],
     ):
         share = np.asarray(passes.dynamic_mask).mean(axis=(1, 2, 3))

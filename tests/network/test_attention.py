@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from jax.experimental.pallas import tpu
 
-from vggtjax.network import attention
+from vggtjax.network import attention, cpu_attention
 
 
 def _formula(q, k, v, kept):
@@ -18,12 +18,17 @@ def _formula(q, k, v, kept):
 
 @pytest.mark.parametrize(
     ("implementation", "at_once"),
-    [(attention._at_once, 0), (attention._in_chunks, 0), (attention._in_chunks, 1000), (attention.attention, 1000)],
+    [
+        (attention._at_once, 0),
+        (cpu_attention.attention_in_chunks, 0),
+        (cpu_attention.attention_in_chunks, 1000),
+        (attention.attention, 1000),
+    ],
 )
 @pytest.mark.parametrize("masked", [False, True])
 def test_equals_the_formula(monkeypatch, implementation, masked, at_once):
-    monkeypatch.setattr(attention, "QUERIES_AT_ONCE", 4)  # 11 queries: three chunks, one padded
-    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", at_once)
+    monkeypatch.setattr(cpu_attention, "QUERIES_AT_ONCE", 4)  # 11 queries: three chunks, one padded
+    monkeypatch.setattr(cpu_attention, "LOGITS_OF_ALL_HEADS", at_once)
     generator = np.random.default_rng(0)
     q, k, v = (generator.normal(size=(2, 11, 3, 8)).astype(np.float32) for _ in range(3))
     kept = generator.random((2, 11)) < 0.6 if masked else np.ones((2, 11), bool)
@@ -34,8 +39,8 @@ def test_equals_the_formula(monkeypatch, implementation, masked, at_once):
 
 @pytest.mark.parametrize("masked", [False, True])
 def test_the_gradient_is_that_of_jaxs_own_attention(monkeypatch, masked):
-    monkeypatch.setattr(attention, "QUERIES_AT_ONCE", 4)
-    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", 0)
+    monkeypatch.setattr(cpu_attention, "QUERIES_AT_ONCE", 4)
+    monkeypatch.setattr(cpu_attention, "LOGITS_OF_ALL_HEADS", 0)
     generator = np.random.default_rng(1)
     q, k, v, weight = (generator.normal(size=(2, 11, 3, 8)).astype(np.float32) for _ in range(4))
     kept = generator.random((2, 11)) < 0.6 if masked else None
@@ -45,7 +50,9 @@ def test_the_gradient_is_that_of_jaxs_own_attention(monkeypatch, masked):
         return jax.jit(slope)(*map(jnp.asarray, (q, k, v)))
 
     with jax.default_matmul_precision("highest"):
-        for made, expected in zip(gradient(attention._in_chunks), gradient(attention._at_once), strict=True):
+        for made, expected in zip(
+            gradient(cpu_attention.attention_in_chunks), gradient(attention._at_once), strict=True
+        ):
             assert np.abs(made - expected).max() < 2e-6
 
 
@@ -72,8 +79,8 @@ def test_the_kernel_for_tpus_interpreted():
 
 @pytest.mark.parametrize("most", [10**6, 3 * 11 * 13 * 2, 100])  # all clips fit at once, two of four do, none does
 def test_what_does_not_fit_at_once_is_cut(monkeypatch, most):
-    monkeypatch.setattr(attention, "LOGITS_ELSEWHERE", most)
-    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", 0)
+    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", most)
+    monkeypatch.setattr(cpu_attention, "LOGITS_OF_ALL_HEADS", 0)
     generator = np.random.default_rng(4)
     q, k, v = (jnp.asarray(generator.normal(size=(4, length, 3, 8)), jnp.float32) for length in (11, 13, 13))
     kept = generator.random((4, 13)) < 0.6
@@ -86,5 +93,5 @@ def test_what_does_not_fit_at_once_is_cut(monkeypatch, most):
 def test_chunks_grow_with_the_cores_but_not_without_bound(monkeypatch, cores, times):
     monkeypatch.setattr("vggtjax.network.pieces.core_count", lambda: cores)
     queries = jnp.zeros((12_800, 1))
-    assert attention._chunks(queries, keys=5000).shape == (16 // times, 800 * times, 1)
-    assert attention._chunks(queries, keys=10**6).shape == (16, 800, 1)
+    assert cpu_attention._chunks(queries, keys=5000).shape == (16 // times, 800 * times, 1)
+    assert cpu_attention._chunks(queries, keys=10**6).shape == (16, 800, 1)

@@ -11,10 +11,10 @@ from testing.golden import BFLOAT16, GoldenPass, spread_error
 from tests.parity.test_golden_forward import assert_close
 from vggtjax import forward
 from vggtjax.config import Suppress
-from vggtjax.network import attention, gathered_attention, pieces
+from vggtjax.network import attention, cpu_attention, gathered_attention, pieces
 
 IMPLEMENTATIONS = {
-    "in chunks": attention._in_chunks,
+    "in chunks": cpu_attention.attention_in_chunks,
     "at once": attention._at_once,
     "packed": partial(attention._packed, implementation="xla"),
 }
@@ -28,8 +28,8 @@ def case():
 @pytest.fixture(params=IMPLEMENTATIONS)
 def implementation(request, monkeypatch):
     monkeypatch.setattr(gathered_attention, "attention", IMPLEMENTATIONS[request.param])
-    monkeypatch.setattr(attention, "QUERIES_AT_ONCE", 60)
-    monkeypatch.setattr(attention, "LOGITS_AT_ONCE", 0)
+    monkeypatch.setattr(cpu_attention, "QUERIES_AT_ONCE", 60)
+    monkeypatch.setattr(cpu_attention, "LOGITS_OF_ALL_HEADS", 0)
     return request.param
 
 

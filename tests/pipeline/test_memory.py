@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from vggtjax.config import vggt_1b
-from vggtjax.network.attention import _chunks
+from vggtjax.network.cpu_attention import _chunks
 from vggtjax.pipeline import memory
 from vggtjax.pretrained.embedded import demo_model
 from vggtjax.storage.free_memory import host_room, own_limits

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from vggtjax.storage.cache import _say_how_to_keep, _show_warning, say_how_to_keep
+from vggtjax.storage.cache import _say_how_to_keep, _show_warning, hint_compilation_cache
 
 PROGRAM = """
 import sys
@@ -83,5 +83,5 @@ def test_a_script_is_told_once_how_to_keep_what_it_compiles(caplog, request):
     jax.config.update(name, None)
     _say_how_to_keep.cache_clear()  # another test may have been told
     for seconds in (1.0, 30.0, 30.0):
-        say_how_to_keep(seconds)
+        hint_compilation_cache(seconds)
     assert [record.message.count("enable_compilation_cache()") for record in caplog.records] == [1]

@@ -23,7 +23,7 @@ _NOTHING_KNOWN = KnownGeometry()
 
 
 @dataclass(frozen=True)
-class More:
+class ExtraOptions:
     """Options in groups of their own. Raises InputError for options that exclude each other."""
 
     geometry: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = _NOTHING_KNOWN
@@ -38,7 +38,7 @@ class More:
 
 
 @dataclass(frozen=True)
-class Known:
+class GivenInputs:
     """Masks and points of the user. Raises InputError for options that exclude each other."""
 
     masks: InWords[Path | None] = None

@@ -12,7 +12,7 @@ from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.queries import parse_queries
 from vggtjax.clips.sampling import Sampling, Source
-from vggtjax.commands.clip_options import Known
+from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.report import Report
 from vggtjax.errors import DeviceMemoryError, one_line
 from vggtjax.known.options import KnownGeometry
@@ -45,7 +45,7 @@ class OneClip:
     fusion: FusionParams | None
     options: Options
     devices: int
-    known: Known
+    known: GivenInputs
     geometry: KnownGeometry
     out: Path
     saving: Saving
@@ -122,7 +122,7 @@ class OneClip:
 
     def _check(self, choice: Choice) -> None:
         """Raise DeviceMemoryError for a clip that cannot fit; say so for one that may not."""
-        if choice.is_hopeless:
+        if choice.cannot_fit:
             raise choice.refusal(cuts=not self._at_once)
         if self._at_once:
             verb = "needs" if len(self._at_once) == 1 else "need"

@@ -9,7 +9,7 @@ import tyro
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
 from vggtjax.commands.arguments import Devices, Frames, Method, Output, ResultFolder, Size, Sources, Unchecked, View
-from vggtjax.commands.clip_options import Known, More
+from vggtjax.commands.clip_options import ExtraOptions, GivenInputs
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
@@ -17,7 +17,7 @@ from vggtjax.errors import InputError
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 
-_NOTHING_GIVEN, _PLAIN = Known(), More()
+_NOTHING_GIVEN, _PLAIN = GivenInputs(), ExtraOptions()
 
 
 def reconstruct(
@@ -29,8 +29,8 @@ def reconstruct(
     files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
     options: Method = Options(),
     devices: Devices = 1,
-    known: Annotated[Known, tyro.conf.arg(name="mask and track", help="")] = _NOTHING_GIVEN,
-    more: Annotated[More, tyro.conf.arg(name="", help="")] = _PLAIN,
+    known: Annotated[GivenInputs, tyro.conf.arg(name="mask and track", help="")] = _NOTHING_GIVEN,
+    more: Annotated[ExtraOptions, tyro.conf.arg(name="", help="")] = _PLAIN,
     unchecked: Unchecked = False,
     out: ResultFolder,
     saving: Output = Saving(),

@@ -27,7 +27,7 @@ from vggtjax.method.assembly import Assembly, assemble
 from vggtjax.method.mask import upsample
 from vggtjax.method.matched_mask import motion_pixels
 from vggtjax.method.passes import Passes
-from vggtjax.options import LADDER, CamerasFrom, ComputeDType, Options, find_method
+from vggtjax.options import ABLATION, CamerasFrom, ComputeDType, Options, find_method
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import Progress
 from vggtjax.results.report import ErrorTable
@@ -87,7 +87,7 @@ def ladder(
     model: Model,
     truth: ClipTruth,
     *,
-    methods: Sequence[str] = LADDER,
+    methods: Sequence[str] = ABLATION,
     masks: Sequence[MaskSource] = ("mined", "true"),
     mask_pairs: Sequence[int] | None = None,
     suppress: Sequence[Suppress] = ("zero",),
@@ -103,7 +103,7 @@ def ladder(
     Args:
         model: the network.
         truth: clips with exact truth, [S, ...] or [B, S, ...]; height and width are multiples of the patch size.
-        methods: names of `LADDER`. A method without a second pass has one row per clip, any other method one row for
+        methods: names of `ABLATION`. A method without a second pass has one row per clip, any other method one row for
             each combination of the three arguments that follow.
         masks: "mined" from the first pass by the Gram saliency, as in the papers; by "matches" too; or the "true"
             masks, an upper bound for any mining.
@@ -121,8 +121,8 @@ def ladder(
             row has the reason.
     """
     truth = batched_truth(truth)
-    if foreign := [method for method in methods if find_method(method) and method not in LADDER]:
-        raise InputError(f"methods has {foreign}, which mine their masks in another way; expected some of {LADDER}")
+    if foreign := [method for method in methods if find_method(method) and method not in ABLATION]:
+        raise InputError(f"methods has {foreign}, which mine their masks in another way; expected some of {ABLATION}")
     if unknown := [source for source in masks if source not in get_args(MaskSource)]:
         raise InputError(f"masks has {unknown}; expected 'mined', 'matches' or 'true'")
     if batch_size < 1:

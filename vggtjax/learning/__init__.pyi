@@ -27,4 +27,4 @@ from .rules import parse_family as parse_family
 from .rules import save_fusion as save_fusion
 from .rules import soft_masking as soft_masking
 from .soft import SoftReconstruction as SoftReconstruction
-from .soft import reconstruct_softly as reconstruct_softly
+from .soft import reconstruct_soft as reconstruct_soft

@@ -32,7 +32,7 @@ class SoftReconstruction(NamedTuple):
 
 
 @full_precision
-def reconstruct_softly(
+def reconstruct_soft(
     params: Params,
     images: Float[Array, "B S H W 3"],
     config: VGGTConfig,

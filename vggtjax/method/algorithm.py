@@ -21,12 +21,12 @@ from vggtjax.errors import InputError
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree, assemble, check_fuses
 from vggtjax.method.matched_mask import Mined
 from vggtjax.method.motion import FEWEST_FRAMES
-from vggtjax.method.passes import Passes, first_pass, mine, mine_softly, only, second_pass, track_from
+from vggtjax.method.passes import Passes, first_pass, mine, mine_soft, only, second_pass, track_from
 from vggtjax.method.soft_mask import SoftMasking
 from vggtjax.method.witnesses import Seen
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
-from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
+from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute
 from vggtjax.network.track_head import Tracks
@@ -35,7 +35,7 @@ from vggtjax.options import Options
 Images = Float[Array, "B S H W 3"]
 Masks = Bool[Array, "B S H W"] | Float[Array, "B S H W"] | SoftMasking | Literal[False] | None
 FIRST_OUTPUTS = ("camera", "depth")
-_CLIPS = ClipBatch(BY_FRAME, BY_FRAME, WHOLE)  # type: ignore[arg-type]
+_CLIPS = ClipBatch(BY_FRAME, BY_FRAME, REPLICATED)  # type: ignore[arg-type]
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 
@@ -134,7 +134,7 @@ def run_method(
     frames = clips.real(compute.frames)
     cameras = "adjusted" if _adjusts(options, clips.counted) else "predicted"
     how = {"method": options.method, "align_scale": options.align_scale, "cameras": cameras, "frames": frames}
-    join = step("assemble", frames.on_devices(assemble, BY_FRAME, WHOLE))
+    join = step("assemble", frames.on_devices(assemble, BY_FRAME, REPLICATED))
     read = passes._replace(patch_tokens=None, tracks=None)
     return join(read, as_tree(fusion), **how), passes
 
@@ -153,7 +153,7 @@ def run_passes(
 ) -> Passes:
     """Run both passes once, for `assemble`.
 
-    The passes of the default options serve all methods of `LADDER`; "vggt4d" and "4dvggt-m" need their own.
+    The passes of the default options serve all methods of `ABLATION`; "vggt4d" and "4dvggt-m" need their own.
 
     Args:
         params, clips, config, options, masks, both_outputs, compute, step: as for `run_method`.
@@ -173,12 +173,12 @@ def run_passes(
 
     if shared is None:
         # Features of the backbone, which both passes share.
-        features = step("image features", on_devices(encode, WHOLE, BY_FRAME))
+        features = step("image features", on_devices(encode, REPLICATED, BY_FRAME))
         tokens = features(params, images, config=config, compute_dtype=compute.compute_dtype, remat=compute.remat)
         batch = ClipBatch(images, tokens, clips.padding(compute.frames))
         # Stage 1: a plain pass, which adds up the similarities of q and k that tell motion.
         exponents = masks.exponents if isinstance(masks, SoftMasking) else None
-        plain = step("first pass", on_devices(first_pass, WHOLE, _CLIPS, WHOLE, WHOLE))
+        plain = step("first pass", on_devices(first_pass, REPLICATED, _CLIPS, REPLICATED, REPLICATED))
         how = {"gram": method.gram, "witness": witness, "compute": compute}
         first, seen = plain(params, batch, clips.query_points.get(0), exponents, config=config, **how)
     else:
@@ -195,7 +195,7 @@ def run_passes(
         mining = step("dynamic mask", real.on_devices(mine, BY_FRAME, BY_FRAME, BY_FRAME))
         mined = mining(*read, batch._replace(frame_count=None), **how, frames=real)
     elif isinstance(masks, SoftMasking):
-        shares = step("dynamic mask", mine_softly)
+        shares = step("dynamic mask", mine_soft)
         how = {"threshold": config.motion.threshold or "otsu", "frames": real}
         mined = Mined(shares(seen.saliency, images, masks, **how))
     elif masks is False:
@@ -207,14 +207,18 @@ def run_passes(
         outputs = FIRST_OUTPUTS if both_outputs else method.second_outputs(options.align_scale)
         strength = masks.strength if isinstance(masks, SoftMasking) else None
         pairs = config.motion.masked_pairs(options.mask_pairs) if strength is None else None
-        masked = step("second pass", on_devices(second_pass, WHOLE, _CLIPS, BY_FRAME, BY_FRAME, WHOLE, WHOLE))
+        masked = step(
+            "second pass", on_devices(second_pass, REPLICATED, _CLIPS, BY_FRAME, BY_FRAME, REPLICATED, REPLICATED)
+        )
         unchanged = only(first, FIRST_OUTPUTS)
         how = {"suppress": method.suppress, "outputs": outputs, "compute": compute}
         second = masked(params, batch, mined.dynamic_mask, unchanged, pairs, strength, config=config, **how)
 
     tracks = None
     if clips.query_points:
-        follow = partial(step("tracks", on_devices(track_from, WHOLE, _CLIPS, WHOLE, WHOLE)), params, batch)
+        follow = partial(
+            step("tracks", on_devices(track_from, REPLICATED, _CLIPS, REPLICATED, REPLICATED)), params, batch
+        )
         tracks = {
             frame: follow(points, np.asarray(frame, np.int32), config=config, compute=compute)
             for frame, points in clips.query_points.items()

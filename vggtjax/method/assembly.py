@@ -67,7 +67,7 @@ def assemble(
     cameras: CamerasFrom = "predicted",
     frames: Frames = Frames(),
 ) -> Assembly:
-    """Return a method's depth, confidence and cameras from two passes; the methods of `LADDER` share one run of them.
+    """Return a method's depth, confidence and cameras from two passes; the methods of `ABLATION` share one run of them.
 
     Args:
         passes: of `run_passes` with this method's options; passes of another method give a wrong result, not an error.

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 from vggtjax.config import Cue, Gram, MotionConfig
 from vggtjax.errors import check_choice
 from vggtjax.network.frames import Frames
-from vggtjax.network.precision import widened
+from vggtjax.network.precision import upcast
 
 FRAMES_AT_ONCE = 4
 _EPSILON = 1e-6
@@ -71,7 +71,7 @@ class GramCues:
 
         def added(cue: Cue):
             def vectors(x: Float[Array, "... T N D"]) -> Float[Array, "... P N D"]:
-                patches = widened(x[..., -sums[0].shape[2] :, :, :])
+                patches = upcast(x[..., -sums[0].shape[2] :, :, :])
                 return _unit(patches) if self.gram == "cosine" else patches
 
             def one_clip(

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.network.frames import Frames
-from vggtjax.network.precision import widened
+from vggtjax.network.precision import upcast
 
 STEPS = (1, 2, 3, 4, 6, 8)  # offsets between frames that are matched, both ways
 _AT_ONCE = 4  # pairs of frames whose attention is in memory
@@ -135,7 +135,7 @@ class DenseMatches:
             numbers = jnp.stack([jnp.arange(S)[:, None].repeat(len(back), 1), others], axis=-1).reshape(-1, 2)
 
             def of_frames(pair):
-                row, column = widened(rows[pair[0]]), widened(near[pair[1]])
+                row, column = upcast(rows[pair[0]]), upcast(near[pair[1]])
                 return _soft_argmax(row @ column.T / (N * D**0.5), self.grid)
 
             found = jax.lax.map(of_frames, numbers, batch_size=_AT_ONCE)

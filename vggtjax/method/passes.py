@@ -113,7 +113,7 @@ def mine(
     return frames.pad(mined._replace(dynamic_mask=mined.dynamic_mask & moves), S)
 
 
-def mine_softly(
+def mine_soft(
     saliency: Float[Array, "B S h w"],
     images: Float[Array, "B S H W 3"],
     masking: SoftMasking,

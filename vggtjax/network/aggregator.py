@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Protocol
@@ -10,15 +9,16 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import linen as nn
 from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.block import Block, storing_little
+from vggtjax.network.block import Block, apply_block, with_remat_policy
 from vggtjax.network.frames import Frames
-from vggtjax.network.layers import Params
+from vggtjax.network.layers import Params, apply, stack
 from vggtjax.network.merging import merged_attention
-from vggtjax.network.precision import Compute, full_precision, widened
+from vggtjax.network.precision import Compute, full_precision, upcast
 from vggtjax.network.rope import rope_table
 from vggtjax.network.suppression import Attend, SuppressedKeys, Suppression, suppressed_attention
 
@@ -94,70 +94,96 @@ def aggregate(
         compute: type of the products; how global attention is computed; with `remat`, only the input of every pair is
             stored for the gradient; where the frames are: global attention gathers keys and values, all else is local.
     """
-    params = params["aggregator"]
-    B, S, P, C = patch_tokens.shape
-    T = SPECIAL_TOKENS + P
-    block = _block(config, compute.compute_dtype)
-    global_block = dataclasses.replace(block, attend=_global_attention(compute, S, grid))
-    rope = rope_table(grid, SPECIAL_TOKENS, C // config.num_heads)
-    frames = compute.frames
-    real = frames.are_real(frame_count, B, S)
-    real_tokens = None if real is None else jnp.repeat(real, T, axis=1)
-    keys = suppression.keys(SPECIAL_TOKENS)
-
-    def suppressed(active: Array, rows: int) -> SuppressedKeys | None:
-        return None if keys is None else SuppressedKeys(keys.reshape(rows, -1), active, suppression.suppress)
-
-    def pair(carry, layer):
-        x, _, taps, sums = carry
-        frame_params, global_params, active, tapped, counts = layer
-        x, _, _ = block(frame_params, x.reshape(B * S, T, C), rope, suppressed(active, B * S))
-        frame = x
-        x, q, k = global_block(global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens)
-        if accumulator is not None:
-            q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
-            x, (q, k) = frames.in_order(x, (q, k))  # in the gradient, cues communicate before attention does
-            sums = accumulator.add(sums, frames.after(counts, x), q, k, frame_count)  # and here, after it
-        taps = tuple(
-            jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
-            for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
-        )
-        x = x.reshape(B, S, T, C)
-        camera = jnp.concatenate([frame.reshape(B, S, T, C)[:, :, 0], x[:, :, 0]], axis=-1)  # [B, S, 2C]
-        return (x, camera, taps, sums), None
-
-    layers = (
-        params["frame_blocks"],
-        params["global_blocks"],
-        suppression.active(config.depth, config.motion.mask_pairs),
-        jnp.asarray(np.arange(config.depth)[:, None] == np.asarray(config.taps)[None]),
-        None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
+    return apply(
+        Aggregator(config),
+        params["aggregator"],
+        patch_tokens,
+        grid,
+        captures,
+        accumulator=accumulator,
+        frame_count=frame_count,
+        suppression=suppression,
+        compute=compute,
     )
-    sums = None if accumulator is None else frames.varying(accumulator.zeros(B, S, P))
-    if real is not None:  # 0 x NaN is NaN: padded frames are set to 0
-        patch_tokens = jnp.where(real[:, :, None, None], patch_tokens, 0)
-    tokens = _tokens(params, widened(patch_tokens), frames)
-    camera = frames.varying(jnp.zeros((B, S, 2 * C), tokens.dtype))
-    taps = frames.varying(tuple(_empty(capture, (B, S, T, 2 * C), tokens.dtype) for capture in captures))
-    step = storing_little(pair, remat=compute.remat)
-    (_, camera, taps, sums), _ = jax.lax.scan(step, (tokens, camera, taps, sums), layers)
-    return camera, taps, sums
 
 
-def declare_aggregator(config: VGGTConfig) -> Params:
-    """Declare the parameters of the aggregator."""
-    C = config.embed_dim
-    blocks = _block(config).declare_stacked(config.depth, C)
-    return {
-        "camera_token": jnp.zeros((2, 1, C)),
-        "register_tokens": jnp.zeros((2, REGISTERS, C)),
-        "frame_blocks": blocks,
-        "global_blocks": blocks,
-    }
+class Aggregator(nn.Module):
+    """Camera and register tokens, and pairs of blocks; arguments as those of `aggregate`."""
 
+    config: VGGTConfig
 
-def _block(config: VGGTConfig, dtype: str = "float32") -> Block:
-    return Block(config.num_heads, qk_norm=True, dtype=jnp.dtype(dtype))
+    @nn.compact
+    def __call__(
+        self,
+        patch_tokens: Float[Array, "B S P C"],
+        grid: tuple[int, int],
+        captures: Sequence[Capture],
+        *,
+        accumulator: Accumulator | None = None,
+        frame_count: Int[Array, " B"] | None = None,
+        suppression: Suppression = Suppression(),
+        compute: Compute = Compute(),
+    ) -> tuple[Float[Array, "B S E"], tuple[Any, ...], Any]:
+        """Return the last pair's camera tokens, the captured taps, and the accumulated sums."""
+        config = self.config
+        B, S, P, C = patch_tokens.shape
+        T = SPECIAL_TOKENS + P
+        block = Block(config.num_heads, qk_norm=True, dtype=jnp.dtype(compute.compute_dtype))
+        global_block = block.clone(attend=_global_attention(compute, S, grid))
+        rope = rope_table(grid, SPECIAL_TOKENS, C // config.num_heads)
+        frames = compute.frames
+        real = frames.are_real(frame_count, B, S)
+        real_tokens = None if real is None else jnp.repeat(real, T, axis=1)
+        keys = suppression.keys(SPECIAL_TOKENS)
+
+        def suppressed(active: Array, rows: int) -> SuppressedKeys | None:
+            return None if keys is None else SuppressedKeys(keys.reshape(rows, -1), active, suppression.suppress)
+
+        def pair(carry, layer):
+            x, _, taps, sums = carry
+            frame_params, global_params, active, tapped, counts = layer
+            x, _, _ = apply_block(block, frame_params, x.reshape(B * S, T, C), rope, suppressed(active, B * S))
+            frame = x
+            x, q, k = apply_block(
+                global_block, global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens
+            )
+            if accumulator is not None:
+                q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
+                x, (q, k) = frames.in_order(x, (q, k))  # in the gradient, cues communicate before attention does
+                sums = accumulator.add(sums, frames.after(counts, x), q, k, frame_count)  # and here, after it
+            taps = tuple(
+                jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
+                for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
+            )
+            x = x.reshape(B, S, T, C)
+            camera = jnp.concatenate([frame.reshape(B, S, T, C)[:, :, 0], x[:, :, 0]], axis=-1)  # [B, S, 2C]
+            return (x, camera, taps, sums), None
+
+        if real is not None:  # 0 x NaN is NaN: padded frames are set to 0
+            patch_tokens = jnp.where(real[:, :, None, None], patch_tokens, 0)
+        tokens = self._tokens(upcast(patch_tokens), frames)
+        layers = (
+            stack(self, "frame_blocks", block, config.depth, tokens[0]),
+            stack(self, "global_blocks", block, config.depth, tokens[0]),
+            suppression.active(config.depth, config.motion.mask_pairs),
+            jnp.asarray(np.arange(config.depth)[:, None] == np.asarray(config.taps)[None]),
+            None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
+        )
+        sums = None if accumulator is None else frames.varying(accumulator.zeros(B, S, P))
+        camera = frames.varying(jnp.zeros((B, S, 2 * C), tokens.dtype))
+        taps = frames.varying(tuple(_empty(capture, (B, S, T, 2 * C), tokens.dtype) for capture in captures))
+        step = with_remat_policy(pair, remat=compute.remat)
+        (_, camera, taps, sums), _ = jax.lax.scan(step, (tokens, camera, taps, sums), layers)
+        return camera, taps, sums
+
+    def _tokens(self, patch_tokens: Float[Array, "B S P C"], frames: Frames) -> Float[Array, "B S T C"]:
+        """Prepend camera and register tokens: variant 0 for the clip's first frame, variant 1 for all others."""
+        B, S, _, C = patch_tokens.shape
+        camera = self.param("camera_token", nn.initializers.zeros, (2, 1, C))
+        registers = self.param("register_tokens", nn.initializers.zeros, (2, REGISTERS, C))
+        special = jnp.concatenate([camera, registers], axis=1)  # [2, 5, C]
+        special = special.astype(patch_tokens.dtype)[(frames.numbers(S) > 0).astype(int)]  # [S, 5, C]
+        return jnp.concatenate([jnp.broadcast_to(special, (B, S, SPECIAL_TOKENS, C)), patch_tokens], axis=2)
 
 
 def _global_attention(compute: Compute, S: int, grid: tuple[int, int]) -> Attend:
@@ -168,14 +194,6 @@ def _global_attention(compute: Compute, S: int, grid: tuple[int, int]) -> Attend
     if compute.attention != "exact":
         raise InputError(f"attention is {compute.attention!r} on several devices; expected 'exact', or one device")
     return partial(suppressed_attention, frames=compute.frames)
-
-
-def _tokens(params: Params, patch_tokens: Float[Array, "B S P C"], frames: Frames) -> Float[Array, "B S T C"]:
-    """Prepend camera and register tokens: variant 0 for the clip's first frame, variant 1 for all others."""
-    B, S, _, C = patch_tokens.shape
-    special = jnp.concatenate([params["camera_token"], params["register_tokens"]], axis=1)  # [2, 5, C]
-    special = special.astype(patch_tokens.dtype)[(frames.numbers(S) > 0).astype(int)]  # [S, 5, C]
-    return jnp.concatenate([jnp.broadcast_to(special, (B, S, SPECIAL_TOKENS, C)), patch_tokens], axis=2)
 
 
 def _captured(capture: Capture, shape: tuple[int, int, int, int]) -> Callable:

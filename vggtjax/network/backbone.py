@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.block import Block, storing_little
-from vggtjax.network.layers import Conv, LayerNorm, Params, apply, declare
-from vggtjax.network.precision import check_compute_dtype, full_precision, widened
+from vggtjax.network.block import Block, apply_block, with_remat_policy
+from vggtjax.network.layers import Conv, LayerNorm, Params, apply, stack
+from vggtjax.network.precision import check_compute_dtype, full_precision, upcast
 
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
@@ -43,26 +44,42 @@ def encode(
         InputError: an invalid shape of the images, or an unknown compute_dtype.
     """
     check_compute_dtype(compute_dtype)
-    params = params["backbone"]
-    grid = patch_grid(images, config)
-    B, S, H, W, _ = images.shape
-    C = config.embed_dim
-    x = (images - jnp.asarray(IMAGE_MEAN)[(None,) * 4]) / jnp.asarray(IMAGE_STD)[(None,) * 4]
-    x = apply(_patch_embedding(config, compute_dtype), params["patch_embedding"], x.reshape(B * S, H, W, 3))
-    x = widened(x).reshape(B * S, grid[0] * grid[1], C)
-    positions = params["position_embedding"].astype(x.dtype)
-    x = x + patch_positions(positions[1:], config.grid_size, grid)[None]
-    special = jnp.concatenate([params["class_token"] + positions[:1], params["register_tokens"]])  # [1 + R, C]
-    special = jnp.broadcast_to(special.astype(x.dtype), (B * S, *special.shape))
-    x = jnp.concatenate([special, x], axis=1)  # [B*S, 1 + R + P, C]
-    block = _block(config, compute_dtype)
+    patch_grid(images, config)
+    return apply(Backbone(config, compute_dtype, remat), params["backbone"], images)
 
-    def step(x, layer):
-        return block(layer, x)[0], None
 
-    x, _ = jax.lax.scan(storing_little(step, remat=remat), x, params["blocks"])
-    x = apply(LayerNorm(_EPSILON), params["norm"], x)
-    return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
+class Backbone(nn.Module):
+    """The patch embedding, the blocks and the last norm; arguments as those of `encode`."""
+
+    config: VGGTConfig
+    compute_dtype: str = "float32"
+    remat: bool = False
+
+    @nn.compact
+    def __call__(self, images: Float[Array, "B S H W 3"]) -> Float[Array, "B S P C"]:
+        """Return the patch tokens after the last norm."""
+        config, dtype = self.config, jnp.dtype(self.compute_dtype)
+        C, size, side = config.embed_dim, config.patch_size, config.grid_size
+        B, S, H, W, _ = images.shape
+        grid = (H // size, W // size)
+        x = (images - jnp.asarray(IMAGE_MEAN)[(None,) * 4]) / jnp.asarray(IMAGE_STD)[(None,) * 4]
+        embed = Conv(C, (size, size), strides=size, padding="VALID", dtype=dtype, name="patch_embedding")
+        x = upcast(embed(x.reshape(B * S, H, W, 3))).reshape(B * S, grid[0] * grid[1], C)
+        positions = self.param("position_embedding", nn.initializers.zeros, (1 + side**2, C)).astype(x.dtype)
+        x = x + patch_positions(positions[1:], side, grid)[None]
+        class_token = self.param("class_token", nn.initializers.zeros, (1, C))
+        registers = self.param("register_tokens", nn.initializers.zeros, (REGISTERS, C))
+        special = jnp.concatenate([class_token + positions[:1], registers]).astype(x.dtype)  # [1 + R, C]
+        x = jnp.concatenate([jnp.broadcast_to(special, (B * S, *special.shape)), x], axis=1)  # [B*S, 1 + R + P, C]
+        block = Block(config.dino_num_heads, epsilon=_EPSILON, dtype=dtype)
+        layers = stack(self, "blocks", block, config.dino_depth, x)
+
+        def step(x, layer):
+            return apply_block(block, layer, x)[0], None
+
+        x, _ = jax.lax.scan(with_remat_policy(step, remat=self.remat), x, layers)
+        x = LayerNorm(_EPSILON, name="norm")(x)
+        return x[:, 1 + REGISTERS :].reshape(B, S, grid[0] * grid[1], C)
 
 
 def patch_grid(images: Float[Array, "B S H W 3"], config: VGGTConfig) -> tuple[int, int]:
@@ -74,29 +91,6 @@ def patch_grid(images: Float[Array, "B S H W 3"], config: VGGTConfig) -> tuple[i
     if H % size or W % size:
         raise InputError(f"images are {H} x {W} pixels; expected multiples of the patch size {size}")
     return H // size, W // size
-
-
-def declare_backbone(config: VGGTConfig) -> Params:
-    """Declare the parameters of the backbone."""
-    C, size = config.embed_dim, config.patch_size
-    x = jnp.zeros((1, 1, C))
-    return {
-        "patch_embedding": declare(_patch_embedding(config), jnp.zeros((1, size, size, 3))),
-        "class_token": jnp.zeros((1, C)),
-        "register_tokens": jnp.zeros((REGISTERS, C)),
-        "position_embedding": jnp.zeros((1 + config.grid_size**2, C)),
-        "blocks": _block(config).declare_stacked(config.dino_depth, C),
-        "norm": declare(LayerNorm(), x),
-    }
-
-
-def _patch_embedding(config: VGGTConfig, dtype: str = "float32") -> Conv:
-    size = (config.patch_size, config.patch_size)
-    return Conv(config.embed_dim, size, strides=size, padding="VALID", dtype=jnp.dtype(dtype))
-
-
-def _block(config: VGGTConfig, dtype: str = "float32") -> Block:
-    return Block(config.dino_num_heads, epsilon=_EPSILON, dtype=jnp.dtype(dtype))
 
 
 def patch_positions(table: Float[Array, "G C"], side: int, grid: tuple[int, int]) -> Float[Array, "P C"]:

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.network.attention import ATTENDED
-from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, Params, apply, declare
-from vggtjax.network.pieces import in_pieces, replaced_in_pieces
+from vggtjax.network.cpu_attention import ATTENDED
+from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, Params, apply
+from vggtjax.network.pieces import map_chunks, map_chunks_in_place
 from vggtjax.network.quantised import dequantised
 from vggtjax.network.rope import Rope, apply_rope
 from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
@@ -22,7 +22,7 @@ _STORED = jax.checkpoint_policies.save_from_both_policies(
 )
 
 
-def storing_little(step: Callable, *, remat: bool) -> Callable:
+def with_remat_policy(step: Callable, *, remat: bool) -> Callable:
     """Return the step of a scan over blocks with little stored for its gradient.
 
     It keeps the outputs of linear layers and of attention, as all else is cheap to compute again, or with `remat` the
@@ -31,9 +31,35 @@ def storing_little(step: Callable, *, remat: bool) -> Callable:
     return jax.checkpoint(step, prevent_cse=False, policy=None if remat else _STORED)
 
 
-@dataclass(frozen=True)
-class Block:
-    """A block as a function of its parameters. The residual stream keeps the input's dtype.
+class Projections(nn.Module):
+    """The linear layers of attention: before the softmax to q, k and v, after it back to the residual stream."""
+
+    num_heads: int
+    channels: int
+    qk_norm: bool
+    dtype: DType
+
+    def setup(self) -> None:
+        self.qkv = Dense(3 * self.channels, dtype=self.dtype)
+        self.projection = Dense(self.channels, dtype=self.dtype)
+        if self.qk_norm:
+            self.q_norm, self.k_norm = LayerNorm(dtype=self.dtype), LayerNorm(dtype=self.dtype)
+
+    def heads(self, x: Float[Array, "R C"], rope: Rope | None) -> tuple[Array, Array, Array]:
+        """Return q, k and v [R, N, D]; q and k after norm, and rotated by the angles of their rows."""
+        y = self.qkv(x).reshape(-1, 3, self.num_heads, self.channels // self.num_heads)
+        q, k, v = (y[:, i] for i in range(3))
+        if self.qk_norm:
+            q, k = self.q_norm(q), self.k_norm(k)
+        return (q, k, v) if rope is None else (apply_rope(q, rope), apply_rope(k, rope), v)
+
+    def project(self, y: Float[Array, "R C"]) -> Float[Array, "R C"]:
+        """Return what attention adds to the residual stream."""
+        return self.projection(y)
+
+
+class Block(nn.Module):
+    """A block. The residual stream keeps the input's dtype.
 
     Only attention mixes tokens; the layers before and after it run over pieces of the tokens.
     """
@@ -44,9 +70,9 @@ class Block:
     dtype: DType = jnp.float32
     attend: Attend = suppressed_attention
 
+    @nn.compact
     def __call__(
         self,
-        params: Params,
         x: Float[Array, "B L C"],
         rope: Rope | None = None,
         suppressed: SuppressedKeys | None = None,
@@ -55,63 +81,38 @@ class Block:
         """Return the tokens after the block, and q and k after norm and rotation, for the motion cues.
 
         Args:
-            params: the block's own, as `declare` declares them; kernels may be `Quantised`.
             x: B sequences of L tokens.
             rope: the angles of T tokens, where L is a multiple of T; or None.
             suppressed: the keys to suppress, or None.
             is_real: tokens that others attend to; None for all.
         """
         B, L, C = x.shape
-        params = dequantised(params)
-        heads = (self.num_heads, C // self.num_heads)
-        tokens = x.reshape(B * L, C)
+        attention = Projections(self.num_heads, C, self.qk_norm, self.dtype, name="attention")
+        norm1, norm2 = (LayerNorm(self.epsilon, dtype=self.dtype, name=name) for name in ("norm1", "norm2"))
+        scale1, scale2 = (self.param(name, nn.initializers.ones, (C,)) for name in ("scale1", "scale2"))
+        mlp = MLP(4 * C, C, self.dtype, name="mlp")
 
         def before(rows):
             x, place = rows
-            y = apply(LayerNorm(self.epsilon, dtype=self.dtype), params["norm1"], x)
-            y = apply(Dense(3 * C, dtype=self.dtype), params["attention"]["qkv"], y).reshape(-1, 3, *heads)
-            q, k, v = (y[:, i] for i in range(3))  # [R, N, D]
-            if self.qk_norm:
-                q = apply(LayerNorm(dtype=self.dtype), params["attention"]["q_norm"], q)
-                k = apply(LayerNorm(dtype=self.dtype), params["attention"]["k_norm"], k)
-            if rope is not None:
-                angles = Rope(rope.cos[place], rope.sin[place])
-                q, k = apply_rope(q, angles), apply_rope(k, angles)
-            return q, k, v
+            angles = None if rope is None else Rope(rope.cos[place], rope.sin[place])
+            return attention.heads(norm1(x), angles)
 
         def after(x, y):
-            y = apply(Dense(C, dtype=self.dtype), params["attention"]["projection"], y)
-            x = add(x, "scale1", y)
-            y = apply(LayerNorm(self.epsilon, dtype=self.dtype), params["norm2"], x)
-            return add(x, "scale2", apply(MLP(4 * C, C, self.dtype), params["mlp"], y))
+            x = add(x, scale1, attention.project(y))
+            return add(x, scale2, mlp(norm2(x)))
 
         def add(x, scale, y):
-            return x + params[scale].astype(x.dtype)[None, :] * y.astype(x.dtype)
+            return x + scale.astype(x.dtype)[None, :] * y.astype(x.dtype)
 
+        tokens = x.reshape(B * L, C)
         place = jnp.arange(B * L) % (L if rope is None else rope.cos.shape[0])
-        q, k, v = (y.reshape(B, L, *heads) for y in in_pieces(before, (tokens, place)))
+        q, k, v = (y.reshape(B, L, *y.shape[1:]) for y in map_chunks(before, (tokens, place)))
         y = self.attend(q, k, v, suppressed, is_real).reshape(B * L, C)
-        return replaced_in_pieces(after, tokens, y).reshape(B, L, C), q, k
+        return map_chunks_in_place(after, tokens, y).reshape(B, L, C), q, k
 
-    def declare(self, C: int) -> Params:
-        """Declare the parameters of a block for tokens of C channels."""
 
-        def declared(module: nn.Module, channels: int) -> Params:
-            return declare(module, jnp.zeros((1, channels)))
-
-        attention = {"qkv": declared(Dense(3 * C), C), "projection": declared(Dense(C), C)}
-        if self.qk_norm:
-            norm = declared(LayerNorm(), C // self.num_heads)
-            attention |= {"q_norm": norm, "k_norm": norm}
-        return {
-            "norm1": declared(LayerNorm(), C),
-            "attention": attention,
-            "scale1": jnp.ones(C),
-            "norm2": declared(LayerNorm(), C),
-            "mlp": declared(MLP(4 * C, C), C),
-            "scale2": jnp.ones(C),
-        }
-
-    def declare_stacked(self, depth: int, C: int) -> Params:
-        """Declare the parameters of `depth` blocks, stacked on axis 0."""
-        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (depth, *leaf.shape)), self.declare(C))
+def apply_block(
+    block: Block, params: Params, x: Float[Array, "B L C"], *inputs: Any, **options: Any
+) -> tuple[Array, Array, Array]:
+    """Run a block with one layer of a stack of parameters, whose kernels may be `Quantised`."""
+    return apply(block, dequantised(params), x, *inputs, **options)

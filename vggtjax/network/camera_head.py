@@ -8,9 +8,9 @@ from flax import linen as nn
 from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.block import Block
+from vggtjax.network.block import Block, apply_block
 from vggtjax.network.frames import Frames
-from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, declare
+from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, iterate, stack
 from vggtjax.network.pose import POSE_SIZE
 from vggtjax.network.precision import full_precision
 
@@ -37,47 +37,46 @@ def predict_pose(
         stop_gradient: treat the previous estimate as a constant in each iteration, as in VGGT's training.
         frames: where the frames are; every device computes the poses of all frames, which takes little.
     """
-    params = params["camera_head"]
-    S = camera_tokens.shape[1]
-    is_real = frames.are_real(frame_count, *camera_tokens.shape[:2])
-    is_real = None if is_real is None else frames.gather(is_real)
-    camera_tokens = frames.gather(camera_tokens)
-    E = config.tap_dim
-    block = Block(config.camera_num_heads, dtype=camera_tokens.dtype)
-    tokens = apply(LayerNorm(), params["token_norm"], camera_tokens)
-    normed = apply(LayerNorm(1e-6, use_bias=False, use_scale=False), {}, tokens)
-    empty = jnp.broadcast_to(params["empty_pose"], (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
-
-    def iteration(estimates, _):
-        pose, previous = estimates  # sum of all updates so far; input of this iteration
-        embedded = apply(Dense(E), params["pose_embedding"], previous)
-        modulation = apply(Dense(3 * E), params["modulation"], nn.silu(embedded))
-        shift, scale, gate = jnp.split(modulation, 3, axis=-1)
-        x = tokens + gate * (normed * (1 + scale) + shift)
-        x, _ = jax.lax.scan(lambda x, layer: (block(layer, x, is_real=is_real)[0], None), x, params["trunk"])
-        x = apply(LayerNorm(), params["trunk_norm"], x)
-        pose = pose + apply(_branch(config), params["pose_branch"], x)
-        return (pose, jax.lax.stop_gradient(pose) if stop_gradient else pose), None
-
-    (pose, _), _ = jax.lax.scan(iteration, (jnp.zeros_like(empty), empty), length=ITERATIONS)
-    pose = frames.share(pose, S)
-    return jnp.concatenate([pose[..., :7], nn.relu(pose[..., 7:])], axis=-1)
+    return apply(CameraHead(config, stop_gradient), params["camera_head"], camera_tokens, frame_count, frames)
 
 
-def declare_camera_head(config: VGGTConfig) -> Params:
-    """Declare the parameters of the camera head."""
-    E = config.tap_dim
-    x, pose = jnp.zeros((1, 1, E)), jnp.zeros((1, 1, POSE_SIZE))
-    return {
-        "token_norm": declare(LayerNorm(), x),
-        "empty_pose": pose,
-        "pose_embedding": declare(Dense(E), pose),
-        "modulation": declare(Dense(3 * E), x),
-        "trunk": Block(config.camera_num_heads).declare_stacked(config.camera_depth, E),
-        "trunk_norm": declare(LayerNorm(), x),
-        "pose_branch": declare(_branch(config), x),
-    }
+class CameraHead(nn.Module):
+    """Iterations of a transformer over frames, modulated by the previous estimate; arguments as `predict_pose`."""
 
+    config: VGGTConfig
+    stop_gradient: bool = True
 
-def _branch(config: VGGTConfig) -> MLP:
-    return MLP(config.tap_dim // 2, POSE_SIZE)
+    @nn.compact
+    def __call__(
+        self,
+        camera_tokens: Float[Array, "B S E"],
+        frame_count: Int[Array, " B"] | None = None,
+        frames: Frames = Frames(),
+    ) -> Float[Array, "B S 9"]:
+        """Return the pose encoding of every frame."""
+        config = self.config
+        S = camera_tokens.shape[1]
+        is_real = frames.are_real(frame_count, *camera_tokens.shape[:2])
+        is_real = None if is_real is None else frames.gather(is_real)
+        camera_tokens = frames.gather(camera_tokens)
+        E = config.tap_dim
+        block = Block(config.camera_num_heads, dtype=camera_tokens.dtype)
+        tokens = LayerNorm(name="token_norm")(camera_tokens)
+        normed = LayerNorm(1e-6, use_bias=False, use_scale=False)(tokens)
+        empty = self.param("empty_pose", nn.initializers.zeros, (1, 1, POSE_SIZE))
+        empty = jnp.broadcast_to(empty, (*tokens.shape[:2], POSE_SIZE)).astype(tokens.dtype)
+        embed, modulate = Dense(E, name="pose_embedding"), Dense(3 * E, name="modulation")
+        trunk, norm = stack(self, "trunk", block, config.camera_depth, tokens), LayerNorm(name="trunk_norm")
+        update = MLP(E // 2, POSE_SIZE, name="pose_branch")
+
+        def iteration(estimates):
+            pose, previous = estimates  # sum of all updates so far; input of this iteration
+            shift, scale, gate = jnp.split(modulate(nn.silu(embed(previous))), 3, axis=-1)
+            x = tokens + gate * (normed * (1 + scale) + shift)
+            x, _ = jax.lax.scan(lambda x, layer: (apply_block(block, layer, x, is_real=is_real)[0], None), x, trunk)
+            pose = pose + update(norm(x))
+            return (pose, jax.lax.stop_gradient(pose) if self.stop_gradient else pose)
+
+        pose, _ = iterate(self, iteration, (jnp.zeros_like(empty), empty), ITERATIONS)
+        pose = frames.share(pose, S)
+        return jnp.concatenate([pose[..., :7], nn.relu(pose[..., 7:])], axis=-1)

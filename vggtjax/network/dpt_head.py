@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 
 import jax
@@ -12,21 +11,12 @@ from flax import linen as nn
 from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
-from vggtjax.network.layers import Conv, Conv3x3, Dense, LayerNorm, Params, apply, declare
+from vggtjax.network.layers import Conv, Conv3x3, Dense, LayerNorm, Params, apply
 from vggtjax.network.pieces import largest_divisor
+from vggtjax.network.resize import resize_aligned
 
 HIDDEN = 32
 PIXELS_AT_ONCE = 4 * 518 * 518  # bounds the memory of the full-resolution maps
-
-
-class TapProjection(nn.Module):
-    """Norm and 1 x 1 convolution of one tap. The norm is shared by the four taps of a head."""
-
-    features: int
-
-    @nn.compact
-    def __call__(self, tokens: Float[Array, "... E"]) -> Float[Array, "... F"]:
-        return Dense(self.features, name="projection")(LayerNorm(name="norm")(tokens))
 
 
 class DepthToSpace(nn.Module):
@@ -106,13 +96,58 @@ class Regression(nn.Module):
         return Dense(self.channels, name="conv2")(x)
 
 
+class TapHead(nn.Module):
+    """What all heads of dense maps share: a projection of each tap, and a map made of the four.
+
+    A projection is a 1 x 1 convolution after a norm, which the four taps share. Nothing else of a tap is stored.
+    """
+
+    config: VGGTConfig
+
+    def setup(self) -> None:
+        self.norm = LayerNorm()
+        for slot, channels in enumerate(self.config.dpt_channels):
+            setattr(self, f"projection{slot}", Dense(channels))
+
+    def project(self, tokens: Float[Array, "... E"], slot: int) -> Float[Array, "... F"]:
+        """Return the projection of the tap in `slot`."""
+        return getattr(self, f"projection{slot}")(self.norm(tokens))
+
+    def project_all(self, tokens: Float[Array, "B S P E"]) -> list[Float[Array, "B S P F"]]:
+        """Return the projections of four equal taps, to declare the parameters."""
+        return [self.project(tokens, slot) for slot in range(len(self.config.dpt_channels))]
+
+
 CHANNELS = {"depth": 2, "points": 4}  # values and confidence logit of the heads that regress
+
+
+class DenseHead(TapHead):
+    """A dense map and its confidence; arguments as those of `predict_dense`."""
+
+    kind: str = "depth"
+
+    @nn.compact
+    def __call__(self, taps: list[Float[Array, "B S P F"]], grid: tuple[int, int]) -> Float[Array, "B S H W O"]:
+        """Return values and a confidence logit, before their activation."""
+        config, (h, w), p = self.config, grid, self.config.patch_size
+        reassemble = DPTFeatures(config.dpt_features, config.dpt_features // 2, name="features")
+        regress = Regression(CHANNELS[self.kind], name="regression")
+
+        def some_frames(taps: list[Float[Array, "n P F"]]) -> Float[Array, "n H W O"]:
+            features = reassemble([tap.reshape(-1, h, w, tap.shape[-1]) for tap in taps])
+            return regress(add_positions(resize_aligned(features, (h * p, w * p)), aspect=w / h))
+
+        out = frames_at_once(some_frames, taps, (h * p) * (w * p))
+        return out.reshape(*taps[0].shape[:2], h * p, w * p, CHANNELS[self.kind])
+
+    def declare(self, tokens: Float[Array, "B S P E"], grid: tuple[int, int]) -> None:
+        """Read every parameter once."""
+        self(self.project_all(tokens), grid)
 
 
 def project_tap(params: Params, tokens: Float[Array, "... E"], slot: int, config: VGGTConfig) -> Float[Array, "... F"]:
     """Return a head's projection of the tap in `slot`; nothing else of the tap needs to be stored."""
-    weights = {"norm": params["norm"], "projection": params[f"projection{slot}"]}
-    return apply(TapProjection(config.dpt_channels[slot]), weights, tokens)
+    return apply(TapHead(config), params, tokens, slot, method="project")
 
 
 def predict_dense(
@@ -133,18 +168,8 @@ def predict_dense(
         kind: "depth" (V = 1, exp(x)) or "points" (V = 3, sign(x) (exp|x| - 1)).
         precision: as in `Compute`. It is that of all products here, which are convolutions in VGGT.
     """
-    (h, w), p = grid, config.patch_size
-    B, S = taps[0].shape[:2]
-
-    def some_frames(frame_taps: list[Float[Array, "n P F"]]) -> Float[Array, "n H W O"]:
-        maps = [tap.reshape(-1, h, w, tap.shape[-1]) for tap in frame_taps]
-        features = apply(_features(config), params["features"], maps)
-        x = add_positions(resize_aligned(features, (h * p, w * p)), aspect=w / h)
-        return apply(Regression(CHANNELS[kind]), params["regression"], x)
-
     with jax.default_matmul_precision("tensorfloat32" if precision == "tf32" else "highest"):
-        out = frames_at_once(some_frames, taps, (h * p) * (w * p))
-    out = out.reshape(B, S, h * p, w * p, CHANNELS[kind])
+        out = apply(DenseHead(config, kind), params, taps, grid)
     values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
     if kind == "depth":
         return jnp.exp(values), confidence
@@ -168,61 +193,6 @@ def frames_at_once(
     return out.reshape(count, *out.shape[2:])
 
 
-def declare_dense_head(config: VGGTConfig, kind: str) -> Params:
-    """Declare the parameters of a dense head."""
-    x = jnp.zeros((1, 1, 1, config.dpt_features // 2))
-    return declare_features(config, _features(config)) | {"regression": declare(Regression(CHANNELS[kind]), x)}
-
-
-def declare_features(config: VGGTConfig, features: DPTFeatures) -> Params:
-    """Declare the parameters of the tap projections and of the reassembly after them."""
-    params = {"features": declare(features, [jnp.zeros((1, 1, 1, channels)) for channels in config.dpt_channels])}
-    for slot, channels in enumerate(config.dpt_channels):
-        weights = declare(TapProjection(channels), jnp.zeros((1, config.tap_dim)))
-        params |= {"norm": weights["norm"], f"projection{slot}": weights["projection"]}
-    return params
-
-
-def resize_aligned(x: Float[Array, "F h w C"], size: tuple[int, int]) -> Float[Array, "F H W C"]:
-    """Resize bilinearly with aligned corners: the centres of corner pixels map onto each other."""
-    for axis, length in zip((1, 2), size, strict=True):
-        if x.shape[axis] != length:
-            x = _resize_axis(x, axis, length)
-    return x
-
-
-@functools.partial(jax.custom_vjp, nondiff_argnums=(1, 2))
-def _resize_axis(x: Float[Array, "F h w C"], axis: int, length: int) -> Float[Array, "F H W C"]:
-    low, high, fraction = _neighbours(x.shape[axis], length)
-    fraction = jnp.asarray(fraction.reshape([length if i == axis else 1 for i in range(4)]), x.dtype)
-    return jnp.take(x, low, axis=axis) * (1 - fraction) + jnp.take(x, high, axis=axis) * fraction
-
-
-def _resize_axis_forward(x, axis: int, length: int):
-    return _resize_axis(x, axis, length), x.shape[axis]
-
-
-def _resize_axis_backward(axis: int, length: int, size: int, gradient):
-    """Multiply by the transposed interpolation: the gather's own gradient is a scatter, which is slow on a CPU."""
-    low, high, fraction = _neighbours(size, length)
-    weights = np.zeros((length, size), np.float32)
-    np.add.at(weights, (np.arange(length), low), 1 - fraction)
-    np.add.at(weights, (np.arange(length), high), fraction)
-    letters = "fhwc"
-    equation = f"fhwc,{letters[axis]}n->{letters.replace(letters[axis], 'n')}"
-    return (jnp.einsum(equation, gradient, jnp.asarray(weights, gradient.dtype)),)
-
-
-_resize_axis.defvjp(_resize_axis_forward, _resize_axis_backward)
-
-
-def _neighbours(size: int, length: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the two source positions of every target position, and the share of the second."""
-    position = np.arange(length, dtype=np.float32) * np.float32((size - 1) / max(length - 1, 1))
-    low = np.minimum(position.astype(np.int32), size - 1)
-    return low, np.minimum(low + 1, size - 1), position - low
-
-
 def add_positions(x: Float[Array, "F h w C"], aspect: float, weight: float = 0.1) -> Float[Array, "F h w C"]:
     """Add a sinusoidal embedding of the position on the image plane, whose diagonal has length 2."""
     h, w, C = x.shape[1:]
@@ -241,7 +211,3 @@ def add_positions(x: Float[Array, "F h w C"], aspect: float, weight: float = 0.1
     across = np.concatenate([waves(u), np.repeat(zeros, w, axis=0)], axis=-1)  # [w, C]
     down = np.concatenate([np.repeat(zeros, h, axis=0), waves(v)], axis=-1)  # [h, C]
     return x + jnp.asarray(weight * across, x.dtype)[None, None] + jnp.asarray(weight * down, x.dtype)[None, :, None]
-
-
-def _features(config: VGGTConfig) -> DPTFeatures:
-    return DPTFeatures(config.dpt_features, config.dpt_features // 2)

@@ -14,7 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Bool, Int
 
 AXIS = "frames"  # of the mesh
-WHOLE = PartitionSpec()  # on every device
+REPLICATED = PartitionSpec()  # on every device
 BY_FRAME = PartitionSpec(None, AXIS)  # arrays [B, S, ...]
 
 _Tree = TypeVar("_Tree")
@@ -45,8 +45,9 @@ class Frames:
     def on_devices(self, function: Callable[_Parameters, _Tree], *specs: Any) -> Callable[_Parameters, _Tree]:
         """Return a function of whole arrays [B, S, ...] that runs `function` on the share of each device.
 
-        `specs` say where its positional arguments are, WHOLE or BY_FRAME; the outputs are by frame. The gradient by an
-        argument that is WHOLE is summed over the devices at the end, not in every loop and conditional that reads it.
+        `specs` say where its positional arguments are, REPLICATED or BY_FRAME; the outputs are by frame. The gradient
+        by an argument that is REPLICATED is summed over the devices at the end, not in every loop and conditional that
+        reads it.
         """
         return function if self.mesh is None else OnDevices(function, self.mesh, specs)
 
@@ -208,7 +209,7 @@ class OnDevices(Generic[_Parameters, _Tree]):
         def share(*arguments: Any) -> _Tree:
             pairs = zip(self.specs, arguments, strict=True)
             varying = Frames(self.mesh).varying
-            return function(*(varying(x) if spec == WHOLE else x for spec, x in pairs), **options)
+            return function(*(varying(x) if spec == REPLICATED else x for spec, x in pairs), **options)
 
         return jax.shard_map(share, mesh=self.mesh, in_specs=self.specs, out_specs=BY_FRAME)(*arguments)
 

@@ -1,19 +1,21 @@
-"""The leaves of the network as linen modules; how to apply and declare them."""
+"""The leaves of the network as linen modules, and stacks of equal layers."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 from jaxtyping import Array, Float
 
-from vggtjax.network.convolution import same_convolution
+from vggtjax.network.cpu_convolution import same_convolution
 
 Params = dict[str, Any]
 DType = Any
+_State = TypeVar("_State")
 
 
 class Dense(nn.Dense):
@@ -73,15 +75,28 @@ def _normal_cdf(x: Array) -> Array:
 gelu.defvjp(lambda x: (gelu(x), x), _gelu_backward)
 
 
-def apply(module: nn.Module, params: Params, *inputs: Any) -> Any:
+def apply(module: nn.Module, params: Params, *inputs: Any, **options: Any) -> Any:
     """Run a module with the given parameters."""
-    return module.apply({"params": params}, *inputs)
+    return module.apply({"params": params}, *inputs, **options)
 
 
-def declare(module: nn.Module, *inputs: Any) -> Params:
-    """Return a module's parameters for inputs of these shapes.
+def stack(parent: nn.Module, name: str, layer: nn.Module, depth: int, *inputs: Any) -> Params:
+    """Return the parameters of `depth` equal layers, stacked on axis 0: a parameter of `parent`, which may scan them.
 
-    Only names and shapes are used: `model.parameter_shapes` evaluates them abstractly, `model.init_params` draws the
-    values.
+    `inputs` are those of one layer; only their shapes are used, and only to declare the parameters.
     """
-    return dict(module.init(jax.random.key(0), *inputs)["params"])
+    if not parent.is_initializing():
+        return dict(parent.get_variable("params", name))
+
+    def declare(key: Array) -> Params:
+        shapes = jax.eval_shape(layer.init, key, *inputs)["params"]
+        return jax.tree.map(lambda leaf: jnp.zeros((depth, *leaf.shape), leaf.dtype), shapes)
+
+    return parent.param(name, declare)
+
+
+def iterate(parent: nn.Module, step: Callable[[_State], _State], start: _State, count: int) -> _State:
+    """Return `step` applied `count` times: a loop of jax, or a single step while `parent` declares its parameters."""
+    if parent.is_initializing():
+        return step(start)
+    return jax.lax.scan(lambda state, _: (step(state), None), start, length=count)[0]

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.network.attention import attention
-from vggtjax.network.precision import widened
+from vggtjax.network.precision import upcast
 from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
 
 REGION = 2  # patches a side: later frames keep one patch of each such square
@@ -120,7 +120,7 @@ def _groups(metric: Float[Array, "T C"], kept: Int[np.ndarray, " G"], real: Bool
     groups = jnp.zeros(T, jnp.int32).at[kept].set(np.arange(len(kept), dtype=np.int32))
     if not len(others):
         return groups
-    metric = widened(metric)
+    metric = upcast(metric)
     metric = metric * jax.lax.rsqrt(jnp.maximum(jnp.sum(metric * metric, axis=1, keepdims=True), 1e-24))
     targets = metric[kept].T
 
@@ -141,7 +141,7 @@ class _GroupMeans:
         self.counts = self._sums(counted.astype(jnp.float32))
 
     def of(self, x: Float[Array, "T N D"]) -> Float[Array, "G N D"]:
-        sums = self._sums(jnp.where(self._counted[:, None, None], widened(x), 0))
+        sums = self._sums(jnp.where(self._counted[:, None, None], upcast(x), 0))
         return (sums / jnp.maximum(self.counts, 1)[:, None, None]).astype(x.dtype)
 
     def _sums(self, x: Float[Array, "T ..."]) -> Float[Array, "G ..."]:

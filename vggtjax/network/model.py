@@ -4,26 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import linen as nn
 from jaxtyping import Array, Bool, Float, Int
 
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, aggregate, declare_aggregator
-from vggtjax.network.backbone import declare_backbone, encode, patch_grid
-from vggtjax.network.camera_head import ITERATIONS, declare_camera_head, predict_pose
+from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, Aggregator, aggregate, identity
+from vggtjax.network.backbone import Backbone, encode, patch_grid
+from vggtjax.network.camera_head import ITERATIONS, CameraHead, predict_pose
 from vggtjax.network.clip_batch import ClipBatch
-from vggtjax.network.dpt_head import declare_dense_head, predict_dense, project_tap
+from vggtjax.network.dpt_head import DenseHead, predict_dense, project_tap
 from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
-from vggtjax.network.track_head import check_track_size, declare_track_head, predict_tracks
+from vggtjax.network.track_head import TrackHead, check_track_size, predict_tracks, smallest_side
 
 DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
 HEADS = {"camera": "camera_head", **DENSE_HEADS, "tracks": "track_head"}
@@ -179,16 +180,26 @@ def parameter_shapes(config: VGGTConfig) -> Params:
 
 @lru_cache(maxsize=16)  # a second for each configuration; a run and its checkpoints ask for one many times
 def _declared(config: VGGTConfig) -> Params:
-    declarations = {
-        "camera": declare_camera_head,
-        "depth": partial(declare_dense_head, kind="depth"),
-        "points": partial(declare_dense_head, kind="points"),
-        "tracks": declare_track_head,
-    }
+    side = -(-smallest_side(config) // config.patch_size)  # patches a side of an image that every head can read
+    grid, size = (side, side), side * config.patch_size
 
     def declare() -> Params:
-        trunk = {"backbone": declare_backbone(config), "aggregator": declare_aggregator(config)}
-        return trunk | {HEADS[name]: declarations[name](config) for name in config.heads}
+        def declared(module: nn.Module, *inputs: Any, method: str = "__call__") -> Params:
+            return dict(module.init(jax.random.key(0), *inputs, method=method)["params"])
+
+        images = jnp.zeros((1, 1, size, size, 3))
+        patches, taps = (jnp.zeros((1, 1, side * side, width)) for width in (config.embed_dim, config.tap_dim))
+        heads = {
+            "camera": lambda: declared(CameraHead(config), taps[:, :, 0]),
+            "depth": lambda: declared(DenseHead(config, "depth"), taps, grid, method="declare"),
+            "points": lambda: declared(DenseHead(config, "points"), taps, grid, method="declare"),
+            "tracks": lambda: declared(TrackHead(config), taps, grid, method="declare"),
+        }
+        return {
+            "backbone": declared(Backbone(config), images),
+            "aggregator": declared(Aggregator(config), patches, grid, [identity] * len(config.taps)),
+            **{HEADS[name]: heads[name]() for name in config.heads},
+        }
 
     return jax.eval_shape(declare)
 

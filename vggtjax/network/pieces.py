@@ -19,7 +19,7 @@ _Rows = TypeVar("_Rows")
 _Outputs = TypeVar("_Outputs")
 
 
-def in_pieces(function: Callable[[_Rows], _Outputs], rows: _Rows) -> _Outputs:
+def map_chunks(function: Callable[[_Rows], _Outputs], rows: _Rows) -> _Outputs:
     """Return `function(rows)` for a tree of arrays [R, C], ..., with the intermediate values of one piece at a time.
 
     The function must treat every row independently. Few rows take a single call, without a loop.
@@ -39,10 +39,10 @@ def in_pieces(function: Callable[[_Rows], _Outputs], rows: _Rows) -> _Outputs:
     return _by_platform(at_most, rows)
 
 
-def replaced_in_pieces(
+def map_chunks_in_place(
     function: Callable[[Float[Array, "r C"], _Rows], Float[Array, "r C"]], x: Float[Array, "R C"], others: _Rows
 ) -> Float[Array, "R C"]:
-    """Return `function(x, others)` as `in_pieces` does; each piece overwrites its own input."""
+    """Return `function(x, others)` as `map_chunks` does; each piece overwrites its own input."""
     if len(x) <= _rows_on_cpu(x):
         return function(x, others)
 

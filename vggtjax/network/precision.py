@@ -66,7 +66,7 @@ def check_compute_dtype(name: str) -> None:
         raise InputError("compute_dtype is 'float64', which requires jax.enable_x64(True)")
 
 
-def widened(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
+def upcast(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
     """Return x in float32, or unchanged in float64: the types of sums and residual streams."""
     return x.astype(jnp.promote_types(x.dtype, jnp.float32))
 

@@ -13,8 +13,6 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int8
 
-from vggtjax.network.layers import Params
-
 LARGEST = 127
 _BLOCKS = ("backbone.blocks.", "aggregator.frame_blocks.", "aggregator.global_blocks.", "camera_head.trunk.")
 
@@ -42,7 +40,7 @@ def quantise(kernel: Float[np.ndarray, "*L I O"]) -> Quantised:
     return Quantised(jax.device_put(values), jax.device_put(scales))
 
 
-def dequantised(params: Mapping[str, Any]) -> Params:
+def dequantised(params: Mapping[str, Any]) -> dict[str, Any]:
     """Return a block's parameters with kernels in float32; others are returned as they are."""
 
     def widen(leaf: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -12,11 +13,12 @@ from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.network.dpt_head import DPTFeatures, add_positions, declare_features, frames_at_once, resize_aligned
+from vggtjax.network.dpt_head import DPTFeatures, TapHead, add_positions, frames_at_once
 from vggtjax.network.frames import Frames
 from vggtjax.network.gathered_attention import gathered_attention
-from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, declare
+from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, iterate, stack
 from vggtjax.network.precision import full_precision
+from vggtjax.network.resize import resize_aligned
 from vggtjax.network.sampling import bilinear, neighbours
 
 LAYERS = 6
@@ -25,6 +27,7 @@ HEADS = 8
 ITERATIONS = 4
 STRIDE = 2  # pixels of the image to one of the feature maps
 FLOW_SCALE = 518.0  # pixels of the feature maps: the unit of flows in the published weights
+_BLOCKS = {"time": False, "virtual_to_point": True, "virtual": False, "point_to_virtual": True}  # has context
 FLOATS_AT_ONCE = 1 << 24  # in feature windows; bounds the memory of the correlations
 
 
@@ -59,41 +62,7 @@ def predict_tracks(
         grid: rows and columns of patches.
         frames: where the frames are: attention over time gathers keys and values of every track, all else is local.
     """
-    B, S = taps[0].shape[:2]
-    F = config.track_features
-    maps = _feature_maps(params, taps, config, grid)  # [B, S, H, W, F]
-    size = (maps.shape[2], maps.shape[3])
-    query = query_points / STRIDE
-    inside = jnp.clip(query, 0, jnp.asarray([[[size[1] - 1, size[0] - 1]]]))
-    features = frames.of_first(jax.vmap(bilinear)(maps[:, 0], inside))  # [B, Q, F]
-    features = jnp.broadcast_to(features[:, None], (B, S, *features.shape[1:]))
-    pyramid = _pyramid(maps, config.track_corr_levels, config.track_corr_radius)
-    place = _position_embedding(inside, size, 3 * F + 4)[:, :, None]  # [B, Q, 1, E]
-    later = frames.numbers(S) > 0
-    kind = params["query_token"][later.astype(np.int32)][None, None]  # [1, 1, S, E]
-    start = jnp.broadcast_to(query[:, None], (B, S, *query.shape[1:]))
-
-    def iteration(state, _):
-        positions, features = state
-        positions = jax.lax.stop_gradient(positions)  # as in VGGT's training
-        similar = jax.vmap(_correlations, (0, 0, 0, None, None))(pyramid, features, positions, size, config)
-        similar = apply(MLP(config.track_hidden, F), params["correlation_mlp"], similar)
-        flow = positions - jax.lax.stop_gradient(start[:, :1])
-        x = jnp.concatenate(
-            [_flow_embedding(flow, F // 2), flow / FLOW_SCALE, flow / FLOW_SCALE, similar, features], -1
-        )
-        x = x.swapaxes(1, 2) + place + kind  # [B, Q, S, E]
-        delta = _updates(params, x, config, frames).swapaxes(1, 2)  # [B, S, Q, 2 + F]
-        update = apply(LayerNorm(), params["feature_norm"], delta[..., 2:])
-        update = nn.gelu(apply(Dense(F), params["feature_update"], update), approximate=False)
-        positions = jnp.where(jnp.asarray(later)[None, :, None, None], positions + delta[..., :2], start)
-        return (positions, features + update), None
-
-    (positions, features), _ = jax.lax.scan(iteration, (start, frames.varying(features)), length=ITERATIONS)
-    visibility, confidence = (
-        jax.nn.sigmoid(apply(Dense(1), params[name], features)[..., 0]) for name in ("visibility", "confidence")
-    )
-    return Tracks(positions * STRIDE, visibility, confidence)
+    return apply(TrackHead(config), params, taps, query_points, grid, frames)
 
 
 def smallest_side(config: VGGTConfig) -> int:
@@ -110,19 +79,154 @@ def check_track_size(height: int, width: int, config: VGGTConfig) -> None:
         )
 
 
-def _feature_maps(params: Params, taps: list[Array], config: VGGTConfig, grid: tuple[int, int]) -> Array:
-    (h, w), p, F = grid, config.patch_size, config.track_features
-    B, S = taps[0].shape[:2]
-    size = (h * p // STRIDE, w * p // STRIDE)
-    module = DPTFeatures(F, F, config.track_position_embedding)
+class TrackHead(TapHead):
+    """Iterations of correlations and a transformer; arguments as those of `predict_tracks`."""
 
-    def some_frames(frame_taps: list[Float[Array, "n P C"]]) -> Float[Array, "n H W F"]:
-        x = apply(module, params["features"], [tap.reshape(-1, h, w, tap.shape[-1]) for tap in frame_taps])
-        x = resize_aligned(x, size)
-        x = add_positions(x, aspect=w / h) if config.track_position_embedding else x
-        return apply(LayerNorm(), params["feature_map_norm"], x)
+    @nn.compact
+    def __call__(
+        self,
+        taps: list[Float[Array, "B S P F"]],
+        query_points: Float[Array, "B Q 2"],
+        grid: tuple[int, int],
+        frames: Frames = Frames(),
+    ) -> Tracks:
+        """Return the tracks of points of the first frame."""
+        B, S = taps[0].shape[:2]
+        config, F, C = self.config, self.config.track_features, self.config.track_hidden
+        maps = self._feature_maps(taps, grid)  # [B, S, H, W, F]
+        size = (maps.shape[2], maps.shape[3])
+        query = query_points / STRIDE
+        inside = jnp.clip(query, 0, jnp.asarray([[[size[1] - 1, size[0] - 1]]]))
+        features = frames.of_first(jax.vmap(bilinear)(maps[:, 0], inside))  # [B, Q, F]
+        features = jnp.broadcast_to(features[:, None], (B, S, *features.shape[1:]))
+        pyramid = _pyramid(maps, config.track_corr_levels, config.track_corr_radius)
+        place = _position_embedding(inside, size, 3 * F + 4)[:, :, None]  # [B, Q, 1, E]
+        later = frames.numbers(S) > 0
+        kind = self.param("query_token", nn.initializers.zeros, (2, 3 * F + 4))[later.astype(np.int32)][
+            None, None
+        ]  # [1, 1, S, E]
+        start = jnp.broadcast_to(query[:, None], (B, S, *query.shape[1:]))
+        compare, transform = MLP(C, F, name="correlation_mlp"), self._transformer(frames)
+        feature_norm, feature_update = LayerNorm(name="feature_norm"), Dense(F, name="feature_update")
+        scores = [Dense(1, name=name) for name in ("visibility", "confidence")]
 
-    return frames_at_once(some_frames, taps, (h * p) * (w * p)).reshape(B, S, *size, F)
+        def iteration(state):
+            positions, features = state
+            positions = jax.lax.stop_gradient(positions)  # as in VGGT's training
+            similar = jax.vmap(_correlations, (0, 0, 0, None, None))(pyramid, features, positions, size, config)
+            similar = compare(similar)
+            flow = positions - jax.lax.stop_gradient(start[:, :1])
+            x = jnp.concatenate(
+                [_flow_embedding(flow, F // 2), flow / FLOW_SCALE, flow / FLOW_SCALE, similar, features], -1
+            )
+            x = x.swapaxes(1, 2) + place + kind  # [B, Q, S, E]
+            delta = transform(x).swapaxes(1, 2)  # [B, S, Q, 2 + F]
+            update = nn.gelu(feature_update(feature_norm(delta[..., 2:])), approximate=False)
+            positions = jnp.where(jnp.asarray(later)[None, :, None, None], positions + delta[..., :2], start)
+            return positions, features + update
+
+        positions, features = iterate(self, iteration, (start, frames.varying(features)), ITERATIONS)
+        visibility, confidence = (jax.nn.sigmoid(score(features)[..., 0]) for score in scores)
+        return Tracks(positions * STRIDE, visibility, confidence)
+
+    def declare(self, tokens: Float[Array, "B S P E"], grid: tuple[int, int]) -> None:
+        """Read every parameter once."""
+        self(self.project_all(tokens), jnp.zeros((1, 1, 2)), grid)
+
+    def _feature_maps(self, taps: list[Float[Array, "B S P F"]], grid: tuple[int, int]) -> Float[Array, "B S H W F"]:
+        (h, w), p, F = grid, self.config.patch_size, self.config.track_features
+        size = (h * p // STRIDE, w * p // STRIDE)
+        has_positions = self.config.track_position_embedding
+        reassemble, norm = DPTFeatures(F, F, has_positions, name="features"), LayerNorm(name="feature_map_norm")
+
+        def some_frames(taps: list[Float[Array, "n P C"]]) -> Float[Array, "n H W F"]:
+            x = resize_aligned(reassemble([tap.reshape(-1, h, w, tap.shape[-1]) for tap in taps]), size)
+            return norm(add_positions(x, aspect=w / h) if has_positions else x)
+
+        return frames_at_once(some_frames, taps, (h * p) * (w * p)).reshape(*taps[0].shape[:2], *size, F)
+
+    def _transformer(self, frames: Frames) -> Callable[[Float[Array, "B Q S E"]], Float[Array, "B Q S O"]]:
+        """Return the transformer: layers alternate over time in every track and over tracks in every frame.
+
+        Tracks attend to each other through virtual tracks: these attend to all tracks and to one another, and all
+        tracks attend to them.
+        """
+        C, F = self.config.track_hidden, self.config.track_features
+        block, example = TrackBlock(), jnp.zeros((1, 1, 1, C))
+        layers = {
+            name: stack(self, f"{name}_blocks", block, LAYERS, example, *(example,) * has_context)
+            for name, has_context in _BLOCKS.items()
+        }
+        virtual_tracks = self.param("virtual_tracks", nn.initializers.zeros, (VIRTUAL_TRACKS, C))
+        input_norm, input_projection = LayerNorm(name="input_norm"), Dense(C, name="input_projection")
+        output_norm, flow_projection = LayerNorm(name="output_norm"), Dense(F + 2, name="flow_projection")
+
+        def transform(x: Float[Array, "B Q S E"]) -> Float[Array, "B Q S O"]:
+            start = input_projection(input_norm(x))
+            virtual = jnp.broadcast_to(virtual_tracks[None, :, None], (x.shape[0], VIRTUAL_TRACKS, x.shape[2], C))
+            tokens, _ = jax.lax.scan(layer, jnp.concatenate([start, virtual], axis=1), layers)
+            return flow_projection(output_norm(tokens[:, : x.shape[1]] + start))
+
+        def layer(tokens: Float[Array, "B N S C"], blocks: dict[str, Params]):
+            tokens = apply(block, blocks["time"], tokens, frames=frames)
+            tokens = tokens.swapaxes(1, 2)  # [B, S, N, C]
+            points, virtual = tokens[:, :, :-VIRTUAL_TRACKS], tokens[:, :, -VIRTUAL_TRACKS:]
+            virtual = apply(block, blocks["virtual_to_point"], virtual, points)
+            virtual = apply(block, blocks["virtual"], virtual)
+            points = apply(block, blocks["point_to_virtual"], points, virtual)
+            return jnp.concatenate([points, virtual], axis=2).swapaxes(1, 2), None
+
+        return transform
+
+
+class TrackBlock(nn.Module):
+    """Attention, to `context` if given, and MLP. The skip starts after the first norm."""
+
+    @nn.compact
+    def __call__(
+        self, x: Float[Array, "B G T C"], context: Float[Array, "B G K C"] | None = None, frames: Frames = Frames()
+    ) -> Float[Array, "B G T C"]:
+        """Return the tokens after the block. With `frames`, T are frames, and attention is over all devices."""
+        B, G, T, C = x.shape
+        x = LayerNorm(name="norm1")(x)
+        source = x if context is None else LayerNorm(name="norm_context")(context)
+        attention = SplitProjections(C, name="attention")
+        q, k, v = (y.reshape(B * G, -1, HEADS, C // HEADS) for y in attention.heads(x, source))
+        out = gathered_attention(q, k, v, frames.are_real(None, B * G, T), frames).reshape(B, G, T, C)
+        x = x + attention.project(out)
+        return x + MLP(4 * C, C, name="mlp")(LayerNorm(name="norm2")(x))
+
+
+class SplitProjections(nn.Module):
+    """The linear layers of attention whose keys and values may come from other tokens than its queries."""
+
+    channels: int
+
+    def setup(self) -> None:
+        self.qkv = SplitDense(self.channels)
+        self.projection = Dense(self.channels)
+
+    def heads(self, x: Float[Array, "... T C"], source: Float[Array, "... K C"]) -> list[Array]:
+        """Return q of x, and k and v of `source`."""
+        return self.qkv([x, source, source])
+
+    def project(self, y: Float[Array, "... C"]) -> Float[Array, "... C"]:
+        """Return what attention adds to the residual stream."""
+        return self.projection(y)
+
+
+class SplitDense(nn.Module):
+    """A linear layer whose outputs are cut into parts, each of an input of its own."""
+
+    channels: int
+
+    @nn.compact
+    def __call__(self, parts: list[Float[Array, "... C"]]) -> list[Float[Array, "... C"]]:
+        count = len(parts)
+        kernel = self.param("kernel", nn.initializers.zeros, (parts[0].shape[-1], count * self.channels))
+        bias = self.param("bias", nn.initializers.zeros, (count * self.channels,))
+        pieces = zip(parts, jnp.split(kernel, count, axis=1), jnp.split(bias, count), strict=True)
+        return [part @ kernel + bias[None, None, None] for part, kernel, bias in pieces]
 
 
 def _pyramid(maps: Float[Array, "B S H W F"], levels: int, radius: int) -> list[Float[Array, "B S h w F"]]:
@@ -215,93 +319,3 @@ def _flow_embedding(flow: Float[Array, "... 2"], channels: int) -> Float[Array, 
     frequencies = jnp.asarray(np.arange(0, channels, 2) * (1000.0 / channels), jnp.float32)
     angle = flow[..., None] * frequencies.reshape((1,) * flow.ndim + (-1,))  # [..., 2, channels/2]
     return jnp.stack([jnp.sin(angle), jnp.cos(angle)], axis=-1).reshape(*flow.shape[:-1], 2 * channels)
-
-
-def _updates(params: Params, x: Float[Array, "B Q S E"], config: VGGTConfig, frames: Frames) -> Float[Array, "B Q S O"]:
-    """Return the transformer's output: layers alternate over time in every track and over tracks in every frame.
-
-    Tracks attend to each other through virtual tracks: these attend to all tracks and to one another, and all tracks
-    attend to them.
-    """
-    C, Q = config.track_hidden, x.shape[1]
-    start = apply(Dense(C), params["input_projection"], apply(LayerNorm(), params["input_norm"], x))
-    virtual = params["virtual_tracks"][None, :, None]
-    virtual = jnp.broadcast_to(virtual, (x.shape[0], VIRTUAL_TRACKS, x.shape[2], C))
-    names = ("time", "virtual_to_point", "virtual", "point_to_virtual")
-
-    def layer(tokens: Float[Array, "B N S C"], blocks: dict[str, Params]):
-        tokens = _block(blocks["time"], tokens, frames=frames)
-        tokens = tokens.swapaxes(1, 2)  # [B, S, N, C]
-        points, virtual = tokens[:, :, :Q], tokens[:, :, Q:]
-        virtual = _block(blocks["virtual_to_point"], virtual, points)
-        virtual = _block(blocks["virtual"], virtual)
-        points = _block(blocks["point_to_virtual"], points, virtual)
-        return jnp.concatenate([points, virtual], axis=2).swapaxes(1, 2), None
-
-    tokens, _ = jax.lax.scan(
-        layer, jnp.concatenate([start, virtual], axis=1), {name: params[f"{name}_blocks"] for name in names}
-    )
-    x = apply(LayerNorm(), params["output_norm"], tokens[:, :Q] + start)
-    return apply(Dense(config.track_features + 2), params["flow_projection"], x)
-
-
-def _block(
-    params: Params,
-    x: Float[Array, "B G T C"],
-    context: Float[Array, "B G K C"] | None = None,
-    frames: Frames = Frames(),
-) -> Float[Array, "B G T C"]:
-    """Return attention, to `context` if given, and MLP. The skip starts after the first norm.
-
-    With `frames`, T are frames, and attention is over those of all devices.
-    """
-    B, G, T, C = x.shape
-    x = apply(LayerNorm(), params["norm1"], x)
-    source: Array = x if context is None else apply(LayerNorm(), params["norm_context"], context)
-    kernels = jnp.split(params["attention"]["qkv"]["kernel"], 3, axis=1)
-    biases = jnp.split(params["attention"]["qkv"]["bias"], 3)
-    q, k, v = (
-        (part @ kernel + bias[None, None, None]).reshape(B * G, -1, HEADS, C // HEADS)
-        for part, kernel, bias in zip((x, source, source), kernels, biases, strict=True)
-    )
-    out = gathered_attention(q, k, v, frames.are_real(None, B * G, T), frames).reshape(B, G, T, C)
-    x = x + apply(Dense(C), params["attention"]["projection"], out)
-    return x + apply(MLP(4 * C, C), params["mlp"], apply(LayerNorm(), params["norm2"], x))
-
-
-def declare_track_head(config: VGGTConfig) -> Params:
-    """Declare the parameters of the track head."""
-    F, C = config.track_features, config.track_hidden
-    E = 3 * F + 4  # flow embedding and flow, correlation, track features
-    correlations = config.track_corr_levels * (2 * config.track_corr_radius + 1) ** 2
-
-    def declared(module: nn.Module, channels: int) -> Params:
-        return declare(module, jnp.zeros((1, 1, channels)))
-
-    def blocks(context: bool) -> Params:
-        block = {
-            "attention": {"qkv": declared(Dense(3 * C), C), "projection": declared(Dense(C), C)},
-            "mlp": declared(MLP(4 * C, C), C),
-        }
-        for name in ("norm1", "norm2") + ("norm_context",) * context:
-            block[name] = declared(LayerNorm(), C)
-        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LAYERS, *leaf.shape)), block)
-
-    return declare_features(config, DPTFeatures(F, F, config.track_position_embedding)) | {
-        "query_token": jnp.zeros((2, E)),
-        "virtual_tracks": jnp.zeros((VIRTUAL_TRACKS, C)),
-        "correlation_mlp": declared(MLP(C, F), correlations),
-        "input_norm": declared(LayerNorm(), E),
-        "input_projection": declared(Dense(C), E),
-        "time_blocks": blocks(context=False),
-        "virtual_blocks": blocks(context=False),
-        "point_to_virtual_blocks": blocks(context=True),
-        "virtual_to_point_blocks": blocks(context=True),
-        "output_norm": declared(LayerNorm(), C),
-        "flow_projection": declared(Dense(F + 2), C),
-        "feature_map_norm": declared(LayerNorm(), F),
-        "feature_norm": declared(LayerNorm(), F),
-        "feature_update": declared(Dense(F), F),
-        "visibility": declared(Dense(1), F),
-        "confidence": declared(Dense(1), F),
-    }

@@ -25,7 +25,7 @@ from vggtjax.options import Options
 from vggtjax.pipeline.clip_work import ClipWork, LongClip
 from vggtjax.pipeline.contact import contact_page
 from vggtjax.pipeline.destination import Destination, destination
-from vggtjax.pipeline.recipe import BatchMasks, ClipOutcome, Recipe, failed, odd_name
+from vggtjax.pipeline.recipe import BatchMasks, ClipOutcome, Recipe, failed, invalid_name
 from vggtjax.pipeline.shards import parse_shard
 from vggtjax.progress import Progress, StageSeconds, no_progress
 from vggtjax.refinement.refine import check_refinement
@@ -135,7 +135,7 @@ def _outcomes(
     work: ClipWork, sources: Mapping[str, ClipSource], place: Destination, sampling: Sampling, progress: Progress
 ) -> Generator[ClipOutcome]:
     """Yield the outcomes of clips that cannot have a folder, then of kept ones, then of the others."""
-    odd = {name: outcome for name in sources if (outcome := odd_name(name)) is not None}
+    odd = {name: outcome for name in sources if (outcome := invalid_name(name)) is not None}
     yield from odd.values()
     kept = place.finished(name for name in sources if name not in odd)
     yield from (ClipOutcome(name, "kept") for name in sources if name in kept)

@@ -18,7 +18,7 @@ from vggtjax.known.intrinsics import known_values
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.pipeline.destination import Destination
-from vggtjax.pipeline.devices import frames_mesh, whole_on
+from vggtjax.pipeline.devices import frames_mesh, replicate
 from vggtjax.pipeline.memory import Load
 from vggtjax.pipeline.recipe import ClipOutcome, Recipe
 from vggtjax.pipeline.run import reconstruct
@@ -47,7 +47,7 @@ class ClipWork:
         self._model, self._fusion, self._recipe, self._out = model, fusion, recipe, out
         self._placed = model  # with its weights on every device
         if mesh is not None:
-            self._placed = dataclasses.replace(model, params=whole_on(model.params, mesh))
+            self._placed = dataclasses.replace(model, params=replicate(model.params, mesh))
         self._fitter: Fitter = recipe.framing.fitter(size=model.config.image_size, patch=model.config.patch_size)
 
     @property
@@ -85,7 +85,7 @@ class ClipWork:
             choice = choose_windows(self._model, opened, recipe.sampling, self._fitter, **how)
             if choice is not None and choice.is_cut and self._cuts:
                 return LongClip(choice.windows, choice.frames, choice.sentence)
-            if choice is not None and choice.is_hopeless:
+            if choice is not None and choice.cannot_fit:
                 raise choice.refusal(cuts=False)
         return None
 

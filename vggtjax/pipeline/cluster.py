@@ -21,7 +21,7 @@ from vggtjax.pipeline.cluster_options import Cluster
 from vggtjax.pipeline.cluster_worker import Job, Load
 from vggtjax.pipeline.contact import contact_page
 from vggtjax.pipeline.destination import LocalFolder, RemoteFolder, destination
-from vggtjax.pipeline.recipe import ClipOutcome, Recipe, odd_name
+from vggtjax.pipeline.recipe import ClipOutcome, Recipe, invalid_name
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.remote import is_in_process, is_url
 
@@ -68,7 +68,7 @@ def reconstruct_on_cluster(
     if isinstance(place, LocalFolder):
         place = LocalFolder(place.path.absolute())
     progress, note = progress or no_progress, note or (lambda text: None)
-    odd = {name: outcome for name in sources if (outcome := odd_name(name)) is not None}
+    odd = {name: outcome for name in sources if (outcome := invalid_name(name)) is not None}
     plan = Plan(
         job=Job(load, recipe, place, os.getcwd()),  # noqa: PTH109 - text
         sources={name: source for name, source in sources.items() if name not in odd},

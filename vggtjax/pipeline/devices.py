@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from vggtjax.errors import InputError, whole_number
-from vggtjax.network.frames import AXIS, BY_FRAME, WHOLE, Frames
+from vggtjax.network.frames import AXIS, BY_FRAME, REPLICATED, Frames
 from vggtjax.pipeline.lengths import shared_length
 
 
@@ -37,15 +37,15 @@ def by_frame_padded(x: Array, mesh: Mesh) -> Array:
     if AXIS not in mesh.axis_names:
         raise InputError(f"mesh has the axes {mesh.axis_names}; expected one named {AXIS!r}, as frames_mesh makes it")
     padding = shared_length(x.shape[1], mesh) - x.shape[1]
-    return by_frame_on(jnp.pad(x, ((0, 0), (0, padding), *((0, 0),) * (x.ndim - 2))) if padding else x, mesh)
+    return shard_frames(jnp.pad(x, ((0, 0), (0, padding), *((0, 0),) * (x.ndim - 2))) if padding else x, mesh)
 
 
-def whole_on(tree: Any, mesh: Mesh | None) -> Any:
+def replicate(tree: Any, mesh: Mesh | None) -> Any:
     """Return the arrays on every device of the mesh; what is there already is not copied."""
-    return jax.device_put(tree, Frames(mesh).sharding(WHOLE))
+    return jax.device_put(tree, Frames(mesh).sharding(REPLICATED))
 
 
-def by_frame_on(tree: Any, mesh: Mesh | None) -> Any:
+def shard_frames(tree: Any, mesh: Mesh | None) -> Any:
     """Return arrays [B, S, ...] shared by the devices of the mesh, which S divides."""
     return jax.device_put(tree, Frames(mesh).sharding(BY_FRAME))
 

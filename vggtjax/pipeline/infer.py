@@ -22,7 +22,7 @@ from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute
 from vggtjax.options import Options
-from vggtjax.pipeline.devices import by_frame_padded, whole_on
+from vggtjax.pipeline.devices import by_frame_padded, replicate
 
 _SLACK = 1e-3  # largest distance of a value from [0, 1] that counts as rounding
 
@@ -66,7 +66,7 @@ def infer(
     frames, rule = images.shape[1], as_tree(fusion)
     if mesh is not None:
         masks = masks if masks is None or masks is False else by_frame_padded(masks, mesh)  # type: ignore[arg-type]
-        params, images, rule = whole_on(params, mesh), by_frame_padded(images, mesh), whole_on(rule, mesh)
+        params, images, rule = replicate(params, mesh), by_frame_padded(images, mesh), replicate(rule, mesh)
     given, moves = (None, False) if masks is False else (masks, True)
     outputs = _infer(params, images, given, rule, config, options, frames, mesh, moves)
     return outputs if images.shape[1] == frames else jax.tree.map(lambda x: x[:, :frames], outputs)

@@ -15,7 +15,7 @@ import jax
 
 from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS
-from vggtjax.network.attention import LOGITS_AT_ONCE, chunk_count
+from vggtjax.network.cpu_attention import LOGITS_OF_ALL_HEADS, chunk_count
 from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
 from vggtjax.network.gathered_attention import GATHERED_AT_ONCE
 from vggtjax.options import Method, find_method
@@ -80,7 +80,7 @@ def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int, *, devi
     share = -(-frames // devices)
     tokens = SPECIAL_TOKENS + height * width // config.patch_size**2
     rows = _ROWS * tokens * config.embed_dim
-    logits = _LOGITS * config.num_heads * tokens**2 if tokens**2 <= LOGITS_AT_ONCE else 0
+    logits = _LOGITS * config.num_heads * tokens**2 if tokens**2 <= LOGITS_OF_ALL_HEADS else 0
     at_once = min(share, max(PIXELS_AT_ONCE // (height * width), 1))  # frames of the dense head, at most
     maps = _MAPS * max(config.dpt_features // 2, HIDDEN) * height * width
     largest = at_once * maps

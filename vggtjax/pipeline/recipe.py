@@ -92,7 +92,7 @@ def failed(name: str, error: BaseException) -> ClipOutcome:
     return ClipOutcome(name, "failed", str(error) or "out of memory")
 
 
-def odd_name(name: str) -> ClipOutcome | None:
+def invalid_name(name: str) -> ClipOutcome | None:
     """Return the failure of a clip whose name is no plain one, or is taken; None for other names."""
     if name not in _TAKEN and Path(name).name == name and name.isprintable():
         return None

@@ -26,10 +26,10 @@ from vggtjax.known.options import KnownGeometry
 from vggtjax.method.algorithm import Clips, run_method
 from vggtjax.method.assembly import FusionRule, as_tree, check_fuses
 from vggtjax.method.mask_refinement import refine_masks
-from vggtjax.network.frames import BY_FRAME, WHOLE, Frames
+from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.precision import Compute
 from vggtjax.options import Options
-from vggtjax.pipeline.devices import by_frame_on, frames_mesh, on_host, whole_on
+from vggtjax.pipeline.devices import frames_mesh, on_host, replicate, shard_frames
 from vggtjax.pipeline.fields import (
     assembled_fields,
     camera_source,
@@ -45,7 +45,7 @@ from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.refinement.refine import check_refinement, refine_cameras
 from vggtjax.results.not_finite import warn_of_not_finite
 from vggtjax.results.reconstruction import Reconstruction
-from vggtjax.storage.cache import say_how_to_keep
+from vggtjax.storage.cache import hint_compilation_cache
 
 _LESS_MEMORY = (
     "fewer frames at once (window, max_frames, stride, fps), a smaller size, fewer points to track, or bfloat16"
@@ -131,16 +131,16 @@ def reconstruct(
     padding = shared_length(length, mesh) - frames
 
     def padded(x: np.ndarray) -> Array:
-        return by_frame_on(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None], mesh)
+        return shard_frames(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None], mesh)
 
     inputs = Clips(
         images=padded(clip.images),
-        query_points={} if tracks is None else whole_on(_points_by_frame(tracks), mesh),
+        query_points={} if tracks is None else replicate(_points_by_frame(tracks), mesh),
         frames=frames,
     )
     params, rule = model.params, as_tree(fusion)
     if mesh is not None:
-        params, rule = whole_on((params, rule), mesh)
+        params, rule = replicate((params, rule), mesh)
     run = partial(
         run_method,
         params,
@@ -158,7 +158,7 @@ def reconstruct(
             compiler = Compile()
             run(step=compiler)
             compiler.wait(progress)
-        say_how_to_keep(time.perf_counter() - started)
+        hint_compilation_cache(time.perf_counter() - started)
         assembly, passes = run(step=Execute(on_stage))
     outputs = (assembly, passes._replace(patch_tokens=None))
     assembly, passes = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
@@ -222,7 +222,7 @@ def compile_ahead(
         )
     options, mesh = options.changed(**changes).resolved(model.config.motion), frames_mesh(devices)
     length = padded_frames(frames, model.config.motion.offsets) if pad_frames else frames
-    by_frame, whole = (Frames(mesh).sharding(spec) for spec in (BY_FRAME, WHOLE))
+    by_frame, whole = (Frames(mesh).sharding(spec) for spec in (BY_FRAME, REPLICATED))
     shape = (1, shared_length(length, mesh), height, width, 3)
     clips = Clips(
         images=jax.ShapeDtypeStruct(shape, jnp.float32, sharding=by_frame),  # type: ignore

@@ -35,7 +35,7 @@ def reconstruct_methods(
 ) -> dict[str, Reconstruction]:
     """Reconstruct a clip by several methods, each as `reconstruct` does.
 
-    Methods that mine and suppress alike, such as those of `LADDER`, share one run of the passes.
+    Methods that mine and suppress alike, such as those of `ABLATION`, share one run of the passes.
 
     Args:
         methods: names of `METHODS`.

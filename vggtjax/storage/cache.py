@@ -112,7 +112,7 @@ def enable_compilation_cache() -> Path:
     return Path(folder)
 
 
-def say_how_to_keep(seconds: float) -> None:
+def hint_compilation_cache(seconds: float) -> None:
     """Say once how later processes save these seconds of compiling, unless compiled programs are kept."""
     if seconds >= _WORTH_KEEPING and sys.modules["jax"].config.values[_FOLDER] is None:
         _say_how_to_keep()

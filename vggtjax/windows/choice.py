@@ -56,7 +56,7 @@ class Choice(NamedTuple):
         return self.windows.cuts(self.frames)
 
     @property
-    def is_hopeless(self) -> bool:
+    def cannot_fit(self) -> bool:
         """Whether the clip is predicted not to fit: without a hard limit, even if too much is predicted, by its error.
 
         What is free of a computer can grow while the clip is read; a process that meets a hard limit is ended.

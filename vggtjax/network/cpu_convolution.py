@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from vggtjax.network.pieces import largest_divisor
-from vggtjax.network.precision import widened
+from vggtjax.network.precision import upcast
 
 _NUMBERS_AT_ONCE = 3 * 2**19  # of the shifted input that one product reads (6 MB): they stay in the cache
 
@@ -80,7 +80,7 @@ def _kernel_gradient(
         shifted = jnp.concatenate([block[:, :, j : j + W] for j in range(b)], axis=-1)
         goals = jnp.concatenate([goal[:, a - 1 - i : 2 * a - 2 - i + rows] for i in range(a)], axis=-1)
         shifted, goals = shifted.reshape(-1, b * C), goals.reshape(-1, a * outputs)
-        return jnp.matmul(shifted.T, goals, precision=precision, preferred_element_type=widened(gradient).dtype)
+        return jnp.matmul(shifted.T, goals, precision=precision, preferred_element_type=upcast(gradient).dtype)
 
     places = np.stack(np.meshgrid(range(0, F, images), range(0, H, rows), indexing="ij"), axis=-1).reshape(-1, 2)
     total, _ = jax.lax.scan(lambda total, place: (total + product(place), None), product(places[0]), places[1:])

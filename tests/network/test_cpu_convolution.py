@@ -5,15 +5,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from vggtjax.network import convolution
-from vggtjax.network.convolution import same_convolution
+from vggtjax.network import cpu_convolution
+from vggtjax.network.cpu_convolution import same_convolution
 
 
 @pytest.mark.parametrize(  # a row, a few rows, everything
     ("at_once", "size"), [(1, (3, 3)), (300, (3, 3)), (10**6, (3, 3)), (300, (5, 1))]
 )
 def test_gradient_against_xlas_own(at_once, size, monkeypatch):
-    monkeypatch.setattr(convolution, "_NUMBERS_AT_ONCE", at_once)
+    monkeypatch.setattr(cpu_convolution, "_NUMBERS_AT_ONCE", at_once)
     generator = np.random.default_rng(0)
     x, kernel, upstream = (
         jnp.asarray(generator.normal(size=shape), jnp.float32) for shape in ((4, 6, 5, 3), (*size, 3, 2), (4, 6, 5, 2))
