@@ -25,7 +25,7 @@ from vggtjax.known.depths import DepthSamples
 from vggtjax.known.given import Given
 from vggtjax.known.options import Baseline, KnownGeometry
 from vggtjax.pretrained.load import load_model
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 
 _EVERY = 7  # pixels of a clip, for the points
 _DEPTHS = 5  # known ones, in frame 0

@@ -12,7 +12,7 @@ import numpy as np
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import load_clip
 from vggtjax.pipeline.run import reconstruct
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
 from vggtjax.scenes import SceneConfig, held_out_scenes
 from vggtjax.scenes.held_out import Kind

@@ -21,9 +21,9 @@ from vggtjax.clips.truth import at_clip_pixels, batched_truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.trajectory import rotation_error, trajectory_errors
 from vggtjax.pretrained.load import load_model
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.refine import check_refinement
 from vggtjax.refinement.refine import refine_cameras as refine
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.scenes import SceneConfig, held_out_scenes
 from vggtjax.scenes.held_out import Kind
 from vggtjax.storage.writing import staging, writing

@@ -7,8 +7,8 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.spatial.transform import Rotation
 
 from vggtjax.cameras import camera_centres, project
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.tracks import Tracks
-from vggtjax.results.reconstruction import Reconstruction
 
 HEIGHT, WIDTH, SCALE = 144, 192, 3  # of the pictures; the result has a third of these sides
 FOCAL = 170.0

@@ -10,7 +10,7 @@ from tests.room import make_room
 from vggtjax.errors import ClipError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.run import Scoring, evaluate
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 
 SETTINGS = {"version": "0", "dataset": "room"}
 

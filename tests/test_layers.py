@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from graphlib import CycleError, TopologicalSorter
 from importlib.util import resolve_name
@@ -99,6 +101,25 @@ def test_imports_form_no_circle(graph):
     assert circle(graph) == []
 
 
+def folders(graph: Graph) -> Graph:
+    """Return folder or file of the root -> those that it imports from; the public names belong to none."""
+    arrows: Graph = {room(module): set() for module in graph if module not in FACES}
+    for module in graph.keys() - set(FACES):
+        arrows[room(module)] |= {room(target) for target in graph[module] - set(FACES)} - {room(module)}
+    return arrows
+
+
+def test_imports_of_folders_form_no_circle(graph):
+    assert circle(folders(graph)) == []
+    twice = {"vggtjax.viewer.page": {"vggtjax.results.frame"}, "vggtjax.results.result": {"vggtjax.viewer.scene"}}
+    assert set(circle(folders(graph | twice))) == {"results", "viewer"}
+
+
+def test_the_network_loads_no_library_of_the_command_line():
+    code = "import sys, vggtjax.network.model; print({'tyro', 'gradio', 'viser'} & set(sys.modules))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "set()\n"
+
+
 def test_an_upward_import_and_a_circle_are_found(graph, layer):
     worse = graph | {"vggtjax.network.rope": {"vggtjax.method.mask"}}
     assert upward(worse, layer) == ["vggtjax.network.rope -> vggtjax.method.mask"]
@@ -114,7 +135,7 @@ def test_tests_and_benchmarks_share_testing_alone(folder, other):
 
 
 def test_the_root_is_small():
-    assert len(list((ROOT / "vggtjax").glob("*.py"))) <= 8
+    assert len(list((ROOT / "vggtjax").glob("*.py"))) <= 9
 
 
 def test_the_page_names_every_file():

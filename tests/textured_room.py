@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from tests.room import make_room
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 
 
 def textured_room(frames: int = 6, **changes: Any) -> Reconstruction:

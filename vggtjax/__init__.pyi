@@ -1,3 +1,4 @@
+from .batch.many import reconstruct_many as reconstruct_many
 from .checkpoint import Model as Model
 from .clips.clip import Clip as Clip
 from .clips.clip import load_clip as load_clip
@@ -29,13 +30,12 @@ from .options import ABLATION as ABLATION
 from .options import METHODS as METHODS
 from .options import Options as Options
 from .pipeline.artefact import write_artefact as write_artefact
-from .pipeline.batch import reconstruct_many as reconstruct_many
 from .pipeline.infer import infer as infer
 from .pipeline.run import compile_ahead as compile_ahead
 from .pipeline.run import reconstruct as reconstruct
 from .pretrained.load import load_model as load_model
+from .reconstruction import Reconstruction as Reconstruction
 from .results.frame import frame_of as frame_of
-from .results.reconstruction import Reconstruction as Reconstruction
 from .storage.cache import enable_compilation_cache as enable_compilation_cache
 from .windows.plan import Windows as Windows
 from .windows.run import reconstruct_long as reconstruct_long

@@ -17,6 +17,9 @@ LARGEST = 1_000_000  # size of one part of a network
 Size = Annotated[int, Meta(ge=1, le=LARGEST)]
 Gram = Literal["cosine", "dot"]
 Suppress = Literal["zero", "drop"]
+Attention = Literal["exact", "merged"]
+ComputeDType = Literal["float32", "bfloat16", "float64"]
+Precision = Literal["highest", "tf32"]
 Threshold = Literal["otsu", "multi-otsu"]
 Witness = Literal["gram", "matches"]  # of motion
 _MATCHING = (0.5, 0.65)  # relative depths of the pairs that match, where no others are named

@@ -9,17 +9,24 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from vggtjax.config import LARGEST, Gram, MotionConfig, Suppress, Threshold, Witness
+from vggtjax.config import (
+    LARGEST,
+    Attention,
+    ComputeDType,
+    Gram,
+    MotionConfig,
+    Precision,
+    Suppress,
+    Threshold,
+    Witness,
+)
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields, without_defaults
 
 Pass = Literal["first", "second"]
 _ShownDType = Literal["float32", "bfloat16"]  # on the command line
-Attention = Literal["exact", "merged"]
 CamerasFrom = Literal["predicted", "adjusted"]
-ComputeDType = Literal["float32", "bfloat16", "float64"]
-Precision = Literal["highest", "tf32"]
 MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d", "4dvggt-m"]
 
 

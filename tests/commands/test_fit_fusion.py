@@ -16,7 +16,7 @@ from vggtjax.learning.ablation import CHOSEN
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, kept_passes, observations, sequence_digest
 from vggtjax.method.fusion_family import identity
 from vggtjax.method.fusion_file import load_fusion, save_fusion
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.storage.arrays import write_arrays
 
 

@@ -8,6 +8,7 @@ from PIL import Image
 
 from tests.videos import write_video
 from vggtjax import Reconstruction, load_model
+from vggtjax.batch.many import reconstruct_many
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import open_source
@@ -19,7 +20,6 @@ from vggtjax.errors import DeviceMemoryError
 from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
 from vggtjax.pipeline import memory
-from vggtjax.pipeline.batch import reconstruct_many
 from vggtjax.pipeline.steps import Compile
 from vggtjax.results.saving import Saving
 from vggtjax.storage.free_memory import Room, in_gigabytes

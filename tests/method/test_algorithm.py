@@ -23,12 +23,12 @@ from vggtjax import (
     reconstruct_long,
     write_artefact,
 )
+from vggtjax.batch.many import reconstruct_many
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
 from vggtjax.learning import identity, reconstruct_soft, soft_masking
 from vggtjax.method.algorithm import run_method, run_passes
-from vggtjax.pipeline.batch import reconstruct_many
 from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.windows.plan import Windows
 

@@ -35,14 +35,14 @@ def test_the_passes_are_predicted_within_a_third_of_the_counts_of_xla(config, fr
 
 @pytest.fixture
 def two_cores(monkeypatch):
-    monkeypatch.setattr("vggtjax.network.attention.times_for_cores", lambda: 1)
+    monkeypatch.setattr("vggtjax.network.cpu_attention.times_for_cores", lambda: 1)
 
 
 def test_the_logits_that_more_cores_hold_at_once_are_counted(monkeypatch):
     queries, keys = 4 * (5 + 21 * 37), 32 * (5 + 21 * 37)  # of one of eight devices
     needs, rows = [], []
     for times in (1, 4):
-        monkeypatch.setattr("vggtjax.network.attention.times_for_cores", lambda times=times: times)
+        monkeypatch.setattr("vggtjax.network.cpu_attention.times_for_cores", lambda times=times: times)
         rows.append(_chunks(jnp.zeros((queries, 1)), keys).shape[1])
         needs.append(memory.pass_bytes(vggt_1b(), 32, 294, 518, devices=8))
     assert rows == [782, 1564]

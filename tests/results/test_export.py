@@ -7,10 +7,10 @@ from PIL import Image
 
 from tests.room import make_room
 from vggtjax.errors import InputError, OutputError
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results import export
 from vggtjax.results.frame import frame_of
 from vggtjax.results.point_cloud import least_confidence
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
 from vggtjax.storage.trajectories import read_trajectory
 

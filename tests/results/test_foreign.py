@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.room import make_room
 from vggtjax.errors import InputError, ResultError
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 
 ROOM = make_room(3)
 

@@ -5,7 +5,7 @@ import pytest
 
 from tests.room import make_room
 from vggtjax.errors import ResultError
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
 from vggtjax.storage import arrays as archive
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.room import make_room
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results import charts
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import REPORT_NAME, ErrorTable, RunFacts, report_page
 from vggtjax.storage.markup import write_page
 

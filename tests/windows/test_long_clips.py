@@ -13,7 +13,7 @@ import pytest
 from tests.windows.walk import CONFIG, FRAMES, SETTINGS, movers, plan_of, tools_of, walk, window_result
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.geometry.similarity import centres, umeyama_sim3
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.storage.writing import locked_folder
 from vggtjax.windows.run import run_windows
 from vggtjax.windows.store import FOLDER

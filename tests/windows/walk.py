@@ -11,7 +11,7 @@ from vggtjax.clips.clip import Clip
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.truth import Truth
 from vggtjax.geometry.similarity import Similarity, align
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.saving import Saving
 from vggtjax.scenes import SceneConfig, closed_walk, render, sample_scene
 from vggtjax.windows.join import JoinRule

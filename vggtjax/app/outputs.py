@@ -18,7 +18,7 @@ from vggtjax.results.films import film_frames, write_film
 from vggtjax.viewer.page import viewer_page
 
 if TYPE_CHECKING:
-    from vggtjax.results.reconstruction import Reconstruction
+    from vggtjax.reconstruction import Reconstruction
 
 _FILM_SECONDS, _FILM_RATE, _FILM_SIZE = 4.0, 15.0, (640, 360)  # drawn in seconds; `vggtjax render` draws larger ones
 _CLIP_RATE = 8.0  # frames per second of clips without times

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vggtjax.batch.cluster_options import Cluster
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.sampling import Sampling
 from vggtjax.commands.arguments import (
@@ -29,12 +30,11 @@ from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
 from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
-from vggtjax.pipeline.cluster_options import Cluster
 from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving
 
 if TYPE_CHECKING:
-    from vggtjax.pipeline.recipe import ClipOutcome
+    from vggtjax.batch.recipe import ClipOutcome
 
 _NOTHING_KNOWN, _HERE = KnownGeometry(), Cluster()
 
@@ -80,10 +80,10 @@ def batch(
     """
     report = Report()
     with report.running():
+        from vggtjax.batch.shards import parse_shard
         from vggtjax.clips.sources import clips_by_name
         from vggtjax.known.given import check_readable
         from vggtjax.pipeline.devices import frames_mesh
-        from vggtjax.pipeline.shards import parse_shard
         from vggtjax.refinement.refine import check_refinement
 
         check_refinement(options.refine_cameras)
@@ -103,8 +103,8 @@ def batch(
             report.note(f"{len(outcomes)}/{len(part)} {one_line(outcome.name)}: {outcome.status}{reason}{clock.left()}")
 
         if cluster.engine == "ray":
-            from vggtjax.pipeline.cluster import reconstruct_on_cluster
-            from vggtjax.pipeline.recipe import Recipe
+            from vggtjax.batch.cluster import reconstruct_on_cluster
+            from vggtjax.batch.recipe import Recipe
 
             check_named(files.model)
             recipe = Recipe(options, framing, sampling, saving, known or None, pad_frames, devices, unchecked, masks)
@@ -120,7 +120,7 @@ def batch(
         else:
             frames_mesh(devices)
             network, fitted = files.load(report, options, [options.method])
-            from vggtjax.pipeline.batch import reconstruct_many
+            from vggtjax.batch.many import reconstruct_many
 
             with report.stage("frames") as show:
                 clock = _Clock(show)

@@ -64,8 +64,8 @@ def import_result(
     saving = Saving(confidence_percentile=confidence_percentile)
     report = Report()
     with report.running():
+        from vggtjax.reconstruction import Reconstruction
         from vggtjax.results.folder import check_folder
-        from vggtjax.results.reconstruction import Reconstruction
 
         check_folder(out)
         with report.stage("read"):

@@ -41,7 +41,7 @@ def export(
             from vggtjax.clips.sources import open_source
 
             source = open_source(pictures)
-        from vggtjax.results.reconstruction import Reconstruction
+        from vggtjax.reconstruction import Reconstruction
 
         with report.stage("read"):
             loaded = Reconstruction.load(result)

@@ -19,8 +19,8 @@ from vggtjax.known.options import KnownGeometry
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.disk import announce, forecast_bytes
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import RunFacts
 from vggtjax.results.saving import Saving
 from vggtjax.windows.choice import Choice, choose_windows, smaller_size, smaller_window

@@ -45,9 +45,9 @@ def render(
     sides = _sides(size)
     report = Report()
     with report.running():
+        from vggtjax.reconstruction import Reconstruction
         from vggtjax.rendering.film import check_film
         from vggtjax.results.films import film_frames, write_film
-        from vggtjax.results.reconstruction import Reconstruction
 
         film = out or _film_of(result.parent if result.is_file() else result)
         check_film(film, fps)

@@ -21,7 +21,7 @@ from vggtjax.progress import Progress
 
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
-    from vggtjax.results.reconstruction import Reconstruction
+    from vggtjax.reconstruction import Reconstruction
     from vggtjax.results.report import ErrorTable
 
 _LISTED_SECONDS = 0.5  # of compiling a program

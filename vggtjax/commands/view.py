@@ -71,7 +71,7 @@ def view(
         check_count(len(results))
         check_format(format, quaternion)
         with report.stage("read") as progress:
-            from vggtjax.results.reconstruction import Reconstruction
+            from vggtjax.reconstruction import Reconstruction
 
             loaded = []
             for number, path in enumerate(results):

@@ -9,7 +9,7 @@ import numpy as np
 
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.errors import ClipError, InputError
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 
 Place = tuple[tuple[float, float], tuple[float, float]]  # scale and offset: source (x, y) = scale * (x, y) + offset
 _SAME: Place = ((1.0, 1.0), (0.0, 0.0))

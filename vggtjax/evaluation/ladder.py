@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import ClipTruth, Truth, batched_truth
-from vggtjax.config import Gram, Suppress, Threshold
+from vggtjax.config import ComputeDType, Gram, Suppress, Threshold
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.depth import depth_errors, measured, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
@@ -27,7 +27,7 @@ from vggtjax.method.assembly import Assembly, assemble
 from vggtjax.method.mask import upsample
 from vggtjax.method.matched_mask import motion_pixels
 from vggtjax.method.passes import Passes
-from vggtjax.options import ABLATION, CamerasFrom, ComputeDType, Options, find_method
+from vggtjax.options import ABLATION, CamerasFrom, Options, find_method
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import Progress
 from vggtjax.results.report import ErrorTable

@@ -9,8 +9,8 @@ from PIL import Image, ImageDraw, ImageFont
 from vggtjax.clips.truth import Truth
 from vggtjax.evaluation.metrics.depth import median_scale
 from vggtjax.geometry.similarity import centres, moves, umeyama_sim3
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_depth, inverse_depth_range, overlay
-from vggtjax.results.reconstruction import Reconstruction
 
 _FRAMES = 6
 _SIDE = 220  # of a picture, in pixels

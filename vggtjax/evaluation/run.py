@@ -21,7 +21,7 @@ from vggtjax.evaluation.records import Record, Records, shown_name
 from vggtjax.evaluation.sources import ResultSource
 from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
 from vggtjax.progress import OnStage, Progress, no_progress
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 
 _SAMPLES = 3  # frames whose depth and mask are in the fingerprint of a sequence
 _MOST_LETTERS = 1000  # of a reason or a note

@@ -16,8 +16,8 @@ from vggtjax.evaluation.foreign_frames import placed
 from vggtjax.evaluation.records import shown_name
 from vggtjax.options import METHODS, Options
 from vggtjax.progress import OnStage
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.foreign import check_format
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.file_digest import file_digest
 from vggtjax.storage.trajectories import Quaternion
 

@@ -30,7 +30,7 @@ from vggtjax.network.model import Predictions
 from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.progress import OnStage, Progress, no_progress
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.storage.arrays import read_arrays, write_arrays
 from vggtjax.storage.cache import cache_folder
 from vggtjax.storage.programs import source_digest

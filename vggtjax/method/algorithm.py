@@ -97,6 +97,15 @@ class Clips:
             raise InputError("clips are padded and have query_points; tracking requires that all frames are real")
 
 
+def compute_by(options: Options, frames: Frames = Frames(), on_accelerator: bool | None = None) -> Compute:
+    """Return how the network is computed by options, with the platform's values in place of None.
+
+    `on_accelerator` is as for `Options.computed`.
+    """
+    options = options.computed(on_accelerator)
+    return Compute(str(options.compute_dtype), str(options.precision), attention=options.attention, frames=frames)
+
+
 def run_method(
     params: Params,
     clips: Clips | Images,
@@ -126,7 +135,7 @@ def run_method(
     Returns depth, confidence and cameras, and the passes they were made of.
     """
     clips = clips if isinstance(clips, Clips) else Clips(clips)
-    compute = compute or Compute.of(options)
+    compute = compute or compute_by(options)
     check_fuses(fusion, options.method)
     passes = run_passes(
         params, clips, config, options, masks=masks, both_outputs=both_outputs, compute=compute, step=step
@@ -161,7 +170,7 @@ def run_passes(
             and have matches if the options read them.
     """
     clips = clips if isinstance(clips, Clips) else Clips(clips)
-    compute = compute or Compute.of(options)
+    compute = compute or compute_by(options)
     method, images, on_devices = options.row, clips.images, compute.frames.on_devices
     clips.check(compute.frames)
     check_masks(masks, images, compute.frames)

@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from vggtjax.config import Attention, ComputeDType, Precision
 from vggtjax.errors import InputError, check_choice
 from vggtjax.network.frames import Frames
-from vggtjax.options import Attention, ComputeDType, Options, Precision
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -48,15 +48,6 @@ class Compute:
         check_choice("precision", self.precision, get_args(Precision))
         if not callable(self.attention):
             check_choice("attention", self.attention, get_args(Attention))
-
-    @classmethod
-    def of(cls, options: Options, frames: Frames = Frames(), on_accelerator: bool | None = None) -> Compute:
-        """Return how the network is computed by options, with the platform's values in place of None.
-
-        `on_accelerator` is as for `Options.computed`.
-        """
-        options = options.computed(on_accelerator)
-        return cls(str(options.compute_dtype), str(options.precision), attention=options.attention, frames=frames)
 
 
 def check_compute_dtype(name: str) -> None:

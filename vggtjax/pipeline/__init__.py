@@ -1,1 +1,1 @@
-"""A clip and a model -> a result: the data flow, one clip, several methods, many clips."""
+"""A clip and a model -> a result: the data flow, one clip, several methods."""

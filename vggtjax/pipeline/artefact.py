@@ -21,11 +21,10 @@ from jax import export
 
 from vggtjax.checkpoint import Model, check_finite
 from vggtjax.errors import InputError, OutputError, check_choice, whole_number
-from vggtjax.method.algorithm import run_method
+from vggtjax.method.algorithm import compute_by, run_method
 from vggtjax.method.assembly import FusionRule, check_fuses
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.network.model import HEADS
-from vggtjax.network.precision import Compute
 from vggtjax.options import Options
 from vggtjax.pipeline import serve
 from vggtjax.progress import OnStage, Progress, no_progress, no_stage
@@ -156,7 +155,7 @@ def _lowered(
     fusion: FusionRule | None,
 ) -> export.Exported:
     on_accelerator = _on_accelerator(platforms)
-    compute = Compute.of(options, on_accelerator=on_accelerator)
+    compute = compute_by(options, on_accelerator=on_accelerator)
     names = list(weights)  # in the order of the structure; jax sorts those of a dictionary
 
     def reconstruction(weights, images):

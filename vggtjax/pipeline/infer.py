@@ -15,12 +15,11 @@ from jaxtyping import Array, Float
 
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.method.algorithm import Clips, Masks, check_masks, run_method
+from vggtjax.method.algorithm import Clips, Masks, check_masks, compute_by, run_method
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree
 from vggtjax.method.passes import Passes
 from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
-from vggtjax.network.precision import Compute
 from vggtjax.options import Options
 from vggtjax.pipeline.devices import by_frame_padded, replicate
 
@@ -95,7 +94,7 @@ def _infer(
     mesh: Mesh | None,
     moves: bool,
 ) -> tuple[Assembly, Passes]:
-    compute = Compute.of(options, Frames(mesh, None if mesh is None else frames))
+    compute = compute_by(options, Frames(mesh, None if mesh is None else frames))
     how = {"masks": masks if moves else False, "fusion": fusion, "compute": compute}
     assembly, passes = run_method(params, Clips(images, frames=frames), config, options, **how)
     matches = passes.matches if options.cameras == "adjusted" else None

@@ -23,11 +23,10 @@ from vggtjax.errors import InputError, ResultError, device_memory_errors
 from vggtjax.known.apply import apply_known, scaled
 from vggtjax.known.given import Given, check_readable, read_known
 from vggtjax.known.options import KnownGeometry
-from vggtjax.method.algorithm import Clips, run_method
+from vggtjax.method.algorithm import Clips, compute_by, run_method
 from vggtjax.method.assembly import FusionRule, as_tree, check_fuses
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
-from vggtjax.network.precision import Compute
 from vggtjax.options import Options
 from vggtjax.pipeline.devices import frames_mesh, on_host, replicate, shard_frames
 from vggtjax.pipeline.fields import (
@@ -42,9 +41,9 @@ from vggtjax.pipeline.fields import (
 from vggtjax.pipeline.lengths import padded_frames, shared_length
 from vggtjax.pipeline.steps import Compile, Execute, StageMemory
 from vggtjax.progress import OnStage, Progress, no_stage
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.refine import check_refinement, refine_cameras
 from vggtjax.results.not_finite import warn_of_not_finite
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.storage.cache import hint_compilation_cache
 
 _LESS_MEMORY = (
@@ -150,7 +149,7 @@ def reconstruct(
         masks=None if given is None else padded(given) if given.any() else False,
         fusion=rule,
         both_outputs=keep_passes,
-        compute=Compute.of(options, Frames(mesh, None if mesh is None else length)),
+        compute=compute_by(options, Frames(mesh, None if mesh is None else length)),
     )
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
         started = time.perf_counter()
@@ -232,7 +231,7 @@ def compile_ahead(
     if mesh is not None:
         params = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole), params)
     compiler = Compile()
-    how = {"compute": Compute.of(options, Frames(mesh, None if mesh is None else length)), "step": compiler}
+    how = {"compute": compute_by(options, Frames(mesh, None if mesh is None else length)), "step": compiler}
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
         run_method(params, clips, model.config, options, both_outputs=keep_passes, **how)
         return compiler.wait()

@@ -18,7 +18,7 @@ from vggtjax.pipeline.fields import assembled_fields
 from vggtjax.pipeline.run import reconstruct, refined
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, no_stage
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
 
 

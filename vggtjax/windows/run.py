@@ -21,21 +21,21 @@ from vggtjax.clips.queries import Queries, check_queries, check_words, parse_que
 from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError
+from vggtjax.method.algorithm import compute_by
 from vggtjax.method.assembly import check_fuses
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_kept, fusion_digest
 from vggtjax.method.passes import track_from
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
-from vggtjax.network.precision import Compute
 from vggtjax.network.track_head import check_track_size
 from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, StageSeconds, no_stage
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import RunFacts, versions
 from vggtjax.results.saving import Saving
 from vggtjax.storage.writing import locked_folder
@@ -149,7 +149,7 @@ def tools_of(
         moving = load_masks(str(masks), clip) if isinstance(masks, str | Path) else masks
         return reconstruct(model, clip, options=options, size=size, masks=moving, fusion=fusion)
 
-    execute, compute = Execute(), Compute.of(options)
+    execute, compute = Execute(), compute_by(options)
 
     def features(images: Array) -> Array:
         return execute("image features", encode)(

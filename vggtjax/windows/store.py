@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vggtjax.errors import InputError, OutputError, ResultError
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.storage.arrays import read_array
 from vggtjax.storage.json_values import read_json
 from vggtjax.storage.writing import locked_folder, write_errors, writing

@@ -19,7 +19,7 @@ from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
 from vggtjax.geometry.similarity import Similarity
 from vggtjax.progress import OnStage, Progress, no_progress, no_stage
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.result import ARRAYS
 from vggtjax.windows.blend import View, blend_frame
 from vggtjax.windows.frames import clip_of

@@ -15,11 +15,11 @@ from tests.fuzz.cases import Reader
 from tests.fuzz.rows.strangers import file
 from tests.room import make_room
 from vggtjax.app.posted import cleaned
+from vggtjax.batch.contact import _read as read_card
+from vggtjax.batch.destination import SETTINGS_NAME, LocalFolder, RemoteFolder
 from vggtjax.evaluation.page import is_report
-from vggtjax.pipeline.contact import _read as read_card
-from vggtjax.pipeline.destination import SETTINGS_NAME, LocalFolder, RemoteFolder
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.archive import saved_names
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.scenes.dataset import read_index
 from vggtjax.storage import arrays
 from vggtjax.training.metrics import read_metrics
@@ -84,8 +84,8 @@ _SETTINGS = {"model": "tiny", "method": "vggt", "size": 28, "outputs": ["depth",
 def _read_remote_settings(path: Path) -> None:
     """Read settings as those of a batch at a URL, whose server gives what the file holds."""
     content = path.read_bytes() if path.is_file() and not path.is_symlink() else None
-    given = patch("vggtjax.pipeline.destination.read_url", return_value=content)
-    with given, patch("vggtjax.pipeline.destination.write_url"):
+    given = patch("vggtjax.batch.destination.read_url", return_value=content)
+    with given, patch("vggtjax.batch.destination.write_url"):
         RemoteFolder("s3://bucket/results").begin(_SETTINGS)
 
 

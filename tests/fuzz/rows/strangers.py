@@ -36,7 +36,7 @@ from vggtjax.evaluation.datasets import find_sequences
 from vggtjax.known.depths import read_depths
 from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
 from vggtjax.known.poses import checked_known_poses, read_poses
-from vggtjax.results.reconstruction import Reconstruction
+from vggtjax.reconstruction import Reconstruction
 
 SIDE = 28
 _POSES = "".join(f"{number} {number} {number % 2} 0 0 0 0 1\n" for number in range(3))

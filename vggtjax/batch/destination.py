@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from vggtjax.batch.shards import SETTLING, Shard, running
 from vggtjax.errors import InputError, one_line
-from vggtjax.pipeline.shards import SETTLING, Shard, running
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.results.disk import announce
 from vggtjax.storage.json_values import parse_json, read_json

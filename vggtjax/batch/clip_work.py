@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vggtjax.batch.destination import Destination
+from vggtjax.batch.recipe import ClipOutcome, Recipe
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.preprocessing import Fitter
@@ -17,14 +19,12 @@ from vggtjax.errors import InputError, one_line
 from vggtjax.known.intrinsics import known_values
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import fusion_digest
-from vggtjax.pipeline.destination import Destination
 from vggtjax.pipeline.devices import frames_mesh, replicate
 from vggtjax.pipeline.memory import Load
-from vggtjax.pipeline.recipe import ClipOutcome, Recipe
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.progress import StageSeconds
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.disk import forecast_bytes
-from vggtjax.results.reconstruction import Reconstruction
 from vggtjax.results.report import RunFacts
 from vggtjax.windows.choice import choose_windows, smaller_window
 from vggtjax.windows.plan import Windows

@@ -14,9 +14,9 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from vggtjax.batch.destination import PAGE_NAME, Destination, LocalFolder
+from vggtjax.batch.recipe import ClipOutcome
 from vggtjax.errors import OutputError, ResultError, one_line
-from vggtjax.pipeline.destination import PAGE_NAME, Destination, LocalFolder
-from vggtjax.pipeline.recipe import ClipOutcome
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.results.report import REPORT_NAME
 from vggtjax.storage.arrays import read_arrays

@@ -15,13 +15,13 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from vggtjax.batch.cluster_driver import Failure, Note, Plan, drive
+from vggtjax.batch.cluster_options import Cluster
+from vggtjax.batch.cluster_worker import Job, Load
+from vggtjax.batch.contact import contact_page
+from vggtjax.batch.destination import LocalFolder, RemoteFolder, destination
+from vggtjax.batch.recipe import ClipOutcome, Recipe, invalid_name
 from vggtjax.errors import ClusterError, InputError, check_extra, one_line
-from vggtjax.pipeline.cluster_driver import Failure, Note, Plan, drive
-from vggtjax.pipeline.cluster_options import Cluster
-from vggtjax.pipeline.cluster_worker import Job, Load
-from vggtjax.pipeline.contact import contact_page
-from vggtjax.pipeline.destination import LocalFolder, RemoteFolder, destination
-from vggtjax.pipeline.recipe import ClipOutcome, Recipe, invalid_name
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.remote import is_in_process, is_url
 

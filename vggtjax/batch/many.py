@@ -9,6 +9,11 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from vggtjax.batch.clip_work import ClipWork, LongClip
+from vggtjax.batch.contact import contact_page
+from vggtjax.batch.destination import Destination, destination
+from vggtjax.batch.recipe import BatchMasks, ClipOutcome, Recipe, failed, invalid_name
+from vggtjax.batch.shards import parse_shard
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.fetched import Fetched
@@ -22,11 +27,6 @@ from vggtjax.method.assembly import check_fuses
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_kept
 from vggtjax.options import Options
-from vggtjax.pipeline.clip_work import ClipWork, LongClip
-from vggtjax.pipeline.contact import contact_page
-from vggtjax.pipeline.destination import Destination, destination
-from vggtjax.pipeline.recipe import BatchMasks, ClipOutcome, Recipe, failed, invalid_name
-from vggtjax.pipeline.shards import parse_shard
 from vggtjax.progress import Progress, StageSeconds, no_progress
 from vggtjax.refinement.refine import check_refinement
 from vggtjax.results.saving import Saving

@@ -15,12 +15,12 @@ from tests.servers import empty_memory, served
 from tests.tiny import tiny_model
 from tests.videos import write_video
 from vggtjax import Reconstruction
+from vggtjax.batch.destination import PAGE_NAME, SETTINGS_NAME
+from vggtjax.batch.many import reconstruct_many
 from vggtjax.checkpoint import save_model
 from vggtjax.clips.sources import clips_by_name
 from vggtjax.commands import main as cli
 from vggtjax.errors import ClipError, InputError, OutputError
-from vggtjax.pipeline.batch import reconstruct_many
-from vggtjax.pipeline.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.results.archive import ARCHIVE_NAME
 
 pytestmark = pytest.mark.filterwarnings("ignore:the field of view")

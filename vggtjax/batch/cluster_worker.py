@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from vggtjax.batch.destination import Destination
+from vggtjax.batch.recipe import ClipOutcome, Recipe, failed
 from vggtjax.clips.fetched import Fetched
 from vggtjax.errors import OutputError, VggtjaxError, one_line
-from vggtjax.pipeline.destination import Destination
-from vggtjax.pipeline.recipe import ClipOutcome, Recipe, failed
 from vggtjax.progress import StageSeconds
 from vggtjax.storage.versions import running_versions
 
 if TYPE_CHECKING:
+    from vggtjax.batch.clip_work import ClipWork
     from vggtjax.checkpoint import Model
     from vggtjax.method.fusion_family import FusionParams
-    from vggtjax.pipeline.clip_work import ClipWork
 
 AT_ONCE = 3  # clips in the work of a worker: one is loaded, one computed, one written
 Load = Callable[[], "tuple[Model, FusionParams | None]"]
@@ -80,7 +80,7 @@ class Worker:
             os.chdir(job.folder)
         if job.threads is not None:
             os.environ.setdefault("NPROC", str(job.threads))  # XLA asks for it when jax begins
-        from vggtjax.pipeline.clip_work import ClipWork
+        from vggtjax.batch.clip_work import ClipWork
 
         try:
             model, fusion = job.load()
@@ -93,7 +93,7 @@ class Worker:
         """Do a clip, unless its result is there."""
         if self._work is None or self._out is None:
             raise RuntimeError("start first")
-        from vggtjax.pipeline.clip_work import LongClip
+        from vggtjax.batch.clip_work import LongClip
 
         try:
             if self._out.has(name):

@@ -7,8 +7,8 @@ import numpy as np
 from tests.chromium import browser, look
 from tests.results.test_report import Reader
 from tests.room import make_room
-from vggtjax.pipeline.contact import ContactPage
-from vggtjax.pipeline.destination import PAGE_NAME
+from vggtjax.batch.contact import ContactPage
+from vggtjax.batch.destination import PAGE_NAME
 
 NAMES = ["dog", "<script>alert(1)<", "a#b?c%20 é"]
 

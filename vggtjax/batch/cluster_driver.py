@@ -13,9 +13,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from vggtjax.batch.cluster_worker import AT_ONCE, Job, Place, Refused, Started, Worker
+from vggtjax.batch.recipe import ClipOutcome, failed
 from vggtjax.errors import ClusterError, VggtjaxError, one_line
-from vggtjax.pipeline.cluster_worker import AT_ONCE, Job, Place, Refused, Started, Worker
-from vggtjax.pipeline.recipe import ClipOutcome, failed
 from vggtjax.storage.versions import running_versions
 
 _TICK = 1.0  # seconds between looks at what Ray does not tell

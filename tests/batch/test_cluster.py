@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.batch import dying_driver
 from tests.moving_ball import moving_ball
-from tests.pipeline import dying_driver
 from tests.room import make_room
 from tests.tiny import tiny_model
+from vggtjax.batch.cluster import _messages
+from vggtjax.batch.cluster_driver import Dispatcher, Note, Plan, _Slot, shared
+from vggtjax.batch.cluster_worker import Job, Place, Refused, Started, Worker
+from vggtjax.batch.destination import SETTINGS_NAME, LocalFolder
+from vggtjax.batch.recipe import ClipOutcome, Recipe
 from vggtjax.checkpoint import save_model
 from vggtjax.errors import ClusterError, InputError
 from vggtjax.options import Options
-from vggtjax.pipeline.cluster import _messages
-from vggtjax.pipeline.cluster_driver import Dispatcher, Note, Plan, _Slot, shared
-from vggtjax.pipeline.cluster_worker import Job, Place, Refused, Started, Worker
-from vggtjax.pipeline.destination import SETTINGS_NAME, LocalFolder
-from vggtjax.pipeline.recipe import ClipOutcome, Recipe
 from vggtjax.results.archive import ARCHIVE_NAME
 from vggtjax.storage.versions import running_versions
 
@@ -214,6 +214,6 @@ def _no_model(reason):
 
 def test_a_driver_that_dies_is_one_sentence(monkeypatch, tmp_path):
     job = Job(dying_driver.no_model, RECIPE, LocalFolder(tmp_path), ".")
-    monkeypatch.setattr("vggtjax.pipeline.cluster.drive", dying_driver.die)
+    monkeypatch.setattr("vggtjax.batch.cluster.drive", dying_driver.die)
     with pytest.raises(ClusterError, match=r"the cluster has died \(Ray's last words: GCS is gone\); finished clips"):
         list(_messages(Plan(job, {})))
