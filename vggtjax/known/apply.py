@@ -8,13 +8,11 @@ from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool
 
 from vggtjax.cameras import world_from_camera
 from vggtjax.known.consistency import consistent_with_poses
 from vggtjax.known.depths import captured_depths
-from vggtjax.known.fit import fit_poses
-from vggtjax.known.flow import implied_flow
 from vggtjax.known.given import Given
 from vggtjax.known.intrinsics import shared_focal
 from vggtjax.known.metric import MetricScale, from_baseline, from_camera_height, from_depths
@@ -86,33 +84,17 @@ def scaled(result: R, factor: float) -> R:
     )
 
 
-def with_intrinsics(result: R, intrinsics: Float64[np.ndarray, "S 3 3"]) -> tuple[R, float]:
-    """Return the result with other intrinsics, and the median distance in pixels that its correspondences moved.
-
-    The distance is not a number where there are none: of a single frame, or where everything moves.
-
-    What the network saw is taken to be the correspondences between frames that its depth and cameras imply. With other
-    intrinsics, poses are fitted again to keep those of static, confident pixels. Depth stays.
-    """
-    fit = fit_poses(implied_flow(result), result.camera_from_world.astype(np.float64), intrinsics)
-    poses = fit.camera_from_world.astype(np.float32)
-    return dataclasses.replace(result, intrinsics=intrinsics.astype(np.float32), camera_from_world=poses), fit.residual
-
-
 def _with_intrinsics(result: R, given: Given, notes: dict[str, str]) -> R:
     name = "shared focal length" if given.intrinsics is None else "intrinsics"
     intrinsics = shared_focal(result) if given.intrinsics is None else given.intrinsics
     if given.options.intrinsics == SOURCE and given.capture is not None and given.capture.distorted:
         logger.warning("the lens of %s has a distortion, which its intrinsics leave out", given.capture.path)
     change = np.log(intrinsics[:, 0, 0] / result.intrinsics[:, 0, 0])
-    result, residual = with_intrinsics(result, intrinsics)
     focal = np.median(intrinsics[:, 0, 0] * result.source_scale[:, 0])
-    kept = f"correspondences kept within {residual:.2g} pixels (median)"
     notes[name] = (
-        f"focal length {focal:.5g} pixels of the source, {np.expm1(np.median(change)):+.1%} against the prediction; "
-        + ("no correspondences to keep" if np.isnan(residual) else kept)
+        f"focal length {focal:.5g} pixels of the source, {np.expm1(np.median(change)):+.1%} against the prediction"
     )
-    return result
+    return dataclasses.replace(result, intrinsics=intrinsics.astype(np.float32))
 
 
 def _with_poses(result: R, given: Given, notes: dict[str, str]) -> tuple[R, float]:
