@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +12,12 @@ from jaxtyping import Bool, Float64
 from vggtjax.captures.capture import Capture
 from vggtjax.clips.clip import Clip
 from vggtjax.errors import InputError
-from vggtjax.known.depths import DepthSamples, check_depths, read_depths
+from vggtjax.known.depths import MOST_FILE_BYTES, DepthSamples, check_depths, read_depths
 from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
 from vggtjax.known.options import SOURCE, Baseline, KnownGeometry, parse_baseline
 from vggtjax.known.poses import POSE_COLUMNS, checked_known_poses, read_poses
 from vggtjax.results.result import Result
+from vggtjax.storage.csv_file import read_csv
 from vggtjax.storage.trajectories import read_numbers
 
 
@@ -33,11 +36,14 @@ class Given(NamedTuple):
 
 def check_readable(known: KnownGeometry) -> None:
     """Raise InputError or ResultError for files that are missing or unreadable: call it before long work."""
-    known.check_files()
     if known.intrinsics not in (None, SOURCE):
         read_intrinsics(known.intrinsics)
     if known.poses not in (None, SOURCE):
         read_numbers(known.poses, POSE_COLUMNS)
+    if known.known_depths not in (None, SOURCE):
+        read_csv(Path(known.known_depths), most_bytes=MOST_FILE_BYTES)
+    if known.leave_out is not None and not os.path.isdir(known.leave_out):  # noqa: PTH112 - False for an over-long name
+        raise InputError(f"leave_out is {str(known.leave_out)!r}; expected a folder of pictures")
 
 
 def read_known(
