@@ -88,7 +88,17 @@ class Capture:
                 f"{self.path} has no frame {missing[0]!r}; it has {len(self)} frames, from {self.frame_names[0]!r} to "
                 f"{self.frame_names[-1]!r}"
             )
-        return self._at([places[name] for name in names], names)
+        chosen = [places[name] for name in names]
+
+        def taken(values: Any) -> Any:
+            if isinstance(values, tuple):
+                return tuple(values[place] for place in chosen)
+            return None if values is None else values[chosen]
+
+        fields = ("pictures", "sizes", "intrinsics", "world_from_camera", "depth_files", "timestamps")
+        capture = dataclasses.replace(self, **{name: taken(getattr(self, name)) for name in fields})
+        capture.__dict__["frame_names"] = tuple(names)  # of the whole capture, also where fewer would be unique
+        return capture
 
     def naming_files(self) -> AbstractContextManager[None]:
         """Return a context for reading `pictures`: errors in it name the file of Record3D, not where it is unpacked."""
@@ -110,17 +120,6 @@ class Capture:
                     f"{path} has {columns} x {rows} pixels and its picture {width} x {height}; expected the same shape"
                 )
         return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
-
-    def _at(self, places: list[int], names: Sequence[str]) -> Capture:
-        def chosen(values: Any) -> Any:
-            if isinstance(values, tuple):
-                return tuple(values[place] for place in places)
-            return None if values is None else values[places]
-
-        fields = ("pictures", "sizes", "intrinsics", "world_from_camera", "depth_files", "timestamps")
-        capture = dataclasses.replace(self, **{name: chosen(getattr(self, name)) for name in fields})
-        capture.__dict__["frame_names"] = tuple(names)  # of the whole capture, also where fewer would be unique
-        return capture
 
 
 def checked_sizes(pictures: Sequence[Path], source: Path) -> tuple[tuple[int, int], ...]:
