@@ -35,7 +35,7 @@ def test_a_crop_moves_the_principal_point(caplog):
 
 def test_intrinsics_replace_the_predicted_ones_and_change_nothing_else():
     room = make_room()
-    found = apply_known(room, read_known(KnownGeometry(intrinsics="60,62,42,28"), room)).result
+    found = apply_known(room, read_known(KnownGeometry(intrinsics="60,62,42,28"), room))[0]
     np.testing.assert_allclose(found.intrinsics[:, [0, 1], [0, 1]], np.tile([[30, 31]], (3, 1)), rtol=1e-6)
     np.testing.assert_array_equal(found.camera_from_world, room.camera_from_world)
     np.testing.assert_array_equal(found.depth, room.depth)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable
-from typing import Generic, NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool
 
 from vggtjax.cameras import world_from_camera
 from vggtjax.known.consistency import consistent_with_poses
@@ -27,14 +26,7 @@ _LARGE_OFFSET = 0.25  # of the path
 logger = logging.getLogger(__name__)
 
 
-class Applied(NamedTuple, Generic[R]):
-    """A result with what is known of it, and how long the unit of its prediction is in its own."""
-
-    result: R
-    unit: float
-
-
-def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None) -> Applied[R]:
+def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None) -> tuple[R, float]:
     """Return the result with known intrinsics, poses and scale, and without the depth that is to be left out.
 
     Args:
@@ -43,14 +35,16 @@ def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None)
         refine: refines the cameras; called when the intrinsics are known, and before lengths are.
 
     Returns:
-        The result; its settings hold what was given and what the fits left over, as sentences by step.
+        The result, whose settings hold what was given and what the fits left over, as sentences by step; and how long
+        the unit of the prediction is in its own.
 
     Raises:
         InputError: known values that do not fit the prediction.
     """
     known, notes, unit = given.options, {}, 1.0
     if given.leave_out is not None:
-        result = without_depth(result, given.leave_out)
+        depth, moving = np.where(given.leave_out, np.float32(0), result.depth), result.dynamic_mask & ~given.leave_out
+        result = dataclasses.replace(result, depth=depth, dynamic_mask=moving)
         notes["left out"] = f"{given.leave_out.sum() / result.inside_pictures.sum():.1%} of the pixels"
     if given.intrinsics is not None or known.shared_focal:
         result = _with_intrinsics(result, given, notes)
@@ -65,14 +59,7 @@ def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None)
         words = "metres" if lengths == "metre" else "units of the capture"
         notes["scale"] = f"{scale.factor:.4g} {words} per unit: {scale.note}"
     settings = result.settings | {"known": known.to_json() | {"found": notes, "lengths": lengths}}
-    return Applied(dataclasses.replace(result, settings=settings), unit)
-
-
-def without_depth(result: R, masks: Bool[np.ndarray, "S H W"]) -> R:
-    """Return the result with unknown depth in the masks, where nothing moves either."""
-    return dataclasses.replace(
-        result, depth=np.where(masks, np.float32(0), result.depth), dynamic_mask=result.dynamic_mask & ~masks
-    )
+    return dataclasses.replace(result, settings=settings), unit
 
 
 def scaled(result: R, factor: float) -> R:

@@ -24,7 +24,7 @@ from jax import export
 from jax.core import Tracer
 
 from vggtjax.errors import InputError, OutputError, check_regular
-from vggtjax.storage.cache import compiled_folder, lowered_folder
+from vggtjax.storage.cache import cache_folder, compiled_folder
 from vggtjax.storage.cores import core_count
 from vggtjax.storage.free_memory import return_freed_memory
 from vggtjax.storage.versions import package_digest
@@ -180,7 +180,7 @@ def kept_text(name: str, make: Callable[[], str]) -> str:
 
 
 def _kept_path(text: str) -> Path:
-    return lowered_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.bin"
+    return cache_folder() / "lowered" / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.bin"
 
 
 def _read_kept(path: Path) -> bytes | None:
