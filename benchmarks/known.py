@@ -122,7 +122,7 @@ def _of_seed(model: str, clips: int, folder: Path, seed: int) -> dict[str, list[
 
 def _measured(clip: KnownClip, given: Given) -> Errors | str:
     try:
-        result = apply_known(clip.result, given).result
+        result = apply_known(clip.result, given)[0]
     except InputError as error:
         return str(error)
     return errors_of(result, clip)

@@ -4,25 +4,17 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 from converters.files import SUFFIXES, choose_file, weight_files
-from converters.hub_record import HubFile, read_record, verified, write_record
+from converters.hub_record import HubFile, HubRecord, read_record, verified, write_record
 from vggtjax.errors import CheckpointError, MissingExtraError, VggtjaxError, one_line
 
 COMMIT = re.compile("[0-9a-f]{40}")
 _DIGEST = re.compile("[0-9a-f]{40}|[0-9a-f]{64}")
 
 
-class Download(NamedTuple):
-    """A file of weights (for shards, their index) in the hub's cache, and its commit."""
-
-    path: Path
-    commit: str
-
-
-def download(hub_id: str, file: str | None = None, revision: str | None = None) -> Download:
-    """Return the file of weights of a hub repository in the hub's cache; download it unless cached.
+def download(hub_id: str, file: str | None = None, revision: str | None = None) -> tuple[Path, str]:
+    """Return a file of weights (for shards, their index) in the hub's cache, and its commit; download it unless cached.
 
     Without `revision`, a commit of 40 hexadecimal letters, the default branch is resolved to its commit once; later
     calls take the same commit. Every file is verified against the digest that the hub declared then, which the record
@@ -60,7 +52,7 @@ def download(hub_id: str, file: str | None = None, revision: str | None = None) 
         ) from error
 
 
-def _download(hub_id: str, file: str | None, revision: str | None) -> Download:
+def _download(hub_id: str, file: str | None, revision: str | None) -> tuple[Path, str]:
     from huggingface_hub import errors, hf_hub_download
 
     record = read_record(hub_id)
@@ -87,9 +79,9 @@ def _download(hub_id: str, file: str | None, revision: str | None) -> Download:
     path = fetch(name)
     for shard in weight_files(path)[1:]:
         fetch(shard.name)
-    if (new := record.with_files(commit, files, resolved=revision is None)) != record:
+    if (new := HubRecord(record.commit if revision else commit, {**record.files, commit: files})) != record:
         write_record(hub_id, new)
-    return Download(path, commit)
+    return path, commit
 
 
 def _declared(hub_id: str, revision: str | None) -> tuple[str, dict[str, HubFile]]:
@@ -110,7 +102,7 @@ def _declared(hub_id: str, revision: str | None) -> tuple[str, dict[str, HubFile
     return commit, {name: HubFile(digest) for name, digest in digests.items()}
 
 
-def _cached(hub_id: str, file: str | None, revision: str | None, error: Exception) -> Download:
+def _cached(hub_id: str, file: str | None, revision: str | None, error: Exception) -> tuple[Path, str]:
     """Return what another program left in the hub's cache, of which no digest is known here; else raise `error`."""
     from huggingface_hub import errors, hf_hub_download, snapshot_download
 
@@ -128,4 +120,4 @@ def _cached(hub_id: str, file: str | None, revision: str | None, error: Exceptio
     path = Path(hf_hub_download(hub_id, file or choose_file(names, f"the hub's '{hub_id}'"), **find))
     for shard in weight_files(path)[1:]:
         hf_hub_download(hub_id, shard.name, **find)
-    return Download(path, folder.name)
+    return path, folder.name

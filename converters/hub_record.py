@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -36,10 +35,6 @@ class HubRecord:
 
     commit: Commit | None = None
     files: dict[Commit, dict[str, HubFile]] = field(default_factory=dict)
-
-    def with_files(self, commit: str, files: Mapping[str, HubFile], *, resolved: bool) -> HubRecord:
-        """Return the record with the files of a commit, which the branch was `resolved` to."""
-        return HubRecord(commit if resolved else self.commit, {**self.files, commit: dict(files)})
 
 
 def record_path(hub_id: str) -> Path:
@@ -72,18 +67,14 @@ def verified(path: Path, file: HubFile, hub_id: str) -> HubFile:
     seen = file_digest([path])
     if seen == file.verified:
         return file
-    found = _sha256(path) if len(file.digest) == 64 else _git_id(path)
+    with path.open("rb") as opened:
+        found = hashlib.file_digest(opened, "sha256").hexdigest() if len(file.digest) == 64 else _git_id(path)
     if found != file.digest:
         raise CheckpointError(
             f"{path.name} of the hub's '{hub_id}' has the digest {found[:16]}..., not the recorded {file.digest[:16]}"
             f"...; do not use it: delete {path.resolve()} and download it again"
         )
     return dataclasses.replace(file, verified=seen)
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
 def _git_id(path: Path) -> str:

@@ -60,7 +60,7 @@ def test_a_capture_that_lacks_something_is_refused(name, message):
 def test_pixels_left_out_have_no_points_and_do_not_move():
     sky = np.zeros(TRUE.depth.shape, bool)
     sky[:, :40] = True
-    found = apply_known(TRUE, read_known(KnownGeometry(), TRUE, leave_out=sky)).result
+    found = apply_known(TRUE, read_known(KnownGeometry(), TRUE, leave_out=sky))[0]
     assert not found.valid_pixels[sky].any()
     assert not found.dynamic_mask[sky].any()
     np.testing.assert_array_equal(found.depth[~sky], TRUE.depth[~sky])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import vggtjax
-from vggtjax.storage import programs
+from vggtjax.storage import programs, versions
 from vggtjax.storage.programs import Program, keep_type, kept_text
 
 
@@ -125,8 +125,8 @@ def test_text_is_kept_and_made_anew_where_it_is_damaged(folder, damage):
 
 
 def test_kept_files_depend_on_every_file_of_the_package(tmp_path, monkeypatch):
-    assert Path(vggtjax.__file__).parent == programs._PACKAGE
-    monkeypatch.setattr(programs, "_PACKAGE", tmp_path)
+    assert Path(vggtjax.__file__).parent == versions._PACKAGE
+    monkeypatch.setattr(versions, "_PACKAGE", tmp_path)
     (tmp_path / "network").mkdir()
     digests = set()
     for name, text in (("a.py", "1"), ("network/b.py", "1"), ("network/b.py", "2"), ("notes.txt", "")):

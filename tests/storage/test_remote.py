@@ -67,7 +67,7 @@ def test_folders_and_files_are_copied_whole_and_the_last_file_comes_last(memory,
 
 
 def test_a_file_system_without_whole_writes_gets_a_file_renamed(memory, tmp_path, monkeypatch):
-    monkeypatch.setattr(remote, "SCHEMES", {"memory": remote.SCHEMES["sftp"]})
+    monkeypatch.setattr(remote, "SCHEMES", {"memory": "files"})
     (tmp_path / "a").write_bytes(b"1")
     moved = []
     move = type(memory).mv
@@ -102,7 +102,7 @@ def test_a_server_that_is_not_there_and_a_library_that_is_missing_are_one_senten
     with pytest.raises(InputError, match=r"^cannot reach http://127.0.0.1:1/a.mp4 \(.*\); check the address, the net"):
         download("http://me:secret@127.0.0.1:1/a.mp4?key=secret", tmp_path)
     monkeypatch.setitem(__import__("sys").modules, "s3fs", None)
-    with pytest.raises(InputError, match=r"^s3:// needs s3fs, which is not installed: pip install s3fs$"):
+    with pytest.raises(InputError, match=r"^s3://bucket/a needs a package that is not installed: Install s3fs"):
         check_url("s3://bucket/a")
 
 

@@ -177,18 +177,6 @@ def test_an_error_names_what_is_in_the_way(tmp_path):
             raise error
 
 
-def test_a_folder_that_another_program_removes_is_made_again(tmp_path, monkeypatch):
-    folder, mkdir = tmp_path / "new", Path.mkdir
-
-    def removed_once(path, *arguments, **options):
-        monkeypatch.setattr(Path, "mkdir", mkdir)
-        raise FileNotFoundError
-
-    monkeypatch.setattr(Path, "mkdir", removed_once)
-    with locked_folder(folder, "a batch"):
-        assert folder.is_dir()
-
-
 @pytest.mark.parametrize(("text", "says"), [('{"format": "clip"}', True), ('{"format": "mask"}', False), ("[", False)])
 def test_a_file_says_its_format(tmp_path, text, says):
     (tmp_path / "a.json").write_text(text)

@@ -1,4 +1,7 @@
-"""Where the results of a batch go: a folder, or a folder at a URL. Does not import jax."""
+"""Where the results of a batch go: a folder, or a folder at a URL, with a folder for every clip. Does not import jax.
+
+The result of a clip appears whole or not at all; another process may write there, too.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 from vggtjax.batch.shards import SETTLING, Shard, running
 from vggtjax.errors import InputError, one_line
@@ -25,31 +28,7 @@ _MOST_SETTINGS_BYTES = 2**20
 _MOST_NAMED = 8  # settings in a message
 
 
-class Destination(Protocol):
-    """A place with a folder for every clip. Each appears whole or not at all; another process may write there, too."""
-
-    def begin(self, settings: dict[str, Any]) -> None:
-        """Write the settings of the batch. Raises InputError if the place has results of other settings."""
-        ...
-
-    def has(self, name: str) -> bool:
-        """Return whether the result of a clip is there, whole."""
-        ...
-
-    def finished(self, names: Iterable[str]) -> set[str]:
-        """Return the clips whose results are there."""
-        ...
-
-    def check_space(self, name: str, needed: float) -> None:
-        """Raise OutputError where there is no space for so many bytes; log how much a large result takes."""
-        ...
-
-    def write(self, name: str, save: Callable[[Path], None]) -> None:
-        """Let `save` write a result into a folder, which becomes that of the clip."""
-        ...
-
-
-def destination(out: str | Path) -> LocalFolder | RemoteFolder:
+def destination(out: str | Path) -> Destination:
     """Return the place that a path or URL names. Raises InputError for a URL that cannot be written."""
     if isinstance(out, str) and is_url(out):
         check_url(out, written=True)
@@ -83,6 +62,7 @@ class LocalFolder:
                     remove_leftovers(self.path)  # of workers that were killed
 
     def begin(self, settings: dict[str, Any]) -> None:
+        """Write the settings of the batch. Raises InputError if the folder has results of other settings."""
         path = self.path / SETTINGS_NAME
         if path.is_file():
             _check_settings(
@@ -95,15 +75,19 @@ class LocalFolder:
             temporary.write_bytes(_settings_text(settings))
 
     def has(self, name: str) -> bool:
+        """Return whether the result of a clip is there, whole."""
         return is_result(self.path / name / ARCHIVE_NAME)
 
     def finished(self, names: Iterable[str]) -> set[str]:
+        """Return the clips whose results are there."""
         return {name for name in names if self.has(name)}
 
     def check_space(self, name: str, needed: float) -> None:
+        """Raise OutputError where there is no space for so many bytes; log how much a large result takes."""
         announce(self.path / name, needed)
 
     def write(self, name: str, save: Callable[[Path], None]) -> None:
+        """Let `save` write a result into a folder, which becomes that of the clip."""
         folder = self.path / name
         with nullcontext(folder) if folder.exists() else writing(folder) as place:
             save(place)
@@ -123,6 +107,7 @@ class RemoteFolder:
         yield
 
     def begin(self, settings: dict[str, Any]) -> None:
+        """Write the settings of the batch. Raises InputError if the folder has results of other settings."""
         url = f"{self.url}/{SETTINGS_NAME}"
         earlier = read_url(url, _MOST_SETTINGS_BYTES)
         if earlier is None:
@@ -133,23 +118,30 @@ class RemoteFolder:
         )
 
     def has(self, name: str) -> bool:
+        """Return whether the result of a clip is there, whole."""
         return exists(f"{self.url}/{name}/{ARCHIVE_NAME}")
 
     def finished(self, names: Iterable[str]) -> set[str]:
+        """Return the clips whose results are there."""
         begun = {entry.name for entry in list_url(self.url) if entry.is_folder}
         asked = [name for name in names if name in begun]
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             return {name for name, there in zip(asked, pool.map(self.has, asked), strict=True) if there}
 
     def check_space(self, name: str, needed: float) -> None:
+        """Raise OutputError where there is no space for so many bytes; log how much a large result takes."""
         announce(tempfile.gettempdir(), needed)
 
     def write(self, name: str, save: Callable[[Path], None]) -> None:
+        """Let `save` write a result into a folder, which becomes that of the clip."""
         with staging(tempfile.gettempdir()) as staged:
             folder = staged / "result"
             folder.mkdir(mode=0o700)
             save(folder)
             upload(folder, f"{self.url}/{name}", last=ARCHIVE_NAME)
+
+
+Destination: TypeAlias = LocalFolder | RemoteFolder
 
 
 def _settings_text(settings: dict[str, Any]) -> bytes:

@@ -15,15 +15,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64
 
-from vggtjax.captures.cameras import checked_intrinsics, checked_world_from_camera, resized_intrinsics
-from vggtjax.captures.pictures import has_unclear_pixels, picture_size
+from vggtjax.captures.cameras import resized_intrinsics
+from vggtjax.captures.pictures import picture_size
 from vggtjax.captures.unpacked import Unpacked
 from vggtjax.errors import InputError
 
 CaptureKind = Literal["record3d", "polycam", "nerfstudio", "colmap", "tum"]
-DepthFileReader = Callable[[Path], Float32[np.ndarray, "h w"]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +30,7 @@ class Capture:
     """Pictures in order, and what is known of each of them: OpenCV's axes, pixels of the upright pictures.
 
     Intrinsics put the outer corner of the first pixel at (0, 0) and its centre at (0.5, 0.5). Raises InputError for
-    arrays of another number of frames, and for cameras that are none.
+    arrays of another number of frames; the readers have checked the cameras.
     """
 
     kind: CaptureKind
@@ -43,7 +42,7 @@ class Capture:
     distorted: bool = False  # the lens has a distortion, which the intrinsics lack
     metric: bool = False  # poses and depth are in metres, not in a unit of the program's own
     depth_files: tuple[Path | None, ...] | None = field(default=None, repr=False)
-    read_depth_file: DepthFileReader | None = field(default=None, repr=False)
+    read_depth_file: Callable[[Path], Float32[np.ndarray, "h w"]] | None = field(default=None, repr=False)
     timestamps: Float64[np.ndarray, " S"] | None = field(default=None, repr=False)  # seconds
     left_out: tuple[str, ...] = ()  # a sentence on pictures that are not among these
     notes: tuple[str, ...] = ()  # a sentence for each part that is missing or not as it seems
@@ -57,10 +56,6 @@ class Capture:
             value = getattr(self, name)
             if value is not None and np.shape(value) != (len(self), *shape):
                 raise InputError(f"{name} of {self.path} have shape {np.shape(value)}; expected {(len(self), *shape)}")
-        if self.intrinsics is not None:
-            checked_intrinsics(self.intrinsics, self.path)
-        if self.world_from_camera is not None:
-            checked_world_from_camera(self.world_from_camera, self.path)
         if self.timestamps is not None and not np.isfinite(self.timestamps).all():
             raise InputError(f"{self.path} has timestamps that are not finite; expected seconds")
 
@@ -93,7 +88,17 @@ class Capture:
                 f"{self.path} has no frame {missing[0]!r}; it has {len(self)} frames, from {self.frame_names[0]!r} to "
                 f"{self.frame_names[-1]!r}"
             )
-        return self._at([places[name] for name in names], names)
+        chosen = [places[name] for name in names]
+
+        def taken(values: Any) -> Any:
+            if isinstance(values, tuple):
+                return tuple(values[place] for place in chosen)
+            return None if values is None else values[chosen]
+
+        fields = ("pictures", "sizes", "intrinsics", "world_from_camera", "depth_files", "timestamps")
+        capture = dataclasses.replace(self, **{name: taken(getattr(self, name)) for name in fields})
+        capture.__dict__["frame_names"] = tuple(names)  # of the whole capture, also where fewer would be unique
+        return capture
 
     def naming_files(self) -> AbstractContextManager[None]:
         """Return a context for reading `pictures`: errors in it name the file of Record3D, not where it is unpacked."""
@@ -116,29 +121,13 @@ class Capture:
                 )
         return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
 
-    def _at(self, places: list[int], names: Sequence[str]) -> Capture:
-        def chosen(values: Any) -> Any:
-            if isinstance(values, tuple):
-                return tuple(values[place] for place in places)
-            return None if values is None else values[places]
-
-        fields = ("pictures", "sizes", "intrinsics", "world_from_camera", "depth_files", "timestamps")
-        capture = dataclasses.replace(self, **{name: chosen(getattr(self, name)) for name in fields})
-        capture.__dict__["frame_names"] = tuple(names)  # of the whole capture, also where fewer would be unique
-        return capture
-
 
 def checked_sizes(pictures: Sequence[Path], source: Path) -> tuple[tuple[int, int], ...]:
     """Return width and height of pictures; raises InputError for a missing one, which `source` names."""
     for path in pictures:
         if not path.is_file():
             raise InputError(f"{path} is missing, but {source} names it; get the capture whole")
-        if has_unclear_pixels(path):
-            raise InputError(
-                f"{path} is stored upside down or mirrored (its EXIF orientation), and its camera may count the stored "
-                "pixels or the shown ones; write the pictures upright, and make the cameras anew"
-            )
-    return tuple(picture_size(path) for path in pictures)
+    return tuple(picture_size(path, with_camera=True) for path in pictures)
 
 
 def fitted_intrinsics(
@@ -157,8 +146,3 @@ def left_out(missing: Sequence[str], count: int, what: str) -> tuple[str, ...]:
     if not missing:
         return ()
     return (f"{len(missing)} of {count} pictures have no {what} and are left out, {missing[0]} first",)
-
-
-def known(values: Float32[np.ndarray, "h w"], sure: Bool[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-    """Return depth with 0 where it is not sure."""
-    return np.where(sure, values, 0).astype(np.float32)

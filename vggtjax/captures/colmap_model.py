@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import scipy
@@ -42,10 +42,7 @@ _IMAGE_WORDS = 10  # of the first line of an image in images.txt
 _MOST_SIDE = 10**6  # pixels of a picture
 
 
-class _Camera(NamedTuple):
-    intrinsics: Float64[np.ndarray, "3 3"]
-    size: tuple[int, int]
-    distorted: bool
+_Camera: TypeAlias = tuple[Float64[np.ndarray, "3 3"], tuple[int, int], bool]  # the first fields of ColmapView
 
 
 class ColmapView(NamedTuple):
@@ -84,7 +81,7 @@ def _camera(path: Path, kind: str, width: int, height: int, values: Sequence[flo
         raise InputError(f"{path} has a camera of {size} pixels; expected sides of 1 to {_MOST_SIDE}")
     fx, fy, (cx, cy) = values[0], values[focal - 1], values[focal : focal + 2]
     intrinsics = intrinsics_matrix(fx, fy, cx, cy, first_pixel=PIXEL_CENTRE, source=path)
-    return _Camera(intrinsics, (width, height), any(values[focal + 2 :]))
+    return intrinsics, (width, height), any(values[focal + 2 :])
 
 
 def _check_model(path: Path, kind: str) -> None:

@@ -33,17 +33,16 @@ def opening(path: Path, formats: tuple[str, ...]) -> Iterator[Image.Image]:
         raise InputError(f"{path} cannot be read: {reason}; expected {' or '.join(formats)}, whole") from error
 
 
-def picture_size(path: Path) -> tuple[int, int]:
-    """Return width and height of an upright picture; raises InputError for any other file."""
-    with opening(path, known_formats()) as image:
-        width, height = image.size
-        return (height, width) if image.getexif().get(_ORIENTATION, 1) >= _FIRST_TURNED else (width, height)
+def picture_size(path: Path, *, with_camera: bool = False) -> tuple[int, int]:
+    """Return width and height of an upright picture.
 
-
-def has_unclear_pixels(path: Path) -> bool:
-    """Return whether a picture is stored mirrored or upside down, at the size of the upright one.
-
-    Raises InputError for any other file.
+    Raises InputError for any other file and, `with_camera`, for a picture that is stored upside down or mirrored.
     """
     with opening(path, known_formats()) as image:
-        return image.getexif().get(_ORIENTATION, 1) in _SAME_SIDES
+        orientation, (width, height) = image.getexif().get(_ORIENTATION, 1), image.size
+    if with_camera and orientation in _SAME_SIDES:
+        raise InputError(
+            f"{path} is stored upside down or mirrored (its EXIF orientation), and its camera may count the stored "
+            "pixels or the shown ones; write the pictures upright, and make the cameras anew"
+        )
+    return (height, width) if orientation >= _FIRST_TURNED else (width, height)

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from vggtjax.captures.cameras import DISTORTED, PIXEL_CENTRE, from_opengl, intrinsics_matrix
-from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, known, left_out
+from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out
 from vggtjax.captures.depth_files import read_png
 from vggtjax.captures.files import files
 from vggtjax.captures.numbers import number
@@ -98,7 +98,7 @@ def _read_depth(path: Path) -> Float32[np.ndarray, "h w"]:
         sure = np.asarray(image.convert("L")) > 0
     if sure.shape != depth.shape:
         raise InputError(f"{confidence} has shape {sure.shape}; expected {depth.shape}, that of the depth")
-    return known(depth, sure)
+    return np.where(sure, depth, np.float32(0))
 
 
 def _times(names: list[str]) -> Float64[np.ndarray, " S"] | None:

@@ -15,17 +15,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 from jaxtyping import Float32, Float64
 
 from vggtjax.captures.cameras import PIXEL_CENTRE, checked_intrinsics, from_opengl, intrinsics_matrix
-from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, known
+from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics
 from vggtjax.captures.depth_files import read_exr
 from vggtjax.captures.files import files, read_bytes
 from vggtjax.captures.numbers import number, numbers
 from vggtjax.captures.unpacked import Unpacked, unpacked
 from vggtjax.errors import InputError, check_extra
 from vggtjax.storage.json_values import read_json
+from vggtjax.storage.trajectories import pose_matrices
 
 
 class _Layout(NamedTuple):
@@ -42,7 +42,6 @@ _MARK = b"bvx"  # every block of LZFSE starts with it
 _HEADER = 16  # bytes of the shortest file
 _BLOCK_BYTES = 40_000  # that LZFSE's compressor fills a block with, at least
 _SPARE_BLOCKS = 8
-_UNIT = 0.01  # by which a quaternion's length may differ from 1
 
 
 def is_record3d(folder: Path) -> bool:
@@ -88,7 +87,7 @@ def _read(path: Path, folder: Path, archive: Unpacked | None) -> Capture:
         pictures,
         sizes,
         fitted_intrinsics(list(_intrinsics(values, count, source)), [size] * count, sizes, source),
-        from_opengl(_poses(poses, source), source),
+        from_opengl(pose_matrices(poses[:, 4:], poses[:, :4], source), source),
         metric=True,
         depth_files=tuple(there) if any(there) else None,
         read_depth_file=partial(_read_depth, shape=_depth_shape(values, size, source)),
@@ -103,16 +102,6 @@ def _intrinsics(values: dict[str, Any], count: int, source: Path) -> Float64[np.
         return np.stack([intrinsics_matrix(*row, first_pixel=PIXEL_CENTRE, source=source) for row in rows.tolist()])
     matrix = numbers(values, "K", ((9,), (3, 3)), source).reshape(3, 3).T
     return np.tile(checked_intrinsics(matrix, source), (count, 1, 1))
-
-
-def _poses(rows: Float64[np.ndarray, "S 7"], source: Path) -> Float64[np.ndarray, "S 4 4"]:
-    lengths = np.linalg.norm(rows[:, :4], axis=1)
-    if (wrong := np.flatnonzero(abs(lengths - 1) > _UNIT)).size:
-        raise InputError(f"{source} has a quaternion of length {lengths[wrong[0]]:.3f} in pose {wrong[0]}; expected 1")
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(rows[:, :4]).as_matrix()
-    poses[:, :3, 3] = rows[:, 4:]
-    return poses
 
 
 def _times(values: dict[str, Any], count: int, source: Path) -> Float64[np.ndarray, " S"] | None:
@@ -144,7 +133,8 @@ def _read_depth(path: Path, shape: tuple[int, int] | None) -> Float32[np.ndarray
     confidence = path.with_suffix(".conf")
     if not confidence.is_file():
         return depth
-    return known(depth, _decompressed(confidence, [depth.shape], np.dtype(np.uint8)) > 0)
+    sure = _decompressed(confidence, [depth.shape], np.dtype(np.uint8)) > 0
+    return np.where(sure, depth, np.float32(0))
 
 
 def _decompressed(path: Path, shapes: list[tuple[int, ...]], dtype: np.dtype) -> np.ndarray:

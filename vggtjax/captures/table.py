@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import get_args
 
 from vggtjax.captures.capture import Capture, CaptureKind
 from vggtjax.captures.colmap import find_model, read_colmap
@@ -18,18 +18,13 @@ from vggtjax.errors import InputError, check_choice, reading
 RECORD3D_SUFFIX = ".r3d"
 
 
-class _Kind(NamedTuple):
-    recognises: Callable[[Path], bool]
-    read: Callable[[Path], Capture]
-
-
-# The first that recognises a folder reads it.
-KINDS: Mapping[CaptureKind, _Kind] = {
-    "record3d": _Kind(lambda path: _is_r3d(path) or is_record3d(path), read_record3d),
-    "polycam": _Kind(is_polycam, read_polycam),
-    "nerfstudio": _Kind(lambda path: any((path / name).is_file() for name in NAMES), read_nerfstudio),
-    "colmap": _Kind(lambda path: find_model(path) is not None, read_colmap),
-    "tum": _Kind(lambda path: _has(path, "rgb.txt", "rgb"), read_tum),
+# Whether a path is of the kind, and its reader. The first that recognises a folder reads it.
+KINDS: Mapping[CaptureKind, tuple[Callable[[Path], bool], Callable[[Path], Capture]]] = {
+    "record3d": (lambda path: _is_r3d(path) or is_record3d(path), read_record3d),
+    "polycam": (is_polycam, read_polycam),
+    "nerfstudio": (lambda path: any((path / name).is_file() for name in NAMES), read_nerfstudio),
+    "colmap": (lambda path: find_model(path) is not None, read_colmap),
+    "tum": (lambda path: (path / "rgb.txt").exists() and (path / "rgb").exists(), read_tum),
 }
 
 
@@ -39,7 +34,7 @@ def capture_kind(path: str | PathLike[str]) -> CaptureKind | None:
     with reading(path):
         if not (path.is_dir() or _is_r3d(path)):
             return None
-        return next((name for name, kind in KINDS.items() if kind.recognises(path)), None)
+        return next((kind for kind, (recognises, _) in KINDS.items() if recognises(path)), None)
 
 
 def find_capture(path: str | PathLike[str]) -> Capture | None:
@@ -67,12 +62,8 @@ def read_capture(path: str | PathLike[str], kind: CaptureKind | None = None) -> 
         )
     check_choice("kind", kind, get_args(CaptureKind))
     with reading(path):
-        return KINDS[kind].read(Path(path))
+        return KINDS[kind][1](Path(path))
 
 
 def _is_r3d(path: Path) -> bool:
     return path.suffix.lower() == RECORD3D_SUFFIX and path.is_file()
-
-
-def _has(path: Path, *names: str) -> bool:
-    return all((path / name).exists() for name in names)

@@ -10,7 +10,7 @@ from threading import Lock
 from typing import Any
 
 from vggtjax.errors import ClipError
-from vggtjax.storage.remote import MOST_BYTES, download, is_url, local_path
+from vggtjax.storage.remote import download, is_url, local_path
 from vggtjax.storage.writing import staging
 
 
@@ -24,7 +24,6 @@ class Fetched:
     def __init__(self) -> None:
         self._stack, self._lock = ExitStack(), Lock()
         self._folder: Path | None = None
-        self._count = 0
         self._copies: dict[str, Path] = {}
 
     def __enter__(self) -> Fetched:
@@ -44,10 +43,8 @@ class Fetched:
             if self._folder is None:
                 self._folder = self._stack.enter_context(staging(tempfile.gettempdir())) / "clips"
                 self._folder.mkdir(mode=0o700)
-            self._count += 1
-            self._copies[name] = folder = self._folder / str(self._count)
-        folder.mkdir()
-        return str(download(source, folder, most_bytes=MOST_BYTES, error=ClipError))
+        self._copies[name] = folder = Path(tempfile.mkdtemp(dir=self._folder))
+        return str(download(source, folder, error=ClipError))
 
     def drop(self, name: str) -> None:
         """Remove the copy of a clip, if there is one."""

@@ -25,18 +25,7 @@ _LITTLE_SHRUNK: dict[str, int] = dict.fromkeys(("PNG", "JPEG", "MPO", "BMP", "PP
 
 # What Pillow's decoders raise on broken files; its size limit is DecompressionBombError.
 UNREADABLE = (
-    *(
-        OSError,
-        SyntaxError,
-        ValueError,
-        TypeError,
-        IndexError,
-        KeyError,
-        RuntimeError,
-        EOFError,
-        OverflowError,
-        MemoryError,
-    ),
+    *(OSError, SyntaxError, ValueError, TypeError, LookupError, RuntimeError, EOFError, OverflowError, MemoryError),
     *(struct.error, Image.DecompressionBombError),
 )
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any
+from typing import Any, TypeAlias
 
 from vggtjax.clips.images import is_image_name
 from vggtjax.clips.video import is_video_name
@@ -23,10 +22,7 @@ _BATCH = 512  # rows of a parquet file that are read at once: at most 8 MiB of a
 _MOST_ROWS = 5_000_000
 
 
-@dataclass(frozen=True)
-class _Row:
-    source: str
-    name: str | None = None
+_Rows: TypeAlias = Iterator[tuple[int, str, str | None]]  # line or row, source, name if there is one
 
 
 def is_manifest(name: str) -> bool:
@@ -46,12 +42,12 @@ def read_manifest(path: Path, url: str | None = None) -> dict[str, str]:
     """
     unit, read = ("row" if path.suffix.lower() == ".parquet" else "line"), _READERS[path.suffix.lower()]
     found: dict[str, tuple[int, str]] = {}
-    for number, row in read(path):
+    for number, source, name in read(path):
         place = f"{path} {unit} {number}"
-        if not row.source or len(row.source) > _MOST_LETTERS or "\0" in row.source:
-            raise ClipError(f"{place} has the source {one_line(row.source, 60)!r}; expected a path or a URL")
-        source = _source(row.source, path, url, place)
-        name = row.name or source_name(source)
+        if not source or len(source) > _MOST_LETTERS or "\0" in source:
+            raise ClipError(f"{place} has the source {one_line(source, 60)!r}; expected a path or a URL")
+        source = _source(source, path, url, place)
+        name = name or source_name(source)
         if (
             name in ("", ".", "..")
             or len(name) > 255
@@ -93,15 +89,15 @@ def _source(source: str, path: Path, url: str | None, place: str) -> str:
     return f"{url.rpartition('/')[0]}/{source}"
 
 
-def _csv_rows(path: Path) -> Iterator[tuple[int, _Row]]:
+def _csv_rows(path: Path) -> _Rows:
     table = read_csv(path, most_bytes=MOST_BYTES, error=ClipError)
     if "source" not in table.columns:
         raise ClipError(f"{path} has no column source; expected columns source and, if wanted, name")
     for line, row in table.rows:
-        yield line, _Row(row["source"] or "", row.get("name") or None)
+        yield line, row["source"] or "", row.get("name")
 
 
-def _json_rows(path: Path) -> Iterator[tuple[int, _Row]]:
+def _json_rows(path: Path) -> _Rows:
     with reading(path, ClipError):
         _check_size(path)
         lines = path.read_bytes().splitlines()
@@ -109,13 +105,13 @@ def _json_rows(path: Path) -> Iterator[tuple[int, _Row]]:
         if line.strip():
             place = f"{path} line {number}"
             values = parse_json(line, dict[str, object], place, most_bytes=_MOST_LINE, error=ClipError)
-            known = {key: value for key, value in values.items() if key in ("source", "name")}
-            if not isinstance(known.get("source"), str) or not isinstance(known.get("name"), str | None):
+            source, name = values.get("source"), values.get("name")
+            if not isinstance(source, str) or not isinstance(name, str | None):
                 raise ClipError(f"{place} has no source; expected source and, if wanted, name, as text")
-            yield number, _Row(**known)  # type: ignore[arg-type]
+            yield number, source, name
 
 
-def _parquet_rows(path: Path) -> Iterator[tuple[int, _Row]]:
+def _parquet_rows(path: Path) -> _Rows:
     check_extra(f"{path}, a list of clips in parquet,", "cluster", "pyarrow")
     import pyarrow as pa
     from pyarrow import parquet
@@ -139,7 +135,7 @@ def _parquet_rows(path: Path) -> Iterator[tuple[int, _Row]]:
                     texts = {name: _texts(path, rows.column(name)) for name in names}
                     for source, name in zip(texts["source"], texts.get("name", [None] * len(rows)), strict=True):
                         number += 1
-                        yield number, _Row(source or "", name)
+                        yield number, source or "", name
         except (pa.ArrowException, KeyError, UnicodeDecodeError) as problem:
             raise ClipError(f"{path} is no parquet file: {one_line(str(problem))}") from problem
 

@@ -80,7 +80,10 @@ def parse_queries(text: str, clip: Clip) -> Queries:
     Raises InputError for other words, or points outside the frames.
     """
     check_words(text)
-    return _grid(text, clip) if text.startswith("grid:") else _read(Path(text), clip)
+    if text.startswith("grid:"):
+        return _grid(text, clip)
+    points, frames = zip(*_places(Path(text), clip, len(clip)), strict=True)
+    return Queries(np.array(points, np.float32), np.array(frames, np.int64))
 
 
 def _grid(text: str, clip: Clip) -> Queries:
@@ -106,11 +109,6 @@ def check_queries(text: str, clip: Clip, frames: int) -> None:
     """
     if not text.startswith("grid:"):
         deque(_places(Path(text), clip, frames), maxlen=0)
-
-
-def _read(path: Path, clip: Clip) -> Queries:
-    points, frames = zip(*_places(path, clip, len(clip)), strict=True)
-    return Queries(np.array(points, np.float32), np.array(frames, np.int64))
 
 
 def _places(path: Path, clip: Clip, frames: int) -> Iterator[tuple[Float64[np.ndarray, " 2"], int]]:

@@ -64,7 +64,9 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
     found: dict[str, str] = {}
     for text in paths:
         listed = _at_url(text) if is_url(text) else _at_path(local_path(text))
-        for name, clip in listed.items():
+        if not listed:
+            raise ClipError(f"{shown(text)} is not a clip and holds no clips; expected folders of images, or videos")
+        for name, clip in listed:
             if name in found:
                 raise ClipError(f"two clips are named {name}: {shown(found[name])} and {shown(clip)}; rename one")
             found[name] = clip
@@ -73,49 +75,37 @@ def clips_by_name(paths: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _at_path(text: str) -> dict[str, str]:
-    """Return the clips at a path by name."""
+def _at_path(text: str) -> list[tuple[str, str]]:
+    """Return names and sources of the clips at a path."""
     path = Path(text)
     with reading(path, ClipError):
         if not path.exists():
             raise _missing(text)
         if is_manifest(text) and path.is_file():
-            return read_manifest(path)
+            return list(read_manifest(path).items())
         entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
         whole = not path.is_dir() or any(is_image_name(entry) for entry in entries) or bool(capture_kind(path))
         clips = [path] if whole else [entry for entry in entries if _is_clip(entry)]
-        named = [(clip.resolve().name if clip.is_dir() else clip.stem, str(clip)) for clip in clips]
-    return _by_name(named, str(path))
+        return [(clip.resolve().name if clip.is_dir() else clip.stem, str(clip)) for clip in clips]
 
 
-def _at_url(url: str) -> dict[str, str]:
-    """Return the clips at a URL by name. A list of clips is downloaded, other files are not."""
+def _at_url(url: str) -> list[tuple[str, str]]:
+    """Return names and sources of the clips at a URL. A list of clips is downloaded, other files are not."""
     check_url(url, error=ClipError)
     name = Path(url_name(url, ClipError))
     if is_manifest(name.name):
         with tempfile.TemporaryDirectory() as folder:
             path = download(url, Path(folder), most_bytes=MOST_BYTES, error=ClipError)
             try:
-                return read_manifest(path, url)
+                return list(read_manifest(path, url).items())
             except ClipError as error:
                 raise ClipError(str(error).replace(str(path), shown(url))) from None
     entries = [] if _is_clip_file(name) or is_image_name(name) else list_url(url, ClipError)
     if not entries or any(is_image_name(Path(entry.name)) for entry in entries):
-        return {source_name(url): url} if entries or name.suffix else _by_name([], shown(url))
+        return [(source_name(url), url)] if entries or name.suffix else []
     entries.sort(key=lambda entry: natural_key(Path(entry.name)))
     clips = [e.url for e in entries if not e.name.startswith(".") and (e.is_folder or _is_clip_file(Path(e.name)))]
-    return _by_name([(source_name(clip), clip) for clip in clips], shown(url))
-
-
-def _by_name(clips: Sequence[tuple[str, str]], place: str) -> dict[str, str]:
-    if not clips:
-        raise ClipError(f"{place} is not a clip and holds no clips; expected folders of images, or videos")
-    found: dict[str, str] = {}
-    for name, clip in clips:
-        if name in found:
-            raise ClipError(f"two clips are named {name}: {shown(found[name])} and {shown(clip)}; rename one")
-        found[name] = clip
-    return found
+    return [(source_name(clip), clip) for clip in clips]
 
 
 def _is_clip_file(name: Path) -> bool:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float64
 
-from vggtjax.cameras import checked_poses
+from vggtjax.cameras import camera_centres, checked_poses
 from vggtjax.errors import InputError
 
 FEWEST_POSES = 3  # fewer centres can always be aligned exactly
@@ -39,8 +39,7 @@ class Similarity(NamedTuple):
 
 def centres(camera_from_world: Float[np.ndarray, "S 3 4"]) -> Float64[np.ndarray, "S 3"]:
     """Return the camera centres in the world, -R^T t."""
-    poses = checked_poses(camera_from_world)
-    return -np.einsum("sji,sj->si", poses[:, :, :3], poses[:, :, 3])
+    return camera_centres(checked_poses(camera_from_world))
 
 
 def umeyama_sim3(

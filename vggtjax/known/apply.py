@@ -5,16 +5,13 @@ from __future__ import annotations
 import dataclasses
 import logging
 from collections.abc import Callable
-from typing import Generic, NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float64
 
 from vggtjax.cameras import world_from_camera
 from vggtjax.known.consistency import consistent_with_poses
 from vggtjax.known.depths import captured_depths
-from vggtjax.known.fit import fit_poses
-from vggtjax.known.flow import implied_flow
 from vggtjax.known.given import Given
 from vggtjax.known.intrinsics import shared_focal
 from vggtjax.known.metric import MetricScale, from_baseline, from_camera_height, from_depths
@@ -29,14 +26,7 @@ _LARGE_OFFSET = 0.25  # of the path
 logger = logging.getLogger(__name__)
 
 
-class Applied(NamedTuple, Generic[R]):
-    """A result with what is known of it, and how long the unit of its prediction is in its own."""
-
-    result: R
-    unit: float
-
-
-def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None) -> Applied[R]:
+def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None) -> tuple[R, float]:
     """Return the result with known intrinsics, poses and scale, and without the depth that is to be left out.
 
     Args:
@@ -45,14 +35,16 @@ def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None)
         refine: refines the cameras; called when the intrinsics are known, and before lengths are.
 
     Returns:
-        The result; its settings hold what was given and what the fits left over, as sentences by step.
+        The result, whose settings hold what was given and what the fits left over, as sentences by step; and how long
+        the unit of the prediction is in its own.
 
     Raises:
         InputError: known values that do not fit the prediction.
     """
     known, notes, unit = given.options, {}, 1.0
     if given.leave_out is not None:
-        result = without_depth(result, given.leave_out)
+        depth, moving = np.where(given.leave_out, np.float32(0), result.depth), result.dynamic_mask & ~given.leave_out
+        result = dataclasses.replace(result, depth=depth, dynamic_mask=moving)
         notes["left out"] = f"{given.leave_out.sum() / result.inside_pictures.sum():.1%} of the pixels"
     if given.intrinsics is not None or known.shared_focal:
         result = _with_intrinsics(result, given, notes)
@@ -67,14 +59,7 @@ def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None)
         words = "metres" if lengths == "metre" else "units of the capture"
         notes["scale"] = f"{scale.factor:.4g} {words} per unit: {scale.note}"
     settings = result.settings | {"known": known.to_json() | {"found": notes, "lengths": lengths}}
-    return Applied(dataclasses.replace(result, settings=settings), unit)
-
-
-def without_depth(result: R, masks: Bool[np.ndarray, "S H W"]) -> R:
-    """Return the result with unknown depth in the masks, where nothing moves either."""
-    return dataclasses.replace(
-        result, depth=np.where(masks, np.float32(0), result.depth), dynamic_mask=result.dynamic_mask & ~masks
-    )
+    return dataclasses.replace(result, settings=settings), unit
 
 
 def scaled(result: R, factor: float) -> R:
@@ -86,33 +71,17 @@ def scaled(result: R, factor: float) -> R:
     )
 
 
-def with_intrinsics(result: R, intrinsics: Float64[np.ndarray, "S 3 3"]) -> tuple[R, float]:
-    """Return the result with other intrinsics, and the median distance in pixels that its correspondences moved.
-
-    The distance is not a number where there are none: of a single frame, or where everything moves.
-
-    What the network saw is taken to be the correspondences between frames that its depth and cameras imply. With other
-    intrinsics, poses are fitted again to keep those of static, confident pixels. Depth stays.
-    """
-    fit = fit_poses(implied_flow(result), result.camera_from_world.astype(np.float64), intrinsics)
-    poses = fit.camera_from_world.astype(np.float32)
-    return dataclasses.replace(result, intrinsics=intrinsics.astype(np.float32), camera_from_world=poses), fit.residual
-
-
 def _with_intrinsics(result: R, given: Given, notes: dict[str, str]) -> R:
     name = "shared focal length" if given.intrinsics is None else "intrinsics"
     intrinsics = shared_focal(result) if given.intrinsics is None else given.intrinsics
     if given.options.intrinsics == SOURCE and given.capture is not None and given.capture.distorted:
         logger.warning("the lens of %s has a distortion, which its intrinsics leave out", given.capture.path)
     change = np.log(intrinsics[:, 0, 0] / result.intrinsics[:, 0, 0])
-    result, residual = with_intrinsics(result, intrinsics)
     focal = np.median(intrinsics[:, 0, 0] * result.source_scale[:, 0])
-    kept = f"correspondences kept within {residual:.2g} pixels (median)"
     notes[name] = (
-        f"focal length {focal:.5g} pixels of the source, {np.expm1(np.median(change)):+.1%} against the prediction; "
-        + ("no correspondences to keep" if np.isnan(residual) else kept)
+        f"focal length {focal:.5g} pixels of the source, {np.expm1(np.median(change)):+.1%} against the prediction"
     )
-    return result
+    return dataclasses.replace(result, intrinsics=intrinsics.astype(np.float32))
 
 
 def _with_poses(result: R, given: Given, notes: dict[str, str]) -> tuple[R, float]:

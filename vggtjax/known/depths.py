@@ -14,7 +14,7 @@ from vggtjax.errors import InputError, one_line
 from vggtjax.results.result import Result
 from vggtjax.storage.csv_file import read_csv
 
-_MOST_FILE_BYTES = 1 << 24
+MOST_FILE_BYTES = 1 << 24
 _FRAME_DEPTHS = 10_000  # of a capture's map
 
 
@@ -35,7 +35,7 @@ def read_depths(path: str | Path, frames: Placed) -> DepthSamples:
     path = Path(path)
     found = []
     count = len(frames.images)
-    for number, line in read_csv(path, most_bytes=_MOST_FILE_BYTES).rows:
+    for number, line in read_csv(path, most_bytes=MOST_FILE_BYTES).rows:
         shown = one_line(str(line))
         try:
             frame, x, y, depth = int(line["frame"]), float(line["x"]), float(line["y"]), float(line["depth"])

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 from vggtjax.captures.capture import Capture
+from vggtjax.clips.clip import Clip
 from vggtjax.errors import InputError
-from vggtjax.known.depths import DepthSamples, check_depths, read_depths
-from vggtjax.known.frames import Frames
+from vggtjax.known.depths import MOST_FILE_BYTES, DepthSamples, check_depths, read_depths
 from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
 from vggtjax.known.options import SOURCE, Baseline, KnownGeometry, parse_baseline
 from vggtjax.known.poses import POSE_COLUMNS, checked_known_poses, read_poses
+from vggtjax.results.result import Result
+from vggtjax.storage.csv_file import read_csv
 from vggtjax.storage.trajectories import read_numbers
 
 
@@ -32,16 +36,19 @@ class Given(NamedTuple):
 
 def check_readable(known: KnownGeometry) -> None:
     """Raise InputError or ResultError for files that are missing or unreadable: call it before long work."""
-    known.check_files()
     if known.intrinsics not in (None, SOURCE):
         read_intrinsics(known.intrinsics)
     if known.poses not in (None, SOURCE):
         read_numbers(known.poses, POSE_COLUMNS)
+    if known.known_depths not in (None, SOURCE):
+        read_csv(Path(known.known_depths), most_bytes=MOST_FILE_BYTES)
+    if known.leave_out is not None and not os.path.isdir(known.leave_out):  # noqa: PTH112 - False for an over-long name
+        raise InputError(f"leave_out is {str(known.leave_out)!r}; expected a folder of pictures")
 
 
 def read_known(
     known: KnownGeometry,
-    frames: Frames,
+    frames: Clip | Result,
     *,
     leave_out: Bool[np.ndarray, "S H W"] | None = None,
     capture: Capture | None = None,
@@ -58,9 +65,18 @@ def read_known(
         InputError: values that do not fit the clip, and "source" without a capture, or with one that lacks them.
     """
     count = len(frames.images)
-    if leave_out is not None and all(mask[_inside(frames, i)].all() for i, mask in enumerate(leave_out)):
+    boxes = [(slice(top, bottom), slice(left, right)) for left, top, right, bottom in frames.valid_box.tolist()]
+    if leave_out is not None and all(mask[box].all() for mask, box in zip(leave_out, boxes, strict=True)):
         raise InputError("leave_out covers every pixel; expected pictures that are bright where depth is left out")
-    capture = _of_frames(known, frames, capture) if known.from_source else None
+    if not known.from_source:
+        capture = None
+    elif capture is None:
+        raise InputError(
+            f"{' and '.join(known.from_source)} shall come from the source, and the clip's source is no capture; "
+            "expected a folder of COLMAP, nerfstudio, Record3D, Polycam or TUM"
+        )
+    else:
+        capture = capture.for_frames(frames.frame_names)
     intrinsics = poses = baseline = depths = None
     poses_name = ""
     if known.intrinsics is not None:
@@ -82,20 +98,6 @@ def read_known(
     elif known.known_depths is not None:
         depths = read_depths(known.known_depths, frames)
     return Given(known, intrinsics, poses, poses_name, baseline, depths, leave_out, capture)
-
-
-def _inside(frames: Frames, frame: int) -> tuple[slice, slice]:
-    left, top, right, bottom = frames.valid_box[frame].tolist()
-    return slice(top, bottom), slice(left, right)
-
-
-def _of_frames(known: KnownGeometry, frames: Frames, capture: Capture | None) -> Capture:
-    if capture is None:
-        raise InputError(
-            f"{' and '.join(known.from_source)} shall come from the source, and the clip's source is no capture; "
-            "expected a folder of COLMAP, nerfstudio, Record3D, Polycam or TUM"
-        )
-    return capture.for_frames(frames.frame_names)
 
 
 def _recorded(capture: Capture | None, name: str) -> Float64[np.ndarray, "S n n"]:

@@ -31,7 +31,7 @@ def read_intrinsics(text: str) -> Float64[np.ndarray, "F 3 3"]:
 
     Raises InputError or ResultError for other words and unreadable files.
     """
-    if "," in text and not os.path.isfile(text):  # noqa: PTH113 - False for an over-long name
+    if not os.path.isfile(text):  # noqa: PTH113 - False for an over-long name
         try:
             numbers = [float(word) for word in text.split(",")]
         except ValueError:

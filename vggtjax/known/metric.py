@@ -10,7 +10,6 @@ from jaxtyping import Bool, Float64
 from vggtjax.cameras import camera_centres
 from vggtjax.errors import InputError
 from vggtjax.known.depths import DepthSamples
-from vggtjax.known.flow import reliable_pixels
 from vggtjax.known.options import Baseline
 from vggtjax.results.result import Result
 
@@ -58,7 +57,7 @@ def from_camera_height(result: Result, height: float) -> MetricScale:
     then least squares on its points; the same points for the same result). Raises InputError where there is none.
     """
     cameras = camera_centres(result.camera_from_world.astype(np.float64))
-    points = result.world_points()[reliable_pixels(result)].astype(np.float64)
+    points = result.world_points()[_reliable_pixels(result)].astype(np.float64)
     points = points[:: max(1, len(points) // _POINTS)]
     if len(points) < 100:
         raise InputError(
@@ -93,6 +92,14 @@ def from_depths(result: Result, known: DepthSamples, name: str) -> MetricScale:
         float(np.exp(middle)),
         f"{int(used.sum())} known depths, from which the scaled ones differ by {spread:.1%} (median)",
     )
+
+
+def _reliable_pixels(result: Result) -> Bool[np.ndarray, "S H W"]:
+    """Return pixels that show a static point whose confidence is not among the lowest fifth of the clip."""
+    used = result.valid_pixels & ~result.dynamic_mask
+    if not used.any():
+        return used
+    return used & (result.depth_confidence >= np.percentile(result.depth_confidence[used], 20))
 
 
 def _through(points: Float64[np.ndarray, "3 3"], down: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 4"] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -93,20 +92,6 @@ class KnownGeometry:
         }
         if given := [name for name, is_given in alone.items() if is_given]:
             raise InputError(f"{given[0]} is of one clip; expected what all clips share, or source")
-
-    def check_files(self) -> None:
-        """Raise InputError for a missing file or folder: call it before long work."""
-        files = {"intrinsics": self.intrinsics, "poses": self.poses, "known_depths": self.known_depths}
-        for name, value in files.items():
-            numbers = name == "intrinsics" and value is not None and "," in value
-            # os.path says False, where a Path raises an error, of an over-long name.
-            if value is not None and value != SOURCE and not numbers and not os.path.isfile(value):  # noqa: PTH113
-                other = "fx,fy,cx,cy, " if name == "intrinsics" else ""
-                raise InputError(
-                    f"{name} is {one_line(value)!r}, and there is no such file; expected {other}a file or source"
-                )
-        if self.leave_out is not None and not os.path.isdir(self.leave_out):  # noqa: PTH112 - as above
-            raise InputError(f"leave_out is {str(self.leave_out)!r}; expected a folder of pictures")
 
 
 def parse_baseline(text: str) -> Baseline:

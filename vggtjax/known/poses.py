@@ -12,8 +12,9 @@ from jaxtyping import Float64
 
 from vggtjax.cameras import camera_centres, world_from_camera
 from vggtjax.captures.cameras import checked_world_from_camera
+from vggtjax.clips.clip import Clip
 from vggtjax.errors import InputError
-from vggtjax.known.frames import Frames
+from vggtjax.results.result import Result
 from vggtjax.storage.trajectories import associate, read_numbers, read_trajectory
 
 _TUM, _KITTI = POSE_COLUMNS = (8, 12)  # numbers a line
@@ -36,7 +37,7 @@ class PoseAgreement(NamedTuple):
     scale: float  # of predicted lengths
 
 
-def read_poses(path: str | Path, clip: Frames) -> Float64[np.ndarray, "S 4 4"]:
+def read_poses(path: str | Path, clip: Clip | Result) -> Float64[np.ndarray, "S 4 4"]:
     """Return the world-from-camera poses of a clip's frames.
 
     Of poses with times every frame takes the one at its own time: the timestamp in its name, as in TUM's data sets, or
@@ -152,7 +153,7 @@ def check_agreement(
     return found
 
 
-def _times(clip: Frames) -> Float64[np.ndarray, " S"] | None:
+def _times(clip: Clip | Result) -> Float64[np.ndarray, " S"] | None:
     """Return the times in the frames' names, or else the clip's; None where neither is known."""
     try:
         times = np.array([float(name) for name in clip.frame_names if "." in name])

@@ -42,11 +42,6 @@ def compiled_folder() -> Path:
     return cache_folder() / "compiled"
 
 
-def lowered_folder() -> Path:
-    """Return the folder of traced programs, not yet compiled."""
-    return cache_folder() / "lowered"
-
-
 def cache_parts() -> dict[str, list[Path]]:
     """Return what this library keeps in its cache folder, by kind; files of others there are not named."""
     folder = cache_folder()

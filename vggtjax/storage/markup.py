@@ -16,7 +16,6 @@ from PIL import Image
 
 from vggtjax.errors import one_line
 
-GENERATOR = "vggtjax"  # of the pages, in their head
 _QUALITY = 78  # of WebP
 
 
@@ -48,7 +47,7 @@ def page(title: str, *body: Element | None, pictures: str = "data:") -> str:
         element("meta", name="viewport", content="width=device-width, initial-scale=1"),
         element("meta", http_equiv="Content-Security-Policy", content=policy),
         element("meta", name="color-scheme", content="light dark"),
-        element("meta", name="generator", content=GENERATOR),
+        element("meta", name="generator", content="vggtjax"),
         element("title", one_line(title)),
         element("style", style()),
     )

@@ -24,7 +24,7 @@ from jax import export
 from jax.core import Tracer
 
 from vggtjax.errors import InputError, OutputError, check_regular
-from vggtjax.storage.cache import compiled_folder, lowered_folder
+from vggtjax.storage.cache import cache_folder, compiled_folder
 from vggtjax.storage.cores import core_count
 from vggtjax.storage.free_memory import return_freed_memory
 from vggtjax.storage.versions import package_digest
@@ -32,7 +32,6 @@ from vggtjax.storage.writing import writing
 
 KEPT_BYTES = 2**28  # of lowered programs and texts; the oldest are removed first
 _DIGEST = 32  # bytes of the sha256 at the start of a kept file
-_PACKAGE = Path(__file__).parents[1]
 # Of LLVM on a CPU. Its third level takes up to a fifth longer to compile the network, which runs no faster with it, as
 # its products are in libraries.
 _OPTIONS_ON_CPU = {"xla_backend_optimization_level": 1}
@@ -181,7 +180,7 @@ def kept_text(name: str, make: Callable[[], str]) -> str:
 
 
 def _kept_path(text: str) -> Path:
-    return lowered_folder() / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.bin"
+    return cache_folder() / "lowered" / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.bin"
 
 
 def _read_kept(path: Path) -> bytes | None:
@@ -216,4 +215,4 @@ def _keeping() -> bool:
 def source_digest() -> str:
     """Return versions, platform, cores, and a digest of all sources: what results depend on besides arguments."""
     versions = [version(name) for name in ("jax", "jaxlib", "flax")]
-    return f"{' '.join(versions)} {jax.default_backend()} {core_count()} {package_digest(_PACKAGE)}"
+    return f"{' '.join(versions)} {jax.default_backend()} {core_count()} {package_digest()}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
@@ -25,21 +25,13 @@ _WEB = ("http", "https")
 _MEMORY = "memory"  # of one process: for tests
 
 
-class _Scheme(NamedTuple):
-    package: str  # that fsspec needs for it; empty for none
-    kind: Literal["objects", "files", "read"]  # written whole or not at all; as files are; never
-
-
-# fsspec knows more: schemes that wrap others (a reference, a cache, an archive) could name what a list must not name.
-SCHEMES: Mapping[str, _Scheme] = {
-    **dict.fromkeys(("s3", "s3a"), _Scheme("s3fs", "objects")),
-    **dict.fromkeys(("gs", "gcs"), _Scheme("gcsfs", "objects")),
-    **dict.fromkeys(("az", "abfs"), _Scheme("adlfs", "objects")),
-    **dict.fromkeys(("http", "https"), _Scheme("aiohttp", "read")),
-    **dict.fromkeys(("sftp", "ssh"), _Scheme("paramiko", "files")),
-    "hdfs": _Scheme("pyarrow", "files"),
-    "hf": _Scheme("huggingface_hub", "read"),
-    _MEMORY: _Scheme("", "objects"),
+# How files are written: whole or not at all, as on a disk, or never. fsspec knows more schemes: those that wrap others
+# (a reference, a cache, an archive) could name what a list must not name.
+SCHEMES: Mapping[str, Literal["objects", "files", "read"]] = {
+    **dict.fromkeys(("s3", "s3a", "gs", "gcs", "az", "abfs"), "objects"),
+    **dict.fromkeys((*_WEB, "hf"), "read"),
+    **dict.fromkeys(("sftp", "ssh", "hdfs"), "files"),
+    _MEMORY: "objects",
 }
 
 
@@ -89,13 +81,14 @@ def check_url(url: str, *, written: bool = False, error: type[InputError] = Inpu
 
     Opens nothing, but imports what fsspec needs for the scheme.
     """
-    scheme = SCHEMES.get(_scheme(url))
-    if scheme is None or "::" in url or not url.partition("://")[2].strip("/") or not url.isprintable():
+    kind = SCHEMES.get(_scheme(url))
+    if kind is None or "::" in url or not url.partition("://")[2].strip("/") or not url.isprintable():
         known = ", ".join(f"{name}://" for name in SCHEMES if name != _MEMORY)
         raise error(f"{shown(url)} is no URL that can be read; expected a path, or one of {known}")
-    if written and scheme.kind == "read":
+    if written and kind == "read":
         raise error(f"{shown(url)} can be read, not written; expected a folder, or a URL such as s3://bucket/results")
-    _opened(url, error)
+    with _opened(url, error):
+        pass
 
 
 def is_in_process(url: str) -> bool:
@@ -106,18 +99,16 @@ def is_in_process(url: str) -> bool:
 def list_url(url: str, error: type[InputError] = InputError) -> list[Entry]:
     """Return the files and folders in a folder at a URL, in no order. Raises `error` where it cannot be read."""
     check_url(url, error=error)
-    with remote_errors(url, error):
-        system, path = _opened(url, error)
+    with _opened(url, error) as (system, path):
         return [
             Entry(f"{url.rstrip('/')}/{name}{'/' if is_folder else ''}", name, is_folder)
             for name, is_folder in _entries(system, url, path)
         ]
 
 
-def exists(url: str, error: type[InputError] = InputError) -> bool:
-    """Return whether there is a file at a URL; raises `error` where that cannot be told."""
-    with remote_errors(url, error):
-        system, path = _opened(url, error)
+def exists(url: str) -> bool:
+    """Return whether there is a file at a URL; raises InputError where that cannot be told."""
+    with _opened(url, InputError) as (system, path):
         system.invalidate_cache()
         try:
             return system.info(path)["type"] == "file"
@@ -125,10 +116,9 @@ def exists(url: str, error: type[InputError] = InputError) -> bool:
             return False
 
 
-def read_url(url: str, most_bytes: int, error: type[InputError] = InputError) -> bytes | None:
-    """Return the bytes of a small file, None where there is none. Raises `error` for a larger or unreadable one."""
-    with remote_errors(url, error):
-        system, path = _opened(url, error)
+def read_url(url: str, most_bytes: int) -> bytes | None:
+    """Return the bytes of a small file, None where there is none. Raises InputError for a larger or unreadable one."""
+    with _opened(url, InputError) as (system, path):
         system.invalidate_cache()
         try:
             with system.open(path, "rb") as file:
@@ -136,7 +126,7 @@ def read_url(url: str, most_bytes: int, error: type[InputError] = InputError) ->
         except FileNotFoundError:
             return None
     if len(content) > most_bytes:
-        raise error(f"{shown(url)} has more than {most_bytes} bytes; expected at most so many")
+        raise InputError(f"{shown(url)} has more than {most_bytes} bytes; expected at most so many")
     return content
 
 
@@ -147,10 +137,8 @@ def download(url: str, folder: Path, *, most_bytes: int = MOST_BYTES, error: typ
     """
     check_url(url, error=error)
     target = folder / url_name(url, error)
-    too_many = error(f"{shown(url)} has more than {most_bytes} bytes; expected at most so many")
-    bytes_left = _BytesLeft(most_bytes, too_many)
-    with remote_errors(url, error):
-        system, path = _opened(url, error)
+    count = _counter(most_bytes, error(f"{shown(url)} has more than {most_bytes} bytes; expected at most so many"))
+    with _opened(url, error) as (system, path):
         files = [(path, target)]
         if _is_folder(system, url, path):
             files = [(f"{path.rstrip('/')}/{name}", target / local) for name, local in _walk(system, url, path, error)]
@@ -160,9 +148,10 @@ def download(url: str, folder: Path, *, most_bytes: int = MOST_BYTES, error: typ
         def copy(file: tuple[str, Path]) -> None:
             source, place = file
             place.parent.mkdir(parents=True, exist_ok=True)
-            system.get_file(source, str(place), callback=bytes_left.callback())
+            system.get_file(source, str(place), callback=count)
 
-        _each(copy, files)
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            list(pool.map(copy, files))  # the first error cancels what has not begun
     return target
 
 
@@ -172,41 +161,42 @@ def upload(folder: Path, url: str, *, last: str) -> None:
     Raises OutputError where the URL cannot be written.
     """
     files = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    with written(url) as (system, path):
+    with _opened(url, OutputError) as (system, path):
 
         def copy(name: str) -> None:
             _put(system, folder / name, f"{path.rstrip('/')}/{name}", url)
 
-        _each(copy, [name for name in files if name != last])
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            list(pool.map(copy, [name for name in files if name != last]))
         copy(last)
 
 
 def write_url(url: str, content: bytes) -> None:
     """Write a small file at a URL. Raises OutputError where it cannot be written."""
-    with written(url) as (system, path), TemporaryDirectory() as folder:
+    with _opened(url, OutputError) as (system, path), TemporaryDirectory() as folder:
         (Path(folder) / "file").write_bytes(content)
         _put(system, Path(folder) / "file", path, url)
 
 
 @contextmanager
-def written(url: str) -> Iterator[tuple[Any, str]]:
-    """Yield the file system of a URL and the path in it; an error of the body becomes an OutputError."""
-    try:
-        with remote_errors(url, InputError):
-            yield _opened(url, InputError)
-    except InputError as problem:
-        raise OutputError(str(problem)) from problem
+def _opened(url: str, error: type[VggtjaxError]) -> Iterator[tuple[Any, str]]:
+    """Yield the file system of a URL and the path in it; whatever it raises becomes `error`, without credentials."""
+    from fsspec.core import url_to_fs
 
-
-@contextmanager
-def remote_errors(url: str, error: type[InputError]) -> Iterator[None]:
-    """Turn whatever a file system of fsspec raises into `error`, with the URL and the reason."""
+    options = {}
     try:
-        yield
+        if _scheme(url) in _WEB:
+            from aiohttp import ClientTimeout
+
+            timeout = ClientTimeout(total=None, sock_connect=_CONNECT, sock_read=_SILENCE)  # any size, in its time
+            options["client_kwargs"] = {"timeout": timeout}
+        yield url_to_fs(url, **options)
     except VggtjaxError:
         raise
     except FileNotFoundError as problem:
         raise error(f"there is nothing at {shown(url)}; check the address") from problem
+    except ImportError as problem:  # names the package
+        raise error(f"{shown(url)} needs a package that is not installed: {problem}") from problem
     except Exception as problem:  # each library of a scheme has exceptions of its own
         reason = one_line(str(problem).replace(url, shown(url)), 200) or type(problem).__name__
         raise error(
@@ -214,54 +204,27 @@ def remote_errors(url: str, error: type[InputError]) -> Iterator[None]:
         ) from problem
 
 
-class _BytesLeft:
-    """How much the files of a download may still have."""
+def _counter(most: int, error: InputError) -> Any:
+    """Return what fsspec tells the sizes and bytes of all files of a download; it raises the error for more bytes."""
+    from fsspec.callbacks import Callback
 
-    def __init__(self, most: int, error: InputError) -> None:
-        self._left, self._error, self._lock = most, error, Lock()
+    class Counter(Callback):
+        left, lock = most, Lock()
 
-    def callback(self) -> Any:
-        """Return what fsspec calls with the bytes of one file; it raises the error where there are too many."""
-        from fsspec.callbacks import Callback
+        def set_size(self, size: int | None) -> None:  # told before the first byte comes
+            if (size or 0) > self.left:
+                raise error
 
-        take = self._take
+        def relative_update(self, inc: int = 1) -> None:
+            with self.lock:
+                self.left -= inc
+            self.set_size(0)
 
-        class Count(Callback):
-            def set_size(self, size: int | None) -> None:
-                take(size or 0, keep=True)  # told before the first byte comes
-
-            def relative_update(self, inc: int = 1) -> None:
-                take(inc)
-
-        return Count()
-
-    def _take(self, count: int, *, keep: bool = False) -> None:
-        with self._lock:
-            left = self._left - count
-            self._left = self._left if keep else left
-        if left < 0:
-            raise self._error
+    return Counter()
 
 
 def _scheme(url: str) -> str:
     return url.partition("://")[0].lower()
-
-
-def _opened(url: str, error: type[InputError]) -> tuple[Any, str]:
-    """Return the file system of a URL and the path in it. Raises `error` where a library is missing."""
-    from fsspec.core import url_to_fs
-
-    scheme, options = _scheme(url), {}
-    try:
-        if scheme in _WEB:
-            from aiohttp import ClientTimeout
-
-            timeout = ClientTimeout(total=None, sock_connect=_CONNECT, sock_read=_SILENCE)  # any size, in its time
-            options["client_kwargs"] = {"timeout": timeout}
-        return url_to_fs(url, **options)
-    except ImportError as problem:
-        package = SCHEMES[scheme].package
-        raise error(f"{scheme}:// needs {package}, which is not installed: pip install {package}") from problem
 
 
 def _is_folder(system: Any, url: str, path: str) -> bool:
@@ -308,7 +271,7 @@ def _walk(system: Any, url: str, path: str, error: type[InputError]) -> Iterator
 
 def _put(system: Any, source: Path, path: str, url: str) -> None:
     """Copy a file, whole or not at all."""
-    if SCHEMES[_scheme(url)].kind == "objects":
+    if SCHEMES[_scheme(url)] == "objects":
         system.put_file(str(source), path)
         return
     system.makedirs(path.rpartition("/")[0], exist_ok=True)
@@ -320,14 +283,3 @@ def _put(system: Any, source: Path, path: str, url: str) -> None:
         with suppress(Exception):
             system.rm_file(temporary)
         raise
-
-
-def _each(copy: Callable[[Any], None], names: Sequence[Any]) -> None:
-    """Call a function for all names, some at a time; raises the first error, and then starts no more."""
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        try:
-            for done in [pool.submit(copy, name) for name in names]:
-                done.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise

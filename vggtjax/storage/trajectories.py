@@ -68,14 +68,24 @@ def read_trajectory(
         if _COLUMNS[other] in file.readline(1000):
             raise ResultError(f"{path} names its columns {_COLUMNS[other]}; read it with quaternion={other!r}")
     turns = rows[:, 4:] if quaternion == "xyzw" else rows[:, [5, 6, 7, 4]]
+    return rows[:, 0], pose_matrices(rows[:, 1:4], turns, path)
+
+
+def pose_matrices(
+    places: Float[np.ndarray, "S 3"], turns: Float[np.ndarray, "S 4"], source: str | Path
+) -> Float64[np.ndarray, "S 4 4"]:
+    """Return the matrices of translations and quaternions x y z w.
+
+    Raises ResultError, which names `source`, for a quaternion not of length 1.
+    """
     lengths = np.linalg.norm(turns, axis=1)
     if (abs(lengths - 1) > _UNIT).any():
         line = int(np.argmax(abs(lengths - 1)))
-        raise ResultError(f"{path} has a quaternion of length {lengths[line]:.3f} in pose {line}; expected 1")
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+        raise ResultError(f"{source} has a quaternion of length {lengths[line]:.3f} in pose {line}; expected 1")
+    poses = np.tile(np.eye(4), (len(turns), 1, 1))
     poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(turns).as_matrix()
-    poses[:, :3, 3] = rows[:, 1:4]
-    return rows[:, 0], poses
+    poses[:, :3, 3] = places
+    return poses
 
 
 def associate(

@@ -9,11 +9,11 @@ from pathlib import Path
 _PACKAGE = Path(__file__).parents[1]
 
 
-def package_digest(package: Path = _PACKAGE) -> str:
-    """Return a digest of all Python files in a folder."""
+def package_digest() -> str:
+    """Return a digest of all Python files of this package."""
     digest = hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        digest.update(str(path.relative_to(package)).encode() + path.read_bytes())
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(str(path.relative_to(_PACKAGE)).encode() + path.read_bytes())
     return digest.hexdigest()
 
 

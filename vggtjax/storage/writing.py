@@ -65,7 +65,7 @@ def locked_folder(folder: str | Path, what: str, wait: float = 0) -> Iterator[No
     path = Path(folder) / ".vggtjax.lock"
     with write_errors(path.parent):
         try:
-            lock = _acquire_in(path.parent, path.name, wait)
+            lock = _acquire(path, wait)
         except Timeout:
             message = f"another run is writing {what} into {folder}; wait for it or choose another folder"
             raise OutputError(message) from None
@@ -80,7 +80,7 @@ def locked_folder(folder: str | Path, what: str, wait: float = 0) -> Iterator[No
 def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str) -> None:
     """Check that files of these names can be written in `folder`, before hours of computation.
 
-    A missing folder is made for the check, and removed. `replaced` tells whether existing files belong to an earlier
+    Of a missing folder the nearest parent is tried. `replaced` tells whether existing files belong to an earlier
     output of this kind (`what`), and may be replaced. Raises OutputError if the folder cannot be made or written, or
     holds files that may not be replaced.
     """
@@ -90,12 +90,9 @@ def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str)
             f"{folder / taken[0]} exists and is not part of an earlier {what}, so it is not replaced; "
             "choose another folder or move it away"
         )
-    new = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
-    with staging(folder):
+    parent = next(parent for parent in (folder, *folder.absolute().parents) if os.path.lexists(parent))
+    with write_errors(folder), _staged(parent):
         pass
-    with suppress(OSError):  # another run writes there by now
-        for parent in new:
-            parent.rmdir()
 
 
 def says_format(path: Path, name: str) -> bool:
@@ -137,7 +134,7 @@ def _staged(folder: Path) -> Iterator[Path]:
     for _ in range(_TRIES):  # another writer may remove our lock file, as a leftover, before we lock it: try again
         staged = folder / f"{_MARK}{token_hex(8)}"
         with suppress(Timeout):
-            lock = _acquire_in(folder, f"{staged.name}.lock")
+            lock = _acquire(folder / f"{staged.name}.lock")
             break
     try:
         _remove_leftovers(folder)
@@ -167,28 +164,12 @@ def remove_leftovers(folder: Path) -> None:
                 shutil.rmtree(path)
 
 
-def _acquire_in(folder: Path, name: str, wait: float = 0) -> FileLock | None:
-    """Make `folder` if it is missing, and return what `_acquire` returns for a file in it.
-
-    Another process may make the same folder for a check, and remove it before our file is there: then try again.
-    """
-    for _ in range(_TRIES):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            return _acquire(folder / name, wait)
-        except FileNotFoundError:
-            continue
-        except FileExistsError:  # also where mkdir finds the folder, and then finds it removed
-            if _blocking(folder) is not None:
-                raise
-    raise OutputError(f"cannot write {folder}: another program removes it again and again; choose another folder")
-
-
 def _acquire(path: Path, wait: float = 0) -> FileLock | None:
-    """Return the lock of a file, made if missing; None if the file system has no locks.
+    """Return the lock of a file, made with its folder if missing; None if the file system has no locks.
 
     Raises Timeout, an OSError, if another writer holds the lock for `wait` seconds.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(path, timeout=wait, thread_local=False, fallback_to_soft=False)
     try:
         lock.acquire()
