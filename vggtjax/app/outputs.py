@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from vggtjax.progress import OnStage, Progress
+from vggtjax.progress import OnStage, Progress, no_progress
 from vggtjax.results import previews
 from vggtjax.results.films import film_frames, write_film
 from vggtjax.viewer.page import viewer_page
@@ -60,7 +60,7 @@ def write_outputs(result: Reconstruction, folder: Path, name: str, on_stage: OnS
     return Outputs(viewer, film, layers, sheet, report, archive, megabytes, facts, result.model_note)
 
 
-def _layers(result: Reconstruction, progress: Progress) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+def _layers(result: Reconstruction, progress: Progress | None) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Yield, for each frame, picture, depth, confidence and moving objects, two by two."""
     valid, size = result.valid_pixels, previews.enlarged(result.depth.shape[1:])
     inverse_range = previews.inverse_depth_range(result.depth, valid)
@@ -71,4 +71,4 @@ def _layers(result: Reconstruction, progress: Progress) -> Iterator[UInt8[np.nda
         large, sure = (np.asarray(Image.fromarray(each).resize(size)) for each in (picture, confidence))
         depth = previews.depth_picture(result.depth[frame], valid[frame], inverse_range)
         yield np.vstack([np.hstack([large, depth]), np.hstack([sure, previews.overlay_picture(picture, moving)])])
-        progress(frame + 1, len(valid))
+        (progress or no_progress)(frame + 1, len(valid))
