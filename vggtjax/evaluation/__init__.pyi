@@ -1,7 +1,6 @@
 from .datasets import DATASETS as DATASETS
 from .datasets import find_sequences as find_sequences
 from .datasets.sequence import LabelledSequence as LabelledSequence
-from .datasets.sequence import Sequence as Sequence
 from .metrics.depth import video_depth_errors as video_depth_errors
 from .metrics.masks import frame_scores as frame_scores
 from .metrics.masks import mask_scores as mask_scores

@@ -54,6 +54,5 @@ class LabelledSequence:
         return len(self.pictures)
 
 
-Sequence = LabelledSequence  # the older name
 Opener = Callable[[FrameChoice], LabelledSequence]
 Reader = Callable[..., Mapping[str, Opener]]  # of a root, and of a ground truth where a data set has several
