@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Unpack
 
@@ -49,7 +50,7 @@ class Reconstruction(Result):
             pictures: for the resolution "original", the source's (`Clip.pictures()`); by default the model's enlarged.
             progress: called with the number of steps done, and of all.
             facts: what report.html says of the run beside the result: times of the stages, errors against the truth.
-            changes: single values of `saving`, such as `resolution="original"`; `layout` is the old name of `format`.
+            changes: single values of `saving`, such as `resolution="original"`.
 
         Raises:
             InputError: a percentile outside [0, 100), an unknown name, or pictures that do not fit.
@@ -59,7 +60,7 @@ class Reconstruction(Result):
         from vggtjax.results.disk import check_space, forecast_bytes
         from vggtjax.results.export import check_saving, write_files
 
-        saving = saving.changed(**changes)
+        saving = replace(saving, **changes)
         check_saving(self, saving, pictures)
         check_space(folder, forecast_bytes(self.depth.shape, self.source_size, saving))
         names = saving.names(tracks=self.track_positions is not None)
@@ -94,7 +95,6 @@ class Reconstruction(Result):
         *,
         format: str = "vggtjax",
         quaternion: Quaternion | None = None,
-        layout: str | None = None,
     ) -> Reconstruction:
         """Read a result back from its folder, or from its reconstruction.npz; or the folder of another program.
 
@@ -105,13 +105,12 @@ class Reconstruction(Result):
                 are named in `settings["missing"]`; the saliency is None.
             quaternion: for "vggt4d" and "monst3r", the order of the quaternions in pred_traj.txt: "wxyz" as these
                 programs and this library write it, "xyzw" as earlier versions of this library did.
-            layout: the old name of `format`.
 
         Raises:
             ResultError: anything but a whole result, of a known version.
             InputError: an unknown format, or a quaternion order that is missing or unknown.
         """
-        path, format = Path(path), layout or format
+        path = Path(path)
         if format != "vggtjax":
             from vggtjax.results.foreign import read_foreign
 

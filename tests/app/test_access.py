@@ -5,12 +5,10 @@ from typing import Any
 
 import pytest
 
-from vggtjax.app.limits import Limits
-
 pytest.importorskip("starlette", reason="the app needs the extra app")
 
 from vggtjax.app.access import Guard
-from vggtjax.app.space import Space
+from vggtjax.viewer.door import Door
 
 
 async def answer(guard: Guard, scope: dict[str, Any], headers: dict[str, str]) -> tuple[int, dict[str, str]]:
@@ -41,8 +39,8 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
 
 
 @pytest.fixture
-def guard(tmp_path):
-    return lambda token=None: Guard(app, Space(tmp_path, Limits(max_upload_mb=1)), {0: 5}, token, 7860)
+def guard():
+    return lambda token=None: Guard(app, Door("127.0.0.1", 7860, token), 1_000_000)
 
 
 def test_without_a_token_only_this_machine_is_answered(guard):
@@ -59,16 +57,17 @@ def test_the_token_opens_the_app_once_and_a_cookie_does_from_then(guard):
     assert "token" not in headers["location"]
     assert "HttpOnly" in headers["set-cookie"]
     assert ask(exposed, cookie=headers["set-cookie"].split(";")[0], host="box:7860")[0] == 200
-    assert ask(exposed, host="box:7860")[0] == 401
-    assert ask(exposed, query="token=wrong")[0] == 401
-    for cookie in ("vggtjax-7860=wrong", "vggtjax-7860=é; =;"):
-        assert ask(exposed, "/results/a/b.zip", cookie=cookie)[0] == 401
+    assert ask(exposed, host="box:7860")[0] == 403
+    assert ask(exposed, query="token=wrong")[0] == 403
+    for cookie in ("vggtjax_7860=wrong", "vggtjax_7860=é; =;"):
+        assert ask(exposed, "/results/a/b.zip", cookie=cookie)[0] == 403
 
 
 def test_uploads_are_bounded_before_they_are_read(guard):
     path = "/gradio_api/upload"
     assert ask(guard(), path, method="POST", content_length="900000")[0] == 200
     assert ask(guard(), path, method="POST", content_length="9000000")[0] == 413
+    assert ask(guard(), "/gradio_api/queue/join", method="POST", content_length="1900000")[0] == 413
     assert ask(guard(), path, method="POST")[0] == 411
     assert ask(guard(), path, method="POST", content_length="9", sec_fetch_site="cross-site")[0] == 403
 
@@ -78,28 +77,3 @@ def test_browsers_are_told_to_load_nothing_from_elsewhere(guard):
     assert page["content-security-policy"].startswith("default-src 'self'")
     assert "http" not in page["content-security-policy"]
     assert "sandbox allow-scripts" in result["content-security-policy"]
-
-
-def test_uploads_at_once_fit_together(tmp_path):
-    """Of five uploads of 0.9 MB beside an earlier one, some arrive; the others are refused before they are read."""
-    space, largest = Space(tmp_path, Limits(max_upload_mb=1)), []
-    (tmp_path / "earlier").mkdir()
-    (tmp_path / "earlier" / "a.mp4").write_bytes(bytes(900_000))
-
-    async def slow(scope: Any, receive: Any, send: Any) -> None:
-        (tmp_path / str(scope["number"])).write_bytes(bytes(900_000))
-        await asyncio.sleep(0.2)
-        largest.append(sum(path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()))
-        await app(scope, receive, send)
-
-    async def uploads() -> list[tuple[int, dict[str, str]]]:
-        guard = Guard(slow, space, {}, None, 7860)
-        scope = {"method": "POST", "path": "/gradio_api/upload", "query_string": b""}
-        headers = {"host": "localhost", "content-length": "900000"}
-        return await asyncio.gather(*(answer(guard, scope | {"number": number}, headers) for number in range(5)))
-
-    assert {status for status, _ in asyncio.run(uploads())} == {200, 413}
-    assert max(largest) <= 3_000_000
-    assert not any(path.is_file() for path in tmp_path.iterdir())  # what broken uploads leave goes with the last one
-    with space.reserved(900_000):
-        pass

@@ -12,6 +12,7 @@ import pytest
 from vggtjax.app.jobs import Desk, Job
 from vggtjax.app.limits import Limits
 from vggtjax.app.models import Models
+from vggtjax.viewer.door import Door
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # of pandas, which gradio uses
@@ -46,24 +47,22 @@ class Server:
 
         from vggtjax.app.server import build_application
 
-        self.app = build_application(self.desk, None, 7860)
+        self.app = build_application(self.desk, Door("127.0.0.1", 7860, None))
         self.client = TestClient(self.app, base_url="http://127.0.0.1:7860")
 
     def _note(self, job: Job, *_):
         paths = job.source if isinstance(job.source, tuple) else (job.source,)
         self.sent += [path.read_bytes() for path in paths if path is not None]
 
-    def join(self, files, *others, **changes):
+    def run(self, files, *others):
+        """Ask for a job as the page does; return what the page is told."""
         data = [files, *(others or ("demo", "vggt", 2, 0))]
-        return self.client.post(
-            JOIN, json={"data": data, "fn_index": 0, "session_hash": "x", "trigger_id": 1} | changes
-        )
+        asked = {"data": data, "fn_index": 0, "session_hash": "x", "trigger_id": 1}
+        assert self.client.post(JOIN, json=asked).status_code == 200
+        return self.client.get("/gradio_api/queue/data", params={"session_hash": "x"}).text
 
     def upload(self, name="a.png", content=b"own", field="files", route=UPLOAD):
         return self.client.post(route, files={field: (name, content)})
-
-    def events(self):
-        return self.client.get("/gradio_api/queue/data", params={"session_hash": "x"}).text
 
     def kept(self):
         return [path for path in self.desk.uploads.rglob("*") if path.is_file()]
@@ -94,48 +93,29 @@ def server(tmp_path_factory):
                 loop.close()
 
 
-def test_files_of_the_machine_are_not_read(server, tmp_path, capfd):
+def test_files_of_the_machine_are_not_read(server, tmp_path):
     own = Path(server.upload().json()[0])
-    assert server.join([file_data(own, url="http://127.0.0.1/a", orig_name="a.png", size=3)]).status_code == 200
-    assert "job done" in server.events()
+    assert "job done" in server.run([file_data(own, url="http://127.0.0.1/a", orig_name="a.png", size=3)])
     assert server.sent[-1] == b"own"
     before, sent = server.kept(), list(server.sent)
-    deep = tmp_path / ("a" * 64)
-    deep.mkdir()
-    for private in (tmp_path / "0.png", deep / "0.png"):
-        private.write_bytes(b"private")
-    for path in (tmp_path / "0.png", "/etc/passwd", "/dev/zero", own.parent / "../../x.png", f"{own.parent}/..", "\0"):
-        assert server.join([file_data(path)]).status_code == 400, path
-        assert server.join([], file_data(path), "vggt", 2, 0).status_code == 400, path
-    assert server.join([str(tmp_path / "0.png")]).status_code == 400
-    assert server.join([{"path": "/etc/passwd", "is_stream": True}]).status_code == 400
-    assert server.join([file_data(deep / "0.png")]).status_code == 200  # stands for an upload that is not there
-    assert "not here any more" in server.events()
+    private = tmp_path / "0.png"
+    private.write_bytes(b"private")
+    for path in (private, "/etc/passwd", "/dev/zero", own.parent / "../../x.png", f"{own.parent}/..", "\0"):
+        plain = {"path": str(path)}
+        for entry in (file_data(path), plain, str(path), plain | {"is_stream": True}, file_data(path, is_stream=True)):
+            assert "job done" not in server.run([entry]), entry
+        assert "job done" not in server.run([file_data(own)], file_data(path), "vggt", 2, 0), path
     assert server.kept() == before
     assert server.sent == sent
-    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_no_address_is_fetched(server, monkeypatch):
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: pytest.fail("a name was looked up"))
     path = server.upload().json()[0]
     for address in ("https://example.com/x.mp4", "http://127.0.0.1:7860/config", "//example.com/x.mp4"):
-        assert server.join([file_data(address)]).status_code == 400
-    assert server.join([file_data(path, url="https://example.com/x.mp4")]).status_code == 200
-    server.events()
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"data": ["x"]},
-        {"data": [[], "demo", "vggt", 2, {"deep": {}}]},
-        {"fn_index": "0"},
-        {"session_hash": "../x"},
-    ],
-)
-def test_what_the_page_does_not_send_is_refused(server, changes):
-    assert server.join([], **changes).status_code == 400
+        assert "job done" not in server.run([file_data(address)])
+        assert "job done" not in server.run([file_data(path)], "demo", file_data(address), 2, 0)
+    assert "job done" in server.run([file_data(path, url="https://example.com/x.mp4")])
 
 
 @pytest.mark.parametrize(
@@ -143,15 +123,13 @@ def test_what_the_page_does_not_send_is_refused(server, changes):
 )
 def test_values_that_the_page_does_not_offer_are_said(server, values, capfd):
     path = server.upload().json()[0]
-    assert server.join([file_data(path)], *values).status_code == 200
-    assert "Not started" in server.events()
+    assert "Not started" in server.run([file_data(path)], *values)
     assert "Traceback" not in capfd.readouterr().err
 
 
-def test_large_requests_are_refused(server):
+def test_large_and_broken_requests_are_refused(server):
     assert server.client.post(JOIN, content=b"[" * 3_000_000).status_code == 413
-    assert server.client.post(JOIN, content=b"[" * 100_000).status_code == 400
-    assert server.client.post(JOIN, content=b"\xff").status_code == 400
+    assert server.client.post(JOIN, content=b"[" * 100_000).status_code == 422
 
 
 def _routes(app, prefix=""):

@@ -1,6 +1,7 @@
 """One bad sequence of an evaluation is a row that says why; the others go on."""
 
 import dataclasses
+from typing import Any, cast
 
 import pytest
 
@@ -46,7 +47,7 @@ def test_sequences_of_odd_names_are_scored_and_those_that_raise_are_rows(tmp_pat
     out, report = tmp_path / "out", Report()
     store = Records(out)
     with report.running():
-        records = evaluate(openers, source, store, SETTINGS, Scoring(), on_stage=report.stage)
+        records = evaluate(openers, cast(Any, source), store, SETTINGS, Scoring(), on_stage=report.stage)
     assert [record.status for record in records] == ["ok", "ok", "failed", "failed", "ok", "failed"]
     assert all(record.name.isprintable() and len(record.name) < 120 for record in records)
     assert records[2].reason.startswith("ZeroDivisionError: [/x] zzz")
@@ -60,7 +61,7 @@ def test_sequences_of_odd_names_are_scored_and_those_that_raise_are_rows(tmp_pat
     report.means({"[/y]": records[0].metrics})
     assert "[/y]" in capsys.readouterr().out
     again = Perfect(room, ["[/y]"])
-    evaluate({name: openers[name] for name in NAMES}, again, store, SETTINGS, Scoring(), on_stage=stage)
+    evaluate({name: openers[name] for name in NAMES}, cast(Any, again), store, SETTINGS, Scoring(), on_stage=stage)
     assert not again.calls
 
 

@@ -1,5 +1,7 @@
 """The forecast of what a result takes on the disk."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -24,7 +26,7 @@ def test_the_forecast_is_right_within_a_factor_of_two(tmp_path, saving):
 
 
 def test_too_little_space_is_said_before_anything_is_written(tmp_path, monkeypatch):
-    monkeypatch.setattr(disk, "_free", lambda _: 1000)
+    monkeypatch.setattr(disk.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     words = r"takes about [0-9.]+ kB and the disk of .* has 1.0 kB left; free some, .*--only"
     with pytest.raises(OutputError, match=words):
         make_room(1).save(tmp_path / "new")

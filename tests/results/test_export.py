@@ -151,7 +151,7 @@ def test_format_of_vggt4d(tmp_path):
     (tmp_path / "vggt4d").mkdir()
     (tmp_path / "vggt4d/frame_0000.npy").write_text("mine")
     with pytest.raises(OutputError, match="vggt4d exists and is not part of an earlier result"):
-        room.save(tmp_path, layout="vggt4d")
+        room.save(tmp_path, format="vggt4d")
 
 
 @pytest.mark.parametrize(

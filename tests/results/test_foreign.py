@@ -74,7 +74,7 @@ QUATERNIONS = {"vggt4d": "wxyz", "monst3r": "wxyz", "cut3r": None, "da3": None}
 @pytest.mark.parametrize("layout", WRITERS)
 def test_everything_comes_back(tmp_path, layout):
     WRITERS[layout](tmp_path / "theirs")
-    result = Reconstruction.load(tmp_path / "theirs", layout=layout, quaternion=QUATERNIONS[layout])
+    result = Reconstruction.load(tmp_path / "theirs", format=layout, quaternion=QUATERNIONS[layout])
     np.testing.assert_array_equal(result.depth, ROOM.depth)
     np.testing.assert_allclose(result.depth_confidence, ROOM.depth_confidence, rtol=1e-6)
     np.testing.assert_allclose(result.camera_from_world, ROOM.camera_from_world, atol=1e-6)
@@ -92,19 +92,19 @@ def test_everything_comes_back(tmp_path, layout):
 def test_small_files_of_da3(tmp_path, caplog):
     write_da3(tmp_path, "mini_npz", rows=4)
     with caplog.at_level(logging.WARNING):
-        result = Reconstruction.load(tmp_path, layout="da3")
+        result = Reconstruction.load(tmp_path, format="da3")
     np.testing.assert_allclose(result.camera_from_world, ROOM.camera_from_world)
     assert (result.images == 128).all()
     assert "has no dynamic_mask, images; plain values stand for them" in caplog.text
-    again = Reconstruction.load(tmp_path / "exports/mini_npz/results.npz", layout="da3")
+    again = Reconstruction.load(tmp_path / "exports/mini_npz/results.npz", format="da3")
     np.testing.assert_array_equal(again.depth, result.depth)
 
 
 def test_the_order_of_quaternions_must_be_said_and_matters(tmp_path):
     WRITERS["vggt4d"](tmp_path / "x")
     with pytest.raises(InputError, match="does not say the order of its quaternions; give quaternion 'wxyz'"):
-        Reconstruction.load(tmp_path / "x", layout="vggt4d")
-    wrong = Reconstruction.load(tmp_path / "x", layout="vggt4d", quaternion="xyzw")
+        Reconstruction.load(tmp_path / "x", format="vggt4d")
+    wrong = Reconstruction.load(tmp_path / "x", format="vggt4d", quaternion="xyzw")
     assert np.abs(wrong.camera_from_world - ROOM.camera_from_world).max() > 0.1
 
 
@@ -161,6 +161,6 @@ def test_what_is_broken_is_named(tmp_path, layout, change, message):
     WRITERS[layout](tmp_path / "x")
     change(tmp_path / "x")
     with pytest.raises(ResultError, match=message) as raised:
-        Reconstruction.load(tmp_path / "x", layout=layout, quaternion=QUATERNIONS[layout])
+        Reconstruction.load(tmp_path / "x", format=layout, quaternion=QUATERNIONS[layout])
     assert str(raised.value).startswith(f"{tmp_path / 'x'} cannot be loaded as a result of {layout}: ")
     assert "\n" not in str(raised.value)

@@ -5,14 +5,13 @@ import numpy as np
 import trimesh
 
 from tests.room import WALL, make_room
-from vggtjax.results import point_cloud
-from vggtjax.results.glb import _LINEAR, build_scene, clip_clouds, glb_bytes, limited_clouds
+from vggtjax.results import glb, point_cloud
+from vggtjax.results.glb import _LINEAR, build_scene, glb_bytes, result_scene
 
 
-def load_scene(room, percentile=0.0, **options):
+def load_scene(room):
     """Return the scene of a result, through a GLB file."""
-    clouds = clip_clouds(room, point_cloud.least_confidence(room, percentile), **options)
-    return trimesh.load_scene(io.BytesIO(glb_bytes(build_scene(room, clouds))), file_type="glb")
+    return trimesh.load_scene(io.BytesIO(glb_bytes(result_scene(room, 0.0))), file_type="glb")
 
 
 def test_nodes_and_points():
@@ -34,9 +33,9 @@ def test_dark_tones_stay_apart_and_nothing_is_lit():
     np.testing.assert_allclose(_LINEAR[[0, 10, 255]], [0, 10 / 255 / 12.92, 1], rtol=1e-6)
     greys = np.repeat(np.arange(256), 3).reshape(-1, 3).astype("u1")
     cloud = point_cloud.PointCloud(np.zeros((256, 3), np.float32), greys)
-    glb = glb_bytes(build_scene(make_room(1), limited_clouds(cloud, [])))
-    size = int.from_bytes(glb[12:16], "little")
-    tree, buffer = json.loads(glb[20 : 20 + size]), glb[28 + size :]
+    data = glb_bytes(build_scene(make_room(1), cloud, []))
+    size = int.from_bytes(data[12:16], "little")
+    tree, buffer = json.loads(data[20 : 20 + size]), data[28 + size :]
     assert tree["extensionsUsed"] == ["KHR_materials_unlit"]
     (material,) = tree["materials"]
     assert "KHR_materials_unlit" in material["extensions"]
@@ -49,13 +48,12 @@ def test_dark_tones_stay_apart_and_nothing_is_lit():
     np.testing.assert_array_equal(values[:, 0], _LINEAR)
 
 
-def test_points_are_limited_evenly_and_reproducibly():
+def test_points_are_limited_and_reproducible(monkeypatch):
+    monkeypatch.setattr(glb, "POINT_LIMIT", 1000)
     room = make_room()
-    scene, again = load_scene(room, point_limit=1000), load_scene(room, point_limit=1000)
-    total, kept = room.depth.size, 0
-    for name in ("static", "dynamic_000000", "dynamic_000001", "dynamic_000002"):
-        whole = (~room.dynamic_mask).sum() if name == "static" else room.dynamic_mask[int(name[-1])].sum()
-        assert abs(len(scene.geometry[name].vertices) - whole * 1000 / total) < 1
-        kept += len(scene.geometry[name].vertices)
+    scene, again = load_scene(room), load_scene(room)
+    moving = [f"dynamic_{frame:06d}" for frame in range(3)]
+    assert 600 < len(scene.geometry["static"].vertices) <= 800
+    assert [len(scene.geometry[name].vertices) for name in moving] == [66] * 3
+    for name in ("static", *moving):
         np.testing.assert_array_equal(scene.geometry[name].vertices, again.geometry[name].vertices)
-    assert 990 < kept <= 1000

@@ -31,7 +31,7 @@ def test_files_of_others_are_never_replaced(tmp_path, name):
         make_room(1).save(tmp_path)
 
 
-@pytest.mark.parametrize(("writer", "earlier"), [("encode_depth", False), ("build_scene", True), ("write_page", True)])
+@pytest.mark.parametrize(("writer", "earlier"), [("encode_depth", False), ("result_scene", True), ("write_page", True)])
 def test_full_disk_leaves_the_earlier_result_untouched(tmp_path, monkeypatch, writer, earlier):
     folder = tmp_path / "result"
     if earlier:

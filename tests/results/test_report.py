@@ -107,10 +107,9 @@ def test_the_path_by_hand():
     """A camera that goes 2 to the right and 1 forward, seen from above: right is right, forward is up."""
     poses = np.tile(np.eye(3, 4, dtype=np.float32), (3, 1, 1))
     poses[:, 0, 3], poses[:, 2, 3] = (0, -1, -2), (0, 0, -1)
-    (above, drawing), (side, _) = charts.camera_views(make_room(camera_from_world=poses))
-    assert (above, side) == ("From above", "From the side")
-    steps = [path.get("d", "") for path in drawing if path.get("stroke-width") == "2.6"]
-    places = np.array([[float(x) for x in re.findall(r"-?[\d.]+", step)] for step in steps])
+    above, side = charts.camera_views(make_room(camera_from_world=poses))
+    assert (above["title"], side["title"]) == ("From above", "From the side")
+    places = np.array([[float(x) for x in re.findall(r"-?[\d.]+", step)] for step, _ in above["way"]])
     (x0, y0, x1, y1), (_, _, x2, y2) = places
     assert (x2 - x1) == pytest.approx(x1 - x0, abs=0.2)
     assert y1 == pytest.approx(y0, abs=0.2)

@@ -43,15 +43,15 @@ def test_on_this_machine_the_page_needs_no_token_and_nothing_else_is_served():
 
 def test_elsewhere_every_request_needs_the_token():
     with served(host="0.0.0.0") as server:
-        assert server.token
-        assert server.url.endswith(f"/?token={server.token}")
+        assert server.door.token
+        assert server.door.url.endswith(f"/?token={server.door.token}")
         cookie = f"vggtjax_{server.server_port}"
         wrong = {"Cookie": f"{cookie}=wrong"}
         for path, headers in (("/", {}), ("/?token=%C3%A9", {}), ("/", wrong), ("/", UPGRADE), ("/any", {})):
             status, body, _ = get(server, path, **headers)
             assert status == 403
             assert "the page" not in body
-        status, _, headers = get(server, f"/?token={server.token}")
+        status, _, headers = get(server, f"/?token={server.door.token}")
         assert (status, headers["Location"]) == (303, "/")
         assert "HttpOnly" in headers["Set-Cookie"]
         assert get(server, "/", Cookie=headers["Set-Cookie"].split(";")[0])[:2] == (200, "<p>the page</p>")

@@ -6,6 +6,7 @@ Knows nothing of browsers. Does not import jax before the first job.
 from __future__ import annotations
 
 import logging
+import re
 import secrets
 import shutil
 import threading
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 from vggtjax.app.limits import Limits
 from vggtjax.app.models import Models
-from vggtjax.app.uploads import check_clip, keep, safe_stem
+from vggtjax.app.uploads import check_clip, clip_of, safe_stem
 from vggtjax.errors import InputError, VggtjaxError, check_choice, whole_number
 from vggtjax.options import Options
 from vggtjax.progress import Progress
@@ -65,12 +66,12 @@ class Stage:
 class Job:
     """One reconstruction, from request to outputs."""
 
-    def __init__(self, request: Request, owner: str, folder: Path) -> None:
-        self.request, self.owner, self.folder = request, owner, folder
+    def __init__(self, request: Request, source: Path | tuple[Path, ...] | None, owner: str, folder: Path) -> None:
+        """`source` is the clip in the uploads; None is the embedded one."""
+        self.request, self.source, self.owner, self.folder = request, source, owner, folder
         self.state: State = "waiting"
         self.message = ""  # why it failed, in one sentence
         self.stages: list[Stage] = []
-        self.source: Path | tuple[Path, ...] | None = None  # None: the embedded clip
         self.outputs: Outputs | None = None
         self._cancelled = threading.Event()
 
@@ -106,7 +107,7 @@ class Job:
 
 
 class Desk:
-    """Takes jobs, runs one at a time, and keeps the last results in `folder`, which it removes at the end."""
+    """Takes jobs, runs one at a time, and keeps the last results in `folder`."""
 
     def __init__(
         self, folder: Path, models: Models, limits: Limits, run: Callable[[Job, Models, Limits], None] | None = None
@@ -116,7 +117,7 @@ class Desk:
         self.uploads, self.results = folder / "uploads", folder / "results"
         for path in (self.uploads, self.results):
             path.mkdir(parents=True)
-        self._folder, self._run = folder, run or run_job
+        self._run = run or run_job
         self._lock = threading.Lock()
         self._open: list[Job] = []  # running first, then waiting in their order
         self._finished: deque[Job] = deque()
@@ -125,24 +126,24 @@ class Desk:
     def submit(self, request: Request, owner: str) -> Job:
         """Check a request and queue it.
 
-        Raises InputError for a value out of range, files that are no clip, a full queue, or an owner who has an open
-        job.
+        Raises InputError for a value that the page does not offer, files that are no clip, a full queue, or an owner
+        who has an open job.
         """
-        check_request(request, self.models, self.limits)
-        job = Job(request, owner, self.results / secrets.token_urlsafe(16))
+        check_choice("model", request.model, self.models.names)
+        Options(method=request.method)  # pyright: ignore[reportArgumentType]
+        if whole_number("frames", request.frames, 1) > self.limits.max_frames:
+            raise InputError(f"frames is {request.frames}; expected at most {self.limits.max_frames}")
+        if request.fps is not None and not 0 < request.fps <= _MOST_FPS:
+            raise InputError(f"fps is {request.fps}; expected a number above 0, at most {_MOST_FPS}")
+        source = clip_of(request.files, self.uploads) if request.files else None
+        job = Job(request, source, owner, self.results / secrets.token_urlsafe(16))
         with self._lock:
             if any(other.owner == owner for other in self._open):
                 raise InputError("your earlier job is not over yet; wait for it or cancel it")
             if len(self._open) > self.limits.max_waiting:
                 raise InputError(f"the queue is full, with {len(self._open) - 1} waiting; try again in a few minutes")
             self._open.append(job)
-        try:
-            if request.files:
-                job.source = keep(request.files, self.uploads, job.folder / "clip", self.limits)
             self._worker.submit(self._work, job)
-        except BaseException:
-            self._end(job, "failed")
-            raise
         return job
 
     def ahead(self, job: Job) -> int:
@@ -153,58 +154,40 @@ class Desk:
     def cancel(self, owner: str) -> None:
         """Cancel the open job of an owner: at once where it waits, else at its next stage or step."""
         with self._lock:
-            jobs = [job for job in self._open if job.owner == owner]
-            for job in jobs:
+            for job in [job for job in self._open if job.owner == owner]:
                 job.cancel()
-            waiting = [job for job in jobs if job.state == "waiting"]
-        for job in waiting:
-            self._end(job, "cancelled")
+                if job.state == "waiting":
+                    job.state = "cancelled"
+                    self._open.remove(job)
 
     def close(self) -> None:
-        """Cancel all jobs, wait for the running one to stop, and remove the folder."""
+        """Cancel all jobs, and wait for the running one to stop."""
         with self._lock:
             for job in self._open:
                 job.cancel()
         self._worker.shutdown(cancel_futures=True)
-        shutil.rmtree(self._folder, ignore_errors=True)
 
     def _work(self, job: Job) -> None:
         with self._lock:
-            if job.is_cancelled:  # while it waited
+            if job.is_over:  # cancelled while it waited
                 return
             job.state = "running"
-        state: State = "cancelled"
+        state: State = "failed"
         try:
             self._run(job, self.models, self.limits)
             state = "cancelled" if job.is_cancelled else "done"
         except CancelledError:
-            pass
+            state = "cancelled"
         except Exception as error:
-            job.message, state = _sentence(error, job.folder), "failed"
-        finally:
-            self._end(job, state)
-
-    def _end(self, job: Job, state: State) -> None:
-        """Set the last state of a job, and remove its upload, and results beyond the limit."""
-        shutil.rmtree(job.folder / "clip" if state == "done" else job.folder, ignore_errors=True)
+            job.message = _sentence(error, (job.folder, self.uploads))
         with self._lock:
-            job.state = state
             self._open.remove(job)
             if state == "done":
                 self._finished.append(job)
             old = [self._finished.popleft() for _ in range(len(self._finished) - self.limits.max_results)]
-        for each in old:
+        for each in old if state == "done" else (job,):
             shutil.rmtree(each.folder, ignore_errors=True)
-
-
-def check_request(request: Request, models: Models, limits: Limits) -> None:
-    """Raise InputError for a value that the page does not offer."""
-    check_choice("model", request.model, models.names)
-    Options(method=request.method)  # pyright: ignore[reportArgumentType]
-    if whole_number("frames", request.frames, 1) > limits.max_frames:
-        raise InputError(f"frames is {request.frames}; expected at most {limits.max_frames}")
-    if request.fps is not None and not 0 < request.fps <= _MOST_FPS:
-        raise InputError(f"fps is {request.fps}; expected a number above 0, at most {_MOST_FPS}")
+        job.state = state
 
 
 def run_job(job: Job, models: Models, limits: Limits) -> None:
@@ -249,10 +232,11 @@ def _demo_clip(model: Model, frames: int) -> Clip:
     return load_clip(images, size=size, patch=model.config.patch_size)
 
 
-def _sentence(error: Exception, folder: Path) -> str:
+def _sentence(error: Exception, folders: tuple[Path, ...]) -> str:
     """Return the sentence that a user reads: of our own errors, without the folders of this machine."""
     if isinstance(error, VggtjaxError):
-        return str(error).replace(f"{folder / 'clip'}/", "").replace(f"{folder}/", "")
+        places = "|".join(re.escape(str(folder.resolve())) for folder in folders)
+        return re.sub(rf"(?:{places})/(?:[0-9a-f]{{64}}/)?", "", str(error))
     if isinstance(error, MemoryError):
         return "this machine has too little memory for the job; choose fewer frames"
     logger.error("a job failed", exc_info=error)

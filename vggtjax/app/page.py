@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import gradio as gr
 import msgspec
-from gradio.data_classes import GradioRootModel
 from gradio.themes import Base, Soft
 
-from vggtjax.app import status
 from vggtjax.app.jobs import Desk, Job, Request
 from vggtjax.app.models import DEMO
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS
+from vggtjax.storage.markup import macros
 
+RESULTS = "results"  # the path under which the server serves the folder of results
 _LOOK_EVERY = 0.3  # seconds
+_CLEAN_UP = (3600, 86400)  # seconds: every hour, uploads of yesterday go
+_HTML = macros("app/status.html")
 _FRAMES, _LEAST_FRAMES = 16, 2
 _MOST_FPS = 30
 _TITLE = "vggtjax: a video in, a 4-D scene out"
@@ -26,7 +30,7 @@ _INTRODUCTION = (
     "# vggtjax\nDrop a video. You get the **cameras**, the **depth** and a mask of **what moves** in every frame, and "
     "a **4-D point cloud** to fly through: a viewer, a film and all files."
 )
-_LAYERS = "Picture and depth (red is near) above; confidence (white is sure) and what moves below."
+_LAYERS = "Picture and depth (red is near) above; confidence (yellow is sure) and what moves below."
 _SHEET = "Up to eight frames at a glance. A click opens the picture in full size."
 _FILM = "The camera circles the scene while the moving points play."
 CSS = (Path(__file__).with_name("page.css")).read_text(encoding="utf-8")
@@ -53,7 +57,7 @@ def theme() -> Base:
 def build_page(desk: Desk) -> gr.Blocks:
     """Return the page, whose jobs run at the desk."""
     limits = desk.limits
-    with gr.Blocks(title=_TITLE, analytics_enabled=False, fill_width=True) as page:
+    with gr.Blocks(title=_TITLE, analytics_enabled=False, fill_width=True, delete_cache=_CLEAN_UP) as page:
         gr.Markdown(_INTRODUCTION, elem_classes="introduction")
         with gr.Row(elem_classes="columns"):
             with gr.Column(scale=2, min_width=320):
@@ -64,7 +68,6 @@ def build_page(desk: Desk) -> gr.Blocks:
                     height=170,
                     elem_id="clip",
                 )
-                files.data_model = _Names
                 gr.Markdown(
                     f"At most {limits.max_upload_mb} MB, and {limits.max_seconds} s of video.", elem_classes="limits"
                 )
@@ -101,7 +104,7 @@ def build_page(desk: Desk) -> gr.Blocks:
                     cancel = gr.Button("Cancel", variant="stop", visible=False, elem_id="cancel", min_width=80)
                 example = gr.Button("Try the demo clip", variant="secondary", elem_id="example")
             with gr.Column(scale=5, min_width=320):
-                progress = gr.HTML(status.idle(), elem_id="progress")
+                progress = gr.HTML(_HTML.idle(), elem_id="progress")
                 with gr.Column(visible=False, elem_id="results") as results:
                     with gr.Tabs():
                         shown = []
@@ -109,6 +112,8 @@ def build_page(desk: Desk) -> gr.Blocks:
                             with gr.Tab(name, render_children=True):
                                 shown.append(gr.HTML(elem_id=name.lower()))
                     shown.append(gr.HTML(elem_id="downloads"))
+        for block in (files, model, method, frames, fps):
+            block.async_move_resource_to_block_cache = _stays  # no address is fetched
         # Every user may wait for a job here; the desk decides whose turn it is.
         outputs = [progress, results, start, example, cancel, *shown]
         listener = {
@@ -127,10 +132,14 @@ def build_page(desk: Desk) -> gr.Blocks:
     return page
 
 
-class _Names(GradioRootModel):
-    """Names of uploads, which the guard puts in place of gradio's paths."""
+async def _stays(url_or_file_path: str | Path | None) -> str | None:
+    return None if url_or_file_path is None else str(url_or_file_path)
 
-    root: Any
+
+class _File(msgspec.Struct):
+    """What counts of an upload's entry."""
+
+    path: str
 
 
 class _Watched:
@@ -142,9 +151,9 @@ class _Watched:
     async def own(
         self, files: Any, model: Any, method: Any, frames: Any, fps: Any, request: gr.Request
     ) -> AsyncIterator[list[Any]]:
-        """Run the user's own clip; files are names of uploads."""
+        """Run the user's own clip; files are entries of uploads."""
         if not files:
-            yield _changes(status.refusal("no clip yet: drop a video or pictures first, or try the demo clip"))
+            yield _changes(_HTML.refusal("no clip yet: drop a video or pictures first, or try the demo clip"))
             return
         async for change in self._watch((files, model, method, frames, fps), request):
             yield change
@@ -163,20 +172,20 @@ class _Watched:
 
     async def _watch(self, values: tuple[Any, ...], request: gr.Request) -> AsyncIterator[list[Any]]:
         try:
-            files, model, method, frames, fps = msgspec.convert(values, tuple[list[str], str, str, int, float])
-            asked = Request(tuple(self._desk.uploads / file for file in files), model, method, frames, fps or None)
+            files, model, method, frames, fps = msgspec.convert(values, tuple[list[_File], str, str, int, float])
+            asked = Request(tuple(Path(file.path) for file in files), model, method, frames, fps or None)
             job = await asyncio.to_thread(self._desk.submit, asked, str(request.session_hash))
         except msgspec.ValidationError:
-            yield _changes(status.refusal("the page sent a value of the wrong kind; load the page again"))
+            yield _changes(_HTML.refusal("the page sent a value of the wrong kind; load the page again"))
             return
         except InputError as error:
-            yield _changes(status.refusal(str(error)))
+            yield _changes(_HTML.refusal(str(error)))
             return
         try:
             while not job.is_over:
-                yield _changes(status.status(job, self._desk.ahead(job)), is_open=True)
+                yield _changes(_HTML.status(job, self._desk.ahead(job), time.monotonic()), is_open=True)
                 await asyncio.sleep(_LOOK_EVERY)
-            yield _changes(status.status(job, 0), job)
+            yield _changes(_HTML.status(job, 0, time.monotonic()), job)
         finally:
             job.cancel()  # where the page is closed meanwhile; nothing where the job is over
 
@@ -187,13 +196,18 @@ def _changes(text: str, job: Job | None = None, *, is_open: bool = False) -> lis
     if job is None or job.outputs is None or job.state != "done":
         return [text, gr.update(visible=False), *buttons, *[gr.update() for _ in range(5)]]
     outputs = job.outputs
+
+    def address(path: Path) -> str:
+        """Return the address of a file of the job, below the page's own."""
+        return f"{RESULTS}/{quote(path.relative_to(job.folder.parent).as_posix())}"
+
     return [
         text,
         gr.update(visible=True),
         *buttons,
-        status.viewer(job, outputs),
-        status.video(job, outputs.film, _FILM),
-        status.video(job, outputs.layers, _LAYERS),
-        status.picture(job, outputs.sheet, _SHEET),
-        status.downloads(job, outputs),
+        _HTML.viewer(address(outputs.viewer)),
+        _HTML.video(address(outputs.film), _FILM),
+        _HTML.video(address(outputs.layers), _LAYERS),
+        _HTML.picture(address(outputs.sheet), _SHEET),
+        _HTML.downloads(outputs, address),
     ]

@@ -1,10 +1,8 @@
-"""What strangers send: a checked video, or checked pictures, in the folder of a job. Does not import jax."""
+"""What users send: a checked video, or checked pictures. Does not import jax."""
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,18 +14,14 @@ from vggtjax.clips.sources import open_source
 from vggtjax.clips.video import VideoFile, is_video_name
 from vggtjax.errors import ClipError, one_line
 
-_MOST_PICTURES = 1000
 _UNKNOWN_LENGTH_FPS = 4.0  # frames per second of a video that does not say how long it is
 
 
-def keep(files: Sequence[Path], uploads: Path, folder: Path, limits: Limits) -> Path | tuple[Path, ...]:
-    """Link one video or several pictures of `uploads` into `folder`; return what `open_source` opens.
+def clip_of(files: Sequence[Path], uploads: Path) -> Path | tuple[Path, ...]:
+    """Return the one video, or the pictures in the order of a folder's, among the files of `uploads`.
 
-    Names are made safe, and pictures sorted as a folder's are. Raises ClipError for files that cannot be a clip by
-    their number, name or size, or that are gone.
+    Raises ClipError for files that cannot be a clip by their number or name, or that are no uploads.
     """
-    if not files:
-        raise ClipError("no file was sent; choose a video, or several pictures")
     paths = [path.resolve() for path in files]
     names = ", ".join(one_line(path.name, 60) for path in paths[:3])
     if not all(path.is_relative_to(uploads.resolve()) and path.is_file() for path in paths):
@@ -37,19 +31,7 @@ def keep(files: Sequence[Path], uploads: Path, folder: Path, limits: Limits) -> 
         raise ClipError(f"{names}: by its name this is no video and no picture; send one such as .mp4, .mov or .jpg")
     if videos and len(paths) > 1:
         raise ClipError(f"{len(paths)} files with a video among them; send one video, or pictures only")
-    if len(paths) > _MOST_PICTURES:
-        raise ClipError(f"{len(paths)} pictures were sent; send at most {_MOST_PICTURES}")
-    total = sum(path.stat().st_size for path in paths)
-    if total > limits.upload_bytes:
-        raise ClipError(f"the upload has {total / 1e6:.1f} MB; send at most {limits.max_upload_mb} MB")
-    folder.mkdir(parents=True)
-    kept = []
-    for number, path in enumerate(sorted(paths, key=lambda path: (natural_key(Path(path.name)), str(path)))):
-        order = "" if videos else f"{number:06d}-"
-        place = folder / f"{order}{safe_stem(path.name)}{path.suffix.lower()}"
-        _link(path, place)
-        kept.append(place)
-    return kept[0] if videos else tuple(kept)
+    return videos[0] if videos else tuple(sorted(paths, key=lambda path: natural_key(Path(path.name))))
 
 
 def check_clip(
@@ -76,10 +58,3 @@ def check_clip(
 def safe_stem(name: str) -> str:
     """Return a file's name without its suffix, of letters, digits, dots and dashes only, at most 60 of them."""
     return re.sub(r"[^A-Za-z0-9._-]+", "-", Path(name).stem)[:60].strip(".-") or "clip"
-
-
-def _link(path: Path, place: Path) -> None:
-    try:
-        os.link(path, place)
-    except OSError:  # another file system, or one without links
-        shutil.copyfile(path, place)

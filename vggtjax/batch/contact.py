@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
-from xml.etree.ElementTree import Element
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from vggtjax.errors import OutputError, ResultError, one_line
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.results.report import REPORT_NAME
 from vggtjax.storage.arrays import read_arrays
-from vggtjax.storage.markup import element, page, relative_link, write_page
+from vggtjax.storage.markup import relative_link, render, write_page
 from vggtjax.storage.writing import writing
 
 _MOST_CARDS = 2000  # of results; more make a page that no browser shows well
@@ -50,7 +49,7 @@ class ContactPage:
 
     def __init__(self, out: Path, clips: int) -> None:
         self._out, self._clips, self._told = out, clips, 0
-        self._cards: dict[str, Element] = {}
+        self._cards: dict[str, dict[str, Any]] = {}
         self._failures: dict[str, str] = {}
         self._results: set[str] = set()
         self._next = 0.0
@@ -93,14 +92,12 @@ class ContactPage:
         counts += [f"{left} to come"] if left else []
         if max(len(self._results), len(self._failures)) > _MOST_CARDS:
             counts.append(f"of which {_MOST_CARDS} are shown")
-        failures = (
-            element("p", element("b", one_line(name, 120)), f" failed: {one_line(reason, 600)}", class_="failed")
-            for name, reason in islice(self._failures.items(), _MOST_CARDS)
-        )
-        header = element("header", element("h1", "Clips"), element("p", ", ".join(counts), class_="faint"), *failures)
-        cards = (self._cards[name] for name in sorted(self._cards))
-        return page(
-            f"{counts[0]}: vggtjax", header, element("div", *cards, class_="cards"), pictures="'self' file: data:"
+        return render(
+            "batch/contact.html",
+            title=f"{counts[0]}: vggtjax",
+            counts=", ".join(counts),
+            failures=dict(islice(self._failures.items(), _MOST_CARDS)),
+            cards=[self._cards[name] for name in sorted(self._cards)],
         )
 
 
@@ -121,26 +118,21 @@ def contact_page(place: Destination, clips: int) -> Iterator[Callable[[ClipOutco
         contact.write()
 
 
-def _card(out: Path, name: str) -> Element:
+def _card(out: Path, name: str) -> dict[str, Any]:
     folder = out / name
     picture, target = (next((n for n in names if (folder / n).is_file()), None) for names in (_PICTURES, _TARGETS))
-    image = None
-    if picture is not None:
-        alt = f"a frame of {one_line(name, 120)}, its depth and what moves"
-        image = element("img", src=relative_link(name, *picture.split("/")), alt=alt, loading="lazy")
     try:
         clip = _read(folder / ARCHIVE_NAME)
         size = f"{clip.frames} frame{'' if clip.frames == 1 else 's'} of {clip.width} x {clip.height} pixels"
         told = f"{size}, {clip.dynamic_share:.1%} moving, {one_line(clip.method, 60)}"
     except ResultError as error:
         told = f"cannot be read: {one_line(str(error))}"
-    link = {"href": relative_link(name, *(target or ARCHIVE_NAME).split("/"))}
-    note = element("p", told, class_="note")
-    return element(
-        "article",
-        element("a", image, **link) if image is not None else None,
-        element("div", element("h2", element("a", one_line(name, 120), **link)), note, class_="text"),
-    )
+    return {
+        "name": name,
+        "picture": relative_link(f"{name}/{picture}") if picture else None,
+        "link": relative_link(f"{name}/{target or ARCHIVE_NAME}"),
+        "told": told,
+    }
 
 
 def _read(path: Path) -> _Clip:

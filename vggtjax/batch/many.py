@@ -110,7 +110,7 @@ def reconstruct_many(
         options=options,
         framing=framing,
         sampling=Sampling(**sampling) if isinstance(sampling, Mapping) else sampling or Sampling(),
-        saving=Saving().changed(**saving) if isinstance(saving, Mapping) else saving or Saving(),
+        saving=Saving(**saving) if isinstance(saving, Mapping) else saving or Saving(),
         known=known or None,
         pad_frames=pad_frames,
         devices=devices,

@@ -32,19 +32,22 @@ def app(
         limits: what users may ask
     """
     check_extra("the app", "app", "gradio")
+    from vggtjax.app.jobs import Desk
     from vggtjax.app.models import Models
-    from vggtjax.app.server import address, bounded_folder, listening, made_token, needs_token, serve
+    from vggtjax.app.server import bounded_folder, build_application, serve
+    from vggtjax.viewer.door import Door, listening, token_for
 
     if token is not None and not (token.isascii() and token.isalnum() and len(token) >= LEAST_TOKEN):
         raise InputError(f"token is {token!r}; expected letters and digits, at least {LEAST_TOKEN}")
-    if token is None and needs_token(host):
-        token = made_token()
     report, models = Report(), Models(model)
-    with listening(host, port) as opened, bounded_folder() as folder:
+    with listening(host, port) as opened, bounded_folder() as folder:  # a port in use is found before the work
         with report.running():
             models.check(report.stage)
-
-        def ready() -> None:
-            report.line(f"Open {address(host, opened.getsockname()[1], token)}  (Ctrl+C ends the app)")
-
-        serve(opened, folder, models, limits, token, ready)
+        door = Door(host, opened.getsockname()[1], token or token_for(host))
+        desk = Desk(folder, models, limits)
+        try:
+            application = build_application(desk, door)
+            report.line(f"Open {door.url}  (Ctrl+C ends the app)")
+            serve(application, opened)
+        finally:
+            desk.close()

@@ -28,7 +28,7 @@ EXTRAS: dict[str, tuple[str, tuple[str, ...]]] = {
     "hub": ("models by hub id, such as facebook/VGGT-1B", ("huggingface_hub",)),
     "convert": ("PyTorch checkpoints, .pt and .pth", ("torch",)),
     "train": ("vggtjax train, and plots of fits", ("optax", "orbax", "matplotlib")),
-    "evaluate": ("plots and the page of vggtjax evaluate", ("matplotlib", "jinja2")),
+    "evaluate": ("plots of vggtjax evaluate", ("matplotlib",)),
     "view": (".viser recordings of vggtjax view", ("viser",)),
     "app": ("vggtjax app", ("gradio",)),
     "colmap": ("--refine-cameras, and models of COLMAP", ("pycolmap",)),

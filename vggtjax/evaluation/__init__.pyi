@@ -1,7 +1,7 @@
 from .datasets import DATASETS as DATASETS
 from .datasets import find_sequences as find_sequences
 from .datasets.sequence import LabelledSequence as LabelledSequence
-from .datasets.sequence import Sequence as Sequence
+from .metrics.depth import video_depth_errors as video_depth_errors
 from .metrics.masks import frame_scores as frame_scores
 from .metrics.masks import mask_scores as mask_scores
 from .metrics.masks import pooled_scores as pooled_scores
@@ -12,6 +12,5 @@ from .metrics.point_clouds import point_cloud_errors as point_cloud_errors
 from .metrics.trajectory import associate as associate
 from .metrics.trajectory import trajectory_errors as trajectory_errors
 from .metrics.uncertainty import uncertainty_scores as uncertainty_scores
-from .metrics.video_depth import video_depth_errors as video_depth_errors
 from .protocol import score as score
 from .truth_at_pixels import TruthAtPixels as TruthAtPixels

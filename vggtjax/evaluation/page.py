@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from vggtjax.evaluation import tables
 from vggtjax.evaluation.plots import draw_sequence
 from vggtjax.evaluation.records import FOLDER, Record, Records, costs, safe_name, summary
 from vggtjax.storage.json_values import read_json
+from vggtjax.storage.markup import render
 from vggtjax.storage.writing import check_free, writing
 
 PLOT_FOLDER = "plots"
@@ -33,10 +33,10 @@ def check_report(out: Path, store: Records) -> None:
     """Make sure that `write_report` can write into `out`, before hours are spent.
 
     Raises:
-        MissingExtraError: matplotlib or jinja2 is not installed.
+        MissingExtraError: matplotlib is not installed.
         OutputError: the folder cannot be written, or holds files that are not of an evaluation.
     """
-    check_extra("drawing an evaluation", "evaluate", "matplotlib", "jinja2")
+    check_extra("drawing an evaluation", "evaluate", "matplotlib")
     replaced = is_report(out / "results.json") or store.exists()
     check_free(out, (*NAMES, FOLDER), replaced=replaced, what="evaluation")
 
@@ -71,7 +71,20 @@ def write_report(
     sequences = [
         _section(out, [r for r in records if r.name == name], store) for name in dict.fromkeys(r.name for r in records)
     ]
-    _write(out / "index.html", _page(sequences, means, costs(records), settings, warnings))
+    seconds = values["seconds"]
+    page = render(
+        "evaluation/page.html",
+        title=f"{settings['dataset']}: {', '.join(means)}",
+        sequences=sequences,
+        means=means,
+        columns=tables.shown_columns(means),
+        costs=seconds,
+        stages=list(dict.fromkeys(stage for row in seconds.values() for stage in row)),
+        settings=settings,
+        warnings=warnings,
+        tables=tables,
+    )
+    _write(out / "index.html", page)
 
 
 def _section(out: Path, records: Sequence[Record], store: Records) -> dict[str, Any]:
@@ -89,32 +102,6 @@ def _section(out: Path, records: Sequence[Record], store: Records) -> dict[str, 
         "columns": tables.shown_columns(rows),
         "plots": [{"file": f"{folder}/{file}", "title": title} for file, title in plots],
     }
-
-
-def _page(
-    sequences: Sequence[Mapping[str, Any]],
-    means: Mapping[str, Mapping[str, float]],
-    seconds: Mapping[str, Mapping[str, float]],
-    settings: Mapping[str, Any],
-    warnings: Sequence[str],
-) -> str:
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(autoescape=True, undefined=StrictUndefined)
-    template = environment.from_string(files("vggtjax.evaluation").joinpath("page.html").read_text(encoding="utf-8"))
-    return template.render(
-        title=f"{settings['dataset']}: {', '.join(means)}",
-        sequences=sequences,
-        frames=sum(sequence["frames"] for sequence in sequences),
-        means=means,
-        columns=tables.shown_columns(means),
-        costs=seconds,
-        stages=list(dict.fromkeys(stage for row in seconds.values() for stage in row)),
-        failed={method: tables.failed(row) for method, row in means.items() if row["failed"]},
-        settings=settings,
-        warnings=warnings,
-        tables=tables,
-    )
 
 
 def _write(path: Path, text: str) -> None:

@@ -12,20 +12,18 @@ from jaxtyping import Bool, Float32, Float64
 from scipy.ndimage import map_coordinates
 
 from vggtjax.errors import InputError
+from vggtjax.evaluation.metrics.depth import Align, depth_alignment, video_depth_errors
 from vggtjax.evaluation.metrics.masks import Empty, auc, frame_scores, mask_statistics
 from vggtjax.evaluation.metrics.point_clouds import nearest_distances, paired_distance, statistics
 from vggtjax.evaluation.metrics.trajectory import trajectory_errors
 from vggtjax.evaluation.metrics.uncertainty import reliability_curve, sparsification_curve, uncertainty_scores
-from vggtjax.evaluation.metrics.video_depth import Align, depth_alignment, video_depth_errors
 from vggtjax.evaluation.truth_at_pixels import AbsentError, TruthAtPixels, known_points
 from vggtjax.geometry.similarity import Similarity, centres, umeyama_sim3
-from vggtjax.progress import Progress
 from vggtjax.results.frame import source_pixels
 from vggtjax.results.result import Result, missing_fields
 
 _HISTOGRAM = np.geomspace(1e-3, 10, 41)  # metres, bins of point distances
 _PICTURED = 4  # frames whose maps are in the curves
-_CHUNK = 1 << 20  # points that are transformed at a time
 
 _Outputs = tuple[dict[str, float], dict[str, np.ndarray]]  # metrics and curves
 
@@ -45,7 +43,6 @@ def score(
     *,
     depth_align: Align = "scale",
     empty: Empty = "davis",
-    progress: Progress | None = None,
 ) -> Scores:
     """Score a result by each protocol of docs/reference/evaluation-protocols.md that the sequence has ground truth for.
 
@@ -54,7 +51,6 @@ def score(
         truth: of the sequence, at the pixels of this result.
         depth_align: alignment of video depth to the truth.
         empty: J of a frame in which neither mask has a pixel: 1 ("davis") or 0 ("vggt4d").
-        progress: called while point clouds are compared.
 
     Returns:
         The metrics, all finite; notes and problems say why others are missing.
@@ -65,7 +61,7 @@ def score(
     problems: list[str] = []
     protocols: dict[str, Callable[[Result, TruthAtPixels], _Outputs]] = {
         "trajectory": _trajectory,
-        "point clouds": partial(_point_clouds, progress=progress),
+        "point clouds": _point_clouds,
         "masks": partial(_masks, empty=empty),
         "video depth": partial(_video_depth, align=depth_align),
         "uncertainty": _uncertainty,
@@ -103,31 +99,26 @@ def _alignment(result: Result, poses: Float64[np.ndarray, "S 4 4"], *, allow_lin
     return umeyama_sim3(centres(result.camera_from_world), poses[:, :3, 3], allow_line=allow_line)
 
 
-def _point_clouds(result: Result, truth: TruthAtPixels, *, progress: Progress | None) -> _Outputs:
+def _point_clouds(result: Result, truth: TruthAtPixels) -> _Outputs:
     true, known = truth.points, truth.depth > 0
     intrinsics = result.intrinsics.astype(np.float64)
     predicted = known_points(result.depth, intrinsics, result.camera_from_world.astype(np.float64), known)
     if not np.isfinite(predicted).all():
         raise InputError(f"{int((~np.isfinite(predicted).all(axis=1)).sum())} predicted points are not finite")
     similarity = _alignment(result, truth.poses)
-    for start in range(0, len(predicted), _CHUNK):
-        predicted[start : start + _CHUNK] = similarity.apply(predicted[start : start + _CHUNK])
+    predicted = similarity.apply(predicted).astype(np.float32)
     paired = paired_distance(predicted, true)
     ways = {"accuracy": (predicted, true), "completeness": (true, predicted)}
     metrics: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {"distance_bins": _HISTOGRAM}
-    for part, (name, (points, others)) in enumerate(ways.items()):
-        distances = nearest_distances(points, others, progress=_half(progress, part))
+    for name, (points, others) in ways.items():
+        distances = nearest_distances(points, others)
         metrics |= {f"{name}_{kind}": value for kind, value in statistics(distances)._asdict().items()}
         curves[name] = np.histogram(np.clip(distances, *_HISTOGRAM[[0, -1]]), _HISTOGRAM)[0]
     metrics |= {f"distance_paired_{kind}": value for kind, value in paired._asdict().items()}
     for kind in ("mean", "median"):
         metrics[f"distance_chamfer_{kind}"] = (metrics[f"accuracy_{kind}"] + metrics[f"completeness_{kind}"]) / 2
     return metrics, curves
-
-
-def _half(progress: Progress | None, part: int) -> Progress | None:
-    return None if progress is None else lambda done, total: progress(done + part * (total or 0), 2 * (total or 0))
 
 
 def _masks(result: Result, truth: TruthAtPixels, *, empty: Empty) -> _Outputs:

@@ -14,18 +14,17 @@ import numpy as np
 
 from vggtjax.errors import VggtjaxError, one_line, reading
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
+from vggtjax.evaluation.metrics.depth import Align
 from vggtjax.evaluation.metrics.masks import Empty
-from vggtjax.evaluation.metrics.video_depth import Align
 from vggtjax.evaluation.protocol import score
 from vggtjax.evaluation.records import Record, Records, shown_name
 from vggtjax.evaluation.sources import ResultSource
 from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
-from vggtjax.progress import OnStage, Progress, no_progress
+from vggtjax.progress import OnStage, no_progress
 from vggtjax.reconstruction import Reconstruction
 
 _SAMPLES = 3  # frames whose depth and mask are in the fingerprint of a sequence
 _MOST_LETTERS = 1000  # of a reason or a note
-_STEPS = 100  # of a progress bar for each result
 
 logger = logging.getLogger(__name__)
 
@@ -63,87 +62,75 @@ def evaluate(
         A record for each sequence and name of a result, in this order. Where opening, computing or
         scoring raises any exception, the records have the status "failed" and a reason.
     """
-    evaluation = _Evaluation(source, records, settings, scoring)
     scored: list[Record] = []
-    for number, (name, opener) in enumerate(sequences.items()):
-        title = shown_name(name)
-        with on_stage(f"{number + 1}/{len(sequences)} {title}") as progress:
-            scored += evaluation.records_of(title, opener, progress)
+    for number, (key, opener) in enumerate(sequences.items(), start=1):
+        title = shown_name(key)
+        with on_stage(f"{number}/{len(sequences)} {title}") as progress:
+            drafts = {name: Record(title, name, "failed", dict(settings)) for name in source.names}
+            try:
+                sequence = opener()
+                facts = {"notes": _lines(sequence.notes), "frames": len(sequence)}
+                data = fingerprint(sequence)
+                for name in drafts:
+                    own = {**settings, "data": data, "result": source.fingerprint(name, sequence)}
+                    drafts[name] = Record(title, name, "failed", own, **facts)
+            except Exception as error:
+                failures = [replace(draft, reason=_reason(error)) for draft in drafts.values()]
+                for failure in failures:
+                    records.keep(failure, {})
+                scored += failures
+                continue
+            kept = {name: records.kept(title, name, draft.settings) for name, draft in drafts.items()}
+            missing = {name: drafts[name] for name, record in kept.items() if record is None}
+            for record, curves in _computed(missing, sequence, source, scoring):
+                records.keep(record, curves)
+                kept[record.method] = record
+                (progress or no_progress)(sum(each is not None for each in kept.values()), len(kept))
+            scored += [record for record in kept.values() if record is not None]
     return scored
 
 
-@dataclass(frozen=True)
-class _Evaluation:
-    source: ResultSource
-    store: Records
-    settings: Mapping[str, Any]
-    scoring: Scoring
-
-    def records_of(self, title: str, opener: Callable[[], LabelledSequence], progress: Progress | None) -> list[Record]:
-        """Return the records of a sequence, computed or kept, in the order of the source's names."""
-        names = self.source.names
-        drafts = {name: Record(title, name, "failed", dict(self.settings)) for name in names}
-        try:
-            sequence = opener()
-            facts = {"notes": _lines(sequence.notes), "frames": len(sequence)}
-            data = fingerprint(sequence)
-            for name in names:
-                settings = {**self.settings, "data": data, "result": self.source.fingerprint(name, sequence)}
-                drafts[name] = Record(title, name, "failed", settings, **facts)
-        except Exception as error:
-            failures = [replace(draft, reason=_reason(error)) for draft in drafts.values()]
-            for failure in failures:
-                self.store.keep(failure, {})
-            return failures
-        records = {name: self.store.kept(title, name, drafts[name].settings) for name in names}
-        groups = [[drafts[name] for name in group if records[name] is None] for group in self.source.groups]
-        truths = _Truths(sequence, self.scoring.max_depth)
-        steps = _Steps(progress, sum(map(len, groups)))
-        for group in filter(None, groups):
-            records |= {record.method: record for record in self._scored(group, sequence, truths, steps)}
-        return [record for record in records.values() if record is not None]
-
-    def _scored(
-        self, drafts: Sequence[Record], sequence: LabelledSequence, truths: _Truths, steps: _Steps
-    ) -> Iterator[Record]:
-        """Compute the results of a group, score them, and write their records."""
+def _computed(
+    drafts: Mapping[str, Record], sequence: LabelledSequence, source: ResultSource, scoring: Scoring
+) -> Iterator[tuple[Record, dict[str, np.ndarray]]]:
+    """Yield the scored results of a sequence with their curves, computed group by group."""
+    truth = None
+    for group in source.groups:
+        names = [name for name in group if name in drafts]
         seconds: dict[str, float] = {}
 
         @contextmanager
-        def timed(name: str) -> Iterator[None]:
+        def timed(stage: str, seconds: dict[str, float] = seconds) -> Iterator[None]:
             started = time.perf_counter()
             yield None
-            seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - started
+            seconds[stage] = seconds.get(stage, 0.0) + time.perf_counter() - started
 
         results: Mapping[str, Reconstruction] = {}
         problem = None
         try:
-            results = self.source.results([draft.method for draft in drafts], sequence, timed)
+            results = source.results(names, sequence, timed) if names else {}
         except Exception as error:
             problem = error
-        for draft in drafts:
-            curves: dict[str, np.ndarray] = {}
+        for name in names:
             try:
                 if problem is not None:
                     raise problem
-                result = results[draft.method]
-                align, empty = self.scoring.depth_align, self.scoring.empty
-                scores = score(result, truths.at(result), depth_align=align, empty=empty, progress=steps.within)
+                result = results[name]
+                if truth is None or not truth.fits(result):  # results with one placement share it
+                    truth = TruthAtPixels(sequence, result, max_depth=scoring.max_depth)
+                scores = score(result, truth, depth_align=scoring.depth_align, empty=scoring.empty)
             except Exception as error:
-                record = replace(draft, reason=_reason(error))
-            else:
-                record = replace(
-                    draft,
-                    status="failed" if scores.problems else "ok",
-                    metrics=scores.metrics,
-                    notes=draft.notes + _lines(scores.notes),
-                    reason=one_line("; ".join(scores.problems), _MOST_LETTERS),
-                    seconds=seconds,
-                )
-                curves = scores.curves
-            self.store.keep(record, curves)
-            steps.next()
-            yield record
+                yield replace(drafts[name], reason=_reason(error)), {}
+                continue
+            record = replace(
+                drafts[name],
+                status="failed" if scores.problems else "ok",
+                metrics=scores.metrics,
+                notes=drafts[name].notes + _lines(scores.notes),
+                reason=one_line("; ".join(scores.problems), _MOST_LETTERS),
+                seconds=seconds,
+            )
+            yield record, scores.curves
 
 
 def _reason(error: Exception) -> str:
@@ -176,30 +163,3 @@ def fingerprint(sequence: LabelledSequence) -> str:
             for frame in frames:
                 digest.update(np.ascontiguousarray(read(frame)).tobytes())
     return digest.hexdigest()
-
-
-class _Truths:
-    """The ground truth of one sequence at the pixels of results, read once for all results with the same placement."""
-
-    def __init__(self, sequence: LabelledSequence, max_depth: float | None) -> None:
-        self._sequence, self._max_depth = sequence, max_depth
-        self._last: TruthAtPixels | None = None
-
-    def at(self, result: Reconstruction) -> TruthAtPixels:
-        if self._last is None or not self._last.fits(result):
-            self._last = TruthAtPixels(self._sequence, result, max_depth=self._max_depth)
-        return self._last
-
-
-class _Steps:
-    """Progress over the results of a sequence."""
-
-    def __init__(self, progress: Progress | None, names: int) -> None:
-        self._progress, self._total, self._done = progress, _STEPS * names, 0
-
-    def within(self, done: int, total: int | None) -> None:
-        (self._progress or no_progress)(self._done + _STEPS * done // (total or 1), self._total)
-
-    def next(self) -> None:
-        self.within(1, 1)
-        self._done += _STEPS

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from vggtjax.captures.pictures import picture_size
 from vggtjax.clips.preprocessing import Framing
@@ -27,30 +27,6 @@ if TYPE_CHECKING:  # the folders of other programs are scored without jax
     from vggtjax.method.fusion_family import FusionParams
 
 _MOST_FILES = 100_000  # of a folder with one result
-
-
-class ResultSource(Protocol):
-    """What `evaluate` scores: results by name for each sequence."""
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of the results of a sequence, in the order of the tables."""
-        ...
-
-    @property
-    def groups(self) -> Sequence[Sequence[str]]:
-        """The same names; the results of one group are computed together."""
-        ...
-
-    def fingerprint(self, name: str, sequence: LabelledSequence) -> str:
-        """Return text that changes when the result of that name changes."""
-        ...
-
-    def results(
-        self, names: Sequence[str], sequence: LabelledSequence, on_stage: OnStage
-    ) -> Mapping[str, Reconstruction]:
-        """Return the results of one group."""
-        ...
 
 
 @dataclass
@@ -179,3 +155,7 @@ class FolderSource:
             result = Reconstruction.load(folder, format=self.format, quaternion=self.quaternion)
             results[name] = placed(result, self.format, sizes, sequence.frame_names)
         return results
+
+
+ResultSource = ModelSource | FolderSource
+"""What `evaluate` scores: results by name for each sequence; the results of one group are computed together."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
-from vggtjax.results.glb import build_scene, glb_bytes, limited_clouds
+from vggtjax.results.glb import build_scene, glb_bytes
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.result import Result
 
@@ -40,7 +40,7 @@ def write_animated_glb(path: Path, result: Result, static: PointCloud, moving: S
         if channels:
             tree["animations"] = [{"name": "frames", "samplers": samplers, "channels": channels}]
 
-    path.write_bytes(glb_bytes(build_scene(result, limited_clouds(static, moving)), animate))
+    path.write_bytes(glb_bytes(build_scene(result, static, moving), animate))
 
 
 def frame_times(result: Result) -> Float64[np.ndarray, " S+1"]:

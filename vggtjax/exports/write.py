@@ -14,7 +14,7 @@ from vggtjax.errors import InputError, OutputError, check_choice, check_extra
 from vggtjax.exports.table import FORMATS, ExportFormat, Exporting
 from vggtjax.exports.views import View, views
 from vggtjax.progress import Progress, no_progress
-from vggtjax.results.point_cloud import PointCloud
+from vggtjax.results.glb import POINT_LIMIT
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, shown_points
 from vggtjax.storage.trajectories import write_trajectory
@@ -83,17 +83,18 @@ def _write(result: Result, path: Path, form: ExportFormat, items: Iterator[View]
             from vggtjax.exports.nerfstudio import write_nerfstudio
 
             static, _ = _shown(result, exporting)
-            write_nerfstudio(path, items, _cloud(result, static))
+            write_nerfstudio(path, items, static.cloud(result))
         case "rerun":
             from vggtjax.exports.rerun import write_rerun
 
             static, moving = _shown(result, exporting)
-            write_rerun(path, items, _cloud(result, static), [_cloud(result, points) for points in moving])
+            write_rerun(path, items, static.cloud(result), [points.cloud(result) for points in moving])
         case "glb-animated":
             from vggtjax.exports.animated_glb import write_animated_glb
 
-            static, moving = _shown(result, exporting)
-            write_animated_glb(path, result, _cloud(result, static), [_cloud(result, points) for points in moving])
+            most_moving = min(exporting.points, POINT_LIMIT // len(result.depth))
+            static, moving = _shown(result, exporting, most_moving)
+            write_animated_glb(path, result, static.cloud(result), [points.cloud(result) for points in moving])
         case "exr":
             from vggtjax.exports.exr import write_exr
 
@@ -106,19 +107,17 @@ def _write(result: Result, path: Path, form: ExportFormat, items: Iterator[View]
             np.savetxt(path, poses, fmt="%.9g", encoding="utf-8")
 
 
-def _shown(result: Result, exporting: Exporting) -> tuple[ShownPoints, list[ShownPoints]]:
+def _shown(
+    result: Result, exporting: Exporting, most_moving: int | None = None
+) -> tuple[ShownPoints, list[ShownPoints]]:
     percentile = exporting.confidence_percentile
     return shown_points(
         result,
         static_percentile=percentile,
         dynamic_percentile=percentile,
         most_static=exporting.points,
-        most_moving=exporting.points,
+        most_moving=exporting.points if most_moving is None else most_moving,
     )
-
-
-def _cloud(result: Result, points: ShownPoints) -> PointCloud:
-    return PointCloud(points.positions, points.values(result.images))
 
 
 def _counted(items: Iterator[View], count: int, progress: Progress | None) -> Iterator[View]:

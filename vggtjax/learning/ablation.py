@@ -16,9 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.depth import depth_errors
+from vggtjax.evaluation.metrics.depth import depth_alignment, depth_errors
 from vggtjax.evaluation.metrics.uncertainty import reliability_curve, uncertainty_scores
-from vggtjax.evaluation.metrics.video_depth import depth_alignment
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, observations
 from vggtjax.learning.fit import NEEDS_FRAMES, FitConfig, FitOutcome, fit_fusion
 from vggtjax.method.fusion_family import Fused, Observations, fuse, identity, parse_family

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from vggtjax.evaluation.metrics.video_depth import depth_alignment
+from vggtjax.evaluation.metrics.depth import depth_alignment
 from vggtjax.evaluation.plots import add_legend, new_figure
 from vggtjax.learning.ablation import PAPER, RuleScore
 from vggtjax.learning.clip_passes import ClipPasses, observations

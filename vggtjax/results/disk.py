@@ -52,32 +52,28 @@ def forecast_bytes(shape: tuple[int, int, int], source_size: Int[np.ndarray, "S 
     return total + (_VGGT4D * pixels if saving.format == "vggt4d" else 0)
 
 
-def check_space(folder: str | Path, needed: float) -> None:
-    """Raise OutputError where the disk of `folder`, which may be missing, has less than `needed` bytes left.
+def check_space(folder: str | Path, needed: float) -> int | None:
+    """Return the free bytes of the disk of `folder`, which may be missing; None where the system does not tell.
 
-    An earlier result in the folder goes only when the new one is whole, so its space does not count.
+    Raises OutputError where it has less than `needed`. An earlier result in the folder goes only when the new one is
+    whole, so its space does not count.
     """
-    free = _free(Path(folder))
-    if free is not None and needed > free:
+    place = Path(folder).absolute()
+    try:
+        free = shutil.disk_usage(next(path for path in (place, *place.parents) if path.exists())).free
+    except OSError:
+        return None
+    if needed > free:
         raise OutputError(
             f"the result takes about {decimal(round(needed))} and the disk of {folder} has {decimal(free)} left; "
             "free some, choose another folder, or write less: --only depth,cameras, --resolution model"
         )
+    return free
 
 
 def announce(folder: str | Path, needed: float) -> None:
     """Check the space and, where much is needed, log how much."""
-    check_space(folder, needed)
+    free = check_space(folder, needed)
     if needed > LARGE:
-        free = _free(Path(folder))
         left = "" if free is None else f"; the disk has {decimal(free)} left"
         logger.info("the result in %s will take about %s%s", folder, decimal(round(needed)), left)
-
-
-def _free(folder: Path) -> int | None:
-    """Return the free bytes of the disk of a folder, or None where the system does not tell."""
-    place = next((path for path in (folder.absolute(), *folder.absolute().parents) if path.exists()), None)
-    try:
-        return None if place is None else shutil.disk_usage(place).free
-    except OSError:
-        return None

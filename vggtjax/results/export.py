@@ -59,7 +59,7 @@ from vggtjax.errors import InputError, one_line
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results import foreign, previews, tracks
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
-from vggtjax.results.glb import build_scene, clip_clouds, glb_bytes
+from vggtjax.results.glb import glb_bytes, result_scene
 from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, least_confidence, write_ply
 from vggtjax.results.report import REPORT_NAME, RunFacts, report_page
 from vggtjax.results.result import Result
@@ -110,8 +110,7 @@ def write_files(
     if saving.format == "vggt4d":
         foreign.write_cameras(folder / "vggt4d", result.world_from_camera, [frame.intrinsics for frame in written])
     if saving.writes("scene"):
-        scene = build_scene(result, clip_clouds(result, least))
-        (folder / "scene.glb").write_bytes(glb_bytes(scene))
+        (folder / "scene.glb").write_bytes(glb_bytes(result_scene(result, saving.confidence_percentile)))
     advance()
     if saving.writes("previews"):
         _write_png(folder / "preview/sheet.png", previews.contact_sheet(result))

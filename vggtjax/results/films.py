@@ -16,6 +16,7 @@ from vggtjax.progress import Progress, no_progress
 from vggtjax.rendering.film import write_film as write_film
 from vggtjax.rendering.paths import fitted_intrinsics, follow, middle_camera, orbit
 from vggtjax.rendering.splats import BACKGROUND, Splats, draw_splats
+from vggtjax.results.glb import FRUSTUM_EDGES
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, shown_points
 
@@ -33,7 +34,6 @@ _NEAR = 0.1  # of the middle's depth; nearer points are not drawn
 _CAMERA_SIZE = 0.07  # of the middle's depth
 _EDGE_POINTS = 160  # of a line
 _MOST_CAMERAS = 12  # drawn beside the due one
-_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])  # of `frustum_corners`
 _LINE, _DUE_LINE = 0.35, 0.9  # width in pixels at the middle's depth; the cameras are nearer
 _FAINT, _DUE = (110, 116, 135), (255, 190, 40)  # the cameras; the due one
 
@@ -174,7 +174,7 @@ def _cameras(result: Result, depth: float) -> Float32[np.ndarray, "S L 3"]:
     _, height, width = result.depth.shape
     poses = result.camera_from_world.astype(np.float64)
     corners = frustum_corners(result.intrinsics, poses, height, width, _CAMERA_SIZE * depth)
-    start, end = corners[:, _EDGES[:, 0], None], corners[:, _EDGES[:, 1], None]  # [S, 8, 1, 3]
+    start, end = corners[:, FRUSTUM_EDGES[:, 0], None], corners[:, FRUSTUM_EDGES[:, 1], None]  # [S, 8, 1, 3]
     share = np.linspace(0, 1, _EDGE_POINTS, dtype=np.float32)[:, None]
     with np.errstate(over="ignore"):  # what is infinitely far is not drawn
         return (start + share * (end - start)).reshape(len(corners), -1, 3).astype(np.float32)

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
 from cmap import Colormap
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Float, Int
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual import ColorVisuals
 
 from vggtjax.cameras import frustum_corners
-from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
-from vggtjax.results.point_cloud import PointCloud, frame_cloud, joined
+from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.result import Result
+from vggtjax.results.shown import shown_points
 from vggtjax.storage.arrays import is_mapped
 
 _LEVELS = np.arange(256) / 255  # of sRGB
@@ -27,72 +27,46 @@ _UNLIT = {
 }
 POINT_LIMIT = 1_000_000  # viewers in a browser still turn so many points smoothly
 _MAPPED_LIMIT = 400_000  # of a mapped result: a point takes up to 100 bytes of memory while the file is made
-_STATIC = "static"
+_STATIC_SHARE = 0.8  # of these points
 _TO_GLTF = np.array([1, -1, -1], np.float32)  # half a turn about x: y down and z forward become y up and z backward
 _CAMERA_SIZE = 0.06  # of the median distance from the middle of the cameras to the points
 _MOST_DISTANCES = 200_000  # of a cloud, of which the median is taken
 _BAR_SIZE = 0.015  # of a camera: half the thickness of its edges
 
 # Corners of `frustum_corners`: 0 the centre, then 1 top left, 2 top right, 3 bottom right, 4 bottom left.
-_FRUSTUM_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+FRUSTUM_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 # A bar between two squares of corners 0-3 and 4-7.
 _BAR_FACES = np.array([[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])
 
 
-class CameraMesh(NamedTuple):
-    """The cameras of a clip and the path between them, in the world, y down."""
-
-    vertices: Float[np.ndarray, "V 3"]
-    faces: Int[np.ndarray, "F 3"]
-    colors: UInt8[np.ndarray, "V 3"]  # sRGB
-
-
-def clip_clouds(result: Result, least: LeastConfidence, *, point_limit: int | None = None) -> dict[str, PointCloud]:
-    """Return the points of a scene by the names of their nodes.
-
-    `static` are those of all frames, `dynamic_000000` the moving ones of a frame. Of more than `point_limit` points
-    (by default a million, 400,000 of a mapped result) every cloud keeps the same share, drawn with a fixed seed. No
-    more than these, and those of a frame, are in memory at once.
-    """
-    if point_limit is None:
-        point_limit = _MAPPED_LIMIT if is_mapped(result.depth) else POINT_LIMIT
-    frames = range(len(result.depth))
-    counts = np.array([[part.sum() for part in _static_and_moving(frame_of(result, n), least)] for n in frames])
-    choice = _EvenChoice(int(counts.sum()), point_limit)
-    static, seen = [], 0
-    clouds: dict[str, PointCloud] = {}
-    for number in frames:
-        frame = frame_of(result, number)
-        still, moving = (frame_cloud(frame, pixels) for pixels in _static_and_moving(frame, least))
-        static.append(choice(still, seen))
-        seen += len(still)
-        clouds[_moving_name(number)] = choice(moving)
-    return {_STATIC: joined(static), **clouds}
+def result_scene(result: Result, confidence_percentile: float) -> trimesh.Scene:
+    """Return the scene of a result without its least confident points, of at most `POINT_LIMIT` points."""
+    limit = _MAPPED_LIMIT if is_mapped(result.depth) else POINT_LIMIT
+    most_static = round(_STATIC_SHARE * limit)
+    static, moving = shown_points(
+        result,
+        static_percentile=confidence_percentile,
+        dynamic_percentile=confidence_percentile,
+        edges=None,
+        most_static=most_static,
+        most_moving=(limit - most_static) // len(result.depth),
+    )
+    return build_scene(result, static.cloud(result), [points.cloud(result) for points in moving])
 
 
-def limited_clouds(
-    static: PointCloud, moving: Sequence[PointCloud], *, point_limit: int = POINT_LIMIT
-) -> dict[str, PointCloud]:
-    """Return the static cloud of a clip and the moving ones of its frames, limited and named as by `clip_clouds`."""
-    choice = _EvenChoice(len(static) + sum(map(len, moving)), point_limit)
-    clouds = {_STATIC: static} | {_moving_name(frame): cloud for frame, cloud in enumerate(moving)}
-    return {name: choice(cloud) for name, cloud in clouds.items()}
-
-
-def build_scene(result: Result, clouds: Mapping[str, PointCloud]) -> trimesh.Scene:
+def build_scene(result: Result, static: PointCloud, moving: Sequence[PointCloud]) -> trimesh.Scene:
     """Return the scene, with y up.
 
-    Nodes: one for each cloud with points, and `cameras`: a frustum per frame, open in the viewing direction, with a
-    filled triangle on its upper edge, coloured from the first frame to the last, and the path between them. Colours
-    are sRGB; `glb_bytes` writes them as glTF wants them.
+    Nodes: one for each cloud with points, `static` and a frame's `dynamic_000000`, and `cameras`: a frustum per frame,
+    open in the viewing direction, with a filled triangle on its upper edge, coloured from the first frame to the last,
+    and the path between them. Colours are sRGB; `glb_bytes` writes them as glTF wants them.
     """
     scene = trimesh.Scene()
+    clouds = {"static": static} | {f"dynamic_{frame:06d}": cloud for frame, cloud in enumerate(moving)}
     shown = {name: cloud for name, cloud in clouds.items() if len(cloud)}
     for name, cloud in shown.items():
         scene.add_geometry(trimesh.PointCloud(cloud.points * _TO_GLTF, cloud.colors), node_name=name, geom_name=name)
-    cameras = camera_mesh(result, _camera_size(result, shown.values()))
-    mesh = trimesh.Trimesh(cameras.vertices * _TO_GLTF, cameras.faces, process=False)
-    mesh.visual = ColorVisuals(mesh, vertex_colors=cameras.colors)
+    mesh = _camera_mesh(result, _camera_size(result, shown.values()))
     scene.add_geometry(mesh, node_name="cameras", geom_name="cameras")
     return scene
 
@@ -108,35 +82,6 @@ def glb_bytes(scene: trimesh.Scene, edit: Callable[[dict[str, bytes], dict[str, 
     return export_glb(scene, buffer_postprocessor=finish)
 
 
-def _moving_name(frame: int) -> str:
-    return f"dynamic_{frame:06d}"
-
-
-def _static_and_moving(
-    frame: ResultFrame, least: LeastConfidence
-) -> tuple[Bool[np.ndarray, "H W"], Bool[np.ndarray, "H W"]]:
-    confident = frame.confident(least)
-    return confident & ~frame.dynamic_mask, confident & frame.dynamic_mask
-
-
-class _EvenChoice:
-    """Keeps the same share of every cloud, drawn with a fixed seed, at most `limit` of all points."""
-
-    def __init__(self, total: int, limit: int) -> None:
-        self._share = min(1.0, limit / max(1, total))
-        self._random = np.random.default_rng(0)
-
-    def kept(self, count: int) -> int:
-        """Return how many of so many points are kept."""
-        return int(self._share * count)
-
-    def __call__(self, cloud: PointCloud, before: int = 0) -> PointCloud:
-        """Return the kept points of a cloud, which comes after `before` points of the same one."""
-        count = self.kept(before + len(cloud)) - self.kept(before)
-        chosen = self._random.choice(len(cloud), count, replace=False, shuffle=False)
-        return PointCloud(cloud.points[chosen], cloud.colors[chosen])
-
-
 def _camera_size(result: Result, clouds: Iterable[PointCloud]) -> float:
     middle = result.camera_centres.mean(axis=0, dtype=np.float64)
     points = [cloud.points[:: -(-len(cloud) // _MOST_DISTANCES)] for cloud in clouds]
@@ -144,26 +89,27 @@ def _camera_size(result: Result, clouds: Iterable[PointCloud]) -> float:
     return _CAMERA_SIZE * (float(np.median(np.concatenate(distances))) if distances else 1.0)
 
 
-def camera_mesh(result: Result, size: float) -> CameraMesh:
-    """Return the cameras of a result, each as long as `size` from its centre to its corners."""
+def _camera_mesh(result: Result, size: float) -> trimesh.Trimesh:
+    """Return the cameras, each as long as `size` from its centre to its corners, and the path between them."""
     frames, height, width = result.depth.shape
     corners = frustum_corners(result.intrinsics, result.camera_from_world, height, width, size)  # [S, 5, 3]
     corners = corners.astype(np.float64)
     colors = (Colormap("plasma")(np.linspace(0, 0.9, frames))[:, :3] * 255).round().astype(np.uint8)
 
-    edges = corners[:, _FRUSTUM_EDGES].reshape(-1, 2, 3)
+    edges = corners[:, FRUSTUM_EDGES].reshape(-1, 2, 3)
     path = np.stack([corners[:-1, 0], corners[1:, 0]], axis=1)
     bars, bar_faces, bar_edges = _bars(np.concatenate([edges, path]), size * _BAR_SIZE)
-    edge_frames = np.concatenate([np.repeat(np.arange(frames), len(_FRUSTUM_EDGES)), np.arange(frames - 1)])
+    edge_frames = np.concatenate([np.repeat(np.arange(frames), len(FRUSTUM_EDGES)), np.arange(frames - 1)])
 
     left, right, low = corners[:, 1], corners[:, 2], corners[:, 4]
     roofs = np.stack([left, right, (left + right) / 2 + 0.4 * (left - low)], axis=1).reshape(-1, 3)
     roof_faces = np.arange(3 * frames).reshape(-1, 3)
     roof_faces = np.concatenate([roof_faces, roof_faces[:, ::-1]])  # seen from both sides
     vertex_frames = np.concatenate([np.repeat(edge_frames[bar_edges], 8), np.repeat(np.arange(frames), 3)])
-    return CameraMesh(
-        np.concatenate([bars, roofs]), np.concatenate([bar_faces, roof_faces + len(bars)]), colors[vertex_frames]
-    )
+    vertices, faces = np.concatenate([bars, roofs]), np.concatenate([bar_faces, roof_faces + len(bars)])
+    mesh = trimesh.Trimesh(vertices * _TO_GLTF, faces, process=False)
+    mesh.visual = ColorVisuals(mesh, vertex_colors=colors[vertex_frames])
+    return mesh
 
 
 def _bars(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -64,13 +63,6 @@ def frame_cloud(frame: ResultFrame, pixels: Bool[np.ndarray, "h w"]) -> PointClo
     points = frame.world_points()[pixels]
     finite = np.isfinite(points).all(axis=-1)
     return PointCloud(points[finite], frame.image[pixels][finite])
-
-
-def joined(clouds: Sequence[PointCloud]) -> PointCloud:
-    """Return the points of all clouds, one after the other."""
-    return PointCloud(
-        np.concatenate([cloud.points for cloud in clouds]), np.concatenate([cloud.colors for cloud in clouds])
-    )
 
 
 class PlyWriter:

@@ -13,10 +13,16 @@ from PIL import Image, ImageDraw, ImageFont
 from vggtjax.results.result import Result
 from vggtjax.storage.arrays import spread_frames
 
-DEPTH_COLORS = (Colormap("turbo").lut(256)[:, :3] * 255).round().astype(np.uint8)  # far cold, near warm
-_SALIENCY_COLORS = (Colormap("inferno").lut(256)[:, :3] * 255).round().astype(np.uint8)
+
+def color_ramp(name: str) -> UInt8[np.ndarray, "256 3"]:
+    """Return the colours of a colour map from its first to its last."""
+    return (Colormap(name).lut(256)[:, :3] * 255).round().astype(np.uint8)
+
+
+DEPTH_COLORS = color_ramp("turbo")  # far cold, near warm
+SALIENCY_COLORS = color_ramp("inferno")
 MOST_MOTION = 5  # times the median: the brightest motion by matches
-CONFIDENCE_COLORS = (Colormap("viridis").lut(256)[:, :3] * 255).round().astype(np.uint8)  # unsure dark, sure bright
+CONFIDENCE_COLORS = color_ramp("viridis")  # unsure dark, sure bright
 _NO_DEPTH = np.array([40, 40, 46], np.uint8)
 # Of objects by id: hues spaced by the golden ratio; black for no object.
 INSTANCE_COLORS = np.array(
@@ -155,8 +161,8 @@ def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
 
     objects = int(result.instances.max())
     notes = (f"{result.dynamic_share:.1%} of pixels", f"{objects} object{'' if objects == 1 else 's'}")
-    legends = {"Depth": (DEPTH_COLORS, "far", "near"), "Saliency": (_SALIENCY_COLORS, "0", "1")}
-    legends["By matches"] = (_SALIENCY_COLORS, "median", f"{MOST_MOTION} x")
+    legends = {"Depth": (DEPTH_COLORS, "far", "near"), "Saliency": (SALIENCY_COLORS, "0", "1")}
+    legends["By matches"] = (SALIENCY_COLORS, "median", f"{MOST_MOTION} x")
     for row, label in enumerate(labels):
         y = top + row * step_y
         draw.text((_MARGIN, y), label, TEXT, small)
@@ -189,12 +195,12 @@ def _thumbnails(
     if result.saliency is not None and np.nan_to_num(result.saliency).any():
         saliency = np.nan_to_num(result.saliency[frame]).clip(0, 1)
         saliency = np.asarray(Image.fromarray(saliency).resize(size, Image.Resampling.BILINEAR))
-        column["Saliency"] = Image.fromarray(_SALIENCY_COLORS[(saliency * 255).round().astype(np.uint8)])
+        column["Saliency"] = Image.fromarray(SALIENCY_COLORS[(saliency * 255).round().astype(np.uint8)])
     if result.motion is not None:
         above = (result.motion[frame] - 1) / (MOST_MOTION - 1)
         motion = Image.fromarray(np.nan_to_num(above).clip(0, 1).astype(np.float32))
         motion = np.asarray(motion.resize(size, Image.Resampling.BILINEAR))
-        column["By matches"] = Image.fromarray(_SALIENCY_COLORS[(motion * 255).round().astype(np.uint8)])
+        column["By matches"] = Image.fromarray(SALIENCY_COLORS[(motion * 255).round().astype(np.uint8)])
     moving = Image.fromarray(moving_ids(result.dynamic_mask[frame], result.instances[frame]))
     moving = np.asarray(moving.resize(size, Image.Resampling.NEAREST))
     return column | {"Dynamic": Image.fromarray(overlay(np.asarray(picture), moving))}

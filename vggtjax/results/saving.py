@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal, TypedDict, get_args
 
 import tyro
@@ -80,10 +80,6 @@ class Saving:
         groups = (name for group, names in GROUPS.items() if self.writes(group) for name in names)
         return (*groups, *(name for name, is_written in optional if is_written))
 
-    def changed(self, *, layout: Format | None = None, **changes: object) -> Saving:
-        """Return a copy with other values; `layout` is the old name of `format`."""
-        return replace(self, **changes, **({} if layout is None else {"format": layout}))  # pyright: ignore[reportArgumentType]
-
 
 class SavingChanges(TypedDict, total=False):
     """Keywords of `Reconstruction.save` that change single values of its `saving`."""
@@ -91,5 +87,4 @@ class SavingChanges(TypedDict, total=False):
     confidence_percentile: float
     resolution: Resolution
     format: Format
-    layout: Format
     only: tuple[Group, ...] | None

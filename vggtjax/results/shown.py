@@ -11,7 +11,7 @@ from vggtjax.cameras import camera_centres
 from vggtjax.errors import InputError, whole_number
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.frame import SAME_SURFACE, ResultFrame, frame_of
-from vggtjax.results.point_cloud import least_confidence
+from vggtjax.results.point_cloud import PointCloud, least_confidence
 from vggtjax.results.result import Result
 from vggtjax.results.thinning import Candidates, EvenThinning, places_in_cube
 
@@ -31,6 +31,10 @@ class ShownPoints(NamedTuple):
         """Return what an array of the clip, [S, H, W, ...], holds at the points: [N, ...]."""
         rows, columns = np.divmod(self.pixels, array.shape[2])
         return array[self.frames, rows, columns]
+
+    def cloud(self, result: Result) -> PointCloud:
+        """Return the points with the colours of the pictures."""
+        return PointCloud(self.positions, self.values(result.images))
 
 
 def shown_points(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import io
 import warnings
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
 
 from vggtjax.results.films import film_frames
-from vggtjax.results.result import FieldOfViewWarning, Result
+from vggtjax.results.result import TRACKS, FieldOfViewWarning, Result
 
 _FRAMES, _SECONDS, _SIDE = 24, 4.0, 360  # of the film; the longer side in pixels
 _MOST_ENLARGED = 5  # times the result's own pixels: wider discs take long to draw and show no more
@@ -74,21 +75,20 @@ def coarse(result: Result, most_frames: int = _CLIP_FRAMES, most_pixels: int = _
     depth = np.where(valid, of(result.depth), 0).astype(np.float32)
     with warnings.catch_warnings():  # the field of view of a camera at the limit changes by a part of a pixel
         warnings.simplefilter("ignore", FieldOfViewWarning)
-        return Result(
+        return replace(
+            result,
             depth=depth,
             depth_confidence=np.where(valid, of(result.depth_confidence), 1).astype(np.float32),
-            saliency=None,
             dynamic_mask=of(result.dynamic_mask),
             camera_from_world=result.camera_from_world[frames],
             intrinsics=intrinsics,
             images=of(result.images),
             frame_names=tuple(result.frame_names[frame] for frame in frames),
             timestamps=None if result.timestamps is None else result.timestamps[frames],
-            method=result.method,
-            model_name=result.model_name,
             settings={},
             source_size=result.source_size[frames],
             source_scale=result.source_scale[frames] * step,
             source_offset=result.source_offset[frames],
             valid_box=np.tile([0, 0, depth.shape[2], depth.shape[1]], (len(frames), 1)),
+            **dict.fromkeys(("saliency", "motion", "passes", *TRACKS)),
         )

@@ -6,16 +6,15 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from cmap import Colormap
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from vggtjax.rendering.film import mp4_codec, write_film
-from vggtjax.results.previews import BACKGROUND, FAINT, TEXT
+from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_ramp
 from vggtjax.results.result import Result
 
 SEEN = 0.5  # visibility from which a point is drawn filled
-_COLORS = (Colormap("gist_rainbow").lut(256)[:, :3] * 255).round().astype(int)
+_COLORS = color_ramp("gist_rainbow")
 _TAIL = 8  # frames of a point's past that are drawn
 _STRIP_FRAMES, _STRIP_WIDTH = 6, 1800
 _VIDEO_SIDE = 720  # least pixels of the video's longer side; frames are enlarged by whole numbers

@@ -6,11 +6,19 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from cmap import Colormap
 from jaxtyping import Bool, Float, UInt8
 
 from vggtjax.options import METHODS
-from vggtjax.results.previews import INSTANCE_COLORS, MOST_MOTION, inverse_depth_range, moving_ids
+from vggtjax.results.previews import (
+    CONFIDENCE_COLORS,
+    DEPTH_COLORS,
+    INSTANCE_COLORS,
+    MOST_MOTION,
+    SALIENCY_COLORS,
+    color_ramp,
+    inverse_depth_range,
+    moving_ids,
+)
 from vggtjax.results.result import Result, missing_fields
 from vggtjax.results.shown import ShownPoints
 
@@ -129,10 +137,6 @@ def _time(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
     return _levels(points.frames, 0, max(len(result.depth) - 1, 1))
 
 
-def _ramp(name: str) -> UInt8[np.ndarray, "256 3"]:
-    return (Colormap(name).lut(256)[:, :3] * 255).round().astype(np.uint8)
-
-
 def _palette(*colors: tuple[int, int, int]) -> UInt8[np.ndarray, "256 3"]:
     palette = np.tile(np.array(_GREY, np.uint8), (256, 1))
     palette[: len(colors)] = colors
@@ -147,21 +151,21 @@ def _has_mask(result: Result) -> bool:
     return not lacks(result, "dynamic_mask")
 
 
-TIME_RAMP = _ramp("plasma")
+TIME_RAMP = color_ramp("plasma")
 _MODES = (
-    ColorMode("depth", lambda _: True, _depth, _ramp("turbo"), _ends("far", "near")),
+    ColorMode("depth", lambda _: True, _depth, DEPTH_COLORS, _ends("far", "near")),
     ColorMode(
         "confidence",
         lambda result: not lacks(result, "depth_confidence"),
         confidence_ranks,
-        _ramp("viridis"),
+        CONFIDENCE_COLORS,
         _ends("lowest", "highest"),
     ),
     ColorMode(
         "fused precision",
         lambda result: bool(result.settings.get("fusion")) and bool(result.valid_pixels.any()),
         _precision,
-        _ramp("cividis"),
+        color_ramp("cividis"),
         lambda result: dict(zip(("low", "high"), (f"{end:.3g}" for end in _precision_range(result)), strict=True)),
     ),
     ColorMode(
@@ -178,12 +182,12 @@ _MODES = (
         np.concatenate([np.array([_GREY], np.uint8), INSTANCE_COLORS[1:]]),
         _object_names,
     ),
-    ColorMode("saliency", lambda result: result.saliency is not None, _saliency, _ramp("inferno"), _ends("0", "1")),
+    ColorMode("saliency", lambda result: result.saliency is not None, _saliency, SALIENCY_COLORS, _ends("0", "1")),
     ColorMode(
         "motion by matches",
         lambda result: result.motion is not None,
         _motion,
-        _ramp("inferno"),
+        SALIENCY_COLORS,
         _ends("as the median patch", f"{MOST_MOTION} times it"),
     ),
     ColorMode(

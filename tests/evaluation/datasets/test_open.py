@@ -9,8 +9,8 @@ from PIL import Image
 from tests.dataset_files import depth_png, opened, picture, png, write
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets import DATASETS, find_sequences, published
-from vggtjax.evaluation.datasets.frames import FrameChoice
 from vggtjax.evaluation.datasets.plain import takes
+from vggtjax.evaluation.datasets.sequence import FrameChoice
 
 EYE = " ".join(map(str, np.eye(4).ravel()))
 

@@ -5,7 +5,6 @@ import pytest
 from sklearn.neighbors import NearestNeighbors
 
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics import point_clouds
 from vggtjax.evaluation.metrics.point_clouds import (
     normals_of,
     paired_distance,
@@ -38,8 +37,7 @@ def test_normal_consistency_by_hand():
 
 
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
-def test_another_librarys_neighbours_give_the_same(monkeypatch, kind):
-    monkeypatch.setattr(point_clouds, "_CHUNK", 170)  # several chunks, the last one not full
+def test_another_librarys_neighbours_give_the_same(kind):
     generator = np.random.default_rng(0)
     clouds = [generator.normal(size=(count, 3)).astype(kind) for count in (700, 900)]
     clouds[1][100:400] = clouds[1][:300]  # points that coincide

@@ -6,8 +6,7 @@ import pytest
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.uncertainty import (
     ause,
-    calibrated_scale,
-    expected_calibration_error,
+    calibration_error,
     gaussian_nll,
     reliability_curve,
     sparsification_curve,
@@ -23,8 +22,6 @@ def test_sparsification_by_hand():
     assert curve.oracle == pytest.approx([8 / 4, 4 / 3, 1, 1])  # without 4, then 2, then a 1
     tied = sparsification_curve(np.array([3.0, 1, 8, 4]), np.array([1, 1, 0, 2]), steps=4)
     assert tied.remaining == pytest.approx([4, 8 / 3, 3, 4])  # 8 goes first; then 2 and 2 for 3 and 1
-    with pytest.raises(InputError, match=r"shape \(4,\) and the confidence \(3,\)"):
-        sparsification_curve(errors, confidence[:3])
     # Two steps more than there are pixels to take: shares of 1 / 8 of four pixels are rounded to the even half.
     curve = sparsification_curve(errors, confidence, steps=8)
     assert curve.remaining == pytest.approx([2, 2, 4 / 3, 3 / 2, 3 / 2, 3 / 2, 1, 1])
@@ -45,10 +42,10 @@ def test_ause_by_hand():
 
 def test_likelihood_by_hand():
     errors, precision = np.array([1.0, -2, 3]), np.array([4.0, 1, 1])
-    assert calibrated_scale(errors, precision) == pytest.approx((4 + 4 + 9) / 3)
+    assert uncertainty_scores(9 + errors, np.full(3, 9.0), precision).scale == pytest.approx((4 + 4 + 9) / 3)
     by_hand = [(np.log(2 * np.pi / 4) + 4) / 2, (np.log(2 * np.pi) + 4) / 2, (np.log(2 * np.pi) + 9) / 2]
     assert gaussian_nll(errors, precision, 1.0) == pytest.approx(np.mean(by_hand))
-    assert gaussian_nll(np.zeros(3), np.full(3, 2 * np.pi)) == pytest.approx(0)
+    assert gaussian_nll(np.zeros(3), np.full(3, 2 * np.pi), 1.0) == pytest.approx(0)
 
 
 def test_calibration_error_by_hand():
@@ -57,13 +54,13 @@ def test_calibration_error_by_hand():
     curve = reliability_curve(errors, np.ones(4), bins=2)
     assert curve.levels.tolist() == [0.25, 0.75]
     assert curve.shares.tolist() == [0.5, 0.75]
-    assert expected_calibration_error(errors, np.ones(4), bins=2) == pytest.approx(0.125)
+    assert calibration_error(errors, np.ones(4), bins=2) == pytest.approx(0.125)
     # Sigma ten times as large: 3.186 and 11.503.
     assert reliability_curve(errors, np.full(4, 0.01), bins=2).shares.tolist() == [0.75, 1]
     assert reliability_curve(errors, np.full(4, 0.01), 0.01, bins=2).shares.tolist() == [0.5, 0.75]
     # Far too sure of itself: nothing is within, and the levels themselves are missed.
-    assert expected_calibration_error(errors, np.full(4, 1e12)) == pytest.approx(0.5)
-    assert expected_calibration_error(np.zeros(4), np.ones(4)) == pytest.approx(0.5)
+    assert calibration_error(errors, np.full(4, 1e12)) == pytest.approx(0.5)
+    assert calibration_error(np.zeros(4), np.ones(4)) == pytest.approx(0.5)
 
 
 def test_scores_by_hand_of_the_parts():
@@ -75,12 +72,12 @@ def test_scores_by_hand_of_the_parts():
     predicted = np.where(np.arange(400) < 30, np.nan, truth + errors)
     scores = uncertainty_scores(predicted.reshape(4, 10, 10), truth.reshape(4, 10, 10), precision.reshape(4, 10, 10))
     errors, precision = errors[30:], precision[30:]
-    assert scores.scale == pytest.approx(calibrated_scale(errors, precision))
+    assert scores.scale == pytest.approx((precision * errors**2).mean())
     assert scores.scale == pytest.approx(5, rel=0.3)
     assert scores.ause == pytest.approx(ause(errors, precision))
     assert scores.nll == pytest.approx(gaussian_nll(errors, precision, 1))
     assert scores.nll_calibrated == pytest.approx(gaussian_nll(errors, precision, scores.scale))
-    assert scores.ece_calibrated == pytest.approx(expected_calibration_error(errors, precision, scores.scale))
+    assert scores.ece_calibrated == pytest.approx(calibration_error(errors, precision, scores.scale))
 
 
 ONES = np.ones((1, 2, 2))

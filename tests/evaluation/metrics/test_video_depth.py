@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import linprog
 
 from vggtjax.errors import InputError
-from vggtjax.evaluation.metrics.video_depth import depth_alignment, video_depth_errors
+from vggtjax.evaluation.metrics.depth import depth_alignment, video_depth_errors
 
 TRUTH = np.array([[[2.0, 4.0]], [[8.0, 0.0]]])  # two frames of two pixels; the last is not measured
 

@@ -14,7 +14,6 @@ from tests.dataset_files import npy
 from tests.fuzz.cases import Reader
 from tests.fuzz.rows.strangers import file
 from tests.room import make_room
-from vggtjax.app.posted import cleaned
 from vggtjax.batch.contact import _read as read_card
 from vggtjax.batch.destination import SETTINGS_NAME, LocalFolder, RemoteFolder
 from vggtjax.evaluation.page import is_report
@@ -73,11 +72,6 @@ def _read_windows(path: Path) -> None:
         find_loops(store.features(names, 4), [range(3), range(3, 6), range(6, 9)], 1)
 
 
-def _posted(path: Path) -> None:
-    if path.is_file() and not path.is_symlink():  # a request is no file
-        cleaned(path.read_bytes(), {0: 5})
-
-
 _SETTINGS = {"model": "tiny", "method": "vggt", "size": 28, "outputs": ["depth", "mask"], "frames": None}
 
 
@@ -91,7 +85,6 @@ def _read_remote_settings(path: Path) -> None:
 
 _SCENES = {"format": "vggtjax scenes", "version": 1, "scenes": ["scene_0000"], "config": {"height": 4}}
 _METRICS = "step,stage,seconds,samples,loss\n1,0,0.5,4,2.5\n2,0,1.0,8,2.25\n"
-_POSTED = {"data": [[{"path": f"/tmp/{'0' * 64}/a.mp4"}], "demo", "vggt", 2, 0], "fn_index": 0, "session_hash": "x"}
 _EVALUATION = {
     "settings": {"dataset": "plain", "methods": ["vggt"]},
     "sequences": [{"name": "a", "method": "vggt", "metrics": {"abs_rel": 0.1}, "notes": []}],
@@ -112,7 +105,6 @@ ROWS = (
     Reader("metrics", file("metrics.csv", _METRICS), read_metrics),
     Reader("index of scenes", _json("index.json", _SCENES), lambda path: read_index(path.parent)),
     Reader("stored windows", _windows, _read_windows, _ARCHIVE),
-    Reader("request of the app's page", _json("posted.json", _POSTED), _posted),
     Reader(
         "settings of a batch",
         _json(SETTINGS_NAME, _SETTINGS),

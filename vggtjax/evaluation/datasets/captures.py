@@ -13,8 +13,7 @@ from vggtjax.captures.files import files
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, read_capture
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
-from vggtjax.evaluation.datasets.frames import FrameChoice
-from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
+from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener
 
 _OWN_UNIT = "its unit is not the metre, but one of its program's own"  # a note
 

@@ -32,9 +32,7 @@ from vggtjax.captures.numbers import numbers
 from vggtjax.captures.pictures import picture_size
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
-from vggtjax.evaluation.datasets.frames import FrameChoice
-from vggtjax.evaluation.datasets.maps import depth_reader
-from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
+from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, depth_reader
 from vggtjax.storage.json_values import read_json
 
 EASI3R, LIDAR = TRUTHS = ("easi3r", "lidar")

@@ -25,9 +25,7 @@ from vggtjax.clips.masks import read_mask
 from vggtjax.clips.order import natural_key
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
-from vggtjax.evaluation.datasets.frames import FrameChoice
-from vggtjax.evaluation.datasets.maps import depth_reader, mask_reader
-from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
+from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, depth_reader, mask_reader
 from vggtjax.storage.trajectories import read_numbers, read_trajectory
 
 _NEW_TAKE = 10.0  # times the median step of the camera: a jump between two takes

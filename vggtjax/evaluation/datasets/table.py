@@ -13,15 +13,11 @@ from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import InputError, reading
 from vggtjax.evaluation.datasets import published
 from vggtjax.evaluation.datasets.captures import captures
-from vggtjax.evaluation.datasets.davis import davis
 from vggtjax.evaluation.datasets.dycheck import TRUTHS, dycheck
 from vggtjax.evaluation.datasets.folders import listed
-from vggtjax.evaluation.datasets.frames import EVERY_FRAME, FrameChoice
-from vggtjax.evaluation.datasets.kitti import kitti
+from vggtjax.evaluation.datasets.layouts import davis, kitti, seven_scenes, sintel
 from vggtjax.evaluation.datasets.plain import plain
-from vggtjax.evaluation.datasets.sequence import LabelledSequence, Reader
-from vggtjax.evaluation.datasets.seven_scenes import seven_scenes
-from vggtjax.evaluation.datasets.sintel import sintel
+from vggtjax.evaluation.datasets.sequence import EVERY_FRAME, FrameChoice, LabelledSequence, Reader
 from vggtjax.evaluation.datasets.tum import bonn, tum
 
 logger = logging.getLogger(__name__)

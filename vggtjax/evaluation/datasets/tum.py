@@ -25,9 +25,7 @@ from vggtjax.captures.tum import (
 )
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
-from vggtjax.evaluation.datasets.frames import FrameChoice
-from vggtjax.evaluation.datasets.maps import depth_reader
-from vggtjax.evaluation.datasets.sequence import LabelledSequence, Opener
+from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, depth_reader
 
 _BONN = (542.822841, 542.576870, 315.593520, 237.756098)
 # Bonn tracks markers on the camera. Its page takes a point of the camera to the world by ROS T ROS MARKERS, with T from

@@ -50,7 +50,7 @@ def auc(saliency: Float[np.ndarray, "*S H W"], mask: Bool[np.ndarray, "*S H W"])
     Raises:
         InputError: different shapes, saliency that is not finite, or a mask that is all dynamic or all static.
     """
-    saliency, mask = np.asarray(saliency), _mask("mask", mask)
+    saliency, mask = np.asarray(saliency), np.asarray(mask, bool)
     if saliency.shape != mask.shape:
         raise InputError(f"saliency has shape {saliency.shape} and the mask {mask.shape}; expected the same")
     if not np.isfinite(saliency).all():
@@ -143,7 +143,7 @@ def boundary(mask: Bool[np.ndarray, "H W"]) -> Bool[np.ndarray, "H W"]:
     half a pixel. The last row has only right neighbours, the last column only lower ones, and the last pixel of all
     has none: the frame's own edge is not a boundary.
     """
-    padded = np.pad(_mask("mask", mask), ((0, 1), (0, 1)), mode="edge")  # padding never differs
+    padded = np.pad(mask, ((0, 1), (0, 1)), mode="edge")  # padding never differs
     inner = padded[:-1, :-1]
     return (inner ^ padded[:-1, 1:]) | (inner ^ padded[1:, :-1]) | (inner ^ padded[1:, 1:])
 
@@ -161,17 +161,13 @@ def _statistics(values: Float64[np.ndarray, " S"]) -> tuple[float, float, float]
     return float(values.mean()), float((values > _RECALLED).mean()), float(first.mean() - last.mean())
 
 
-def _masks(predicted, truth):
-    predicted, truth = _mask("predicted mask", predicted), _mask("true mask", truth)
+def _masks(predicted, truth) -> tuple[np.ndarray, np.ndarray]:
+    predicted, truth = np.asarray(predicted), np.asarray(truth)
+    for name, mask in (("predicted", predicted), ("true", truth)):
+        if mask.dtype != bool:
+            raise InputError(f"the {name} mask has type {mask.dtype}; expected bool")
     if predicted.shape != truth.shape:
         raise InputError(
             f"the predicted mask has shape {predicted.shape} and the true one {truth.shape}; expected one shape"
         )
     return predicted, truth
-
-
-def _mask(name: str, values) -> np.ndarray:
-    values = np.asarray(values)
-    if values.dtype != bool:
-        raise InputError(f"the {name} has type {values.dtype}; expected bool")
-    return values

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float64, Int
+from jaxtyping import Float, Float64, Int64
 from scipy.spatial import KDTree
 
 from vggtjax.errors import InputError
-from vggtjax.progress import Progress, no_progress
 
-_CHUNK = 2**20  # points of one look-up
 _LEAF = 20  # points in a leaf of the tree: the fastest of 10, 20 and 40
 _NOT_UNIT = 1e-2  # largest difference of the squared length of a normal from 1
 
@@ -45,12 +42,8 @@ def point_cloud_errors(
     truth: Float[np.ndarray, "M 3"],
     *,
     normals: tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "M 3"]] | None = None,
-    progress: Progress | None = None,
 ) -> PointCloudErrors:
     """Return accuracy, completeness and their mean, by exact nearest neighbours in float64.
-
-    The tree of one cloud is in memory at a time: about 50 bytes for each of its points, and 8 for each point of the
-    other.
 
     Args:
         predicted: points; they are not aligned, filtered or thinned here.
@@ -58,29 +51,20 @@ def point_cloud_errors(
         normals: unit normals of the predicted and of the true points, as from `normals_of`. The consistency is the
             mean |cosine| from prediction to truth and the mean from truth to prediction, averaged. Their sign does
             not matter, and pairs with a NaN do not count.
-        progress: called with the number of points looked up and of all points, N + M.
 
     Raises:
         InputError: a cloud that is empty, not [N, 3] or not finite; normals of another shape, of another length than 1,
             or without a pair to compare.
     """
     predicted, truth = _cloud("predicted", predicted), _cloud("true", truth)
-    predicted_normals = true_normals = None
-    if normals is not None:
-        predicted_normals = _checked_normals("predicted", normals[0], predicted)
-        true_normals = _checked_normals("true", normals[1], truth)
-    tell, total = progress or no_progress, len(predicted) + len(truth)
-
-    def look_up(source, target, source_normals, target_normals, before: int):
-        distances, consistency = _nearest(
-            source, target, source_normals, target_normals, lambda done: tell(before + done, total)
-        )
-        return statistics(distances), consistency
-
-    accuracy, of_predicted = look_up(predicted, truth, predicted_normals, true_normals, 0)
-    completeness, of_true = look_up(truth, predicted, true_normals, predicted_normals, len(predicted))
+    distances, neighbours = _nearest(predicted, truth)
+    true_distances, true_neighbours = _nearest(truth, predicted)
+    accuracy, completeness = statistics(distances), statistics(true_distances)
     chamfer = Statistics(*((one + other) / 2 for one, other in zip(accuracy, completeness, strict=True)))
-    consistency = None if of_predicted is None or of_true is None else (of_predicted + of_true) / 2
+    consistency = None
+    if normals is not None:
+        ours, theirs = _checked_normals("predicted", normals[0], predicted), _checked_normals("true", normals[1], truth)
+        consistency = (_cosine(ours, theirs[neighbours]) + _cosine(theirs, ours[true_neighbours])) / 2
     return PointCloudErrors(accuracy, completeness, chamfer, consistency)
 
 
@@ -95,10 +79,7 @@ def paired_distance(predicted: Float[np.ndarray, "N 3"], truth: Float[np.ndarray
     predicted, truth = _cloud("predicted", predicted), _cloud("true", truth)
     if len(predicted) != len(truth):
         raise InputError(f"{len(predicted)} predicted points and {len(truth)} true ones; expected pairs")
-    distances = np.empty(len(truth))
-    for part in _chunks(len(truth)):
-        distances[part] = np.linalg.norm(predicted[part].astype(np.float64) - truth[part], axis=1)
-    return statistics(distances)
+    return statistics(np.linalg.norm(predicted.astype(np.float64) - truth, axis=1))
 
 
 def normals_of(points: Float[np.ndarray, "S H W 3"]) -> Float[np.ndarray, "S H W 3"]:
@@ -124,16 +105,12 @@ def normals_of(points: Float[np.ndarray, "S H W 3"]) -> Float[np.ndarray, "S H W
     return normals
 
 
-def nearest_distances(
-    points: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "M 3"], *, progress: Progress | None = None
-) -> Float64[np.ndarray, " N"]:
-    """Return the distance from every point to the nearest of the others; progress and errors as `point_cloud_errors`.
+def nearest_distances(points: Float[np.ndarray, "N 3"], others: Float[np.ndarray, "M 3"]) -> Float64[np.ndarray, " N"]:
+    """Return the distance from every point to the nearest of the others; errors as `point_cloud_errors`.
 
     Accuracy is the `statistics` of the distances from prediction to truth.
     """
-    points, others = _cloud("first", points), _cloud("second", others)
-    tell = progress or no_progress
-    return _nearest(points, others, None, None, lambda done: tell(done, len(points)))[0]
+    return _nearest(_cloud("first", points), _cloud("second", others))[0]
 
 
 def statistics(distances: Float[np.ndarray, " N"]) -> Statistics:
@@ -144,33 +121,20 @@ def statistics(distances: Float[np.ndarray, " N"]) -> Statistics:
     return Statistics(float(distances.mean()), float(np.median(distances)))
 
 
-def _nearest(
-    source, target, source_normals, target_normals, advance: Callable[[int], object]
-) -> tuple[Float64[np.ndarray, " N"], float | None]:
-    """Look up every point of `source` in a tree of `target`; return distances and the consistency of normals."""
-    tree = KDTree(target, leafsize=_LEAF, balanced_tree=False)  # cells cut in the middle: twice as fast to build
-    distances = np.empty(len(source))
-    cosines, counted = 0.0, 0
-    for part in _chunks(len(source)):
-        distances[part], indices = tree.query(source[part], workers=-1)
-        neighbours = np.asarray(indices)
-        if source_normals is not None:
-            cosine = _cosines(source_normals[part], target_normals, neighbours)
-            cosines, counted = cosines + float(cosine.sum()), counted + len(cosine)
-        advance(part.stop)
-    if source_normals is not None and not counted:
+def _nearest(points, others) -> tuple[Float64[np.ndarray, " N"], Int64[np.ndarray, " N"]]:
+    """Return distance and index of the nearest of the others, for every point."""
+    tree = KDTree(others, leafsize=_LEAF, balanced_tree=False)  # cells cut in the middle: twice as fast to build
+    distances, indices = tree.query(points, workers=-1)
+    return np.asarray(distances), np.asarray(indices)
+
+
+def _cosine(normals, neighbours) -> float:
+    """Return the mean |cosine| of the pairs of normals without NaN."""
+    cosine = np.einsum("ni,ni->n", normals.astype(np.float64), neighbours)
+    cosine = cosine[~np.isnan(cosine)]
+    if not len(cosine):
         raise InputError("no nearest neighbours both have a normal; expected some that are not NaN")
-    return distances, cosines / counted if counted else None
-
-
-def _cosines(normals, others, neighbours: Int[np.ndarray, " N"]) -> Float64[np.ndarray, " K"]:
-    """Return |cosine| of the pairs of normals without NaN, at most 1."""
-    cosine = np.einsum("ni,ni->n", normals.astype(np.float64), others[neighbours])
-    return np.minimum(np.abs(cosine[~np.isnan(cosine)]), 1)
-
-
-def _chunks(count: int) -> Iterator[slice]:
-    return (slice(start, min(start + _CHUNK, count)) for start in range(0, count, _CHUNK))
+    return float(np.minimum(np.abs(cosine), 1).mean())
 
 
 def _cloud(name: str, points) -> Float[np.ndarray, "N 3"]:
@@ -179,7 +143,7 @@ def _cloud(name: str, points) -> Float[np.ndarray, "N 3"]:
         raise InputError(f"the {name} points have shape {points.shape}; expected [N, 3]")
     if not len(points):
         raise InputError(f"the {name} cloud has no points; expected at least 1")
-    if (wrong := sum(int((~np.isfinite(points[part]).all(axis=1)).sum()) for part in _chunks(len(points)))) > 0:
+    if (wrong := int((~np.isfinite(points).all(axis=1)).sum())) > 0:
         raise InputError(f"{wrong} of {len(points)} {name} points are not finite; remove them from both clouds")
     return points
 
@@ -188,11 +152,9 @@ def _checked_normals(name: str, normals, points) -> Float[np.ndarray, "N 3"]:
     normals = np.asarray(normals)
     if normals.shape != points.shape:
         raise InputError(f"the {name} normals have shape {normals.shape}; expected {points.shape}, one for each point")
-    for part in _chunks(len(normals)):
-        length = np.linalg.norm(normals[part].astype(np.float64), axis=1)
-        if (wrong := np.flatnonzero(np.abs(length**2 - 1) > _NOT_UNIT)).size:
-            first = part.start + wrong[0]
-            raise InputError(
-                f"the {name} normal of point {first} has length {length[wrong[0]]:.3g}; expected 1, or NaN for none"
-            )
+    length = np.linalg.norm(normals.astype(np.float64), axis=1)
+    if (wrong := np.flatnonzero(np.abs(length**2 - 1) > _NOT_UNIT)).size:
+        raise InputError(
+            f"the {name} normal of point {wrong[0]} has length {length[wrong[0]]:.3g}; expected 1, or NaN for none"
+        )
     return normals

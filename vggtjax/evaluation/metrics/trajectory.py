@@ -10,7 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from vggtjax.cameras import checked_poses
 from vggtjax.errors import InputError, check_choice
-from vggtjax.geometry.similarity import FEWEST_POSES, Similarity, align, centres, moves, umeyama_sim3
+from vggtjax.geometry.similarity import FEWEST_POSES, Similarity, centres, umeyama_sim3
+from vggtjax.geometry.similarity import align as moved
+from vggtjax.geometry.similarity import moves as is_moving
 from vggtjax.storage.trajectories import associate as associate  # a step of every comparison with a recorded path
 
 Alignment = Literal["sim3", "se3", "first"]
@@ -29,9 +31,8 @@ def centre_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray,
 
     Raises InputError for fewer than 3 poses, or a trajectory that does not move.
     """
-    source, target = _pair_of_centres(predicted, truth)
-    offsets = umeyama_sim3(source, target, allow_line=True).apply(source) - target
-    return float(np.sqrt((offsets**2).sum(axis=1).mean()))
+    source, target = _moving(predicted, truth)
+    return _rmse(umeyama_sim3(source, target, allow_line=True).apply(source) - target)
 
 
 def rotation_error(predicted: Float[np.ndarray, "S 3 4"], truth: Float[np.ndarray, "S 3 4"]) -> float:
@@ -68,19 +69,25 @@ def trajectory_errors(
             and "se3" also fewer than 3 poses or cameras that do not move, with "first" fewer than 2 poses.
     """
     check_choice("align", align, get_args(Alignment))
-    fewest = 2 if align == "first" else FEWEST_POSES
-    source, target = _pair(_camera_from_world("predicted", predicted), _camera_from_world("true", truth), fewest)
-    aligned = _onto(source, target, align)
-    offsets = centres(aligned) - centres(target)
-    return TrajectoryErrors(float(np.sqrt((offsets**2).sum(axis=1).mean())), *_step_errors(aligned, target))
+    source, target = _camera_from_world("predicted", predicted), _camera_from_world("true", truth)
+    if align == "first":
+        source, target = _pair(source, target, 2)
+        rotation = target[0, :, :3].T @ source[0, :, :3]
+        similarity = Similarity(1.0, rotation, centres(target)[0] - rotation @ centres(source)[0])
+    else:
+        similarity = umeyama_sim3(*_moving(source, target), allow_line=True, with_scale=align == "sim3")
+    aligned = moved(source, similarity)
+    (steps, moves), (true_steps, true_moves) = _steps(aligned), _steps(target)
+    angles = (true_steps.inv() * steps).magnitude()
+    return TrajectoryErrors(
+        _rmse(centres(aligned) - centres(target)),
+        _rmse(true_steps.inv().apply(moves - true_moves)),
+        float(np.degrees(np.sqrt((angles**2).mean()))),
+    )
 
 
-def _step_errors(aligned: Float64[np.ndarray, "S 3 4"], truth: Float64[np.ndarray, "S 3 4"]) -> tuple[float, float]:
-    """Return RTE and RRE of camera-from-world poses in one world."""
-    (rotation, translation), (true_rotation, true_translation) = _steps(aligned), _steps(truth)
-    offsets = true_rotation.inv().apply(translation - true_translation)
-    angles = (true_rotation.inv() * rotation).magnitude()
-    return float(np.sqrt((offsets**2).sum(axis=1).mean())), float(np.degrees(np.sqrt((angles**2).mean())))
+def _rmse(offsets: Float64[np.ndarray, "S 3"]) -> float:
+    return float(np.sqrt((offsets**2).sum(axis=1).mean()))
 
 
 def _camera_from_world(name: str, world_from_camera) -> Float64[np.ndarray, "S 3 4"]:
@@ -94,15 +101,6 @@ def _camera_from_world(name: str, world_from_camera) -> Float64[np.ndarray, "S 3
     return np.concatenate([inverse.as_matrix(), -inverse.apply(poses[:, :3, 3])[:, :, None]], axis=2)
 
 
-def _onto(predicted: Float64[np.ndarray, "S 3 4"], truth: Float64[np.ndarray, "S 3 4"], how: Alignment):
-    """Return the predicted camera-from-world poses in the world of the true ones."""
-    if how != "first":
-        pair = _pair_of_centres(predicted, truth)
-        return align(predicted, umeyama_sim3(*pair, allow_line=True, with_scale=how == "sim3"))
-    rotation = truth[0, :, :3].T @ predicted[0, :, :3]
-    return align(predicted, Similarity(1.0, rotation, centres(truth)[0] - rotation @ centres(predicted)[0]))
-
-
 def _pair(predicted, truth, fewest: int) -> tuple[Float64[np.ndarray, "S 3 4"], Float64[np.ndarray, "S 3 4"]]:
     predicted, truth = checked_poses(predicted), checked_poses(truth)
     if len(predicted) != len(truth):
@@ -112,10 +110,10 @@ def _pair(predicted, truth, fewest: int) -> tuple[Float64[np.ndarray, "S 3 4"], 
     return predicted, truth
 
 
-def _pair_of_centres(predicted, truth) -> tuple[Float64[np.ndarray, "S 3"], Float64[np.ndarray, "S 3"]]:
+def _moving(predicted, truth) -> tuple[Float64[np.ndarray, "S 3"], Float64[np.ndarray, "S 3"]]:
     predicted, truth = (centres(poses) for poses in _pair(predicted, truth, FEWEST_POSES))
     for name, points in (("predicted", predicted), ("true", truth)):
-        if not moves(points):
+        if not is_moving(points):
             raise InputError(f"the {name} cameras do not move; their centres cannot be aligned")
     return predicted, truth
 

@@ -1,0 +1,207 @@
+"""Data sets with a layout of folders each: DAVIS, Sintel, 7-Scenes and KITTI. Does not import jax.
+
+DAVIS 2016 and 2017 at 480p: JPEGImages/480p/<sequence>/%05d.jpg, Annotations/480p/<sequence>/%05d.png. Any label
+above 0 is dynamic. https://davischallenge.org/davis2017/code.html.
+
+MPI Sintel's training sequences with depth and cameras, final pass. training/final/<sequence>/frame_%04d.png, and of
+the same names training/depth/*.dpt, in metres, and training/camdata_left/*.cam: a tag, K as nine 64-bit floats,
+camera-from-world as twelve. Pixels count from the centre of the first: the principal point of 1024 x 436 pictures is
+(511.5, 217.5), their middle. http://sintel.is.tue.mpg.de/depth, `sintel_io.py`
+
+7-Scenes: seq-XX/frame-%06d.color.png, .depth.png and .pose.txt. Depth is PNG of 16 bits in millimetres, 65535 and 0
+where it is unknown; poses are camera-to-world, 4 x 4, in metres. The page says that colour and depth are not
+calibrated, so depth is not at exactly the pixels of the pictures, and gives one camera, KinectFusion's default for
+the depth: focal length 585, principal point (320, 240). Its pixel origin is unknown; the centre of the first pixel is
+taken to be 0. https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/
+
+KITTI's annotated depth with the pictures of the raw drives, left colour camera. Depth is
+val/<drive>/proj_depth/groundtruth/image_02/%010d.png, of 16 bits, 256 to the metre, 0 where it is unknown (the depth
+benchmark's readme); its pictures are <date>/<drive>/image_02/data or val/<drive>/image_02/data. MonST3R's gathered
+folders are read too: image_gathered/<drive>_02 and groundtruth_depth_gathered/<drive>_02. Intrinsics are P_rect_02 of
+<date>/calib_cam_to_cam.txt. KITTI does not say from where its pixels count: as in OpenCV, whose calibration it uses,
+the centre of the first is taken to be 0. https://www.cvlibs.net/datasets/kitti
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from vggtjax.captures.cameras import (
+    PIXEL_CENTRE,
+    checked_intrinsics,
+    checked_world_from_camera,
+    intrinsics_matrix,
+    world_from_camera_of,
+)
+from vggtjax.captures.depth_files import SINTEL_TAG, read_dpt, read_png
+from vggtjax.captures.files import files, read_bytes, read_text
+from vggtjax.errors import InputError
+from vggtjax.evaluation.datasets.folders import sequence_folders, subfolders
+from vggtjax.evaluation.datasets.sequence import (
+    FrameChoice,
+    LabelledSequence,
+    Opener,
+    depth_reader,
+    mask_reader,
+    read_labels,
+)
+from vggtjax.storage.trajectories import read_numbers
+
+_RESOLUTION = "480p"  # of DAVIS
+
+
+def davis(root: Path) -> dict[str, Opener]:
+    """Find the sequences of the folder that holds JPEGImages and Annotations."""
+    folders = subfolders(root / "JPEGImages" / _RESOLUTION)
+    if folders:
+        return {folder.name: partial(_read_davis, root, folder.name) for folder in folders}
+    raise InputError(f"{root} holds no sequence of DAVIS; expected JPEGImages/{_RESOLUTION} with folders of frames")
+
+
+def _read_davis(root: Path, name: str, frames: FrameChoice) -> LabelledSequence:
+    pictures = frames.of(list(files(root / "JPEGImages" / _RESOLUTION / name, ".jpg").values()), name)
+    labels = files(root / "Annotations" / _RESOLUTION / name, ".png")
+    mask, notes = mask_reader(pictures, [labels.get(path.stem) for path in pictures], read_labels)
+    return LabelledSequence(name, tuple(pictures), mask=mask, notes=notes)
+
+
+# Sintel
+_CAM_BYTES = 4 + 8 * (9 + 12)
+
+
+def sintel(root: Path) -> dict[str, Opener]:
+    """Find the sequences of the folder training/, or of the folder around it."""
+    for folder in (root / "training", root):
+        if names := [child.name for child in subfolders(folder / "final")]:
+            return {name: partial(_read_sintel, folder, name) for name in names}
+    raise InputError(f"{root} holds no sequence of Sintel; expected training/final with folders of frames")
+
+
+def read_cam(path: Path) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3 4"]]:
+    """Read a camera: K, with pixels counted from the centre of the first, and camera-from-world."""
+    data = read_bytes(path)
+    if data[:4] != SINTEL_TAG or len(data) != _CAM_BYTES:
+        raise InputError(
+            f"{path} has {len(data)} bytes and starts with {data[:4]!r}; expected {_CAM_BYTES} that start with "
+            f"{SINTEL_TAG!r}, the tag of a Sintel camera"
+        )
+    values = np.frombuffer(data, "<f8", offset=4).astype(np.float64)
+    return values[:9].reshape(3, 3), values[9:].reshape(3, 4)
+
+
+def _read_sintel(training: Path, name: str, frames: FrameChoice) -> LabelledSequence:
+    pictures = frames.of(list(files(training / "final" / name, ".png").values()), name)
+    depths = files(training / "depth" / name, ".dpt")
+    depth, notes = depth_reader(pictures, [depths.get(path.stem) for path in pictures], read_dpt)
+    cams = files(training / "camdata_left" / name, ".cam")
+    poses = intrinsics = None
+    if missing := [path.stem for path in pictures if path.stem not in cams]:
+        notes += (f"{len(missing)} of {len(pictures)} frames have no camera, {missing[0]} first; no cameras",)
+    else:
+        source = training / "camdata_left" / name
+        matrices, camera_from_world = zip(*(read_cam(cams[path.stem]) for path in pictures), strict=True)
+        intrinsics = checked_intrinsics(np.stack(matrices), source)
+        intrinsics[:, :2, 2] += PIXEL_CENTRE
+        poses = world_from_camera_of(np.stack(camera_from_world), source)
+    return LabelledSequence(name, tuple(pictures), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes)
+
+
+# 7-Scenes
+_MILLIMETRES = 1000.0
+_INVALID = 65535
+_CAMERA = (585.0, 585.0, 320.0, 240.0)
+_PICTURE, _DEPTH, _POSE = ".color.png", ".depth.png", ".pose.txt"
+
+
+def seven_scenes(root: Path) -> dict[str, Opener]:
+    """Find the sequences of a scene (names such as "seq-01") or of a folder of scenes ("chess/seq-01")."""
+    folders = sequence_folders(root, lambda folder: bool(files(folder, _PICTURE)), f"frames *{_PICTURE}", levels=2)
+    return {name: partial(_read_seven_scenes, folder, name) for name, folder in folders.items()}
+
+
+def _read_seven_scenes(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
+    pictures, depths, pose_files = (files(folder, ending) for ending in (_PICTURE, _DEPTH, _POSE))
+    chosen = frames.of(list(pictures), name)
+    taken = [pictures[frame] for frame in chosen]
+    read = partial(read_png, per_metre=_MILLIMETRES, invalid=_INVALID)
+    depth, notes = depth_reader(taken, [depths.get(frame) for frame in chosen], read)
+    poses = None
+    if missing := [frame for frame in chosen if frame not in pose_files]:
+        notes += (f"{len(missing)} of {len(chosen)} frames have no pose, {missing[0]} first; no poses",)
+    else:
+        poses = np.stack([_pose(pose_files[frame]) for frame in chosen])
+    intrinsics = np.broadcast_to(intrinsics_matrix(*_CAMERA, first_pixel=0, source="7-Scenes"), (len(taken), 3, 3))
+    notes += ("depth is not registered to the pictures; the intrinsics are the depth camera's",)
+    return LabelledSequence(name, tuple(taken), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes)
+
+
+def _pose(path: Path) -> Float64[np.ndarray, "4 4"]:
+    rows = read_numbers(path, 4)
+    if len(rows) != 4:
+        raise InputError(f"{path} has {len(rows)} rows; expected a pose of 4 rows")
+    return checked_world_from_camera(rows[None], path)[0]
+
+
+# KITTI
+_PER_METRE = 256.0
+_TRUTH = Path("proj_depth/groundtruth/image_02")
+_PICTURES = Path("image_02/data")
+_GATHERED = "groundtruth_depth_gathered"
+_DATE = len("2011_09_26")  # what a drive's name starts with
+_CALIBRATION = "calib_cam_to_cam.txt"
+_PROJECTION = "P_rect_02"
+
+
+def kitti(root: Path) -> dict[str, Opener]:
+    """Find the drives of a folder with val/, or of MonST3R's folder of gathered drives."""
+    openers: dict[str, Opener] = {}
+    for drive in subfolders(root / "val"):
+        if (drive / _TRUTH).is_dir():
+            date = root / drive.name[:_DATE]
+            places = (date / drive.name / _PICTURES, drive / _PICTURES)
+            pictures = next((place for place in places if place.is_dir()), places[0])
+            openers[drive.name] = partial(_read_kitti, drive.name, drive / _TRUTH, pictures, date / _CALIBRATION)
+    for drive in subfolders(root / _GATHERED):
+        name = drive.name.removesuffix("_02")
+        if name not in openers:
+            pictures = root / "image_gathered" / drive.name
+            openers[name] = partial(_read_kitti, name, drive, pictures, root / _CALIBRATION)
+    if not openers:
+        raise InputError(f"{root} holds no drive of KITTI; expected val/<drive>/{_TRUTH} or {_GATHERED}/<drive>_02")
+    return openers
+
+
+def _read_kitti(name: str, truth: Path, folder: Path, calibration: Path, frames: FrameChoice) -> LabelledSequence:
+    depths, pictures = files(truth, ".png"), files(folder, ".png")
+    if not depths or not pictures:
+        raise InputError(f"{folder if depths else truth} holds no .png; the drive {name} needs pictures and depth")
+    chosen = frames.of(list(depths), name)  # frames with depth: the first and the last few of a drive have none
+    notes: tuple[str, ...] = ()
+    if missing := [frame for frame in chosen if frame not in pictures]:
+        notes += (f"{len(missing)} of {len(chosen)} frames have no picture and are skipped, {missing[0]} first",)
+        chosen = [frame for frame in chosen if frame in pictures]
+    taken = [pictures[frame] for frame in chosen]
+    depth, more = depth_reader(taken, [depths[frame] for frame in chosen], partial(read_png, per_metre=_PER_METRE))
+    intrinsics = None
+    if calibration.is_file():
+        intrinsics = np.broadcast_to(_projection(calibration), (len(taken), 3, 3))
+    else:
+        notes += (f"it has no {calibration.name}, so no intrinsics",)
+    return LabelledSequence(name, tuple(taken), depth, intrinsics=intrinsics, notes=(*notes, *more, "it has no poses"))
+
+
+def _projection(path: Path) -> Float64[np.ndarray, "3 3"]:
+    lines = [line.partition(":") for line in read_text(path).splitlines()]
+    values = [value for key, _, value in lines if key.strip() == _PROJECTION]
+    try:
+        numbers = [float(word) for word in values[0].split()]
+        fx, _, cx, _, _, fy, cy = numbers[:7]
+    except (IndexError, ValueError):
+        raise InputError(f"{path} has no line '{_PROJECTION}: ' with 12 numbers; get it whole") from None
+    if len(numbers) != 12:
+        raise InputError(f"{path} has {len(numbers)} numbers for {_PROJECTION}; expected 12")
+    return intrinsics_matrix(fx, fy, cx, cy, first_pixel=0, source=path)
