@@ -20,11 +20,11 @@ from benchmarks.plots import plot_paths
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import load_clip
 from vggtjax.clips.preprocessing import Fitter
-from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import open_source
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.geometry.similarity import centres, umeyama_sim3
+from vggtjax.media.sampling import Sampling
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, SyntheticClip, closed_walk, load_textures, render, sample_scene

@@ -10,9 +10,9 @@ import numpy as np
 from PIL import Image
 
 from vggtjax.cameras import world_from_camera
-from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.truth import Truth
 from vggtjax.evaluation.datasets import find_sequences
+from vggtjax.media.sampling import Sampling
 
 SINTEL_TAG = struct.pack("<f", 202021.25)
 

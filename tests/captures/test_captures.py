@@ -15,9 +15,9 @@ from vggtjax.cameras import project
 from vggtjax.captures.cameras import DISTORTED
 from vggtjax.captures.table import KINDS, find_capture, read_capture
 from vggtjax.clips.clip import load_clip
-from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import clips_by_name, open_source
 from vggtjax.errors import ClipError, InputError, MissingExtraError
+from vggtjax.media.sampling import Sampling
 
 read: Any = read_capture  # of no type: a test knows what there is
 find: Any = find_capture

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from vggtjax.clips.images import to_rgb
 from vggtjax.clips.preprocessing import Fit, Fitter
 from vggtjax.errors import ClipError, InputError
+from vggtjax.media.images import to_rgb
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "preprocess.npz"
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.clips.arrays import ArrayFrames
-from vggtjax.clips.images import ImageFiles
-from vggtjax.clips.order import natural_key
-from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import open_source
-from vggtjax.clips.video import VideoFile
 from vggtjax.errors import ClipError
+from vggtjax.media.arrays import ArrayFrames
+from vggtjax.media.images import ImageFiles
+from vggtjax.media.order import natural_key
+from vggtjax.media.sampling import Sampling
+from vggtjax.media.video import VideoFile
 
 
 @pytest.fixture

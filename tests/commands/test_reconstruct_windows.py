@@ -10,7 +10,6 @@ from tests.videos import write_video
 from vggtjax import Reconstruction, load_model
 from vggtjax.batch.many import reconstruct_many
 from vggtjax.clips.preprocessing import Fitter
-from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import open_source
 from vggtjax.commands import main as cli
 from vggtjax.commands.clip_options import GivenInputs
@@ -18,6 +17,7 @@ from vggtjax.commands.one_clip import OneClip
 from vggtjax.commands.report import Report
 from vggtjax.errors import DeviceMemoryError
 from vggtjax.known.options import KnownGeometry
+from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
 from vggtjax.pipeline import memory
 from vggtjax.pipeline.steps import Compile

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 
 from tests.videos import write_video
 from vggtjax.clips.preprocessing import Fitter
-from vggtjax.clips.sampling import Frame, Sampling
-from vggtjax.clips.video import VideoFile
+from vggtjax.media.sampling import Frame, Sampling
+from vggtjax.media.video import VideoFile
 from vggtjax.windows.frames import count_frames, window_clips
 from vggtjax.windows.plan import plan_windows
 

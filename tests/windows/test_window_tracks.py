@@ -9,9 +9,9 @@ from vggtjax import load_clip, reconstruct
 from vggtjax.clips.masks import masks_digest
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.queries import Queries, check_queries, parse_queries
-from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import open_source
 from vggtjax.errors import ClipError, InputError
+from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 from vggtjax.windows.frames import SeenFrames, window_clips

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vggtjax.app.limits import Limits
-from vggtjax.clips.images import is_image_name
-from vggtjax.clips.order import natural_key
-from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.clips.sources import open_source
-from vggtjax.clips.video import VideoFile, is_video_name
 from vggtjax.errors import ClipError, one_line
+from vggtjax.media.images import is_image_name
+from vggtjax.media.order import natural_key
+from vggtjax.media.sampling import Sampling, Source
+from vggtjax.media.video import VideoFile, is_video_name
 
 _UNKNOWN_LENGTH_FPS = 4.0  # frames per second of a video that does not say how long it is
 

@@ -18,11 +18,11 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.fetched import Fetched
 from vggtjax.clips.preprocessing import Framing, FramingChanges
-from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import VggtjaxError
 from vggtjax.known.given import check_readable
 from vggtjax.known.options import KnownGeometry
+from vggtjax.media.sampling import Sampling
 from vggtjax.method.assembly import check_fuses
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_kept

@@ -12,9 +12,9 @@ import numpy as np
 from vggtjax.batch.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.clips.masks import masks_digest
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import InputError
 from vggtjax.known.options import KnownGeometry
+from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 from vggtjax.storage.file_digest import file_digest

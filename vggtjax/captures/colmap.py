@@ -14,9 +14,9 @@ from vggtjax.captures.cameras import DISTORTED, world_from_camera_of
 from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out
 from vggtjax.captures.colmap_model import Suffix, read_views
 from vggtjax.captures.files import inside
-from vggtjax.clips.images import is_image_name
-from vggtjax.clips.order import natural_key
 from vggtjax.errors import InputError
+from vggtjax.media.images import is_image_name
+from vggtjax.media.order import natural_key
 
 _MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0")  # places in a folder
 _PICTURES = ("images", "../images", "../../images", ".")  # places beside a model's own folder

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path, PureWindowsPath
 
-from vggtjax.clips.order import natural_key
 from vggtjax.errors import InputError, one_line, reading
+from vggtjax.media.order import natural_key
 
 _MOST_BYTES = 2**28  # of a file
 

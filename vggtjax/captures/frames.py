@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from vggtjax.captures.capture import Capture
-from vggtjax.clips.images import ImageFiles, read_image
-from vggtjax.clips.sampling import Frame, Sampling
+from vggtjax.media.images import ImageFiles, read_image
+from vggtjax.media.sampling import Frame, Sampling
 
 
 @dataclass(frozen=True)

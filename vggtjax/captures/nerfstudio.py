@@ -21,9 +21,9 @@ from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics
 from vggtjax.captures.depth_files import read_npy, read_png
 from vggtjax.captures.files import inside
 from vggtjax.captures.numbers import number, numbers
-from vggtjax.clips.images import is_image_name
-from vggtjax.clips.order import natural_key
 from vggtjax.errors import InputError
+from vggtjax.media.images import is_image_name
+from vggtjax.media.order import natural_key
 from vggtjax.storage.json_values import read_json
 
 NAMES = ("transforms.json", "transforms_train.json")

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from PIL import Image
 
-from vggtjax.clips.images import UNREADABLE, check_pixels, known_formats
 from vggtjax.errors import InputError, check_regular
+from vggtjax.media.images import UNREADABLE, check_pixels, known_formats
 
 PNG = ("PNG",)
 _ORIENTATION = 0x0112  # EXIF; from 5 on, width and height are swapped

@@ -22,9 +22,9 @@ from vggtjax.captures.depth_files import read_png
 from vggtjax.captures.files import files
 from vggtjax.captures.numbers import number
 from vggtjax.captures.pictures import PNG, opening
-from vggtjax.clips.images import is_image_name
-from vggtjax.clips.order import natural_key
 from vggtjax.errors import InputError
+from vggtjax.media.images import is_image_name
+from vggtjax.media.order import natural_key
 from vggtjax.storage.json_values import read_json
 
 _KEYFRAMES = "keyframes"

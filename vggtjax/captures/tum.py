@@ -22,8 +22,8 @@ from vggtjax.captures.cameras import DISTORTED, intrinsics_matrix
 from vggtjax.captures.capture import Capture, checked_sizes, left_out
 from vggtjax.captures.depth_files import read_png
 from vggtjax.captures.files import inside, read_text
-from vggtjax.clips.order import natural_key
 from vggtjax.errors import InputError
+from vggtjax.media.order import natural_key
 from vggtjax.storage.trajectories import associate, read_numbers, read_trajectory
 
 PER_METRE = 5000.0

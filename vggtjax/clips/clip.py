@@ -14,10 +14,10 @@ from jaxtyping import Float, Float32, Float64, Int, UInt8
 
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.clips.preprocessing import Fit, Fitter, Mode
-from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.clips.still import same_picture
 from vggtjax.errors import ClipError, InputError
+from vggtjax.media.sampling import Sampling, Source
 from vggtjax.progress import Progress, no_progress
 
 logger = logging.getLogger(__name__)

@@ -13,10 +13,10 @@ from jaxtyping import Bool
 from PIL import Image
 
 from vggtjax.clips.clip import Clip
-from vggtjax.clips.images import ImageFiles, has_transparency, known_formats, read_image
 from vggtjax.clips.sources import open_source
 from vggtjax.clips.truth import at_clip_pixels
 from vggtjax.errors import ClipError, InputError, reading
+from vggtjax.media.images import ImageFiles, has_transparency, known_formats, read_image
 from vggtjax.storage.file_digest import file_digest
 
 _WHITE = 127  # above it, a pixel of a picture in grey or colour moves

@@ -14,13 +14,13 @@ from PIL import Image, ImageOps
 
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, find_capture
-from vggtjax.clips.arrays import ArrayFrames
-from vggtjax.clips.images import ImageFiles, is_image_name, to_rgb
 from vggtjax.clips.manifest import MOST_BYTES, is_manifest, read_manifest, source_name
-from vggtjax.clips.order import natural_key
-from vggtjax.clips.sampling import Source
-from vggtjax.clips.video import VideoFile, is_video_name
 from vggtjax.errors import ClipError, InputError, reading
+from vggtjax.media.arrays import ArrayFrames
+from vggtjax.media.images import ImageFiles, is_image_name, to_rgb
+from vggtjax.media.order import natural_key
+from vggtjax.media.sampling import Source
+from vggtjax.media.video import VideoFile, is_video_name
 from vggtjax.storage.remote import check_url, download, is_url, list_url, local_path, shown, url_name
 
 Name: TypeAlias = str | os.PathLike[str]

@@ -8,8 +8,8 @@ from typing import Annotated
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import whole_number
+from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 from vggtjax.storage.flags import InWords, Switch

@@ -11,7 +11,6 @@ import tyro
 
 from vggtjax.batch.cluster_options import Cluster
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.clips.sampling import Sampling
 from vggtjax.commands.arguments import (
     BatchFolder,
     BatchMasks,
@@ -29,6 +28,7 @@ from vggtjax.commands.models import ModelFiles, check_named, load_on_worker
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
 from vggtjax.known.options import KnownGeometry
+from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
 from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving

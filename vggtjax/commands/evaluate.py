@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.clips.sampling import Sampling
 from vggtjax.commands.arguments import EvaluationFolder, Size
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
+from vggtjax.media.sampling import Sampling
 from vggtjax.options import METHODS, MethodName, Options, find_method
 from vggtjax.results.saving import ReadFormat
 from vggtjax.storage.flags import InWords

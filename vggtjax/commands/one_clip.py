@@ -11,11 +11,11 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.queries import parse_queries
-from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.report import Report
 from vggtjax.errors import DeviceMemoryError, one_line
 from vggtjax.known.options import KnownGeometry
+from vggtjax.media.sampling import Sampling, Source
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.options import Options
 from vggtjax.pipeline.run import reconstruct

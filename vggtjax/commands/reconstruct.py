@@ -7,13 +7,13 @@ from typing import Annotated
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.clips.sampling import Sampling
 from vggtjax.commands.arguments import Devices, Frames, Method, Output, ResultFolder, Size, Sources, Unchecked, View
 from vggtjax.commands.clip_options import ExtraOptions, GivenInputs
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
 from vggtjax.errors import InputError
+from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
 from vggtjax.results.saving import Saving
 

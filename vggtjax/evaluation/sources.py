@@ -87,8 +87,8 @@ class ModelSource:
     ) -> Mapping[str, Reconstruction]:
         """Return the results of one group; the groups of a sequence share its clip."""
         from vggtjax.clips.clip import read_clip
-        from vggtjax.clips.sampling import Sampling
         from vggtjax.clips.sources import open_source
+        from vggtjax.media.sampling import Sampling
         from vggtjax.pipeline.several import reconstruct_methods
 
         if self._last is None or self._last[0] is not sequence:

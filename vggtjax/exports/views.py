@@ -13,9 +13,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from vggtjax.cameras import world_from_camera
-from vggtjax.clips.images import ImageFiles
-from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.errors import ClipError
+from vggtjax.media.images import ImageFiles
+from vggtjax.media.sampling import Sampling, Source
 from vggtjax.results.frame import ResultFrame, frame_of
 from vggtjax.results.result import Result
 

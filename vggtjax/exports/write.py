@@ -9,10 +9,10 @@ from typing import get_args
 
 import numpy as np
 
-from vggtjax.clips.sampling import Source
 from vggtjax.errors import InputError, OutputError, check_choice, check_extra
 from vggtjax.exports.table import FORMATS, ExportFormat, Exporting
 from vggtjax.exports.views import View, views
+from vggtjax.media.sampling import Source
 from vggtjax.progress import Progress, no_progress
 from vggtjax.results.glb import POINT_LIMIT
 from vggtjax.results.result import Result

@@ -176,9 +176,9 @@ def dataset_passes(
 
     Raises InputError where no sequence has true depth.
     """
-    from vggtjax.clips.sampling import Sampling
     from vggtjax.evaluation.datasets import DATASETS, find_sequences
     from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
+    from vggtjax.media.sampling import Sampling
 
     openers = find_sequences(dataset, root, sampling=Sampling(max_frames=max_frames))
     max_depth = DATASETS[dataset].max_depth

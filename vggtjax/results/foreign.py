@@ -27,9 +27,9 @@ from jaxtyping import Float, Float32
 from PIL import Image
 
 from vggtjax.cameras import Cameras, world_from_camera
-from vggtjax.clips.images import read_image
 from vggtjax.clips.masks import read_mask
 from vggtjax.errors import InputError, ResultError, check_choice, reading
+from vggtjax.media.images import read_image
 from vggtjax.results.frame import ResultFrame
 from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, read_headers
 from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory

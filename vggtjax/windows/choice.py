@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.preprocessing import Fitter
-from vggtjax.clips.sampling import Sampling, Source
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import DeviceMemoryError
+from vggtjax.media.sampling import Sampling, Source
 from vggtjax.pipeline import memory
 from vggtjax.storage.free_memory import in_gigabytes
 from vggtjax.windows.frames import count_frames

@@ -14,8 +14,8 @@ import numpy as np
 
 from vggtjax.clips.clip import Clip, read_clip, warn_of_left_out
 from vggtjax.clips.preprocessing import Fitter
-from vggtjax.clips.sampling import Frame, Sampling, Source
 from vggtjax.errors import ClipError
+from vggtjax.media.sampling import Frame, Sampling, Source
 from vggtjax.results.result import Result
 
 

@@ -18,9 +18,9 @@ from vggtjax.clips.clip import Clip
 from vggtjax.clips.masks import load_masks, masks_digest
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.queries import Queries, check_queries, check_words, parse_queries
-from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError
+from vggtjax.media.sampling import Sampling
 from vggtjax.method.algorithm import compute_by
 from vggtjax.method.assembly import check_fuses
 from vggtjax.method.fusion_family import FusionParams

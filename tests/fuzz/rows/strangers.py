@@ -27,15 +27,15 @@ from tests.results.test_foreign import QUATERNIONS, WRITERS
 from vggtjax.captures.depth_files import read_dpt, read_exr, read_npy, read_png
 from vggtjax.captures.table import read_capture
 from vggtjax.clips.clip import Clip, load_clip
-from vggtjax.clips.images import read_image
 from vggtjax.clips.masks import load_masks
 from vggtjax.clips.queries import parse_queries
-from vggtjax.clips.sampling import Sampling
 from vggtjax.clips.sources import clips_by_name, open_source
 from vggtjax.evaluation.datasets import find_sequences
 from vggtjax.known.depths import read_depths
 from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
 from vggtjax.known.poses import checked_known_poses, read_poses
+from vggtjax.media.images import read_image
+from vggtjax.media.sampling import Sampling
 from vggtjax.reconstruction import Reconstruction
 
 SIDE = 28

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from vggtjax.clips.order import natural_key
 from vggtjax.errors import InputError
+from vggtjax.media.order import natural_key
 
 _MOST_NAMES = 8  # of a message
 

@@ -20,12 +20,12 @@ from jaxtyping import Float64
 from vggtjax.captures.cameras import checked_intrinsics, checked_world_from_camera
 from vggtjax.captures.depth_files import read_png
 from vggtjax.captures.files import files
-from vggtjax.clips.images import is_image_name
 from vggtjax.clips.masks import read_mask
-from vggtjax.clips.order import natural_key
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
 from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, depth_reader, mask_reader
+from vggtjax.media.images import is_image_name
+from vggtjax.media.order import natural_key
 from vggtjax.storage.trajectories import read_numbers, read_trajectory
 
 _NEW_TAKE = 10.0  # times the median step of the camera: a jump between two takes

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
 from vggtjax.captures.pictures import PNG, opening, picture_size
-from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import InputError
+from vggtjax.media.sampling import Sampling
 
 T = TypeVar("T")
 DepthReader = Callable[[int], Float32[np.ndarray, "h w"]]

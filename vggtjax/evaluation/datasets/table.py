@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import InputError, reading
 from vggtjax.evaluation.datasets import published
 from vggtjax.evaluation.datasets.captures import captures
@@ -19,6 +18,7 @@ from vggtjax.evaluation.datasets.layouts import davis, kitti, seven_scenes, sint
 from vggtjax.evaluation.datasets.plain import plain
 from vggtjax.evaluation.datasets.sequence import EVERY_FRAME, FrameChoice, LabelledSequence, Reader
 from vggtjax.evaluation.datasets.tum import bonn, tum
+from vggtjax.media.sampling import Sampling
 
 logger = logging.getLogger(__name__)
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from PIL import Image
 
-from vggtjax.clips.arrays import frame_name
-from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.errors import ClipError, check_regular
+from vggtjax.media.arrays import frame_name
+from vggtjax.media.sampling import Frame, Sampling
 
 if TYPE_CHECKING:
     from types import ModuleType

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.clips.images import read_image
 from vggtjax.errors import ClipError
+from vggtjax.media.images import read_image
 
 RAMP = np.array([[0, 128, 129, 33023, 65535]], np.uint16)
 RAMP_8 = [0, 0, 1, 128, 255]

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.errors import ClipError
+from vggtjax.media.sampling import Frame, Sampling
 
 _SLACK = 1e-3  # largest distance of a floating-point value from [0, 1] that counts as rounding
 

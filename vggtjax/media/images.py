@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
-from vggtjax.clips.arrays import eight_bit
-from vggtjax.clips.sampling import Frame, Sampling
 from vggtjax.errors import ClipError, InputError, check_regular
+from vggtjax.media.arrays import eight_bit
+from vggtjax.media.sampling import Frame, Sampling
 
 # Formats of still pictures only: for others (EPS) Pillow starts another program.
 FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP", "PPM", "WEBP", "TGA", "JPEG2000", "AVIF", "HEIF")

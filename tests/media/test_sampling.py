@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import ClipError, InputError
+from vggtjax.media.sampling import Sampling
 
 
 def taken(times, **values):

@@ -9,9 +9,9 @@ import pytest
 from av.stream import Disposition
 
 from tests.videos import HEIGHT, WIDTH, picture, write_video
-from vggtjax.clips.sampling import Sampling
-from vggtjax.clips.video import VideoFile, upright
 from vggtjax.errors import ClipError
+from vggtjax.media.sampling import Sampling
+from vggtjax.media.video import VideoFile, upright
 
 # Upper left (a, b, c, d) of a display matrix, x' = a x + c y and y' = b x + d y with y down, and what FFmpeg's filters
 # of the same names make of the rows abc and def.
@@ -108,7 +108,7 @@ def test_a_video_that_breaks_off_within_a_frame(broken, monkeypatch):
     with pytest.raises(ClipError, match=r"broken.mp4 breaks off at frame 8 .*; set max_frames"):
         read(path)
     assert len(read(path, max_frames=8)) == 8  # nothing after the last frame taken is looked at
-    monkeypatch.setattr("vggtjax.clips.video._MOST_PIXELS", WIDTH * HEIGHT - 1)
+    monkeypatch.setattr("vggtjax.media.video._MOST_PIXELS", WIDTH * HEIGHT - 1)
     with pytest.raises(ClipError, match=f"has frames of {WIDTH} x {HEIGHT}"):
         read(path)
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from vggtjax.clips.arrays import ArrayFrames, eight_bit
-from vggtjax.clips.sampling import Sampling
 from vggtjax.errors import ClipError
+from vggtjax.media.arrays import ArrayFrames, eight_bit
+from vggtjax.media.sampling import Sampling
 
 
 def test_depths():

@@ -1,0 +1,1 @@
+"""Pictures and videos, whoever reads them: their order, which of them, and their pixels."""
