@@ -7,7 +7,8 @@ import sys
 
 import pytest
 
-from vggtjax import MotionConfig, VGGTConfig, vggt_1b
+from vggtjax import VGGTConfig
+from vggtjax.config import MotionConfig, vggt_1b
 from vggtjax.errors import InputError
 
 

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import vggtjax
 from tests.documented import LANGUAGES, NOTEBOOKS, PAGES, ROOT, blocks, commands, page_name
 from vggtjax.clips.truth import Truth
 from vggtjax.commands import main as cli
@@ -182,3 +183,13 @@ def test_the_reference_has_every_option():
     assert {flag for flag in flags if f"`{flag}" not in page} == set()
     assert "│" not in page
     assert "(required)" in page
+
+
+def test_the_reference_has_every_public_name():
+    names = set(dir(vggtjax)) - {"__version__"}
+    assert len(names) <= 24
+    pages = {path.name: path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md")}
+    shown = re.findall(r"^::: vggtjax\.(\w+)$", "\n".join(pages.values()), flags=re.MULTILINE)
+    assert names - set(shown) == set()
+    levels = pages["index.md"].split("| level | names |")[1].split("\n\n")[0]
+    assert sorted(re.findall(r"`(\w+)`", levels)) == sorted(names)

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from vggtjax import MotionConfig
+from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS, Options
 

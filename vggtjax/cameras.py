@@ -21,6 +21,8 @@ _Array = TypeVar("_Array", np.ndarray, "jax.Array")
 FIELD_OF_VIEW_RANGE = (0.01, 3.1)  # radians; beyond it a pinhole camera has no usable focal length
 _NOT_RIGID = 1e-2  # largest difference of R^T R from the identity
 _FIELD_OF_VIEW_SLACK = 1e-6  # radians; a clamped camera that went through float32 is not clamped again
+# Corners of `frustum_corners`: 0 the centre, then 1 top left, 2 top right, 3 bottom right, 4 bottom left.
+FRUSTUM_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 
 
 class Cameras(NamedTuple):

@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import vggtjax
+from vggtjax.options import ABLATION
 from vggtjax.pretrained.embedded import demo_clip
 
 model, truth = vggtjax.load_model("demo"), demo_clip()
@@ -20,7 +21,7 @@ _, passes = vggtjax.infer(model.params, images, model.config)
 # `passes.first` and `passes.second` are what the network predicted, `passes.dynamic_mask` is the mask between them.
 
 # %%
-ladder = {name: vggtjax.assemble(passes, method=name) for name in vggtjax.ABLATION}
+ladder = {name: vggtjax.assemble(passes, method=name) for name in ABLATION}
 
 # %% [markdown]
 # ## Depth, by region

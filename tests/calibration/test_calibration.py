@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from tests.tiny import tiny_config
-from vggtjax import Cue, Model, MotionConfig, init_params, load_model, motion_saliency
+from vggtjax import init_params, load_model
 from vggtjax.calibration.choice import candidates, choose, halves
 from vggtjax.calibration.export import MODEL, NUMBERS, PICTURE, check_folder, save_calibration
 from vggtjax.calibration.matching import CameBack, matching_pairs
@@ -27,11 +27,13 @@ from vggtjax.calibration.sweep import (
     token_auc,
     token_truth,
 )
-from vggtjax.checkpoint import save_model
+from vggtjax.checkpoint import Model, save_model
 from vggtjax.commands import calibrate_cues as command
 from vggtjax.commands.calibrate_cues import calibrate_cues
+from vggtjax.config import Cue, MotionConfig
 from vggtjax.errors import InputError, OutputError
 from vggtjax.method.cues import GramCues
+from vggtjax.method.passes import motion_saliency
 
 FRAMES, SIZE, CLIPS = 4, 56, 4
 

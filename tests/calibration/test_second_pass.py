@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from tests.tiny import tiny_config
-from vggtjax import Model, MotionConfig, init_params, load_model, reconstruct
+from vggtjax import init_params, load_model, reconstruct
 from vggtjax.calibration.choice import Choice, Rating
 from vggtjax.calibration.export import calibrated
 from vggtjax.calibration.second_pass import CameraErrors, SecondPassChoice, Setting, choose_second_pass
-from vggtjax.checkpoint import save_model
+from vggtjax.checkpoint import Model, save_model
 from vggtjax.commands.calibrate_cues import calibrate_cues, generated_clips
-from vggtjax.config import VGGTConfig
+from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import LadderRow, ladder
 from vggtjax.evaluation.sources import ModelSource

@@ -8,7 +8,8 @@ from PIL import Image
 
 from testing.seeded import seeded_images
 from tests.tiny import tiny_config
-from vggtjax import Model, Reconstruction, init_params, load_clip, reconstruct
+from vggtjax import Reconstruction, init_params, load_clip, reconstruct
+from vggtjax.checkpoint import Model
 from vggtjax.clips.queries import Queries, check_words, parse_queries
 from vggtjax.errors import InputError, ResultError
 

@@ -21,8 +21,9 @@ from converters import convert, convert_state_dict
 from converters.rules import CONV, DENSE, DEPTH_TO_SPACE, IGNORED, POINTWISE, RULES, SAME, TRACKS, UNBATCHED
 from converters.torch_to_flax import source_shapes
 from testing.seeded import seeded_state_dict
-from vggtjax import forward, load_model, vggt_1b
+from vggtjax import forward, load_model
 from vggtjax.checkpoint import flat_shapes
+from vggtjax.config import vggt_1b
 from vggtjax.errors import CheckpointError, InputError, OutputError
 from vggtjax.network.model import HEADS
 

@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from testing.seeded import seeded_images
 from tests.tiny import tiny_config
-from vggtjax import Model, Passes, assemble, infer, init_params
+from vggtjax import assemble, infer, init_params
+from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth
 from vggtjax.evaluation.ladder import LadderRow, error_table, ladder, second_pass_in_words
 from vggtjax.evaluation.metrics.depth import depth_errors, median_scale
@@ -20,6 +21,7 @@ from vggtjax.evaluation.metrics.masks import auc, jaccard
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.method.mask import upsample
+from vggtjax.method.passes import Passes
 from vggtjax.options import ABLATION
 
 CLIPS, FRAMES, SIZE = 3, 4, (28, 42)

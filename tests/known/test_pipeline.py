@@ -6,8 +6,9 @@ from PIL import Image
 
 from tests.moving_ball import moving_ball
 from tests.tiny import tiny_model
-from vggtjax import KnownGeometry, Reconstruction, load_clip, reconstruct, reconstruct_many
+from vggtjax import Reconstruction, load_clip, reconstruct, reconstruct_many
 from vggtjax.errors import InputError
+from vggtjax.known.options import KnownGeometry
 
 
 @pytest.fixture(scope="module")

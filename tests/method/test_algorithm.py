@@ -11,24 +11,16 @@ from jax.sharding import Mesh
 from jax.tree_util import Partial
 
 from tests.tiny import tiny_model
-from vggtjax import (
-    Clips,
-    Model,
-    Options,
-    assemble,
-    compile_ahead,
-    infer,
-    load_clip,
-    reconstruct,
-    reconstruct_long,
-    write_artefact,
-)
+from vggtjax import Clips, Options, assemble, infer, load_clip, reconstruct, reconstruct_long
 from vggtjax.batch.many import reconstruct_many
+from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
 from vggtjax.learning import identity, reconstruct_soft, soft_masking
 from vggtjax.method.algorithm import run_method, run_passes
+from vggtjax.pipeline.artefact import write_artefact
+from vggtjax.pipeline.run import compile_ahead
 from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.windows.plan import Windows
 

@@ -9,8 +9,7 @@ import pytest
 from jax.sharding import Mesh
 
 from tests import reference
-from vggtjax import MotionConfig
-from vggtjax.config import Cue
+from vggtjax.config import Cue, MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.method.cues import GramCues, _sample_std, _unit, normalise, sources
 from vggtjax.network.frames import BY_FRAME, Frames

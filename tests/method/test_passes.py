@@ -12,7 +12,6 @@ from testing.seeded import seeded_images
 from tests.tiny import tiny_model
 from vggtjax import (
     METHODS,
-    Model,
     assemble,
     decode_pose,
     encode,
@@ -20,13 +19,14 @@ from vggtjax import (
     fuse_depth,
     infer,
     load_clip,
-    motion_saliency,
     reconstruct,
     run_passes,
 )
+from vggtjax.checkpoint import Model
 from vggtjax.errors import InputError
 from vggtjax.method.fusion import scale_between
 from vggtjax.method.mask import dynamic_pixels, dynamic_tokens, mine_mask
+from vggtjax.method.passes import motion_saliency
 from vggtjax.options import Options
 from vggtjax.results.result import FieldOfViewWarning
 

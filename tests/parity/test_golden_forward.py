@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from testing.golden import FORWARD, OUTPUTS, TOLERANCE, GoldenPass, spread_error
-from vggtjax import decode_pose, encode, encode_pose, forward
+from vggtjax import decode_pose, encode, forward
 from vggtjax.network.aggregator import aggregate, identity
+from vggtjax.network.pose import encode_pose
 
 golden_pass = functools.cache(GoldenPass)
 _forward = jax.jit(forward, static_argnames=("config", "suppress", "outputs"))

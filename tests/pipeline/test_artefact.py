@@ -14,8 +14,9 @@ import pytest
 
 from testing.seeded import seeded_images
 from tests.tiny import tiny_model
-from vggtjax import infer, write_artefact
+from vggtjax import infer
 from vggtjax.pipeline import serve
+from vggtjax.pipeline.artefact import write_artefact
 
 SHAPE = (4, 28, 42)  # frames, height, width
 INSTALLED = ("jax", "jaxlib", "numpy", "ml_dtypes", "opt_einsum", "scipy")  # by `pip install jax`

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tests.tiny import tiny_config
-from vggtjax import Model, compile_ahead, encode, infer, load_clip, reconstruct
+from vggtjax import encode, infer, load_clip, reconstruct
+from vggtjax.checkpoint import Model
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import CheckpointError, InputError
 from vggtjax.method.passes import first_pass, second_pass
@@ -16,6 +17,7 @@ from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.model import init_params, parameter_shapes
 from vggtjax.pipeline.fields import assembled_fields
 from vggtjax.pipeline.lengths import padded_frames
+from vggtjax.pipeline.run import compile_ahead
 from vggtjax.results.not_finite import NotFiniteWarning, warn_of_not_finite
 
 SIDE, OFFSETS = 70, MotionConfig().offsets

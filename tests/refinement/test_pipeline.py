@@ -7,7 +7,8 @@ pytest.importorskip("pycolmap", reason="needs the extra colmap")
 
 from tests.corner import make_corner, paint
 from tests.tiny import tiny_model
-from vggtjax import KnownGeometry, load_clip, reconstruct
+from vggtjax import load_clip, reconstruct
+from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
 from vggtjax.progress import StageSeconds
 

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.room import make_room
-from vggtjax import Clip, Reconstruction, load_clip
+from vggtjax import Reconstruction, load_clip
+from vggtjax.clips.clip import Clip
 from vggtjax.results.frame import SAME_SURFACE, enlarged_depth, frame_of
 
 

@@ -14,9 +14,8 @@ from vggtjax.exports.table import FORMATS, ExportFormat, Exporting
 from vggtjax.exports.views import View, views
 from vggtjax.media.sampling import Source
 from vggtjax.progress import Progress, no_progress
-from vggtjax.results.glb import POINT_LIMIT
 from vggtjax.results.result import Result
-from vggtjax.results.shown import ShownPoints, shown_points
+from vggtjax.results.shown import POINT_LIMIT, ShownPoints, shown_points
 from vggtjax.storage.trajectories import write_trajectory
 from vggtjax.storage.writing import writing
 

@@ -10,13 +10,12 @@ import numpy as np
 import scipy
 from jaxtyping import Float32, Int32, UInt8
 
-from vggtjax.cameras import Cameras, frustum_corners, project
+from vggtjax.cameras import FRUSTUM_EDGES, Cameras, frustum_corners, project
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.progress import Progress, no_progress
 from vggtjax.rendering.film import write_film as write_film
 from vggtjax.rendering.paths import fitted_intrinsics, follow, middle_camera, orbit
 from vggtjax.rendering.splats import BACKGROUND, Splats, draw_splats
-from vggtjax.results.glb import FRUSTUM_EDGES
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, shown_points
 

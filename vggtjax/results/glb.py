@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual import ColorVisuals
 
-from vggtjax.cameras import frustum_corners
+from vggtjax.cameras import FRUSTUM_EDGES, frustum_corners
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.result import Result
-from vggtjax.results.shown import shown_points
+from vggtjax.results.shown import POINT_LIMIT, shown_points
 from vggtjax.storage.arrays import is_mapped
 
 _LEVELS = np.arange(256) / 255  # of sRGB
@@ -25,7 +25,6 @@ _UNLIT = {
     "pbrMetallicRoughness": {"baseColorFactor": [1.0, 1.0, 1.0, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0},
     "extensions": {"KHR_materials_unlit": {}},
 }
-POINT_LIMIT = 1_000_000  # viewers in a browser still turn so many points smoothly
 _MAPPED_LIMIT = 400_000  # of a mapped result: a point takes up to 100 bytes of memory while the file is made
 _STATIC_SHARE = 0.8  # of these points
 _TO_GLTF = np.array([1, -1, -1], np.float32)  # half a turn about x: y down and z forward become y up and z backward
@@ -33,8 +32,6 @@ _CAMERA_SIZE = 0.06  # of the median distance from the middle of the cameras to 
 _MOST_DISTANCES = 200_000  # of a cloud, of which the median is taken
 _BAR_SIZE = 0.015  # of a camera: half the thickness of its edges
 
-# Corners of `frustum_corners`: 0 the centre, then 1 top left, 2 top right, 3 bottom right, 4 bottom left.
-FRUSTUM_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 # A bar between two squares of corners 0-3 and 4-7.
 _BAR_FACES = np.array([[0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6], [3, 0, 4], [3, 4, 7]])
 

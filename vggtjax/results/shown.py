@@ -15,6 +15,7 @@ from vggtjax.results.point_cloud import PointCloud, least_confidence
 from vggtjax.results.result import Result
 from vggtjax.results.thinning import Candidates, EvenThinning, places_in_cube
 
+POINT_LIMIT = 1_000_000  # viewers in a browser still turn so many points smoothly
 MOST_STATIC, MOST_MOVING = 1_000_000, 50_000  # points of the clip, points of a frame
 _STEEPEST = 8.0  # slope of a surface, away over across, beyond which neighbours belong to two: 83 degrees
 _NEIGHBOURS = ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:]))  # pixels and the next ones, by axis
