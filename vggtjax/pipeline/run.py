@@ -5,27 +5,24 @@ from __future__ import annotations
 import dataclasses
 import time
 from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model, check_finite
-from vggtjax.clips.clip import Clip, load_clip
-from vggtjax.clips.masks import load_masks, masks_at_clip_pixels
+from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.sources import ClipSource
 from vggtjax.errors import InputError, ResultError, device_memory_errors
 from vggtjax.known.apply import apply_known, scaled
-from vggtjax.known.given import Given, check_readable, read_known
 from vggtjax.known.options import KnownGeometry
 from vggtjax.method.algorithm import Clips, compute_by, run_method
-from vggtjax.method.assembly import FusionRule, as_tree, check_fuses
+from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
 from vggtjax.method.mask_refinement import refine_masks
+from vggtjax.method.passes import Passes
 from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.options import Options
 from vggtjax.pipeline.devices import frames_mesh, on_host, replicate, shard_frames
@@ -38,9 +35,11 @@ from vggtjax.pipeline.fields import (
     settings_of,
     track_fields,
 )
+from vggtjax.pipeline.inputs import GivenMasks, Inputs, read_inputs
 from vggtjax.pipeline.lengths import padded_frames, shared_length
+from vggtjax.pipeline.running import Running, changed
 from vggtjax.pipeline.steps import Compile, Execute, StageMemory
-from vggtjax.progress import OnStage, Progress, no_stage
+from vggtjax.progress import OnStage, Progress
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.refine import check_refinement, refine_cameras
 from vggtjax.results.not_finite import warn_of_not_finite
@@ -57,14 +56,11 @@ def reconstruct(
     *,
     options: Options = Options(),
     size: int | None = None,
-    masks: Bool[np.ndarray, "S h w"] | str | Path | Literal[False] | None = None,
+    masks: GivenMasks | None = None,
     tracks: Queries | None = None,
     fusion: FusionRule | None = None,
     known: KnownGeometry | None = None,
-    pad_frames: bool = False,
-    devices: int = 1,
-    keep_passes: bool = False,
-    on_stage: OnStage | None = None,
+    running: Running = Running(),
     **changes: Any,
 ) -> Reconstruction:
     """Reconstruct a clip: cameras, depth, its confidence, and what moves.
@@ -75,20 +71,15 @@ def reconstruct(
             `size`, or of another patch size than the model's, is read from its source again.
         options: the method and its settings.
         size: side in pixels to run at, a multiple of the patch size; the model's own if None.
-        masks: what moves, instead of the mined masks: boolean at the size of the clip's frames, as given or as
-            fitted, or of the source's pictures, or a folder of pictures; False: nothing moves. If no pixel moves, the
-            second pass is skipped. It is also skipped if masks are mined and all frames are identical.
+        masks: dynamic regions, instead of the mined masks: boolean at the size of the clip's frames, as given or as
+            fitted, or of the source's images, or a folder of images; False: nothing is dynamic. If no pixel is dynamic,
+            the second pass is skipped. It is also skipped if masks are mined and all frames are identical.
         tracks: points to follow, in pixels of the frames; points of a later frame than the first cost one more pass.
         fusion: a fitted rule (`load_fusion`) or a function, as for `assemble`, whose precision is the confidence; None:
             the paper's rule.
         known: intrinsics, poses or lengths that are known, and pixels without depth: the prediction is brought to them.
-        pad_frames: pad the clip to one of a few lengths, so that clips of similar length share compiled programs; the
-            result is the same to rounding. Not for clips with tracks.
-        devices: share the frames among so many devices, each with a copy of the weights; the result is the same to
-            rounding. With several processes (`jax.distributed`) every one calls this and returns the whole result.
-        keep_passes: keep both passes on the result, as `.passes`.
-        on_stage: called with the name of each stage, returns a context in which the stage runs.
-        changes: fields of `options` by name, such as `method="vggt4d"`.
+        running: devices, padded lengths, kept passes, and what is told of the stages.
+        changes: fields of `options` or of `running` by name, such as `method="vggt4d"` or `devices=2`.
 
     A NotFiniteWarning tells how much of depth, confidence and saliency is NaN or infinite.
 
@@ -100,89 +91,18 @@ def reconstruct(
         DeviceMemoryError: the clip does not fit in the memory of the device.
         MissingExtraError: cameras are to be refined, and pycolmap is not installed.
     """
-    options = options.changed(**changes)
+    options, running = changed(options, running, changes)
     if masks is not None:
         options.check_given_masks()
     options = options.resolved(model.config.motion)
-    on_stage = on_stage or no_stage
-    mesh = frames_mesh(devices)
-    if mesh is not None and tracks is not None:
-        raise InputError(f"devices is {devices} and points are to be tracked, which takes one device; leave one out")
-    check_fuses(fusion, options.method)
-    poses_are_known = known is not None and known.poses is not None
-    check_refinement(options.refine_cameras, poses_are_known)
-    if options.cameras == "adjusted" and poses_are_known:
-        raise InputError("cameras is 'adjusted' and poses are given, which would replace them; leave one of them out")
-    if known is not None:
-        check_readable(known)
-    source, (clip, tracks) = clip, _fitted(model, clip, size, tracks, on_stage)
-    given = None
-    if masks is False:
-        given = np.zeros(clip.images.shape[:3], bool)
-    elif masks is not None:
-        given = masks_at_clip_pixels(masks, clip, source if isinstance(source, Clip) else clip)
-    mask_source = "mined" if masks is None else "given"
-    if masks is None and clip.is_still:
-        given, mask_source = np.zeros(clip.images.shape[:3], bool), "none: all frames are equal"
-    geometry = _given_geometry(known, clip) if known else None
-    frames, height, width = clip.images.shape[:3]
-    length = padded_frames(frames, model.config.motion.offsets) if pad_frames and tracks is None else frames
-    padding = shared_length(length, mesh) - frames
-
-    def padded(x: np.ndarray) -> Array:
-        return shard_frames(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None], mesh)
-
-    inputs = Clips(
-        images=padded(clip.images),
-        query_points={} if tracks is None else replicate(_points_by_frame(tracks), mesh),
-        frames=frames,
-    )
-    params, rule = model.params, as_tree(fusion)
-    if mesh is not None:
-        params, rule = replicate((params, rule), mesh)
-    run = partial(
-        run_method,
-        params,
-        inputs,
-        model.config,
-        options,
-        masks=None if given is None else padded(given) if given.any() else False,
-        fusion=rule,
-        both_outputs=keep_passes,
-        compute=compute_by(options, Frames(mesh, None if mesh is None else length)),
-    )
-    with device_memory_errors(_LESS_MEMORY, frames, height, width):
-        started = time.perf_counter()
-        with on_stage("compile programs") as progress:
-            compiler = Compile()
-            run(step=compiler)
-            compiler.wait(progress)
-        hint_compilation_cache(time.perf_counter() - started)
-        assembly, passes = run(step=Execute(on_stage))
-    outputs = (assembly, passes._replace(patch_tokens=None))
-    assembly, passes = jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
-    motion, mask_source = motion_by_matches(passes, mask_source)
-    tracked = {} if tracks is None else track_fields(tracks, passes.tracks, frames)
-    try:
-        result = Reconstruction(
-            **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
-            **clip_fields(clip),
-            **tracked,
-            saliency=passes.saliency[0],
-            motion=motion,
-            dynamic_mask=passes.dynamic_mask[0],
-            method=options.method,
-            model_name=model.name,
-            settings=settings_of(model, clip, options, mask_source, fusion) | camera_source(options, passes),
-            passes=kept_passes(passes, options) if keep_passes else None,
-        )
-    except ResultError:
-        check_finite(model)  # they may be the reason
-        raise
+    _check(options, running, tracks, fusion, known)
+    inputs = read_inputs(model, clip, size=size, masks=masks, tracks=tracks, known=known, on_stage=running.stage)
+    outputs = _run(model, inputs, options, running, fusion)
+    result = _result(model, inputs, options, running, fusion, outputs)
     warn_of_not_finite(result)
-    result, unit = _with_geometry(result, clip, options, geometry, on_stage)
+    result, unit = _with_geometry(result, inputs, options, running.stage)
     if options.refine_mask:
-        with on_stage("refine mask") as progress:
+        with running.stage("refine mask") as progress:
             result = refined(result, progress, unit)
     return result
 
@@ -194,9 +114,7 @@ def compile_ahead(
     width: int,
     *,
     options: Options = Options(),
-    pad_frames: bool = False,
-    devices: int = 1,
-    keep_passes: bool = False,
+    running: Running = Running(),
     **changes: Any,
 ) -> dict[str, StageMemory]:
     """Compile ahead of time what `reconstruct` runs with these options for a clip of this shape.
@@ -219,8 +137,9 @@ def compile_ahead(
             f"{frames} frames of {width} x {height} pixels; expected at least one frame, with sides that are multiples "
             f"of the patch size {patch}"
         )
-    options, mesh = options.changed(**changes).resolved(model.config.motion), frames_mesh(devices)
-    length = padded_frames(frames, model.config.motion.offsets) if pad_frames else frames
+    options, running = changed(options, running, changes)
+    options, mesh = options.resolved(model.config.motion), frames_mesh(running.devices)
+    length = padded_frames(frames, model.config.motion.offsets) if running.pad_frames else frames
     by_frame, whole = (Frames(mesh).sharding(spec) for spec in (BY_FRAME, REPLICATED))
     shape = (1, shared_length(length, mesh), height, width, 3)
     clips = Clips(
@@ -233,7 +152,7 @@ def compile_ahead(
     compiler = Compile()
     how = {"compute": compute_by(options, Frames(mesh, None if mesh is None else length)), "step": compiler}
     with device_memory_errors(_LESS_MEMORY, frames, height, width):
-        run_method(params, clips, model.config, options, both_outputs=keep_passes, **how)
+        run_method(params, clips, model.config, options, both_outputs=running.keep_passes, **how)
         return compiler.wait()
 
 
@@ -249,47 +168,117 @@ def refined(result: Reconstruction, progress: Progress | None, unit: float = 1.0
     return dataclasses.replace(result, dynamic_mask=mask)
 
 
+def _check(
+    options: Options,
+    running: Running,
+    tracks: Queries | None,
+    fusion: FusionRule | None,
+    known: KnownGeometry | None,
+) -> None:
+    """Raise InputError for arguments that are mutually exclusive, or for more devices than there are."""
+    frames_mesh(running.devices)
+    if running.devices != 1 and tracks is not None:
+        raise InputError(
+            f"devices is {running.devices} and points are to be tracked, which takes one device; leave one out"
+        )
+    check_fuses(fusion, options.method)
+    poses_are_known = known is not None and known.poses is not None
+    check_refinement(options.refine_cameras, poses_are_known)
+    if options.cameras == "adjusted" and poses_are_known:
+        raise InputError("cameras is 'adjusted' and poses are given, which would replace them; leave one of them out")
+
+
+def _run(
+    model: Model, inputs: Inputs, options: Options, running: Running, fusion: FusionRule | None
+) -> tuple[Assembly, Passes]:
+    """Compile the method for the clip and run it; return its outputs on the host, without padded frames."""
+    clip, tracks, masks = inputs.clip, inputs.tracks, inputs.masks
+    frames, height, width = clip.images.shape[:3]
+    mesh = frames_mesh(running.devices)
+    is_padded = running.pad_frames and tracks is None
+    length = padded_frames(frames, model.config.motion.offsets) if is_padded else frames
+    padding = shared_length(length, mesh) - frames
+
+    def padded(x: np.ndarray) -> Array:
+        return shard_frames(np.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1)))[None], mesh)
+
+    clips = Clips(
+        images=padded(clip.images),
+        query_points={} if tracks is None else replicate(_points_by_frame(tracks), mesh),
+        frames=frames,
+    )
+    params, rule = model.params, as_tree(fusion)
+    if mesh is not None:
+        params, rule = replicate((params, rule), mesh)
+    run = partial(
+        run_method,
+        params,
+        clips,
+        model.config,
+        options,
+        masks=None if masks is None else padded(masks) if masks.any() else False,
+        fusion=rule,
+        both_outputs=running.keep_passes,
+        compute=compute_by(options, Frames(mesh, None if mesh is None else length)),
+    )
+    with device_memory_errors(_LESS_MEMORY, frames, height, width):
+        started = time.perf_counter()
+        with running.stage("compile programs") as progress:
+            compiler = Compile()
+            run(step=compiler)
+            compiler.wait(progress)
+        hint_compilation_cache(time.perf_counter() - started)
+        assembly, passes = run(step=Execute(running.stage))
+    outputs = (assembly, passes._replace(patch_tokens=None))
+    return jax.tree.map(lambda x: on_host(x)[:, :frames], outputs)
+
+
+def _result(
+    model: Model,
+    inputs: Inputs,
+    options: Options,
+    running: Running,
+    fusion: FusionRule | None,
+    outputs: tuple[Assembly, Passes],
+) -> Reconstruction:
+    """Return what the method made of the clip. Raises CheckpointError where parameters are not finite."""
+    clip, tracks, (assembly, passes) = inputs.clip, inputs.tracks, outputs
+    motion, mask_source = motion_by_matches(passes, inputs.mask_source)
+    tracked = {} if tracks is None or passes.tracks is None else track_fields(tracks, passes.tracks, len(clip.images))
+    try:
+        return Reconstruction(
+            **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
+            **clip_fields(clip),
+            **tracked,
+            saliency=np.asarray(passes.saliency[0]),
+            motion=motion,
+            dynamic_mask=np.asarray(passes.dynamic_mask[0]),
+            method=options.method,
+            model_name=model.name,
+            settings=settings_of(model, clip, options, mask_source, fusion) | camera_source(options, passes),
+            passes=kept_passes(passes, options) if running.keep_passes else None,
+        )
+    except ResultError:
+        check_finite(model)  # they may be the reason
+        raise
+
+
 def _with_geometry(
-    result: Reconstruction, clip: Clip, options: Options, geometry: Given | None, on_stage: OnStage
+    result: Reconstruction, inputs: Inputs, options: Options, on_stage: OnStage
 ) -> tuple[Reconstruction, float]:
     """Return the result with refined cameras and what is known, and how long the prediction's unit is in its own."""
+    geometry = inputs.geometry
     if geometry is None and not options.refine_cameras:
         return result, 1.0
     with on_stage("refine cameras" if options.refine_cameras else "known geometry") as progress:
 
         def refine(result: Reconstruction) -> Reconstruction:
             fixed = geometry is not None and geometry.intrinsics is not None
-            return refine_cameras(result, clip.pictures(), fixed_intrinsics=fixed, progress=progress)[0]
+            return refine_cameras(result, inputs.clip.pictures(), fixed_intrinsics=fixed, progress=progress)[0]
 
         if geometry is None:
             return refine(result), 1.0
         return apply_known(result, geometry, refine if options.refine_cameras else None)
-
-
-def _fitted(
-    model: Model, clip: Clip | ClipSource, size: int | None, tracks: Queries | None, on_stage: OnStage
-) -> tuple[Clip, Queries | None]:
-    """Return the clip at the model's size and patch size, and the points to track in its pixels."""
-    config = model.config
-    size = config.image_size if size is None else size
-    if not isinstance(clip, Clip):
-        if tracks is not None:
-            raise InputError("tracks are points in pixels of a loaded clip; load the clip with load_clip first")
-        with on_stage("load clip") as progress:
-            return load_clip(clip, size=size, patch=config.patch_size, progress=progress), None
-    if tracks is not None:
-        tracks.check(*clip.images.shape[:3])
-    if (clip.size, clip.patch) != (size, config.patch_size):
-        with on_stage("fit clip to model"):
-            loaded, clip = clip, clip.refit(size, config.patch_size)
-            tracks = None if tracks is None else tracks.moved(loaded, clip)
-    return clip, tracks
-
-
-def _given_geometry(known: KnownGeometry, clip: Clip) -> Given:
-    masks = None if known.leave_out is None else load_masks(known.leave_out, clip)
-    capture = clip.source.capture if isinstance(clip.source, CaptureFrames) else None
-    return read_known(known, clip, leave_out=masks, capture=capture)
 
 
 def _points_by_frame(queries: Queries) -> dict[int, Float[Array, "1 Q 2"]]:
