@@ -193,3 +193,7 @@ def test_the_reference_has_every_public_name():
     assert names - set(shown) == set()
     levels = pages["index.md"].split("| level | names |")[1].split("\n\n")[0]
     assert sorted(re.findall(r"`(\w+)`", levels)) == sorted(names)
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 120
