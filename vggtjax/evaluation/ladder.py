@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import ClipTruth, Truth, batched_truth
-from vggtjax.config import ComputeDType, Gram, Suppress, Threshold
+from vggtjax.config import Suppress
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.depth import depth_errors, measured, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
@@ -91,12 +91,10 @@ def ladder(
     masks: Sequence[MaskSource] = ("mined", "true"),
     mask_pairs: Sequence[int] | None = None,
     suppress: Sequence[Suppress] = ("zero",),
-    gram: Gram = "cosine",
-    threshold: Threshold | None = None,
-    cameras: CamerasFrom = "predicted",
-    compute_dtype: ComputeDType = "float32",
+    options: Options = Options(compute_dtype="float32"),
     batch_size: int = 4,
     progress: Progress | None = None,
+    **changes: Any,
 ) -> list[LadderRow]:
     """Score methods on clips of one shape; features and first pass are computed once per clip.
 
@@ -109,9 +107,10 @@ def ladder(
             masks, an upper bound for any mining.
         mask_pairs: numbers of pairs in which the keys of dynamic tokens are suppressed; the model's own if None.
         suppress: ways to suppress them, in place of the methods' own.
-        gram, threshold, cameras, compute_dtype: as in `Options`.
+        options: the other settings, such as `cameras` or the threshold of mined masks.
         batch_size: number of clips that go through the network together.
         progress: called with the number of passes done and of all passes.
+        changes: fields of `options` by name, such as `gram="dot"`.
 
     Returns:
         Rows in the order of clips, then mask, pairs, suppression and method; methods without a second pass come first.
@@ -132,7 +131,7 @@ def ladder(
     pairs = (model.config.motion.mask_pairs,) if mask_pairs is None else mask_pairs
     settings = [_Setting(*values) for values in product(masks, pairs, suppress)] if masked else []
     witness = "matches" if "matches" in masks else "gram"
-    options = Options(gram=gram, mask=witness, threshold=threshold, cameras=cameras, compute_dtype=compute_dtype)
+    options = options.changed(**changes).changed(mask=witness)
     batches = list(_batches(len(truth.images), batch_size))
     total, steps = len(batches) * (1 + len(settings)), count(1)
     advance = (lambda: None) if progress is None else (lambda: progress(next(steps), total))
@@ -155,10 +154,10 @@ def ladder(
             passes = run(batch, options=own, masks=true_masks if setting.mask_source == "true" else None, shared=shared)
             shared = shared or passes
             pixels = _seen_motion(execute, passes, batch.images)
-            by_setting[setting] = list(_scored(passes, masked, scenes, pixels, setting, cameras))
+            by_setting[setting] = list(_scored(passes, masked, scenes, pixels, setting, options.cameras))
             advance()
         passes = run(batch, options=options.changed(method="vggt", mask="gram"), shared=shared)
-        rows += _scored(passes, plain, scenes, _seen_motion(execute, passes, batch.images), _Setting(), cameras)
+        rows += _scored(passes, plain, scenes, _seen_motion(execute, passes, batch.images), _Setting(), options.cameras)
         advance()
         rows += chain.from_iterable(by_setting[setting] for setting in settings)
     return sorted(rows, key=lambda row: row.clip)

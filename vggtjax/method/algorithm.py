@@ -28,6 +28,7 @@ from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.layers import Params
+from vggtjax.network.model import Predictions
 from vggtjax.network.precision import Compute
 from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
@@ -223,19 +224,29 @@ def run_passes(
         how = {"suppress": method.suppress, "outputs": outputs, "compute": compute}
         second = masked(params, batch, mined.dynamic_mask, unchanged, pairs, strength, config=config, **how)
 
-    tracks = None
-    if clips.query_points:
-        follow = partial(
-            step("tracks", on_devices(track_from, REPLICATED, _CLIPS, REPLICATED, REPLICATED)), params, batch
-        )
-        tracks = {
-            frame: follow(points, np.asarray(frame, np.int32), config=config, compute=compute)
-            for frame, points in clips.query_points.items()
-            if frame != 0
-        }
-        if 0 in clips.query_points:  # the first pass has followed them
-            tracks[0] = Tracks(first.tracks, first.track_visibility, first.track_confidence)  # type: ignore[arg-type]
+    tracks = _follow(params, batch, clips.query_points, first, config, compute, step) if clips.query_points else None
     return Passes(first, second, seen.saliency, *mined, seen.matches, batch.patch_tokens, tracks)
+
+
+def _follow(
+    params: Params,
+    batch: ClipBatch,
+    query_points: Mapping[int, Float[Array, "B Q 2"]],
+    first: Predictions,
+    config: VGGTConfig,
+    compute: Compute,
+    step: Step,
+) -> dict[int, Tracks]:
+    """Return tracks by the frame in which their points are given; the first pass has those of frame 0."""
+    follow = step("tracks", compute.frames.on_devices(track_from, REPLICATED, _CLIPS, REPLICATED, REPLICATED))
+    tracks = {
+        frame: follow(params, batch, points, np.asarray(frame, np.int32), config=config, compute=compute)
+        for frame, points in query_points.items()
+        if frame != 0
+    }
+    if 0 in query_points:
+        tracks[0] = Tracks(first.tracks, first.track_visibility, first.track_confidence)  # type: ignore[arg-type]
+    return tracks
 
 
 def _adjusts(options: Options, frames: int) -> bool:
