@@ -16,7 +16,7 @@ from tests.batch import dying_driver
 from tests.moving_ball import moving_ball
 from tests.room import make_room
 from tests.tiny import tiny_model
-from vggtjax.batch.cluster import _messages
+from vggtjax.batch.cluster import _outcomes
 from vggtjax.batch.cluster_driver import Dispatcher, _Slot, shared
 from vggtjax.batch.cluster_options import Cluster
 from vggtjax.batch.cluster_worker import Job, Place, Started, Worker
@@ -235,4 +235,4 @@ def _no_model(reason):
 def test_a_driver_that_dies_is_one_sentence(monkeypatch, tmp_path):
     monkeypatch.setattr("vggtjax.batch.cluster.drive", dying_driver.die)
     with pytest.raises(ClusterError, match=r"the cluster has died \(Ray's last words: GCS is gone\); finished clips"):
-        list(_messages(job(dying_driver.no_model, tmp_path), {}))
+        list(_outcomes(job(dying_driver.no_model, tmp_path), {}, print))

@@ -20,7 +20,7 @@ from vggtjax.batch.cluster_options import Cluster
 from vggtjax.batch.cluster_worker import Job, Load
 from vggtjax.batch.contact import contact_page
 from vggtjax.batch.destination import LocalFolder, RemoteFolder, destination
-from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, invalid_name
+from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, counted, invalid_name
 from vggtjax.errors import ClusterError, InputError, VggtjaxError, check_extra, one_line
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.remote import is_in_process, is_url
@@ -76,21 +76,13 @@ def reconstruct_on_cluster(
             yield outcome
         if not named:
             return
-        done, total = 0, len(named)
-        progress(done, total)
-        for message in _messages(job, named):
-            if isinstance(message, str):
-                note(message)
-                continue
-            done += message.status == "done"
-            total -= message.status != "done"
-            progress(done, total)
-            tell(message)
-            yield message
+        for outcome in counted(_outcomes(job, named, note), len(named), progress):
+            tell(outcome)
+            yield outcome
 
 
-def _messages(job: Job, sources: Mapping[str, str]) -> Generator[str | ClipOutcome]:
-    """Yield notes and outcomes of the process that drives Ray, until all clips are done; raise its error."""
+def _outcomes(job: Job, sources: Mapping[str, str], note: Callable[[str], None]) -> Generator[ClipOutcome]:
+    """Yield the outcomes that the process which drives Ray sends, until all clips are done; raise its error."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "ray.log"
         with _driver(job, sources, log) as pipe:
@@ -106,7 +98,10 @@ def _messages(job: Job, sources: Mapping[str, str]) -> Generator[str | ClipOutco
                     return
                 if isinstance(message, VggtjaxError):
                     raise message
-                yield message
+                if isinstance(message, str):
+                    note(message)
+                else:
+                    yield message
 
 
 @contextmanager

@@ -5,25 +5,24 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vggtjax.batch.clip_work import ClipWork, LongClip
 from vggtjax.batch.contact import contact_page
 from vggtjax.batch.destination import Destination, destination
-from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, failed, invalid_name
+from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, counted, failed, invalid_name
 from vggtjax.batch.shards import parse_shard
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.fetched import Fetched
-from vggtjax.clips.sources import ClipSource, open_source
+from vggtjax.clips.sources import ClipSource
 from vggtjax.errors import VggtjaxError
-from vggtjax.media.sampling import Sampling
 from vggtjax.method.assembly import check_fuses
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_kept
 from vggtjax.progress import Progress, StageSeconds, no_progress
-from vggtjax.storage.remote import is_url
 
 _AHEAD = 1  # clips that are loaded before they are needed, and results that wait to be written
 
@@ -55,8 +54,8 @@ def reconstruct_many(
         fusion: as for `reconstruct`.
         shard: "K/N" takes every N-th of the sources, from the K-th on. Runs for K from 1 to N together do the batch, at
             the same time or not, in one folder; none of them writes index.html. A later run without `shard` does.
-        progress: called before the first clip and after each computed clip, with the frames done and the frames of all
-            clips but kept and failed ones; a clip of unknown length, such as a video, counts as the mean of the others.
+        progress: called before the first clip and after each, with the number of computed clips, and of all but kept
+            and failed ones.
         changes: parts of the recipe by name, or what they hold: `options` (`method="vggt"`, ...), `framing` (`size`,
             `mode`), `sampling` (`fps`, `stride`, ...) and `saving` (`only`, `resolution`, ...);
             `known`, as for `reconstruct`, as far as all clips share it: intrinsics, a shared focal length, the height
@@ -82,28 +81,27 @@ def reconstruct_many(
     progress = progress or no_progress
     with place.held(part, work.settings):
         if part is not None:
-            yield from _outcomes(work, part.share(sources), place, recipe.sampling, progress)
+            yield from _outcomes(work, part.share(sources), place, progress)
             return
         with contact_page(place, len(sources)) as tell:
-            for outcome in _outcomes(work, sources, place, recipe.sampling, progress):
+            for outcome in _outcomes(work, sources, place, progress):
                 tell(outcome)
                 yield outcome
 
 
 def _outcomes(
-    work: ClipWork, sources: Mapping[str, ClipSource], place: Destination, sampling: Sampling, progress: Progress
+    work: ClipWork, sources: Mapping[str, ClipSource], place: Destination, progress: Progress
 ) -> Generator[ClipOutcome]:
     """Yield the outcomes of clips that cannot have a folder, then of kept ones, then of the others."""
     odd = {name: outcome for name in sources if (outcome := invalid_name(name)) is not None}
     yield from odd.values()
     kept = place.finished(name for name in sources if name not in odd)
     yield from (ClipOutcome(name, "kept") for name in sources if name in kept)
-    names = [name for name in sources if name not in odd and name not in kept]
-    frames = _Frames({name: _length(sources[name], sampling) for name in names}, progress)
-    yield from _reconstruct_all(work, {name: sources[name] for name in names}, frames)
+    left = {name: source for name, source in sources.items() if name not in odd and name not in kept}
+    yield from counted(_reconstruct_all(work, left), len(left), progress)
 
 
-def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource], frames: _Frames) -> Generator[ClipOutcome]:
+def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource]) -> Generator[ClipOutcome]:
     """Yield the outcomes of clips: while one is computed, the next is loaded and the previous one written."""
     with Fetched() as fetched, ThreadPoolExecutor(1) as loader, ThreadPoolExecutor(1) as writer:
         loading: deque[tuple[str, Future[tuple[ClipSource, Clip | LongClip]]]] = deque()
@@ -139,20 +137,16 @@ def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource], frames: 
                     result = clip if isinstance(clip, LongClip) else work.reconstruct_or_cut(name, clip, seconds)
                     if isinstance(result, LongClip):
                         del clip
-                        outcome = work.run_long(name, source, result)
-                        fetched.drop(name)
-                        frames.finish(name, outcome.frames)
-                        yield outcome
-                        continue
+                        finish = partial(_same, work.run_long(name, source, result))
+                    else:
+                        assert isinstance(clip, Clip)
+                        finish = partial(work.write, name, clip, result, seconds.seconds)
+                        del clip
+                    del result
                 except (VggtjaxError, MemoryError) as error:
-                    fetched.drop(name)
-                    frames.finish(name, 0)
-                    yield failed(name, error)
-                    continue
-                assert isinstance(clip, Clip)  # a long one has been run
-                frames.finish(name, len(clip))
-                writes.append((name, writer.submit(work.write, name, clip, result, seconds.seconds)))
-                del clip, result  # the writer holds them
+                    finish = partial(_same, failed(name, error))
+                writes.append((name, writer.submit(finish)))
+                del finish  # the writer holds clip and result
                 while len(writes) > _AHEAD:
                     yield written()
             while writes:
@@ -163,34 +157,5 @@ def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource], frames: 
             raise
 
 
-class _Frames:
-    """Frames done and to do; a clip of unknown length counts as the mean of the others, or as 1 if none is known."""
-
-    def __init__(self, lengths: Mapping[str, int | None], progress: Progress) -> None:
-        self._waiting = dict(lengths)
-        self._done: list[int] = []
-        self._progress = progress
-        self._tell()
-
-    def finish(self, name: str, frames: int) -> None:
-        """Count a clip as done; a failed clip has 0 frames."""
-        del self._waiting[name]
-        if frames:
-            self._done.append(frames)
-        self._tell()
-
-    def _tell(self) -> None:
-        lengths = self._done + [length for length in self._waiting.values() if length]
-        unknown = sum(length is None for length in self._waiting.values())
-        mean = sum(lengths) / len(lengths) if lengths else 1
-        self._progress(sum(self._done), sum(lengths) + round(unknown * mean))
-
-
-def _length(source: ClipSource, sampling: Sampling) -> int | None:
-    """Return the number of frames of a clip: 0 if the clip will fail, None if only reading it can tell."""
-    if is_url(source):
-        return None
-    try:
-        return open_source(source).total(sampling)
-    except VggtjaxError:
-        return 0
+def _same(outcome: ClipOutcome) -> ClipOutcome:
+    return outcome

@@ -6,7 +6,7 @@ Does not import jax.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
@@ -21,6 +21,7 @@ from vggtjax.errors import InputError
 from vggtjax.known.options import KnownGeometry
 from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
+from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving
 from vggtjax.storage.file_digest import file_digest
 from vggtjax.storage.flags import InWords, Switch
@@ -179,6 +180,17 @@ class BatchRecipe(ClipRecipe):
         if isinstance(self.masks, Mapping):
             return {"masks": {name: masks_digest(masks) for name, masks in sorted(self.masks.items())}}
         return {"masks": "nothing moves"}
+
+
+def counted(outcomes: Iterable[ClipOutcome], total: int, progress: Progress) -> Generator[ClipOutcome]:
+    """Yield outcomes; tell the number of computed clips, and of all but kept and failed ones."""
+    done = 0
+    progress(done, total)
+    for outcome in outcomes:
+        done += outcome.status == "done"
+        total -= outcome.status != "done"
+        progress(done, total)
+        yield outcome
 
 
 def failed(name: str, error: BaseException) -> ClipOutcome:

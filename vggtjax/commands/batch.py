@@ -60,16 +60,16 @@ def batch(
             check_named(files.model)
             load = partial(load_on_worker, files, recipe.options)
             run = partial(reconstruct_on_cluster, load, named, out, cluster, recipe, note=report.note)
-            counted, warning = "clips", ""  # a worker says the warning
+            warning = ""  # a worker says it
         else:
             from vggtjax.batch.many import reconstruct_many
 
             frames_mesh(recipe.devices)
             network, fitted = files.load(report, recipe.options, [recipe.options.method])
             run = partial(reconstruct_many, network, named, out, recipe=recipe, fusion=fitted, shard=shard)
-            counted, warning = "frames", network.warning
+            warning = network.warning
         outcomes: list[ClipOutcome] = []
-        with report.stage(counted) as show:
+        with report.stage("clips") as show:
             clock = _Clock(show)
             for outcome in run(progress=clock.progress):
                 outcomes.append(outcome)
@@ -88,18 +88,18 @@ def batch(
 
 
 class _Clock:
-    """The remaining time of a batch, from the mean time of the frames done."""
+    """The remaining time of a batch, from the mean time of the clips done."""
 
     def __init__(self, show: Progress) -> None:
         self._show, self._started = show, time.perf_counter()
         self._seconds: float | None = None
 
     def progress(self, done: int, total: int | None) -> None:
-        """Show the frames done and all frames."""
+        """Show the clips done and all clips."""
         self._show(done, total)
         self._seconds = (time.perf_counter() - self._started) * (total / done - 1) if done and total else None
 
     def left(self) -> str:
-        """Return words for the remaining time; none before the first frame is done, or below half a second."""
+        """Return words for the remaining time; none before the first clip is done, or below half a second."""
         left = timedelta(seconds=round(self._seconds or 0))
         return f", {left} left" if left else ""
