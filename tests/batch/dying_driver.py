@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 
-def die(pipe: Any, log: str, plan: Any) -> None:
+def die(pipe: Any, log: str, job: Any, sources: Any) -> None:
     """End as Ray ends its process where the cluster dies."""
     Path(log).write_text("one\nGCS is gone\n\n")
     os._exit(1)

@@ -16,11 +16,12 @@ from tests.batch import dying_driver
 from tests.moving_ball import moving_ball
 from tests.room import make_room
 from tests.tiny import tiny_model
-from vggtjax.batch.cluster import _messages
-from vggtjax.batch.cluster_driver import Dispatcher, Note, Plan, _Slot, shared
-from vggtjax.batch.cluster_worker import Job, Place, Refused, Started, Worker
+from vggtjax.batch.cluster import _outcomes
+from vggtjax.batch.cluster_driver import Dispatcher, _Slot, shared
+from vggtjax.batch.cluster_options import Cluster
+from vggtjax.batch.cluster_worker import Job, Place, Started, Worker
 from vggtjax.batch.destination import SETTINGS_NAME, LocalFolder
-from vggtjax.batch.recipe import ClipOutcome, Recipe
+from vggtjax.batch.recipe import BatchRecipe, ClipOutcome
 from vggtjax.checkpoint import save_model
 from vggtjax.errors import ClusterError, InputError
 from vggtjax.options import Options
@@ -28,7 +29,7 @@ from vggtjax.results.archive import ARCHIVE_NAME
 from vggtjax.storage.versions import running_versions
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'vggtjax[cluster]'")
-RECIPE = Recipe(options=Options(method="vggt"))
+RECIPE = BatchRecipe(options=Options(method="vggt"))
 
 
 @pytest.mark.proof
@@ -63,7 +64,7 @@ def test_a_killed_worker_costs_its_clips_alone_and_they_are_run_again(tmp_path):
                 killed = True
         table = running.stdout.read()  # type: ignore[union-attr]
     assert running.returncode == 0, said
-    assert any("has ended; in its work: " in line for line in said)
+    assert sum("has ended; in its work: " in line for line in said) == 1
     assert dict(line.split(maxsplit=1) for line in table.splitlines()[:4]) == {
         "clips": "8",
         "done": "7",
@@ -107,71 +108,92 @@ class Actor:
         return (id(self), len(self.asked))
 
 
+def job(load, out, folder="."):
+    return Job(load, RECIPE, LocalFolder(out), folder, Cluster("ray", workers=2))
+
+
 @pytest.fixture
 def dispatcher(monkeypatch, tmp_path):
     """Return a dispatcher of five clips with two workers that are ready, and what it has sent."""
     actors, sent = Actors(monkeypatch), []
-    job = Job(load=dying_driver.no_model, recipe=RECIPE, out=LocalFolder(tmp_path), folder=".")
-    dispatcher = Dispatcher(Plan(job, {name: name for name in "abcde"}, workers=2), sent.append)
-    dispatcher._wanted, dispatcher._job = 2, job
-    dispatcher._class = SimpleNamespace(remote=Actor)
-    dispatcher._grow()
-    settings = {"size": 56}
-    for number, slot in enumerate(dispatcher._slots):
-        slot.place = Place("host", number, running_versions())
-        dispatcher._begin(slot, Started(settings, ""))
-    dispatcher._tasks.clear()
-    return SimpleNamespace(it=dispatcher, actors=actors, sent=sent)
+    dispatcher = Dispatcher(job(dying_driver.no_model, tmp_path), {name: name for name in "abcde"}, sent.append)
+    it = SimpleNamespace(it=dispatcher, actors=actors, sent=sent)
+    dispatcher.begin([Actor(), Actor()])
+    for slot in dispatcher._slots:
+        begin(it, slot)
+    return it
+
+
+def begin(dispatcher, slot):
+    """Let a worker answer where it is, and that it is ready."""
+    end(dispatcher, slot, None, Place("host", dispatcher.it._slots.index(slot), running_versions()))
+    end(dispatcher, slot, None, Started({"size": 56}, ""))
 
 
 def end(dispatcher, slot, name, answer):
     """Let a worker answer for a clip."""
     reference = next(key for key, task in dispatcher.it._tasks.items() if task == (slot, name))
     dispatcher.actors.answers[reference] = answer
-    dispatcher.it._finish(reference)
+    dispatcher.it.finish(reference)
 
 
 def test_a_clip_that_ends_two_workers_fails_and_those_beside_it_do_not(dispatcher):
     from ray.exceptions import RayActorError
 
     it = dispatcher.it
-    it._assign()
+    it.assign()
     first, second = it._slots
     assert (first.clips, second.clips) == (["a", "c", "e"], ["b", "d"])
     end(dispatcher, first, "c", RayActorError())
-    assert [slot for slot, _ in it._tasks.values()] == [second, second]
-    assert dispatcher.actors.killed == [first.actor]
-    assert dispatcher.sent[-1] == Note("a worker (host, process 0) has ended; in its work: a, c, e")
-    it._grow()
-    third = it._slots[1]
-    third.place, third.ready = second.place, True
-    it._assign()
-    assert third.clips == ["a"]  # alone, so that another end tells which clip it is
-    end(dispatcher, third, "a", ClipOutcome("a", "kept"))
+    assert dispatcher.sent[-1] == "a worker (host, process 0) has ended; in its work: a, c, e"
+    again = it._slots[1]
+    assert again.actor is first.actor  # which Ray begins anew
+    begin(dispatcher, again)
+    it.assign()
+    assert again.clips == ["a"]  # alone, so that another end tells which clip it is
+    end(dispatcher, again, "a", ClipOutcome("a", "kept"))
     assert dispatcher.sent[-1] == ClipOutcome("a", "done")  # the first worker had written it
-    it._assign()
-    assert third.clips == ["c"]
-    end(dispatcher, third, "c", RayActorError())
+    it.assign()
+    assert again.clips == ["c"]
+    end(dispatcher, again, "c", RayActorError())
     (outcome,) = [sent for sent in dispatcher.sent if getattr(sent, "status", "") == "failed"]
     assert outcome.name == "c"
     assert "two workers ended with it in their work" in outcome.reason
     assert list(it._again) == ["e"]
     assert second.clips == ["b", "d"]
+    assert dispatcher.actors.killed == []
+
+
+def test_a_worker_that_never_begins_is_given_up(dispatcher):
+    from ray.exceptions import RayActorError
+
+    it = dispatcher.it
+    it._slots.clear()
+    it.begin([Actor()])
+    for _ in range(2):
+        end(dispatcher, it._slots[0], None, RayActorError())
+    with pytest.raises(ClusterError, match="workers ended 3 times in a row before they began"):
+        end(dispatcher, it._slots[0], None, RayActorError())
+    assert len(dispatcher.actors.killed) == 1
 
 
 def test_workers_of_other_code_and_other_files_are_refused(dispatcher):
+    from ray.exceptions import RayTaskError
+
     slot = _Slot(Actor())
-    dispatcher.actors.answers["x"] = Place("far", 7, "vggtjax 0.0.9 (sources 01234567) with jax 0.9")
     dispatcher.it._tasks["x"] = (slot, None)
     with pytest.raises(
         ClusterError, match=r"\(far, process 7\) runs vggtjax 0.0.9 .*, this command vggtjax .* the same"
     ):
-        dispatcher.it._finish("x")
+        end(dispatcher, slot, None, Place("far", 7, "vggtjax 0.0.9 (sources 01234567) with jax 0.9"))
     slot.place = Place("far", 7, running_versions())
+    dispatcher.it._tasks["x"] = (slot, None)
     with pytest.raises(ClusterError, match="has another size than the one on host, process 0"):
-        dispatcher.it._begin(slot, Started({"size": 70}, ""))
+        end(dispatcher, slot, None, Started({"size": 70}, ""))
+    dispatcher.it._tasks["x"] = (slot, None)
+    problem = RayTaskError("start", "Traceback ...", InputError("no such model"), proctitle="a worker", ip="here")
     with pytest.raises(ClusterError, match="cannot begin: no such model"):
-        dispatcher.it._begin(slot, Refused("no such model"))
+        end(dispatcher, slot, None, problem.as_instanceof_cause())
 
 
 @pytest.mark.parametrize(
@@ -179,12 +201,11 @@ def test_workers_of_other_code_and_other_files_are_refused(dispatcher):
     [
         ([{"CPU": 8}, {"CPU": 4}], {}, (3, 4, 0)),
         ([{"CPU": 16, "GPU": 4}, {"CPU": 2}], {}, (4, 1, 1)),
-        ([{"CPU": 16, "GPU": 4}], {"gpus": 0.5}, (8, 1, 0.5)),
+        ([{"CPU": 16, "GPU": 4}], {"worker_gpus": 0.5}, (8, 1, 0.5)),
     ],
 )
 def test_the_share_of_a_worker(nodes, asked, share):
-    plan = Plan(Job(lambda: 1 / 0, RECIPE, LocalFolder("/"), "."), {}, **asked)  # type: ignore[arg-type]
-    assert shared(nodes, plan) == share
+    assert shared(nodes, Cluster("ray", **asked)) == share
 
 
 def test_a_worker_does_a_clip_once(tmp_path, monkeypatch):
@@ -192,9 +213,8 @@ def test_a_worker_does_a_clip_once(tmp_path, monkeypatch):
     model = tiny_model()
     Image.fromarray(np.zeros((70, 98, 3), np.uint8)).save(tmp_path / "a.png")
     worker = Worker()
-    place = LocalFolder(tmp_path / "out")
     assert worker.place() == Place(os.uname().nodename, os.getpid(), running_versions())
-    started = worker.start(Job(lambda: (model, None), RECIPE, place, str(tmp_path)))
+    started = worker.start(job(lambda: (model, None), tmp_path / "out", str(tmp_path)))
     assert isinstance(started, Started)
     assert started.settings["method"] == "vggt"
     worker._work.reconstruct_or_cut = lambda name, clip, seconds: make_room()  # type: ignore[union-attr]
@@ -204,8 +224,8 @@ def test_a_worker_does_a_clip_once(tmp_path, monkeypatch):
     worker._work.load = lambda source: 1 / 0  # type: ignore[union-attr]
     assert "ZeroDivisionError" in worker.run("c", "a.png").reason
     worker.close()
-    refused = Worker().start(Job(partial(_no_model, "no such model"), RECIPE, place, "/nowhere"))
-    assert refused == Refused("no such model")
+    with pytest.raises(InputError, match="no such model"):
+        Worker().start(job(partial(_no_model, "no such model"), tmp_path, "/nowhere"))
 
 
 def _no_model(reason):
@@ -213,7 +233,6 @@ def _no_model(reason):
 
 
 def test_a_driver_that_dies_is_one_sentence(monkeypatch, tmp_path):
-    job = Job(dying_driver.no_model, RECIPE, LocalFolder(tmp_path), ".")
     monkeypatch.setattr("vggtjax.batch.cluster.drive", dying_driver.die)
     with pytest.raises(ClusterError, match=r"the cluster has died \(Ray's last words: GCS is gone\); finished clips"):
-        list(_messages(Plan(job, {})))
+        list(_outcomes(job(dying_driver.no_model, tmp_path), {}, print))

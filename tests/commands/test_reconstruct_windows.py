@@ -9,15 +9,12 @@ from PIL import Image
 from tests.videos import write_video
 from vggtjax import Reconstruction, load_model
 from vggtjax.batch.many import reconstruct_many
-from vggtjax.clips.preprocessing import Fitter
-from vggtjax.clips.sources import open_source
+from vggtjax.batch.recipe import ClipRecipe
 from vggtjax.commands import main as cli
 from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.one_clip import OneClip
 from vggtjax.commands.report import Report
 from vggtjax.errors import DeviceMemoryError
-from vggtjax.known.options import KnownGeometry
-from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
 from vggtjax.pipeline import memory
 from vggtjax.pipeline.steps import Compile
@@ -158,21 +155,8 @@ def test_windows_are_chosen_by_the_frames_that_fit(frames, tmp_path, capsys, mon
 
     def with_room(count, *, window=None, devices=1, **options):
         free_for(monkeypatch, count)
-        clip = OneClip(
-            report=Report(),
-            frames=str(frames),
-            source=open_source(str(frames)),
-            sampling=Sampling(),
-            fitter=Fitter(size=SIDE, patch=8),
-            model=model,
-            fusion=None,
-            options=Options(**options),
-            devices=devices,
-            known=GivenInputs(),
-            geometry=KnownGeometry(),
-            out=tmp_path,
-            saving=Saving(),
-        )
+        recipe = ClipRecipe().changed(size=SIDE, devices=devices, **options)
+        clip = OneClip(Report(), str(frames), model, None, recipe, GivenInputs(), tmp_path)
         return clip.cut(Windows(window))
 
     def said():

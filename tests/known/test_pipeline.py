@@ -49,9 +49,7 @@ def test_masks_intrinsics_and_scale_reach_the_result(model, clip, tmp_path):
 @pytest.mark.filterwarnings("ignore:the field of view")
 def test_a_batch_takes_what_its_clips_share(model, tmp_path):
     frames = (255 * np.asarray(moving_ball(3))).astype(np.uint8)
-    (done,) = reconstruct_many(
-        model, {"ball": frames}, tmp_path, options={"method": "vggt"}, known=KnownGeometry(shared_focal=True)
-    )
+    (done,) = reconstruct_many(model, {"ball": frames}, tmp_path, method="vggt", known=KnownGeometry(shared_focal=True))
     assert done.status == "done"
     intrinsics = Reconstruction.load(tmp_path / "ball").intrinsics
     np.testing.assert_allclose(intrinsics, intrinsics[:1].repeat(3, axis=0))

@@ -32,9 +32,9 @@ def main(out: str, truth: str, stage: str, done: str) -> None:
         yield progress
 
     moving = walks.movers()
-    plan = walks.plan_of(loops=True)._replace(on_stage=kill_at)
+    plan = walks.plan_of()._replace(on_stage=kill_at)
     tools = walks.tools_of(lambda clip: walks.window_result(clip, 0, moving, 0.03))
-    run_windows(np.asarray(walk.images), Path(out), plan, tools, walks.SETTINGS)
+    run_windows(np.asarray(walk.images), Path(out), walks.windows_of(loops=True), plan, tools, walks.SETTINGS)
 
 
 if __name__ == "__main__":

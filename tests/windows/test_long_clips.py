@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.windows.walk import CONFIG, FRAMES, SETTINGS, movers, plan_of, tools_of, walk, window_result
+from tests.windows.walk import CONFIG, FRAMES, SETTINGS, movers, plan_of, tools_of, walk, window_result, windows_of
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.reconstruction import Reconstruction
@@ -27,7 +27,7 @@ def exact(clip) -> Reconstruction:
 
 def reconstructed(out, run, *, loops=False, masks=True, source=None) -> Reconstruction:
     images = np.asarray(walk().images) if source is None else source
-    return run_windows(images, out, plan_of(loops=loops, masks=masks), tools_of(run), SETTINGS)
+    return run_windows(images, out, windows_of(loops=loops), plan_of(masks=masks), tools_of(run), SETTINGS)
 
 
 def path_error(result) -> float:

@@ -129,10 +129,10 @@ def test_the_network_follows_points_as_in_a_clip_that_is_run_at_once():
 @pytest.mark.proof
 def test_points_of_a_file_are_followed_in_windows(tmp_path):
     (tmp_path / "points.csv").write_text("x,y,frame\n10,20,0\n40.5,30,8\n")
-    run = LongRun(Windows(6, 2), fitter=Fitter(size=56), tracks=str(tmp_path / "points.csv"))
+    run = LongRun(fitter=Fitter(size=56), tracks=str(tmp_path / "points.csv"))
     run = run._replace(saving=Saving(only=("cameras",)))
     images = np.random.default_rng(2).random((9, 56, 56, 3), np.float32)
-    result = reconstruct_long(tiny_model(), images, tmp_path / "out", run.windows, long_run=run, method="vggt")
+    result = reconstruct_long(tiny_model(), images, tmp_path / "out", Windows(6, 2), long_run=run, method="vggt")
     assert result.track_positions is not None
     assert result.track_positions[[0, 8], [0, 1]].tolist() == [[10, 20], [40.5, 30]]
     assert (tmp_path / "out" / "tracks.npz").is_file()
@@ -142,10 +142,10 @@ def test_given_masks_are_a_folder_or_a_pattern_and_windows_of_other_masks_are_no
     masks, out = tmp_path / "masks", tmp_path / "out"
     masks.mkdir()
     images = np.random.default_rng(3).random((6, 56, 56, 3), np.float32)
-    run = LongRun(Windows(4, 2), fitter=Fitter(size=56), saving=Saving(only=("cameras",)))
+    run = LongRun(fitter=Fitter(size=56), saving=Saving(only=("cameras",)))
 
     def reconstructed(given):
-        return reconstruct_long(tiny_model(), images, out, run.windows, long_run=run, masks=given)
+        return reconstruct_long(tiny_model(), images, out, Windows(4, 2), long_run=run, masks=given)
 
     with pytest.raises(ClipError, match="masks"):
         reconstructed(str(masks / "*.png"))

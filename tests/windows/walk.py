@@ -74,10 +74,15 @@ def window_result(clip: Clip, seed: int, moving: np.ndarray, off: float = 0.0) -
     )
 
 
-def plan_of(*, loops: bool = False, masks: bool = True) -> LongRun:
-    """Return how the walk is cut and written."""
-    windows, fitter = Windows(16, 4, no_loops=not loops), Fitter(size=CONFIG.width, patch=8)
-    return LongRun(windows, fitter=fitter, saving=Saving(only=("cameras", "depth")), rule=JoinRule(masks=masks))
+def windows_of(*, loops: bool = False) -> Windows:
+    """Return how the walk is cut."""
+    return Windows(16, 4, no_loops=not loops)
+
+
+def plan_of(*, masks: bool = True) -> LongRun:
+    """Return how the walk is read and written."""
+    fitter = Fitter(size=CONFIG.width, patch=8)
+    return LongRun(fitter=fitter, saving=Saving(only=("cameras", "depth")), rule=JoinRule(masks=masks))
 
 
 def tools_of(run) -> Tools:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vggtjax.batch.destination import Destination
-from vggtjax.batch.recipe import ClipOutcome, Recipe
+from vggtjax.batch.recipe import BatchRecipe, ClipOutcome
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.preprocessing import Fitter
@@ -42,7 +42,7 @@ class LongClip(NamedTuple):
 class ClipWork:
     """A model and a recipe, ready for one clip after another."""
 
-    def __init__(self, model: Model, fusion: FusionParams | None, recipe: Recipe, out: Destination) -> None:
+    def __init__(self, model: Model, fusion: FusionParams | None, recipe: BatchRecipe, out: Destination) -> None:
         mesh = frames_mesh(recipe.devices)
         self._model, self._fusion, self._recipe, self._out = model, fusion, recipe, out
         self._placed = model  # with its weights on every device
@@ -64,15 +64,10 @@ class ClipWork:
             **dataclasses.asdict(recipe.saving),
             "only": None if recipe.saving.only is None else list(recipe.saving.only),
             "fusion": fusion_digest(self._fusion),
-            **({} if recipe.known is None else {"known": known_values(recipe.known)}),
+            **({"known": known_values(recipe.known)} if recipe.known else {}),
             "pad_frames": recipe.pad_frames,
             **recipe.masks_setting(),
         }
-
-    @property
-    def _cuts(self) -> bool:
-        """Whether a clip may be run in windows."""
-        return not (self._recipe.known or self._recipe.options.refine_cameras or self._recipe.devices > 1)
 
     def long_clip(self, source: ClipSource, *, clips: int = 1) -> LongClip | None:
         """Return windows for a clip that does not fit in memory beside `clips` - 1 others; None for one that does.
@@ -83,7 +78,7 @@ class ClipWork:
         if not recipe.unchecked:
             how: Load = {"method": recipe.options.method, "clips": clips, "devices": recipe.devices}
             choice = choose_windows(self._model, opened, recipe.sampling, self._fitter, **how)
-            if choice is not None and choice.is_cut and self._cuts:
+            if choice is not None and choice.is_cut and not recipe.needs_all_frames:
                 return LongClip(choice.windows, choice.frames, choice.sentence)
             if choice is not None and choice.cannot_fit:
                 raise choice.refusal(cuts=False)
@@ -96,7 +91,7 @@ class ClipWork:
     def run_long(self, name: str, source: ClipSource, clip: LongClip) -> ClipOutcome:
         """Reconstruct a clip in windows, and write its result."""
         recipe = self._recipe
-        plan = LongRun(clip.windows, clip.frames, recipe.sampling, self._fitter, recipe.saving)
+        plan = LongRun(clip.frames, recipe.sampling, self._fitter, recipe.saving)
 
         def run(folder: Path) -> None:
             how: dict[str, Any] = {"options": recipe.options, "long_run": plan, "fusion": self._fusion}
@@ -132,7 +127,7 @@ class ClipWork:
         try:
             return self.reconstruct(name, clip, seconds)
         except MemoryError as error:  # of the host or of the device
-            windows = smaller_window(len(clip)) if self._cuts else None
+            windows = None if self._recipe.needs_all_frames else smaller_window(len(clip))
             if windows is None:
                 raise
             reason = one_line(str(error)) or "out of memory"

@@ -10,18 +10,18 @@ import multiprocessing
 import os
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from vggtjax.batch.cluster_driver import Failure, Note, Plan, drive
+from vggtjax.batch.cluster_driver import drive
 from vggtjax.batch.cluster_options import Cluster
 from vggtjax.batch.cluster_worker import Job, Load
 from vggtjax.batch.contact import contact_page
 from vggtjax.batch.destination import LocalFolder, RemoteFolder, destination
-from vggtjax.batch.recipe import ClipOutcome, Recipe, invalid_name
-from vggtjax.errors import ClusterError, InputError, check_extra, one_line
+from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, counted, invalid_name
+from vggtjax.errors import ClusterError, InputError, VggtjaxError, check_extra, one_line
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.remote import is_in_process, is_url
 
@@ -33,7 +33,7 @@ def reconstruct_on_cluster(
     sources: Mapping[str, str],
     out: str | Path,
     cluster: Cluster,
-    recipe: Recipe,
+    recipe: BatchRecipe,
     *,
     progress: Progress | None = None,
     note: Callable[[str], None] | None = None,
@@ -60,7 +60,6 @@ def reconstruct_on_cluster(
         OutputError: the folder cannot be written, or another run is writing it.
     """
     check_extra("--engine ray", "cluster", "ray")
-    recipe.check_masks(sources)
     place = destination(out)
     for url in (*sources.values(), *([place.url] if isinstance(place, RemoteFolder) else [])):
         if is_url(url) and is_in_process(url):
@@ -69,38 +68,24 @@ def reconstruct_on_cluster(
         place = LocalFolder(place.path.absolute())
     progress, note = progress or no_progress, note or (lambda text: None)
     odd = {name: outcome for name in sources if (outcome := invalid_name(name)) is not None}
-    plan = Plan(
-        job=Job(load, recipe, place, os.getcwd()),  # noqa: PTH109 - text
-        sources={name: source for name, source in sources.items() if name not in odd},
-        address=cluster.address,
-        workers=cluster.workers,
-        cpus=cluster.worker_cpus,
-        gpus=cluster.worker_gpus,
-    )
+    job = Job(load, recipe, place, os.getcwd(), cluster)  # noqa: PTH109 - text
+    named = {name: source for name, source in sources.items() if name not in odd}
     with place.held(None), contact_page(place, len(sources)) as tell:
         for outcome in odd.values():
             tell(outcome)
             yield outcome
-        if not plan.sources:
+        if not named:
             return
-        done, total = 0, len(plan.sources)
-        progress(done, total)
-        for message in _messages(plan):
-            if isinstance(message, Note):
-                note(message.text)
-                continue
-            done += message.status == "done"
-            total -= message.status != "done"
-            progress(done, total)
-            tell(message)
-            yield message
+        for outcome in counted(_outcomes(job, named, note), len(named), progress):
+            tell(outcome)
+            yield outcome
 
 
-def _messages(plan: Plan) -> Generator[Note | ClipOutcome]:
-    """Yield what the process that drives Ray says, until all clips are done."""
+def _outcomes(job: Job, sources: Mapping[str, str], note: Callable[[str], None]) -> Generator[ClipOutcome]:
+    """Yield the outcomes that the process which drives Ray sends, until all clips are done; raise its error."""
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "ray.log"
-        with _driver(plan, log) as pipe:
+        with _driver(job, sources, log) as pipe:
             while True:
                 try:
                     message = pipe.recv()
@@ -111,30 +96,30 @@ def _messages(plan: Plan) -> Generator[Note | ClipOutcome]:
                     ) from None
                 if message is None:
                     return
-                if isinstance(message, Failure):
-                    raise message.error
-                yield message
+                if isinstance(message, VggtjaxError):
+                    raise message
+                if isinstance(message, str):
+                    note(message)
+                else:
+                    yield message
 
 
 @contextmanager
-def _driver(plan: Plan, log: Path) -> Iterator[Connection]:
+def _driver(job: Job, sources: Mapping[str, str], log: Path) -> Iterator[Connection]:
     """Start the process that drives Ray, and end it; yields what it writes to."""
     context: Any = multiprocessing.get_context("spawn")
     pipe, other = context.Pipe(duplex=False)
-    process = context.Process(target=drive, args=(other, str(log), plan), name="vggtjax-ray", daemon=True)
+    process = context.Process(target=drive, args=(other, str(log), job, sources), name="vggtjax-ray", daemon=True)
+    process.start()
+    other.close()
     try:
-        process.start()
-        other.close()
         yield pipe
     finally:
         pipe.close()  # tells the process to end, if it has not
-        for end in (lambda: None, process.terminate, process.kill):
-            if process.pid is not None:
-                end()
-                with suppress(AssertionError):
-                    process.join(_GOODBYE)
-                if process.exitcode is not None:
-                    break
+        process.join(_GOODBYE)
+        process.terminate()
+        process.join(_GOODBYE)
+        process.kill()
 
 
 def _last_words(log: Path) -> str:

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from vggtjax.batch.cluster_options import Cluster
 from vggtjax.batch.destination import Destination
-from vggtjax.batch.recipe import ClipOutcome, Recipe, failed
+from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, failed
 from vggtjax.clips.fetched import Fetched
 from vggtjax.errors import OutputError, VggtjaxError, one_line
 from vggtjax.progress import StageSeconds
@@ -31,10 +32,10 @@ class Job:
     """What a worker is told once."""
 
     load: Load  # returns the model and the fitted rule of fusion
-    recipe: Recipe
+    recipe: BatchRecipe
     out: Destination
     folder: str  # where relative paths start
-    threads: int | None = None  # for computing on a CPU; None for all
+    cluster: Cluster
 
 
 class Place(NamedTuple):
@@ -55,12 +56,6 @@ class Started(NamedTuple):
     warning: str
 
 
-class Refused(NamedTuple):
-    """A worker that cannot start, and why."""
-
-    reason: str
-
-
 class Worker:
     """Runs in a process of its own. Several threads call `run`: while one computes, others load and write."""
 
@@ -69,25 +64,25 @@ class Worker:
         self._fetched = Fetched()
         self._work: ClipWork | None = None
         self._out: Destination | None = None
+        self._warning = ""
 
     def place(self) -> Place:
         """Return where the worker runs."""
         return Place(socket.gethostname(), os.getpid(), running_versions())
 
-    def start(self, job: Job) -> Started | Refused:
-        """Load the model."""
+    def start(self, job: Job, threads: int | None = None) -> Started:
+        """Load the model, unless it is there. `threads` is for computing on a CPU; None for all."""
         with suppress(OSError):  # a machine without the folder: relative paths are not found
             os.chdir(job.folder)
-        if job.threads is not None:
-            os.environ.setdefault("NPROC", str(job.threads))  # XLA asks for it when jax begins
+        if threads is not None:
+            os.environ.setdefault("NPROC", str(threads))  # XLA asks for it when jax begins
         from vggtjax.batch.clip_work import ClipWork
 
-        try:
+        if self._work is None:
             model, fusion = job.load()
             self._out, self._work = job.out, ClipWork(model, fusion, job.recipe, job.out)
-        except (VggtjaxError, MemoryError) as error:
-            return Refused(str(error) or "out of memory")
-        return Started(self._work.settings, model.warning)
+            self._warning = model.warning
+        return Started(self._work.settings, self._warning)
 
     def run(self, name: str, source: str) -> ClipOutcome:
         """Do a clip, unless its result is there."""

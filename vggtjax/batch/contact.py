@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -28,16 +28,6 @@ _PICTURES = ("preview/card.webp", "preview/sheet.png")  # the first that a clip'
 _TARGETS = (REPORT_NAME, "preview/sheet.png", ARCHIVE_NAME)  # the first that a clip's folder has is linked to
 
 logger = logging.getLogger(__name__)
-
-
-class _Clip(NamedTuple):
-    """What a card tells of a finished clip."""
-
-    frames: int
-    width: int
-    height: int
-    dynamic_share: float
-    method: str
 
 
 class ContactPage:
@@ -122,9 +112,7 @@ def _card(out: Path, name: str) -> dict[str, Any]:
     folder = out / name
     picture, target = (next((n for n in names if (folder / n).is_file()), None) for names in (_PICTURES, _TARGETS))
     try:
-        clip = _read(folder / ARCHIVE_NAME)
-        size = f"{clip.frames} frame{'' if clip.frames == 1 else 's'} of {clip.width} x {clip.height} pixels"
-        told = f"{size}, {clip.dynamic_share:.1%} moving, {one_line(clip.method, 60)}"
+        told = _told(folder / ARCHIVE_NAME)
     except ResultError as error:
         told = f"cannot be read: {one_line(str(error))}"
     return {
@@ -135,20 +123,18 @@ def _card(out: Path, name: str) -> dict[str, Any]:
     }
 
 
-def _read(path: Path) -> _Clip:
-    """Read what a card tells. Raises ResultError for a broken archive."""
+def _told(path: Path) -> str:
+    """Return what a card tells of a clip. Raises ResultError for a broken archive."""
     arrays = read_arrays(path, ["dynamic_mask", "valid_box", "method"])
-    for name, kinds, axes in (("dynamic_mask", "b", (-1, -1, -1)), ("valid_box", "iu", (-1, 4)), ("method", "U", ())):
+    for name, kinds, axes in (("dynamic_mask", "b", 3), ("valid_box", "iu", 2), ("method", "U", 0)):
         array = arrays.get(name)
-        if array is None or array.dtype.kind not in kinds or not _has_axes(array.shape, axes):
+        if array is None or array.dtype.kind not in kinds or array.ndim != axes:
             found = "nothing" if array is None else f"{array.dtype} {array.shape}"
             raise ResultError(f"its {name} is {found}; expected that of a saved result")
     mask, box = arrays["dynamic_mask"], arrays["valid_box"].astype(np.float64)
     frames, height, width = mask.shape
-    pictured = float(((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])).sum())
-    return _Clip(frames, width, height, float(mask.sum()) / max(pictured, 1.0), str(arrays["method"].item()))
-
-
-def _has_axes(shape: tuple[int, ...], axes: tuple[int, ...]) -> bool:
-    """Return whether a shape has these sides, -1 being any."""
-    return len(shape) == len(axes) and all(side in (-1, own) for side, own in zip(axes, shape, strict=True))
+    if box.shape[1] != 4:
+        raise ResultError(f"its valid_box has the shape {box.shape}; expected that of a saved result")
+    pictured = max(float(((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])).sum()), 1.0)
+    size = f"{frames} frame{'' if frames == 1 else 's'} of {width} x {height} pixels"
+    return f"{size}, {mask.sum() / pictured:.1%} moving, {one_line(str(arrays['method'].item()), 60)}"

@@ -65,14 +65,11 @@ class LocalFolder:
         """Write the settings of the batch. Raises InputError if the folder has results of other settings."""
         path = self.path / SETTINGS_NAME
         if path.is_file():
-            _check_settings(
-                str(path),
-                read_json(path, dict[str, Any], "settings of a batch", most_bytes=_MOST_SETTINGS_BYTES),
-                settings,
-            )
-            return
-        with writing(path) as temporary:
-            temporary.write_bytes(_settings_text(settings))
+            what, most = "settings of a batch", _MOST_SETTINGS_BYTES
+            _check_settings(str(path), read_json(path, dict[str, Any], what, most_bytes=most), settings)
+        else:
+            with writing(path) as temporary:
+                temporary.write_bytes(_settings_text(settings))
 
     def has(self, name: str) -> bool:
         """Return whether the result of a clip is there, whole."""
@@ -108,14 +105,11 @@ class RemoteFolder:
 
     def begin(self, settings: dict[str, Any]) -> None:
         """Write the settings of the batch. Raises InputError if the folder has results of other settings."""
-        url = f"{self.url}/{SETTINGS_NAME}"
-        earlier = read_url(url, _MOST_SETTINGS_BYTES)
-        if earlier is None:
+        url, most = f"{self.url}/{SETTINGS_NAME}", _MOST_SETTINGS_BYTES
+        if (earlier := read_url(url, most)) is None:
             write_url(url, _settings_text(settings))
-            return
-        _check_settings(
-            shown(url), parse_json(earlier, dict[str, Any], shown(url), most_bytes=_MOST_SETTINGS_BYTES), settings
-        )
+        else:
+            _check_settings(shown(url), parse_json(earlier, dict[str, Any], shown(url), most_bytes=most), settings)
 
     def has(self, name: str) -> bool:
         """Return whether the result of a clip is there, whole."""

@@ -2,35 +2,27 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections import deque
 from collections.abc import Generator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from vggtjax.batch.clip_work import ClipWork, LongClip
 from vggtjax.batch.contact import contact_page
 from vggtjax.batch.destination import Destination, destination
-from vggtjax.batch.recipe import BatchMasks, ClipOutcome, Recipe, failed, invalid_name
+from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, counted, failed, invalid_name
 from vggtjax.batch.shards import parse_shard
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.fetched import Fetched
-from vggtjax.clips.preprocessing import Framing, FramingChanges
-from vggtjax.clips.sources import ClipSource, open_source
+from vggtjax.clips.sources import ClipSource
 from vggtjax.errors import VggtjaxError
-from vggtjax.known.given import check_readable
-from vggtjax.known.options import KnownGeometry
-from vggtjax.media.sampling import Sampling
 from vggtjax.method.assembly import check_fuses
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_kept
-from vggtjax.options import Options
 from vggtjax.progress import Progress, StageSeconds, no_progress
-from vggtjax.refinement.refine import check_refinement
-from vggtjax.results.saving import Saving
-from vggtjax.storage.remote import is_url
 
 _AHEAD = 1  # clips that are loaded before they are needed, and results that wait to be written
 
@@ -40,17 +32,9 @@ def reconstruct_many(
     sources: Mapping[str, ClipSource],
     out: str | Path,
     *,
-    options: Options | Mapping[str, Any] | None = None,
-    framing: Framing | None = None,
-    sampling: Sampling | Mapping[str, Any] | None = None,
-    saving: Saving | Mapping[str, Any] | None = None,
+    recipe: BatchRecipe = BatchRecipe(),
     fusion: FusionParams | None = None,
-    masks: BatchMasks | str = None,
-    known: KnownGeometry | None = None,
-    pad_frames: bool = False,
     shard: str | None = None,
-    devices: int = 1,
-    unchecked: bool = False,
     progress: Progress | None = None,
     **changes: Any,
 ) -> Generator[ClipOutcome]:
@@ -66,24 +50,21 @@ def reconstruct_many(
         model: what `load_model` returned.
         sources: clips by name, as for `load_clip`, or URLs; the names become folders.
         out: the folder of these folders, or a URL such as "s3://bucket/results".
-        options: as for `reconstruct`; a mapping of the names in `changes`, of fusion and of pad_frames serves, too.
+        recipe: how all clips are read, reconstructed and written; `changes` says its parts.
         fusion: as for `reconstruct`.
-        masks: what moves in each clip, by its name: an array or a folder of pictures as for `reconstruct`, or False for
-            nothing; or a folder of such folders, named like the clips. Masks of other clips are mined. False: nothing
-            moves in any clip. Options of mined masks are then refused. A later run with other masks is refused, too.
-        known: as for `reconstruct`, as far as all clips share it: intrinsics, a shared focal length, the height of the
-            cameras, and what "source" names.
-        pad_frames: as for `reconstruct`.
-        devices: as for `reconstruct`; the weights are copied once.
-        framing: how frames are fitted; the keywords of `load_clip` serve, too.
-        sampling: which frames are taken; the keywords of `load_clip` serve, too.
-        saving: how results are written; the keywords of `Reconstruction.save` serve, too.
         shard: "K/N" takes every N-th of the sources, from the K-th on. Runs for K from 1 to N together do the batch, at
             the same time or not, in one folder; none of them writes index.html. A later run without `shard` does.
-        unchecked: do not compare the memory that a clip needs with what is free.
-        progress: called before the first clip and after each computed clip, with the frames done and the frames of all
-            clips but kept and failed ones; a clip of unknown length, such as a video, counts as the mean of the others.
-        changes: fields of `framing` and `options` by name, such as `mode="pad"`.
+        progress: called before the first clip and after each, with the number of computed clips, and of all but kept
+            and failed ones.
+        changes: parts of the recipe by name, or what they hold: `options` (`method="vggt"`, ...), `framing` (`size`,
+            `mode`), `sampling` (`fps`, `stride`, ...) and `saving` (`only`, `resolution`, ...);
+            `known`, as for `reconstruct`, as far as all clips share it: intrinsics, a shared focal length, the height
+            of the cameras, and what "source" names; `devices`, as for `reconstruct`, where the weights are copied once;
+            `pad_frames`, as for `reconstruct`; `unchecked`: do not compare the memory that a clip needs with what is
+            free; `masks`: what moves in each clip, by its name: an array or a folder of pictures as for `reconstruct`,
+            or False for nothing; or a folder of such folders, named like the clips. Masks of other clips are mined.
+            False: nothing moves in any clip. Options of mined masks are then refused. A later run with other masks is
+            refused, too.
 
     Raises:
         InputError: an invalid option, or a folder with results of other settings.
@@ -91,60 +72,36 @@ def reconstruct_many(
         TypeError: a name that is no option.
     """
     part = None if shard is None else parse_shard(shard)
-    if isinstance(masks, str | Mapping):
-        masks = Path(masks) if isinstance(masks, str) else masks or None
-    words: dict[str, Any] = dict(changes)
-    if isinstance(options, Mapping):
-        words, options = words | dict(options), None
-        fusion, pad_frames = words.pop("fusion", fusion), words.pop("pad_frames", pad_frames)
-    of_framing = {name: words.pop(name) for name in FramingChanges.__annotations__ if name in words}
-    framing = dataclasses.replace(framing or Framing(), **of_framing)
-    options = (options or Options()).changed(**words)
-    check_fuses(fusion, options.method)
+    recipe = recipe.changed(**changes)
+    check_fuses(fusion, recipe.options.method)
     check_kept(fusion)
-    if known is not None:
-        known.check_many()
-        check_readable(known)
-    check_refinement(options.refine_cameras, known is not None and known.poses is not None)
-    recipe = Recipe(
-        options=options,
-        framing=framing,
-        sampling=Sampling(**sampling) if isinstance(sampling, Mapping) else sampling or Sampling(),
-        saving=Saving(**saving) if isinstance(saving, Mapping) else saving or Saving(),
-        known=known or None,
-        pad_frames=pad_frames,
-        devices=devices,
-        unchecked=unchecked,
-        masks=masks,
-    )
-    recipe.check_masks(sources)
+    recipe.check(sources)
     place = destination(out)
     work = ClipWork(model, fusion, recipe, place)
     progress = progress or no_progress
     with place.held(part, work.settings):
         if part is not None:
-            yield from _outcomes(work, part.share(sources), place, recipe.sampling, progress)
+            yield from _outcomes(work, part.share(sources), place, progress)
             return
         with contact_page(place, len(sources)) as tell:
-            for outcome in _outcomes(work, sources, place, recipe.sampling, progress):
+            for outcome in _outcomes(work, sources, place, progress):
                 tell(outcome)
                 yield outcome
 
 
 def _outcomes(
-    work: ClipWork, sources: Mapping[str, ClipSource], place: Destination, sampling: Sampling, progress: Progress
+    work: ClipWork, sources: Mapping[str, ClipSource], place: Destination, progress: Progress
 ) -> Generator[ClipOutcome]:
     """Yield the outcomes of clips that cannot have a folder, then of kept ones, then of the others."""
     odd = {name: outcome for name in sources if (outcome := invalid_name(name)) is not None}
     yield from odd.values()
     kept = place.finished(name for name in sources if name not in odd)
     yield from (ClipOutcome(name, "kept") for name in sources if name in kept)
-    names = [name for name in sources if name not in odd and name not in kept]
-    frames = _Frames({name: _length(sources[name], sampling) for name in names}, progress)
-    yield from _reconstruct_all(work, {name: sources[name] for name in names}, frames)
+    left = {name: source for name, source in sources.items() if name not in odd and name not in kept}
+    yield from counted(_reconstruct_all(work, left), len(left), progress)
 
 
-def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource], frames: _Frames) -> Generator[ClipOutcome]:
+def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource]) -> Generator[ClipOutcome]:
     """Yield the outcomes of clips: while one is computed, the next is loaded and the previous one written."""
     with Fetched() as fetched, ThreadPoolExecutor(1) as loader, ThreadPoolExecutor(1) as writer:
         loading: deque[tuple[str, Future[tuple[ClipSource, Clip | LongClip]]]] = deque()
@@ -180,20 +137,16 @@ def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource], frames: 
                     result = clip if isinstance(clip, LongClip) else work.reconstruct_or_cut(name, clip, seconds)
                     if isinstance(result, LongClip):
                         del clip
-                        outcome = work.run_long(name, source, result)
-                        fetched.drop(name)
-                        frames.finish(name, outcome.frames)
-                        yield outcome
-                        continue
+                        finish = partial(_same, work.run_long(name, source, result))
+                    else:
+                        assert isinstance(clip, Clip)
+                        finish = partial(work.write, name, clip, result, seconds.seconds)
+                        del clip
+                    del result
                 except (VggtjaxError, MemoryError) as error:
-                    fetched.drop(name)
-                    frames.finish(name, 0)
-                    yield failed(name, error)
-                    continue
-                assert isinstance(clip, Clip)  # a long one has been run
-                frames.finish(name, len(clip))
-                writes.append((name, writer.submit(work.write, name, clip, result, seconds.seconds)))
-                del clip, result  # the writer holds them
+                    finish = partial(_same, failed(name, error))
+                writes.append((name, writer.submit(finish)))
+                del finish  # the writer holds clip and result
                 while len(writes) > _AHEAD:
                     yield written()
             while writes:
@@ -204,34 +157,5 @@ def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource], frames: 
             raise
 
 
-class _Frames:
-    """Frames done and to do; a clip of unknown length counts as the mean of the others, or as 1 if none is known."""
-
-    def __init__(self, lengths: Mapping[str, int | None], progress: Progress) -> None:
-        self._waiting = dict(lengths)
-        self._done: list[int] = []
-        self._progress = progress
-        self._tell()
-
-    def finish(self, name: str, frames: int) -> None:
-        """Count a clip as done; a failed clip has 0 frames."""
-        del self._waiting[name]
-        if frames:
-            self._done.append(frames)
-        self._tell()
-
-    def _tell(self) -> None:
-        lengths = self._done + [length for length in self._waiting.values() if length]
-        unknown = sum(length is None for length in self._waiting.values())
-        mean = sum(lengths) / len(lengths) if lengths else 1
-        self._progress(sum(self._done), sum(lengths) + round(unknown * mean))
-
-
-def _length(source: ClipSource, sampling: Sampling) -> int | None:
-    """Return the number of frames of a clip: 0 if the clip will fail, None if only reading it can tell."""
-    if is_url(source):
-        return None
-    try:
-        return open_source(source).total(sampling)
-    except VggtjaxError:
-        return 0
+def _same(outcome: ClipOutcome) -> ClipOutcome:
+    return outcome

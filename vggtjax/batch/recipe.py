@@ -1,13 +1,18 @@
-"""What all clips of a batch have in common, and what becomes of each. Does not import jax."""
+"""How clips are read, reconstructed and written, also as options of commands, and what becomes of each.
+
+Does not import jax.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+import dataclasses
+from collections.abc import Collection, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
+import tyro
 
 from vggtjax.batch.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.clips.masks import masks_digest
@@ -16,14 +21,16 @@ from vggtjax.errors import InputError
 from vggtjax.known.options import KnownGeometry
 from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
+from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving
 from vggtjax.storage.file_digest import file_digest
+from vggtjax.storage.flags import InWords, Switch
 
 _TAKEN = ("", "..", SETTINGS_NAME, PAGE_NAME)
 
 # By the name of a clip: an array, a folder of pictures, or False where nothing moves; or the folder of such folders.
 # Masks of other clips are mined. False: nothing moves in any clip.
-BatchMasks = Mapping[str, np.ndarray | str | Path | Literal[False] | None] | Path | Literal[False] | None
+BatchMasks = Mapping[str, np.ndarray | str | Path | Literal[False] | None] | str | Path | Literal[False] | None
 
 
 class ClipOutcome(NamedTuple):
@@ -35,19 +42,107 @@ class ClipOutcome(NamedTuple):
     frames: int = 0
 
 
+def _devices(devices: int = 1) -> int:
+    """Return the number.
+
+    Args:
+        devices: share the frames of a clip among so many devices, each with a copy of the weights
+    """
+    return devices
+
+
+def _no_memory_check(no_memory_check: Switch = False) -> bool:
+    """Return the choice.
+
+    Args:
+        no_memory_check: run all frames together, without comparing the memory that they need with what is free
+    """
+    return no_memory_check
+
+
+def _pad_frames(pad_frames: Switch = False) -> bool:
+    """Return the choice.
+
+    Args:
+        pad_frames: pad clips to one of a few lengths, so that clips of similar length share compiled programs; for many
+            lengths on a GPU, where compiling takes longer than running
+    """
+    return pad_frames
+
+
+def _masks(masks: InWords[Path | None] = None) -> Path | None:
+    """Return the folder.
+
+    Args:
+        masks: folder with a folder of pictures for each clip, named like it, as --masks of vggtjax reconstruct takes
+            them; masks of other clips are mined
+    """
+    return masks
+
+
 @dataclass(frozen=True)
-class Recipe:
+class ClipRecipe:
+    """How a clip is read, reconstructed and written. The names of groups and flags are those of commands."""
+
+    sampling: Annotated[Sampling, tyro.conf.arg(name="input", help="")] = Sampling()
+    framing: Annotated[Framing, tyro.conf.arg(name="input", help="")] = Framing()
+    options: Annotated[Options, tyro.conf.arg(name="method", help="")] = Options()
+    devices: Annotated[int, tyro.conf.arg(constructor=_devices, name="method", prefix_name=False, help="")] = 1
+    known: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = KnownGeometry()
+    unchecked: Annotated[
+        bool, tyro.conf.arg(constructor=_no_memory_check, name="long clip", prefix_name=False, help="")
+    ] = False  # do not compare the memory that a clip needs with what is free
+    saving: Annotated[Saving, tyro.conf.arg(name="output", help="")] = Saving()
+
+    @property
+    def needs_all_frames(self) -> list[str]:
+        """The options that need all frames at once, so that a clip is not run in windows."""
+        needs = {
+            "--devices": self.devices > 1,
+            "known cameras or lengths": self.known,
+            "--refine-cameras": self.options.refine_cameras,
+        }
+        return [name for name, given in needs.items() if given]
+
+    def changed(self, **changes: Any) -> Self:
+        """Return the recipe with other values, by the names of its fields or of fields of its parts, such as `fps`.
+
+        Raises TypeError for a name that is no option.
+        """
+        values = {field.name: changes.pop(field.name) for field in dataclasses.fields(self) if field.name in changes}
+        for part in ("sampling", "framing", "saving", "options"):
+            value = values.get(part, getattr(self, part))
+            names = [field.name for field in dataclasses.fields(value) if field.name in changes]
+            values[part] = dataclasses.replace(value, **{name: changes.pop(name) for name in names})
+        if changes:
+            raise TypeError(f"no option is named {' or '.join(sorted(changes))}")
+        return dataclasses.replace(self, **values)
+
+
+@dataclass(frozen=True)
+class BatchRecipe(ClipRecipe):
     """How all clips of a batch are read, reconstructed and written."""
 
-    options: Options = Options()
-    framing: Framing = Framing()
-    sampling: Sampling = Sampling()
-    saving: Saving = Saving()
-    known: KnownGeometry | None = None
-    pad_frames: bool = False
-    devices: int = 1
-    unchecked: bool = False  # do not compare the memory that a clip needs with what is free
-    masks: BatchMasks = None
+    pad_frames: Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="method", prefix_name=False, help="")] = (
+        False
+    )
+    masks: Annotated[BatchMasks, tyro.conf.arg(constructor=_masks, name="method", prefix_name=False, help="")] = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.masks, str):
+            object.__setattr__(self, "masks", Path(self.masks))
+        elif isinstance(self.masks, Mapping) and not self.masks:
+            object.__setattr__(self, "masks", None)
+
+    def check(self, names: Collection[str]) -> None:
+        """Raise InputError for what cannot be done for clips of these names."""
+        from vggtjax.known.given import check_readable
+        from vggtjax.refinement.refine import check_refinement
+
+        self.known.check_many()
+        check_readable(self.known)
+        check_refinement(self.options.refine_cameras, self.known.poses is not None)
+        self._check_masks(names)
 
     def masks_of(self, name: str) -> Any:
         """Return the masks of a clip, as `reconstruct` takes them; None where they are mined."""
@@ -57,7 +152,7 @@ class Recipe:
             raise InputError(f"masks is {self.masks}, which is no folder here; expected a folder that all workers see")
         return folder if (folder := self.masks / name).is_dir() else None
 
-    def check_masks(self, names: Collection[str]) -> None:
+    def _check_masks(self, names: Collection[str]) -> None:
         """Raise InputError for masks of no clip, and for options of mined masks beside given ones."""
         if self.masks is None:
             return
@@ -85,6 +180,17 @@ class Recipe:
         if isinstance(self.masks, Mapping):
             return {"masks": {name: masks_digest(masks) for name, masks in sorted(self.masks.items())}}
         return {"masks": "nothing moves"}
+
+
+def counted(outcomes: Iterable[ClipOutcome], total: int, progress: Progress) -> Generator[ClipOutcome]:
+    """Yield outcomes; tell the number of computed clips, and of all but kept and failed ones."""
+    done = 0
+    progress(done, total)
+    for outcome in outcomes:
+        done += outcome.status == "done"
+        total -= outcome.status != "done"
+        progress(done, total)
+        yield outcome
 
 
 def failed(name: str, error: BaseException) -> ClipOutcome:

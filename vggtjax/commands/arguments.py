@@ -8,21 +8,16 @@ from typing import Annotated
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.errors import whole_number
-from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
-from vggtjax.results.saving import Saving
-from vggtjax.storage.flags import InWords, Switch
+from vggtjax.storage.flags import Switch
 
 _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(required)")
 
 Sources = Annotated[tuple[str, ...], tyro.conf.Positional, _SOURCES]
 ResultPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")]
 ModelName = Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="(required)")]
-Frames = Annotated[Sampling, tyro.conf.arg(name="input", help="")]
 Size = Annotated[Framing, tyro.conf.arg(name="input", help="")]
 Method = Annotated[Options, tyro.conf.arg(name="method", help="")]
-Output = Annotated[Saving, tyro.conf.arg(name="output", help="")]
 
 
 def _result_folder(out: Path) -> Path:
@@ -61,16 +56,6 @@ def _view(view: Switch = False) -> bool:
     return view
 
 
-def _pad_frames(pad_frames: Switch = False) -> bool:
-    """Return the choice.
-
-    Args:
-        pad_frames: pad clips to one of a few lengths, so that clips of similar length share compiled programs; for many
-            lengths on a GPU, where compiling takes longer than running
-    """
-    return pad_frames
-
-
 def _shard(shard: Annotated[str | None, tyro.conf.arg(metavar="K/N", help_behavior_hint="")] = None) -> str | None:
     """Return the choice.
 
@@ -78,34 +63,6 @@ def _shard(shard: Annotated[str | None, tyro.conf.arg(metavar="K/N", help_behavi
         shard: take every N-th clip, from the K-th on: runs for K from 1 to N do the batch together, in one folder
     """
     return shard
-
-
-def _devices(devices: int = 1) -> int:
-    """Return the number.
-
-    Args:
-        devices: share the frames of a clip among so many devices, each with a copy of the weights
-    """
-    return whole_number("devices", devices, 1)
-
-
-def _no_memory_check(no_memory_check: Switch = False) -> bool:
-    """Return the choice.
-
-    Args:
-        no_memory_check: run all frames together, without comparing the memory that they need with what is free
-    """
-    return no_memory_check
-
-
-def _batch_masks(masks: InWords[Path | None] = None) -> Path | None:
-    """Return the folder.
-
-    Args:
-        masks: folder with a folder of pictures for each clip, named like it, as --masks of vggtjax reconstruct takes
-            them; masks of other clips are mined
-    """
-    return masks
 
 
 # The name puts a flag into the group of that name.
@@ -116,7 +73,3 @@ EvaluationFolder = Annotated[
 ]
 View = Annotated[bool, tyro.conf.arg(constructor=_view, name="output", prefix_name=False, help="")]
 Shards = Annotated[str | None, tyro.conf.arg(constructor=_shard, name="output", prefix_name=False, help="")]
-BatchMasks = Annotated[Path | None, tyro.conf.arg(constructor=_batch_masks, name="method", prefix_name=False, help="")]
-Devices = Annotated[int, tyro.conf.arg(constructor=_devices, name="method", prefix_name=False, help="")]
-PadFrames = Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="method", prefix_name=False, help="")]
-Unchecked = Annotated[bool, tyro.conf.arg(constructor=_no_memory_check, name="long clip", prefix_name=False, help="")]

@@ -17,6 +17,8 @@ from vggtjax.storage.flags import InWords
 if TYPE_CHECKING:
     import numpy as np
 
+    from vggtjax.calibration.choice import Choice
+    from vggtjax.calibration.second_pass import SecondPassChoice
     from vggtjax.scenes import SyntheticClip
 
 _Pairs = Annotated[tuple[int, ...] | None, tyro.conf.arg(help_behavior_hint="", metavar="INT [INT ...]")]
@@ -96,14 +98,20 @@ def calibrate_cues(
         source |= {"key": f"fold_in(fold_in(key({seed}), {_KEYS}), scene)"}
         with report.stage("write"):
             path = save_calibration(out, loaded, swept, choice, second=second, source=source)
+    _print(report, choice, swept.came_back.mean(axis=1), second, path)
+    if loaded.note:
+        report.line(loaded.warning)
+
+
+def _print(report: Report, choice: Choice, came_back: np.ndarray, second: SecondPassChoice | None, path: Path) -> None:
+    """Print the chosen cues, the pairs of blocks that match frames, and the second passes, with their ratings."""
     rows = {
-        step.cue.name + (" (1 - m)" if step.cue.inverted else ""): f"{calibration:.3f}   {held_out:.3f}"
+        step.cue.name + (" (1 - m)" if step.cue.inverted else ""): "{:.3f}   {:.3f}".format(*step.rating)
         for step in choice.steps
-        for calibration, held_out in [step.rating]
     }
     report.line("AUC of the product up to each cue, on the calibration half and on the held-out half:")
     report.table(rows | {"default table": "{:.3f}   {:.3f}".format(*choice.table), "model": path})
-    report.line(_matching_line(choice.motion.matching, swept.came_back.mean(axis=1)))
+    report.line(_matching_line(choice.motion.matching, came_back))
     if choice.steps[-1].rating.held_out < choice.table.held_out:
         report.line("On the held-out half the default table is better than the chosen table; try more scenes.")
     if second is not None:
@@ -116,8 +124,6 @@ def calibrate_cues(
             }
             | {"recommended": f"{second.best.pairs} pairs, {second.best.threshold}"}
         )
-    if loaded.note:
-        report.line(loaded.warning)
 
 
 def _matching_line(pairs: tuple[int, ...] | None, shares: np.ndarray) -> str:

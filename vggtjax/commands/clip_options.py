@@ -1,40 +1,17 @@
-"""Options of `vggtjax reconstruct` in groups of their own. Does not import jax before it is needed."""
+"""Masks and points of the user, as options of `vggtjax reconstruct`. Does not import jax before it is needed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 
+from vggtjax.batch.recipe import ClipRecipe
 from vggtjax.errors import InputError
-from vggtjax.known.options import KnownGeometry
-from vggtjax.options import Options
 from vggtjax.storage.flags import InWords, Switch
 from vggtjax.windows.plan import Windows
-
-if TYPE_CHECKING:
-    import numpy as np
-
-    from vggtjax.clips.clip import Clip
-
-_NOTHING_KNOWN = KnownGeometry()
-
-
-@dataclass(frozen=True)
-class ExtraOptions:
-    """Options in groups of their own. Raises InputError for options that exclude each other."""
-
-    geometry: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = _NOTHING_KNOWN
-    windows: Annotated[Windows, tyro.conf.arg(name="long clip", help="")] = Windows()
-
-    def __post_init__(self) -> None:
-        if self.windows.window and self.geometry:
-            raise InputError(
-                "known cameras or lengths and --window exclude each other: they are brought into a clip "
-                "that is run as a whole"
-            )
 
 
 @dataclass(frozen=True)
@@ -53,12 +30,21 @@ class GivenInputs:
         if self.masks is not None and self.no_masks:
             raise InputError("--masks and --no-masks are opposites; give one of them")
 
-    def check(self, options: Options, windows: Windows) -> None:
-        """Raise InputError for missing files, for options that need mined masks, or all frames at once."""
-        if options.refine_cameras and windows.window:
+    def check(self, recipe: ClipRecipe, windows: Windows) -> None:
+        """Raise InputError for missing files, for options that need mined masks, and for those that exclude others."""
+        if windows.window and recipe.devices > 1:
+            raise InputError("--devices and --window exclude each other: a window is run on one device")
+        if windows.window and recipe.known:
+            raise InputError(
+                "known cameras or lengths and --window exclude each other: they are brought into a clip "
+                "that is run as a whole"
+            )
+        if windows.window and recipe.options.refine_cameras:
             raise InputError("--refine-cameras and --window exclude each other: cameras are adjusted over all frames")
+        if self.tracks is not None and recipe.devices > 1:
+            raise InputError("--devices and --tracks exclude each other: points are followed on one device")
         if self.masks is not None or self.no_masks:
-            options.check_given_masks()
+            recipe.options.check_given_masks()
         if self.masks is not None:
             from vggtjax.clips.sources import open_source
 
@@ -67,13 +53,3 @@ class GivenInputs:
             from vggtjax.clips.queries import check_words
 
             check_words(self.tracks)
-
-    def masks_of(self, clip: Clip) -> np.ndarray | None:
-        """Return the masks at the clip's frames, or None where they are mined."""
-        import numpy as np
-
-        from vggtjax.clips.masks import load_masks
-
-        if self.no_masks:
-            return np.zeros(clip.images.shape[:3], bool)
-        return None if self.masks is None else load_masks(self.masks, clip)

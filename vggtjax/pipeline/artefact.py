@@ -45,7 +45,6 @@ _ABOUT = {
     "dynamic_mask": "what moves, as mined",
     "saliency": "of the patches, in [0, 1]",
 }
-_CHUNK = 1 << 24  # bytes that are hashed at once
 
 
 def check_artefact(out: Path, frames: int, height: int, width: int, platforms: Sequence[str], options: Options) -> None:
@@ -110,7 +109,7 @@ def write_artefact(
         OutputError: the folder exists or cannot be written.
     """
     out, on_stage = Path(out), on_stage or no_stage
-    options = options.changed(**changes).resolved(model.config.motion, _on_accelerator(platforms))
+    options = options.changed(**changes).resolved(model.config.motion, "cpu" not in platforms)
     check_artefact(out, frames, height, width, platforms, options)
     check_fuses(fusion, options.method)
     patch = model.config.patch_size
@@ -128,21 +127,14 @@ def write_artefact(
         (folder / serve.PROGRAM).write_bytes(exported.serialize())
         with on_stage("write weights") as progress:
             _write_weights(folder / serve.WEIGHTS, weights, progress or no_progress)
-        with on_stage("write manifest") as progress:
+        with on_stage("write manifest"):
             manifest = _manifest(model, exported, options, fusion)
-            manifest["files"] = {
-                name: _facts(folder / name, progress or no_progress) for name in (serve.PROGRAM, serve.WEIGHTS)
-            }
+            manifest["files"] = {name: _facts(folder / name) for name in (serve.PROGRAM, serve.WEIGHTS)}
             text = json.dumps(manifest, indent=2, allow_nan=False)
             (folder / serve.MANIFEST).write_text(f"{text}\n", encoding="utf-8")
         shutil.copyfile(serve.__file__, folder / "serve.py")
         _copy_flatbuffers(folder / "flatbuffers")
     return out
-
-
-def _on_accelerator(platforms: Sequence[str]) -> bool:
-    """Return whether the program is for accelerators alone, wherever it is written."""
-    return "cpu" not in platforms
 
 
 def _lowered(
@@ -154,8 +146,7 @@ def _lowered(
     options: Options,
     fusion: FusionRule | None,
 ) -> export.Exported:
-    on_accelerator = _on_accelerator(platforms)
-    compute = compute_by(options, on_accelerator=on_accelerator)
+    compute = compute_by(options, on_accelerator="cpu" not in platforms)
     names = list(weights)  # in the order of the structure; jax sorts those of a dictionary
 
     def reconstruction(weights, images):
@@ -210,14 +201,10 @@ def _described(value: Any, about: str) -> dict[str, Any]:
     return {"shape": list(value.shape), "dtype": str(value.dtype), "about": about}
 
 
-def _facts(path: Path, progress: Progress) -> dict[str, Any]:
+def _facts(path: Path) -> dict[str, Any]:
     """Return size and digest of a file."""
-    size, digest = path.stat().st_size, hashlib.sha256()
     with path.open("rb") as file:
-        while piece := file.read(_CHUNK):
-            digest.update(piece)
-            progress(file.tell() // _CHUNK, size // _CHUNK)
-    return {"bytes": size, "sha256": digest.hexdigest()}
+        return {"bytes": path.stat().st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
 def _copy_flatbuffers(folder: Path) -> None:

@@ -31,7 +31,6 @@ FORMAT, VERSION = "vggtjax-artefact", 1
 MANIFEST, PROGRAM, WEIGHTS = "manifest.json", "program.bin", "weights.safetensors"
 
 _DTYPES = {"F32": "float32", "BF16": "bfloat16", "F16": "float16", "I8": "int8"}  # of safetensors
-_CHUNK = 1 << 24  # bytes that are hashed at once
 _MOST_BYTES = 1 << 24  # of the manifest, and of the header of the weights
 _MOST_LETTERS = 480  # of a message
 _MOST_WORD = 200  # letters of a text in the manifest that is used
@@ -148,11 +147,9 @@ def _reason(error: Exception) -> str:
 
 def _check_file(path: Path, facts: dict[str, Any]) -> None:
     _check_regular(path)
-    digest = hashlib.sha256()
     try:
         with path.open("rb") as file:
-            while piece := file.read(_CHUNK):
-                digest.update(piece)
+            digest = hashlib.file_digest(file, "sha256")
     except OSError as error:
         raise ArtefactError(f"cannot read {path}: {error.strerror}; copy the artefact again") from error
     if digest.hexdigest() != facts["sha256"]:

@@ -59,16 +59,15 @@ class Tools(NamedTuple):
 
 
 class LongRun(NamedTuple):
-    """How a long clip is read, cut and written."""
+    """How a long clip is read, joined and written."""
 
-    windows: Windows
     frames: int | None = None  # of the clip, where it is known; else they are counted
     sampling: Sampling = Sampling()
     fitter: Fitter = Fitter()
     saving: Saving = Saving()
-    rule: JoinRule = JoinRule()
     tracks: Queries | str | None = None  # points to follow: in pixels of the fitted frames, or words for parse_queries
     on_stage: OnStage = no_stage
+    rule: JoinRule = JoinRule()
 
 
 def reconstruct_long(
@@ -94,7 +93,7 @@ def reconstruct_long(
         out: the folder of the result, as for `Reconstruction.save`.
         windows: how the clip is cut.
         options: as for `reconstruct`.
-        long_run: how the clip is read and written; its `windows` are replaced. By default the model's size.
+        long_run: how the clip is read and written; by default at the model's size.
         fusion: as for `reconstruct`.
         masks: folder of pictures of what moves, named like the frames; False: nothing moves; None: mined.
         changes: fields of `options` by name.
@@ -114,14 +113,13 @@ def reconstruct_long(
     options = asked.resolved(model.config.motion)
     check_fuses(fusion, options.method)
     check_kept(fusion)
-    if long_run is not None and isinstance(long_run.tracks, str):
-        check_words(long_run.tracks)
+    config = model.config
+    plan = long_run or LongRun(fitter=Fitter(size=config.image_size, patch=config.patch_size))
+    if isinstance(plan.tracks, str):
+        check_words(plan.tracks)
     if options.refine_cameras:
         raise InputError("refine_cameras is for clips that are run at once; leave it out, or take fewer frames")
-    config = model.config
-    fitter = Fitter(size=config.image_size, patch=config.patch_size)
-    plan = (long_run or LongRun(windows, fitter=fitter))._replace(windows=windows)
-
+    tools = tools_of(model, asked, plan.fitter.size, fusion=fusion, masks=masks)
     settings = {
         "model": model.identity.to_json(),
         "options": options.to_json(),
@@ -129,9 +127,7 @@ def reconstruct_long(
         "masks": masks_digest(masks),
         "versions": versions(),
     }
-    return run_windows(
-        source, Path(out), plan, tools_of(model, asked, plan.fitter.size, fusion=fusion, masks=masks), settings
-    )
+    return run_windows(source, Path(out), windows, plan, tools, settings)
 
 
 def tools_of(
@@ -172,17 +168,20 @@ def tools_of(
     return Tools(run, describe, follow, partial(check_track_size, config=config))
 
 
-def run_windows(source: ClipSource, out: Path, plan: LongRun, tools: Tools, settings: dict[str, Any]) -> Reconstruction:
+def run_windows(
+    source: ClipSource, out: Path, windows: Windows, plan: LongRun, tools: Tools, settings: dict[str, Any]
+) -> Reconstruction:
     """Run, join and write the windows of a clip; `reconstruct_long` says more.
 
     Args:
         source: of the frames.
         out: the folder of the result.
-        plan: how the clip is read, cut and written.
+        windows: how the clip is cut.
+        plan: how the clip is read, joined and written.
         tools: what runs and describes the frames of a window.
         settings: all else that decides the windows, as JSON values; stored windows of other settings are not used.
     """
-    opened, windows, seconds = open_source(source), plan.windows, StageSeconds()
+    opened, seconds = open_source(source), StageSeconds()
     check_folder(out, plan.saving.names(tracks=plan.tracks is not None))
     frames = count_frames(opened, plan.sampling) if plan.frames is None else plan.frames
     if not windows.cuts(frames):

@@ -14,7 +14,7 @@ from tests.dataset_files import npy
 from tests.fuzz.cases import Reader
 from tests.fuzz.rows.strangers import file
 from tests.room import make_room
-from vggtjax.batch.contact import _read as read_card
+from vggtjax.batch.contact import _told as read_card
 from vggtjax.batch.destination import SETTINGS_NAME, LocalFolder, RemoteFolder
 from vggtjax.evaluation.page import is_report
 from vggtjax.reconstruction import Reconstruction
