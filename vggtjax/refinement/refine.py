@@ -6,6 +6,7 @@ import dataclasses
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, TypeVar
 
 import numpy as np
@@ -94,17 +95,22 @@ def refine_cameras(
     check_refinement(True)
     frames = len(result.depth)
     pairs = frame_pairs(frames)
-    steps = _Steps(progress or no_progress, frames + len(pairs) + _ROUNDS)
+    progress, total, done = progress or no_progress, frames + len(pairs) + _ROUNDS, count()
+
+    def step() -> None:
+        progress(next(done), total)
+
+    step()
     unit = working_unit(result)
     with quiet():
-        features = find_features(result, pictures, steps.step)
-        matches = match_pairs(features, pairs, unit, steps.step)
+        features = find_features(result, pictures, step)
+        matches = match_pairs(features, pairs, unit, step)
     matched = Matched([each.positions for each in features], matches)
     tracks = join_matches(*matched, min(frames, 3))
     refined, report = adjust_to_tracks(
-        result, tracks, matched=matched, unit=unit, fixed_intrinsics=fixed_intrinsics, on_round=steps.step
+        result, tracks, matched=matched, unit=unit, fixed_intrinsics=fixed_intrinsics, on_round=step
     )
-    steps.finish()
+    progress(total, total)  # rounds that were not needed, too
     if not report.refined:
         logger.warning("%s", report.sentence)
     return refined, report
@@ -212,20 +218,3 @@ def _source_intrinsics(result: Result) -> Float64[np.ndarray, "S 3 3"]:
     K[:, :2] *= result.source_scale[:, :, None]
     K[:, :2, 2] += result.source_offset
     return K
-
-
-class _Steps:
-    """Counts steps of work, of a number that is known before."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self._progress, self._total, self._done = progress, total, 0
-        progress(0, total)
-
-    def step(self) -> None:
-        """Count one step."""
-        self._done += 1
-        self._progress(self._done, self._total)
-
-    def finish(self) -> None:
-        """Count the steps that were not needed."""
-        self._progress(self._total, self._total)
