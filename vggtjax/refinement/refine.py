@@ -16,10 +16,9 @@ from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError, check_extra
 from vggtjax.progress import Progress, no_progress
 from vggtjax.refinement.adjust import Adjusted, adjust, quiet, reprojection_errors
-from vggtjax.refinement.gauge import fit_to_result
 from vggtjax.refinement.mapping import Matched, map_globally, nearest_to_rays
 from vggtjax.refinement.matches import find_features, frame_pairs, match_pairs, working_unit
-from vggtjax.refinement.tracks import Tracks, join_matches, starting_points
+from vggtjax.refinement.tracks import Tracks, dense_depth_at, join_matches, starting_points
 from vggtjax.results.result import Result
 
 R = TypeVar("R", bound=Result)
@@ -158,11 +157,11 @@ def adjust_to_tracks(
         "error_before": before if np.isfinite(before) else None,
         "error_after": after,
     }
-    fitted = fit_to_result(adjusted, tracks, result)
+    poses, spread = _fitted(adjusted, tracks, result)
     if after >= before:
         reason = f"the reprojection error did not fall from {before:.2f} pixels"
-    elif fitted.spread > _MOST_SPREAD:
-        reason = f"the adjusted points differ from the dense depth by a factor of {fitted.spread:.1f} in the middle"
+    elif spread > _MOST_SPREAD:
+        reason = f"the adjusted points differ from the dense depth by a factor of {spread:.1f} in the middle"
     if reason:
         return _reported(result, RefinementReport(False, reason, **numbers))
     K = result.intrinsics.astype(np.float64)
@@ -170,10 +169,32 @@ def adjust_to_tracks(
     K[:, focal, focal] = adjusted.cameras.intrinsics[:, focal, focal] / result.source_scale
     refined = dataclasses.replace(
         result,
-        camera_from_world=fitted.camera_from_world.astype(np.float32),
+        camera_from_world=poses.astype(np.float32),
         intrinsics=K.astype(np.float32),
     )
     return _reported(refined, RefinementReport(True, **numbers))
+
+
+def _fitted(adjusted: Adjusted, tracks: Tracks, result: Result) -> tuple[Float64[np.ndarray, "S 3 4"], float]:
+    """Return the adjusted cameras in the world of the result, whose first camera and dense depth decide.
+
+    Depths agree in the middle at the scale of these cameras. The second value is the factor, at least 1, by which
+    adjusted and dense depth then still differ in the middle.
+    """
+    poses, kept = adjusted.cameras.camera_from_world, adjusted.kept
+    seen_by = poses[tracks.frames[kept]]
+    z = np.einsum("mj,mj->m", seen_by[:, 2, :3], adjusted.points[tracks.points[kept]]) + seen_by[:, 2, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(z / dense_depth_at(result, tracks)[kept])  # of unscaled adjusted depth by dense depth
+    known = np.isfinite(logs)
+    scale = np.exp(-np.median(logs[known]))
+    spread = float(np.exp(np.median(np.abs(logs[known] + np.log(scale)))))
+    first = result.camera_from_world[0].astype(np.float64)
+    turn = poses[:, :, :3] @ poses[0, :, :3].T
+    moved = scale * (poses[:, :, 3] - turn @ poses[0, :, 3])
+    placed = np.concatenate([turn @ first[:, :3], (turn @ first[:, 3] + moved)[:, :, None]], axis=2)
+    placed[0] = first  # to the last bit
+    return placed, spread
 
 
 def _best(
