@@ -53,10 +53,8 @@ class Sweep(NamedTuple):
     def map(self, gram: Gram, cue: Cue) -> Float32[np.ndarray, "N S P"]:
         """Return a cue's map as in `GramCues`: averaged over its layers, min-max normalised per frame.
 
-        Raises InputError for a std over several layers, as it is not the average of the maps of single layers.
+        A std is of a single layer: over several, it is not the average of the maps of single layers.
         """
-        if cue.statistic == "std" and len(cue.layers) > 1:
-            raise InputError(f"cue '{cue.name}' is a std over layers {cue.layers}; expected a single layer")
         maps = self.maps[GRAMS.index(gram), kind_index(cue)]
         return np.asarray(normalise(jnp.asarray(sum(maps[layer] for layer in cue.layers) / len(cue.layers))))
 
