@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import shutil
-from functools import partial
 
 import numpy as np
 import pytest
@@ -182,10 +181,9 @@ def test_kept_passes_are_made_anew_where_the_file_is_damaged(tmp_path):
     assert len(calls) == 1
     (path,) = tmp_path.iterdir()
     whole = path.read_bytes()
-    arrays = clip._asdict()
-    wrong_arrays = (arrays | {"truth": clip.truth[:1]}, arrays | {"images": clip.truth}, arrays | {"x": clip.truth})
-    for damage in (partial(path.write_bytes, whole[:200]), *(partial(write_arrays, path, one) for one in wrong_arrays)):
-        damage()
-        kept_passes({"a": 1}, make, tmp_path)
+    path.write_bytes(whole[:200])
+    kept_passes({"a": 1}, make, tmp_path)
+    write_arrays(path, {"depth1": clip.depth1})
+    kept_passes({"a": 1}, make, tmp_path)
     kept_passes({"a": 2}, make, tmp_path)
-    assert len(calls) == 6
+    assert len(calls) == 4

@@ -14,7 +14,6 @@ from vggtjax.errors import InputError
 from vggtjax.learning.fit import FitClips, FitConfig, fit_fusion
 from vggtjax.learning.objectives import joint_negative_log_likelihood, unit_factor
 from vggtjax.method.fusion_family import Observations, fuse, identity, log_precisions, parse_family
-from vggtjax.storage.arrays import read_arrays, write_arrays
 
 TRUE = identity() | {
     "scale": jnp.asarray([2.5, 1.5]),
@@ -108,16 +107,11 @@ def test_an_interrupted_fit_goes_on_exactly(tmp_path):
     resumed = fit_fusion(clips, held_out, config, checkpoint=path)
     assert jax.tree.all(jax.tree.map(np.array_equal, whole.params, resumed.params))
     assert np.array_equal(whole.losses, resumed.losses)
-    arrays = read_arrays(path)  # of the ended fit
     path.write_bytes(state)
     assert begun(config) == 110
     assert begun(dataclasses.replace(config, seed=1)) == 10  # the state of another fit is not gone on from
     path.write_bytes(state[:100])  # a file that is not whole is not gone on from
     assert begun(config) == 10
-    *_, step = [name for name, array in arrays.items() if array.shape == () and array == STEPS]  # others: optimiser's
-    for wrong in (2**31 - 1, -10, STEPS + 1):
-        write_arrays(path, arrays | {step: np.array(wrong, np.int32)})
-        assert begun(config) == 10
 
 
 def test_a_fit_ends_where_held_out_clips_gain_nothing():

@@ -103,12 +103,11 @@ def test_an_interrupted_run_gives_the_same_numbers(straight, tmp_path, undrawn):
 def test_a_finished_run_stays_and_says_that_its_recipe_has_changed(straight, tmp_path, undrawn, caplog):
     whole, out, _ = straight
     copy = shutil.copytree(out, tmp_path / "copy")
-    before = (copy / "model.safetensors").stat().st_mtime_ns
     faster = dataclasses.replace(SHORT, optimiser=dataclasses.replace(SHORT.optimiser, learning_rate=0.1))
     again = train(faster, copy, task=TASK)
     assert again.finished
     assert same(again.state, whole.state)
-    assert (copy / "model.safetensors").stat().st_mtime_ns == before
+    assert (copy / "model.safetensors").read_bytes() == (out / "model.safetensors").read_bytes()
     assert "resuming with the new recipe" in caplog.text
 
 
@@ -186,7 +185,7 @@ def test_a_worker_that_ends_is_said_and_the_run_resumes(tmp_path):
             multiprocessing.active_children()[0].kill()
 
     options = RunOptions(log_every=2, checkpoint_seconds=NOW, workers=2)
-    with pytest.raises(VggtjaxError, match="ended with exit code -9, perhaps for lack of memory; take fewer workers"):
+    with pytest.raises(VggtjaxError, match="worker of the training run has ended, perhaps for lack of memory"):
         train(SHORT, tmp_path, options=options, progress=kill, task=TASK)
     assert not multiprocessing.active_children()
     assert latest(tmp_path / "checkpoints") == 2
@@ -200,7 +199,7 @@ def test_an_error_in_a_worker_is_said():
         pytest.raises(VggtjaxError, match="a worker of the training run failed: ValueError: no such loss") as raised,
     ):
         workers.loss_and_gradient(trained, jnp.zeros((2, 2, 28, 28, 3)))
-    assert "in broken" in raised.value.__notes__[0]  # where in the objective
+    assert "in broken" in str(raised.value.__cause__)  # where in the objective
 
 
 def test_workers_that_cannot_share(monkeypatch):

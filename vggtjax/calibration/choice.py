@@ -15,7 +15,7 @@ from jaxtyping import Float32, Int8
 from vggtjax.calibration.matching import matching_pairs
 from vggtjax.calibration.sweep import DYNAMIC, GRAMS, KINDS, STATIC, Sweep, token_auc
 from vggtjax.config import Cue, Gram, MotionConfig
-from vggtjax.errors import InputError, check_choice, share, whole_number
+from vggtjax.errors import InputError
 from vggtjax.method.cues import normalise
 from vggtjax.progress import Progress, no_progress
 
@@ -74,12 +74,8 @@ def choose(
         floor: added to every map, in [0, 1]: see `MotionConfig`.
         progress: called with the number of tried candidates and the largest possible number.
 
-    Raises:
-        InputError: a half without moving or without static tokens, or an argument out of range.
+    Raises InputError for a half without moving or without static tokens.
     """
-    check_choice("gram", gram, GRAMS)
-    max_terms = whole_number("max_terms", max_terms, 1)
-    min_gain, floor = share("min_gain", min_gain), share("floor", floor)
     calibration, held_out = halves(sweep)
     _check_truth("calibration", calibration)
     _check_truth("held-out", held_out)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from cmap import Colormap
 from jaxtyping import Float64, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from vggtjax.calibration.choice import Choice
 from vggtjax.calibration.sweep import GRAMS, KINDS, kind_index
 from vggtjax.errors import one_line
-from vggtjax.results.previews import BACKGROUND, FAINT, TEXT
+from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_ramp
 
 # Blue below one half, red above.
-_COLORS = (Colormap("colorbrewer:RdBu_r").lut(256)[:, :3] * 255).round().astype(np.uint8)
+_COLORS = color_ramp("colorbrewer:RdBu_r")
 _DARK, _OUTLINE = (20, 20, 24), (30, 200, 90)
 _CELL, _GAP, _MARGIN = (46, 30), 26, 24  # width and height; between the similarities; around everything
 _LABEL_WIDTH, _HEADER_HEIGHT, _LINE, _LEGEND = 150, 96, 22, (256, 12)

@@ -267,18 +267,10 @@ def _keep(path: Path, state: FitState, digest: str) -> None:
 
 def _restored(path: Path, state: FitState, digest: str) -> FitState:
     """Return the state in a file; `state` itself unless the file holds a whole state of the same fit."""
-    leaves, structure = jax.tree.flatten(state)
     try:
         stored = read_arrays(path)
     except ResultError:
         return state
     if stored.pop("digest", np.zeros(0, np.uint8)).tobytes() != bytes.fromhex(digest):
         return state
-    read = [stored.get(f"{i:04d}") for i in range(len(leaves))]
-    whole = len(stored) == len(leaves) and all(
-        new is not None and (new.shape, new.dtype) == (old.shape, old.dtype)
-        for new, old in zip(read, leaves, strict=True)
-    )
-    found = jax.tree.unflatten(structure, [jnp.asarray(leaf) for leaf in read]) if whole else state
-    evaluations = range(len(state.losses))
-    return found if int(found.step) % _CHUNK == 0 and int(found.step) // _CHUNK in evaluations else state
+    return jax.tree.unflatten(jax.tree.structure(state), [jnp.asarray(stored[name]) for name in sorted(stored)])

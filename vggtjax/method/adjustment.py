@@ -77,7 +77,6 @@ def adjust(
     others = frame_pairs(S).others
     seen_by = np.concatenate([np.arange(S)[:, None], others], axis=1)  # [S, M + 1], the cameras that a patch connects
     prior = jnp.repeat(jnp.array([how.rotation_prior, how.translation_prior]) ** -2.0, 3)
-    is_free = np.arange(6 * S) >= 6
 
     def seen(rotation: Array, translation: Array, inverse: Array) -> tuple[Array, Array, Array]:
         """Return each patch in the other frames, over its depth in its own; and the motions between the frames."""
@@ -115,12 +114,7 @@ def adjust(
         cross = jnp.concatenate([cross_own, jnp.einsum("smpia,smpi->spma", other, by_depth)], axis=2)
         blocks -= jnp.einsum("spma,spnb->smnab", cross / depth_curvature[..., None, None], cross)
         gradient -= jnp.einsum("spma,sp->sma", cross, depth_slope / depth_curvature)
-        H = jnp.zeros((S, S, 6, 6), depth.dtype).at[seen_by[:, :, None], seen_by[:, None, :]].add(blocks)
-        H = H.swapaxes(1, 2).reshape(6 * S, 6 * S) + jnp.diag(jnp.tile(prior, S))
-        g = (jnp.zeros((S, 6), depth.dtype).at[seen_by].add(gradient) + prior[None] * moved).ravel() * is_free
-        H = jnp.where(is_free[:, None] & is_free[None], H, np.eye(6 * S))
-        H += _DAMPING * jnp.diag(jnp.diag(H))
-        change = -jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(H), g).reshape(S, 6)
+        change = _change(blocks, gradient, seen_by, prior, moved)
         deeper = -(depth_slope + jnp.einsum("spma,sma->sp", cross, change[seen_by])) / depth_curvature
         turned = quaternion_to_matrix(jnp.concatenate([change[:, :3] / 2, jnp.ones_like(change[:, :1])], axis=-1))
         translation = jnp.einsum("sij,sj->si", turned, translation) + change[:, 3:]
@@ -142,6 +136,20 @@ def at_patches(depth: Float[Array, "B S H W"], grid: tuple[int, int]) -> Float[A
     side = H // h
     middle = slice((side - 1) // 2, side // 2 + 1)
     return depth.reshape(B, S, h, side, w, side)[:, :, :, middle, :, middle].mean(axis=(3, 5)).reshape(B, S, h * w)
+
+
+def _change(
+    blocks: Float[Array, "S N N 6 6"], gradient: Float[Array, "S N 6"], seen_by: np.ndarray, prior: Array, moved: Array
+) -> Float[Array, "S 6"]:
+    """Return the step of every camera by the damped normal equations, summed over the frames; 0 for the first."""
+    S = len(gradient)
+    is_free = np.arange(6 * S) >= 6
+    H = jnp.zeros((S, S, 6, 6), blocks.dtype).at[seen_by[:, :, None], seen_by[:, None, :]].add(blocks)
+    H = H.swapaxes(1, 2).reshape(6 * S, 6 * S) + jnp.diag(jnp.tile(prior, S))
+    g = (jnp.zeros((S, 6), blocks.dtype).at[seen_by].add(gradient) + prior[None] * moved).ravel() * is_free
+    H = jnp.where(is_free[:, None] & is_free[None], H, np.eye(6 * S))
+    H += _DAMPING * jnp.diag(jnp.diag(H))
+    return -jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(H), g).reshape(S, 6)
 
 
 def _local_blocks(

@@ -26,7 +26,6 @@ logger = logging.getLogger(__name__)
 
 FORMAT = "vggtjax fusion"
 VERSION = 1
-_MODEL_FILES = (".safetensors", ".pt", ".pth", ".json")
 
 
 def save_fusion(path: str | Path, params: FusionParams, about: Mapping[str, Any] | None = None) -> None:
@@ -80,20 +79,18 @@ def origin_of_fit(model: Model, options: Options) -> dict[str, Any]:
 def warn_if_fitted_otherwise(path: Path, model: Model, options: Options) -> None:
     """Log a warning for each of the model, the options of the passes and `align_scale` that differs from the fit's.
 
-    Models are compared by the sha256 of the model or of its weights, whose type in memory does not count. If the file
-    has neither, models are compared by name; a path is not compared.
+    Models are compared by the sha256 of the model or of its weights, whose type in memory does not count; not if the
+    file has neither.
     """
     _, about = _read(path)
     settings: dict[str, Any] = options.passes_settings(model.config.motion) | {"align_scale": options.align_scale}
     settings, about = {"mask": "gram"} | settings, {"mask": "gram"} | about  # absent where it is the papers'
-    digest, fitted = about.get("model_sha256"), str(about.get("model"))
+    digest = about.get("model_sha256")
     if isinstance(digest, str):
         digests = (digest, about.get("weights_sha256"))
         if model.identity.sha256 not in digests and _weights_digest(model) not in digests:
-            about["model"] = f"{fitted} (sha256 {digest[:8]})"
+            about["model"] = f"{about.get('model')} (sha256 {digest[:8]})"
             settings["model"] = f"{model.name} (sha256 {model.identity.sha256[:8]})"
-    elif not Path(fitted).is_absolute() and Path(fitted).suffix not in _MODEL_FILES:
-        settings["model"] = model.name
     for name, value in settings.items():
         if name in about and about[name] != value:
             logger.warning("%s was fitted with %s %s, and is used with %s", path, name, about[name], value)

@@ -6,6 +6,7 @@ import dataclasses
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,10 +16,9 @@ from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError, check_extra
 from vggtjax.progress import Progress, no_progress
 from vggtjax.refinement.adjust import Adjusted, adjust, quiet, reprojection_errors
-from vggtjax.refinement.gauge import fit_to_result
 from vggtjax.refinement.mapping import Matched, map_globally, nearest_to_rays
 from vggtjax.refinement.matches import find_features, frame_pairs, match_pairs, working_unit
-from vggtjax.refinement.tracks import Tracks, join_matches, starting_points
+from vggtjax.refinement.tracks import Tracks, dense_depth_at, join_matches, starting_points
 from vggtjax.results.result import Result
 
 R = TypeVar("R", bound=Result)
@@ -94,17 +94,22 @@ def refine_cameras(
     check_refinement(True)
     frames = len(result.depth)
     pairs = frame_pairs(frames)
-    steps = _Steps(progress or no_progress, frames + len(pairs) + _ROUNDS)
+    progress, total, done = progress or no_progress, frames + len(pairs) + _ROUNDS, count()
+
+    def step() -> None:
+        progress(next(done), total)
+
+    step()
     unit = working_unit(result)
     with quiet():
-        features = find_features(result, pictures, steps.step)
-        matches = match_pairs(features, pairs, unit, steps.step)
+        features = find_features(result, pictures, step)
+        matches = match_pairs(features, pairs, unit, step)
     matched = Matched([each.positions for each in features], matches)
     tracks = join_matches(*matched, min(frames, 3))
     refined, report = adjust_to_tracks(
-        result, tracks, matched=matched, unit=unit, fixed_intrinsics=fixed_intrinsics, on_round=steps.step
+        result, tracks, matched=matched, unit=unit, fixed_intrinsics=fixed_intrinsics, on_round=step
     )
-    steps.finish()
+    progress(total, total)  # rounds that were not needed, too
     if not report.refined:
         logger.warning("%s", report.sentence)
     return refined, report
@@ -152,11 +157,11 @@ def adjust_to_tracks(
         "error_before": before if np.isfinite(before) else None,
         "error_after": after,
     }
-    fitted = fit_to_result(adjusted, tracks, result)
+    poses, spread = _fitted(adjusted, tracks, result)
     if after >= before:
         reason = f"the reprojection error did not fall from {before:.2f} pixels"
-    elif fitted.spread > _MOST_SPREAD:
-        reason = f"the adjusted points differ from the dense depth by a factor of {fitted.spread:.1f} in the middle"
+    elif spread > _MOST_SPREAD:
+        reason = f"the adjusted points differ from the dense depth by a factor of {spread:.1f} in the middle"
     if reason:
         return _reported(result, RefinementReport(False, reason, **numbers))
     K = result.intrinsics.astype(np.float64)
@@ -164,10 +169,32 @@ def adjust_to_tracks(
     K[:, focal, focal] = adjusted.cameras.intrinsics[:, focal, focal] / result.source_scale
     refined = dataclasses.replace(
         result,
-        camera_from_world=fitted.camera_from_world.astype(np.float32),
+        camera_from_world=poses.astype(np.float32),
         intrinsics=K.astype(np.float32),
     )
     return _reported(refined, RefinementReport(True, **numbers))
+
+
+def _fitted(adjusted: Adjusted, tracks: Tracks, result: Result) -> tuple[Float64[np.ndarray, "S 3 4"], float]:
+    """Return the adjusted cameras in the world of the result, whose first camera and dense depth decide.
+
+    Depths agree in the middle at the scale of these cameras. The second value is the factor, at least 1, by which
+    adjusted and dense depth then still differ in the middle.
+    """
+    poses, kept = adjusted.cameras.camera_from_world, adjusted.kept
+    seen_by = poses[tracks.frames[kept]]
+    z = np.einsum("mj,mj->m", seen_by[:, 2, :3], adjusted.points[tracks.points[kept]]) + seen_by[:, 2, 3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logs = np.log(z / dense_depth_at(result, tracks)[kept])  # of unscaled adjusted depth by dense depth
+    known = np.isfinite(logs)
+    scale = np.exp(-np.median(logs[known]))
+    spread = float(np.exp(np.median(np.abs(logs[known] + np.log(scale)))))
+    first = result.camera_from_world[0].astype(np.float64)
+    turn = poses[:, :, :3] @ poses[0, :, :3].T
+    moved = scale * (poses[:, :, 3] - turn @ poses[0, :, 3])
+    placed = np.concatenate([turn @ first[:, :3], (turn @ first[:, 3] + moved)[:, :, None]], axis=2)
+    placed[0] = first  # to the last bit
+    return placed, spread
 
 
 def _best(
@@ -212,20 +239,3 @@ def _source_intrinsics(result: Result) -> Float64[np.ndarray, "S 3 3"]:
     K[:, :2] *= result.source_scale[:, :, None]
     K[:, :2, 2] += result.source_offset
     return K
-
-
-class _Steps:
-    """Counts steps of work, of a number that is known before."""
-
-    def __init__(self, progress: Progress, total: int) -> None:
-        self._progress, self._total, self._done = progress, total, 0
-        progress(0, total)
-
-    def step(self) -> None:
-        """Count one step."""
-        self._done += 1
-        self._progress(self._done, self._total)
-
-    def finish(self) -> None:
-        """Count the steps that were not needed."""
-        self._progress(self._total, self._total)

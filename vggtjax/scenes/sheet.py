@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_depth, inverse_depth_range, overlay
+from vggtjax.results.previews import (
+    BACKGROUND,
+    FAINT,
+    INSTANCE_COLORS,
+    TEXT,
+    color_depth,
+    inverse_depth_range,
+    overlay,
+)
 
 _MOST_ROWS = 8
 _THUMBNAIL = (260, 200)  # widest and highest
@@ -47,12 +54,9 @@ def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
     return sheet
 
 
-def color_parts(part_ids: Int[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+def color_parts(part_ids: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
     """Colour every part by its number, alike in all pictures; the room is grey."""
-    hues = [colorsys.hsv_to_rgb((0.618034 * n) % 1, 0.55 + 0.4 * (n % 2), 0.95 - 0.25 * (n % 3)) for n in range(256)]
-    colors = (255 * np.array(hues)).round().astype(np.uint8)
-    colors[0] = _REST
-    return colors[part_ids]
+    return np.where(part_ids[..., None] > 0, INSTANCE_COLORS[part_ids], _REST)
 
 
 def color_flow(flow: Float[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:

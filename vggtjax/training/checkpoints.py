@@ -76,8 +76,6 @@ def restore(folder: str | Path, shapes: TrainingState, recipe: Recipe) -> Restor
     with _opened(folder) as manager, _explaining(place):
         run = manager.restore(step, args=orbax.args.Composite(**{_RUN: orbax.args.JsonRestore()}))[_RUN]
         written = Recipe.from_json(json.dumps(run["recipe"]))
-        if not isinstance(run["notes"], dict):
-            raise CheckpointError(f"{place} has notes that are not an object; expected names and values")
         for name, old, new in (
             ("model", written.model, recipe.model),
             ("trainable", written.trainable, recipe.trainable),

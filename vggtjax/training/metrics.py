@@ -11,8 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtjax.errors import InputError, reading
-from vggtjax.storage.writing import write_errors, writing
+from vggtjax.errors import InputError
+from vggtjax.storage.csv_file import read_csv
+from vggtjax.storage.writing import writing
 
 Row = dict[str, float]
 
@@ -55,68 +56,40 @@ class Averages:
         return row
 
 
-class MetricsFile:
-    """metrics.csv of a run: rows are appended one at a time; the header grows with new metrics."""
+def write_metrics(path: str | Path, rows: Sequence[Row]) -> None:
+    """Write metrics.csv: the columns `COLUMNS`, then the metrics in order of appearance, of which a row may lack some.
 
-    def __init__(self, path: str | Path, *, last_step: int) -> None:
-        """Open the file of a run that resumes from `last_step`: later rows are dropped, as the run repeats them."""
-        self.path = Path(path)
-        self.rows = [row for row in read_metrics(self.path) if row["step"] <= last_step] if self.path.exists() else []
-        self._write_all()
-
-    def append(self, row: Row) -> None:
-        """Add a row: the columns `COLUMNS` and any metrics."""
-        self.rows.append(row)
-        if not row.keys() <= set(self.names):
-            self._write_all()
-            return
-        with write_errors(self.path), self.path.open("a", newline="", encoding="utf-8") as file:
-            csv.DictWriter(file, self.names).writerow(row)
-
-    def _write_all(self) -> None:
-        self.names = _header(self.rows)
-        with writing(self.path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, self.names)
-            writer.writeheader()
-            writer.writerows(self.rows)
+    Raises OutputError where the file cannot be written.
+    """
+    with writing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, _header(rows))
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def read_metrics(path: str | Path) -> list[Row]:
-    """Read metrics.csv without an incomplete last line.
-
-    Raises InputError for an unreadable file or a file of another kind.
-    """
-    path = Path(path)
-    try:
-        with reading(path), path.open(newline="", encoding="utf-8") as file:
-            if path.stat().st_size > _MOST_BYTES:
-                raise InputError(f"{path} is {path.stat().st_size} bytes; expected the metrics of a training run")
-            lines = list(csv.reader(file))
-    except (UnicodeDecodeError, csv.Error):
-        raise InputError(f"{path} is not a table of text; expected the metrics of a training run") from None
-    if not lines or tuple(lines[0][: len(COLUMNS)]) != COLUMNS:
+    """Read metrics.csv. Raises InputError for an unreadable file or a file of another kind."""
+    columns, table = read_csv(Path(path), most_bytes=_MOST_BYTES)
+    if columns[: len(COLUMNS)] != COLUMNS:
         raise InputError(f"{path} does not begin with the columns {COLUMNS}; expected the metrics of a training run")
     rows: list[Row] = []
-    for number, line in enumerate(lines[1:], start=2):
+    for number, cells in table:
         try:
-            row = {name: float(cell) for name, cell in zip(lines[0], line, strict=True) if cell}
+            row = {name: float(cell) for name, cell in cells.items() if cell}
             row |= {name: int(row[name]) for name in ("step", "stage", "samples")}
-        except (ValueError, KeyError, OverflowError):
-            if number == len(lines):  # the run was killed while it wrote
-                break
+        except (ValueError, KeyError, OverflowError, TypeError):
             raise InputError(f"{path} has a line {number} that is not a row of numbers") from None
         rows.append(row)
     return rows
 
 
-def plot(table: str | Path, picture: str | Path) -> None:
-    """Draw the curves of metrics.csv as a PNG: losses, errors compared with no motion, other metrics.
+def plot(rows: Sequence[Row], picture: str | Path) -> None:
+    """Draw the curves of a run's metrics as a PNG: losses, errors compared with no motion, other metrics.
 
-    Raises InputError for an unreadable table, OutputError where the picture cannot be written.
+    Raises OutputError where the picture cannot be written.
     """
     from matplotlib.figure import Figure
 
-    rows = read_metrics(table)
     steps = np.array([row["step"] for row in rows])
     panels = _panels([name for name in _header(rows) if name not in COLUMNS])
     columns = min(3, max(len(panels), 1))

@@ -11,14 +11,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from vggtjax.checkpoint import Model, numpy_dtype, read_model, save_model
+from vggtjax.checkpoint import Model, numpy_dtype, save_model
 from vggtjax.errors import CheckpointError, VggtjaxError
 from vggtjax.network.layers import Params
 from vggtjax.network.model import HEADS
 from vggtjax.storage.writing import writing
 from vggtjax.training import checkpoints
 from vggtjax.training.devices import placement
-from vggtjax.training.metrics import Averages, MetricsFile, Row, plot
+from vggtjax.training.metrics import Averages, Row, plot, read_metrics, write_metrics
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, Recipe
 from vggtjax.training.state import Metrics, exported, initial_state, state_shapes
@@ -59,7 +59,7 @@ class Run:
         self.averages = Averages()
         self.pending: list[Metrics] = []  # of the last steps, on the device
         self.row: Row = {}
-        self.exported: int | None = None  # step whose model this run has written or compared
+        self.exported: int | None = None  # step whose model this run has written
         self.earlier = 0.0  # seconds of the runs before this one
         if checkpoints.latest(self.checkpoints) is None:
             # Committed to the device like a restored state, for which jit would compile again otherwise.
@@ -68,7 +68,10 @@ class Run:
             self._restore(probes)
         with writing(out / "recipe.json") as temporary:
             temporary.write_text(recipe.to_json(), "utf-8")
-        self.table = MetricsFile(out / "metrics.csv", last_step=self.step)
+        self.table = out / "metrics.csv"
+        earlier = read_metrics(self.table) if self.table.exists() else []
+        self.rows = [row for row in earlier if row["step"] <= self.step]  # a resumed run repeats the later ones
+        write_metrics(self.table, self.rows)
         self.began = self._saved_at = self._plotted_at = time.perf_counter()
 
     @property
@@ -102,7 +105,8 @@ class Run:
         self.collect()
         place = {"step": self.step, "stage": self.phase, "seconds": round(self.seconds, 3), "samples": self.samples}
         self.row = {**place, **self.averages.take()}
-        self.table.append(self.row)
+        self.rows.append(self.row)
+        write_metrics(self.table, self.rows)
 
     def keep(self, *, save: bool) -> None:
         """Draw the metrics, and write a checkpoint and the model, where these are due (`save`: now)."""
@@ -112,10 +116,7 @@ class Run:
             self.save()
 
     def save(self) -> None:
-        """Write a checkpoint of this step and the averaged model, unless they exist.
-
-        A run can be killed between the two, so the model of an earlier run is compared with the state.
-        """
+        """Write a checkpoint of this step, unless it exists, and the averaged model."""
         if self.exported == self.step:
             return
         self.collect()
@@ -129,30 +130,14 @@ class Run:
         checkpoints.save(self.checkpoints, self.state, self.recipe, notes)
         averaged, dtype = exported(self.state, self.recipe), numpy_dtype(self.options.dtype)
         params = jax.tree.map(lambda leaf: np.asarray(leaf).astype(dtype, copy=False), averaged)
-        if not self._has_exported(params):
-            save_model(self.model_path, params, self.recipe.model, name=self.recipe.name, **self.labels)
+        save_model(self.model_path, params, self.recipe.model, name=self.recipe.name, **self.labels)
         self.exported, self._saved_at = self.step, time.perf_counter()
         logger.info("step %d of %d saved in %s", self.step, self.recipe.total_steps, self.out)
 
     def plot(self) -> None:
         """Draw the metrics."""
-        plot(self.table.path, self.out / "metrics.png")
+        plot(self.rows, self.out / "metrics.png")
         self._plotted_at = time.perf_counter()
-
-    def _has_exported(self, params: Params) -> bool:
-        """Return whether the file of the model holds these parameters, the labels, and the recipe's name and model."""
-        if self.exported is not None or not self.model_path.exists():
-            return False
-        try:
-            model = read_model(self.model_path)
-        except CheckpointError:
-            return False
-        labels = {"note": model.note, "untrained_heads": list(model.untrained_heads)}
-        if (model.config, model.name, labels) != (self.recipe.model, self.recipe.name, self.labels):
-            return False
-        return jax.tree.all(
-            jax.tree.map(lambda a, b: a.dtype == b.dtype and np.array_equal(a, b), model.params, params)
-        )
 
     def _restore(self, probes: Params) -> None:
         restored = checkpoints.restore(self.checkpoints, state_shapes(self.recipe, probes), self.recipe)
@@ -165,7 +150,7 @@ class Run:
             self.averages = Averages(**notes["averages"])
             self.samples, self.skipped_in_a_row = int(notes["samples"]), int(notes["skipped_in_a_row"])
             self.earlier = float(notes["seconds"])
-            self.labels = dict(notes.get("labels", self.labels))  # an old checkpoint has none
+            self.labels = dict(notes["labels"])
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(
                 f"the checkpoint of step {self.step} in {self.checkpoints} lacks the counts of a training run ({error})"
