@@ -39,8 +39,8 @@ async def app(scope: Any, receive: Any, send: Any) -> None:
 
 
 @pytest.fixture
-def guard():
-    return lambda token=None: Guard(app, Door("127.0.0.1", 7860, token), 1_000_000)
+def guard(tmp_path):
+    return lambda token=None: Guard(app, Door("127.0.0.1", 7860, token), 1_000_000, tmp_path)
 
 
 def test_without_a_token_only_this_machine_is_answered(guard):

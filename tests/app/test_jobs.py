@@ -1,5 +1,6 @@
 """The jobs of the app, without a browser: checked uploads, one job at a time, cancel, bounded results."""
 
+import os
 import threading
 import time
 import zipfile
@@ -14,8 +15,8 @@ from vggtjax.app import outputs
 from vggtjax.app.jobs import Desk, Job, Request
 from vggtjax.app.limits import Limits
 from vggtjax.app.models import Models
-from vggtjax.app.uploads import check_clip, clip_of, safe_stem
-from vggtjax.errors import InputError, ResultError
+from vggtjax.app.uploads import check_clip, clip_of, room_for, safe_stem
+from vggtjax.errors import ClipError, InputError, ResultError
 
 
 @pytest.fixture
@@ -166,13 +167,29 @@ def test_a_long_video_is_refused_and_a_short_one_is_sampled_evenly(tmp_path):
         assert [frame.time for frame in source.frames(sampling)] == times
 
 
+def test_the_oldest_uploads_go_where_room_is_needed_and_those_of_the_last_hour_stay(tmp_path):
+    for age, name in ((90_000, "old.png"), (7200, "cut.tmp"), (60, "new.png")):
+        (tmp_path / name).write_bytes(bytes(100))
+        then = time.time() - age
+        os.utime(tmp_path / name, (then, then))
+    assert room_for(tmp_path, 50, 1000)
+    assert len(list(tmp_path.iterdir())) == 3
+    assert room_for(tmp_path, 50, 260)
+    assert {path.name for path in tmp_path.iterdir()} == {"cut.tmp", "new.png"}
+    assert not room_for(tmp_path, 50, 100)
+    assert {path.name for path in tmp_path.iterdir()} == {"new.png"}
+    (tmp_path / "new.png").write_bytes(bytes(600_000))
+    with pytest.raises(ClipError, match=r"has 1\.2 MB; send at most 1 MB"):
+        clip_of([tmp_path / "new.png"] * 2, tmp_path, Limits(max_upload_mb=1))
+
+
 def test_pictures_keep_their_order_and_results_have_safe_names(tmp_path):
     uploads = tmp_path / "uploads"
     uploads.mkdir()
     paths = [uploads / f"frame {number}.png" for number in range(11)]
     for path in paths:
         Image.new("RGB", (28, 28), "teal").save(path)
-    kept = clip_of(sorted(paths), uploads)
+    kept = clip_of(sorted(paths), uploads, Limits())
     assert kept == tuple(paths)
     source, sampling = check_clip(kept, 4, 7.0, Limits())
     assert len(list(source.frames(sampling))) == 4

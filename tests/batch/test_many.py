@@ -101,7 +101,9 @@ def test_results_are_those_of_single_runs(model, clips, tmp_path):
     assert [outcome.status for outcome in outcomes] == ["done", "done"]
     for name, source in sources.items():
         alone = reconstruct(model, load_clip(source, size=56, patch=14), method="vggt")
-        np.testing.assert_array_equal(Reconstruction.load(tmp_path / name).depth, alone.depth)
+        many = Reconstruction.load(tmp_path / name)
+        np.testing.assert_array_equal(many.depth, alone.depth)
+        assert "known" not in many.settings
         with Image.open(tmp_path / name / "mask/000000.png") as mask, Image.open(f"{source}/0.png") as picture:
             assert mask.size == picture.size
 
@@ -258,6 +260,10 @@ def test_masks_by_clip(model, clips, tmp_path):
 def test_what_is_wrong_for_all_clips_is_said_once(model, clips, tmp_path):
     with pytest.raises(InputError, match="size is 50"):
         next(reconstruct_many(model, {"a": str(clips / "clip0")}, tmp_path, size=50))
+    with pytest.raises(InputError, match="devices is 0"):
+        next(reconstruct_many(model, {"a": str(clips / "clip0")}, tmp_path, known=None, devices=0))
+    with pytest.raises(TypeError, match="sampling is of type dict; expected Sampling"):
+        next(reconstruct_many(model, {"a": str(clips / "clip0")}, tmp_path, sampling={"fps": 2}))
     assert not any(tmp_path.iterdir())
 
 

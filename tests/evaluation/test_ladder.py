@@ -15,6 +15,7 @@ from tests.tiny import tiny_config
 from vggtjax import assemble, infer, init_params
 from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth
+from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import LadderRow, error_table, ladder, second_pass_in_words
 from vggtjax.evaluation.metrics.depth import depth_errors, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
@@ -159,6 +160,12 @@ def test_what_the_truth_leaves_undefined_is_none(model, truth):
     assert row.abs_rel_static == row.abs_rel
     assert row.rotation_error is not None
     assert row.failure == "the true cameras do not move; their centres cannot be aligned"
+
+
+def test_options_of_other_methods_are_refused(model, truth):
+    for name, value in {"method": "vggt", "mask": "matches", "refine_mask": True}.items():
+        with pytest.raises(InputError, match=f"options have {name} "):
+            ladder(model, truth, **{name: value})
 
 
 def test_a_model_gone_wrong_is_a_row_that_says_so(model, truth):

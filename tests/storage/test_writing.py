@@ -193,6 +193,8 @@ def test_a_check_finds_files_that_may_not_be_replaced_and_leaves_nothing(tmp_pat
     with pytest.raises(OutputError) as raised:
         check_free(full, ("free", "x", "y"), replaced=False, what="result")
     assert str(raised.value).startswith(f"{full / 'x'} exists and is not part of an earlier result, so it is not")
+    with pytest.raises(OutputError, match="File name too long"):
+        check_free(tmp_path / ("n" * 300), ("x",), replaced=False, what="result")
     check_free(full, ("x",), replaced=True, what="result")
     check_free(full, ("z",), replaced=False, what="result")
     assert {path.name for path in full.iterdir()} == {"x", "y"}

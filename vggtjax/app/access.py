@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import Any
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from vggtjax.app.uploads import room_for
 from vggtjax.viewer.door import REFUSAL, Door
 
+_UPLOADS = 8  # of the largest size are on the disk together
 _FORM = 2**20  # bytes around the files of an upload, and of any other request
 # All that the page asks for. Gradio would also serve files of this machine, and much else.
 _READ = re.compile(
@@ -29,8 +32,8 @@ _SANDBOX = "; sandbox allow-scripts allow-downloads"  # pages of results, in a t
 class Guard:
     """Wraps the app (ASGI): refuses what is not allowed before the app sees it."""
 
-    def __init__(self, app: ASGIApp, door: Door, upload_bytes: int) -> None:
-        self._app, self._door, self._upload_bytes = app, door, upload_bytes
+    def __init__(self, app: ASGIApp, door: Door, upload_bytes: int, uploads: Path) -> None:
+        self._app, self._door, self._upload_bytes, self._uploads = app, door, upload_bytes, uploads
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan":
@@ -62,6 +65,8 @@ class Guard:
         most = _FORM + (self._upload_bytes if path.endswith("upload") else 0)
         if int(length) > most:
             return _text(413, f"The request has {int(length) / 1e6:.1f} MB; send at most {most / 1e6:.1f} MB.")
+        if path.endswith("upload") and not room_for(self._uploads, int(length), _UPLOADS * self._upload_bytes):
+            return _text(507, "There is no room for more uploads; try again in an hour.")
         return None
 
 

@@ -135,7 +135,7 @@ class Desk:
             raise InputError(f"frames is {request.frames}; expected at most {self.limits.max_frames}")
         if request.fps is not None and not 0 < request.fps <= _MOST_FPS:
             raise InputError(f"fps is {request.fps}; expected a number above 0, at most {_MOST_FPS}")
-        source = clip_of(request.files, self.uploads) if request.files else None
+        source = clip_of(request.files, self.uploads, self.limits) if request.files else None
         job = Job(request, source, owner, self.results / secrets.token_urlsafe(16))
         with self._lock:
             if any(other.owner == owner for other in self._open):

@@ -83,4 +83,4 @@ def build_application(desk: Desk, door: Door) -> Any:
         theme=theme(),
         css=CSS,
     )
-    return Guard(application, door, desk.limits.upload_bytes)
+    return Guard(application, door, desk.limits.upload_bytes, desk.uploads)

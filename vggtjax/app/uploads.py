@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,13 +15,30 @@ from vggtjax.media.order import natural_key
 from vggtjax.media.sampling import Sampling, Source
 from vggtjax.media.video import VideoFile, is_video_name
 
+_MOST_PICTURES = 1000
+_IN_USE = 3600  # seconds after an upload in which it stays
 _UNKNOWN_LENGTH_FPS = 4.0  # frames per second of a video that does not say how long it is
 
 
-def clip_of(files: Sequence[Path], uploads: Path) -> Path | tuple[Path, ...]:
+def room_for(uploads: Path, needed: int, most: int) -> bool:
+    """Return whether `needed` more bytes keep the uploads below `most`; if not, the oldest ones go first.
+
+    Uploads of the last hour stay, as a job may read them. Parts of uploads that were cut are files like the others.
+    """
+    files = sorted((path.stat().st_mtime, path) for path in uploads.rglob("*") if path.is_file())
+    total = needed + sum(path.stat().st_size for _, path in files)
+    for written, path in files:
+        if total <= most or time.time() - written < _IN_USE:
+            break
+        total -= path.stat().st_size
+        path.unlink()
+    return total <= most
+
+
+def clip_of(files: Sequence[Path], uploads: Path, limits: Limits) -> Path | tuple[Path, ...]:
     """Return the one video, or the pictures in the order of a folder's, among the files of `uploads`.
 
-    Raises ClipError for files that cannot be a clip by their number or name, or that are no uploads.
+    Raises ClipError for files that cannot be a clip by their number, name or size, or that are no uploads.
     """
     paths = [path.resolve() for path in files]
     names = ", ".join(one_line(path.name, 60) for path in paths[:3])
@@ -31,6 +49,11 @@ def clip_of(files: Sequence[Path], uploads: Path) -> Path | tuple[Path, ...]:
         raise ClipError(f"{names}: by its name this is no video and no picture; send one such as .mp4, .mov or .jpg")
     if videos and len(paths) > 1:
         raise ClipError(f"{len(paths)} files with a video among them; send one video, or pictures only")
+    if len(paths) > _MOST_PICTURES:
+        raise ClipError(f"{len(paths)} pictures were sent; send at most {_MOST_PICTURES}")
+    total = sum(path.stat().st_size for path in paths)
+    if total > limits.upload_bytes:
+        raise ClipError(f"the upload has {total / 1e6:.1f} MB; send at most {limits.max_upload_mb} MB")
     return videos[0] if videos else tuple(sorted(paths, key=lambda path: natural_key(Path(path.name))))
 
 

@@ -1,4 +1,4 @@
-"""How clips are read, reconstructed and written, also as options of commands, and what becomes of each.
+"""The settings of a clip and of a batch, which are also the options of commands, and the outcome of a clip.
 
 Does not import jax.
 """
@@ -17,7 +17,7 @@ import tyro
 from vggtjax.batch.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.clips.masks import masks_digest
 from vggtjax.clips.preprocessing import Framing
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, whole_number
 from vggtjax.known.options import KnownGeometry
 from vggtjax.media.sampling import Sampling
 from vggtjax.options import Options
@@ -107,15 +107,23 @@ class ClipRecipe:
     def changed(self, **changes: Any) -> Self:
         """Return the recipe with other values, by the names of its fields or of fields of its parts, such as `fps`.
 
-        Raises TypeError for a name that is no option.
+        None for a part is its default. Raises TypeError for an unknown name, and for a part of another type.
         """
         values = {field.name: changes.pop(field.name) for field in dataclasses.fields(self) if field.name in changes}
+        for part in ("sampling", "framing", "saving", "options", "known"):
+            kind = type(getattr(self, part))
+            if values.get(part, 0) is None:
+                values[part] = kind()
+            elif not isinstance(values.get(part, getattr(self, part)), kind):
+                raise TypeError(f"{part} is of type {type(values[part]).__name__}; expected {kind.__name__}")
         for part in ("sampling", "framing", "saving", "options"):
             value = values.get(part, getattr(self, part))
             names = [field.name for field in dataclasses.fields(value) if field.name in changes]
             values[part] = dataclasses.replace(value, **{name: changes.pop(name) for name in names})
         if changes:
-            raise TypeError(f"no option is named {' or '.join(sorted(changes))}")
+            parts = [self, self.sampling, self.framing, self.saving, self.options]
+            names = sorted({field.name for part in parts for field in dataclasses.fields(part)})
+            raise TypeError(f"no option is named {' or '.join(sorted(changes))}; expected some of {names}")
         return dataclasses.replace(self, **values)
 
 
@@ -139,6 +147,7 @@ class BatchRecipe(ClipRecipe):
         from vggtjax.known.given import check_readable
         from vggtjax.refinement.refine import check_refinement
 
+        whole_number("devices", self.devices, 1)
         self.known.check_many()
         check_readable(self.known)
         check_refinement(self.options.refine_cameras, self.known.poses is not None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Literal, TypedDict, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 import tyro
@@ -37,13 +37,6 @@ class Framing:
     def fitter(self, *, size: int, patch: int) -> Fitter:
         """Return the fitter for a model of this `size` and `patch` size in pixels; `self.size` wins over `size`."""
         return Fitter(self.mode, size if self.size is None else self.size, patch)
-
-
-class FramingChanges(TypedDict, total=False):
-    """Keywords of functions with `framing`: each changes one field of it."""
-
-    mode: Mode
-    size: int | None
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,14 @@ def ladder(
     pairs = (model.config.motion.mask_pairs,) if mask_pairs is None else mask_pairs
     settings = [_Setting(*values) for values in product(masks, pairs, suppress)] if masked else []
     witness = "matches" if "matches" in masks else "gram"
-    options = options.changed(**changes).changed(mask=witness)
+    options = options.changed(**changes)
+    for name in ("method", "mask", "mask_pairs", "suppress", "align_scale", "refine_mask", "refine_cameras"):
+        if getattr(options, name) != getattr(Options(), name):
+            raise InputError(
+                f"options have {name} {getattr(options, name)!r}; leave it out: methods, masks, mask_pairs and "
+                "suppress are arguments of the ladder, and nothing is refined"
+            )
+    options = options.changed(mask=witness)
     batches = list(_batches(len(truth.images), batch_size))
     total, steps = len(batches) * (1 + len(settings)), count(1)
     advance = (lambda: None) if progress is None else (lambda: progress(next(steps), total))

@@ -36,6 +36,11 @@ class Given(NamedTuple):
 
 def check_readable(known: KnownGeometry) -> None:
     """Raise InputError or ResultError for files that are missing or unreadable: call it before long work."""
+    for name in ("poses", "known_depths"):
+        path = getattr(known, name)
+        if path not in (None, SOURCE) and not os.path.lexists(path):
+            flag = f"--{name.replace('_', '-')}"
+            raise InputError(f"{flag} is {str(path)!r}, and there is no such file; expected a file or {SOURCE!r}")
     if known.intrinsics not in (None, SOURCE):
         read_intrinsics(known.intrinsics)
     if known.poses not in (None, SOURCE):

@@ -38,7 +38,8 @@ def read_intrinsics(text: str) -> Float64[np.ndarray, "F 3 3"]:
             numbers = []
         if len(numbers) != 4 or not np.isfinite(numbers).all():
             raise InputError(
-                f"intrinsics is {one_line(text)!r}; expected fx,fy,cx,cy, four numbers in pixels, or a file"
+                f"intrinsics is {one_line(text)!r}; expected fx,fy,cx,cy, four numbers in pixels, 'source', or a "
+                "file that is there"
             )
         return _matrices(np.array([numbers]))
     rows = read_numbers(text, (3, 4, 9))

@@ -6,16 +6,15 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict, Unpack
+from typing import Any, NamedTuple, TypedDict, Unpack, get_type_hints
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8, jaxtyped
 
 from vggtjax.cameras import Cameras
 from vggtjax.checkpoint import Model
@@ -91,8 +90,8 @@ def kept_passes(key: Mapping[str, Any], make: Callable[[], ClipPasses], folder: 
     text = json.dumps({"sources": source_digest(), "versions": versions, "method": METHOD, **key}, sort_keys=True)
     folder = cache_folder() / "passes" if folder is None else folder
     path = folder / f"{hashlib.sha256(text.encode()).hexdigest()[:32]}.npz"
-    with suppress(ResultError, TypeError):  # no file, or a damaged one
-        return ClipPasses(**read_arrays(path))
+    if (clip := _read(path)) is not None:
+        return clip
     clip = make()
     try:
         with writing(path) as temporary:
@@ -100,6 +99,18 @@ def kept_passes(key: Mapping[str, Any], make: Callable[[], ClipPasses], folder: 
     except OutputError as error:
         logger.warning("passes are not kept: %s", error)
     return clip
+
+
+def _read(path: Path) -> ClipPasses | None:
+    """Return the passes of a file; None where there is no file, or it is damaged."""
+    try:
+        arrays = read_arrays(path)
+    except ResultError:
+        return None
+    hints = get_type_hints(ClipPasses)
+    with jaxtyped("context"):  # sizes of the same letter agree
+        whole = set(arrays) == set(hints) and all(isinstance(arrays[name], hint) for name, hint in hints.items())
+    return ClipPasses(**arrays) if whole else None
 
 
 class PassesSettings(TypedDict, total=False):

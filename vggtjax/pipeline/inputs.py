@@ -55,7 +55,7 @@ def read_inputs(
         given, mask_source = empty, "none: all frames are equal"
     else:
         given = None
-    geometry = None if known is None else _given_geometry(known, clip)
+    geometry = _given_geometry(known, clip) if known else None
     return Inputs(clip, tracks, given, mask_source, geometry)
 
 

@@ -39,4 +39,7 @@ def changed(options: Options, running: Running, changes: dict[str, Any]) -> tupl
     names = [field.name for field in dataclasses.fields(Running)]
     own = {name: value for name, value in changes.items() if name in names}
     others = {name: value for name, value in changes.items() if name not in names}
+    expected = [*(field.name for field in dataclasses.fields(Options)), *names]
+    if unknown := sorted(changes.keys() - set(expected)):
+        raise TypeError(f"no option is named {' or '.join(unknown)}; expected some of {expected}")
     return options.changed(**others), dataclasses.replace(running, **own)

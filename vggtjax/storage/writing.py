@@ -90,9 +90,12 @@ def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str)
             f"{folder / taken[0]} exists and is not part of an earlier {what}, so it is not replaced; "
             "choose another folder or move it away"
         )
-    parent = next(parent for parent in (folder, *folder.absolute().parents) if os.path.lexists(parent))
-    with write_errors(folder), _staged(parent):
-        pass
+    with write_errors(folder):
+        with suppress(FileNotFoundError):
+            os.stat(folder)  # noqa: PTH116 - raises for a name that is too long, where lexists says False
+        parent = next(parent for parent in (folder, *folder.absolute().parents) if os.path.lexists(parent))
+        with _staged(parent):
+            pass
 
 
 def says_format(path: Path, name: str) -> bool:
