@@ -132,12 +132,7 @@ def ladder(
     settings = [_Setting(*values) for values in product(masks, pairs, suppress)] if masked else []
     witness = "matches" if "matches" in masks else "gram"
     options = options.changed(**changes)
-    for name in ("method", "mask", "mask_pairs", "suppress", "align_scale", "refine_mask", "refine_cameras"):
-        if getattr(options, name) != getattr(Options(), name):
-            raise InputError(
-                f"options have {name} {getattr(options, name)!r}; leave it out: methods, masks, mask_pairs and "
-                "suppress are arguments of the ladder, and nothing is refined"
-            )
+    _check_options(options)
     options = options.changed(mask=witness)
     batches = list(_batches(len(truth.images), batch_size))
     total, steps = len(batches) * (1 + len(settings)), count(1)
@@ -168,6 +163,16 @@ def ladder(
         advance()
         rows += chain.from_iterable(by_setting[setting] for setting in settings)
     return sorted(rows, key=lambda row: row.clip)
+
+
+def _check_options(options: Options) -> None:
+    """Raise InputError for options that are arguments of the ladder, or that it does not read."""
+    for name in ("method", "mask", "mask_pairs", "suppress", "align_scale", "refine_mask", "refine_cameras"):
+        if getattr(options, name) != getattr(Options(), name):
+            raise InputError(
+                f"options have {name} {getattr(options, name)!r}; leave it out: methods, masks, mask_pairs and "
+                "suppress are arguments of the ladder, and nothing is refined"
+            )
 
 
 def _seen_motion(execute: Execute, passes: Passes, images: Any) -> Float[np.ndarray, "B S H W"]:
