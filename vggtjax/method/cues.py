@@ -106,7 +106,8 @@ class GramCues:
             is_read = counts[i] > 0
             if totals:
                 is_read = self.frames.after(is_read, totals[-1])
-            total = jax.lax.cond(is_read, added(cue), lambda total, count, q, k: total, total, counts[i], q, k)
+            with jax.named_scope(f"cue-{cue.name}"):
+                total = jax.lax.cond(is_read, added(cue), lambda total, count, q, k: total, total, counts[i], q, k)
             total, (q, k) = self.frames.in_order(total, (q, k))  # in the gradient, the last cue communicates first
             totals.append(total)
         return tuple(totals)

@@ -115,7 +115,8 @@ class DenseMatches:
                 jnp.where(is_better, found.cycle, sums.cycle),
             )
 
-        return jax.lax.cond(counts[0] > 0, better, lambda sums, q, k: sums, sums, q, k)
+        with jax.named_scope("matches"):
+            return jax.lax.cond(counts[0] > 0, better, lambda sums, q, k: sums, sums, q, k)
 
     def _matched(self, q: Array, k: Array, frame_count: Int[Array, " B"] | None) -> Matches:
         B, S, _, N, D = q.shape

@@ -152,7 +152,9 @@ class Aggregator(nn.Module):
                 x, (q, k) = frames.in_order(x, (q, k))  # in the gradient, cues communicate before attention does
                 sums = accumulator.add(sums, frames.after(counts, x), q, k, frame_count)  # and here, after it
             taps = tuple(
-                jax.lax.cond(tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap)
+                jax.named_scope(f"tap{i}")(jax.lax.cond)(
+                    tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap
+                )
                 for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
             )
             x = x.reshape(B, S, T, C)

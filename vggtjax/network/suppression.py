@@ -131,4 +131,5 @@ def suppressed_attention(
         return attention(q, k, v, is_real)
 
     masked = {"zero": zero, "drop": drop}[suppressed.suppress]
-    return jax.lax.cond(suppressed.active, masked, plain, q, k, v, suppressed.keys)
+    with jax.named_scope("suppress"):
+        return jax.lax.cond(suppressed.active, masked, plain, q, k, v, suppressed.keys)
