@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import tyro
 
+from benchmarks.accelerator.command import accelerator
 from benchmarks.approximations import approximations
 from benchmarks.demo_model import demo_model
 from benchmarks.embed import embed
@@ -21,6 +22,7 @@ from benchmarks.suite.command import suite
 from vggtjax.errors import VggtjaxError
 
 COMMANDS = {
+    "accelerator": accelerator,
     "approximations": approximations,
     "demo-model": demo_model,
     "embed": embed,

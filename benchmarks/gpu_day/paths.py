@@ -48,7 +48,7 @@ def attention_paths(size: Size, lines: Lines) -> None:
 
 def _paths(dtype: str) -> dict[str, Path | None]:
     """Return the ways by name; None for one that this machine or type does not have."""
-    cudnn = dtype == "bfloat16" and attention.cudnn_works()
+    cudnn = dtype == "bfloat16" and jax.default_backend() == "gpu" and attention.cudnn_works()
     return {
         "chosen here": attention.attention,
         "chosen here, gradient": _gradient(attention.attention),

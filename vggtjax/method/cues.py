@@ -18,9 +18,10 @@ from jaxtyping import Array, Float, Int
 from vggtjax.config import Cue, Gram, MotionConfig
 from vggtjax.errors import check_choice
 from vggtjax.network.frames import Frames
-from vggtjax.network.precision import upcast
+from vggtjax.network.in_place import added_if
+from vggtjax.network.precision import products, upcast
 
-FRAMES_AT_ONCE = 4
+FRAMES_AT_ONCE = {"cpu": 4, "default": 16}  # whose similarities are in memory, by platform
 _EPSILON = 1e-6
 
 Sums = tuple[Array, ...]
@@ -30,13 +31,15 @@ Sums = tuple[Array, ...]
 class GramCues:
     """An `Accumulator` of a table of cues, for a model with `depth` pairs and one similarity; one sum per cue.
 
-    Source frames on other devices are fetched from there, in the pairs that a cue reads.
+    Source frames on other devices are fetched from there, in the pairs that a cue reads. `precision` is that of
+    `Compute`.
     """
 
     motion: MotionConfig
     depth: int
     gram: Gram = "cosine"
     frames: Frames = Frames()
+    precision: str = "highest"
 
     def __post_init__(self) -> None:
         check_choice("gram", self.gram, get_args(Gram))
@@ -47,7 +50,7 @@ class GramCues:
 
     def zeros(self, B: int, S: int, P: int) -> Sums:
         """Return empty sums: [B, S, P], or [B, S, P, P] for a std over several layers, which are averaged first."""
-        return tuple(jnp.zeros((B, S, P) + (P,) * self._keeps_gram(cue)) for cue in self.motion.cues)
+        return tuple(jnp.zeros((B, S, P) + (P,) * self.keeps_gram(cue)) for cue in self.motion.cues)
 
     def add(
         self,
@@ -69,7 +72,7 @@ class GramCues:
             weights = jnp.where(index[None] < frame_count[:, None, None], weights, 0)
             weights = weights / jnp.maximum(weights.sum(axis=-1, keepdims=True), _EPSILON)
 
-        def added(cue: Cue):
+        def of_pair(cue: Cue):
             def vectors(x: Float[Array, "... T N D"]) -> Float[Array, "... P N D"]:
                 patches = upcast(x[..., -sums[0].shape[2] :, :, :])
                 return _unit(patches) if self.gram == "cosine" else patches
@@ -82,24 +85,25 @@ class GramCues:
                     source = jnp.einsum("m,mnd->nd", weights, means[index])
                     return jnp.einsum("pnd,nd->p", vectors(row), source) / heads
 
-                def deviation(frame):
+                def of_gram(frame):
                     row, index, weights = frame
                     source = jnp.einsum("m,mpnd->pnd", weights, vectors(near[index]))
                     gram = jnp.einsum("pnd,jnd->pj", vectors(row), source) / heads
-                    return gram if self._keeps_gram(cue) else _sample_std(gram)
+                    return gram if self.keeps_gram(cue) else OF_GRAM[cue.statistic](gram)
 
-                if cue.statistic == "std":
-                    near, first_near = self.frames.around(columns, reach, axis=0)
-                    return _over_frames(deviation, (rows, index - first_near, weights))
-                means = _over_frames(lambda column: vectors(column).mean(axis=0), columns)  # [S, N, D]
-                means = self.frames.gather(means, axis=0)
-                return _over_frames(mean_similarity, (rows, index, weights))
+                if cue.statistic == "mean":
+                    means = _over_frames(lambda column: vectors(column).mean(axis=0), columns)  # [S, N, D]
+                    means = self.frames.gather(means, axis=0)
+                    return _over_frames(mean_similarity, (rows, index, weights))
+                near, first_near = self.frames.around(columns, reach, axis=0)
+                return _over_frames(of_gram, (rows, index - first_near, weights))
 
-            def branch(total, count, q, k):
+            def summand(count, q, k):
                 rows, columns = ({"q": q, "k": k}[name] for name in (cue.rows, cue.columns))
-                return total + count * jax.vmap(one_clip)(rows, columns, weights)
+                with products(self.precision):
+                    return count * jax.vmap(one_clip)(rows, columns, weights)
 
-            return branch
+            return summand
 
         totals = []
         for i, (cue, total) in enumerate(zip(self.motion.cues, sums, strict=True)):
@@ -107,7 +111,7 @@ class GramCues:
             if totals:
                 is_read = self.frames.after(is_read, totals[-1])
             with jax.named_scope(f"cue-{cue.name}"):
-                total = jax.lax.cond(is_read, added(cue), lambda total, count, q, k: total, total, counts[i], q, k)
+                total = added_if(is_read, total, of_pair(cue), counts[i], q, k)
             total, (q, k) = self.frames.in_order(total, (q, k))  # in the gradient, the last cue communicates first
             totals.append(total)
         return tuple(totals)
@@ -117,7 +121,7 @@ class GramCues:
         result = {}
         for cue, total in zip(self.motion.cues, sums, strict=True):
             average = total / len(self._layers(cue))
-            result[cue.name] = normalise(_sample_std(average) if self._keeps_gram(cue) else average)
+            result[cue.name] = normalise(OF_GRAM[cue.statistic](average) if self.keeps_gram(cue) else average)
         return result
 
     def saliency(self, sums: Sums, exponents: Float[Array, " cues"] | None = None) -> Float[Array, "B S P"]:
@@ -148,8 +152,9 @@ class GramCues:
     def _layers(self, cue: Cue) -> tuple[int, ...]:
         return self.motion.layers(cue, self.depth)
 
-    def _keeps_gram(self, cue: Cue) -> bool:
-        return cue.statistic == "std" and len(set(self._layers(cue))) > 1
+    def keeps_gram(self, cue: Cue) -> bool:
+        """Return whether a cue's Gram maps are averaged over layers before the statistic of each row is taken."""
+        return cue.statistic in OF_GRAM and len(set(self._layers(cue))) > 1
 
 
 def sources(S: int, offsets: tuple[int, ...]) -> tuple[Int[np.ndarray, "S m"], Float[np.ndarray, "S m"]]:
@@ -168,7 +173,11 @@ def sources(S: int, offsets: tuple[int, ...]) -> tuple[Int[np.ndarray, "S m"], F
 
 def _over_frames(function, frames):
     """Map a function over frames, a few of them vectorised at a time, which bounds the memory."""
-    return jax.lax.map(function, frames, batch_size=FRAMES_AT_ONCE)
+
+    def at_once(count: int):
+        return lambda frames: jax.lax.map(function, frames, batch_size=count)
+
+    return jax.lax.platform_dependent(frames, **{name: at_once(count) for name, count in FRAMES_AT_ONCE.items()})
 
 
 def normalise(values: Float[Array, "B S P"]) -> Float[Array, "B S P"]:
@@ -191,3 +200,6 @@ def _sample_std(x: Float[Array, "... J"]) -> Float[Array, ...]:
     centred = x - x.mean(axis=-1, keepdims=True)
     variance = jnp.sum(centred * centred, axis=-1) / max(x.shape[-1] - 1, 1)
     return jnp.sqrt(jnp.maximum(variance, 1e-30))  # the floor keeps the gradient finite where all values are equal
+
+
+OF_GRAM = {"std": _sample_std}  # statistics of the rows of a Gram map; "mean" needs no Gram map

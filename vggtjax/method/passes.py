@@ -65,7 +65,8 @@ def first_pass(
     the `witness` "matches", what is seen has the matches too.
     """
     B, S = clips.images.shape[:2]
-    witnesses = Witnesses(config.motion, config.depth, patch_grid(clips.images, config), gram, witness, compute.frames)
+    grid = patch_grid(clips.images, config)
+    witnesses = Witnesses(config.motion, config.depth, grid, gram, witness, compute.frames, compute.precision)
     predictions = predict(
         params,
         clips,

@@ -33,6 +33,7 @@ class Witnesses:
     gram: Gram = "cosine"
     witness: Witness = "gram"
     frames: Frames = Frames()
+    precision: str = "highest"
 
     @property
     def accumulator(self) -> Accumulator:
@@ -51,4 +52,4 @@ class Witnesses:
 
     @property
     def _cues(self) -> GramCues:
-        return GramCues(self.motion, self.depth, self.gram, self.frames)
+        return GramCues(self.motion, self.depth, self.gram, self.frames, self.precision)

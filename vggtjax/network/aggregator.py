@@ -16,6 +16,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.block import Block, apply_block, with_remat_policy
 from vggtjax.network.frames import Frames
+from vggtjax.network.in_place import replaced_if
 from vggtjax.network.layers import Params, apply, stack
 from vggtjax.network.merging import merged_attention
 from vggtjax.network.precision import Compute, full_precision, upcast
@@ -152,14 +153,11 @@ class Aggregator(nn.Module):
                 x, (q, k) = frames.in_order(x, (q, k))  # in the gradient, cues communicate before attention does
                 sums = accumulator.add(sums, frames.after(counts, x), q, k, frame_count)  # and here, after it
             taps = tuple(
-                jax.named_scope(f"tap{i}")(jax.lax.cond)(
-                    tapped[i], _captured(capture, (B, S, T, C)), lambda frame, x, tap: tap, frame, x, tap
-                )
+                jax.named_scope(f"tap{i}")(replaced_if)(tapped[i], tap, _joined(capture, (B, S, T, C)), frame, x)
                 for i, (capture, tap) in enumerate(zip(captures, taps, strict=True))
             )
-            x = x.reshape(B, S, T, C)
-            camera = jnp.concatenate([frame.reshape(B, S, T, C)[:, :, 0], x[:, :, 0]], axis=-1)  # [B, S, 2C]
-            return (x, camera, taps, sums), None
+            camera = [tokens.reshape(B, S, T, C)[:, :, 0] for tokens in (frame, x)]
+            return (x.reshape(B * S * T, C), jnp.concatenate(camera, axis=-1), taps, sums), None
 
         if real is not None:  # 0 x NaN is NaN: padded frames are set to 0
             patch_tokens = jnp.where(real[:, :, None, None], patch_tokens, 0)
@@ -175,7 +173,8 @@ class Aggregator(nn.Module):
         camera = frames.varying(jnp.zeros((B, S, 2 * C), tokens.dtype))
         taps = frames.varying(tuple(_empty(capture, (B, S, T, 2 * C), tokens.dtype) for capture in captures))
         step = with_remat_policy(pair, remat=compute.remat)
-        (_, camera, taps, sums), _ = jax.lax.scan(step, (tokens, camera, taps, sums), layers)
+        start = (tokens.reshape(B * S * T, C), camera, taps, sums)
+        (_, camera, taps, sums), _ = jax.lax.scan(step, start, layers)
         return camera, taps, sums
 
     def _tokens(self, patch_tokens: Float[Array, "B S P C"], frames: Frames) -> Float[Array, "B S T C"]:
@@ -198,14 +197,13 @@ def _global_attention(compute: Compute, S: int, grid: tuple[int, int]) -> Attend
     return partial(suppressed_attention, frames=compute.frames)
 
 
-def _captured(capture: Capture, shape: tuple[int, int, int, int]) -> Callable:
-    """Return the branch of a tapped pair: join frame and global output, and capture them."""
+def _joined(capture: Capture, shape: tuple[int, int, int, int]) -> Callable[[Array, Array], Any]:
+    """Return what captures a tapped pair: its frame and global outputs, joined."""
 
-    def branch(frame, x, tap):
-        del tap
+    def captured(frame: Array, x: Array) -> Any:
         return capture(jnp.concatenate([frame.reshape(shape), x.reshape(shape)], axis=-1))
 
-    return branch
+    return captured
 
 
 def _empty(capture: Capture, shape: tuple[int, ...], dtype: Any) -> Any:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import functools
+from importlib.util import find_spec
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.network.cpu_attention import attention_in_chunks
+from vggtjax.network.gpu_attention import fused_attention, is_fused
 from vggtjax.network.pieces import largest_divisor
 
 LOGITS_AT_ONCE = 2**28  # maximum of all clips and heads in memory, except on a CPU
@@ -25,32 +28,54 @@ def attention(
     """Return softmax(q k^T / sqrt(D)) v; only `visible` keys enter the softmax, at least one of every clip.
 
     A CPU computes one head and a few hundred queries at a time: several times faster than all at once, in little
-    memory. NVIDIA GPUs use cuDNN's flash attention for bfloat16, TPUs jax's own kernel. Float32 on a GPU is computed at
-    once where the logits fit in memory, otherwise in chunks.
+    memory. NVIDIA GPUs use cuDNN's flash attention for bfloat16 and a kernel of `gpu_attention` for float32, TPUs jax's
+    own kernel. Elsewhere attention is computed at once where the logits fit in memory, otherwise in chunks.
     """
     branches: dict[str, Any] = {"cpu": attention_in_chunks, "default": _at_once_or_in_chunks}
     D = q.shape[-1]
+    # The platform that the program is compiled for chooses, whether or not one is plugged in.
     if q.dtype == jnp.bfloat16 and D % 8 == 0 and D <= 128 and cudnn_works():
-        branches["cuda"] = functools.partial(_packed, implementation="cudnn")
-    if jax.default_backend() == "tpu" and jax.device_count() == 1 and (D <= 128 or D % 128 == 0):
-        branches["tpu"] = _on_tpu  # jax cannot divide the kernel's work among several devices
+        branches["cuda"] = _with_cudnn
+    if q.dtype == jnp.float32 and is_fused(D) and cuda_is_installed():
+        branches["cuda"] = _in_one_kernel
+    if (D <= 128 or D % 128 == 0) and _compiles_for_one_tpu():
+        branches["tpu"] = _on_tpu
     return jax.lax.platform_dependent(q, k, v, visible, **branches)
+
+
+def _compiles_for_one_tpu() -> bool:
+    """Return whether programs may be for a single TPU: jax cannot divide its kernel's work among several devices."""
+    if jax.sharding.get_abstract_mesh().manual_axes:
+        return False
+    is_here = jax.default_backend() == "tpu"
+    return jax.device_count() == 1 if is_here else find_spec("libtpu") is not None
+
+
+@functools.cache
+def cuda_is_installed() -> bool:
+    """Return whether jax compiles for NVIDIA GPUs here, plugged in or not; all branches are traced."""
+    return any(find_spec(f"jax_cuda{version}_plugin") for version in (12, 13))
 
 
 @functools.cache
 def cudnn_works() -> bool:
-    """Return whether cuDNN's attention and its gradient run on the first NVIDIA GPU, if any; tried once."""
+    """Return whether cuDNN's attention and its gradient run on the first NVIDIA GPU; tried once.
+
+    Without a GPU, return whether cuDNN is installed: what is compiled for a GPU here runs on another machine.
+    """
+    visible = np.ones((2, 13), bool)
+    gradient = jax.grad(lambda x: _with_cudnn(x, x, x, jnp.asarray(visible)).sum())
+    x = jax.ShapeDtypeStruct((2, 13, 1, 64), jnp.bfloat16)
     try:
-        device = jax.local_devices(backend="cuda")[0]
-    except RuntimeError:
-        return False
-    with jax.ensure_compile_time_eval(), jax.default_device(device):
+        jax.eval_shape(gradient, x)
         try:
-            x, visible = jnp.ones((2, 13, 1, 64), jnp.bfloat16), jnp.ones((2, 13), bool)
-            gradient = jax.grad(lambda x: _packed(x, x, x, visible, implementation="cudnn").sum())
-            jax.block_until_ready(gradient(x))
-        except (RuntimeError, NotImplementedError, ValueError):  # no cuDNN, or too old, or too old a GPU
-            return False
+            device = jax.local_devices(backend="cuda")[0]
+        except RuntimeError:
+            return True
+        with jax.ensure_compile_time_eval(), jax.default_device(device):
+            jax.block_until_ready(gradient(jnp.ones(x.shape, x.dtype)))
+    except (RuntimeError, NotImplementedError, ValueError):  # no cuDNN, or too old, or too old a GPU
+        return False
     return True
 
 
@@ -67,6 +92,52 @@ def _at_once_or_in_chunks(q, k, v, visible):
 
 def _at_once(q, k, v, visible):
     return jax.nn.dot_product_attention(q, k, v, mask=None if visible is None else visible[:, None, None, :])
+
+
+@jax.custom_vjp
+def _with_cudnn(q, k, v, visible):
+    return _packed(q, k, v, visible, implementation="cudnn")
+
+
+def _with_cudnn_forward(q, k, v, visible):
+    """Attend with even numbers of queries and keys: jax 0.10 takes no gradient of odd ones."""
+    T, K = q.shape[1], k.shape[1]
+    if T % 2 == K % 2 == 0:
+        return jax.vjp(lambda q, k, v: _packed(q, k, v, visible, implementation="cudnn"), q, k, v)
+    real = jnp.ones(k.shape[:2], bool) if visible is None else visible
+
+    def even(x):
+        return jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), *((0, 0),) * (x.ndim - 2)))
+
+    def attend(q, k, v):
+        return _packed(even(q), even(k), even(v), even(real), implementation="cudnn")[:, :T]
+
+    return jax.vjp(attend, q, k, v)
+
+
+def _with_cudnn_backward(pull, gradient):
+    return *pull(gradient), None
+
+
+_with_cudnn.defvjp(_with_cudnn_forward, _with_cudnn_backward)
+
+
+@jax.custom_vjp
+def _in_one_kernel(q, k, v, visible):
+    return fused_attention(q, k, v, visible)
+
+
+def _in_one_kernel_forward(q, k, v, visible):
+    return _in_one_kernel(q, k, v, visible), (q, k, v, visible)
+
+
+def _in_one_kernel_backward(inputs, gradient):
+    """Compute the attention again, in chunks: training in float32 on a GPU is for checks."""
+    *inputs, visible = inputs
+    return *jax.vjp(lambda q, k, v: _at_once_or_in_chunks(q, k, v, visible), *inputs)[1](gradient), None
+
+
+_in_one_kernel.defvjp(_in_one_kernel_forward, _in_one_kernel_backward)
 
 
 def _packed(q, k, v, visible, *, implementation):

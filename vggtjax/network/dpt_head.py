@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from vggtjax.config import VGGTConfig
 from vggtjax.network.layers import Conv, Conv3x3, Dense, LayerNorm, Params, apply
 from vggtjax.network.pieces import largest_divisor
+from vggtjax.network.precision import products, upcast
 from vggtjax.network.resize import resize_aligned
 
 HIDDEN = 32
@@ -145,9 +146,12 @@ class DenseHead(TapHead):
         self(self.project_all(tokens), grid)
 
 
-def project_tap(params: Params, tokens: Float[Array, "... E"], slot: int, config: VGGTConfig) -> Float[Array, "... F"]:
+def project_tap(
+    params: Params, tokens: Float[Array, "... E"], slot: int, config: VGGTConfig, precision: str = "highest"
+) -> Float[Array, "... F"]:
     """Return a head's projection of the tap in `slot`; nothing else of the tap needs to be stored."""
-    return apply(TapHead(config), params, tokens, slot, method="project")
+    with products(precision):
+        return apply(TapHead(config), params, tokens, slot, method="project")
 
 
 def predict_dense(
@@ -166,9 +170,9 @@ def predict_dense(
         config: the model's configuration.
         grid: rows and columns of patches.
         kind: "depth" (V = 1, exp(x)) or "points" (V = 3, sign(x) (exp|x| - 1)).
-        precision: as in `Compute`. It is that of all products here, which are convolutions in VGGT.
+        precision: as in `Compute`.
     """
-    with jax.default_matmul_precision("tensorfloat32" if precision == "tf32" else "highest"):
+    with products(precision):
         out = apply(DenseHead(config, kind), params, taps, grid)
     values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
     if kind == "depth":
@@ -184,12 +188,16 @@ def frames_at_once(
     Frames share the batch axis of the convolutions, and small maps need no loop: inside a loop or a map over single
     frames, the gradient with respect to a kernel is a convolution with only a slow implementation in XLA for CPUs.
     """
+
+    def in_float32(taps: list[Array]) -> Array:
+        return some_frames([upcast(tap) for tap in taps])
+
     frames = [tap.reshape(-1, *tap.shape[2:]) for tap in taps]
     count, most = frames[0].shape[0], max(PIXELS_AT_ONCE // pixels, 1)
     if most >= count:
-        return some_frames(frames)
+        return in_float32(frames)
     at_once = largest_divisor(count, most)
-    out = jax.lax.map(some_frames, [tap.reshape(-1, at_once, *tap.shape[1:]) for tap in frames])
+    out = jax.lax.map(in_float32, [tap.reshape(-1, at_once, *tap.shape[1:]) for tap in frames])
     return out.reshape(count, *out.shape[2:])
 
 

@@ -130,11 +130,13 @@ def predict(
     if patch_tokens is None:
         patch_tokens = encode(params, clips.images, config, compute_dtype=compute.compute_dtype, remat=compute.remat)
     tapped = [HEADS[name] for name in outputs if name != "camera"]
+    stored = jnp.dtype(compute.compute_dtype)  # taps in bfloat16 add nothing to the error of blocks in bfloat16
 
     def capture(slot: int):
         def projected(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
             patches = tokens[:, :, SPECIAL_TOKENS:]
-            return {head: project_tap(params[head], patches, slot, config) for head in tapped}
+            taps = {head: project_tap(params[head], patches, slot, config, compute.precision) for head in tapped}
+            return {head: tap.astype(stored) for head, tap in taps.items()}
 
         return projected
 

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from vggtjax.storage.cores import core_count
 
 NUMBERS_ON_CPU = 1600 * 1024  # of a piece on two cores: an MLP's hidden rows (26 MB) stay in the cache
-ROWS_ELSEWHERE = 2**15
+ROWS_ELSEWHERE = 2**18  # an MLP's hidden rows take 2 GB in bfloat16; smaller pieces cost kernels and copies
 _MOST_TIMES = 8  # as large as on two cores are the pieces of more, at most: it bounds their memory
 
 _Rows = TypeVar("_Rows")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import ParamSpec, TypeVar, get_args
 
@@ -26,8 +27,9 @@ class Compute:
     Attributes:
         compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
             "float64" is for checks of gradients; it requires parameters and images in float64 and jax.enable_x64.
-        precision: of the convolutions of the dense heads on accelerators: "highest" for float32; "tf32" as PyTorch
-            computes them on an NVIDIA GPU (on a TPU, three passes in bfloat16). Other products are float32 always.
+        precision: of the products of the dense heads and of the motion cues on accelerators: "highest" for float32;
+            "tf32" as PyTorch computes convolutions on an NVIDIA GPU (on a TPU, three passes in bfloat16). The camera
+            head's products are float32 always.
         remat: compute activations of blocks and dense heads again in the backward pass: less memory, more time.
         stop_camera_gradient: treat the previous estimate as a constant in every iteration of the camera head, as in
             VGGT's training.
@@ -60,6 +62,11 @@ def check_compute_dtype(name: str) -> None:
 def upcast(x: Float[Array, "*S"]) -> Float[Array, "*S"]:
     """Return x in float32, or unchanged in float64: the types of sums and residual streams."""
     return x.astype(jnp.promote_types(x.dtype, jnp.float32))
+
+
+def products(precision: str) -> AbstractContextManager[None]:
+    """Return a context in which float32 products are traced with `Compute.precision`."""
+    return jax.default_matmul_precision("tensorfloat32" if precision == "tf32" else "highest")
 
 
 def full_precision(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:

@@ -1,0 +1,61 @@
+"""What a loop over layers carries and changes in some of them only, in place.
+
+A conditional copies what it returns unchanged, in every layer. A loop of one step or none leaves it where it is in
+memory; it has a gradient here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+_Tree = TypeVar("_Tree")
+
+
+def replaced_if(flag: Bool[Array, ""], old: _Tree, function: Callable[..., _Tree], *inputs: Array) -> _Tree:
+    """Return `function(*inputs)` if the flag is true, else `old`.
+
+    The function may read other arrays, by which it has gradients too.
+    """
+    function, others = jax.closure_convert(function, *inputs)
+    return _updated(function, False, flag, old, *inputs, *others)
+
+
+def added_if(flag: Bool[Array, ""], old: _Tree, function: Callable[..., _Tree], *inputs: Array) -> _Tree:
+    """Return `old + function(*inputs)` if the flag is true, else `old`; otherwise as `replaced_if`."""
+    function, others = jax.closure_convert(function, *inputs)
+    return _updated(function, True, flag, old, *inputs, *others)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _updated(function, adds, flag, old, *inputs):
+    def step(_, old):
+        new = function(*inputs)
+        return jax.tree.map(jnp.add, old, new) if adds else new
+
+    return jax.lax.fori_loop(0, flag.astype(jnp.int32), step, old)
+
+
+def _forward(function, adds, flag, old, *inputs):
+    return _updated(function, adds, flag, old, *inputs), (flag, inputs)
+
+
+def _backward(function, adds, residuals, gradient):
+    flag, inputs = residuals
+
+    def changed(gradient: Any) -> Any:
+        of_old = gradient if adds else jax.tree.map(jnp.zeros_like, gradient)
+        return of_old, *jax.vjp(function, *inputs)[1](gradient)
+
+    def unchanged(gradient: Any) -> Any:
+        return gradient, *jax.tree.map(jnp.zeros_like, inputs)
+
+    return None, *jax.lax.cond(flag, changed, unchanged, gradient)
+
+
+_updated.defvjp(_forward, _backward)
