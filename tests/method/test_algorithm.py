@@ -89,8 +89,11 @@ def test_masks_of_a_batch_are_those_of_its_clips(model):
     unmoved, _ = infer(model.params, IMAGES, model.config, masks=False)
     assert np.allclose(unmoved.depth[1], made.depth[1], rtol=1e-5)
     assert not np.allclose(unmoved.camera_from_world[0], made.camera_from_world[0], atol=1e-5)
-    for masks in (MASKS[:1], MASKS.astype(np.uint8)):
-        with pytest.raises(InputError, match=r"or of shares as floats, of shape \(2, 4, 28, 28\)"):
+    for masks, sentence in (
+        (MASKS[:1], r"or of shares as floats, of shape \(2, 4, 28, 28\)"),
+        (MASKS.astype(np.uint8), r"masks have type uint8; expected bool, .*: masks\.astype\(bool\)"),
+    ):
+        with pytest.raises(InputError, match=sentence):
             infer(model.params, IMAGES, model.config, masks=masks)
 
 
@@ -112,7 +115,7 @@ def test_a_function_is_a_rule_of_fusion(model):
     made = reconstruct(model, load_clip(IMAGES[0], size=SIDE), fusion=lambda seen: (seen.depth1, 3 + 0 * seen.depth2))
     assert (made.depth_confidence == 3).all()
     assert "lambda" in made.settings["fusion"]
-    with pytest.raises(InputError, match=r"arrays of shape \[\(2, 4, 28, 28\)\]; expected depth and"):
+    with pytest.raises(InputError, match=r"returned 1 array of shape \(2, 4, 28, 28\); expected a pair \(depth"):
         infer(model.params, IMAGES, model.config, fusion=one_map)
     with pytest.raises(InputError, match="method 'vggt' does not fuse"):
         infer(model.params, IMAGES, model.config, fusion=one_map, method="vggt")

@@ -262,12 +262,14 @@ def check_masks(masks: Masks, images: Images, frames: Frames = Frames()) -> None
         return
     if masks is None or masks is False:
         return
-    shape, dtype = tuple(np.shape(masks)), getattr(masks, "dtype", type(masks).__name__)
-    is_mask = hasattr(masks, "dtype") and any(jnp.issubdtype(dtype, kind) for kind in (jnp.bool_, jnp.floating))
-    if shape != tuple(images.shape[:4]) or not is_mask:
+    shape, dtype = tuple(np.shape(masks)), getattr(masks, "dtype", None)
+    if dtype is not None and not any(jnp.issubdtype(dtype, kind) for kind in (jnp.bool_, jnp.floating)):
+        raise InputError(f"masks have type {dtype}; expected bool, or shares as floats: masks.astype(bool)")
+    if dtype is None or shape != tuple(images.shape[:4]):
         raise InputError(
-            f"masks are {dtype} of shape {shape}; expected an array of bool, or of shares as floats, of shape "
-            f"{tuple(images.shape[:4])}: one value for each pixel of the images; or False where nothing moves"
+            f"masks are {dtype or type(masks).__name__} of shape {shape}; expected an array of bool, or of shares as "
+            f"floats, of shape {tuple(images.shape[:4])}: one value for each pixel of the images; or False where "
+            "nothing moves"
         )
 
 

@@ -132,9 +132,10 @@ def _by_rule(fusion: FusionRule, seen: Observations) -> tuple[Depth, Depth]:
     made: Any = fusion(seen)
     is_pair = isinstance(made, tuple) and len(made) == 2
     if not is_pair or any(jnp.shape(array) != seen.depth1.shape for array in made):
-        shapes = [jnp.shape(array) for array in jax.tree.leaves(made)]
+        shapes = [str(jnp.shape(array)) for array in jax.tree.leaves(made)]
+        returned = f"{len(shapes)} array{'' if len(shapes) == 1 else 's'} of shape {' and '.join(shapes)}"
         raise InputError(
-            f"the rule of fusion returned arrays of shape {shapes}; expected depth and precision, both of shape "
+            f"the rule of fusion returned {returned}; expected a pair (depth, precision), both of shape "
             f"{seen.depth1.shape}"
         )
     return made
