@@ -23,7 +23,8 @@ Precision = Literal["highest", "tf32"]
 Threshold = Literal["otsu", "multi-otsu"]
 Witness = Literal["gram", "matches"]  # of motion
 _MATCHING = (0.5, 0.65)  # relative depths of the pairs that match, where no others are named
-HEAD_NAMES = ("camera", "depth", "points", "tracks")
+VGGT_HEADS = ("camera", "depth", "points", "tracks")  # of the published weights
+HEAD_NAMES = VGGT_HEADS  # all heads that the network knows, in the order of `VGGTConfig.heads`
 
 
 @dataclass(frozen=True)
@@ -146,11 +147,13 @@ class VGGTConfig:
     track_corr_levels: Size = 7
     track_corr_radius: Annotated[int, Meta(ge=0, le=LARGEST)] = 4
     track_position_embedding: bool = False
-    heads: tuple[str, ...] = HEAD_NAMES  # of the model; a conversion can omit some
+    heads: tuple[str, ...] = VGGT_HEADS  # of the model; a conversion can omit some
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if unknown := [name for name in self.heads if name not in HEAD_NAMES]:
+            raise InputError(f"heads has {unknown}; expected some of {HEAD_NAMES}")
         if not self.heads or self.heads != tuple(name for name in HEAD_NAMES if name in self.heads):
             raise InputError(f"heads is {self.heads}; expected at least one of {HEAD_NAMES}, in this order")
         if self.image_size % self.patch_size:

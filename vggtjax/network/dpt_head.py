@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,31 @@ from vggtjax.network.layers import Conv, Conv3x3, Dense, LayerNorm, Params, appl
 from vggtjax.network.pieces import largest_divisor
 from vggtjax.network.resize import resize_aligned
 
+
+@dataclass(frozen=True)
+class DenseMap:
+    """A row of the table of dense heads. A head regresses its values and, as a channel after them, a confidence."""
+
+    module: str  # of the parameter tree
+    field: str  # of `Predictions`, without the axis of a single value; `fields` has its confidence too
+    values: int  # of a pixel
+    activate: Callable[[Array], Array]  # of the values: keeps their shape
+
+    @property
+    def fields(self) -> tuple[str, str]:
+        """The fields of `Predictions` that the head fills: values, confidence."""
+        return self.field, f"{self.field}_confidence"
+
+
+def _signed_expm1(x: Float[Array, ...]) -> Float[Array, ...]:
+    return jnp.sign(x) * jnp.expm1(jnp.abs(x))
+
+
+DENSE_HEADS = {
+    "depth": DenseMap("depth_head", "depth", values=1, activate=jnp.exp),
+    "points": DenseMap("point_head", "world_points", values=3, activate=_signed_expm1),
+}
+CHANNELS = {name: head.values + 1 for name, head in DENSE_HEADS.items()}  # values and confidence logit
 HIDDEN = 32
 PIXELS_AT_ONCE = 4 * 518 * 518  # bounds the memory of the full-resolution maps
 
@@ -118,9 +144,6 @@ class TapHead(nn.Module):
         return [self.project(tokens, slot) for slot in range(len(self.config.dpt_channels))]
 
 
-CHANNELS = {"depth": 2, "points": 4}  # values and confidence logit of the heads that regress
-
-
 class DenseHead(TapHead):
     """A dense map and its confidence; arguments as those of `predict_dense`."""
 
@@ -165,15 +188,13 @@ def predict_dense(
         taps: outputs of `project_tap` for the four taps.
         config: the model's configuration.
         grid: rows and columns of patches.
-        kind: "depth" (V = 1, exp(x)) or "points" (V = 3, sign(x) (exp|x| - 1)).
+        kind: the head's name in `DENSE_HEADS`: "depth" (V = 1, exp(x)) or "points" (V = 3, sign(x) (exp|x| - 1)).
         precision: as in `Compute`. It is that of all products here, which are convolutions in VGGT.
     """
     with jax.default_matmul_precision("tensorfloat32" if precision == "tf32" else "highest"):
         out = apply(DenseHead(config, kind), params, taps, grid)
     values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
-    if kind == "depth":
-        return jnp.exp(values), confidence
-    return jnp.sign(values) * jnp.expm1(jnp.abs(values)), confidence
+    return DENSE_HEADS[kind].activate(values), confidence
 
 
 def frames_at_once(
