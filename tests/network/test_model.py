@@ -160,7 +160,8 @@ def test_a_row_of_the_table_is_a_dense_head(monkeypatch, config):
         monkeypatch.setitem(table, "sky", row)
     config = dataclasses.replace(config, heads=("camera", "sky"))
     params = init_params(0, config)
-    run: Any = partial(forward, params, np.zeros((1, 2, 28, 42, 3), np.float32), config, outputs=("sky",))
+    images: Any = np.zeros((1, 2, 28, 42, 3), np.float32)
+    run: Any = partial(forward, params, images, config, outputs=("sky",))
     assert set(params) == {"backbone", "aggregator", "camera_head", "sky_head"}
     made = run()
     assert made.depth.shape == (1, 2, 28, 42)
