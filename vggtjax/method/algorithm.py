@@ -20,7 +20,7 @@ from vggtjax.config import VGGTConfig, Witness
 from vggtjax.errors import InputError
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree, assemble, check_fuses
 from vggtjax.method.matched_mask import Mined
-from vggtjax.method.motion import FEWEST_FRAMES
+from vggtjax.method.matched_motion import FEWEST_FRAMES
 from vggtjax.method.passes import Passes, first_pass, mine, mine_soft, only, second_pass, track_from
 from vggtjax.method.soft_mask import SoftMasking
 from vggtjax.method.witnesses import Seen
