@@ -17,7 +17,7 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
-from vggtjax.learning import identity, reconstruct_soft, soft_masking
+from vggtjax.learning import paper_rule, reconstruct_soft, soft_masking
 from vggtjax.method.algorithm import run_method, run_passes
 from vggtjax.pipeline.artefact import write_artefact
 from vggtjax.pipeline.run import compile_ahead
@@ -124,7 +124,7 @@ def test_a_function_is_a_rule_of_fusion(model):
 def test_a_rule_is_for_methods_that_fuse(model):
     passes = run_passes(model.params, jnp.asarray(IMAGES), model.config)
     with pytest.raises(InputError, match="method 'vggt' does not fuse"):
-        assemble(passes, identity(), method="vggt")
+        assemble(passes, paper_rule(), method="vggt")
     with pytest.raises(
         InputError, match="fusion is 'vggt'; expected a rule of fusion; a method's name is given as met"
     ):
