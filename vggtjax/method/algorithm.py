@@ -121,6 +121,10 @@ def run_method(
 ) -> tuple[Assembly, Passes]:
     """Reconstruct clips by a method. Pure: works under jit, grad and vmap; `infer` is its jit.
 
+    Under a jit of your own, close over `config` and `options`, or name them:
+    `jax.jit(run_method, static_argnames=("config", "options"))`. Parameters, clips, masks (but False), and a tree or a
+    `Partial` as `fusion` can be traced.
+
     Args:
         params: the model's parameter tree.
         clips: images, or `Clips`.
