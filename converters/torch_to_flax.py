@@ -21,7 +21,7 @@ from converters.locate import Weights, locate
 from converters.rules import IGNORED, RULES, Transform
 from converters.strangers import refuse_strangers
 from vggtjax.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
-from vggtjax.config import HEAD_NAMES, VGGTConfig, vggt_1b
+from vggtjax.config import VGGT_HEADS, VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.tensor_file import Spec
@@ -216,7 +216,7 @@ def source_shapes(config: VGGTConfig) -> dict[str, tuple[int, ...]]:
 
 def _keys_of_other_heads(config: VGGTConfig) -> set[str]:
     """Return the source names of the heads that the model lacks."""
-    whole = flat_shapes(dataclasses.replace(config, heads=HEAD_NAMES))
+    whole = flat_shapes(dataclasses.replace(config, heads=VGGT_HEADS))
     absent = {path: shape for path, shape in whole.items() if path not in flat_shapes(config)}
     return {name for keys in _expected(absent).values() for key in keys for name in key.names}
 

@@ -23,6 +23,7 @@ def test_defaults_are_vggt_1b():
         ({"taps": (4, 11, 17, 24)}, "below depth 24"),
         ({"depth": 0}, "depth is 0; expected a whole number of at least 1"),
         ({"heads": ("depth", "camera")}, "in this order"),
+        ({"heads": ("depth", "nose")}, r"heads has \['nose'\]; expected some of \('camera', 'depth'"),
         ({"embed_dim": 1000}, "embed_dim 1000 is not a multiple"),
         ({"dpt_channels": (4, 4, 4, 6)}, "of 4"),
         ({"motion": {"offsets": (0,)}}, "offsets other than 0"),

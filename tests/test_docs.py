@@ -106,7 +106,7 @@ def test_commands_are_understood(page, workplace, monkeypatch):
     called = []
 
     def recorder(name, command):
-        return functools.wraps(command)(lambda *_, **__: called.append(name))
+        return command._replace(run=functools.wraps(command.run)(lambda *_, **__: called.append(name)))
 
     monkeypatch.setattr(cli, "COMMANDS", {name: recorder(name, command) for name, command in cli.COMMANDS.items()})
     for line, program, arguments in _shell_commands(page):

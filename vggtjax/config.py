@@ -23,7 +23,8 @@ Precision = Literal["highest", "tf32"]
 Threshold = Literal["otsu", "multi-otsu"]
 Witness = Literal["gram", "matches"]  # of motion
 _MATCHING = (0.5, 0.65)  # relative depths of the pairs that match, where no others are named
-HEAD_NAMES = ("camera", "depth", "points", "tracks")
+VGGT_HEADS = ("camera", "depth", "points", "tracks")  # of the published weights
+HEAD_NAMES = VGGT_HEADS  # all heads that the network knows, in the order of `VGGTConfig.heads`
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,9 @@ class Cue:
 @dataclass(frozen=True)
 class MotionConfig:
     """The cues, and the frames that each cue is averaged over, as offsets from the reference frame.
+
+    The cues become a saliency in `method.cues`. The score of motion by matches (`method.matched_motion`) reads of these
+    values `matching` alone.
 
     `floor` is added to every map, inverted or not, before the product: 0 in the papers. Each map is 0 at some patch of
     every frame. Without a floor the product is 0 there, whatever the other maps say, which matters where a frame has
@@ -146,11 +150,13 @@ class VGGTConfig:
     track_corr_levels: Size = 7
     track_corr_radius: Annotated[int, Meta(ge=0, le=LARGEST)] = 4
     track_position_embedding: bool = False
-    heads: tuple[str, ...] = HEAD_NAMES  # of the model; a conversion can omit some
+    heads: tuple[str, ...] = VGGT_HEADS  # of the model; a conversion can omit some
     motion: MotionConfig = field(default_factory=MotionConfig)
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if unknown := [name for name in self.heads if name not in HEAD_NAMES]:
+            raise InputError(f"heads has {unknown}; expected some of {HEAD_NAMES}")
         if not self.heads or self.heads != tuple(name for name in HEAD_NAMES if name in self.heads):
             raise InputError(f"heads is {self.heads}; expected at least one of {HEAD_NAMES}, in this order")
         if self.image_size % self.patch_size:

@@ -241,10 +241,16 @@ class _Counter:
             for position, operand in enumerate(inner.operands):
                 if operand in alias:
                     reads[alias[operand]].append(_part(inner, position))
-            if inner.opcode in ("dynamic-update-slice", "scatter") and (inner.is_root or _only_converted(computation, inner)):
+            if inner.opcode in ("dynamic-update-slice", "scatter") and (
+                inner.is_root or _only_converted(computation, inner)
+            ):
                 update = inner.operands[1 if inner.opcode == "dynamic-update-slice" else -1]
                 written = float(computation[update].bytes) if update in computation else None
-        parts = {number[name]: sum(r for r in found if r is not None) for name, found in reads.items() if found and None not in found}
+        parts = {
+            number[name]: sum(r for r in found if r is not None)
+            for name, found in reads.items()
+            if found and None not in found
+        }
         return parts, written
 
 

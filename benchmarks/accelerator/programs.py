@@ -131,7 +131,12 @@ def shares_of(config: VGGTConfig) -> Shares:
     depth, motion = config.depth, config.motion
     taps = {f"tap{slot}": 1 / depth for slot in range(len(config.taps))}
     cues = {f"cue-{cue.name}": len(set(motion.layers(cue, depth))) / depth for cue in motion.cues}
-    return {**taps, **cues, "matches": len(motion.matching_layers(depth)) / depth, "suppress": motion.mask_pairs / depth}
+    return {
+        **taps,
+        **cues,
+        "matches": len(motion.matching_layers(depth)) / depth,
+        "suppress": motion.mask_pairs / depth,
+    }
 
 
 def compile_programs(setup: Setup, names: Sequence[str], progress: Callable[[str], None]) -> list[Compiled]:
@@ -195,9 +200,7 @@ def _fusion_gradient(compiler: Compiler, setup: Setup) -> None:
         return clip_loss(fusion, clip, "gaussian")
 
     weights = jax.eval_shape(identity)
-    compiler.step("fusion gradient", jax.value_and_grad(loss))(
-        weights, read, jax.ShapeDtypeStruct(shape, jnp.float32)
-    )
+    compiler.step("fusion gradient", jax.value_and_grad(loss))(weights, read, jax.ShapeDtypeStruct(shape, jnp.float32))
 
 
 def _training_step(compiler: Compiler, setup: Setup) -> None:

@@ -154,7 +154,8 @@ def _require(platform: Platform) -> None:
 
 def _text(fields: dict[str, Any]) -> str:
     """Return a protocol buffer as text."""
-    lines = (f"{name} {{ {_text(value)} }}" if isinstance(value, dict) else f"{name}: {value}" for name, value in fields.items())
+    lines = (
+        f"{name} {{ {_text(value)} }}" if isinstance(value, dict) else f"{name}: {value}"
+        for name, value in fields.items()
+    )
     return "\n".join(lines)
-
-

@@ -14,7 +14,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.network import camera_head as camera
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.backbone import REGISTERS
-from vggtjax.network.dpt_head import CHANNELS, HIDDEN
+from vggtjax.network.dpt_head import DENSE_HEADS, HIDDEN
 from vggtjax.network.pose import POSE_SIZE
 
 Work = Mapping[str, float]  # kind -> FLOP, functions of a number, or bytes
@@ -81,7 +81,7 @@ def depth_head(config: VGGTConfig, S: int, grid: Grid) -> list[Work]:
     features = {"linear, float32": float(S * linear), "convolution": 2.0 * S * products}
     last = {
         "convolution": 18.0 * S * pixels * (F // 2) * HIDDEN,
-        "linear, float32": 2.0 * S * pixels * HIDDEN * CHANNELS["depth"],
+        "linear, float32": 2.0 * S * pixels * HIDDEN * DENSE_HEADS["depth"].channels,
     }
     return [features, last]
 

@@ -252,8 +252,8 @@ def matches(model: Model, clip: Clip) -> Figure:
     from vggtjax.cameras import Cameras
     from vggtjax.method.adjustment import Adjustment, adjust, at_patches
     from vggtjax.method.matched_mask import motion_pixels
+    from vggtjax.method.matched_motion import motion
     from vggtjax.method.matches import frame_pairs, patch_centres
-    from vggtjax.method.motion import motion
     from vggtjax.method.passes import first_pass
     from vggtjax.network.clip_batch import ClipBatch
     from vggtjax.network.pose import decode_pose

@@ -13,7 +13,7 @@ import numpy as np
 import optax
 
 import vggtjax
-from vggtjax.learning import fuse, identity, negative_log_likelihood, observe
+from vggtjax.learning import fuse, negative_log_likelihood, observe, paper_rule
 from vggtjax.pretrained.embedded import demo_clip
 
 model, truth = vggtjax.load_model("demo"), demo_clip()
@@ -24,20 +24,20 @@ seen = observe(passes)  # what a rule may look at
 # %% [markdown]
 # ## The loss
 #
-# How likely is the true depth, if the fused precision is right? `identity()` is the paper's rule, a tree of numbers;
+# How likely is the true depth, if the fused precision is right? `paper_rule()` is the paper's rule, a tree of numbers;
 # `scale` and `power` are the a and b of both passes.
 
 
 # %%
 def rule_of(free):
-    return identity() | free
+    return paper_rule() | free
 
 
 def loss(free):
     return negative_log_likelihood(fuse(rule_of(free), seen), true_depth)
 
 
-free = {name: identity()[name] for name in ("scale", "power")}
+free = {name: paper_rule()[name] for name in ("scale", "power")}
 print("the paper's rule:", float(loss(free)), "nats a pixel")
 
 # %% [markdown]
@@ -75,7 +75,7 @@ axes.set(xlabel="step", ylabel="nats a pixel")
 # passes are alike in their confidence, and the fused precision changes much.
 
 # %%
-paper, fitted = fuse(identity(), seen), fuse(rule_of(free), seen)
+paper, fitted = fuse(paper_rule(), seen), fuse(rule_of(free), seen)
 
 
 def abs_rel(depth):

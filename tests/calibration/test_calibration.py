@@ -23,6 +23,7 @@ from vggtjax.calibration.sweep import (
     UNCLEAR,
     Sweep,
     SweepCues,
+    kind_index,
     sweep,
     token_auc,
     token_truth,
@@ -118,6 +119,12 @@ def test_maps_and_table_are_those_of_the_cues(queries_and_keys, gram):
         assert np.allclose(made.map(gram, cue)[0], values[0], atol=1e-5), name
     table = GramCues(default, 4, gram)
     assert np.allclose(saliency[GRAMS.index(gram)], table.saliency(add_all(table, *queries_and_keys)), atol=1e-5)
+
+
+def test_a_cue_that_the_sweep_does_not_measure_is_named():
+    assert [kind_index(kind) for kind in KINDS] == list(range(len(KINDS)))
+    with pytest.raises(InputError, match="cue 'other' is the mean of k with q; the sweep has only qq_mean, qq_std"):
+        kind_index(Cue("other", "k", "q", (0,), "mean"))
 
 
 def test_pairs_match_whose_matches_come_back(queries_and_keys):

@@ -13,7 +13,7 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.learning.ablation import CHOSEN
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, kept_passes, observations, sequence_digest
-from vggtjax.method.fusion_family import identity
+from vggtjax.method.fusion_family import paper_rule
 from vggtjax.method.fusion_file import load_fusion, save_fusion
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.storage.arrays import write_arrays
@@ -83,7 +83,7 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(
     model = ["--model", tmp_path / "link.safetensors"]
     common = ["--only", "cameras", *model]
     results = {}
-    save_fusion(tmp_path / "paper.safetensors", identity())
+    save_fusion(tmp_path / "paper.safetensors", paper_rule())
     files = {"none": [], "paper": ["--fusion", tmp_path / "paper.safetensors"]}
     files["fitted"] = ["--fusion", fitted / "families" / "scale.safetensors"]
     for name, option in files.items():

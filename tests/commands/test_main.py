@@ -142,6 +142,8 @@ def test_the_overview_names_every_command_once(capsys):
     code, out, err = run(capsys, "--help")
     assert (code, err) == (0, "")
     assert sorted(re.findall(r"(?m)^  (\S+)  ", out)) == sorted(cli.COMMANDS)
+    groups = {command.group for command in cli.COMMANDS.values()}
+    assert sum(line in groups for line in out.splitlines()) == len(groups)
     assert max(map(len, out.splitlines())) <= 90
     assert run(capsys) == (2, "", out)
 

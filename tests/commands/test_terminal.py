@@ -35,7 +35,7 @@ def test_names_of_files_forge_no_lines(tmp_path, capsys, monkeypatch):
         Report().line(f"{path} is printed")
         raise FileNotFoundError(errno.ENOENT, "no such file", str(path))
 
-    monkeypatch.setitem(cli.COMMANDS, "scenes", command)
+    monkeypatch.setitem(cli.COMMANDS, "scenes", cli.COMMANDS["scenes"]._replace(run=command))
     out, (odd, long, *traceback, noted, failed) = printed("scenes")
     assert odd == f"vggtjax: {shown} is odd"
     assert len(long) < 500

@@ -13,7 +13,7 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.sequence import LabelledSequence
 from vggtjax.evaluation.sources import FolderSource, ModelSource
 from vggtjax.method.assembly import check_fuses
-from vggtjax.method.fusion_family import identity
+from vggtjax.method.fusion_family import paper_rule
 from vggtjax.progress import no_stage
 
 
@@ -38,7 +38,7 @@ def test_retrained_weights_are_another_model(tmp_path, model):
 
 
 def test_methods_that_do_not_fuse_run_beside_those_that_do(monkeypatch, model):
-    fusion, calls = identity(), []
+    fusion, calls = paper_rule(), []
 
     def methods(model, clip, names, *, fusion, **_):
         check_fuses(fusion, *names)  # as reconstruct_methods does

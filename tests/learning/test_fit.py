@@ -13,9 +13,9 @@ from tests.simulated import simulate
 from vggtjax.errors import InputError
 from vggtjax.learning.fit import FitClips, FitConfig, fit_fusion
 from vggtjax.learning.objectives import joint_negative_log_likelihood, unit_factor
-from vggtjax.method.fusion_family import Observations, fuse, identity, log_precisions, parse_family
+from vggtjax.method.fusion_family import Observations, fuse, log_precisions, paper_rule, parse_family
 
-TRUE = identity() | {
+TRUE = paper_rule() | {
     "scale": jnp.asarray([2.5, 1.5]),
     "power": jnp.asarray([0.6, 1.3]),
     "correlation": jnp.asarray(0.5),
@@ -49,7 +49,7 @@ def test_variances_and_correlation_are_recovered(recovered):
 def test_the_fused_depth_attains_the_cramer_rao_bound(recovered):
     """Its mean squared error over the bound 1 / (Fisher information) is 1 within 2 %; the paper's rule is above."""
     (_, fit), fresh = recovered, simulated(2, 16, 20_000)
-    rules = {"true": TRUE, "fitted": fit.params, "paper": identity()}
+    rules = {"true": TRUE, "fitted": fit.params, "paper": paper_rule()}
     made = {name: jax.device_get(fused(rule, fresh.seen)) for name, rule in rules.items()}
     errors = {name: np.asarray(one.depth, np.float64) - fresh.truth for name, one in made.items()}
     bound = np.exp(-np.asarray(made["true"].log_precision, np.float64))
@@ -152,7 +152,7 @@ def test_a_soft_mask_is_recovered():
     d1, d2 = (jnp.asarray(generator.uniform(1, 3, shape), jnp.float32) for _ in range(2))
     zero = jnp.zeros(shape)
     seen = Observations(d1, zero, d2, zero, (margin >= 0).astype(jnp.float32), margin, jnp.zeros((*shape, 4)))
-    true = identity() | {"offset": jnp.asarray(0.1), "temperature": jnp.asarray(0.05)}
+    true = paper_rule() | {"offset": jnp.asarray(0.1), "temperature": jnp.asarray(0.05)}
     truth = fused(true, seen).depth + 0.02 * jnp.asarray(generator.normal(size=shape), jnp.float32)
     config = FitConfig(
         parse_family("scale+offset+temperature"), steps=STEPS, learning_rate=0.2, patience=60, clips_at_once=4

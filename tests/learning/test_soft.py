@@ -14,7 +14,7 @@ from vggtjax import forward, infer, init_params
 from vggtjax.errors import InputError
 from vggtjax.learning.distances import pose_error
 from vggtjax.learning.soft import reconstruct_soft
-from vggtjax.method.fusion_family import identity
+from vggtjax.method.fusion_family import paper_rule
 from vggtjax.method.soft_mask import SoftMasking, soft_masking
 
 CONFIG = tiny_config(patch_size=8, image_size=32, taps=(0, 1, 2, 3))
@@ -46,7 +46,7 @@ def test_at_temperature_0_it_is_the_method(threshold):
     config = dataclasses.replace(CONFIG, motion=dataclasses.replace(CONFIG.motion, threshold=threshold))
     assembly, passes = infer(params(), images(), config)
     assert 0 < np.asarray(passes.dynamic_mask).mean() < 1
-    soft = softly(params(), images(), config, soft_masking(config), identity())
+    soft = softly(params(), images(), config, soft_masking(config), paper_rule())
     assert (np.asarray(soft.dynamic) == np.asarray(passes.dynamic_mask)).all()
     assert np.allclose(soft.depth, assembly.depth, rtol=2e-6)
     assert np.allclose(np.exp(soft.log_precision), assembly.confidence, rtol=1e-5)
@@ -98,7 +98,7 @@ def test_every_gradient_by_finite_differences():
         masking = _in_float64(soft_masking(CONFIG, temperature=0.15))._replace(
             strength=jnp.asarray([0.9, 0.7, 0.4, 0.2]), exponents=jnp.asarray([1.2, 0.7, 1.0, 0.9, 1.1])
         )
-        fusion = _in_float64(identity()) | {"temperature": jnp.asarray(0.3), "floor": jnp.asarray([0.1, 0.2])}
+        fusion = _in_float64(paper_rule()) | {"temperature": jnp.asarray(0.3), "floor": jnp.asarray([0.1, 0.2])}
         generator = np.random.default_rng(2)
         true = jnp.concatenate([jnp.tile(jnp.eye(3), (4, 1, 1)), jnp.asarray(generator.normal(size=(4, 3, 1)))], axis=2)
         mix = [jnp.asarray(generator.normal(size=(1, 4, 16, 24))) for _ in range(2)]
@@ -147,5 +147,5 @@ def test_the_fusion_gradient_does_not_go_through_the_network():
         inner = [loops(part) for equation in jaxpr.eqns for part in jaxprs_in_params(equation.params)]
         return sum(inner) + sum(equation.primitive.name == "scan" for equation in jaxpr.eqns)
 
-    plain, gradient = (loops(jax.make_jaxpr(function)(identity()).jaxpr) for function in (loss, jax.grad(loss)))
+    plain, gradient = (loops(jax.make_jaxpr(function)(paper_rule()).jaxpr) for function in (loss, jax.grad(loss)))
     assert gradient == plain > 3

@@ -17,7 +17,7 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
-from vggtjax.learning import identity, reconstruct_soft, soft_masking
+from vggtjax.learning import paper_rule, reconstruct_soft, soft_masking
 from vggtjax.method.algorithm import run_method, run_passes
 from vggtjax.pipeline.artefact import write_artefact
 from vggtjax.pipeline.run import compile_ahead
@@ -89,8 +89,11 @@ def test_masks_of_a_batch_are_those_of_its_clips(model):
     unmoved, _ = infer(model.params, IMAGES, model.config, masks=False)
     assert np.allclose(unmoved.depth[1], made.depth[1], rtol=1e-5)
     assert not np.allclose(unmoved.camera_from_world[0], made.camera_from_world[0], atol=1e-5)
-    for masks in (MASKS[:1], MASKS.astype(np.uint8)):
-        with pytest.raises(InputError, match=r"or of shares as floats, of shape \(2, 4, 28, 28\)"):
+    for masks, sentence in (
+        (MASKS[:1], r"or of shares as floats, of shape \(2, 4, 28, 28\)"),
+        (MASKS.astype(np.uint8), r"masks have type uint8; expected bool, .*: masks\.astype\(bool\)"),
+    ):
+        with pytest.raises(InputError, match=sentence):
             infer(model.params, IMAGES, model.config, masks=masks)
 
 
@@ -112,7 +115,7 @@ def test_a_function_is_a_rule_of_fusion(model):
     made = reconstruct(model, load_clip(IMAGES[0], size=SIDE), fusion=lambda seen: (seen.depth1, 3 + 0 * seen.depth2))
     assert (made.depth_confidence == 3).all()
     assert "lambda" in made.settings["fusion"]
-    with pytest.raises(InputError, match=r"arrays of shape \[\(2, 4, 28, 28\)\]; expected depth and"):
+    with pytest.raises(InputError, match=r"returned 1 array of shape \(2, 4, 28, 28\); expected a pair \(depth"):
         infer(model.params, IMAGES, model.config, fusion=one_map)
     with pytest.raises(InputError, match="method 'vggt' does not fuse"):
         infer(model.params, IMAGES, model.config, fusion=one_map, method="vggt")
@@ -121,7 +124,7 @@ def test_a_function_is_a_rule_of_fusion(model):
 def test_a_rule_is_for_methods_that_fuse(model):
     passes = run_passes(model.params, jnp.asarray(IMAGES), model.config)
     with pytest.raises(InputError, match="method 'vggt' does not fuse"):
-        assemble(passes, identity(), method="vggt")
+        assemble(passes, paper_rule(), method="vggt")
     with pytest.raises(
         InputError, match="fusion is 'vggt'; expected a rule of fusion; a method's name is given as met"
     ):

@@ -18,9 +18,9 @@ from vggtjax.method.fusion_family import (
     FEATURES,
     PARTS,
     Observations,
-    identity,
     is_free,
     log_precisions,
+    paper_rule,
     parse_family,
     projected,
     soft_mask,
@@ -46,7 +46,7 @@ def test_the_identity_is_the_papers_rule(d1, log1, d2, log2, dynamic):
     """For confidences from 1 to 1e30; a precision is as exact as its logarithm, which it is kept as."""
     c1, c2 = np.exp(log1), np.exp(log2)
     depth, confidence = fuse_depth(d1, c1, d2, c2, dynamic)
-    fused = fuse(identity(), seen(d1, c1, d2, c2, dynamic))
+    fused = fuse(paper_rule(), seen(d1, c1, d2, c2, dynamic))
     assert np.allclose(fused.depth, depth, rtol=1e-6, atol=0)
     assert np.allclose(fused.log_precision, np.log(confidence), rtol=1e-6, atol=1e-6)
 
@@ -62,7 +62,7 @@ def test_correlated_passes_are_joined_by_generalised_least_squares(variances, co
     inverse = np.linalg.inv([[variances[0], covariance], [covariance, variances[1]]])
     precision = inverse.sum()
     best = inverse.sum(axis=0) @ depths / precision
-    params = identity() | {"correlation": jnp.asarray(correlation, jnp.float32)}
+    params = paper_rule() | {"correlation": jnp.asarray(correlation, jnp.float32)}
     fused = fuse(params, seen(depths[0], 1 / variances[0], depths[1], 1 / variances[1], np.zeros((1, 1, 1))))
     scale = np.abs(inverse.sum(axis=0) / precision) @ np.abs(depths)  # weights can cancel
     assert abs(fused.depth.item() - best) < 1e-4 * scale
@@ -72,13 +72,13 @@ def test_correlated_passes_are_joined_by_generalised_least_squares(variances, co
 def test_an_offset_moves_hard_masks_too():
     maps = seen(2.0, 1.0, 4.0, 1.0, np.zeros((1, 1, 3)))._replace(margin=jnp.asarray([[[-0.3, -0.1, 0.1]]]))
     for temperature in (0.0, 1e-5):
-        fused = fuse(identity() | {"offset": jnp.asarray(-0.2), "temperature": jnp.asarray(temperature)}, maps)
+        fused = fuse(paper_rule() | {"offset": jnp.asarray(-0.2), "temperature": jnp.asarray(temperature)}, maps)
         assert np.allclose(fused.dynamic, [[[0, 1, 1]]], atol=1e-6)
 
 
 def test_floors_hold_however_small_the_precision():
     for power in (-1.0, -2.0, -4.0):
-        params = identity() | {"power": jnp.full(2, power), "floor": jnp.asarray([1.0, 0.0])}
+        params = paper_rule() | {"power": jnp.full(2, power), "floor": jnp.asarray([1.0, 0.0])}
         first, second = log_precisions(params, seen(2.0, 1e30, 2.0, 1e30, np.zeros((1, 1, 1))))
         assert first.item() == pytest.approx(0, abs=1e-6)
         assert second.item() == pytest.approx(power * np.log(1e30), rel=1e-6)
@@ -94,7 +94,7 @@ def test_the_gradient_of_a_very_cold_mask_is_a_number():
 def test_claims_by_hand():
     features = jnp.asarray([[[[0.5, -1.0, 0.25, 1.0]]]])
     maps = seen(2.0, 4.0, 3.0, 9.0, np.zeros((1, 1, 1)), features)
-    params = identity() | {
+    params = paper_rule() | {
         "scale": jnp.asarray([0.1, 0.2]),
         "power": jnp.asarray([0.5, 2.0]),
         "floor": jnp.asarray([1.0, 0.5]),
@@ -111,16 +111,16 @@ def test_claims_by_hand():
 def test_inflation_is_the_birge_ratio():
     """Variances 1/4 and 3/4, three apart: chi^2 is 9, and a fused variance of 3/16 becomes nine times as large."""
     maps = seen(2.0, 4.0, 5.0, 4 / 3, np.zeros((1, 1, 1)))
-    fused = fuse(identity() | {"inflation": jnp.asarray(1.0)}, maps)
+    fused = fuse(paper_rule() | {"inflation": jnp.asarray(1.0)}, maps)
     assert fused.precision.item() == pytest.approx((4 + 4 / 3) / 9, rel=1e-5)
     assert fused.depth.item() == pytest.approx(2.75, rel=1e-6)
-    near = fuse(identity() | {"inflation": jnp.asarray(1.0)}, seen(2.0, 4.0, 2.9, 4 / 3, np.zeros((1, 1, 1))))
+    near = fuse(paper_rule() | {"inflation": jnp.asarray(1.0)}, seen(2.0, 4.0, 2.9, 4 / 3, np.zeros((1, 1, 1))))
     assert near.precision.item() == pytest.approx(4 + 4 / 3, rel=1e-5)  # chi^2 below 1 says nothing
 
 
 def test_distrust_discounts_a_pass_that_disagrees():
     maps = seen(2.0, 4.0, 5.0, 4 / 3, np.zeros((1, 1, 1)))
-    fused = fuse(identity() | {"distrust": jnp.asarray([0.0, 1.0])}, maps)
+    fused = fuse(paper_rule() | {"distrust": jnp.asarray([0.0, 1.0])}, maps)
     weight = (4 / 3 / 9) / (4 + 4 / 3 / 9)
     assert fused.weight.item() == pytest.approx(weight, rel=1e-5)
     assert fused.depth.item() == pytest.approx(2 + 3 * weight, rel=1e-6)
@@ -129,7 +129,7 @@ def test_distrust_discounts_a_pass_that_disagrees():
 def test_soft_regions_blend_between_their_limits():
     maps = seen(2.0, 3.0, 4.0, 1.0, np.zeros((1, 1, 1)))._replace(margin=jnp.full((1, 1, 1), 0.2))
     for temperature, share in ((0.0, 0.0), (0.2, 1 / (1 + np.exp(-1.0))), (1e-3, 1.0)):
-        fused = fuse(identity() | {"temperature": jnp.asarray(temperature)}, maps)
+        fused = fuse(paper_rule() | {"temperature": jnp.asarray(temperature)}, maps)
         assert fused.dynamic.item() == pytest.approx(share, abs=1e-6)
         assert fused.depth.item() == pytest.approx(share * 2 + (1 - share) * 2.5, rel=1e-6)
         variance = share**2 / 3 + (1 - share**2) / 4
@@ -149,7 +149,7 @@ def test_extremes_have_no_nan(name):
         return jnp.sum(fused.depth) * 1e-6 + jnp.sum(fused.log_precision), fused
 
     with jax.debug_nans(True):
-        for tree in (params, identity()):
+        for tree in (params, paper_rule()):
             (_, fused), gradient = jax.jit(jax.value_and_grad(total, argnums=(0, 1), has_aux=True))(tree, maps)
             assert all(np.isfinite(x).all() for x in jax.tree.leaves((fused, gradient, fused.precision)))
 
@@ -215,7 +215,7 @@ def test_families_are_sets_of_free_leaves():
     ],
 )
 def test_a_misspelt_rule_is_refused(change, sentence):
-    rule = {name: value for name, value in (identity() | change).items() if value is not None}
+    rule = {name: value for name, value in (paper_rule() | change).items() if value is not None}
     with pytest.raises(InputError, match=sentence):
         family.fuse(rule, seen(1, 1, 1, 1, np.zeros(SHAPE)))
 

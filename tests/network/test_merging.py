@@ -1,6 +1,7 @@
 """Token merging against groups formed one token at a time, and what it must leave as it is."""
 
 from functools import partial
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.tiny import tiny_config
+from vggtjax.config import Suppress
 from vggtjax.method.cues import GramCues
 from vggtjax.network.merging import kept_tokens, merged_attention
 from vggtjax.network.model import forward, init_params
@@ -28,8 +30,8 @@ def tokens():
     return q, k, v, suppressed.reshape(2, -1), real
 
 
-def hide(keys, active, suppress):
-    return SuppressedKeys(jnp.asarray(keys), jnp.asarray(active), suppress)
+def hide(hidden, active, suppress):
+    return SuppressedKeys(jnp.asarray(hidden), jnp.asarray(active), suppress)
 
 
 def reference(q, k, v, suppressed, real, suppress):
@@ -60,7 +62,7 @@ def reference(q, k, v, suppressed, real, suppress):
     return out
 
 
-@pytest.mark.parametrize("suppress", [None, "zero", "drop"])
+@pytest.mark.parametrize("suppress", [None, *get_args(Suppress)])
 def test_equals_groups_formed_one_by_one(tokens, suppress):
     q, k, v, suppressed, real = tokens
     keys = None if suppress is None else hide(suppressed, True, suppress)
@@ -80,6 +82,13 @@ def test_keeping_all_tokens_is_exact(tokens, suppress, active):
     both = jax.jit(lambda q, k, v: (merged(q, k, v, keys, real), suppressed_attention(q, k, v, keys, real)))
     out, expected = both(q, k, v)
     assert np.abs(np.asarray(out) - np.asarray(expected))[real].max() < 2e-6
+
+
+def test_an_unknown_way_to_suppress_is_an_error(tokens):
+    q, k, v, suppressed, real = tokens
+    for attend in (merged_attention(S, GRID, SPECIAL), suppressed_attention):
+        with pytest.raises(KeyError, match="forget"):
+            attend(q, k, v, hide(suppressed, True, "forget"), real)
 
 
 def test_the_tokens_that_are_kept():

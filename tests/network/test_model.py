@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +10,12 @@ import numpy as np
 import pytest
 
 from testing.seeded import seeded_images
+from tests.tiny import tiny_config
 from vggtjax import VGGTConfig, forward
+from vggtjax.config import HEAD_NAMES, VGGT_HEADS
 from vggtjax.errors import InputError
-from vggtjax.network.model import parameter_shapes
+from vggtjax.network.dpt_head import DENSE_HEADS, DenseMap
+from vggtjax.network.model import FIELDS, HEADS, init_params, parameter_shapes
 from vggtjax.network.suppression import Suppression
 
 SIZE = (28, 42)
@@ -129,6 +133,43 @@ def test_bad_arguments_are_named(params, config, change, sentence):
     arguments = {"images": np.zeros((1, 2, 28, 42, 3)), **change}
     with pytest.raises(InputError, match=sentence):
         forward(params, config=config, **arguments)
+
+
+def test_parameters_without_a_head_of_the_configuration_are_named(params, config):
+    run: Any = partial(forward, {name: value for name, value in params.items() if name != "depth_head"})
+    with pytest.raises(InputError, match="params has no 'depth_head'; the configuration names the head 'depth'"):
+        run(np.zeros((1, 2, 28, 42, 3)), config)
+
+
+def test_every_head_fills_its_fields():
+    config = tiny_config()
+    assert config.heads == HEAD_NAMES == tuple(HEADS)
+    images = np.zeros((1, 2, 28, 42, 3), np.float32)
+    for name in HEAD_NAMES:
+        queries = np.ones((1, 1, 2), np.float32) if name == "tracks" else None
+        run = partial(forward, config=config, outputs=(name,))
+        made = jax.eval_shape(run, parameter_shapes(config), images, query_points=queries)
+        assert tuple(field for field, value in made._asdict().items() if value is not None) == FIELDS[name]
+
+
+def test_a_row_of_the_table_is_a_dense_head(monkeypatch, config):
+    """One value a pixel, without an axis; an output that no code makes is an error, not None."""
+    sky = DenseMap("sky_head", "depth", values=1, activate=jax.nn.sigmoid)
+    monkeypatch.setattr("vggtjax.config.HEAD_NAMES", (*VGGT_HEADS, "sky"))
+    for table, row in ((HEADS, sky.module), (FIELDS, sky.fields), (DENSE_HEADS, sky)):
+        monkeypatch.setitem(table, "sky", row)
+    config = dataclasses.replace(config, heads=("camera", "sky"))
+    params = init_params(0, config)
+    images: Any = np.zeros((1, 2, 28, 42, 3), np.float32)
+    run: Any = partial(forward, params, images, config, outputs=("sky",))
+    assert set(params) == {"backbone", "aggregator", "camera_head", "sky_head"}
+    made = run()
+    assert made.depth.shape == (1, 2, 28, 42)
+    assert (jnp.abs(made.depth - 0.5) < 0.5).all()
+    assert (made.depth_confidence >= 1).all()
+    monkeypatch.delitem(DENSE_HEADS, "sky")
+    with pytest.raises(KeyError, match="sky"):
+        run()
 
 
 def test_full_size_parameters():

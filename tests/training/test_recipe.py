@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from tests.training_runs import RECIPE
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
+from vggtjax.network.dpt_head import DENSE_HEADS
 from vggtjax.scenes import SceneConfig, load_textures
 from vggtjax.training.data import make_batch
 from vggtjax.training.objective import LossWeights, init_probes, objective
@@ -31,6 +32,11 @@ def test_json_round_trip():
     assert hash(again) == hash(recipe)
     assert isinstance(again.model, VGGTConfig)
     assert isinstance(again.stages[0].frames, tuple)
+
+
+def test_a_head_of_the_network_without_a_loss_is_not_needed(monkeypatch):
+    monkeypatch.setitem(DENSE_HEADS, "sky", DENSE_HEADS["depth"])
+    assert Recipe.from_json(RECIPE.to_json()).losses.dense == ("depth", "points")
 
 
 @given(st.integers(1, 1000))

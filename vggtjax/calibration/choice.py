@@ -125,7 +125,7 @@ def candidates(depth: int) -> tuple[Cue, ...]:
     """Return the candidates, not inverted: every map of one pair, then means over neighbouring pairs."""
     cues = []
     for count, kind in product(range(1, _MOST_NEIGHBOURS + 1), KINDS):
-        if count > 1 and kind.statistic == "std":  # of the averaged Gram map, not an average of maps
+        if count > 1 and kind.statistic != "mean":  # of the averaged Gram map, not an average of maps
             continue
         for first in range(depth - count + 1):
             layers = tuple(range(first, first + count))

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -25,13 +25,11 @@ from vggtjax.network.together import Together
 from vggtjax.progress import Progress, no_progress
 
 GRAMS: tuple[Gram, ...] = ("cosine", "dot")
-KINDS = (
-    Cue("qq_mean", "q", "q", (0,), "mean"),
-    Cue("qq_std", "q", "q", (0,), "std"),
-    Cue("kk_mean", "k", "k", (0,), "mean"),
-    Cue("kk_std", "k", "k", (0,), "std"),
-    Cue("qk_mean", "q", "k", (0,), "mean"),
-    Cue("qk_std", "q", "k", (0,), "std"),
+_COMPARED: tuple[tuple[Literal["q", "k"], Literal["q", "k"]], ...] = (("q", "q"), ("k", "k"), ("q", "k"))
+KINDS = tuple(  # every statistic that a cue can have
+    Cue(f"{rows}{columns}_{statistic}", rows, columns, (0,), statistic)
+    for rows, columns in _COMPARED
+    for statistic in get_args(get_type_hints(Cue)["statistic"])
 )
 STATIC, DYNAMIC, UNCLEAR = 0, 1, -1
 
@@ -168,8 +166,14 @@ def sweep(
 
 
 def kind_index(cue: Cue) -> int:
-    """Return the index in `KINDS` of a cue's Gram map and statistic."""
-    return [(kind.rows, kind.columns, kind.statistic) for kind in KINDS].index((cue.rows, cue.columns, cue.statistic))
+    """Return the index in `KINDS` of a cue's Gram map and statistic. Raises InputError for one that is not in it."""
+    for index, kind in enumerate(KINDS):
+        if (kind.rows, kind.columns, kind.statistic) == (cue.rows, cue.columns, cue.statistic):
+            return index
+    raise InputError(
+        f"cue {cue.name!r} is the {cue.statistic} of {cue.rows} with {cue.columns}; the sweep has only "
+        f"{', '.join(kind.name for kind in KINDS)}"
+    )
 
 
 def token_truth(mask: Bool[np.ndarray, "S H W"], patch_size: int) -> Int8[np.ndarray, "S P"]:

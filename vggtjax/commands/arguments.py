@@ -1,4 +1,4 @@
-"""Arguments that commands share, with their names in help texts. Does not import jax."""
+"""Types that several commands take; each command lists them itself. Does not import jax."""
 
 from __future__ import annotations
 

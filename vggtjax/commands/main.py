@@ -29,7 +29,7 @@ from vggtjax.commands.evaluate import evaluate
 from vggtjax.commands.export import export
 from vggtjax.commands.export_model import export_model
 from vggtjax.commands.fit_fusion import fit_fusion
-from vggtjax.commands.overview import overview
+from vggtjax.commands.overview import Command, overview
 from vggtjax.commands.process import check_limits, give_devices_threads
 from vggtjax.commands.reconstruct import reconstruct
 from vggtjax.commands.render import render
@@ -40,24 +40,27 @@ from vggtjax.errors import InputError, VggtjaxError, message_line, one_line, pri
 from vggtjax.storage.cache import enable_compilation_cache
 from vggtjax.storage.kept_memory import keep_freed_memory
 
+_START, _RESULTS, _MODELS = "Start", "Look at results, and pass them on", "Models"
+_MEASURE, _COMPUTER = "Measure", "This computer"
+
 COMMANDS = {
-    "reconstruct": reconstruct,
-    "view": view,
-    "batch": batch,
-    "convert": convert,
-    "export": export,
-    "import": import_result,
-    "demo": demo,
-    "render": render,
-    "info": info,
-    "train": train,
-    "evaluate": evaluate,
-    "calibrate-cues": calibrate_cues,
-    "fit-fusion": fit_fusion,
-    "export-model": export_model,
-    "scenes": scenes,
-    "app": app,
-    "doctor": doctor,
+    "demo": Command(demo, _START, "reconstruct the clip that comes with the package, and measure it"),
+    "reconstruct": Command(reconstruct, _START, "cameras, depth, masks and a 4-D point cloud of a clip"),
+    "batch": Command(batch, _START, "the same for many clips; resumes where it was interrupted"),
+    "view": Command(view, _RESULTS, "play results in a browser, or write them as one page"),
+    "render": Command(render, _RESULTS, "films of a result: around it, or along its cameras"),
+    "app": Command(app, _RESULTS, "a page to drop a video on"),
+    "export": Command(export, _RESULTS, "a result as files of another program"),
+    "import": Command(import_result, _RESULTS, "a result of another program as ours"),
+    "info": Command(info, _MODELS, "what a model is made of"),
+    "convert": Command(convert, _MODELS, "a PyTorch checkpoint of VGGT as one .safetensors"),
+    "train": Command(train, _MODELS, "train a model on generated scenes, or finetune one"),
+    "calibrate-cues": Command(calibrate_cues, _MODELS, "choose a model's motion cues"),
+    "fit-fusion": Command(fit_fusion, _MODELS, "fit how the two passes are fused"),
+    "export-model": Command(export_model, _MODELS, "a model as a program that jax runs without vggtjax"),
+    "evaluate": Command(evaluate, _MEASURE, "score methods on a data set with ground truth"),
+    "scenes": Command(scenes, _MEASURE, "generate clips with exact ground truth"),
+    "doctor": Command(doctor, _COMPUTER, "versions, devices, memory, the longest clips, extras, the cache"),
 }
 
 _OUT_OF_MEMORY = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size"
@@ -142,14 +145,16 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
     """Return the command with its arguments, ready to be called.
 
     tyro prints errors of the option dataclasses in a box. Find the error in the chain of exceptions and raise it.
-    """
 
+    tyro reads the command's signature through `ready`. An option that all commands take is one more parameter in
+    `ready.__signature__` and `ready.__annotations__`, which `ready` takes out of `options`.
+    """
     name, *others = arguments
     if name not in COMMANDS:
         similar = difflib.get_close_matches(name, COMMANDS, n=1)
         guess = f"did you mean {similar[0]}? " if similar else ""
         raise InputError(f"there is no command {one_line(name, 40)!r}; {guess}vggtjax --help lists all")
-    command = COMMANDS[name]
+    command = COMMANDS[name].run
 
     @functools.wraps(command)
     def ready(*positional: object, **options: object) -> Callable[[], None]:

@@ -20,9 +20,9 @@ from .rules import Fused as Fused
 from .rules import Observations as Observations
 from .rules import SoftMasking as SoftMasking
 from .rules import fuse as fuse
-from .rules import identity as identity
 from .rules import load_fusion as load_fusion
 from .rules import observe as observe
+from .rules import paper_rule as paper_rule
 from .rules import parse_family as parse_family
 from .rules import save_fusion as save_fusion
 from .rules import soft_masking as soft_masking

@@ -20,7 +20,7 @@ from vggtjax.evaluation.metrics.depth import depth_alignment, depth_errors
 from vggtjax.evaluation.metrics.uncertainty import reliability_curve, uncertainty_scores
 from vggtjax.learning.clip_passes import ClipPasses, fit_clips, observations
 from vggtjax.learning.fit import NEEDS_FRAMES, FitConfig, FitOutcome, fit_fusion
-from vggtjax.method.fusion_family import Fused, Observations, fuse, identity, parse_family
+from vggtjax.method.fusion_family import Fused, Observations, fuse, paper_rule, parse_family
 from vggtjax.progress import Progress, no_progress
 
 METRICS = {
@@ -88,7 +88,7 @@ def baselines() -> dict[str, Rule]:
         "pass 1 alone": jax.jit(lambda seen: Fused(seen.depth1, seen.log_confidence1, seen.dynamic, seen.dynamic)),
         "pass 2 alone": jax.jit(lambda seen: Fused(seen.depth2, seen.log_confidence2, seen.dynamic, seen.dynamic)),
         "hard replacement": jax.jit(replaced),
-        PAPER: partial(_fused, identity()),
+        PAPER: partial(_fused, paper_rule()),
     }
 
 

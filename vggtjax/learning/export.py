@@ -26,7 +26,7 @@ from vggtjax.learning.ablation import PAPER, RuleScore, fit_split, gains, markdo
 from vggtjax.learning.clip_passes import ClipPasses, observations
 from vggtjax.learning.fit import FitConfig
 from vggtjax.learning.plots import draw_fits
-from vggtjax.method.fusion_family import identity, parse_family
+from vggtjax.method.fusion_family import paper_rule, parse_family
 from vggtjax.method.fusion_file import save_fusion
 from vggtjax.storage.writing import check_free, says_format, staging, writing
 
@@ -64,7 +64,7 @@ def save_fits(
     split = split._replace(fitted=sorted([*split.fitted, *split.test]))
     all_clips = list(clips.values())
     seen = [observations(clip) for clip in all_clips]
-    trees = {PAPER: identity()}
+    trees = {PAPER: paper_rule()}
     for name in families:
         whole = dataclasses.replace(config, family=parse_family(name))
         fit = fit_split(all_clips, seen, split, whole, pixels=int(about["pixels"]), folder=folder / STATES)

@@ -23,7 +23,7 @@ from vggtjax.learning.objectives import (
     negative_log_likelihood,
     photometric_loss,
 )
-from vggtjax.method.fusion_family import PARTS, FusionParams, Observations, fuse, identity, is_free, projected, start
+from vggtjax.method.fusion_family import PARTS, FusionParams, Observations, fuse, is_free, paper_rule, projected, start
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.arrays import read_arrays, write_arrays
 from vggtjax.storage.json_values import Count, check_fields
@@ -141,7 +141,7 @@ def fit_fusion(
     plan = _Plan(config.steps, config.learning_rate, config.decay)
     state = _initial(config, plan)
     free = jax.tree.map(jnp.asarray, is_free(state.params, config.family))
-    paper = identity() | ({"gate": state.params["gate"]} if "gate" in state.params else {})
+    paper = paper_rule() | ({"gate": state.params["gate"]} if "gate" in state.params else {})
     state = _evaluated(state._replace(params=paper), fitted, held_out, config.objective)._replace(params=state.params)
     _check_finite(state, 0)
     digest = "" if checkpoint is None else _digest(config, fitted, held_out)

@@ -4,7 +4,7 @@ from vggtjax.method.fusion_family import PARTS as PARTS
 from vggtjax.method.fusion_family import Fused as Fused
 from vggtjax.method.fusion_family import Observations as Observations
 from vggtjax.method.fusion_family import fuse as fuse
-from vggtjax.method.fusion_family import identity as identity
+from vggtjax.method.fusion_family import paper_rule as paper_rule
 from vggtjax.method.fusion_family import parse_family as parse_family
 from vggtjax.method.fusion_file import load_fusion as load_fusion
 from vggtjax.method.fusion_file import save_fusion as save_fusion

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from vggtjax.cameras import Cameras, unproject
 from vggtjax.config import Gram, MotionConfig, VGGTConfig
 from vggtjax.method.algorithm import run_passes
-from vggtjax.method.fusion_family import FusionParams, fuse, identity
+from vggtjax.method.fusion_family import FusionParams, fuse, paper_rule
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.passes import Passes, present
 from vggtjax.method.soft_mask import SoftMasking
@@ -67,7 +67,7 @@ def reconstruct_soft(
     config = config if motion is None else dataclasses.replace(config, motion=motion)
     compute = Compute(compute_dtype, remat=remat, stop_camera_gradient=stop_camera_gradient)
     passes = run_passes(params, images, config, Options(gram=gram), masks=masking, compute=compute)
-    fused = fuse(identity() if fusion is None else fusion, observe(passes))
+    fused = fuse(paper_rule() if fusion is None else fusion, observe(passes))
     second = present(passes.second)
     cameras = Cameras(*decode_pose(present(second.pose_encoding), (images.shape[2], images.shape[3])))
     points = unproject(fused.depth, cameras.intrinsics, cameras.camera_from_world, pixel_offset=0.5)

@@ -20,7 +20,7 @@ from vggtjax.config import VGGTConfig, Witness
 from vggtjax.errors import InputError
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree, assemble, check_fuses
 from vggtjax.method.matched_mask import Mined
-from vggtjax.method.motion import FEWEST_FRAMES
+from vggtjax.method.matched_motion import FEWEST_FRAMES
 from vggtjax.method.passes import Passes, first_pass, mine, mine_soft, only, second_pass, track_from
 from vggtjax.method.soft_mask import SoftMasking
 from vggtjax.method.witnesses import Seen
@@ -121,6 +121,10 @@ def run_method(
 ) -> tuple[Assembly, Passes]:
     """Reconstruct clips by a method. Pure: works under jit, grad and vmap; `infer` is its jit.
 
+    Under a jit of your own, close over `config` and `options`, or name them:
+    `jax.jit(run_method, static_argnames=("config", "options"))`. Parameters, clips, masks (but False), and a tree or a
+    `Partial` as `fusion` can be traced.
+
     Args:
         params: the model's parameter tree.
         clips: images, or `Clips`.
@@ -143,10 +147,10 @@ def run_method(
     )
     frames = clips.real(compute.frames)
     cameras = "adjusted" if _adjusts(options, clips.counted) else "predicted"
-    how = {"method": options.method, "align_scale": options.align_scale, "cameras": cameras, "frames": frames}
     join = step("assemble", frames.on_devices(assemble, BY_FRAME, REPLICATED))
-    read = passes._replace(patch_tokens=None, tracks=None)
-    return join(read, as_tree(fusion), **how), passes
+    arrays = (passes._replace(patch_tokens=None, tracks=None), as_tree(fusion))
+    made = join(*arrays, method=options.method, align_scale=options.align_scale, cameras=cameras, frames=frames)
+    return made, passes
 
 
 def run_passes(
@@ -188,9 +192,9 @@ def run_passes(
         batch = ClipBatch(images, tokens, clips.padding(compute.frames))
         # Stage 1: a plain pass, which adds up the similarities of q and k that tell motion.
         exponents = masks.exponents if isinstance(masks, SoftMasking) else None
-        plain = step("first pass", on_devices(first_pass, REPLICATED, _CLIPS, REPLICATED, REPLICATED))
-        how = {"gram": method.gram, "witness": witness, "compute": compute}
-        first, seen = plain(params, batch, clips.query_points.get(0), exponents, config=config, **how)
+        plain_pass = step("first pass", on_devices(first_pass, REPLICATED, _CLIPS, REPLICATED, REPLICATED))
+        arrays = (params, batch, clips.query_points.get(0), exponents)
+        first, seen = plain_pass(*arrays, config=config, gram=method.gram, witness=witness, compute=compute)
     else:
         _check_shared(shared, masks, witness)
         batch = ClipBatch(images, shared.patch_tokens, clips.padding(compute.frames))
@@ -200,14 +204,15 @@ def run_passes(
     threshold = config.motion.cut_by(options.threshold, method.threshold)
     mined = Mined(masks)  # type: ignore[arg-type]
     if masks is None:
-        read = (seen, only(first, FIRST_OUTPUTS)) if mines_by_matches else (Seen(seen.saliency), None)
-        how = {"clusters": method.clusters, "threshold": threshold, "smooth_frames": options.smooth_frames}
+        evidence, predicted = (seen, only(first, FIRST_OUTPUTS)) if mines_by_matches else (Seen(seen.saliency), None)
+        arrays = (evidence, predicted, batch._replace(frame_count=None))
         mining = step("dynamic mask", real.on_devices(mine, BY_FRAME, BY_FRAME, BY_FRAME))
-        mined = mining(*read, batch._replace(frame_count=None), **how, frames=real)
+        mined = mining(
+            *arrays, clusters=method.clusters, threshold=threshold, smooth_frames=options.smooth_frames, frames=real
+        )
     elif isinstance(masks, SoftMasking):
         shares = step("dynamic mask", mine_soft)
-        how = {"threshold": config.motion.threshold or "otsu", "frames": real}
-        mined = Mined(shares(seen.saliency, images, masks, **how))
+        mined = Mined(shares(seen.saliency, images, masks, threshold=config.motion.threshold or "otsu", frames=real))
     elif masks is False:
         mined = Mined(np.zeros(images.shape[:4], bool))  # type: ignore[arg-type]
 
@@ -217,12 +222,11 @@ def run_passes(
         outputs = FIRST_OUTPUTS if both_outputs else method.second_outputs(options.align_scale)
         strength = masks.strength if isinstance(masks, SoftMasking) else None
         pairs = config.motion.masked_pairs(options.mask_pairs) if strength is None else None
-        masked = step(
+        masked_pass = step(
             "second pass", on_devices(second_pass, REPLICATED, _CLIPS, BY_FRAME, BY_FRAME, REPLICATED, REPLICATED)
         )
-        unchanged = only(first, FIRST_OUTPUTS)
-        how = {"suppress": method.suppress, "outputs": outputs, "compute": compute}
-        second = masked(params, batch, mined.dynamic_mask, unchanged, pairs, strength, config=config, **how)
+        arrays = (params, batch, mined.dynamic_mask, only(first, FIRST_OUTPUTS), pairs, strength)
+        second = masked_pass(*arrays, config=config, suppress=method.suppress, outputs=outputs, compute=compute)
 
     tracks = _follow(params, batch, clips.query_points, first, config, compute, step) if clips.query_points else None
     return Passes(first, second, seen.saliency, *mined, seen.matches, batch.patch_tokens, tracks)
@@ -262,12 +266,14 @@ def check_masks(masks: Masks, images: Images, frames: Frames = Frames()) -> None
         return
     if masks is None or masks is False:
         return
-    shape, dtype = tuple(np.shape(masks)), getattr(masks, "dtype", type(masks).__name__)
-    is_mask = hasattr(masks, "dtype") and any(jnp.issubdtype(dtype, kind) for kind in (jnp.bool_, jnp.floating))
-    if shape != tuple(images.shape[:4]) or not is_mask:
+    shape, dtype = tuple(np.shape(masks)), getattr(masks, "dtype", None)
+    if dtype is not None and not any(jnp.issubdtype(dtype, kind) for kind in (jnp.bool_, jnp.floating)):
+        raise InputError(f"masks have type {dtype}; expected bool, or shares as floats: masks.astype(bool)")
+    if dtype is None or shape != tuple(images.shape[:4]):
         raise InputError(
-            f"masks are {dtype} of shape {shape}; expected an array of bool, or of shares as floats, of shape "
-            f"{tuple(images.shape[:4])}: one value for each pixel of the images; or False where nothing moves"
+            f"masks are {dtype or type(masks).__name__} of shape {shape}; expected an array of bool, or of shares as "
+            f"floats, of shape {tuple(images.shape[:4])}: one value for each pixel of the images; or False where "
+            "nothing moves"
         )
 
 

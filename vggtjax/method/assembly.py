@@ -14,7 +14,7 @@ from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError
 from vggtjax.method.adjusted_cameras import adjusted_cameras
 from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
-from vggtjax.method.fusion_family import FusionParams, Observations, fuse, identity
+from vggtjax.method.fusion_family import FusionParams, Observations, fuse, paper_rule
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.passes import Passes, present
 from vggtjax.network.frames import Frames
@@ -71,8 +71,9 @@ def assemble(
 
     Args:
         passes: of `run_passes` with this method's options; passes of another method give a wrong result, not an error.
-        fusion: a rule of fusion in place of the paper's: a fitted tree, or a function of `Observations` that returns
-            depth and precision, of the same shape. The precision becomes the confidence.
+        fusion: a rule of fusion in place of the paper's: a fitted tree, or a function of
+            `fusion_family.Observations` that returns depth and precision, of the same shape. The precision becomes the
+            confidence.
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
             pixels before it is used. Not in the paper.
@@ -90,7 +91,7 @@ def assemble(
         scale = scale_between(present(first.depth), present(second.depth), passes.dynamic_mask, frames)
     depth, confidence = _depth(passes, row.depth, scale)
     if fusion is None and row.depth == "fused" and passes.dynamic_mask.dtype != bool:
-        fusion = identity()  # the paper's rule, which blends by shares
+        fusion = paper_rule()  # the same rule, which blends by shares
     if fusion is not None:
         depth, confidence = _by_rule(fusion, observe(passes, scale=scale, frames=frames))
     size = (depth.shape[2], depth.shape[3])
@@ -132,9 +133,10 @@ def _by_rule(fusion: FusionRule, seen: Observations) -> tuple[Depth, Depth]:
     made: Any = fusion(seen)
     is_pair = isinstance(made, tuple) and len(made) == 2
     if not is_pair or any(jnp.shape(array) != seen.depth1.shape for array in made):
-        shapes = [jnp.shape(array) for array in jax.tree.leaves(made)]
+        shapes = [str(jnp.shape(array)) for array in jax.tree.leaves(made)]
+        returned = f"{len(shapes)} array{'' if len(shapes) == 1 else 's'} of shape {' and '.join(shapes)}"
         raise InputError(
-            f"the rule of fusion returned arrays of shape {shapes}; expected depth and precision, both of shape "
+            f"the rule of fusion returned {returned}; expected a pair (depth, precision), both of shape "
             f"{seen.depth1.shape}"
         )
     return made

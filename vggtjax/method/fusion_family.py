@@ -63,8 +63,8 @@ class Part:
     """A leaf of the tree: its shape, its value in the paper's rule, its value at the start of a fit, and its range."""
 
     shape: tuple[int, ...] = (2,)  # one value for each pass
-    identity: float = 0.0
-    start: float | None = None  # the identity if None; another value where the gradient at the identity is 0
+    paper: float = 0.0
+    start: float | None = None  # the paper's value if None; another one where the gradient at that is 0
     low: float = -math.inf
     high: float = math.inf
     least: float | None = None  # lower end of the range during a fit, where the gradient at `low` is 0
@@ -73,7 +73,7 @@ class Part:
 
 PARTS: dict[str, Part] = {
     "scale": Part(),  # logarithm of a factor on the precision
-    "power": Part(identity=1.0, low=-8, high=8),  # exponent of the confidence
+    "power": Part(paper=1.0, low=-8, high=8),  # exponent of the confidence
     "floor": Part(start=1e-3, low=0, high=1e6),  # precision added at any confidence
     "saliency": Part(low=-50, high=50),  # change of log precision from saliency 0 to 1
     "depth": Part(low=-50, high=50),  # change of log precision with log depth over the clip's median
@@ -112,9 +112,9 @@ def parse_family(text: str) -> tuple[str, ...]:
     return parts
 
 
-def identity() -> FusionParams:
+def paper_rule() -> FusionParams:
     """Return the tree of the paper's rule."""
-    return {name: jnp.full(part.shape, part.identity, float) for name, part in PARTS.items()}
+    return {name: jnp.full(part.shape, part.paper, float) for name, part in PARTS.items()}
 
 
 def start(family: tuple[str, ...], seed: int = 0) -> FusionParams:
@@ -122,7 +122,7 @@ def start(family: tuple[str, ...], seed: int = 0) -> FusionParams:
 
     `seed` is that of the gate's weights, whose last layer is 0.
     """
-    tree = identity()
+    tree = paper_rule()
     for name, part in PARTS.items():
         if name in family and part.start is not None:
             tree[name] = jnp.full(part.shape, part.start, float)
@@ -152,7 +152,7 @@ def check_rule(params: FusionParams) -> None:
     if unknown := sorted(names - set(PARTS)):
         raise InputError(f"the rule has {', '.join(unknown)}; expected the parts {', '.join((*PARTS, 'gate'))}")
     if missing := sorted(set(PARTS) - names):
-        raise InputError(f"the rule lacks {', '.join(missing)}; start from the parts of identity() or start(family)")
+        raise InputError(f"the rule lacks {', '.join(missing)}; start from the parts of paper_rule() or start(family)")
     for name, part in PARTS.items():
         if jnp.shape(params[name]) != part.shape:
             raise InputError(f"part {name} of the rule has shape {jnp.shape(params[name])}; expected {part.shape}")

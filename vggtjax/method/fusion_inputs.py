@@ -1,4 +1,4 @@
-"""Two passes over a clip -> the inputs of a fusion rule."""
+"""Two passes over a clip -> the inputs of a fusion rule, `Observations` (declared in `fusion_family`)."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ from vggtjax.cameras import Cameras
 from vggtjax.method.adjustment import at_patches
 from vggtjax.method.edges import follow_edges
 from vggtjax.method.mask import otsu_threshold, upsample
+from vggtjax.method.matched_motion import FEWEST_FRAMES, motion
 from vggtjax.method.matches import Matches
-from vggtjax.method.motion import FEWEST_FRAMES, motion
 from vggtjax.network.frames import Frames
 from vggtjax.network.pose import decode_pose
 

@@ -22,7 +22,7 @@ from vggtjax.network.backbone import patch_grid
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
-from vggtjax.network.model import Predictions, predict
+from vggtjax.network.model import FIELDS, Predictions, predict
 from vggtjax.network.precision import Compute
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import Tracks
@@ -183,8 +183,7 @@ def second_pass(
 
 def only(predictions: Predictions, outputs: tuple[str, ...]) -> Predictions | None:
     """Return the predictions of these outputs alone; None if there is one that was not predicted."""
-    fields = {"camera": ("pose_encoding",), "depth": ("depth", "depth_confidence")}
-    wanted = {name: getattr(predictions, name, None) for output in outputs for name in fields.get(output, (output,))}
+    wanted = {field: getattr(predictions, field) for output in outputs for field in FIELDS[output]}
     return None if any(value is None for value in wanted.values()) else Predictions(**wanted)
 
 

@@ -135,10 +135,10 @@ class Aggregator(nn.Module):
         frames = compute.frames
         real = frames.are_real(frame_count, B, S)
         real_tokens = None if real is None else jnp.repeat(real, T, axis=1)
-        keys = suppression.keys(SPECIAL_TOKENS)
+        hidden = suppression.hidden_tokens(SPECIAL_TOKENS)
 
         def suppressed(active: Array, rows: int) -> SuppressedKeys | None:
-            return None if keys is None else SuppressedKeys(keys.reshape(rows, -1), active, suppression.suppress)
+            return None if hidden is None else SuppressedKeys(hidden.reshape(rows, -1), active, suppression.suppress)
 
         def pair(carry, layer):
             x, _, taps, sums = carry

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,35 @@ from vggtjax.network.pieces import largest_divisor
 from vggtjax.network.precision import products, upcast
 from vggtjax.network.resize import resize_aligned
 
+
+@dataclass(frozen=True)
+class DenseMap:
+    """A row of the table of dense heads. A head regresses its values and, as a channel after them, a confidence."""
+
+    module: str  # of the parameter tree
+    field: str  # of `Predictions`, without the axis of a single value; `fields` has its confidence too
+    values: int  # of a pixel
+    activate: Callable[[Array], Array]  # of the values: keeps their shape
+
+    @property
+    def channels(self) -> int:
+        """What is regressed: values and a confidence logit."""
+        return self.values + 1
+
+    @property
+    def fields(self) -> tuple[str, str]:
+        """The fields of `Predictions` that the head fills: values, confidence."""
+        return self.field, f"{self.field}_confidence"
+
+
+def _signed_expm1(x: Float[Array, ...]) -> Float[Array, ...]:
+    return jnp.sign(x) * jnp.expm1(jnp.abs(x))
+
+
+DENSE_HEADS = {
+    "depth": DenseMap("depth_head", "depth", values=1, activate=jnp.exp),
+    "points": DenseMap("point_head", "world_points", values=3, activate=_signed_expm1),
+}
 HIDDEN = 32
 PIXELS_AT_ONCE = 4 * 518 * 518  # bounds the memory of the full-resolution maps
 
@@ -119,9 +149,6 @@ class TapHead(nn.Module):
         return [self.project(tokens, slot) for slot in range(len(self.config.dpt_channels))]
 
 
-CHANNELS = {"depth": 2, "points": 4}  # values and confidence logit of the heads that regress
-
-
 class DenseHead(TapHead):
     """A dense map and its confidence; arguments as those of `predict_dense`."""
 
@@ -132,14 +159,14 @@ class DenseHead(TapHead):
         """Return values and a confidence logit, before their activation."""
         config, (h, w), p = self.config, grid, self.config.patch_size
         reassemble = DPTFeatures(config.dpt_features, config.dpt_features // 2, name="features")
-        regress = Regression(CHANNELS[self.kind], name="regression")
+        regress = Regression(DENSE_HEADS[self.kind].channels, name="regression")
 
         def some_frames(taps: list[Float[Array, "n P F"]]) -> Float[Array, "n H W O"]:
             features = reassemble([tap.reshape(-1, h, w, tap.shape[-1]) for tap in taps])
             return regress(add_positions(resize_aligned(features, (h * p, w * p)), aspect=w / h))
 
         out = frames_at_once(some_frames, taps, (h * p) * (w * p))
-        return out.reshape(*taps[0].shape[:2], h * p, w * p, CHANNELS[self.kind])
+        return out.reshape(*taps[0].shape[:2], h * p, w * p, DENSE_HEADS[self.kind].channels)
 
     def declare(self, tokens: Float[Array, "B S P E"], grid: tuple[int, int]) -> None:
         """Read every parameter once."""
@@ -169,15 +196,13 @@ def predict_dense(
         taps: outputs of `project_tap` for the four taps.
         config: the model's configuration.
         grid: rows and columns of patches.
-        kind: "depth" (V = 1, exp(x)) or "points" (V = 3, sign(x) (exp|x| - 1)).
+        kind: the head's name in `DENSE_HEADS`: "depth" (V = 1, exp(x)) or "points" (V = 3, sign(x) (exp|x| - 1)).
         precision: as in `Compute`.
     """
     with products(precision):
         out = apply(DenseHead(config, kind), params, taps, grid)
     values, confidence = out[..., :-1], 1 + jnp.exp(out[..., -1])
-    if kind == "depth":
-        return jnp.exp(values), confidence
-    return jnp.sign(values) * jnp.expm1(jnp.abs(values)), confidence
+    return DENSE_HEADS[kind].activate(values), confidence
 
 
 def frames_at_once(

@@ -45,7 +45,12 @@ def fused_attention(
     out = pl.pallas_call(
         functools.partial(_kernel, scale=D**-0.5),
         grid=(queries.shape[1] // BLOCK, B, N),
-        in_specs=[of_queries, of_keys, of_keys, pl.BlockSpec((None, keys.shape[1]), lambda block, clip, head: (clip, 0))],
+        in_specs=[
+            of_queries,
+            of_keys,
+            of_keys,
+            pl.BlockSpec((None, keys.shape[1]), lambda block, clip, head: (clip, 0)),
+        ],
         out_specs=of_queries,
         out_shape=jax.eval_shape(lambda x: x, queries),
         compiler_params=triton.CompilerParams(num_warps=4, num_stages=2),

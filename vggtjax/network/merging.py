@@ -18,6 +18,7 @@ from vggtjax.network.attention import attention
 from vggtjax.network.precision import upcast
 from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
 
+IS_ZEROED = {"zero": True, "drop": False}  # whether suppressed keys stay in the softmax, as keys 0
 REGION = 2  # patches a side: later frames keep one patch of each such square
 STRIDE = 10  # every tenth token is kept as well
 _ROWS_AT_ONCE = 800  # tokens whose similarities to all kept tokens are in memory
@@ -58,11 +59,11 @@ def merged_attention(
         real = jnp.ones((B, T), bool) if is_real is None else is_real
         hidden = jnp.zeros((B, T), bool)
         is_zeroed = False
-        if suppressed is not None and jnp.issubdtype(suppressed.keys.dtype, jnp.floating):
-            k = k * (1 - suppressed.active * suppressed.keys).astype(k.dtype)[:, :, None, None]
+        if suppressed is not None and suppressed.are_shares:
+            k = suppressed.scaled(k)
         elif suppressed is not None:
-            hidden = suppressed.keys & suppressed.active
-            is_zeroed = suppressed.suppress == "zero"
+            hidden = suppressed.hidden & suppressed.active
+            is_zeroed = IS_ZEROED[suppressed.suppress]
 
         def one_clip(q, k, v, real, hidden) -> _Merged:
             groups = _groups(k.reshape(T, N * D), kept, real)

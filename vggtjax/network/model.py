@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
@@ -19,15 +19,24 @@ from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, Aggregator, 
 from vggtjax.network.backbone import Backbone, encode, patch_grid
 from vggtjax.network.camera_head import ITERATIONS, CameraHead, predict_pose
 from vggtjax.network.clip_batch import ClipBatch
-from vggtjax.network.dpt_head import DenseHead, predict_dense, project_tap
+from vggtjax.network.dpt_head import DENSE_HEADS, DenseHead, predict_dense, project_tap
 from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
 from vggtjax.network.track_head import TrackHead, check_track_size, predict_tracks, smallest_side
 
-DENSE_HEADS = {"depth": "depth_head", "points": "point_head"}
-HEADS = {"camera": "camera_head", **DENSE_HEADS, "tracks": "track_head"}
+# The modules of all heads in the parameter tree, and the fields of `Predictions` that they fill.
+HEADS = {
+    "camera": "camera_head",
+    **{name: head.module for name, head in DENSE_HEADS.items()},
+    "tracks": "track_head",
+}
+FIELDS = {
+    "camera": ("pose_encoding",),
+    **{name: head.fields for name, head in DENSE_HEADS.items()},
+    "tracks": ("tracks", "track_visibility", "track_confidence"),
+}
 
 
 class Predictions(NamedTuple):
@@ -123,7 +132,7 @@ def predict(
     Outputs that are not requested are not computed.
     """
     grid = patch_grid(clips.images, config)
-    _check(grid, clips, config, outputs)
+    _check(params, grid, clips, config, outputs)
     suppression.check((*clips.images.shape[:2], *grid), config.depth)
     _check_queries(clips, config, outputs, query_points)
     patch_tokens = clips.patch_tokens
@@ -151,27 +160,21 @@ def predict(
         suppression=suppression,
         compute=compute,
     )
+
+    def made_by(name: str) -> tuple[Array, ...]:
+        if name == "camera":
+            computing = {"stop_gradient": compute.stop_camera_gradient, "frames": compute.frames}
+            return (predict_pose(params, camera_tokens, config, frame_count=clips.frame_count, **computing),)
+        head, projected = params[HEADS[name]], [tap[HEADS[name]] for tap in taps]
+        if name == "tracks":
+            return predict_tracks(head, projected, query_points, config, grid, compute.frames)  # type: ignore[arg-type]
+        regress = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4, 5)) if compute.remat else predict_dense
+        values, confidence = regress(head, projected, config, grid, name, compute.precision)
+        return values[..., 0] if DENSE_HEADS[name].values == 1 else values, confidence
+
     fields: dict[str, Any] = {"cue_sums": sums}
-    if "camera" in outputs:
-        fields["pose_encoding"] = predict_pose(
-            params,
-            camera_tokens,
-            config,
-            frame_count=clips.frame_count,
-            stop_gradient=compute.stop_camera_gradient,
-            frames=compute.frames,
-        )
-    regress = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4, 5)) if compute.remat else predict_dense
-    for name, field in (("depth", "depth"), ("points", "world_points")):
-        if name in outputs:
-            head = HEADS[name]
-            projected = [tap[head] for tap in taps]
-            values, confidence = regress(params[head], projected, config, grid, name, compute.precision)
-            fields |= {field: values[..., 0] if name == "depth" else values, f"{field}_confidence": confidence}
-    if query_points is not None:
-        head = HEADS["tracks"]
-        tracks = predict_tracks(params[head], [tap[head] for tap in taps], query_points, config, grid, compute.frames)
-        fields |= zip(("tracks", "track_visibility", "track_confidence"), tracks, strict=True)
+    for name in (name for name in HEADS if name in outputs):
+        fields |= zip(FIELDS[name], made_by(name), strict=True)
     return Predictions(**fields)
 
 
@@ -193,8 +196,7 @@ def _declared(config: VGGTConfig) -> Params:
         patches, taps = (jnp.zeros((1, 1, side * side, width)) for width in (config.embed_dim, config.tap_dim))
         heads = {
             "camera": lambda: declared(CameraHead(config), taps[:, :, 0]),
-            "depth": lambda: declared(DenseHead(config, "depth"), taps, grid, method="declare"),
-            "points": lambda: declared(DenseHead(config, "points"), taps, grid, method="declare"),
+            **{name: partial(declared, DenseHead(config, name), taps, grid, method="declare") for name in DENSE_HEADS},
             "tracks": lambda: declared(TrackHead(config), taps, grid, method="declare"),
         }
         return {
@@ -237,13 +239,13 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
         pose = params["camera_head"]["pose_branch"]["fc2"]
         pose |= {"kernel": 0.1 * pose["kernel"], "bias": jnp.asarray(start, jnp.float32)}
     for name in DENSE_HEADS.keys() & set(config.heads):  # exp of full-size inputs would overflow
-        params[DENSE_HEADS[name]]["regression"]["conv2"]["kernel"] *= 0.01
+        params[HEADS[name]]["regression"]["conv2"]["kernel"] *= 0.01
     if "tracks" in config.heads:
         params["track_head"]["flow_projection"]["kernel"] *= 0.01  # tracks start without motion
     return params
 
 
-def _check(grid: tuple[int, int], clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str]) -> None:
+def _check(params: Params, grid: tuple[int, int], clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str]) -> None:
     if not jnp.issubdtype(clips.images.dtype, jnp.floating):
         raise InputError(f"images have type {clips.images.dtype}; expected floats in [0, 1]: divide bytes by 255")
     tokens_shape = (*clips.images.shape[:2], grid[0] * grid[1], config.embed_dim)
@@ -253,6 +255,9 @@ def _check(grid: tuple[int, int], clips: ClipBatch, config: VGGTConfig, outputs:
         raise InputError(f"frame_count has shape {tuple(clips.frame_count.shape)}; expected {tokens_shape[:1]}")
     if absent := [name for name in outputs if name not in config.heads]:
         raise InputError(f"outputs has {absent}; this model has only the heads {config.heads}")
+    for name in outputs:
+        if HEADS[name] not in params:
+            raise InputError(f"params has no {HEADS[name]!r}; the configuration names the head {name!r}")
 
 
 def _check_queries(clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str], query_points) -> None:

@@ -63,8 +63,8 @@ class Suppression:
         if strength is not None and tuple(strength.shape) != (depth,):
             raise InputError(f"strength has shape {tuple(strength.shape)}; expected {(depth,)}, one for each pair")
 
-    def keys(self, special_tokens: int) -> Bool[Array, "B S T"] | Float[Array, "B S T"] | None:
-        """Return which keys are suppressed, or their shares; never those of the special tokens before the patches."""
+    def hidden_tokens(self, special_tokens: int) -> Bool[Array, "B S T"] | Float[Array, "B S T"] | None:
+        """Return which tokens have suppressed keys, or their shares; never the special tokens before the patches."""
         tokens = self.dynamic_tokens
         if tokens is None:
             return None
@@ -88,9 +88,18 @@ class Suppression:
 class SuppressedKeys:
     """The keys that one block suppresses; `active` is the pair's flag, or the share of the suppression for shares."""
 
-    keys: Bool[Array, "B T"] | Float[Array, "B T"]
+    hidden: Bool[Array, "B T"] | Float[Array, "B T"]
     active: Bool[Array, ""] | Float[Array, ""]
     suppress: Suppress
+
+    @property
+    def are_shares(self) -> bool:
+        """Whether keys are scaled by `scaled`, not hidden as a whole."""
+        return jnp.issubdtype(self.hidden.dtype, jnp.floating)
+
+    def scaled(self, k: Float[Array, "B T N D"]) -> Float[Array, "B T N D"]:
+        """Return the keys, scaled by 1 - their shares."""
+        return k * (1 - self.active * self.hidden).astype(k.dtype)[:, :, None, None]
 
 
 # (q, k, v, suppressed keys, real tokens) -> outputs: `suppressed_attention`, or an approximation of it
@@ -117,19 +126,19 @@ def suppressed_attention(
 
     if suppressed is None:
         return attention(q, k, v, is_real)
-    if jnp.issubdtype(suppressed.keys.dtype, jnp.floating):
-        scale = 1 - suppressed.active * suppressed.keys
-        return attention(q, k * scale.astype(k.dtype)[:, :, None, None], v, is_real)
+    if suppressed.are_shares:
+        return attention(q, suppressed.scaled(k), v, is_real)
 
-    def zero(q, k, v, keys):
-        return attention(q, jnp.where(keys[:, :, None, None], 0, k), v, is_real)
+    def zero(q, k, v, hidden):
+        return attention(q, jnp.where(hidden[:, :, None, None], 0, k), v, is_real)
 
-    def drop(q, k, v, keys):
-        return attention(q, k, v, ~keys if is_real is None else ~keys & is_real)
+    def drop(q, k, v, hidden):
+        return attention(q, k, v, ~hidden if is_real is None else ~hidden & is_real)
 
-    def plain(q, k, v, keys):
+    def plain(q, k, v, hidden):
         return attention(q, k, v, is_real)
 
+    # `network.merging` merges before it suppresses, so it has a table of its own: `IS_ZEROED`.
     masked = {"zero": zero, "drop": drop}[suppressed.suppress]
     with jax.named_scope("suppress"):
-        return jax.lax.cond(suppressed.active, masked, plain, q, k, v, suppressed.keys)
+        return jax.lax.cond(suppressed.active, masked, plain, q, k, v, suppressed.hidden)

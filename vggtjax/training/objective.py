@@ -14,9 +14,9 @@ from vggtjax.config import VGGTConfig
 from vggtjax.network.aggregator import SPECIAL_TOKENS, aggregate
 from vggtjax.network.backbone import encode, patch_grid
 from vggtjax.network.camera_head import predict_pose
-from vggtjax.network.dpt_head import predict_dense, project_tap
+from vggtjax.network.dpt_head import DENSE_HEADS, predict_dense, project_tap
 from vggtjax.network.layers import LayerNorm, Params, apply
-from vggtjax.network.model import DENSE_HEADS
+from vggtjax.network.model import HEADS
 from vggtjax.network.pose import quaternion_to_matrix
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.storage.json_values import Natural, NotNegative, check_fields
@@ -57,6 +57,11 @@ class LossWeights:
     def __post_init__(self) -> None:
         check_fields(self, "losses")
 
+    @property
+    def dense(self) -> tuple[str, ...]:
+        """The dense heads that have a loss: those with a field here, above 0."""
+        return tuple(name for name in DENSE_HEADS if getattr(self, name, 0))
+
 
 def init_probes(seed: int, config: VGGTConfig) -> Params:
     """Return the parameters of the linear read-outs of the taps, all 0."""
@@ -88,14 +93,13 @@ def objective(
     truth = targets(clips)
     paired = matches(clips, config.patch_size)
     counts = _counts(batch, paired)
-    dense = [name for name, weight in (("depth", weights.depth), ("points", weights.points)) if weight]
     matching = MatchLoss(paired, counts, weights.match_layers, config.depth) if weights.match else None
 
     def capture(slot: int):
         @jax.checkpoint  # otherwise the scan stores this in every layer
         def captured(tokens: Float[Array, "B S T E"]) -> dict[str, Array]:
             patches = tokens[:, :, SPECIAL_TOKENS:]
-            outputs = {name: project_tap(model[DENSE_HEADS[name]], patches, slot, config) for name in dense}
+            outputs = {name: project_tap(model[HEADS[name]], patches, slot, config) for name in weights.dense}
             if weights.probe or weights.moments:
                 outputs |= {
                     "patch_probe": _probe(probes["patch"], slot, patches),
@@ -117,11 +121,11 @@ def objective(
     pose = predict_pose(model, camera_tokens, config)
     terms = _camera_terms(pose, truth.pose_encoding, weights)
     metrics = _camera_metrics(pose, truth.pose_encoding)
-    for name in dense:
+    goals = {"depth": truth.depth[..., None], "points": truth.points}
+    for name in weights.dense:
         predict = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4)) if remat else predict_dense
-        values, confidence = predict(model[DENSE_HEADS[name]], [tap[name] for tap in taps], config, grid, name)
-        goal = truth.depth[..., None] if name == "depth" else truth.points
-        terms[name] = getattr(weights, name) * dense_loss(values, confidence, goal, weights.gradient)
+        values, confidence = predict(model[HEADS[name]], [tap[name] for tap in taps], config, grid, name)
+        terms[name] = getattr(weights, name) * dense_loss(values, confidence, goals[name], weights.gradient)
         if name == "depth":
             metrics["depth_error"] = _depth_error(values[..., 0], truth.depth)
             metrics["confidence"] = confidence.mean()

@@ -13,7 +13,7 @@ from msgspec import Meta
 
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError, whole_number
-from vggtjax.network.model import DENSE_HEADS, HEADS
+from vggtjax.network.model import HEADS
 from vggtjax.scenes.config import SceneConfig, Side
 from vggtjax.storage.json_values import (
     Count,
@@ -160,7 +160,7 @@ class Recipe:
         modules = ("backbone", "aggregator", *HEADS.values())
         if unknown := [name for name in self.untrained if name not in modules]:
             raise InputError(f"recipe.untrained has {unknown}; expected some of {modules}")
-        needed = ["camera", *(name for name in DENSE_HEADS if getattr(self.losses, name))]
+        needed = ["camera", *self.losses.dense]
         if absent := [name for name in needed if name not in self.model.heads]:
             raise InputError(
                 f"the model has no head {absent[0]!r}, only {self.model.heads}; training needs 'camera', and "

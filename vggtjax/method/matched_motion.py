@@ -1,4 +1,7 @@
-"""What moves, by matches that do not fit a static world, together with the Gram saliency (not in the papers)."""
+"""The score of motion by matches that do not fit a static world, with the Gram saliency: "4dvggt-m", not in the papers.
+
+The papers' motion cues are `config.MotionConfig` and `method.cues`.
+"""
 
 from __future__ import annotations
 

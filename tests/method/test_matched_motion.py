@@ -10,7 +10,7 @@ import pytest
 from tests.static_world import GRID, PATCH, StaticWorld
 from vggtjax.method.edges import follow_edges
 from vggtjax.method.matched_mask import mine_matched_mask
-from vggtjax.method.motion import motion
+from vggtjax.method.matched_motion import motion
 from vggtjax.network.pose import encode_pose
 
 find = jax.jit(motion, static_argnames="grid")
