@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
-from rich.progress import Progress
+from rich.console import Console
+from rich.progress import Progress, TaskID
 
 from benchmarks.accelerator.programs import PROGRAMS, Compiled, Setup, compile_programs
 from benchmarks.accelerator.targets import TARGETS, target
@@ -21,9 +23,9 @@ from vggtjax.storage.writing import writing
 
 _FULL_FRAME = (392, 518)  # of published figures
 _NOTE = (
-    "Bounds, not times: each kernel takes at least the longer of its products and of its bytes, and 2 us. Products reach "
-    "80 % of the data sheet's peak on tensor cores, 90 % in float32. FLOP: what the arithmetic needs, at the rate of the "
-    "blocks' type; ratio: bound over FLOP; temporary: memory beside inputs and outputs. Nothing was run."
+    "Bounds, not times: each kernel takes at least the longer of its products and of its bytes, and 2 us. Products "
+    "reach 80 % of the data sheet's peak on tensor cores, 90 % in float32. FLOP: what the arithmetic needs, at the "
+    "rate of the blocks' type; ratio: bound over FLOP; temporary: memory beside inputs and outputs. Nothing was run."
 )
 
 
@@ -68,16 +70,8 @@ def accelerator(
     screen = console()
     found: list[dict[str, Any]] = []
     for name in names:
-        rows: list[tuple[Setup, Compiled]] = []
-        with Progress(console=screen, transient=True) as progress:
-            task = progress.add_task(name, total=len(frames) * len(wanted))
-            for count in frames:
-                setup = Setup(target(name), config_of(size), count, *shape, dtype, precision, devices)
-
-                def told(program: str, count: int = count) -> None:
-                    progress.update(task, description=f"{name}, {count} frames: {program}", advance=1)
-
-                rows += [(setup, compiled) for compiled in compile_programs(setup, wanted, told)]
+        setups = [Setup(target(name), config_of(size), count, *shape, dtype, precision, devices) for count in frames]
+        rows = _compiled(setups, wanted, screen)
         title = f"{TARGETS[name].name} x {devices}, {size}, {shape[1]} x {shape[0]} pixels, {dtype}, heads {precision}"
         Sheet(title, _HEADINGS, [_row(setup, compiled) for setup, compiled in rows]).show(screen)
         for setup, compiled in rows if top else []:
@@ -87,6 +81,21 @@ def accelerator(
     if out is not None:
         with writing(out) as temporary:
             temporary.write_text(json.dumps({"note": _NOTE, "jax": jax.__version__, "programs": found}, indent=1))
+
+
+def _compiled(setups: Sequence[Setup], wanted: Sequence[str], screen: Console) -> list[tuple[Setup, Compiled]]:
+    """Return the programs of every setup, with a line about the one that is compiled."""
+    rows: list[tuple[Setup, Compiled]] = []
+    with Progress(console=screen, transient=True) as progress:
+        task = progress.add_task("", total=len(setups) * len(wanted))
+        for setup in setups:
+            told = partial(_tell, progress, task, f"{setup.target.name}, {setup.frames} frames")
+            rows += [(setup, compiled) for compiled in compile_programs(setup, wanted, told)]
+    return rows
+
+
+def _tell(progress: Progress, task: TaskID, where: str, program: str) -> None:
+    progress.update(task, description=f"{where}: {program}", advance=1)
 
 
 _HEADINGS = (
@@ -101,7 +110,7 @@ def at_peak(setup: Setup, compiled: Compiled) -> float | None:
 
 
 def _row(setup: Setup, compiled: Compiled) -> tuple[str, ...]:
-    counted, least = compiled.count, at_peak(setup, compiled)
+    counted, least = compiled.counted, at_peak(setup, compiled)
     return (
         compiled.name,
         str(setup.frames),
@@ -128,14 +137,14 @@ def _kernels(setup: Setup, compiled: Compiled, top: int) -> Sheet:
             number(sum(kernels.flop.values()) / 1e12),
             "/".join(sorted(kernels.flop)),
         )
-        for kernels in compiled.count.longest(top)
+        for kernels in compiled.counted.longest(top)
     ]
     headings = ("kernel", "operation", "ms", "times", "GB", "TFLOP", "type")
     return Sheet(f"{compiled.name}, {setup.frames} frames", headings, rows)
 
 
 def _record(name: str, setup: Setup, compiled: Compiled) -> dict[str, Any]:
-    counted = compiled.count
+    counted = compiled.counted
     facts = dataclasses.asdict(setup) | {"target": name}
     del facts["config"]
     return facts | {

@@ -182,7 +182,7 @@ class _Counter:
         summed = 1
         for axis in re.findall(r"\d+", found.group(1) if found else ""):
             summed *= left.sides[int(axis)]
-        return Counter({_kind(left, instruction.text): 2.0 * instruction.result[0].count * summed})
+        return Counter({_kind(left, instruction.text): 2.0 * instruction.result[0].size * summed})
 
     def _convolution(self, name: str, instruction: Instruction, output: Shape) -> Flop:
         """Count a convolution by its output, or a gradient by the gradient that it reads."""
@@ -191,9 +191,9 @@ class _Counter:
         kernel = instruction.result[0] if "BackwardFilter" in call else self._program.operand(name, instruction, 1)
         if labels is None or "o" not in labels.group(1) or len(kernel.sides) != len(labels.group(1)):
             return Counter()
-        summed = kernel.count / max(kernel.sides[labels.group(1).index("o")], 1)
+        summed = kernel.size / max(kernel.sides[labels.group(1).index("o")], 1)
         read = self._program.operand(name, instruction, 0)
-        return Counter({_kind(read, instruction.text): 2.0 * output.count * summed})
+        return Counter({_kind(read, instruction.text): 2.0 * output.size * summed})
 
     def _attention(self, name: str, instruction: Instruction) -> Flop:
         products = self._attended(name, instruction)
@@ -202,7 +202,7 @@ class _Counter:
     def _attended(self, name: str, instruction: Instruction) -> float:
         """Count both products of attention, whose operands are [B, T, N, D] and [B, K, N, D]."""
         queries, keys = (self._program.operand(name, instruction, i) for i in (0, 1))
-        return 4.0 * queries.count * keys.sides[1]
+        return 4.0 * queries.size * keys.sides[1]
 
     # Bytes.
 

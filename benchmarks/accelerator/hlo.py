@@ -27,14 +27,14 @@ class Shape(NamedTuple):
     sides: tuple[int, ...]
 
     @property
-    def count(self) -> int:
+    def size(self) -> int:
         """The number of its elements."""
         return math.prod(self.sides)
 
     @property
     def bytes(self) -> int:
         """Its size in memory."""
-        return self.count * _BYTES.get(self.dtype, 0)
+        return self.size * _BYTES.get(self.dtype, 0)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The programs of a reconstruction, compiled for a target: the same steps as at a run, with shapes in place of arrays."""
+"""The programs of a reconstruction, compiled for a target: the steps of a run, with shapes in place of arrays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.learning.fit import FitClips, clip_loss
 from vggtjax.method.algorithm import Clips, run_method
-from vggtjax.method.fusion_family import identity
+from vggtjax.method.fusion_family import paper_rule
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.passes import Passes
 from vggtjax.network.clip_batch import ClipBatch
@@ -61,7 +61,7 @@ class Compiled(NamedTuple):
     temporary: int
     outputs: int
     inputs: int
-    count: Count
+    counted: Count
     needed: float | None  # FLOP that the arithmetic needs, where they are known
 
 
@@ -116,9 +116,9 @@ class Compiler:
         lowered = jax.jit(bound).trace(*arguments).lower(lowering_platforms=(platform,))
         program = lowered.compile(compiler_options=_BLIND if platform == "cuda" else None)
         seconds = time.perf_counter() - began
-        memory = program.memory_analysis()
+        memory: Any = program.memory_analysis()
         sizes = (memory.temp_size_in_bytes, memory.output_size_in_bytes, memory.argument_size_in_bytes)
-        counted = count(parse(program.as_text()), self.setup.target, shares_of(self.setup.config))
+        counted = count(parse(program.as_text() or ""), self.setup.target, shares_of(self.setup.config))
         return Compiled(name, seconds, *sizes, counted, self.needed.get(name))
 
     def _placed(self, leaf: Any, spec: PartitionSpec) -> jax.ShapeDtypeStruct:
@@ -199,7 +199,7 @@ def _fusion_gradient(compiler: Compiler, setup: Setup) -> None:
         clip = FitClips(jax.tree.map(lambda x: x[0], observe(read)), truth[0])
         return clip_loss(fusion, clip, "gaussian")
 
-    weights = jax.eval_shape(identity)
+    weights = jax.eval_shape(paper_rule)
     compiler.step("fusion gradient", jax.value_and_grad(loss))(weights, read, jax.ShapeDtypeStruct(shape, jnp.float32))
 
 

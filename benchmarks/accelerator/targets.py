@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import distribution
 from importlib.util import find_spec
@@ -50,7 +50,7 @@ class Target:
     shared: int = 0
     cache: int = 0
 
-    def seconds(self, flop: dict[str, float], moved: float) -> float:
+    def seconds(self, flop: Mapping[str, float], moved: float) -> float:
         """Return the roofline of a kernel: the longer of computing and of moving bytes."""
         return max(sum(amount / self.rate(kind) for kind, amount in flop.items()), moved / self.bandwidth)
 

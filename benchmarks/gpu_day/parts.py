@@ -42,9 +42,8 @@ def main(part: str, size: Any, file: str) -> None:
     """Run a part; its lines go to the file."""
     threading.Thread(target=_end_with_input, daemon=True).start()
     lines = Lines(Path(file))
-    lines.facts(
-        machine=describe(machine()), cudnn="works" if jax.default_backend() == "gpu" and cudnn_works() else "not used"
-    )
+    uses_cudnn = machine()["platform"] == "gpu" and cudnn_works()
+    lines.facts(machine=describe(machine()), cudnn="works" if uses_cudnn else "not used")
     PARTS[part].run(size, lines)
 
 
