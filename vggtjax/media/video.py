@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -14,6 +13,7 @@ from PIL import Image
 
 from vggtjax.errors import ClipError, check_regular
 from vggtjax.media.arrays import frame_name
+from vggtjax.media.colour import Colours, colours_of, rgb_pixels, tags
 from vggtjax.media.sampling import Frame, Sampling
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class VideoFile:
     """A video file; frames are named by their index in it, and times count from its first frame."""
 
     path: Path
-    _odd: set[Fraction] = field(default_factory=set, init=False, repr=False, compare=False)  # aspects warned about
+    _said: set[str] = field(default_factory=set, init=False, repr=False, compare=False)  # warnings, each once
 
     @property
     def name(self) -> str:
@@ -60,7 +60,7 @@ class VideoFile:
 
         try:
             with _opened(self.path, av) as container:
-                stream = _video_stream(container, self.path, self._odd)
+                stream = _video_stream(container, self.path, self._said)
                 if stream.duration is not None and stream.time_base is not None:
                     return float(stream.duration * stream.time_base)
                 return None if container.duration is None else container.duration / 1e6
@@ -76,11 +76,11 @@ class VideoFile:
         import av.error
 
         rotation, matrix = None, np.eye(2)
-        for index, time, frame in sampling.select(_timed(self.path, av, self._odd)):
+        for index, time, (frame, colours) in sampling.select(_timed(self.path, av, self._said)):
             if frame.rotation != rotation:  # asking a frame for its matrix keeps it alive until garbage is collected
                 rotation, matrix = frame.rotation, _display_matrix(frame, self.path)
             try:
-                pixels = frame.to_ndarray(format="rgb24")
+                pixels = rgb_pixels(frame, colours)
             except (av.error.FFmpegError, ValueError) as error:
                 raise _unreadable(self.path, index, error) from error
             yield Frame(frame_name(index), Image.fromarray(upright(pixels, matrix)), time)
@@ -132,12 +132,13 @@ def _opened(path: Path, av: ModuleType) -> InputContainer:
     return av.open(str(path.absolute()), **options)
 
 
-def _timed(path: Path, av: ModuleType, odd: set[Fraction]) -> Iterator[tuple[float, VideoFrame]]:
-    """Yield (seconds since the first frame, frame) of every frame of the file's best video stream."""
+def _timed(path: Path, av: ModuleType, said: set[str]) -> Iterator[tuple[float, tuple[VideoFrame, Colours]]]:
+    """Yield (seconds since the first frame, frame and its colours) of every frame of the file's best video stream."""
     count, first = 0, 0.0
     try:
         with _opened(path, av) as container:
-            stream = _video_stream(container, path, odd)
+            stream = _video_stream(container, path, said)
+            container_tags = tags(stream.codec_context)
             for frame in _decoded(container, stream):
                 if frame.pts is None or stream.time_base is None:
                     raise ClipError(f"frame {count} of video {path} has no presentation time; write the video as MP4")
@@ -150,12 +151,25 @@ def _timed(path: Path, av: ModuleType, odd: set[Fraction]) -> Iterator[tuple[flo
                 if count == 0:
                     first = time
                 count += 1
-                yield time - first, frame
+                yield time - first, (frame, _known_colours(frame, container_tags, path, said))
     except (av.error.FFmpegError, OSError, EOFError) as error:
         raise _unreadable(path, count, error) from error
 
 
-def _video_stream(container: InputContainer, path: Path, odd: set[Fraction]) -> VideoStream:
+def _known_colours(frame: VideoFrame, container_tags: tuple[int, int, int], path: Path, said: set[str]) -> Colours:
+    """Return the colours of a frame and log what is done to them. Raises ClipError for such as cannot be read."""
+    colours = colours_of(frame, container_tags)
+    if not colours.is_readable:
+        raise ClipError(
+            f"video {path} has colours in ICtCp or IPT, such as of Dolby Vision's profile 5; expected YCbCr or RGB, "
+            "write it anew as SDR"
+        )
+    if colours.note is not None:
+        _say(path, colours.note, said)
+    return colours
+
+
+def _video_stream(container: InputContainer, path: Path, said: set[str]) -> VideoStream:
     from av.stream import Disposition
 
     stream = cast("VideoStream | None", container.streams.best("video"))
@@ -172,10 +186,16 @@ def _video_stream(container: InputContainer, path: Path, odd: set[Fraction]) -> 
     decoder.options = {"max_pixels": str(most)}  # also of sizes that the frames themselves say
     stream.thread_type = "AUTO"
     aspect = stream.sample_aspect_ratio
-    if aspect not in (None, 0, 1) and aspect not in odd:
-        odd.add(aspect)
-        logger.warning("%s has pixels of aspect %s; they are taken as square", path, aspect)
+    if aspect not in (None, 0, 1):
+        _say(path, f"has pixels of aspect {aspect}; they are taken as square", said)
     return stream
+
+
+def _say(path: Path, note: str, said: set[str]) -> None:
+    """Log what is odd about a video, once."""
+    if note not in said:
+        said.add(note)
+        logger.warning("%s %s", path, note)
 
 
 def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
