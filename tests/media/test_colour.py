@@ -1,6 +1,7 @@
 """Colours of videos: HDR and wide gamuts as sRGB, and videos that do not say what their numbers mean."""
 
 from fractions import Fraction
+from typing import Any
 
 import av
 import numpy as np
@@ -61,7 +62,7 @@ def write(path, rgb, matrix, codec="libx264", pixel="yuv444p10le", tags=(None, N
     """Write frames of values in [0, 1] by a codec; `tags` are the matrix, transfer and primaries that the file says."""
     bits = 10 if "p10" in pixel else 8
     with av.open(str(path), "w") as container:
-        stream = container.add_stream(codec, rate=10, options=options)
+        stream: Any = container.add_stream(codec, rate=10, options=options)
         stream.height, stream.width = rgb.shape[:2]
         stream.pix_fmt, stream.codec_context.time_base = pixel, Fraction(1, 10)
         stream.codec_context.color_range = 1
@@ -71,12 +72,12 @@ def write(path, rgb, matrix, codec="libx264", pixel="yuv444p10le", tags=(None, N
         y, cb, cr = planes(rgb, matrix, bits)
         if "420" in pixel:
             cb, cr = (plane.reshape(len(y) // 2, 2, -1, 2).mean(axis=(1, 3)).round() for plane in (cb, cr))
-        frame = VideoFrame(*rgb.shape[1::-1], pixel)
+        frame = VideoFrame(rgb.shape[1], rgb.shape[0], pixel)
         for plane, values in zip(frame.planes, (y, cb, cr), strict=True):
             values = values.astype(np.uint16 if bits > 8 else np.uint8)
             row = np.zeros((plane.height, plane.line_size // values.itemsize), values.dtype)
             row[:, : plane.width] = values
-            plane.update(row)
+            plane.update(row.tobytes())
         for index in range(2):
             frame.pts, frame.time_base = index, Fraction(1, 10)
             for name, tag in zip(("colorspace", "color_trc", "color_primaries"), tags, strict=True):
@@ -109,9 +110,19 @@ def test_colours_come_out_as_srgb(tmp_path, caplog, transfer, primaries, ending,
     quality = {"libx264": {"crf": "0"}, "libx265": {"x265-params": "lossless=1:log-level=0"}, "libsvtav1": {"crf": "5"}}
     path, matrix = tmp_path / f"a.{ending}", 9 if primaries == 9 else 1
     sdr = chart()
-    write(path, coded(sdr, transfer, primaries), matrix, codec, pixel, (matrix, transfer, primaries), **quality.get(codec, {}))
+    write(
+        path,
+        coded(sdr, transfer, primaries),
+        matrix,
+        codec,
+        pixel,
+        (matrix, transfer, primaries),
+        **quality.get(codec, {}),
+    )
     difference = np.abs(first(path) - sdr)
-    inner = np.concatenate([difference[4:28, 16 * number + 4 : 16 * number + 12] for number in range(6)])  # chroma bleeds
+    inner = np.concatenate(
+        [difference[4:28, 16 * number + 4 : 16 * number + 12] for number in range(6)]
+    )  # chroma bleeds
     assert inner.max() <= 4
     assert difference[36:].max() <= 8
     said = caplog.messages
@@ -146,6 +157,8 @@ def test_highlights_roll_off(tmp_path, transfer):
 )
 def test_videos_without_colour_tags(tmp_path, caplog, size, tag, expected):
     green = np.broadcast_to(np.array([40, 180, 40]) / 255, (*size, 3))
-    path = write(tmp_path / "a.mp4", green, expected, "libx264", "yuv420p", (tag, None, None), crf="5", preset="ultrafast")
+    path = write(
+        tmp_path / "a.mp4", green, expected, "libx264", "yuv420p", (tag, None, None), crf="5", preset="ultrafast"
+    )
     assert np.abs(first(path)[8:-8, 8:-8] - (40, 180, 40)).max() <= 4
     assert not caplog.messages

@@ -85,10 +85,10 @@ def tags(decoder: VideoCodecContext) -> tuple[int, int, int]:
 
 def rgb_pixels(frame: VideoFrame, colours: Colours) -> np.ndarray:
     """Return the pixels of a frame as sRGB, uint8 [H, W, 3]. Raises what the decoder raises."""
-    matrix = {} if colours.matrix in (None, frame.colorspace) else {"src_colorspace": _swscale(colours.matrix)}
+    matrix = None if colours.matrix in (None, frame.colorspace) else _swscale(colours.matrix)
     if colours.is_plain:
-        return frame.to_ndarray(format="rgb24", **matrix)
-    pixels = frame.to_ndarray(format="rgb48le", **matrix)
+        return frame.to_ndarray(format="rgb24", src_colorspace=matrix)
+    pixels = frame.to_ndarray(format="rgb48le", src_colorspace=matrix)
     rows = max(1, _BAND // pixels.shape[1])
     bands = [_to_srgb(pixels[row : row + rows], colours) for row in range(0, len(pixels), rows)]
     return np.concatenate(bands)
@@ -103,7 +103,7 @@ def _to_srgb(values: np.ndarray, colours: Colours) -> np.ndarray:
     """Return coded values, uint16 [H, W, 3], as sRGB in 8 bits."""
     light, peak = _linear(colours.transfer)[values], np.float32(_PEAKS.get(colours.transfer, 1))
     if colours.transfer == _HLG:
-        luminance = light @ np.float32(_XYZ.get(colours.primaries, _XYZ[_BT709])[1])
+        luminance = light @ np.array(_XYZ.get(colours.primaries, _XYZ[_BT709])[1], np.float32)
         light *= luminance[..., None] ** np.float32(_HLG_GAMMA - 1) * peak
     if colours.primaries in (_BT2020, _P3):
         light = light @ _to_bt709(colours.primaries).T

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
 
     from av import VideoCodecContext, VideoFrame, VideoStream
     from av.container import InputContainer
+    from av.filter import Graph
     from av.stream import Stream
 
 logger = logging.getLogger(__name__)
@@ -34,6 +37,7 @@ _SUFFIXES = (
 _CONTAINERS = "mov,matroska,avi,mpeg,mpegts,asf,flv,ogg,mxf,gif"
 _MOST_PIXELS = 2**27  # of one frame; 15360 x 8640 is below it
 _ALWAYS_PIXELS, _MOST_PIXELS_A_BYTE = 2**23, 10_000  # of a frame in any file, 3840 x 2160; and by the file's size
+_LEAST_DEINTERLACED = 4  # lines and columns; the filter refuses smaller frames
 _EXACT_CONTAINERS = frozenset(("mov", "matroska", "avi"))  # their stated length is reliable
 _MISSING_END = 0.5  # seconds by which a whole file may end before its stated length
 
@@ -139,15 +143,16 @@ def _timed(path: Path, av: ModuleType, said: set[str]) -> Iterator[tuple[float, 
         with _opened(path, av) as container:
             stream = _video_stream(container, path, said)
             container_tags = tags(stream.codec_context)
-            for frame in _decoded(container, stream):
-                if frame.pts is None or stream.time_base is None:
+            for frame in _progressive(_decoded(container, stream), stream, path, said):
+                unit = frame.time_base or stream.time_base  # the last frames of a damaged file have none
+                if frame.pts is None or unit is None:
                     raise ClipError(f"frame {count} of video {path} has no presentation time; write the video as MP4")
                 if frame.width * frame.height > _MOST_PIXELS:
                     raise ClipError(
                         f"video {path} has frames of {frame.width} x {frame.height}; expected at most {_MOST_PIXELS} "
                         f"pixels, make them smaller"
                     )
-                time = float(frame.pts * stream.time_base)
+                time = float(frame.pts * unit)
                 if count == 0:
                     first = time
                 count += 1
@@ -196,6 +201,48 @@ def _say(path: Path, note: str, said: set[str]) -> None:
     if note not in said:
         said.add(note)
         logger.warning("%s %s", path, note)
+
+
+def _progressive(frames: Iterator[VideoFrame], stream: VideoStream, path: Path, said: set[str]) -> Iterator[VideoFrame]:
+    """Yield frames as they are up to the first interlaced one; from there on those that are lose their combs.
+
+    Each pair of fields becomes one frame, at the time of the first field.
+    """
+    for frame in frames:
+        if frame.interlaced_frame and min(frame.width, frame.height) >= _LEAST_DEINTERLACED:
+            _say(path, "is interlaced; its frames are deinterlaced, one for each pair of fields", said)
+            yield from _deinterlaced(chain([frame], frames), stream)
+            return
+        yield frame
+
+
+def _deinterlaced(frames: Iterator[VideoFrame], stream: VideoStream) -> Iterator[VideoFrame]:
+    """Yield the frames with those that are interlaced made whole by FFmpeg's bwdif; it runs a frame behind."""
+    from av.filter import Graph
+
+    graph, shape = None, None
+    for frame in frames:
+        now = (frame.width, frame.height, frame.format.name)
+        if graph is None or now != shape:
+            if graph is not None:
+                yield from _filtered(graph, None)
+            graph, shape = Graph(), now
+            source = graph.add_buffer(template=stream, width=frame.width, height=frame.height, format=frame.format)
+            graph.link_nodes(source, graph.add("bwdif", "mode=send_frame:deint=interlaced"), graph.add("buffersink"))
+            graph.configure()
+        yield from _filtered(graph, frame)
+    if graph is not None:
+        yield from _filtered(graph, None)
+
+
+def _filtered(graph: Graph, frame: VideoFrame | None) -> Iterator[VideoFrame]:
+    """Yield what a graph gives after a frame, or after the last one."""
+    import av.error
+
+    graph.vpush(frame)
+    with suppress(av.error.BlockingIOError, av.error.EOFError):  # it needs more, or has no more
+        while True:
+            yield graph.vpull()
 
 
 def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
