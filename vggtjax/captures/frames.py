@@ -37,7 +37,7 @@ class CaptureFrames(ImageFiles):
         for index in self._taken(sampling):
             time = None if times is None else float(times[index] - times[0])
             with self.capture.naming_files():
-                image = read_image(self.paths[index])
+                image = read_image(self.paths[index], self._said)
             yield Frame(self.frame_names[index], image, time)
 
     def _taken(self, sampling: Sampling) -> list[int]:

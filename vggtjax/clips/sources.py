@@ -15,7 +15,9 @@ from PIL import Image, ImageOps
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, find_capture
 from vggtjax.clips.manifest import MOST_BYTES, is_manifest, read_manifest, source_name
+from vggtjax.clips.mixture import check_frames, odd_ones
 from vggtjax.errors import ClipError, InputError, reading
+from vggtjax.media.animation import Animation, is_animation
 from vggtjax.media.arrays import ArrayFrames
 from vggtjax.media.images import ImageFiles, is_image_name, to_rgb
 from vggtjax.media.order import natural_key
@@ -131,9 +133,18 @@ def _from_path(name: str) -> Source:
         if path.exists():
             raise ClipError(f"{path} is neither a file nor a folder; expected images or a video")
         if glob.has_magic(name) and "://" not in name:
-            matches = [Path(match) for match in glob.glob(name, recursive=True)]  # noqa: PTH207 - absolute patterns too
+            found = glob.glob(_pattern(path), recursive=True)  # noqa: PTH207 - absolute patterns too
+            matches = [Path(match) for match in found]
             return _images(matches, f"pattern {name} matches", "expected images")
     raise _missing(name)
+
+
+def _pattern(path: Path) -> str:
+    """Return a pattern with the signs in the names of folders that are there escaped: a[1] may be a folder's name."""
+    there = next(parent for parent in path.parents if parent.is_dir() or parent == parent.parent)
+    if there == Path():
+        return str(path)
+    return os.path.join(glob.escape(str(there)), path.relative_to(there))  # noqa: PTH118
 
 
 def _capture(path: Path) -> CaptureFrames | None:
@@ -152,7 +163,7 @@ def _missing(name: str) -> ClipError:
 
 def _from_file(path: Path) -> Source:
     if is_image_name(path):
-        return ImageFiles((path.absolute(),))
+        return Animation(path.absolute()) if is_animation(path) else ImageFiles((path.absolute(),))
     if is_video_name(path):
         return VideoFile(path.absolute())
     raise ClipError(f"{path} has the name of neither an image nor a video; expected one such as .png, .jpg or .mp4")
@@ -168,11 +179,16 @@ def _from_list(paths: list[Path]) -> Source:
 
 
 def _images(paths: list[Path], place: str, advice: str) -> Source:
-    """Return the image files among `paths` in natural order, absolute; names that tie keep a fixed order."""
-    images = [path.absolute() for path in paths if is_image_name(path) and path.is_file()]
+    """Return the image files among `paths` in natural order, absolute; names that tie keep a fixed order.
+
+    Raises ClipError where there are none, or several for each frame.
+    """
+    entries = sorted((path.absolute() for path in paths), key=lambda path: (natural_key(path), str(path)))
+    images = [path for path in entries if is_image_name(path) and path.is_file()]
     if not images:
         raise ClipError(f"{place} no images{_inventory(paths)}; {advice}")
-    return ImageFiles(tuple(sorted(images, key=lambda path: (natural_key(path), str(path)))))
+    check_frames(images, place)
+    return ImageFiles(tuple(images), notes=odd_ones(entries, images))
 
 
 def _inventory(entries: list[Path]) -> str:

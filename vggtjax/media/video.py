@@ -16,6 +16,7 @@ from PIL import Image
 from vggtjax.errors import ClipError, check_regular
 from vggtjax.media.arrays import frame_name
 from vggtjax.media.colour import Colours, colours_of, rgb_pixels, tags
+from vggtjax.media.images import check_not_empty
 from vggtjax.media.sampling import Frame, Sampling
 
 if TYPE_CHECKING:
@@ -129,6 +130,8 @@ def _display_matrix(frame: VideoFrame, path: Path) -> np.ndarray:
 def _opened(path: Path, av: ModuleType) -> InputContainer:
     """Return the opened file, of one of the `_CONTAINERS` only."""
     check_regular(path, ClipError)
+    if path.exists():
+        check_not_empty(path)
     options: dict[str, Any] = {"container_options": {"format_whitelist": _CONTAINERS}}
     if int(av.__version__.split(".")[0]) < 19:  # later ones never fail on titles in odd encodings
         options["metadata_errors"] = "replace"
