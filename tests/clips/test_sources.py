@@ -10,7 +10,7 @@ from vggtjax.clips.sources import open_source
 from vggtjax.errors import ClipError
 from vggtjax.media.arrays import ArrayFrames
 from vggtjax.media.images import ImageFiles
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.media.sampling import Sampling
 from vggtjax.media.video import VideoFile
 
@@ -35,9 +35,27 @@ def names(source):
 def test_natural_order():
     ordered = ["2", "10", "a1b2", "a1b10", "a02", "a10", "B1"]
     shuffled = [Path(name) for name in ("B1", "a10", "10", "a1b10", "2", "a02", "a1b2")]
-    assert [path.name for path in sorted(shuffled, key=natural_key)] == ordered
-    assert natural_key(Path("cam2/frame_10")) < natural_key(Path("cam10/frame_2"))
-    sorted([Path("1"), Path("a"), Path("1a"), Path("²"), Path("٣")], key=natural_key)  # other digits do not break it
+    assert [path.name for path in in_order(shuffled)] == ordered
+    assert in_order(["cam10/frame_2", "cam2/frame_10"], Path) == ["cam2/frame_10", "cam10/frame_2"]
+    in_order([Path("1"), Path("a"), Path("1a"), Path("²"), Path("٣")])  # other digits do not break it
+
+
+@pytest.mark.parametrize(
+    "ordered",
+    [
+        ["1700000000.05.png", "1700000000.1.png", "1700000000.15.png", "1700000000.2.png", "1700000001.png"],
+        ["0.0.jpg", "0.033333.jpg", "0.1.jpg", "0.25.jpg", "9.5.jpg", "10.05.jpg"],
+        ["rgb_1305031102.175304.png", "rgb_1305031102.21.png", "rgb_1305031102.3.png"],
+        ["t=0.5s.png", "t=0.75s.png", "t=1s.png", "t=1.25s.png"],
+        ["1700000000.05", "1700000000.1", "1700000000.15"],  # folders
+        ["shot1.8.png", "shot1.9.png", "shot1.10.png", "shot1.11.png"],  # counted on
+        ["v1.2.9.png", "v1.2.10.png"],
+        ["1.0009.png", "1.0010.png"],
+    ],
+)
+def test_decimal_names_by_value(ordered):
+    assert in_order(sorted(ordered, reverse=True), Path) == ordered
+    assert [path.name for path in in_order(Path("a2.10") / name for name in sorted(ordered))] == ordered
 
 
 def test_folder(folder):

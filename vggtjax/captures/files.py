@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path, PureWindowsPath
 
 from vggtjax.errors import InputError, one_line, reading
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 
 _MOST_BYTES = 2**28  # of a file
 
@@ -13,7 +13,7 @@ _MOST_BYTES = 2**28  # of a file
 def files(folder: Path, ending: str) -> dict[str, Path]:
     """Return files by their names without `ending`, in natural order; none if the folder is missing."""
     paths = [path for path in folder.glob(f"*{ending}") if path.is_file() and not path.name.startswith(".")]
-    return {path.name.removesuffix(ending): path for path in sorted(paths, key=natural_key)}
+    return {path.name.removesuffix(ending): path for path in in_order(paths)}
 
 
 def inside(folder: Path, name: str, source: Path) -> Path:

@@ -20,7 +20,7 @@ from vggtjax.errors import ClipError, InputError, reading
 from vggtjax.media.animation import Animation, is_animation
 from vggtjax.media.arrays import ArrayFrames
 from vggtjax.media.images import ImageFiles, is_image_name, to_rgb
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.media.sampling import Source
 from vggtjax.media.video import VideoFile, is_video_name
 from vggtjax.storage.remote import check_url, download, is_url, list_url, local_path, shown, url_name
@@ -85,7 +85,7 @@ def _at_path(text: str) -> list[tuple[str, str]]:
             raise _missing(text)
         if is_manifest(text) and path.is_file():
             return list(read_manifest(path).items())
-        entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
+        entries = in_order(path.iterdir()) if path.is_dir() else [path]
         whole = not path.is_dir() or any(is_image_name(entry) for entry in entries) or bool(capture_kind(path))
         clips = [path] if whole else [entry for entry in entries if _is_clip(entry)]
         return [(clip.resolve().name if clip.is_dir() else clip.stem, str(clip)) for clip in clips]
@@ -105,7 +105,7 @@ def _at_url(url: str) -> list[tuple[str, str]]:
     entries = [] if _is_clip_file(name) or is_image_name(name) else list_url(url, ClipError)
     if not entries or any(is_image_name(Path(entry.name)) for entry in entries):
         return [(source_name(url), url)] if entries or name.suffix else []
-    entries.sort(key=lambda entry: natural_key(Path(entry.name)))
+    entries = in_order(entries, lambda entry: Path(entry.name))
     clips = [e.url for e in entries if not e.name.startswith(".") and (e.is_folder or _is_clip_file(Path(e.name)))]
     return [(source_name(clip), clip) for clip in clips]
 
@@ -183,7 +183,7 @@ def _images(paths: list[Path], place: str, advice: str) -> Source:
 
     Raises ClipError where there are none, or several for each frame.
     """
-    entries = sorted((path.absolute() for path in paths), key=lambda path: (natural_key(path), str(path)))
+    entries = in_order(path.absolute() for path in paths)
     images = [path for path in entries if is_image_name(path) and path.is_file()]
     if not images:
         raise ClipError(f"{place} no images{_inventory(paths)}; {advice}")
@@ -194,7 +194,7 @@ def _images(paths: list[Path], place: str, advice: str) -> Source:
 def _inventory(entries: list[Path]) -> str:
     """Return in words, after a comma, the number of folders, videos and other files, and up to three names of each."""
     names: dict[str, list[str]] = {"folder": [], "video": [], "other file": []}
-    for entry in sorted(entries, key=natural_key):
+    for entry in in_order(entries):
         names["folder" if entry.is_dir() else "video" if is_video_name(entry) else "other file"].append(entry.name)
     found = [
         f"{len(some)} {kind}{'s' if len(some) > 1 else ''} ({', '.join(some[:3])}{', ...' if len(some) > 3 else ''})"

@@ -25,7 +25,7 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
 from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, depth_reader, mask_reader
 from vggtjax.media.images import is_image_name
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.storage.trajectories import read_numbers, read_trajectory
 
 _NEW_TAKE = 10.0  # times the median step of the camera: a jump between two takes
@@ -98,7 +98,7 @@ def _pictures(folder: Path) -> list[Path]:
         raise InputError(f"{place} holds no pictures; expected one for each frame")
     if len({path.stem for path in pictures}) < len(pictures):
         raise InputError(f"{place} holds two pictures of one name; expected one for each frame")
-    return sorted(pictures, key=natural_key)
+    return in_order(pictures)
 
 
 def _poses(folder: Path) -> Float64[np.ndarray, "S 4 4"] | None:
