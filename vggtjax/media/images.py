@@ -6,6 +6,7 @@ import functools
 import logging
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,6 +28,7 @@ FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP", "PPM", "WEBP", "TGA", "JPEG2000"
 _MOST_PIXELS_A_BYTE, _ALWAYS_PIXELS = 10_000, 2**24
 _LITTLE_SHRUNK: dict[str, int] = dict.fromkeys(("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA"), 2**22)
 
+ORIENTATION = 0x0112  # of EXIF; from 5 on, width and height are swapped
 _DARK = 16  # of 255: the most that a picture of 12 bits has when it is stored in 16
 _SEVERAL = ("MPO",)  # formats whose further pictures are previews of the first
 
@@ -117,6 +119,22 @@ def check_not_empty(path: Path) -> None:
     """Raise ClipError for a file without bytes."""
     if path.stat().st_size == 0:
         raise ClipError(f"{path} is empty (0 bytes); get it whole, or leave it out")
+
+
+def stored_orientation(path: Path) -> int:
+    """Return EXIF's orientation of the stored pixels, 1 for pictures that are stored upright or cannot be read."""
+    with suppress(*UNREADABLE), Image.open(path, formats=known_formats()) as image:
+        return int(image.info.get("original_orientation") or image.getexif().get(ORIENTATION, 1))  # of HEIF, of others
+    return 1
+
+
+def turned(values: np.ndarray, orientation: int) -> np.ndarray:
+    """Return stored values [H, W] as they are shown with an orientation of EXIF, a view [H, W] or [W, H]."""
+    if orientation in (5, 6, 7, 8):  # across the diagonal
+        values = values.T
+    if orientation in (2, 3, 6, 7):
+        values = values[:, ::-1]
+    return values[::-1] if orientation in (3, 4, 7, 8) else values
 
 
 def check_pixels(image: Image.Image, path: Path, error: type[InputError] = ClipError) -> None:
