@@ -200,13 +200,11 @@ def test_pictures_stored_upside_down_are_refused(tmp_path):
         read(folder)
 
 
-@pytest.mark.parametrize("kind", ["nerfstudio", "colmap", "polycam"])
+@pytest.mark.parametrize("kind", ["nerfstudio", "colmap"])
 @pytest.mark.parametrize("orientation", [6, 8])
 def test_cameras_of_stored_pixels_name_exif(tmp_path, kind, orientation):
     folder = write(kind, tmp_path / "scene")
-    path = next(
-        path for path in sorted(folder.rglob("*.*")) if path.suffix in (".png", ".jpg") and path.parent.name != "depth"
-    )
+    path = next(folder.rglob("*.png"))
     with Image.open(path) as opened:
         opened.load()
         opened.getexif()[0x0112] = orientation

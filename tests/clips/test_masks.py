@@ -1,5 +1,7 @@
 """Masks that a user brings: names, order, crop and padding, and what the pipeline does with them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from PIL import Image, ImageOps
@@ -107,7 +109,7 @@ def test_given_masks_replace_the_mined_ones():
         reconstruct(model, clip, size=56, masks=masks[:2])
 
 
-def box(value, background=0, dtype=np.uint8):
+def box(value, background=0, dtype: Any = np.uint8):
     """Return 28 x 56 values with a box, and where the box is."""
     values = np.full((28, 56), background, dtype)
     values[4:12, 8:20] = value
@@ -178,8 +180,8 @@ def test_frames_that_exif_turns(tmp_path, caplog, orientation, of):
     for name in ("frames", "masks"):
         (tmp_path / name).mkdir()
     stored.save(tmp_path / "frames/0.png", exif=tags)
-    mask, options = (shown, {}) if of == "shown" else (stored, {"exif": tags} if of == "exif" else {})
-    mask.save(tmp_path / "masks/0.png", **options)
+    options: dict[str, Any] = {"exif": tags} if of == "exif" else {}
+    (shown if of == "shown" else stored).save(tmp_path / "masks/0.png", **options)
     clip = load_clip(tmp_path / "frames", size=56, mode="pad")
     (found,) = load_masks(tmp_path / "masks", clip)
     ambiguous = orientation in (2, 3, 4)
