@@ -35,6 +35,6 @@ def read_bytes(path: Path) -> bytes:
 def read_text(path: Path) -> str:
     """Return the content of a text file; raises InputError as `read_bytes`, and for bytes that are not UTF-8."""
     try:
-        return read_bytes(path).decode("utf-8")
+        return read_bytes(path).decode("utf-8-sig")  # Windows puts a mark of its byte order first
     except UnicodeDecodeError:
         raise InputError(f"{path} is not a text file; expected UTF-8") from None
