@@ -27,6 +27,11 @@ class CaptureFrames(ImageFiles):
         """Those of the capture."""
         return self.capture.frame_names
 
+    @property
+    def first_time(self) -> float | None:
+        """The time of the capture's first frame by its own clock, in seconds; times of frames count from it."""
+        return None if self.capture.timestamps is None else float(self.capture.timestamps[0])
+
     def total(self, sampling: Sampling) -> int:
         """Return how many frames `sampling` takes."""
         return len(self._taken(sampling))
