@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.clips.sources import open_source
+from vggtjax.clips.sources import clips_by_name, open_source
 from vggtjax.errors import ClipError
 from vggtjax.media.arrays import ArrayFrames
 from vggtjax.media.images import ImageFiles
@@ -113,3 +113,21 @@ def test_a_list_of_pil_images_is_read_like_their_files():
     assert [frame.image.getpixel((0, 0)) for frame in frames] == [(255, 255, 255), (7, 7, 7)]
     arrays = np.zeros((2, 4, 5, 3), np.uint8)
     assert all(isinstance(open_source(given), ArrayFrames) for given in (arrays, list(arrays), tuple(arrays)))
+
+
+def test_links_are_named_as_they_are(tmp_path, monkeypatch):
+    for name in ("x/rgb", "y/rgb"):
+        (tmp_path / name).mkdir(parents=True)
+        for number in (0, 1):
+            Image.new("RGB", (28, 14)).save(tmp_path / name / f"{number}.png")
+    video = tmp_path / "x/video.mp4"
+    video.write_bytes(b"x")
+    links = tmp_path / "links"
+    links.mkdir()
+    for name, target in (("a", "x/rgb"), ("b", "y/rgb"), ("c.mp4", "x/video.mp4"), ("d", "a")):
+        (links / name).symlink_to(tmp_path / target if "/" in target else links / target)
+    assert list(clips_by_name([str(links)])) == ["a", "b", "c", "d"]
+    assert list(clips_by_name([str(links / "b"), f"{links}/a/"])) == ["b", "a"]
+    assert open_source(links / "a").name == "a"
+    monkeypatch.chdir(tmp_path / "x/rgb")
+    assert list(clips_by_name(["."])) == ["rgb"]

@@ -16,6 +16,11 @@ def files(folder: Path, ending: str) -> dict[str, Path]:
     return {path.name.removesuffix(ending): path for path in in_order(paths)}
 
 
+def folder_name(path: Path) -> str:
+    """Return the name by which a folder was named: a link's own; that of the folder itself for "." and ".."."""
+    return path.name if path.name not in ("", "..") else path.resolve().name
+
+
 def inside(folder: Path, name: str, source: Path) -> Path:
     """Return the path of a name from the file `source`; raises InputError for a path outside `folder`."""
     path = PureWindowsPath(name)  # with slashes, backslashes and drives

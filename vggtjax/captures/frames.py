@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from vggtjax.captures.capture import Capture
+from vggtjax.captures.files import folder_name
 from vggtjax.media.images import ImageFiles, read_image
 from vggtjax.media.sampling import Frame, Sampling
 
@@ -19,8 +20,8 @@ class CaptureFrames(ImageFiles):
     @property
     def name(self) -> str:
         """The name of the capture's folder, or of its file without the suffix."""
-        path = self.capture.path.resolve()
-        return path.name if self.capture.path.is_dir() else path.stem
+        path = self.capture.path
+        return folder_name(path) if path.is_dir() else path.stem
 
     @property
     def frame_names(self) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from PIL import Image, ImageOps
 
+from vggtjax.captures.files import folder_name
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, find_capture
 from vggtjax.clips.manifest import MOST_BYTES, is_manifest, read_manifest, source_name
@@ -88,7 +89,7 @@ def _at_path(text: str) -> list[tuple[str, str]]:
         entries = in_order(path.iterdir()) if path.is_dir() else [path]
         whole = not path.is_dir() or any(is_image_name(entry) for entry in entries) or bool(capture_kind(path))
         clips = [path] if whole else [entry for entry in entries if _is_clip(entry)]
-        return [(clip.resolve().name if clip.is_dir() else clip.stem, str(clip)) for clip in clips]
+        return [(folder_name(clip) if clip.is_dir() else clip.stem, str(clip)) for clip in clips]
 
 
 def _at_url(url: str) -> list[tuple[str, str]]:

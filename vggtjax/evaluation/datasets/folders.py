@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from vggtjax.captures.files import folder_name
 from vggtjax.errors import InputError
 from vggtjax.media.order import in_order
 
@@ -23,7 +24,7 @@ def sequence_folders(root: Path, holds: Callable[[Path], bool], expected: str, l
     Raises InputError if there is no sequence.
     """
     if holds(root):
-        return {root.resolve().name: root}
+        return {folder_name(root): root}
     parents, folders = [root], {}
     for _ in range(levels):
         children = [child for parent in parents for child in subfolders(parent)]
