@@ -2,11 +2,11 @@
 
 Clips of `vggtjax scenes` are read too: images/, intrinsics.txt and trajectory.txt stand for the first and the last two.
 
-Depth is PNG of 16 bits in millimetres, .npy in metres (in millimetres, if of whole numbers) or .exr in metres, 0 where it
+Depth is PNG of 16 bits in millimetres, .npy in metres (of whole numbers: in millimetres) or .exr in metres, 0 where it
 is unknown; masks are pictures of any kind, bright where the world moves. K.txt has three rows of three numbers for all
-frames, or three rows for each; world_from_camera.txt a row of 16 numbers for
-each frame, or of 12 as KITTI's, in metres. Intrinsics are not shifted by half a pixel: the pixel origin of the HoloLens
-is unknown, and half a pixel is below the accuracy of its poses and depth.
+frames, or three rows for each; world_from_camera.txt a row of 16 numbers for each frame, or of 12 as KITTI's, in
+metres. Intrinsics are not shifted by half a pixel: the pixel origin of the HoloLens is unknown, and half a pixel is
+below the accuracy of its poses and depth.
 """
 
 from __future__ import annotations
