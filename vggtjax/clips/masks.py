@@ -36,7 +36,7 @@ _WHITE = 127  # above it, a pixel of a picture in grey or colour moves
 _LABELS = ("P", "1")  # modes whose values are numbers of objects, not brightness
 _DEEP_LABELS = ("I", "I;16", "I;16B", "I;16L", "I;16N")  # and of 16 or 32 bits, unless white is their brightest
 _DEEP_WHITE = 65535
-_SAME_SHAPE = (2, 3, 4)  # orientations of EXIF that leave width and height as they are
+_SAME_SHAPE, _ACROSS = (2, 3, 4), (5, 6, 7, 8)  # orientations of EXIF that leave and that swap width and height
 _NEARLY = 16  # values by which black and white may be off; others are those of a picture
 _FEW_GREYS = 0.1  # share of the opaque pixels of a mask that are neither black nor white: its edges
 
@@ -105,6 +105,10 @@ def masks_at_clip_pixels(
         return np.stack([_resampled(mask, clip, i, partial(loaded.from_source, i)) for i, mask in enumerate(masks)])
     if masks.dtype == bool and masks.ndim == 3 and len(masks) == len(clip) and {masks.shape[1:]} == sizes:
         return at_clip_pixels(clip, masks)
+    turns = [_turns(clip).get(name, 1) for name in clip.frame_names]
+    are_turned = masks.dtype == bool and masks.ndim == 3 and all(turn in _ACROSS for turn in turns)
+    if are_turned and len(masks) == len(clip) and {masks.shape[:0:-1]} == sizes:  # of the stored pixels
+        return at_clip_pixels(clip, np.stack([turned(*pair) for pair in zip(masks, turns, strict=True)]))
     source = f" or {(len(clip), *sizes.pop())}, as the source's pictures" if len(sizes) == 1 else ""
     raise InputError(f"masks are {masks.dtype} {masks.shape}; expected bool {expected}, as the frames{source}")
 
@@ -124,7 +128,7 @@ def _mask(path: Path, clip: Clip, frame: int, turns: dict[str, int]) -> Bool[np.
     height, width = clip.source_size[frame]
     turn = turns.get(clip.frame_names[frame], 1)
     is_stored = abs(picture.shape[1] * width - picture.shape[0] * height) <= max(picture.shape)
-    if turn not in (1, *_SAME_SHAPE) and height != width and is_stored:  # the mask is of the stored pixels
+    if turn in _ACROSS and height != width and is_stored:  # the mask is of the stored pixels
         picture = turned(picture, turn)
     if abs(picture.shape[0] * width - picture.shape[1] * height) > max(picture.shape):  # more than rounding
         raise ClipError(

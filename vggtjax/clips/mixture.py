@@ -23,6 +23,8 @@ _BESIDE = re.compile(
 _FRAMES = re.compile("colou?r|rgb|image|img|frames?|photo|picture|left")
 _EITHER = re.compile("dynamic|enlarged|pred|predicted|gt|aligned|raw|vis")
 
+_COVER = re.compile("thumbs?|thumbnails?|preview|cover|poster|contact")  # of a clip
+
 # Pictures that cannot be read: raw ones of cameras, of compositing and drawing programs, and new formats.
 _UNREAD = (
     *(".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw"),
@@ -31,7 +33,7 @@ _UNREAD = (
 )
 _LEAST_ALIKE = 3  # pictures named alike, before others are odd ones
 _MOST_ODD = 0.1  # share of all pictures
-_SHOWN = 3  # names in a sentence
+_SHOWN = 20  # names in a sentence
 
 
 def check_frames(images: Sequence[Path], place: str) -> None:
@@ -66,7 +68,7 @@ def odd_ones(entries: Sequence[Path], images: Sequence[Path]) -> tuple[str, ...]
     alike = Counter(_template(path) for path in images)
     template, count = alike.most_common(1)[0]
     odd = [path for path in images if _template(path) != template]
-    beside = [path for path in images if _is_beside(path)]
+    beside = [path for path in images if _is_beside(path) or any(map(_COVER.fullmatch, _words(path)))]
     if len(beside) == len(images):
         beside = []
     if count >= _LEAST_ALIKE and 0 < len(odd) <= max(1, _MOST_ODD * len(images)):

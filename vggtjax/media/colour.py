@@ -101,29 +101,33 @@ def _swscale(matrix: int) -> int:
 
 def _to_srgb(values: np.ndarray, colours: Colours) -> np.ndarray:
     """Return coded values, uint16 [H, W, 3], as sRGB in 8 bits."""
-    light, peak = _linear(colours.transfer)[values], np.float32(_PEAKS.get(colours.transfer, 1))
+    light = _linear(colours.transfer)[values.reshape(-1, 3).T]  # [3, H * W]
+    peak = np.float32(_PEAKS.get(colours.transfer, 1))
     if colours.transfer == _HLG:
-        luminance = light @ np.array(_XYZ.get(colours.primaries, _XYZ[_BT709])[1], np.float32)
-        light *= luminance[..., None] ** np.float32(_HLG_GAMMA - 1) * peak
+        luminance = np.array(_XYZ.get(colours.primaries, _XYZ[_BT709])[1], np.float32) @ light
+        light *= luminance ** np.float32(_HLG_GAMMA - 1) * peak
     if colours.primaries in (_BT2020, _P3):
-        light = light @ _to_bt709(colours.primaries).T
+        light = _to_bt709(colours.primaries) @ light
     if colours.transfer in _PEAKS:
-        light = _rolled_off(light, peak)
-    steps = np.sqrt(light.clip(0, 1)) * np.float32(_STEPS - 1)
-    return _srgb_codes()[(steps + np.float32(0.5)).astype(np.uint16)]
+        _roll_off(light, peak)
+    steps = np.sqrt(light.clip(0, 1, out=light), out=light)
+    steps *= np.float32(_STEPS - 1)
+    steps += np.float32(0.5)
+    return _srgb_codes()[steps.astype(np.uint16)].T.reshape(values.shape)
 
 
-def _rolled_off(light: np.ndarray, peak: np.float32) -> np.ndarray:
-    """Return linear values with those above the knee drawn below 1, by a curve without a bend that ends at the peak.
+def _roll_off(light: np.ndarray, peak: np.float32) -> None:
+    """Draw linear values [3, N] above the knee below 1, in place, by a curve without a bend that ends at the peak.
 
     All channels of a pixel are scaled by what its brightest one is, which keeps its hue.
     """
     knee = np.float32(_KNEE)
-    brightest = light.max(axis=-1, keepdims=True)
-    above = np.maximum(brightest - knee, 0) / (1 - knee)
+    brightest = np.maximum(np.maximum(light[0], light[1]), light[2])
+    (bright,) = np.nonzero(brightest > knee)
+    above = (brightest[bright] - knee) / (1 - knee)
     most = (peak - knee) / (1 - knee)
     shown = knee + (1 - knee) * above * (1 + above / most**2) / (1 + above)
-    return np.where(brightest > knee, light * (shown / np.maximum(brightest, knee)), light)
+    light[:, bright] *= shown / brightest[bright]
 
 
 @functools.cache
