@@ -5,9 +5,11 @@ from typing import Any
 
 import av
 import numpy as np
+import pillow_heif
 import pytest
 from av.video.frame import VideoFrame
 
+from vggtjax.media.images import ImageFiles
 from vggtjax.media.sampling import Sampling
 from vggtjax.media.video import VideoFile
 
@@ -162,3 +164,17 @@ def test_videos_without_colour_tags(tmp_path, caplog, size, tag, expected):
     )
     assert np.abs(first(path)[8:-8, 8:-8] - (40, 180, 40)).max() <= 4
     assert not caplog.messages
+
+
+@pytest.mark.parametrize("transfer", [HLG, PQ])
+def test_photos_in_hdr(tmp_path, caplog, transfer):
+    pillow_heif.register_heif_opener()
+    sdr = chart()
+    codes = np.rint(coded(sdr, transfer, 9) * 65535).astype("<u2")
+    tags = {"color_primaries": 9, "transfer_characteristics": transfer, "matrix_coefficients": 9, "full_range_flag": 1}
+    picture = pillow_heif.from_bytes("RGB;16", codes.shape[1::-1], codes.tobytes())
+    picture.save(tmp_path / "a.hif", quality=-1, chroma=444, **tags)
+    (frame,) = ImageFiles((tmp_path / "a.hif",)).frames(Sampling())
+    difference = np.abs(np.asarray(frame.image).astype(int) - sdr)
+    assert max(difference[4:28, 16 * number + 4 : 16 * number + 12].max() for number in range(6)) <= 8
+    assert f"HDR ({'HLG' if transfer == HLG else 'PQ'})" in caplog.messages[0]

@@ -19,6 +19,7 @@ _LIGHTNESS_ONLY = (14, 15)  # ICtCp and IPT, as in Dolby Vision's profile 5, are
 _HD_LINES, _HD_COLUMNS = 720, 1280  # from either on, a video without tags is BT.709; below, swscale takes BT.601
 
 _WHITE = 203  # nits of SDR's white in HDR (ITU-R BT.2408)
+HDR = (_HLG, _PQ)
 _PEAKS = {_HLG: 1000 / _WHITE, _PQ: 10000 / _WHITE}  # brightest value; HLG as on BT.2100's display of 1000 nits
 _NAMES = {_HLG: "HLG", _PQ: "PQ"}
 _HLG_GAMMA = 1.2  # of that display
@@ -92,6 +93,12 @@ def rgb_pixels(frame: VideoFrame, colours: Colours) -> np.ndarray:
     rows = max(1, _BAND // pixels.shape[1])
     bands = [_to_srgb(pixels[row : row + rows], colours) for row in range(0, len(pixels), rows)]
     return np.concatenate(bands)
+
+
+def srgb_of_coded(pixels: np.ndarray, transfer: int, primaries: int) -> tuple[np.ndarray, str]:
+    """Return the pixels of an HDR picture, uint16 [H, W, 3], as sRGB in 8 bits, and what was done."""
+    colours = Colours(None, transfer, _BT2020 if primaries in _UNKNOWN else primaries)
+    return _to_srgb(pixels, colours), colours.note or ""
 
 
 def _swscale(matrix: int) -> int:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pillow_heif
@@ -16,6 +17,7 @@ from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 
 from vggtjax.errors import ClipError, InputError, check_regular
 from vggtjax.media.arrays import eight_bit
+from vggtjax.media.colour import HDR, srgb_of_coded
 from vggtjax.media.sampling import Frame, Sampling
 
 logger = logging.getLogger(__name__)
@@ -91,6 +93,9 @@ def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
             check_pixels(image, path)
             is_deep, count = _has_sixteen_bits(image), 1 if image.format in _SEVERAL else getattr(image, "n_frames", 1)
             picture = to_rgb(ImageOps.exif_transpose(image), path.name)
+            picture, hdr = _without_hdr(picture, path, image.info.get("nclx_profile"))
+        if said is not None and hdr is not None:
+            _say(path, hdr, "hdr", said)
         if said is not None and count > 1:
             _say(path, f"holds {count} pictures; the first is read, write the others as files", "several", said)
         if said is not None and is_deep and 0 < np.asarray(picture).max() <= _DARK:
@@ -106,6 +111,21 @@ def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
     except UNREADABLE as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise ClipError(f"cannot read image {path}: {reason}; leave it out or write it anew") from error
+
+
+def _without_hdr(picture: Image.Image, path: Path, profile: Any) -> tuple[Image.Image, str | None]:
+    """Return a picture as SDR, by the colours that its HEIF file states, and what was done, if anything was.
+
+    The file is read again for its 10 or 12 bits, of which Pillow's pictures have 8.
+    """
+    names = ("transfer_characteristics", "color_primaries")
+    transfer, primaries = (int(profile[name]) for name in names) if profile else (0, 0)
+    if transfer not in HDR:
+        return picture, None
+    deep = np.asarray(pillow_heif.open_heif(path, convert_hdr_to_8bit=False))
+    pixels = deep[..., :3] if deep.dtype == np.uint16 else np.asarray(picture).astype(np.uint16) * np.uint16(257)
+    pixels, note = srgb_of_coded(pixels, transfer, primaries)
+    return Image.fromarray(pixels), note
 
 
 def _say(path: Path, note: str, kind: str, said: set[str]) -> None:
