@@ -74,7 +74,8 @@ def odd_ones(entries: Sequence[Path], images: Sequence[Path]) -> tuple[str, ...]
     if count >= _LEAST_ALIKE and 0 < len(odd) <= max(1, _MOST_ODD * len(images)):
         beside = odd
     if beside:
-        frames = [path for path in images if path not in beside]
+        unlike = set(beside)
+        frames = [path for path in images if path not in unlike]
         notes.append(
             f"taken as a frame, but named unlike the others: {_names(beside)}; if it is none, {_advice(frames, images)}"
         )
@@ -119,7 +120,7 @@ def _advice(frames: Sequence[Path], images: Sequence[Path]) -> str:
     start = start.rstrip("0123456789.")
     end = end[: max(0, min(map(len, names)) - len(start))][::-1].lstrip("0123456789")
     pattern = f"{start}*{end}" if len(names) > 1 else f"*{frames[0].suffix}"
-    others = [path.name for path in images if path not in frames]
+    others = [path.name for path in set(images).difference(frames)]
     if len(folders) == 1 and names and not any(fnmatch.fnmatchcase(name, pattern) for name in others):
         return f"give the pattern '{folders.pop() / pattern}'"
     return "put the frames into a folder of their own"
