@@ -10,7 +10,7 @@ from itertools import count, groupby
 from math import prod
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import ml_dtypes
 import numpy as np
@@ -20,11 +20,14 @@ from converters.files import Tensor, read_state_dict, weight_files
 from converters.locate import Weights, locate
 from converters.rules import IGNORED, RULES, Transform
 from converters.strangers import refuse_strangers
+from converters.trained import own_heads, own_names
 from vggtjax.checkpoint import DType, flat_shapes, numpy_dtype, write_checkpoint
 from vggtjax.config import VGGT_HEADS, VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, InputError, problems_sentence, reading
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.tensor_file import Spec
+
+T = TypeVar("T")
 
 _RULES = {path: list(rules) for path, rules in groupby(sorted(RULES, key=attrgetter("path")), attrgetter("path"))}
 _FLOATS = tuple(np.dtype(kind) for kind in (np.float32, ml_dtypes.bfloat16, np.float16, np.float64))
@@ -88,7 +91,7 @@ def convert_state_dict(state_dict: Mapping[str, np.ndarray], config: VGGTConfig)
     or names the other network of the state dict.
     """
     refuse_strangers("the state dict", state_dict)
-    tensors = {name: np.asarray(value) for name, value in state_dict.items()}
+    tensors = {name: np.asarray(value) for name, value in _own(state_dict, "the state dict").items()}
     targets = plan_conversion(tensors, config)
     flat = {path: np.concatenate(list(target.parts(tensors))) for path, target in targets.items()}
     return unflatten_dict(flat, sep=".")
@@ -131,15 +134,24 @@ def convert(
 
 
 def convert_weights(
-    weights: Weights, destination: str | Path, *, dtype: DType, config: VGGTConfig, progress: Progress | None = None
+    weights: Weights,
+    destination: str | Path,
+    *,
+    dtype: DType,
+    config: VGGTConfig,
+    with_its_heads: bool = False,
+    progress: Progress | None = None,
 ) -> Conversion:
-    """Convert located weights as `convert` does."""
+    """Convert located weights as `convert` does; `with_its_heads`, the model has those heads alone that they have."""
     kind = numpy_dtype(dtype)
     destination = Path(destination).expanduser()
     if os.path.isfile(destination) and os.path.samefile(destination, weights.path):  # noqa: PTH113, PTH121
         raise InputError(f"the destination {destination} is the source; choose another name")
     tensors, problems = read_state_dict(weights.path)
     refuse_strangers(weights.name, tensors)
+    tensors = _own(tensors, weights.name)
+    if with_its_heads:
+        config = own_heads(tensors, config, weights.name)
     targets = plan_conversion(tensors, config, problems)
     files = weight_files(weights.path)
     used = {source for target in targets.values() for source in target.sources}
@@ -170,6 +182,15 @@ def convert_weights(
         sha256=sha256,
         revision=weights.revision,
     )
+
+
+def _own(tensors: Mapping[str, T], source: str) -> Mapping[str, T]:
+    """Return tensors by VGGT's own names; raises CheckpointError as `own_names`, and for another network's names."""
+    modules = {rule.source.partition(".")[0] for rule in RULES}
+    own = own_names(tensors, modules, source)
+    if own is not tensors:
+        refuse_strangers(source, own)
+    return own
 
 
 def plan_conversion(
@@ -228,7 +249,7 @@ def _hint(tensors: Mapping[str, Tensor], config: VGGTConfig) -> str:
     absent = [name for name in expected if name not in modules]
     if not modules & set(expected) or not absent:
         return ""
-    return f" (it has no {', '.join(absent)}: omit these heads by --heads)"
+    return f" (it has no {', '.join(absent)}: omit these heads by --heads of vggtjax convert)"
 
 
 def _digest(file: Path, advance: Callable[[], None]) -> str:

@@ -200,6 +200,21 @@ def test_pictures_stored_upside_down_are_refused(tmp_path):
         read(folder)
 
 
+@pytest.mark.parametrize("kind", ["nerfstudio", "colmap"])
+@pytest.mark.parametrize("orientation", [6, 8])
+def test_cameras_of_stored_pixels_name_exif(tmp_path, kind, orientation):
+    folder = write(kind, tmp_path / "scene")
+    path = next(folder.rglob("*.png"))
+    with Image.open(path) as opened:
+        opened.load()
+        opened.getexif()[0x0112] = orientation
+        opened.save(path, exif=opened.getexif())
+    with pytest.raises(
+        InputError, match=r"stored on their side are read upright, as their EXIF .*mogrify -auto-orient"
+    ):
+        read(folder)
+
+
 def test_times_of_a_capture_choose_frames_by_second(tmp_path):
     source = open_source(str(write("tum", tmp_path / "scene")))
     taken = list(source.frames(Sampling(fps=5)))

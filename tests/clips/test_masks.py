@@ -1,13 +1,15 @@
 """Masks that a user brings: names, order, crop and padding, and what the pipeline does with them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from testing.seeded import seeded_images
 from tests.tiny import tiny_model
 from vggtjax import load_clip, reconstruct
-from vggtjax.clips.masks import load_masks, masks_at_clip_pixels
+from vggtjax.clips.masks import load_masks, masks_at_clip_pixels, read_mask
 from vggtjax.errors import ClipError, InputError
 
 WIDE, TALL = (90, 160), (160, 90)  # height, width
@@ -105,3 +107,88 @@ def test_given_masks_replace_the_mined_ones():
     assert not np.allclose(made.camera_from_world, still.camera_from_world, atol=1e-4)
     with pytest.raises(InputError, match="expected bool"):
         reconstruct(model, clip, size=56, masks=masks[:2])
+
+
+def box(value, background=0, dtype: Any = np.uint8):
+    """Return 28 x 56 values with a box, and where the box is."""
+    values = np.full((28, 56), background, dtype)
+    values[4:12, 8:20] = value
+    return values
+
+
+INSIDE = box(1).astype(bool)
+
+
+@pytest.mark.parametrize(
+    ("values", "ending"),
+    [
+        (box(3, dtype=np.uint16), "png"),
+        (box(3, dtype=np.uint16), "tif"),
+        (box(26001, dtype=np.uint16), "png"),  # KITTI's class and object
+        (np.maximum(box(3, dtype=np.uint16), np.uint16(40000) * (np.arange(56) == 9) * INSIDE), "png"),
+        (box(65535, dtype=np.uint16), "png"),
+        (box(70000, dtype=np.int32), "tif"),
+    ],
+)
+def test_numbers_of_objects_in_sixteen_bits(tmp_path, values, ending):
+    path = tmp_path / f"a.{ending}"
+    Image.fromarray(values).save(path)
+    np.testing.assert_array_equal(read_mask(path), INSIDE)
+
+
+def test_grey_of_sixteen_bits_is_brightness(tmp_path):
+    values = box(65535, dtype=np.uint16)
+    values[20:] = 9000
+    Image.fromarray(values).save(tmp_path / "a.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "a.png"), INSIDE)
+
+
+@pytest.mark.parametrize("colour", [(30, 40, 20), (100, 120, 90), (240, 240, 240), (200, 20, 20)])
+@pytest.mark.parametrize("behind", [(0, 0, 0, 0), (255, 255, 255, 0), (90, 200, 30, 0)])
+@pytest.mark.parametrize("ending", ["png", "webp"])
+def test_cut_outs_move_where_they_are_opaque(tmp_path, colour, behind, ending):
+    layers = np.full((28, 56, 4), behind, np.uint8)
+    layers[INSIDE] = (*colour, 255)
+    Image.fromarray(layers).save(tmp_path / f"a.{ending}", lossless=True, exact=True)
+    np.testing.assert_array_equal(read_mask(tmp_path / f"a.{ending}"), INSIDE)
+
+
+def test_masks_with_a_layer_of_opacity(tmp_path):
+    mask = box(255)
+    for name, alpha, expected in (
+        ("opaque", np.full_like(mask, 255), INSIDE),
+        ("empty", np.zeros_like(mask), np.zeros_like(INSIDE)),
+        ("border", np.where(np.arange(28)[:, None] > 24, 0, 255).astype(np.uint8) + mask * 0, INSIDE),  # warped
+    ):
+        Image.fromarray(np.dstack([mask, mask, mask, alpha])).save(tmp_path / f"{name}.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / f"{name}.png"), expected)
+    black = np.zeros_like(mask)
+    Image.fromarray(np.dstack([black, black, black, mask])).save(tmp_path / "black.png")
+    with pytest.raises(ClipError, match="is black where it is opaque and transparent elsewhere"):
+        read_mask(tmp_path / "black.png")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("of", ["stored", "shown", "exif"])
+def test_frames_that_exif_turns(tmp_path, caplog, orientation, of):
+    stored = Image.fromarray(box(255))
+    tags = Image.Exif()
+    tags[0x0112] = orientation
+    stored.save(tmp_path / "tagged.png", exif=tags)
+    with Image.open(tmp_path / "tagged.png") as tagged:
+        shown = ImageOps.exif_transpose(tagged).copy()
+    for name in ("frames", "masks"):
+        (tmp_path / name).mkdir()
+    stored.save(tmp_path / "frames/0.png", exif=tags)
+    options: dict[str, Any] = {"exif": tags} if of == "exif" else {}
+    (shown if of == "shown" else stored).save(tmp_path / "masks/0.png", **options)
+    clip = load_clip(tmp_path / "frames", size=56, mode="pad")
+    (found,) = load_masks(tmp_path / "masks", clip)
+    ambiguous = orientation in (2, 3, 4)
+    if of == "stored" and orientation > 4:
+        given = masks_at_clip_pixels(np.asarray(stored)[None] > 127, clip, clip)[0]
+        np.testing.assert_array_equal(given, found)
+    if not (of == "stored" and ambiguous):  # the shape does not tell
+        left, top, right, bottom = clip.valid_box[0]
+        np.testing.assert_array_equal(found[top:bottom, left:right], np.asarray(shown) > 127)
+    assert bool(caplog.messages) == (ambiguous and of != "exif")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from vggtjax.clips.sources import open_source
+from vggtjax.clips.sources import clips_by_name, open_source
 from vggtjax.errors import ClipError
 from vggtjax.media.arrays import ArrayFrames
 from vggtjax.media.images import ImageFiles
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.media.sampling import Sampling
 from vggtjax.media.video import VideoFile
 
@@ -35,9 +35,27 @@ def names(source):
 def test_natural_order():
     ordered = ["2", "10", "a1b2", "a1b10", "a02", "a10", "B1"]
     shuffled = [Path(name) for name in ("B1", "a10", "10", "a1b10", "2", "a02", "a1b2")]
-    assert [path.name for path in sorted(shuffled, key=natural_key)] == ordered
-    assert natural_key(Path("cam2/frame_10")) < natural_key(Path("cam10/frame_2"))
-    sorted([Path("1"), Path("a"), Path("1a"), Path("²"), Path("٣")], key=natural_key)  # other digits do not break it
+    assert [path.name for path in in_order(shuffled)] == ordered
+    assert in_order(["cam10/frame_2", "cam2/frame_10"], Path) == ["cam2/frame_10", "cam10/frame_2"]
+    in_order([Path("1"), Path("a"), Path("1a"), Path("²"), Path("٣")])  # other digits do not break it
+
+
+@pytest.mark.parametrize(
+    "ordered",
+    [
+        ["1700000000.05.png", "1700000000.1.png", "1700000000.15.png", "1700000000.2.png", "1700000001.png"],
+        ["0.0.jpg", "0.033333.jpg", "0.1.jpg", "0.25.jpg", "9.5.jpg", "10.05.jpg"],
+        ["rgb_1305031102.175304.png", "rgb_1305031102.21.png", "rgb_1305031102.3.png"],
+        ["t=0.5s.png", "t=0.75s.png", "t=1s.png", "t=1.25s.png"],
+        ["1700000000.05", "1700000000.1", "1700000000.15"],  # folders
+        ["shot1.8.png", "shot1.9.png", "shot1.10.png", "shot1.11.png"],  # counted on
+        ["v1.2.9.png", "v1.2.10.png"],
+        ["1.0009.png", "1.0010.png"],
+    ],
+)
+def test_decimal_names_by_value(ordered):
+    assert in_order(sorted(ordered, reverse=True), Path) == ordered
+    assert [path.name for path in in_order(Path("a2.10") / name for name in sorted(ordered))] == ordered
 
 
 def test_folder(folder):
@@ -95,3 +113,21 @@ def test_a_list_of_pil_images_is_read_like_their_files():
     assert [frame.image.getpixel((0, 0)) for frame in frames] == [(255, 255, 255), (7, 7, 7)]
     arrays = np.zeros((2, 4, 5, 3), np.uint8)
     assert all(isinstance(open_source(given), ArrayFrames) for given in (arrays, list(arrays), tuple(arrays)))
+
+
+def test_links_are_named_as_they_are(tmp_path, monkeypatch):
+    for name in ("x/rgb", "y/rgb"):
+        (tmp_path / name).mkdir(parents=True)
+        for number in (0, 1):
+            Image.new("RGB", (28, 14)).save(tmp_path / name / f"{number}.png")
+    video = tmp_path / "x/video.mp4"
+    video.write_bytes(b"x")
+    links = tmp_path / "links"
+    links.mkdir()
+    for name, target in (("a", "x/rgb"), ("b", "y/rgb"), ("c.mp4", "x/video.mp4"), ("d", "a")):
+        (links / name).symlink_to(tmp_path / target if "/" in target else links / target)
+    assert list(clips_by_name([str(links)])) == ["a", "b", "c", "d"]
+    assert list(clips_by_name([str(links / "b"), f"{links}/a/"])) == ["b", "a"]
+    assert open_source(links / "a").name == "a"
+    monkeypatch.chdir(tmp_path / "x/rgb")
+    assert list(clips_by_name(["."])) == ["rgb"]

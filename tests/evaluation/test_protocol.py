@@ -161,3 +161,35 @@ def test_depth_at_the_source_is_a_bilinear_resize_but_for_what_was_cut_off():
     assert not seen[:, :9].any()
     assert not seen[:, -9:].any()
     assert seen[:, 10:66].all()
+
+
+@pytest.mark.parametrize("hole", [np.s_[:, 10:30, 20:50], np.s_[:, ::2, ::2], np.s_[0], np.s_[:, :, -1]])
+def test_unknown_depth_is_never_blended(hole):
+    """A right prediction with pixels of depth 0 scores as right as it does without them."""
+    room, sequence = room_and_truth()
+    true = room.depth.repeat(2, axis=1).repeat(2, axis=2)
+    holed = dataclasses.replace(room, depth=room.depth.copy())
+    holed.depth[hole] = 0
+    before, after = (score(result, TruthAtPixels(sequence, room)).metrics for result in (room, holed))
+    assert after["abs_rel"] < 0.02
+    assert after["depth_pixels"] < before["depth_pixels"]
+    assert after["delta1"] > 0.97
+    assert max(after["accuracy_mean"], after["distance_paired_mean"]) < 1e-4
+    predicted, _ = depth_at_source(holed)
+    off = np.abs(predicted / true - 1)[predicted != 0]
+    assert np.median(off) < 0.01
+    assert predicted[predicted != 0].min() >= room.depth.min() * (1 - 1e-6)
+
+
+def test_a_prediction_that_is_unknown_wherever_the_truth_is_known():
+    room, sequence = room_and_truth()
+    scores = score(dataclasses.replace(room, depth=np.zeros_like(room.depth)), TruthAtPixels(sequence, room))
+    assert scores.problems == ()
+    assert {note.split(": ")[1] for note in scores.notes} == {"no pixel with a true depth has a predicted one"}
+
+
+def test_two_frames_cannot_be_aligned():
+    room, sequence = room_and_truth(frames=2)
+    scores = score(room, TruthAtPixels(sequence, room))
+    assert scores.problems == ()
+    assert "trajectory: there are 2 true cameras; an alignment needs 3" in scores.notes

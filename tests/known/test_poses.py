@@ -8,7 +8,7 @@ from tests.room import make_room
 from tests.textured_room import textured_room
 from vggtjax.errors import InputError
 from vggtjax.known.apply import apply_known
-from vggtjax.known.given import read_known
+from vggtjax.known.given import check_readable, read_known
 from vggtjax.known.options import KnownGeometry
 from vggtjax.known.poses import read_poses
 from vggtjax.storage.trajectories import write_trajectory
@@ -78,8 +78,8 @@ PLACE, ROTATION, REPLICATED = np.s_[:, :3, 3], np.s_[:, :3, :3], np.s_[:]
             r"at about \[5000\d.0, .*, too far from",
         ),
         (ROTATION, lambda turns: TURNING @ turns, r"differ from the predicted ones by \d+ degrees"),
-        (ROTATION, lambda turns: turns * [1, -1, -1], "by 14 degrees .* 0.0 if read in OpenGL's axes"),
-        (REPLICATED, np.linalg.inv, r"by \d+ degrees .* 0.0 if read as camera-from-world"),
+        (ROTATION, lambda turns: turns * [1, -1, -1], "by 14 degrees .* 0.0 degrees and 0% if read in OpenGL's axes"),
+        (REPLICATED, np.linalg.inv, r"by \d+ degrees .* 0.0 degrees and 0% if read as camera-from-world"),
     ],
 )
 def test_poses_that_do_not_fit_are_refused(tmp_path, part, change, message):
@@ -88,3 +88,90 @@ def test_poses_that_do_not_fit_are_refused(tmp_path, part, change, message):
     poses[part] = change(poses[part])
     with pytest.raises(InputError, match=message):
         apply_known(room, read_known(KnownGeometry(poses=_kitti(tmp_path / "poses.txt", poses)), room))
+
+
+def _lines(poses, order, times=None):
+    turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=order == "wxyz")
+    times = np.arange(len(poses)) if times is None else times
+    return [" ".join(f"{value:.9g}" for value in row) for row in np.column_stack([times, poses[:, :3, 3], turns])]
+
+
+ROOM = make_room(frames=6)
+MARK = "\ufeff"
+
+
+@pytest.mark.parametrize(
+    ("header", "order"),
+    [
+        ("", "xyzw"),
+        ("# timestamp tx ty tz qx qy qz qw", "xyzw"),
+        ("# timestamp tx ty tz qw qx qy qz", "wxyz"),
+        ("# made by a program\n#time,x,y,z,q_w,q_x,q_y,q_z", "wxyz"),
+        ("timestamp tx ty tz qw qx qy qz", "wxyz"),
+        ("timestamp,p_RS_R_x,p_RS_R_y,p_RS_R_z,q_RS_w,q_RS_x,q_RS_y,q_RS_z", "wxyz"),
+        ("Time Pos.X Pos.Y Pos.Z Rot.X Rot.Y Rot.Z Rot.W", "xyzw"),
+    ],
+)
+@pytest.mark.parametrize("mark", ["", MARK])
+@pytest.mark.parametrize("comma", [False, True])
+def test_the_names_of_the_columns_tell_the_order(tmp_path, header, order, mark, comma):
+    lines = "\n".join(_lines(ROOM.world_from_camera, order))
+    text = "\n".join([header, lines.replace(" ", ",") if comma else lines])
+    (tmp_path / "poses.txt").write_text(mark + text, encoding="utf-8")
+    np.testing.assert_allclose(read_poses(tmp_path / "poses.txt", ROOM), ROOM.world_from_camera, atol=1e-6)
+
+
+@pytest.mark.parametrize("width", [12, 16, 4])
+@pytest.mark.parametrize("mark", ["", MARK])
+def test_matrices_row_by_row(tmp_path, width, mark):
+    poses = ROOM.world_from_camera
+    rows = (poses[:, :3] if width == 12 else poses).reshape(-1, width)
+    (tmp_path / "p.txt").write_text(
+        mark + "\n".join(" ".join(map(repr, row)) for row in rows.tolist()), encoding="utf-8"
+    )
+    np.testing.assert_allclose(read_poses(tmp_path / "p.txt", ROOM), poses, atol=1e-6)
+    with pytest.raises(InputError, match="has matrices; leave --quaternion out"):
+        read_poses(tmp_path / "p.txt", ROOM, "wxyz")
+
+
+@pytest.mark.parametrize(("written", "read"), [("wxyz", None), ("wxyz", "xyzw"), ("xyzw", "wxyz")])
+def test_quaternions_in_another_order_are_named(tmp_path, written, read):
+    path = tmp_path / "poses.txt"
+    path.write_text("\n".join(_lines(ROOM.world_from_camera, written)))
+    right = read_known(KnownGeometry(poses=str(path), quaternion=written), ROOM).poses
+    assert right is not None
+    np.testing.assert_allclose(right, ROOM.world_from_camera, atol=1e-6)
+    message = (
+        rf"\d+ degrees .* and by 0\.\d degrees and 0% if read with the quaternion's w .* \(--quaternion {written}\)"
+    )
+    with pytest.raises(InputError, match=message):
+        apply_known(ROOM, read_known(KnownGeometry(poses=str(path), quaternion=read), ROOM))
+
+
+def test_files_of_programs_with_w_first_need_the_order(tmp_path):
+    path = tmp_path / "pred_traj.txt"
+    path.write_text("\n".join(_lines(ROOM.world_from_camera, "wxyz")))
+    with pytest.raises(InputError, match="does not say the order of its quaternions; give --quaternion wxyz"):
+        check_readable(KnownGeometry(poses=str(path)))
+    known = KnownGeometry(poses=str(path), quaternion="wxyz")
+    check_readable(known)
+    found = read_known(known, ROOM).poses
+    assert found is not None
+    np.testing.assert_allclose(found, ROOM.world_from_camera, atol=1e-6)
+    with pytest.raises(InputError, match="is of a file of poses; give the file with --poses"):
+        KnownGeometry(quaternion="wxyz")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("# t tx ty tz qy qx qz qw\n0 0 0 0 0 0 0 1", "names its columns qy qx qz qw; expected qw first or last"),
+        ("nan nan nan nan nan nan nan nan\n0 0 0 0 0 0 0 1", "holds nan; expected finite"),
+        ("1 2 3\n", "3 numbers a line; expected 8 or 12 or 16 or 4"),
+        ("1 2 3 4\n1 2 3 4\n", "has 2 rows of four numbers"),
+    ],
+)
+def test_files_that_are_no_poses(tmp_path, text, message):
+    (tmp_path / "p.txt").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_poses(tmp_path / "p.txt", ROOM)

@@ -117,7 +117,7 @@ def test_files_that_are_no_video(tmp_path, even):
     path = tmp_path / "a.mp4"
     with pytest.raises(ClipError, match=r"cannot read video .*a.mp4: No such file"):
         read(path)
-    path.touch()
+    path.write_bytes(b"no video")
     with pytest.raises(ClipError, match=r"cannot read video .*a.mp4: Invalid data"):
         read(path)
     # A program stream need not say when each frame is shown, and this one's rate does not tell either.

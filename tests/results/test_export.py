@@ -1,12 +1,17 @@
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
 
+from tests.captures.folders import make_truth, tum
 from tests.room import make_room
+from vggtjax import load_clip
 from vggtjax.errors import InputError, OutputError
+from vggtjax.options import Options
+from vggtjax.pipeline.fields import settings_of
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.results import export
 from vggtjax.results.frame import frame_of
@@ -208,3 +213,43 @@ def test_what_moves_has_a_percentile_of_its_own():
     confidence = np.where(moving, 1, 2) + np.linspace(0, 0.5, moving.size, dtype=np.float32).reshape(moving.shape)
     kept = confident(make_room(2, 14, 14, depth_confidence=confidence.astype(np.float32), dynamic_mask=moving), 20)
     assert [round(float(kept[pixels].mean()), 2) for pixels in (moving, ~moving)] == [0.8, 0.8]
+
+
+NAMES = ("1305031102.175304", "1305031102.211214", "1305031102.3")
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"timestamps": np.array([0, 0.035, 0.125]), "settings": {"first_time": 1305031102.175304}}, 1305031102.175304),
+        ({"timestamps": np.array([0, 0.035, 0.125]), "settings": {"first_time": 12}}, 12),
+        ({"timestamps": np.array([0, 0.035, 0.125])}, 0),
+        ({"timestamps": None, "frame_names": NAMES}, [float(name) for name in NAMES]),
+        ({"timestamps": np.array([0, 0.035, 0.125]), "frame_names": NAMES}, [float(name) for name in NAMES]),
+        ({"timestamps": None, "frame_names": ("v1.2", "v1.3", "v1.4")}, [0, 1, 2]),
+        ({"timestamps": None, "frame_names": ("7", "8", "9")}, [0, 1, 2]),
+    ],
+)
+def test_files_have_the_times_of_the_source(tmp_path, changes, expected):
+    room = make_room(**changes)
+    start = [0] * 3 if isinstance(expected, list) else [0, 0.035, 0.125]
+    np.testing.assert_allclose(room.file_times, np.add(expected, start), atol=1e-6, rtol=0)
+    room.save(tmp_path / "out", only=("cameras",))
+    times, _ = read_trajectory(tmp_path / "out/trajectory.txt")
+    np.testing.assert_allclose(times, room.file_times, atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("named", [True, False])
+def test_a_capture_tells_its_clock(tmp_path, named):
+    folder = tum(tmp_path / "scene", make_truth(shared=True))
+    if not named:  # files that are not named after their times
+        text = (folder / "rgb.txt").read_text()
+        for number, path in enumerate(sorted((folder / "rgb").iterdir())):
+            text = text.replace(f"rgb/{path.name}", f"rgb/{number}.png")
+            path.rename(folder / f"rgb/{number}.png")
+        (folder / "rgb.txt").write_text(text)
+    clip = load_clip(folder, size=28)
+    assert clip.timestamps is not None
+    assert clip.timestamps[0] == 0
+    settings = settings_of(cast(Any, SimpleNamespace(note="")), clip, Options(), "cues", None)
+    assert settings["first_time"] == 100

@@ -11,7 +11,7 @@ from vggtjax.app.limits import Limits
 from vggtjax.clips.sources import open_source
 from vggtjax.errors import ClipError, one_line
 from vggtjax.media.images import is_image_name
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.media.sampling import Sampling, Source
 from vggtjax.media.video import VideoFile, is_video_name
 
@@ -54,7 +54,7 @@ def clip_of(files: Sequence[Path], uploads: Path, limits: Limits) -> Path | tupl
     total = sum(path.stat().st_size for path in paths)
     if total > limits.upload_bytes:
         raise ClipError(f"the upload has {total / 1e6:.1f} MB; send at most {limits.max_upload_mb} MB")
-    return videos[0] if videos else tuple(sorted(paths, key=lambda path: natural_key(Path(path.name))))
+    return videos[0] if videos else tuple(in_order(paths, lambda path: Path(path.name)))
 
 
 def check_clip(

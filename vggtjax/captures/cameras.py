@@ -11,6 +11,10 @@ from vggtjax.cameras import checked_poses, world_from_camera
 from vggtjax.errors import InputError
 
 DISTORTED = "lens distortion is not undone, and not part of the intrinsics"  # a note
+TURNED = (
+    ". Pictures that are stored on their side are read upright, as their EXIF orientation says; write them upright, "
+    "such as by mogrify -auto-orient, and make what belongs to them anew"
+)
 PIXEL_CENTRE = 0.5  # of the first pixel; 0 for data sets that count from the centre
 
 
@@ -40,9 +44,10 @@ def resized_intrinsics(
     """Return intrinsics of pictures of one (width, height) at another; raises InputError for another shape."""
     scale = np.array(picture) / np.array(size)
     if abs(size[0] * picture[1] - size[1] * picture[0]) > max(picture):  # one pixel of difference is rounding
+        across = abs(size[1] * picture[1] - size[0] * picture[0]) <= max(picture)
         raise InputError(
             f"{source} is for pictures of {size[0]:g} x {size[1]:g} and the picture is {picture[0]} x {picture[1]}; "
-            "expected the same shape"
+            f"expected the same shape{TURNED if across else ''}"
         )
     resized = matrix.copy()
     resized[:2] *= scale[:, None]

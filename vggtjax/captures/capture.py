@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vggtjax.captures.cameras import resized_intrinsics
+from vggtjax.captures.cameras import TURNED, resized_intrinsics
 from vggtjax.captures.pictures import picture_size
 from vggtjax.captures.unpacked import Unpacked
 from vggtjax.errors import InputError
@@ -116,8 +116,10 @@ class Capture:
             values = self.read_depth_file(path)
             (width, height), (rows, columns) = self.sizes[frame], values.shape
             if abs(columns * height - rows * width) > max(width, height):  # more than one pixel of rounding
+                turned = TURNED if abs(rows * height - columns * width) <= max(width, height) else ""
                 raise InputError(
                     f"{path} has {columns} x {rows} pixels and its picture {width} x {height}; expected the same shape"
+                    f"{turned}"
                 )
         return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
 

@@ -16,7 +16,7 @@ from vggtjax.captures.colmap_model import Suffix, read_views
 from vggtjax.captures.files import inside
 from vggtjax.errors import InputError
 from vggtjax.media.images import is_image_name
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 
 _MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0")  # places in a folder
 _PICTURES = ("images", "../images", "../../images", ".")  # places beside a model's own folder
@@ -52,13 +52,13 @@ def read_colmap(folder: Path) -> Capture:
     views = read_views(model.folder, model.suffix)
     if not views:
         raise InputError(f"{source} has no image; expected a model with registered images")
-    names = sorted(views, key=lambda name: natural_key(Path(name)))
+    names = in_order(views, Path)
     place = _pictures(folder, names[0])
     pictures = tuple(inside(place, name, source) for name in names)
     sizes = checked_sizes(pictures, source)
     taken = [views[name] for name in names]
     found = {path for path in place.rglob("*") if is_image_name(path) and not path.name.startswith(".")}
-    lost = sorted(found - set(pictures), key=natural_key) if place.name == "images" else []
+    lost = in_order(found - set(pictures)) if place.name == "images" else []
     missing = left_out([path.stem for path in lost], len(found), "pose")
     distorted = any(view.distorted for view in taken)
     return Capture(

@@ -45,14 +45,17 @@ def read_dpt(path: Path) -> Float32[np.ndarray, "h w"]:
     return np.frombuffer(data, "<f4", offset=_DPT_HEADER).reshape(height, width).astype(np.float32)
 
 
-def read_npy(path: Path) -> Float32[np.ndarray, "h w"]:
-    """Read an .npy of shape (h, w) or (h, w, 1) without a unit; raises InputError for anything else."""
+def read_npy(path: Path, per_unit: float = 1) -> Float32[np.ndarray, "h w"]:
+    """Read an .npy of shape (h, w) or (h, w, 1) without a unit; whole numbers are `per_unit` a unit.
+
+    Raises InputError for anything else.
+    """
     values = read_array(path)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     if values.ndim != 2 or values.dtype.kind not in "fiu":
         raise InputError(f"{path} has shape {values.shape} of {values.dtype}; expected (h, w) or (h, w, 1) of numbers")
-    return values.astype(np.float32)
+    return values.astype(np.float32) / np.float32(1 if values.dtype.kind == "f" else per_unit)
 
 
 def read_exr(path: Path) -> Float32[np.ndarray, "h w"]:

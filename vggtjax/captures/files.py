@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path, PureWindowsPath
 
 from vggtjax.errors import InputError, one_line, reading
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 
 _MOST_BYTES = 2**28  # of a file
 
@@ -13,7 +13,12 @@ _MOST_BYTES = 2**28  # of a file
 def files(folder: Path, ending: str) -> dict[str, Path]:
     """Return files by their names without `ending`, in natural order; none if the folder is missing."""
     paths = [path for path in folder.glob(f"*{ending}") if path.is_file() and not path.name.startswith(".")]
-    return {path.name.removesuffix(ending): path for path in sorted(paths, key=natural_key)}
+    return {path.name.removesuffix(ending): path for path in in_order(paths)}
+
+
+def folder_name(path: Path) -> str:
+    """Return the name by which a folder was named: a link's own; that of the folder itself for "." and ".."."""
+    return path.name if path.name not in ("", "..") else path.resolve().name
 
 
 def inside(folder: Path, name: str, source: Path) -> Path:
@@ -35,6 +40,6 @@ def read_bytes(path: Path) -> bytes:
 def read_text(path: Path) -> str:
     """Return the content of a text file; raises InputError as `read_bytes`, and for bytes that are not UTF-8."""
     try:
-        return read_bytes(path).decode("utf-8")
+        return read_bytes(path).decode("utf-8-sig")  # Windows puts a mark of its byte order first
     except UnicodeDecodeError:
         raise InputError(f"{path} is not a text file; expected UTF-8") from None

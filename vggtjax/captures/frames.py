@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from vggtjax.captures.capture import Capture
+from vggtjax.captures.files import folder_name
 from vggtjax.media.images import ImageFiles, read_image
 from vggtjax.media.sampling import Frame, Sampling
 
@@ -19,13 +20,18 @@ class CaptureFrames(ImageFiles):
     @property
     def name(self) -> str:
         """The name of the capture's folder, or of its file without the suffix."""
-        path = self.capture.path.resolve()
-        return path.name if self.capture.path.is_dir() else path.stem
+        path = self.capture.path
+        return folder_name(path) if path.is_dir() else path.stem
 
     @property
     def frame_names(self) -> tuple[str, ...]:
         """Those of the capture."""
         return self.capture.frame_names
+
+    @property
+    def first_time(self) -> float | None:
+        """The time of the capture's first frame by its own clock, in seconds; times of frames count from it."""
+        return None if self.capture.timestamps is None else float(self.capture.timestamps[0])
 
     def total(self, sampling: Sampling) -> int:
         """Return how many frames `sampling` takes."""
@@ -37,7 +43,7 @@ class CaptureFrames(ImageFiles):
         for index in self._taken(sampling):
             time = None if times is None else float(times[index] - times[0])
             with self.capture.naming_files():
-                image = read_image(self.paths[index])
+                image = read_image(self.paths[index], self._said)
             yield Frame(self.frame_names[index], image, time)
 
     def _taken(self, sampling: Sampling) -> list[int]:

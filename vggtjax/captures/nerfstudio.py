@@ -23,7 +23,7 @@ from vggtjax.captures.files import inside
 from vggtjax.captures.numbers import number, numbers
 from vggtjax.errors import InputError
 from vggtjax.media.images import is_image_name
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.storage.json_values import read_json
 
 NAMES = ("transforms.json", "transforms_train.json")
@@ -44,7 +44,7 @@ def read_nerfstudio(folder: Path) -> Capture:
     frames = scene.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise InputError(f"{path} has no list 'frames'; expected a scene of nerfstudio or instant-ngp")
-    found = sorted(((_picture(folder, frame, path), frame) for frame in frames), key=lambda pair: natural_key(pair[0]))
+    found = in_order(((_picture(folder, frame, path), frame) for frame in frames), lambda pair: pair[0])
     pictures = tuple(picture for picture, _ in found)
     if len(set(pictures)) < len(pictures):
         raise InputError(f"{path} names a picture twice; expected each once")

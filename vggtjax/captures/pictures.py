@@ -9,10 +9,9 @@ from pathlib import Path
 from PIL import Image
 
 from vggtjax.errors import InputError, check_regular
-from vggtjax.media.images import UNREADABLE, check_pixels, known_formats
+from vggtjax.media.images import ORIENTATION, UNREADABLE, check_pixels, known_formats
 
 PNG = ("PNG",)
-_ORIENTATION = 0x0112  # EXIF; from 5 on, width and height are swapped
 _FIRST_TURNED = 5
 _SAME_SIDES = (2, 3, 4)  # turned or mirrored, with width and height as they were
 _BROKEN = (*UNREADABLE, Image.DecompressionBombWarning)
@@ -39,7 +38,7 @@ def picture_size(path: Path, *, with_camera: bool = False) -> tuple[int, int]:
     Raises InputError for any other file and, `with_camera`, for a picture that is stored upside down or mirrored.
     """
     with opening(path, known_formats()) as image:
-        orientation, (width, height) = image.getexif().get(_ORIENTATION, 1), image.size
+        orientation, (width, height) = image.getexif().get(ORIENTATION, 1), image.size
     if with_camera and orientation in _SAME_SIDES:
         raise InputError(
             f"{path} is stored upside down or mirrored (its EXIF orientation), and its camera may count the stored "

@@ -24,7 +24,7 @@ from vggtjax.captures.numbers import number
 from vggtjax.captures.pictures import PNG, opening
 from vggtjax.errors import InputError
 from vggtjax.media.images import is_image_name
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.storage.json_values import read_json
 
 _KEYFRAMES = "keyframes"
@@ -74,7 +74,7 @@ def read_polycam(folder: Path) -> Capture:
 def _pictures(folder: Path) -> dict[str, Path]:
     found = folder.iterdir() if folder.is_dir() else ()
     paths = [path for path in found if is_image_name(path) and not path.name.startswith(".")]
-    return {path.stem: path for path in sorted(paths, key=natural_key)}
+    return {path.stem: path for path in in_order(paths)}
 
 
 def _camera(path: Path) -> tuple[Float64[np.ndarray, "3 3"], tuple[int, int], Float64[np.ndarray, "4 4"]]:

@@ -23,7 +23,7 @@ from vggtjax.captures.capture import Capture, checked_sizes, left_out
 from vggtjax.captures.depth_files import read_png
 from vggtjax.captures.files import inside, read_text
 from vggtjax.errors import InputError
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.storage.trajectories import associate, read_numbers, read_trajectory
 
 PER_METRE = 5000.0
@@ -66,7 +66,7 @@ def read_list(folder: Path, name: str) -> Files:
         entries.append((time, inside(folder, words[1], path)))
     if not entries:
         raise InputError(f"{path} names no files; expected lines of a timestamp and a path")
-    entries.sort(key=lambda entry: (entry[0], natural_key(entry[1])))
+    entries = sorted(in_order(entries, lambda entry: entry[1]), key=lambda entry: entry[0])
     return Files(np.array([time for time, _ in entries]), [file for _, file in entries])
 
 

@@ -17,6 +17,7 @@ from vggtjax.clips.preprocessing import Fit, Fitter, Mode
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.clips.still import same_picture
 from vggtjax.errors import ClipError, InputError
+from vggtjax.media.images import ImageFiles
 from vggtjax.media.sampling import Sampling, Source
 from vggtjax.progress import Progress, no_progress
 
@@ -184,7 +185,10 @@ def read_clip(
 
 
 def warn_of_left_out(source: Source) -> None:
-    """Log what a capture has and its clip leaves out."""
+    """Log what a folder or capture has and its clip leaves out, and files that may be no frames."""
+    if isinstance(source, ImageFiles):
+        for note in source.notes:
+            logger.warning("%s: %s", source.paths[0].parent, note)
     if isinstance(source, CaptureFrames):
         for note in source.capture.left_out:
             logger.warning("%s: %s", source.capture.path, note)

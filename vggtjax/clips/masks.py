@@ -3,32 +3,51 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
-from PIL import Image
+from PIL import Image, ImageOps
 
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.sources import open_source
 from vggtjax.clips.truth import at_clip_pixels
 from vggtjax.errors import ClipError, InputError, reading
-from vggtjax.media.images import ImageFiles, has_transparency, known_formats, read_image
+from vggtjax.media.images import (
+    UNREADABLE,
+    ImageFiles,
+    check_pixels,
+    has_transparency,
+    known_formats,
+    read_image,
+    stored_orientation,
+    turned,
+)
 from vggtjax.storage.file_digest import file_digest
+
+logger = logging.getLogger(__name__)
 
 _WHITE = 127  # above it, a pixel of a picture in grey or colour moves
 _LABELS = ("P", "1")  # modes whose values are numbers of objects, not brightness
+_DEEP_LABELS = ("I", "I;16", "I;16B", "I;16L", "I;16N")  # and of 16 or 32 bits, unless white is their brightest
+_DEEP_WHITE = 65535
+_SAME_SHAPE, _ACROSS = (2, 3, 4), (5, 6, 7, 8)  # orientations of EXIF that leave and that swap width and height
+_NEARLY = 16  # values by which black and white may be off; others are those of a picture
+_FEW_GREYS = 0.1  # share of the opaque pixels of a mask that are neither black nor white: its edges
 
 
 def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
     """Load pictures of what moves, fitted to the clip's frames.
 
-    A pixel moves where a grey or coloured picture is bright and not transparent, or where a picture with a palette, as
-    DAVIS has them, holds an object (any value but 0). Crop, scale and padding are those of the frames: every pixel
-    takes the value at the place in the source that its centre shows, and padding is static.
+    A pixel moves where a grey or coloured picture is bright and not transparent, where a picture with a palette, as
+    DAVIS has them, or of 16 bits, as KITTI has them, holds an object (any value but 0), or where a cut-out is opaque.
+    Crop, scale and padding are those of the frames: every pixel takes the value at the place in the source that its
+    centre shows, and padding is static. Frames that are turned by EXIF have masks of the shown or the stored pixels.
 
     Args:
         folder: a picture per frame, matched by name (`frame_3.png` for `frame_3.jpg`). If no picture is named like a
@@ -56,7 +75,14 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
         )
     else:
         paths = list(source.paths)
-    return np.stack([_mask(path, clip, frame) for frame, path in enumerate(paths)])
+    turns = _turns(clip)
+    same_shape = [name for path, name in zip(paths, clip.frame_names, strict=True) if turns.get(name, 1) in _SAME_SHAPE]
+    if same_shape and all(stored_orientation(path) == 1 for path in paths):
+        logger.warning(
+            "%s is stored upside down or mirrored (its EXIF orientation); its mask is taken as of the upright frame",
+            same_shape[0],
+        )
+    return np.stack([_mask(path, clip, frame, turns) for frame, path in enumerate(paths)])
 
 
 def masks_at_clip_pixels(
@@ -79,13 +105,31 @@ def masks_at_clip_pixels(
         return np.stack([_resampled(mask, clip, i, partial(loaded.from_source, i)) for i, mask in enumerate(masks)])
     if masks.dtype == bool and masks.ndim == 3 and len(masks) == len(clip) and {masks.shape[1:]} == sizes:
         return at_clip_pixels(clip, masks)
+    turns = [_turns(clip).get(name, 1) for name in clip.frame_names]
+    are_turned = masks.dtype == bool and masks.ndim == 3 and all(turn in _ACROSS for turn in turns)
+    if are_turned and len(masks) == len(clip) and {masks.shape[:0:-1]} == sizes:  # of the stored pixels
+        return at_clip_pixels(clip, np.stack([turned(*pair) for pair in zip(masks, turns, strict=True)]))
     source = f" or {(len(clip), *sizes.pop())}, as the source's pictures" if len(sizes) == 1 else ""
     raise InputError(f"masks are {masks.dtype} {masks.shape}; expected bool {expected}, as the frames{source}")
 
 
-def _mask(path: Path, clip: Clip, frame: int) -> Bool[np.ndarray, "H W"]:
+def _turns(clip: Clip) -> dict[str, int]:
+    """Return the EXIF orientation of frames that are stored in another way than they are shown, by name."""
+    if not isinstance(clip.source, ImageFiles):
+        return {}
+    files = zip(clip.source.frame_names, clip.source.paths, strict=True)
+    wanted = set(clip.frame_names)
+    found = {name: stored_orientation(path) for name, path in files if name in wanted}
+    return {name: orientation for name, orientation in found.items() if orientation != 1}
+
+
+def _mask(path: Path, clip: Clip, frame: int, turns: dict[str, int]) -> Bool[np.ndarray, "H W"]:
     picture = read_mask(path)
     height, width = clip.source_size[frame]
+    turn = turns.get(clip.frame_names[frame], 1)
+    is_stored = abs(picture.shape[1] * width - picture.shape[0] * height) <= max(picture.shape)
+    if turn in _ACROSS and height != width and is_stored:  # the mask is of the stored pixels
+        picture = turned(picture, turn)
     if abs(picture.shape[0] * width - picture.shape[1] * height) > max(picture.shape):  # more than rounding
         raise ClipError(
             f"mask {path.name} is {picture.shape[1]} x {picture.shape[0]} and its frame {width} x {height}; "
@@ -112,20 +156,52 @@ def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
 
     Raises ClipError for an unreadable picture, or one too dark to be a mask.
     """
+    if (labels := _deep_labels(path)) is not None:
+        return labels != 0
     shown = read_image(path)  # says what is wrong with a file that is no picture
     with Image.open(path, formats=known_formats()) as picture:
         is_see_through = has_transparency(picture)
         if picture.mode in _LABELS and picture.size == shown.size and not is_see_through:
             return np.asarray(picture) > 0
-        opaque = np.asarray(picture.convert("RGBA"))[..., 3] > _WHITE if is_see_through else None
+        layers = np.asarray(ImageOps.exif_transpose(picture).convert("RGBA")) if is_see_through else None
     bright = np.asarray(shown).max(axis=-1)
-    if opaque is not None and opaque.shape == bright.shape:
+    if layers is not None:
+        opaque = layers[..., 3] > _WHITE
+        if not opaque.all() and _is_cut_out(layers[opaque][:, :3].max(axis=-1), path):
+            return opaque
         bright = np.where(opaque, bright, 0)
     if 0 < bright.max() <= _WHITE:
         raise ClipError(
             f"mask {path.name} is {bright.max()} of 255 at its brightest; expected black and white, or a palette"
         )
     return bright > _WHITE
+
+
+def _deep_labels(path: Path) -> np.ndarray | None:
+    """Return the upright numbers of objects of a picture of 16 or 32 bits; None for others, and for black and white."""
+    with suppress(*UNREADABLE), Image.open(path, formats=known_formats()) as picture:
+        if picture.mode not in _DEEP_LABELS:
+            return None
+        check_pixels(picture, path)
+        labels = np.asarray(ImageOps.exif_transpose(picture))
+        return None if labels.max() == _DEEP_WHITE else labels
+    return None
+
+
+def _is_cut_out(opaque: np.ndarray, path: Path) -> bool:
+    """Return whether opaque pixels show a thing rather than black and white, by the brightest channel of each.
+
+    Raises ClipError for such as are all black: a thing, or a mask without one.
+    """
+    if not opaque.size:
+        return False
+    greys = (opaque > _NEARLY) & (opaque < 255 - _NEARLY)
+    if (opaque <= _NEARLY).all():
+        raise ClipError(
+            f"mask {path.name} is black where it is opaque and transparent elsewhere; expected white where the world "
+            "moves, black or transparent elsewhere"
+        )
+    return bool(greys.mean() > _FEW_GREYS)
 
 
 def masks_digest(masks: np.ndarray | str | Path | bool | None) -> str:

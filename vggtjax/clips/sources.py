@@ -12,13 +12,16 @@ from typing import Any, TypeAlias
 import numpy as np
 from PIL import Image, ImageOps
 
+from vggtjax.captures.files import folder_name
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, find_capture
 from vggtjax.clips.manifest import MOST_BYTES, is_manifest, read_manifest, source_name
+from vggtjax.clips.mixture import check_frames, odd_ones
 from vggtjax.errors import ClipError, InputError, reading
+from vggtjax.media.animation import Animation, is_animation
 from vggtjax.media.arrays import ArrayFrames
 from vggtjax.media.images import ImageFiles, is_image_name, to_rgb
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.media.sampling import Source
 from vggtjax.media.video import VideoFile, is_video_name
 from vggtjax.storage.remote import check_url, download, is_url, list_url, local_path, shown, url_name
@@ -83,10 +86,10 @@ def _at_path(text: str) -> list[tuple[str, str]]:
             raise _missing(text)
         if is_manifest(text) and path.is_file():
             return list(read_manifest(path).items())
-        entries = sorted(path.iterdir(), key=natural_key) if path.is_dir() else [path]
+        entries = in_order(path.iterdir()) if path.is_dir() else [path]
         whole = not path.is_dir() or any(is_image_name(entry) for entry in entries) or bool(capture_kind(path))
         clips = [path] if whole else [entry for entry in entries if _is_clip(entry)]
-        return [(clip.resolve().name if clip.is_dir() else clip.stem, str(clip)) for clip in clips]
+        return [(folder_name(clip) if clip.is_dir() else clip.stem, str(clip)) for clip in clips]
 
 
 def _at_url(url: str) -> list[tuple[str, str]]:
@@ -103,7 +106,7 @@ def _at_url(url: str) -> list[tuple[str, str]]:
     entries = [] if _is_clip_file(name) or is_image_name(name) else list_url(url, ClipError)
     if not entries or any(is_image_name(Path(entry.name)) for entry in entries):
         return [(source_name(url), url)] if entries or name.suffix else []
-    entries.sort(key=lambda entry: natural_key(Path(entry.name)))
+    entries = in_order(entries, lambda entry: Path(entry.name))
     clips = [e.url for e in entries if not e.name.startswith(".") and (e.is_folder or _is_clip_file(Path(e.name)))]
     return [(source_name(clip), clip) for clip in clips]
 
@@ -131,9 +134,18 @@ def _from_path(name: str) -> Source:
         if path.exists():
             raise ClipError(f"{path} is neither a file nor a folder; expected images or a video")
         if glob.has_magic(name) and "://" not in name:
-            matches = [Path(match) for match in glob.glob(name, recursive=True)]  # noqa: PTH207 - absolute patterns too
+            found = glob.glob(_pattern(path), recursive=True)  # noqa: PTH207 - absolute patterns too
+            matches = [Path(match) for match in found]
             return _images(matches, f"pattern {name} matches", "expected images")
     raise _missing(name)
+
+
+def _pattern(path: Path) -> str:
+    """Return a pattern with the signs in the names of folders that are there escaped: a[1] may be a folder's name."""
+    there = next(parent for parent in path.parents if parent.is_dir() or parent == parent.parent)
+    if there == Path():
+        return str(path)
+    return os.path.join(glob.escape(str(there)), path.relative_to(there))  # noqa: PTH118
 
 
 def _capture(path: Path) -> CaptureFrames | None:
@@ -152,7 +164,7 @@ def _missing(name: str) -> ClipError:
 
 def _from_file(path: Path) -> Source:
     if is_image_name(path):
-        return ImageFiles((path.absolute(),))
+        return Animation(path.absolute()) if is_animation(path) else ImageFiles((path.absolute(),))
     if is_video_name(path):
         return VideoFile(path.absolute())
     raise ClipError(f"{path} has the name of neither an image nor a video; expected one such as .png, .jpg or .mp4")
@@ -168,17 +180,22 @@ def _from_list(paths: list[Path]) -> Source:
 
 
 def _images(paths: list[Path], place: str, advice: str) -> Source:
-    """Return the image files among `paths` in natural order, absolute; names that tie keep a fixed order."""
-    images = [path.absolute() for path in paths if is_image_name(path) and path.is_file()]
+    """Return the image files among `paths` in natural order, absolute; names that tie keep a fixed order.
+
+    Raises ClipError where there are none, or several for each frame.
+    """
+    entries = in_order(path.absolute() for path in paths)
+    images = [path for path in entries if is_image_name(path) and path.is_file()]
     if not images:
         raise ClipError(f"{place} no images{_inventory(paths)}; {advice}")
-    return ImageFiles(tuple(sorted(images, key=lambda path: (natural_key(path), str(path)))))
+    check_frames(images, place)
+    return ImageFiles(tuple(images), notes=odd_ones(entries, images))
 
 
 def _inventory(entries: list[Path]) -> str:
     """Return in words, after a comma, the number of folders, videos and other files, and up to three names of each."""
     names: dict[str, list[str]] = {"folder": [], "video": [], "other file": []}
-    for entry in sorted(entries, key=natural_key):
+    for entry in in_order(entries):
         names["folder" if entry.is_dir() else "video" if is_video_name(entry) else "other file"].append(entry.name)
     found = [
         f"{len(some)} {kind}{'s' if len(some) > 1 else ''} ({', '.join(some[:3])}{', ...' if len(some) > 3 else ''})"

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from vggtjax.captures.files import folder_name
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.commands.arguments import EvaluationFolder, Size
 from vggtjax.commands.models import ModelFiles
@@ -83,7 +84,7 @@ class Folders:
             path = Path(folder)
             if not path.is_dir():
                 raise InputError(f"--results has {text}, which names no folder; expected NAME=FOLDER")
-            name = name if equals else path.resolve().name
+            name = name if equals else folder_name(path)
             if name in folders:
                 raise InputError(f"--results has two folders named {name}; give them different names: NAME=FOLDER")
             folders[name] = path

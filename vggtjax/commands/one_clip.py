@@ -15,7 +15,7 @@ from vggtjax.clips.sources import open_source
 from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.report import Report
 from vggtjax.errors import DeviceMemoryError, one_line
-from vggtjax.media.sampling import Sampling
+from vggtjax.media.sampling import Sampling, Source
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.reconstruction import Reconstruction
@@ -40,8 +40,10 @@ class OneClip:
         recipe: ClipRecipe,
         given: GivenInputs,
         out: Path,
+        source: Source | None = None,  # of these frames, where it is open: what is odd about it is said once
     ) -> None:
-        self._report, self._frames, self._source = report, frames, open_source(frames)
+        self._report, self._frames = report, frames
+        self._source = open_source(frames) if source is None else source
         self._model, self._fusion, self._recipe, self._given, self._out = model, fusion, recipe, given, out
         self._fitter = recipe.framing.fitter(size=model.config.image_size, patch=model.config.patch_size)
 

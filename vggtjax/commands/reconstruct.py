@@ -61,7 +61,7 @@ def reconstruct(
         network, fitted = files.load(report, recipe.options, [recipe.options.method])
         from vggtjax.commands.one_clip import OneClip
 
-        result = OneClip(report, frames, network, fitted, recipe, given, out).run(windows)
+        result = OneClip(report, frames, network, fitted, recipe, given, out, opened).run(windows)
     report.summary(result, out, network)
     if given.tracks is not None and "tracks" in network.untrained_heads:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")

@@ -23,6 +23,7 @@ from vggtjax.results.frame import source_pixels
 from vggtjax.results.result import Result, missing_fields
 
 _HISTOGRAM = np.geomspace(1e-3, 10, 41)  # metres, bins of point distances
+_UNKNOWN = np.float32(0)  # depth of pixels without a prediction; they are not scored
 _PICTURED = 4  # frames whose maps are in the curves
 
 _Outputs = tuple[dict[str, float], dict[str, np.ndarray]]  # metrics and curves
@@ -88,6 +89,12 @@ def _check_predicted(result: Result, field: str, what: str) -> None:
         raise AbsentError(f"the result has no {what}")
 
 
+def _check_any(known: np.ndarray) -> None:
+    """Raise AbsentError where no pixel has a true depth and a predicted one."""
+    if not known.any():
+        raise AbsentError("no pixel with a true depth has a predicted one")
+
+
 def _trajectory(result: Result, truth: TruthAtPixels) -> _Outputs:
     poses = truth.poses
     errors = trajectory_errors(result.world_from_camera, poses)
@@ -101,13 +108,16 @@ def _alignment(result: Result, poses: Float64[np.ndarray, "S 4 4"], *, allow_lin
 
 def _point_clouds(result: Result, truth: TruthAtPixels) -> _Outputs:
     true, known = truth.points, truth.depth > 0
+    is_predicted = result.depth[known] != _UNKNOWN
+    known &= result.depth != _UNKNOWN
+    _check_any(is_predicted)
     intrinsics = result.intrinsics.astype(np.float64)
     predicted = known_points(result.depth, intrinsics, result.camera_from_world.astype(np.float64), known)
     if not np.isfinite(predicted).all():
         raise InputError(f"{int((~np.isfinite(predicted).all(axis=1)).sum())} predicted points are not finite")
     similarity = _alignment(result, truth.poses)
     predicted = similarity.apply(predicted).astype(np.float32)
-    paired = paired_distance(predicted, true)
+    paired = paired_distance(predicted, true[is_predicted])
     ways = {"accuracy": (predicted, true), "completeness": (true, predicted)}
     metrics: dict[str, float] = {}
     curves: dict[str, np.ndarray] = {"distance_bins": _HISTOGRAM}
@@ -146,6 +156,8 @@ def _video_depth(result: Result, truth: TruthAtPixels, *, align: Align) -> _Outp
     true = np.where(in_frame, true, 0)
     if not (true > 0).any():
         raise AbsentError("no pixel of the sequence has a true depth")
+    true = np.where(predicted != _UNKNOWN, true, 0)
+    _check_any(true > 0)
     errors = video_depth_errors(predicted, true, align)
     scale, shift = depth_alignment(predicted[true > 0], true[true > 0], align)
     metrics = {f"depth_{key}" if key == "pixels" else key: value for key, value in errors._asdict().items()}
@@ -158,7 +170,7 @@ def _depth_maps(result: Result, truth: TruthAtPixels, scale: float, shift: float
     true = truth.depth[shown]
     maps = (scale * result.depth[shown].astype(np.float64) + shift).astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
-        errors = np.where(true > 0, np.abs(maps - true) / true, np.nan)
+        errors = np.where((true > 0) & (result.depth[shown] != _UNKNOWN), np.abs(maps - true) / true, np.nan)
     return {
         "error_maps": errors.clip(max=100).astype(np.float16),
         "true_depth": true,
@@ -171,7 +183,8 @@ def _depth_maps(result: Result, truth: TruthAtPixels, scale: float, shift: float
 def depth_at_source(result: Result) -> tuple[Float32[np.ndarray, "S h w"], Bool[np.ndarray, "S h w"]]:
     """Return the depth at the source's size, bilinear as in the protocols of video depth, and the pixels in the frame.
 
-    Without a crop, that is a resize with half-pixel centres; a crop is undone first.
+    Without a crop, that is a resize with half-pixel centres; a crop is undone first. Depth 0 is unknown and is never
+    blended: a pixel whose nearest one is unknown is 0, and others are blended from those that are known.
 
     Raises:
         InputError: frames of different sizes.
@@ -185,13 +198,25 @@ def depth_at_source(result: Result) -> tuple[Float32[np.ndarray, "S h w"], Bool[
     for frame, (left, top, right, bottom) in enumerate(result.valid_box):
         x, y, in_frame[frame] = source_pixels(result, frame)
         places = np.stack(np.meshgrid(y - top - 0.5, x - left - 0.5, indexing="ij"))
-        depth[frame] = map_coordinates(result.depth[frame, top:bottom, left:right], places, order=1, mode="nearest")
+        depth[frame] = _blended(result.depth[frame, top:bottom, left:right], places)
     return depth, in_frame
 
 
+def _blended(depth: Float32[np.ndarray, "H W"], places: Float64[np.ndarray, "2 h w"]) -> Float32[np.ndarray, "h w"]:
+    """Return depth at places (y, x), bilinear over what is known; 0 where the nearest pixel is unknown."""
+    known = depth != _UNKNOWN
+    values = map_coordinates(depth, places, order=1, mode="nearest")
+    if known.all():
+        return values
+    share = map_coordinates(known.astype(np.float32), places, order=1, mode="nearest")
+    nearest = map_coordinates(known.astype(np.uint8), places, order=0, mode="nearest") > 0
+    return np.where(nearest, values / np.where(nearest & (share > 0), share, 1), _UNKNOWN)
+
+
 def _uncertainty(result: Result, truth: TruthAtPixels) -> _Outputs:
-    known = truth.depth > 0
+    known = (truth.depth > 0) & (result.depth != _UNKNOWN)
     _check_predicted(result, "depth_confidence", "confidence")
+    _check_any(known)
     predicted, true = result.depth[known].astype(np.float64), truth.depth[known].astype(np.float64)
     precision = result.depth_confidence[known].astype(np.float64)
     true /= depth_alignment(predicted, true, "scale")[0]  # the precision is in the unit of the prediction

@@ -68,7 +68,9 @@ class TruthAtPixels:
         poses = self.sequence.world_from_camera
         if poses is None:
             raise AbsentError("the sequence has no camera poses")
-        if len(poses) < FEWEST_POSES or not moves(poses[:, :3, 3]):
+        if len(poses) < FEWEST_POSES:
+            raise AbsentError(f"there are {len(poses)} true cameras; an alignment needs {FEWEST_POSES}")
+        if not moves(poses[:, :3, 3]):
             raise AbsentError(f"the {len(poses)} true cameras do not move; an alignment needs motion")
         return poses
 

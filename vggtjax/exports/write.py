@@ -99,8 +99,7 @@ def _write(result: Result, path: Path, form: ExportFormat, items: Iterator[View]
 
             write_exr(path, items)
         case "tum":
-            times = np.arange(len(result.depth)) if result.timestamps is None else result.timestamps
-            write_trajectory(path, result.world_from_camera, times.astype(np.float64), note=result.model_note)
+            write_trajectory(path, result.world_from_camera, result.file_times, note=result.model_note)
         case "kitti":
             poses = result.world_from_camera[:, :3].reshape(-1, 12).astype(np.float64)
             np.savetxt(path, poses, fmt="%.9g", encoding="utf-8")

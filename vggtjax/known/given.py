@@ -15,10 +15,9 @@ from vggtjax.errors import InputError
 from vggtjax.known.depths import MOST_FILE_BYTES, DepthSamples, check_depths, read_depths
 from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
 from vggtjax.known.options import SOURCE, Baseline, KnownGeometry, parse_baseline
-from vggtjax.known.poses import POSE_COLUMNS, checked_known_poses, read_poses
+from vggtjax.known.poses import checked_known_poses, pose_table, read_poses
 from vggtjax.results.result import Result
 from vggtjax.storage.csv_file import read_csv
-from vggtjax.storage.trajectories import read_numbers
 
 
 class Given(NamedTuple):
@@ -44,7 +43,7 @@ def check_readable(known: KnownGeometry) -> None:
     if known.intrinsics not in (None, SOURCE):
         read_intrinsics(known.intrinsics)
     if known.poses not in (None, SOURCE):
-        read_numbers(known.poses, POSE_COLUMNS)
+        pose_table(known.poses, known.quaternion)
     if known.known_depths not in (None, SOURCE):
         read_csv(Path(known.known_depths), most_bytes=MOST_FILE_BYTES)
     if known.leave_out is not None and not os.path.isdir(known.leave_out):  # noqa: PTH112 - False for an over-long name
@@ -89,7 +88,11 @@ def read_known(
         intrinsics = at_clip_pixels(matrices, frames, "intrinsics")
     if known.poses is not None:
         from_source = known.poses == SOURCE
-        poses = _recorded(capture, "world_from_camera") if from_source else read_poses(known.poses, frames)
+        poses = (
+            _recorded(capture, "world_from_camera")
+            if from_source
+            else read_poses(known.poses, frames, known.quaternion)
+        )
         poses_name = str(capture.path) if from_source and capture is not None else known.poses
         poses = checked_known_poses(poses, count, poses_name)
     if known.baseline is not None:

@@ -11,6 +11,7 @@ import tyro
 from vggtjax.errors import InputError, one_line
 from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields
+from vggtjax.storage.trajectories import Quaternion
 
 SOURCE = "source"  # in place of a file: what the capture that the clip comes from says
 
@@ -37,8 +38,11 @@ class KnownGeometry:
     shared_focal: Switch = False
     """one focal length for the whole clip, the median of the predicted ones"""
     poses: Annotated[str | None, _words("FILE|source")] = None
-    """known camera poses, world-from-camera: TUM's eight numbers a line or KITTI's twelve; source: those of the
-    capture's folder"""
+    """known camera poses, world-from-camera: TUM's eight numbers a line, KITTI's twelve, or sixteen; source: those of
+    the capture's folder"""
+    quaternion: InWords[Quaternion | None] = None
+    """order of the quaternions in the file of poses: wxyz as MonST3R, CUT3R and VGGT4D write them, or xyzw as TUM does;
+    by default what the names of its columns say, or xyzw"""
     baseline: Annotated[str | None, _words("I,J,METRES")] = None
     """metric scale: the distance between the cameras of frames I and J, such as 0,7,0.85"""
     camera_height: InWords[float | None] = None
@@ -55,6 +59,8 @@ class KnownGeometry:
         check_fields(self)
         if self.intrinsics is not None and self.shared_focal:
             raise InputError("--intrinsics and --shared-focal exclude each other; give one of them")
+        if self.quaternion is not None and self.poses in (None, SOURCE):
+            raise InputError("--quaternion is of a file of poses; give the file with --poses")
         scales = {
             "--baseline": self.baseline,
             "--camera-height": self.camera_height,

@@ -15,14 +15,16 @@ from vggtjax.captures.cameras import checked_world_from_camera
 from vggtjax.clips.clip import Clip
 from vggtjax.errors import InputError
 from vggtjax.results.result import Result
-from vggtjax.storage.trajectories import associate, read_numbers, read_trajectory
+from vggtjax.storage.trajectories import Quaternion, associate, named_order, read_numbers, read_trajectory
 
-_TUM, _KITTI = POSE_COLUMNS = (8, 12)  # numbers a line
+_TUM = 8  # numbers a line; others are matrices
+_MATRICES = (12, 16, 4)  # of three rows, of four, and of four a row a line
+_UNNAMED = "pred_traj.txt"  # of VGGT4D, MonST3R and CUT3R: without names of columns, and the quaternion's w is first
 _FEWEST = 3
 _NO_MOTION = 1e-6  # a path, or its share of the distance from the origin, below which cameras stand still
 _FAR_AWAY = 1e-4  # share of the distance from the origin; the motion loses a thousandth to 32 bits
 _MOST_TURN = 45.0  # degrees; poses that differ more in the middle belong to another clip
-_TURN, _LESS = 5.0, 1 / 3  # degrees; the share of both residuals left in another convention, which is then right
+_RESIDUAL, _LESS = 5.0, 1 / 3  # of `_residual`; the share of it left in another convention, which is then right
 
 
 logger = logging.getLogger(__name__)
@@ -37,22 +39,47 @@ class PoseAgreement(NamedTuple):
     scale: float  # of predicted lengths
 
 
-def read_poses(path: str | Path, clip: Clip | Result) -> Float64[np.ndarray, "S 4 4"]:
-    """Return the world-from-camera poses of a clip's frames.
+def pose_table(
+    path: str | Path, quaternion: Quaternion | None = None
+) -> tuple[Float64[np.ndarray, " N"] | None, Float64[np.ndarray, "N 4 4"]]:
+    """Return the times, if there are any, and the poses of a text file.
+
+    Lines have TUM's eight numbers, with quaternions in the order that is given, that the first lines name, or in TUM's;
+    twelve or sixteen of a matrix, row by row; or four, a row of a matrix each. Raises InputError or ResultError for an
+    unreadable file, an order with matrices, or none with a file whose name is that of programs with w first.
+    """
+    rows = read_numbers(path, (_TUM, *_MATRICES))
+    if rows.shape[1] == _TUM:
+        if quaternion is None and Path(path).name == _UNNAMED and named_order(path) is None:
+            raise InputError(
+                f"{path} does not say the order of its quaternions; give --quaternion wxyz, as VGGT4D, MonST3R, CUT3R "
+                "and vggtjax write such files, or xyzw"
+            )
+        return read_trajectory(path, quaternion)
+    if quaternion is not None:
+        raise InputError(f"quaternion is {quaternion!r}, but {path} has matrices; leave --quaternion out")
+    if rows.shape[1] == 4 and len(rows) % 4:
+        raise InputError(f"{path} has {len(rows)} rows of four numbers; expected four rows for each pose")
+    poses = np.tile(np.eye(4), (len(rows) if rows.shape[1] > 4 else len(rows) // 4, 1, 1))
+    if rows.shape[1] == 12:
+        poses[:, :3] = rows.reshape(-1, 3, 4)
+    else:
+        poses[:] = rows.reshape(-1, 4, 4)
+    return None, poses
+
+
+def read_poses(
+    path: str | Path, clip: Clip | Result, quaternion: Quaternion | None = None
+) -> Float64[np.ndarray, "S 4 4"]:
+    """Return the world-from-camera poses of a clip's frames; `pose_table` says which files are read.
 
     Of poses with times every frame takes the one at its own time: the timestamp in its name, as in TUM's data sets, or
     its time in the video. Where there are no times, or others, the file has one pose for every frame, in their order.
 
     Raises InputError or ResultError for an unreadable file, another number of poses, or a frame without a pose.
     """
-    rows = read_numbers(path, POSE_COLUMNS)
+    times, poses = pose_table(path, quaternion)
     frames = len(clip.images)
-    if rows.shape[1] == _KITTI:
-        poses = np.tile(np.eye(4), (len(rows), 1, 1))
-        poses[:, :3] = rows.reshape(-1, 3, 4)
-        times = None
-    else:
-        times, poses = read_trajectory(path)
     wanted = _times(clip)
     pairs = np.zeros((0, 2), int) if times is None or wanted is None else associate(wanted, times)
     if len(poses) == frames and len(pairs) < frames:  # by their order
@@ -136,14 +163,16 @@ def check_agreement(
     others = {
         "in OpenGL's axes (y up, z backward)": np.diag([1.0, -1.0, -1.0]) @ known,
         "as camera-from-world": world_from_camera(known)[:, :3],
+        "with the quaternion's w first (--quaternion wxyz)": _in_order(known, [1, 2, 3, 0]),
+        "with the quaternion's w last (--quaternion xyzw)": _in_order(known, [3, 0, 1, 2]),
     }
     read = {convention: agreement(camera_from_world, poses) for convention, poses in others.items()}
-    convention = min(read, key=lambda name: read[name].turn_median + 100 * read[name].centres)
-    left, offset = read[convention].turn_median, read[convention].centres
-    if found.turn_median > _TURN and left < _LESS * found.turn_median and offset < _LESS * found.centres:
+    convention = min(read, key=lambda name: _residual(read[name]))
+    if _residual(found) > _RESIDUAL and _residual(read[convention]) < _LESS * _residual(found):
+        left, offset = read[convention].turn_median, read[convention].centres
         raise InputError(
-            f"{words} in the middle, and by {left:.1f} if read {convention}; expected world-from-camera poses in "
-            "OpenCV's axes (x right, y down, z forward)"
+            f"{words} in the middle and {found.centres:.0%} of their path, and by {left:.1f} degrees and {offset:.0%} "
+            f"if read {convention}; expected world-from-camera poses in OpenCV's axes (x right, y down, z forward)"
         )
     if found.turn_median > _MOST_TURN:
         raise InputError(
@@ -151,6 +180,20 @@ def check_agreement(
             "poses of these frames"
         )
     return found
+
+
+def _residual(found: PoseAgreement) -> float:
+    """Return degrees and hundredths of the path together: a pan misread turns alike about another axis."""
+    return found.turn_median + 100 * found.centres
+
+
+def _in_order(known: Float64[np.ndarray, "S 3 4"], order: list[int]) -> Float64[np.ndarray, "S 3 4"]:
+    """Return poses with the numbers of their quaternions x y z w taken in another order, at the same places."""
+    turns = scipy.spatial.transform.Rotation.from_matrix(known[:, :, :3]).inv().as_quat()[:, order]
+    poses = np.tile(np.eye(4), (len(known), 1, 1))
+    poses[:, :3, :3] = scipy.spatial.transform.Rotation.from_quat(turns).as_matrix()
+    poses[:, :3, 3] = camera_centres(known)
+    return world_from_camera(poses[:, :3])[:, :3]
 
 
 def _times(clip: Clip | Result) -> Float64[np.ndarray, " S"] | None:

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import functools
+import logging
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from PIL import Image, ImageOps, UnidentifiedImageError
+import pillow_heif
+from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 
 from vggtjax.errors import ClipError, InputError, check_regular
 from vggtjax.media.arrays import eight_bit
+from vggtjax.media.colour import HDR, srgb_of_coded
 from vggtjax.media.sampling import Frame, Sampling
+
+logger = logging.getLogger(__name__)
 
 # Formats of still pictures only: for others (EPS) Pillow starts another program.
 FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP", "PPM", "WEBP", "TGA", "JPEG2000", "AVIF", "HEIF")
@@ -22,6 +29,10 @@ FORMATS = ("PNG", "JPEG", "MPO", "TIFF", "BMP", "PPM", "WEBP", "TGA", "JPEG2000"
 # shorter file makes Pillow take memory in vain. Formats that are not in the table shrink one colour to almost nothing.
 _MOST_PIXELS_A_BYTE, _ALWAYS_PIXELS = 10_000, 2**24
 _LITTLE_SHRUNK: dict[str, int] = dict.fromkeys(("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA"), 2**22)
+
+ORIENTATION = 0x0112  # of EXIF; from 5 on, width and height are swapped
+_DARK = 16  # of 255: the most that a picture of 12 bits has when it is stored in 16
+_SEVERAL = ("MPO",)  # formats whose further pictures are previews of the first
 
 # What Pillow's decoders raise on broken files; its size limit is DecompressionBombError.
 UNREADABLE = (
@@ -32,9 +43,11 @@ UNREADABLE = (
 
 @dataclass(frozen=True)
 class ImageFiles:
-    """Image files, one frame each, named by the stem of the file; an animated image gives its first picture."""
+    """Image files, one frame each, named by the stem of the file; of a file with several pictures the first."""
 
     paths: tuple[Path, ...]
+    notes: tuple[str, ...] = field(default=(), kw_only=True, compare=False)  # what is odd about the choice of files
+    _said: set[str] = field(default_factory=set, init=False, repr=False, compare=False)  # kinds of warnings, each once
 
     @property
     def name(self) -> str:
@@ -55,7 +68,7 @@ class ImageFiles:
         """Yield the frames that `sampling` takes. Raises ClipError for a file that cannot be read."""
         for index in sampling.indices(len(self.paths)):
             path = self.paths[index]
-            yield Frame(path.stem, read_image(path))
+            yield Frame(path.stem, read_image(path, self._said))
 
 
 def is_image_name(path: Path) -> bool:
@@ -63,20 +76,32 @@ def is_image_name(path: Path) -> bool:
     return path.suffix.lower() in _suffixes()
 
 
-def read_image(path: Path) -> Image.Image:
+def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
     """Read an image file as upright RGB.
 
     The orientation of its EXIF data is applied, transparency is composited over white, 16-bit values are scaled to
-    8 bits and floating-point values must lie in [0, 1].
+    8 bits and floating-point values must lie in [0, 1]. With `said`, the kinds of warnings that were given, pictures
+    that use few of their bits or have others behind them are warned of.
 
-    Raises ClipError for a file that is missing, no image, truncated, corrupt, above Pillow's limit of pixels, or too
-    short for the pixels that it says it has.
+    Raises ClipError for a file that is missing, empty, no image, truncated, corrupt, above Pillow's limit of pixels, or
+    too short for the pixels that it says it has.
     """
     check_regular(path, ClipError)
     try:
+        check_not_empty(path)
         with Image.open(path, formats=known_formats()) as image:
             check_pixels(image, path)
-            return to_rgb(ImageOps.exif_transpose(image), path.name)
+            is_deep, count = _has_sixteen_bits(image), 1 if image.format in _SEVERAL else getattr(image, "n_frames", 1)
+            picture = to_rgb(ImageOps.exif_transpose(image), path.name)
+            picture, hdr = _without_hdr(picture, path, image.info.get("nclx_profile"))
+        if said is not None and hdr is not None:
+            _say(path, hdr, "hdr", said)
+        if said is not None and count > 1:
+            _say(path, f"holds {count} pictures; the first is read, write the others as files", "several", said)
+        if said is not None and is_deep and 0 < np.asarray(picture).max() <= _DARK:
+            bits = "has 16 bits a value and uses at most 12 of them, so it is nearly black; if all pictures are"
+            _say(path, f"{bits}, multiply their values by 16 (for 12 bits) or 64 (for 10)", "deep", said)
+        return picture
     except ClipError:
         raise
     except FileNotFoundError as error:
@@ -86,6 +111,50 @@ def read_image(path: Path) -> Image.Image:
     except UNREADABLE as error:
         reason = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise ClipError(f"cannot read image {path}: {reason}; leave it out or write it anew") from error
+
+
+def _without_hdr(picture: Image.Image, path: Path, profile: Any) -> tuple[Image.Image, str | None]:
+    """Return a picture as SDR, by the colours that its HEIF file states, and what was done, if anything was.
+
+    The file is read again for its 10 or 12 bits, of which Pillow's pictures have 8.
+    """
+    names = ("transfer_characteristics", "color_primaries")
+    transfer, primaries = (int(profile[name]) for name in names) if profile else (0, 0)
+    if transfer not in HDR:
+        return picture, None
+    deep = np.asarray(pillow_heif.open_heif(path, convert_hdr_to_8bit=False))
+    pixels = deep[..., :3] if deep.dtype == np.uint16 else np.asarray(picture).astype(np.uint16) * np.uint16(257)
+    pixels, note = srgb_of_coded(pixels, transfer, primaries)
+    return Image.fromarray(pixels), note
+
+
+def _say(path: Path, note: str, kind: str, said: set[str]) -> None:
+    """Log what is odd about a picture, once for all of a kind."""
+    if kind not in said:
+        said.add(kind)
+        logger.warning("%s %s", path, note)
+
+
+def check_not_empty(path: Path) -> None:
+    """Raise ClipError for a file without bytes."""
+    if path.stat().st_size == 0:
+        raise ClipError(f"{path} is empty (0 bytes); get it whole, or leave it out")
+
+
+def stored_orientation(path: Path) -> int:
+    """Return EXIF's orientation of the stored pixels, 1 for pictures that are stored upright or cannot be read."""
+    with suppress(*UNREADABLE), Image.open(path, formats=known_formats()) as image:
+        return int(image.info.get("original_orientation") or image.getexif().get(ORIENTATION, 1))  # of HEIF, of others
+    return 1
+
+
+def turned(values: np.ndarray, orientation: int) -> np.ndarray:
+    """Return stored values [H, W] as they are shown with an orientation of EXIF, a view [H, W] or [W, H]."""
+    if orientation in (5, 6, 7, 8):  # across the diagonal
+        values = values.T
+    if orientation in (2, 3, 6, 7):
+        values = values[:, ::-1]
+    return values[::-1] if orientation in (3, 4, 7, 8) else values
 
 
 def check_pixels(image: Image.Image, path: Path, error: type[InputError] = ClipError) -> None:
@@ -116,13 +185,20 @@ def to_rgb(image: Image.Image, name: str) -> Image.Image:
     return image.convert("RGB")
 
 
+def _has_sixteen_bits(image: ImageFile.ImageFile) -> bool:
+    """Return whether an opened picture, not loaded yet, stores 16 bits a value; Pillow takes 8 of those of colours."""
+    return ";16" in image.mode or any(";16" in str(tile[3]) for tile in image.tile)
+
+
 @functools.cache
 def known_formats() -> tuple[str, ...]:
-    """Return the FORMATS that this Pillow can read; files in other formats are refused."""
+    """Return the FORMATS that this Pillow can read, HEIF by pillow-heif; files in other formats are refused."""
     Image.init()
+    pillow_heif.register_heif_opener()
     return tuple(name for name in FORMATS if name in Image.OPEN)
 
 
 @functools.cache
 def _suffixes() -> frozenset[str]:
+    known_formats()
     return frozenset(suffix for suffix, name in Image.registered_extensions().items() if name in FORMATS)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
-from fractions import Fraction
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -14,6 +15,8 @@ from PIL import Image
 
 from vggtjax.errors import ClipError, check_regular
 from vggtjax.media.arrays import frame_name
+from vggtjax.media.colour import Colours, colours_of, rgb_pixels, tags
+from vggtjax.media.images import check_not_empty
 from vggtjax.media.sampling import Frame, Sampling
 
 if TYPE_CHECKING:
@@ -21,6 +24,7 @@ if TYPE_CHECKING:
 
     from av import VideoCodecContext, VideoFrame, VideoStream
     from av.container import InputContainer
+    from av.filter import Graph
     from av.stream import Stream
 
 logger = logging.getLogger(__name__)
@@ -34,6 +38,7 @@ _SUFFIXES = (
 _CONTAINERS = "mov,matroska,avi,mpeg,mpegts,asf,flv,ogg,mxf,gif"
 _MOST_PIXELS = 2**27  # of one frame; 15360 x 8640 is below it
 _ALWAYS_PIXELS, _MOST_PIXELS_A_BYTE = 2**23, 10_000  # of a frame in any file, 3840 x 2160; and by the file's size
+_LEAST_DEINTERLACED = 4  # lines and columns; the filter refuses smaller frames
 _EXACT_CONTAINERS = frozenset(("mov", "matroska", "avi"))  # their stated length is reliable
 _MISSING_END = 0.5  # seconds by which a whole file may end before its stated length
 
@@ -43,7 +48,7 @@ class VideoFile:
     """A video file; frames are named by their index in it, and times count from its first frame."""
 
     path: Path
-    _odd: set[Fraction] = field(default_factory=set, init=False, repr=False, compare=False)  # aspects warned about
+    _said: set[str] = field(default_factory=set, init=False, repr=False, compare=False)  # warnings, each once
 
     @property
     def name(self) -> str:
@@ -60,7 +65,7 @@ class VideoFile:
 
         try:
             with _opened(self.path, av) as container:
-                stream = _video_stream(container, self.path, self._odd)
+                stream = _video_stream(container, self.path, self._said)
                 if stream.duration is not None and stream.time_base is not None:
                     return float(stream.duration * stream.time_base)
                 return None if container.duration is None else container.duration / 1e6
@@ -76,11 +81,11 @@ class VideoFile:
         import av.error
 
         rotation, matrix = None, np.eye(2)
-        for index, time, frame in sampling.select(_timed(self.path, av, self._odd)):
+        for index, time, (frame, colours) in sampling.select(_timed(self.path, av, self._said)):
             if frame.rotation != rotation:  # asking a frame for its matrix keeps it alive until garbage is collected
                 rotation, matrix = frame.rotation, _display_matrix(frame, self.path)
             try:
-                pixels = frame.to_ndarray(format="rgb24")
+                pixels = rgb_pixels(frame, colours)
             except (av.error.FFmpegError, ValueError) as error:
                 raise _unreadable(self.path, index, error) from error
             yield Frame(frame_name(index), Image.fromarray(upright(pixels, matrix)), time)
@@ -125,6 +130,8 @@ def _display_matrix(frame: VideoFrame, path: Path) -> np.ndarray:
 def _opened(path: Path, av: ModuleType) -> InputContainer:
     """Return the opened file, of one of the `_CONTAINERS` only."""
     check_regular(path, ClipError)
+    if path.exists():
+        check_not_empty(path)
     options: dict[str, Any] = {"container_options": {"format_whitelist": _CONTAINERS}}
     if int(av.__version__.split(".")[0]) < 19:  # later ones never fail on titles in odd encodings
         options["metadata_errors"] = "replace"
@@ -132,30 +139,45 @@ def _opened(path: Path, av: ModuleType) -> InputContainer:
     return av.open(str(path.absolute()), **options)
 
 
-def _timed(path: Path, av: ModuleType, odd: set[Fraction]) -> Iterator[tuple[float, VideoFrame]]:
-    """Yield (seconds since the first frame, frame) of every frame of the file's best video stream."""
+def _timed(path: Path, av: ModuleType, said: set[str]) -> Iterator[tuple[float, tuple[VideoFrame, Colours]]]:
+    """Yield (seconds since the first frame, frame and its colours) of every frame of the file's best video stream."""
     count, first = 0, 0.0
     try:
         with _opened(path, av) as container:
-            stream = _video_stream(container, path, odd)
-            for frame in _decoded(container, stream):
-                if frame.pts is None or stream.time_base is None:
+            stream = _video_stream(container, path, said)
+            container_tags = tags(stream.codec_context)
+            for frame in _progressive(_decoded(container, stream), stream, path, said):
+                unit = frame.time_base or stream.time_base  # the last frames of a damaged file have none
+                if frame.pts is None or unit is None:
                     raise ClipError(f"frame {count} of video {path} has no presentation time; write the video as MP4")
                 if frame.width * frame.height > _MOST_PIXELS:
                     raise ClipError(
                         f"video {path} has frames of {frame.width} x {frame.height}; expected at most {_MOST_PIXELS} "
                         f"pixels, make them smaller"
                     )
-                time = float(frame.pts * stream.time_base)
+                time = float(frame.pts * unit)
                 if count == 0:
                     first = time
                 count += 1
-                yield time - first, frame
+                yield time - first, (frame, _known_colours(frame, container_tags, path, said))
     except (av.error.FFmpegError, OSError, EOFError) as error:
         raise _unreadable(path, count, error) from error
 
 
-def _video_stream(container: InputContainer, path: Path, odd: set[Fraction]) -> VideoStream:
+def _known_colours(frame: VideoFrame, container_tags: tuple[int, int, int], path: Path, said: set[str]) -> Colours:
+    """Return the colours of a frame and log what is done to them. Raises ClipError for such as cannot be read."""
+    colours = colours_of(frame, container_tags)
+    if not colours.is_readable:
+        raise ClipError(
+            f"video {path} has colours in ICtCp or IPT, such as of Dolby Vision's profile 5; expected YCbCr or RGB, "
+            "write it anew as SDR"
+        )
+    if colours.note is not None:
+        _say(path, colours.note, said)
+    return colours
+
+
+def _video_stream(container: InputContainer, path: Path, said: set[str]) -> VideoStream:
     from av.stream import Disposition
 
     stream = cast("VideoStream | None", container.streams.best("video"))
@@ -172,10 +194,58 @@ def _video_stream(container: InputContainer, path: Path, odd: set[Fraction]) -> 
     decoder.options = {"max_pixels": str(most)}  # also of sizes that the frames themselves say
     stream.thread_type = "AUTO"
     aspect = stream.sample_aspect_ratio
-    if aspect not in (None, 0, 1) and aspect not in odd:
-        odd.add(aspect)
-        logger.warning("%s has pixels of aspect %s; they are taken as square", path, aspect)
+    if aspect not in (None, 0, 1):
+        _say(path, f"has pixels of aspect {aspect}; they are taken as square", said)
     return stream
+
+
+def _say(path: Path, note: str, said: set[str]) -> None:
+    """Log what is odd about a video, once."""
+    if note not in said:
+        said.add(note)
+        logger.warning("%s %s", path, note)
+
+
+def _progressive(frames: Iterator[VideoFrame], stream: VideoStream, path: Path, said: set[str]) -> Iterator[VideoFrame]:
+    """Yield frames as they are up to the first interlaced one; from there on those that are lose their combs.
+
+    Each pair of fields becomes one frame, at the time of the first field.
+    """
+    for frame in frames:
+        if frame.interlaced_frame and min(frame.width, frame.height) >= _LEAST_DEINTERLACED:
+            _say(path, "is interlaced; its frames are deinterlaced, one for each pair of fields", said)
+            yield from _deinterlaced(chain([frame], frames), stream)
+            return
+        yield frame
+
+
+def _deinterlaced(frames: Iterator[VideoFrame], stream: VideoStream) -> Iterator[VideoFrame]:
+    """Yield the frames with those that are interlaced made whole by FFmpeg's bwdif; it runs a frame behind."""
+    from av.filter import Graph
+
+    graph, shape = None, None
+    for frame in frames:
+        now = (frame.width, frame.height, frame.format.name)
+        if graph is None or now != shape:
+            if graph is not None:
+                yield from _filtered(graph, None)
+            graph, shape = Graph(), now
+            source = graph.add_buffer(template=stream, width=frame.width, height=frame.height, format=frame.format)
+            graph.link_nodes(source, graph.add("bwdif", "mode=send_frame:deint=interlaced"), graph.add("buffersink"))
+            graph.configure()
+        yield from _filtered(graph, frame)
+    if graph is not None:
+        yield from _filtered(graph, None)
+
+
+def _filtered(graph: Graph, frame: VideoFrame | None) -> Iterator[VideoFrame]:
+    """Yield what a graph gives after a frame, or after the last one."""
+    import av.error
+
+    graph.vpush(frame)
+    with suppress(av.error.BlockingIOError, av.error.EOFError):  # it needs more, or has no more
+        while True:
+            yield graph.vpull()
 
 
 def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
@@ -79,6 +80,8 @@ def settings_of(
     settings |= {"masks": mask_source}
     settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
     settings |= {"clip": clip.source.name} if clip.source.name else {}
+    if isinstance(clip.source, CaptureFrames) and clip.source.first_time is not None:
+        settings["first_time"] = clip.source.first_time
     return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}
 
 

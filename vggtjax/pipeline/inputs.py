@@ -71,6 +71,10 @@ def _fitted(
         with on_stage("load clip") as progress:
             return load_clip(clip, size=size, patch=config.patch_size, progress=progress), None
     if tracks is not None:
+        if "tracks" not in model.heads:
+            raise InputError(
+                f"tracks need a model that follows points; this one has the heads {', '.join(model.heads)}"
+            )
         tracks.check(*clip.images.shape[:3])
     if (clip.size, clip.patch) != (size, config.patch_size):
         with on_stage("fit clip to model"):

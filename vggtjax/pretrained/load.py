@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import logging
 import re
@@ -40,6 +41,7 @@ def load_model(
             (.safetensors, index or folder of shards, .pt, .pth), or a hub id such as "facebook/VGGT-1B", at the commit
             that was its newest on the first use, unless it ends in "@" and another of 40 hexadecimal letters.
         config: the configuration of PyTorch weights; None for VGGT-1B. A checkpoint of this library contains its own.
+            Weights that lack heads, as VGGT's trainer writes them, give a model without these heads.
         dtype: of the parameters; None for the types in the checkpoint, and float32 for PyTorch weights. "int8" rounds
             the kernels of the blocks to 8 bits as they are read: an approximation (docs/research-notes).
         progress: called during a conversion with the number of steps done and the total.
@@ -50,7 +52,7 @@ def load_model(
         MissingExtraError: the weights need torch or huggingface_hub, which is not installed.
     """
     model = load_weights(name_or_path, config=config, dtype=dtype, progress=progress)
-    if config not in (None, model.config):
+    if config is not None and dataclasses.replace(config, heads=model.heads) != model.config:
         raise CheckpointError(f"{name_or_path} has another configuration than the argument config; omit config")
     return model
 
@@ -87,7 +89,7 @@ def _converted(weights: Weights, config: VGGTConfig, dtype: DType, progress: Pro
     key = hashlib.sha256("\n".join(facts).encode("utf-8", "surrogateescape")).hexdigest()[:16]
     destination = cache_folder() / f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', weights.name)[:80]}-{key}.safetensors"
     if not _is_whole(destination):
-        convert_weights(weights, destination, dtype=dtype, config=config, progress=progress)
+        convert_weights(weights, destination, dtype=dtype, config=config, with_its_heads=True, progress=progress)
         logger.info("converted %s to %s, once", path, destination)
     logger.info("loading %s", destination)
     return destination

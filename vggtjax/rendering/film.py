@@ -19,6 +19,7 @@ from vggtjax.storage.writing import writing
 Frames = Iterator[UInt8[np.ndarray, "H W 3"]]
 _QUALITY = "20"  # constant rate factor of H.264: hardly any loss
 _WEBP_QUALITY = 75
+_BT709 = 1  # matrix, primaries and transfer of an .mp4, for players and for us
 _PALETTE_FRAMES = 12  # of a .gif, whose colours make its one palette
 
 
@@ -93,8 +94,10 @@ def _write_mp4(path: Path, frames: Frames, fps: float) -> None:
                     raise InputError(f"a frame of {frame.shape[1]} x {frame.shape[0]} pixels is too small for an .mp4")
                 stream = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1000), options=options)
                 stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+                coder = stream.codec_context
+                coder.colorspace = coder.color_primaries = coder.color_trc = _BT709
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame[:height, :width]), format="rgb24")
-            container.mux(stream.encode(picture))
+            container.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace=_BT709)))
         container.mux(stream.encode())
 
 

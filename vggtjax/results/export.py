@@ -248,9 +248,7 @@ def _frame_writer(
 
 
 def _write_cameras(result: Result, written: Sequence[_Written], folder: Path) -> None:
-    times, poses = result.timestamps, result.world_from_camera
-    times = np.arange(len(poses), dtype=np.float64) if times is None else times  # by default the frames' numbers
-    write_trajectory(folder / "trajectory.txt", poses, times, note=result.model_note)
+    write_trajectory(folder / "trajectory.txt", result.world_from_camera, result.file_times, note=result.model_note)
     intrinsics, sizes = [frame.intrinsics for frame in written], [frame.size for frame in written]
     write_intrinsics(folder / "intrinsics.txt", intrinsics, sizes, note=result.model_note)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from vggtjax.errors import ResultError
 from vggtjax.method.instances import find_instances
 from vggtjax.storage.arrays import is_mapped, zeros_beside
 
+_TIME = re.compile(r"\d{1,18}\.\d{1,18}")  # in seconds, as a frame's name
 _MOST_SIDE, _MOST_PIXELS = 1 << 20, 1 << 28  # of a source's picture
 
 
@@ -187,6 +189,20 @@ class Result:
     def world_from_camera(self) -> Float32[np.ndarray, "S 4 4"]:
         """Poses of the cameras in the world, as 4x4 matrices."""
         return world_from_camera(self.camera_from_world)
+
+    @property
+    def file_times(self) -> Float64[np.ndarray, " S"]:
+        """Times of the frames by the source's own clock, for files that others pair with theirs.
+
+        They are those of a capture, those in the frames' names (1305031102.175304), or seconds from a video's first
+        frame; frames without times are numbered from 0.
+        """
+        first = self.settings.get("first_time")
+        if self.timestamps is not None and isinstance(first, float | int) and np.isfinite(first):
+            return self.timestamps + first
+        if all(_TIME.fullmatch(name) for name in self.frame_names):
+            return np.array([float(name) for name in self.frame_names])
+        return np.arange(len(self.depth), dtype=np.float64) if self.timestamps is None else self.timestamps
 
     @property
     def model_note(self) -> str:

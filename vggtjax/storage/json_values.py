@@ -37,6 +37,7 @@ T = TypeVar("T")
 _type_info = lru_cache(maxsize=512)(kinds.type_info)
 
 _ANY = kinds.AnyType()
+_MARK = b"\xef\xbb\xbf"  # of the byte order, which Windows puts first
 _ITEMS = (kinds.VarTupleType, kinds.ListType)
 _BOUNDS = {"ge": "at least", "gt": "more than", "le": "at most", "lt": "less than"}
 _WORDS = {kinds.StrType: "text", kinds.BoolType: "true or false", kinds.NoneType: "null", kinds.DictType: "an object"}
@@ -69,7 +70,7 @@ def parse_json(
     if len(text) > most_bytes:
         raise error(f"{what} has more than {most_bytes} bytes")
     try:
-        value = msgspec.json.decode(text)
+        value = msgspec.json.decode(text.removeprefix(_MARK) if isinstance(text, bytes) else text)
     except (ValueError, RecursionError) as problem:
         raise error(f"{what} is not JSON that can be read: {problem}") from None
     try:

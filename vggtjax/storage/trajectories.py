@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,11 +17,15 @@ from vggtjax.errors import InputError, ResultError, check_choice, reading
 Quaternion = Literal["xyzw", "wxyz"]
 
 _MOST_BYTES = 2**27  # of a text file; a million poses
+_NAME = re.compile(r"(?!(?:nan|inf|infinity)$)[^\W\d][\w.]*|\[\S*\]", re.IGNORECASE)  # of a column, or its unit
+_FEWEST_NAMES = 3
+_TURN_NAME = re.compile(r"\b(?:q|quat|quaternion|orientation|rot)(?:_\w+)?[._]?([wxyz])\b")
 _LONGEST_LINE = 2**16  # letters
+_MOST_HEADER = 50  # lines of comments in front
 _UNIT = 0.01  # by which a quaternion's length may differ from 1
 _WIDER = 1.01  # times the tolerance is the search range for partners: sums of times are rounded
 _MOST_CANDIDATES = 10_000_000  # pairs of timestamps within the tolerance; 160 MB of indices
-_COLUMNS = {"xyzw": "qx qy qz qw", "wxyz": "qw qx qy qz"}
+_COLUMNS: dict[Quaternion, str] = {"xyzw": "qx qy qz qw", "wxyz": "qw qx qy qz"}
 
 
 def write_trajectory(
@@ -52,23 +57,42 @@ def commented(columns: str, note: str) -> str:
 
 
 def read_trajectory(
-    path: str | Path, quaternion: Quaternion = "xyzw"
+    path: str | Path, quaternion: Quaternion | None = None
 ) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, "S 4 4"]]:
     """Read a trajectory: timestamps, and world-from-camera poses.
 
-    Each line has eight numbers; text after # is a comment. `quaternion` is the order of the last four: "xyzw" is TUM's,
-    "wxyz" that of MonST3R, CUT3R, Easi3R and VGGT4D. Raises InputError for an unknown order, and ResultError for an
-    unreadable file, a first line that names the other order, lines without eight finite numbers, or quaternions not of
+    Each line has eight numbers; text after # is a comment, and the first line may name the columns. `quaternion` is the
+    order of the last four: "xyzw" is TUM's, "wxyz" that of MonST3R, CUT3R, Easi3R and VGGT4D; without it the names of
+    the columns tell, and where there are none it is TUM's. Raises InputError for an unknown order, and ResultError for
+    an unreadable file, names of columns in the other order, lines without eight finite numbers, or quaternions not of
     length 1.
     """
-    check_choice("quaternion", quaternion, get_args(Quaternion))
-    rows = read_numbers(path, 8)
-    other: Quaternion = "wxyz" if quaternion == "xyzw" else "xyzw"
-    with Path(path).open(encoding="utf-8") as file:
-        if _COLUMNS[other] in file.readline(1000):
-            raise ResultError(f"{path} names its columns {_COLUMNS[other]}; read it with quaternion={other!r}")
-    turns = rows[:, 4:] if quaternion == "xyzw" else rows[:, [5, 6, 7, 4]]
+    if quaternion is not None:
+        check_choice("quaternion", quaternion, get_args(Quaternion))
+    rows, named = read_numbers(path, 8), named_order(path)
+    if named is not None and quaternion is not None and named != quaternion:
+        raise ResultError(f"{path} names its columns {_COLUMNS[named]}; read it with quaternion={named!r}")
+    is_first = (quaternion or named) == "wxyz"
+    turns = rows[:, [5, 6, 7, 4]] if is_first else rows[:, 4:]
     return rows[:, 0], pose_matrices(rows[:, 1:4], turns, path)
+
+
+def named_order(path: str | Path) -> Quaternion | None:
+    """Return the order of the quaternions that the first lines of a text file name, None where they name none.
+
+    Names are such as qw, q_w or q_RS_w [], in any case. Raises ResultError for other orders than the two.
+    """
+    with reading(path, ResultError), Path(path).open(encoding="utf-8-sig", errors="replace") as file:
+        for _ in range(_MOST_HEADER):
+            line = file.readline(1000)
+            letters = "".join(_TURN_NAME.findall(line.lower()))
+            if letters in ("xyzw", "wxyz"):
+                return letters
+            if sorted(letters) == sorted("wxyz"):
+                raise ResultError(f"{path} names its columns q{' q'.join(letters)}; expected qw first or last of them")
+            if not line or (line.strip() and not line.lstrip().startswith("#")):
+                break
+    return None
 
 
 def pose_matrices(
@@ -142,12 +166,13 @@ def _timestamps(name: str, times) -> Float64[np.ndarray, " N"]:
 def read_numbers(path: str | Path, columns: int | tuple[int, ...]) -> Float[np.ndarray, "S columns"]:
     """Read a text file of finite numbers, `columns` in every line, or one of several numbers of columns.
 
-    Raises ResultError for anything else.
+    Text after # is a comment, commas count as spaces, and a first line of words names the columns. Raises ResultError
+    for anything else.
     """
     path = Path(path)
     choices = (columns,) if isinstance(columns, int) else columns
     expected = " or ".join(map(str, choices))
-    with reading(path, ResultError), path.open(encoding="utf-8") as file, warnings.catch_warnings():
+    with reading(path, ResultError), path.open(encoding="utf-8-sig") as file, warnings.catch_warnings():
         if path.stat().st_size > _MOST_BYTES:
             raise ResultError(f"{path} has {path.stat().st_size} bytes; expected at most {_MOST_BYTES}")
         warnings.simplefilter("ignore")  # of an empty file, an error below
@@ -167,8 +192,12 @@ def read_numbers(path: str | Path, columns: int | tuple[int, ...]) -> Float[np.n
 
 
 def _lines(file: TextIO, path: Path) -> Iterator[str]:
-    """Yield lines with spaces for commas; one long line would take many times its size."""
+    """Yield lines with spaces for commas, without names of columns; one long line would take many times its size."""
+    names_may_come = True
     while line := file.readline(_LONGEST_LINE + 1):
         if len(line) > _LONGEST_LINE:
             raise ResultError(f"{path} has a line of over {_LONGEST_LINE} letters; expected numbers")
-        yield line.replace(",", " ")
+        words = line.partition("#")[0].replace(",", " ").split()
+        is_named = names_may_come and len(words) >= _FEWEST_NAMES and all(map(_NAME.fullmatch, words))
+        names_may_come = names_may_come and not words
+        yield "" if is_named else line.replace(",", " ")

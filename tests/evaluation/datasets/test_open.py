@@ -1,6 +1,7 @@
 """Opening data sets: what is taken and what is noted, and plain folders."""
 
 import logging
+import shutil
 
 import numpy as np
 import pytest
@@ -54,6 +55,45 @@ def test_plain_folder(tmp_path):
     assert [path.name for path in second.pictures] == ["00.png", "02.png"]
     assert second.depth(1).max() == 2
     assert [sequence.name for sequence in opened("plain", tmp_path, sequences=["clip10"])] == ["clip10"]
+
+
+@pytest.mark.parametrize(
+    ("depth", "mask"), [("npy", "jpg"), ("uint16.npy", "webp"), ("exr", "tif"), ("npz", "npy"), ("npy and png", "png")]
+)
+def test_other_kinds_of_depth_and_masks(tmp_path, depth, mask):
+    folder, labels = plain_folder(tmp_path / "clip", frames=2), np.zeros((3, 4), np.uint8)
+    labels[:, 2:] = 255
+    if mask != "png":
+        shutil.rmtree(folder / "mask")
+        (folder / "mask").mkdir()
+    if depth != "npy and png":
+        shutil.rmtree(folder / "depth")
+        (folder / "depth").mkdir()
+    for i in range(2):
+        metres = np.full((3, 4), 1.5 + i, np.float32)
+        if depth.endswith("exr"):
+            OpenEXR = pytest.importorskip("OpenEXR")
+            OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION}, {"Z": metres}).write(str(folder / f"depth/0{i}.exr"))
+        elif depth == "npz":
+            np.savez(folder / f"depth/0{i}.npz", metres)
+        else:
+            values = (metres * 1000).astype(np.uint16) if depth == "uint16.npy" else metres
+            np.save(folder / f"depth/0{i}.npy", values)
+        if mask == "npy":
+            np.save(folder / f"mask/0{i}.npy", labels)
+        elif mask != "png":
+            Image.fromarray(labels).save(folder / f"mask/0{i}.{mask}")
+    (sequence,) = opened("plain", folder)
+    expected = {"npz": None, "npy and png": 1.0}.get(depth, 2.5)
+    assert (None if sequence.depth is None else sequence.depth(1).max()) == expected
+    assert (sequence.mask is None) == (mask == "npy")
+    if sequence.mask is not None and mask != "png":
+        assert np.array_equal(sequence.mask(1)[:, [0, 3]], labels[:, [0, 3]] > 0)
+    unread = [f"clip: 2 files of its folder depth are not read, such as 00.{depth[:3]}"] * (
+        depth in ("npz", "npy and png")
+    )
+    unread += ["clip: 2 files of its folder mask are not read, such as 00.npy"] * (mask == "npy")
+    assert list(sequence.notes) == ["clip: it has no depth"] * (depth == "npz") + unread
 
 
 def test_takes_split_where_the_camera_jumps(tmp_path):

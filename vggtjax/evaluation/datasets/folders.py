@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from vggtjax.captures.files import folder_name
 from vggtjax.errors import InputError
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 
 _MOST_NAMES = 8  # of a message
 
@@ -23,7 +24,7 @@ def sequence_folders(root: Path, holds: Callable[[Path], bool], expected: str, l
     Raises InputError if there is no sequence.
     """
     if holds(root):
-        return {root.resolve().name: root}
+        return {folder_name(root): root}
     parents, folders = [root], {}
     for _ in range(levels):
         children = [child for parent in parents for child in subfolders(parent)]
@@ -31,7 +32,7 @@ def sequence_folders(root: Path, holds: Callable[[Path], bool], expected: str, l
         parents = [child for child in children if not holds(child)]
     if not folders:
         raise InputError(f"{root} holds no sequence; expected {expected}, or folders of that kind")
-    return dict(sorted(folders.items(), key=lambda item: natural_key(item[1])))
+    return dict(in_order(folders.items(), lambda item: item[1]))
 
 
 def subfolders(folder: Path) -> list[Path]:
@@ -42,7 +43,7 @@ def subfolders(folder: Path) -> list[Path]:
         return []
     except OSError as error:
         raise InputError(f"cannot read {folder}: {error.strerror}; check its permissions") from error
-    return sorted(children, key=natural_key)
+    return in_order(children)
 
 
 def listed(names: list[str]) -> str:

@@ -2,34 +2,42 @@
 
 Clips of `vggtjax scenes` are read too: images/, intrinsics.txt and trajectory.txt stand for the first and the last two.
 
-Depth is PNG of 16 bits in millimetres, 0 where it is unknown; masks are pictures, bright where the world moves. K.txt
-has three rows of three numbers for all frames, or three rows for each; world_from_camera.txt a row of 16 numbers for
-each frame, or of 12 as KITTI's, in metres. Intrinsics are not shifted by half a pixel: the pixel origin of the HoloLens
-is unknown, and half a pixel is below the accuracy of its poses and depth.
+Depth is PNG of 16 bits in millimetres, .npy in metres (of whole numbers: in millimetres) or .exr in metres, 0 where it
+is unknown; masks are pictures of any kind, bright where the world moves. K.txt has three rows of three numbers for all
+frames, or three rows for each; world_from_camera.txt a row of 16 numbers for each frame, or of 12 as KITTI's, in
+metres. Intrinsics are not shifted by half a pixel: the pixel origin of the HoloLens is unknown, and half a pixel is
+below the accuracy of its poses and depth.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from vggtjax.captures.cameras import checked_intrinsics, checked_world_from_camera
-from vggtjax.captures.depth_files import read_png
+from vggtjax.captures.depth_files import read_exr, read_npy, read_png
 from vggtjax.captures.files import files
 from vggtjax.clips.masks import read_mask
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, one_line
 from vggtjax.evaluation.datasets.folders import sequence_folders
 from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, depth_reader, mask_reader
 from vggtjax.media.images import is_image_name
-from vggtjax.media.order import natural_key
+from vggtjax.media.order import in_order
 from vggtjax.storage.trajectories import read_numbers, read_trajectory
 
 _NEW_TAKE = 10.0  # times the median step of the camera: a jump between two takes
 _PER_METRE = 1000.0
+_DEPTH_FILES: dict[str, Callable[[Path], Float32[np.ndarray, "h w"]]] = {
+    ".png": partial(read_png, per_metre=_PER_METRE),
+    ".npy": partial(read_npy, per_unit=_PER_METRE),
+    ".exr": read_exr,
+}
+_MASK_FILES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 
 
 def plain(root: Path) -> dict[str, Opener]:
@@ -67,10 +75,10 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
     chosen = frames.of(range(len(pictures))[part], name)
     intrinsics = _intrinsics(folder, len(pictures))
     taken = [pictures[frame] for frame in chosen]
-    depths, masks = files(folder / "depth", ".png"), files(folder / "mask", ".png")
-    depth, notes = depth_reader(
-        taken, [depths.get(path.stem) for path in taken], partial(read_png, per_metre=_PER_METRE)
-    )
+    depths, unread = _of_one_kind(folder / "depth", _DEPTH_FILES)
+    masks, unread_masks = _of_one_kind(folder / "mask", _MASK_FILES)
+    depth, notes = depth_reader(taken, [depths.get(path.stem) for path in taken], _read_depth)
+    notes += unread + unread_masks
     mask = None
     if masks:
         mask, more = mask_reader(taken, [masks.get(path.stem) for path in taken], read_mask)
@@ -87,6 +95,27 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
     )
 
 
+def _of_one_kind(folder: Path, endings: Iterable[str]) -> tuple[dict[str, Path], tuple[str, ...]]:
+    """Return the files of the first of the endings that is there, by the stems of their names, and a note on others."""
+    there = files(folder, "").values()
+    for ending in endings:
+        if found := {path.stem: path for path in there if path.suffix.lower() == ending}:
+            break
+    else:
+        found = {}
+    others = [path.name for path in there if path not in found.values()]
+    note = (
+        f"{len(others)} files of its folder {folder.name} are not read, such as {one_line(others[0], 60)}"
+        if others
+        else ""
+    )
+    return found, (note,) * bool(note)
+
+
+def _read_depth(path: Path) -> Float32[np.ndarray, "h w"]:
+    return _DEPTH_FILES[path.suffix.lower()](path)
+
+
 def _holds_pictures(folder: Path) -> bool:
     return (folder / "rgb").is_dir() or all((folder / name).exists() for name in ("images", "trajectory.txt"))
 
@@ -98,7 +127,7 @@ def _pictures(folder: Path) -> list[Path]:
         raise InputError(f"{place} holds no pictures; expected one for each frame")
     if len({path.stem for path in pictures}) < len(pictures):
         raise InputError(f"{place} holds two pictures of one name; expected one for each frame")
-    return sorted(pictures, key=natural_key)
+    return in_order(pictures)
 
 
 def _poses(folder: Path) -> Float64[np.ndarray, "S 4 4"] | None:

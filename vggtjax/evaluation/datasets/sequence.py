@@ -13,6 +13,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
+from vggtjax.captures.cameras import TURNED
 from vggtjax.captures.pictures import PNG, opening, picture_size
 from vggtjax.errors import InputError
 from vggtjax.media.sampling import Sampling
@@ -149,5 +150,8 @@ def read_labels(path: Path) -> Bool[np.ndarray, "h w"]:
 def _of_picture_size(values: Shaped[np.ndarray, "h w"], path: Path, picture: Path) -> Shaped[np.ndarray, "h w"]:
     width, height = picture_size(picture)
     if values.shape != (height, width):
-        raise InputError(f"{path} has shape {values.shape}; expected {(height, width)}, the size of {picture.name}")
+        turned = TURNED if values.shape == (width, height) else ""
+        raise InputError(
+            f"{path} has shape {values.shape}; expected {(height, width)}, the size of {picture.name}{turned}"
+        )
     return values

@@ -1,0 +1,116 @@
+"""Checkpoints as trainers write them: other entries, shared prefixes, adapters, heads that were not trained."""
+
+import argparse
+import json
+import logging
+import types
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from converters import convert_state_dict
+from converters.files import read_state_dict
+from testing.seeded import seeded_state_dict
+from vggtjax import forward, load_model
+from vggtjax.errors import CheckpointError, InputError
+
+TINY = {"aggregator.camera_token": np.ones((1, 2), np.float32), "depth_head.norm.bias": np.zeros(3, np.float32)}
+
+
+@pytest.fixture(scope="module")
+def torch():
+    return pytest.importorskip("torch")
+
+
+@pytest.fixture(scope="module")
+def state_dict(golden):
+    return seeded_state_dict(json.loads((golden / "shapes.json").read_text()))
+
+
+@pytest.mark.parametrize("prefix", ["module.", "model.", "_orig_mod.", "module._orig_mod.", "vggt.net."])
+def test_a_shared_prefix_is_left_out_and_said(state_dict, config, caplog, prefix):
+    plain = convert_state_dict(state_dict, config)
+    assert not caplog.messages
+    others = {"n_averaged": np.array(3)} if prefix == "module." else {}  # of torch's AveragedModel
+    made = convert_state_dict(others | {prefix + name: value for name, value in state_dict.items()}, config)
+    assert jax.tree.all(jax.tree.map(np.array_equal, made, plain))
+    assert caplog.messages == [f"the keys of the state dict begin with {prefix}, which is left out"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda name: {f"base_model.model.{name}": 0, f"base_model.model.{name[:-7]}.lora_A.default.weight": 0},
+            "adapter",
+        ),
+        (lambda name: {name: 0, name.replace(".weight", ".lora_down.weight"): 0}, "merge the adapter first"),
+        (lambda name: {f"model.{name}": 0, f"ema_model.{name}": 0}, "twice or more, under 'ema_model.' and 'model.'"),
+        (lambda name: {name: 0, f"ema.{name}": 0}, "twice or more, under no prefix and 'ema.'"),
+        (lambda name: {f"module.{name}": 0, "module.aggregator.spatial_mask_head.x": 0}, "checkpoint of PAGE-4D"),
+    ],
+)
+def test_keys_that_need_work_first(config, change, message):
+    names = ("aggregator.frame_blocks.0.attn.qkv.weight", "camera_head.pose_branch.fc1.weight")
+    keys = {key: np.zeros(1, np.float32) for name in names for key in change(name)}
+    with pytest.raises(CheckpointError, match=message):
+        convert_state_dict(keys, config)
+
+
+@pytest.mark.parametrize(
+    ("wrap", "said"),
+    [
+        (lambda weights, tensor: weights, None),
+        (
+            lambda weights, tensor: {"model": weights, "optimizer": {"state": {0: {"exp_avg": tensor}}}, "epoch": 3},
+            None,
+        ),
+        (lambda weights, tensor: {"state_dict": weights, "scale": tensor}, None),
+        (
+            lambda weights, tensor: {"model": weights, "ema": {"module": weights}},
+            "weights are read from 'model'; those in ema",
+        ),
+        (lambda weights, tensor: {"ema": weights, "steps": 7}, "weights are read from 'ema'"),
+        (lambda weights, tensor: {"module": weights, "lr_scheduler": {"last": 1}}, "weights are read from 'module'"),
+        (lambda weights, tensor: {"ema": {"state_dict": weights}}, "weights are read from 'ema'"),
+    ],
+)
+def test_the_entry_that_is_read(torch, tmp_path, caplog, wrap, said):
+    weights = {name: torch.from_numpy(value) for name, value in TINY.items()}
+    torch.save(wrap(weights, torch.ones(2)), tmp_path / "a.pt")
+    read = read_state_dict(tmp_path / "a.pt")
+    assert read.problems == []
+    assert set(read.tensors) == set(TINY)
+    assert [said in message for message in caplog.messages] == [True] * (said is not None)
+
+
+def test_several_entries_with_weights_are_refused(torch, tmp_path):
+    weights = {name: torch.from_numpy(value) for name, value in TINY.items()}
+    torch.save({"student": weights, "teacher": weights, "epoch": 1}, tmp_path / "a.pt")
+    with pytest.raises(CheckpointError, match="holds weights in student, teacher; save one of them alone"):
+        read_state_dict(tmp_path / "a.pt")
+
+
+@pytest.mark.parametrize("value", [argparse.Namespace(lr=1), types.SimpleNamespace(lr=1), np.float64(2)])
+def test_the_class_that_is_refused_is_named(torch, tmp_path, value):
+    torch.save({"model": {"a": torch.ones(2)}, "args": value}, tmp_path / "a.pt")
+    name = {argparse.Namespace: "argparse.Namespace", types.SimpleNamespace: "types.SimpleNamespace"}
+    with pytest.raises(CheckpointError, match=name.get(type(value), r"numpy\.\S*multiarray\.scalar")):
+        read_state_dict(tmp_path / "a.pt")
+
+
+def test_weights_of_some_heads_make_a_model_of_these(state_dict, config, tmp_path, monkeypatch, caplog):
+    """VGGT's trainer writes the heads that it trained: camera and depth."""
+    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path / "cache"))
+    kept = {name: value for name, value in state_dict.items() if not name.startswith(("point_head", "track_head"))}
+    save_file(kept, tmp_path / "trained.safetensors")
+    with caplog.at_level(logging.WARNING):
+        model = load_model(tmp_path / "trained.safetensors", config=config)
+    assert model.heads == ("camera", "depth")
+    assert "trained has the heads camera, depth, and not points, tracks" in caplog.messages
+    assert load_model(tmp_path / "trained.safetensors", config=config).heads == ("camera", "depth")  # from the cache
+    with pytest.raises(InputError, match=r"outputs has \['tracks'\]; this model has only the heads"):
+        forward(model.params, jnp.zeros((1, 1, 28, 28, 3)), model.config, outputs=("tracks",))
