@@ -168,7 +168,6 @@ def test_videos_without_colour_tags(tmp_path, caplog, size, tag, expected):
 
 @pytest.mark.parametrize("transfer", [HLG, PQ])
 def test_photos_in_hdr(tmp_path, caplog, transfer):
-    pillow_heif.register_heif_opener()
     sdr = chart()
     codes = np.rint(coded(sdr, transfer, 9) * 65535).astype("<u2")
     tags = {"color_primaries": 9, "transfer_characteristics": transfer, "matrix_coefficients": 9, "full_range_flag": 1}

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pillow_heif
+import pi_heif
 from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 
 from vggtjax.errors import ClipError, InputError, check_regular
@@ -122,7 +122,7 @@ def _without_hdr(picture: Image.Image, path: Path, profile: Any) -> tuple[Image.
     transfer, primaries = (int(profile[name]) for name in names) if profile else (0, 0)
     if transfer not in HDR:
         return picture, None
-    deep = np.asarray(pillow_heif.open_heif(path, convert_hdr_to_8bit=False))
+    deep = np.asarray(pi_heif.open_heif(path, convert_hdr_to_8bit=False))
     pixels = deep[..., :3] if deep.dtype == np.uint16 else np.asarray(picture).astype(np.uint16) * np.uint16(257)
     pixels, note = srgb_of_coded(pixels, transfer, primaries)
     return Image.fromarray(pixels), note
@@ -192,9 +192,9 @@ def _has_sixteen_bits(image: ImageFile.ImageFile) -> bool:
 
 @functools.cache
 def known_formats() -> tuple[str, ...]:
-    """Return the FORMATS that this Pillow can read, HEIF by pillow-heif; files in other formats are refused."""
+    """Return the FORMATS that this Pillow can read, HEIF by pi-heif; files in other formats are refused."""
     Image.init()
-    pillow_heif.register_heif_opener()
+    pi_heif.register_heif_opener()
     return tuple(name for name in FORMATS if name in Image.OPEN)
 
 
