@@ -5,6 +5,7 @@ import hashlib
 import json
 import logging
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -18,10 +19,12 @@ from safetensors.numpy import save_file
 import converters.torch_to_flax
 from converters import convert_state_dict
 from testing.make_checkpoint import make_checkpoint
-from testing.seeded import seeded_state_dict
+from testing.seeded import seeded_images, seeded_state_dict
 from vggtjax import load_model
 from vggtjax.checkpoint import Model, is_checkpoint, read_model, save_model
 from vggtjax.errors import CheckpointError, OutputError
+from vggtjax.network.model import forward
+from vggtjax.network.narrow import is_multiplied, narrowed
 
 
 @pytest.fixture(scope="module")
@@ -101,6 +104,21 @@ def test_type_on_loading(saved_once, tree):
     model = load_model(saved_once, dtype="bfloat16")
     same = jax.tree.map(lambda a, b: np.array_equal(a, b.astype(ml_dtypes.bfloat16)), model.params, tree)
     assert jax.tree.all(same)
+
+
+def test_weights_in_the_type_of_the_products_give_equal_results(saved_once, config):
+    images = seeded_images(2, 28, 42).transpose(0, 2, 3, 1)[None]
+    stored, narrow = load_model(saved_once), load_model(saved_once, compute_dtype="bfloat16")
+    flat: dict[str, jax.Array] = flatten_dict(stored.params, sep=".")  # type: ignore[assignment]
+    products = sum(leaf.nbytes for name, leaf in flat.items() if is_multiplied(name))
+    assert products > 0.3 * stored.parameter_bytes
+    assert narrow.parameter_bytes == stored.parameter_bytes - products // 2
+    assert narrow.identity == stored.identity
+    expected = narrowed(stored.params, "bfloat16")
+    assert jax.tree.all(jax.tree.map(lambda a, b: a.dtype == b.dtype, expected, narrow.params))
+    run = jax.jit(partial(forward, config=config, compute_dtype="bfloat16"))
+    made = [run(model.params, images) for model in (stored, narrow)]
+    assert jax.tree.all(jax.tree.map(np.array_equal, *made))
 
 
 @pytest.mark.skipif(

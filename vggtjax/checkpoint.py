@@ -23,6 +23,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import CheckpointError, check_choice, problems_sentence
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
+from vggtjax.network.narrow import is_multiplied
 from vggtjax.network.quantised import Quantised, is_quantised, quantise
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.programs import kept_text
@@ -130,13 +131,17 @@ def checkpoint_config(path: str | Path) -> VGGTConfig:
     return _read_metadata(Path(path), read_tensors(path).metadata)[0]
 
 
-def read_model(path: str | Path, *, dtype: LoadedDType | None = None, **fields: Any) -> Model:
+def read_model(
+    path: str | Path, *, dtype: LoadedDType | None = None, compute_dtype: str | None = None, **fields: Any
+) -> Model:
     """Read a checkpoint of this library.
 
     Args:
         path: the file.
         dtype: of the parameters; None for the types in the file. "int8" rounds the kernels of the blocks to 8 bits and
             leaves the others as they are in the file: an approximation.
+        compute_dtype: type in which the blocks will be computed: what they multiply is read in it if it is narrower,
+            with equal results and half the memory. The model's identity stays that of its file.
         fields: fields of `Model` in place of those in the file: name, note, untrained_heads.
 
     Raises CheckpointError, which counts the problems and lists the first ones, unless the file is a whole checkpoint of
@@ -149,6 +154,7 @@ def read_model(path: str | Path, *, dtype: LoadedDType | None = None, **fields: 
     check_parameters(f"{path} does not fit its own configuration", tensors, config)
     content = np.asarray(np.memmap(path, np.uint8, mode="r"))
     flat: dict[str, Any] = {}
+    is_as_stored = dtype != "int8"
     for key, stored in tensors.items():
         tensor = stored.within(content)
         if dtype == "int8" and is_quantised(key):
@@ -156,9 +162,12 @@ def read_model(path: str | Path, *, dtype: LoadedDType | None = None, **fields: 
             continue
         if dtype not in (None, "int8"):
             tensor = tensor.astype(numpy_dtype(dtype), copy=False)
+        is_as_stored &= tensor.dtype == stored.dtype
+        if compute_dtype == "bfloat16" and is_multiplied(key):
+            tensor = tensor.astype(numpy_dtype("bfloat16"), copy=False)
         flat[key] = jax.device_put(tensor).block_until_ready()  # on a CPU, a view of the file if aligned
     model = Model(config, unflatten_dict(flat, sep="."), path=path, **(stored_fields | fields))
-    if dtype != "int8" and all(flat[key].dtype == stored.dtype for key, stored in tensors.items()):
+    if is_as_stored:
         object.__setattr__(model, "_file", facts)
     return model
 

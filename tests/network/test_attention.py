@@ -1,5 +1,7 @@
 """Attention as computed on every platform, against the formula written out."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,8 @@ import pytest
 from jax.experimental.pallas import tpu
 
 from vggtjax.network import attention, cpu_attention
+from vggtjax.network.cpu_attention import attention_in_chunks
+from vggtjax.network.gpu_attention import fused_attention
 
 
 def _formula(q, k, v, kept):
@@ -95,3 +99,32 @@ def test_chunks_grow_with_the_cores_but_not_without_bound(monkeypatch, cores, ti
     queries = jnp.zeros((12_800, 1))
     assert cpu_attention._chunks(queries, keys=5000).shape == (16 // times, 800 * times, 1)
     assert cpu_attention._chunks(queries, keys=10**6).shape == (16, 800, 1)
+
+
+@pytest.mark.parametrize("tokens", [(37, 131), (64, 65)])
+def test_the_kernel_for_float32_on_gpus(tokens):
+    """In Pallas's interpreter. Some clips see no key of the first block."""
+    T, K = tokens
+    generator = np.random.default_rng(0)
+    q, k, v = (jnp.asarray(generator.standard_normal((2, n, 2, 16), np.float32)) for n in (T, K, K))
+    visible = generator.random((2, K)) < 0.6
+    visible[0, :64] = False
+    visible[:, -1] = True
+    for mask in (None, jnp.asarray(visible)):
+        made = fused_attention(q, k, v, mask, interpret=True)
+        assert np.abs(made - attention_in_chunks(q, k, v, mask)).max() < 1e-6
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_odd_numbers_of_tokens_become_even(masked):
+    """cuDNN's gradient takes even ones alone; XLA computes here."""
+    generator = np.random.default_rng(0)
+    q, k, v = (jnp.asarray(generator.standard_normal((2, n, 2, 8), np.float32)) for n in (7, 9, 9))
+    visible = jnp.asarray(generator.random((2, 9)) < 0.7).at[:, 0].set(True) if masked else None
+
+    def loss(attend, *inputs):
+        return (attend(*inputs, visible) * q).sum()
+
+    wanted = jax.value_and_grad(partial(loss, attention_in_chunks), (0, 1, 2))(q, k, v)
+    made = jax.value_and_grad(partial(loss, partial(attention.evened, implementation="xla")), (0, 1, 2))(q, k, v)
+    assert jax.tree.all(jax.tree.map(lambda a, b: np.allclose(a, b, atol=1e-5), made, wanted))

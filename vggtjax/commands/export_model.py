@@ -51,7 +51,8 @@ def export_model(
         from vggtjax.pipeline.artefact import check_artefact, write_artefact
 
         check_artefact(out, frames, height, width, names, options)
-        network, fitted = ModelFiles(model=model, config=config, fusion=fusion).load(report, options, [options.method])
+        files = ModelFiles(model=model, config=config, fusion=fusion)
+        network, fitted = files.load(report, options, [options.method], runs_here=False)
         write_artefact(
             network,
             out,

@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 _MOST_CONFIG_BYTES = 1 << 20
 
 
-def load(report: Report, name: str | None, config: Path | None = None) -> Model:
-    """Load a model as a stage of the report. Raises InputError without a name."""
+def load(report: Report, name: str | None, config: Path | None = None, compute_dtype: str | None = None) -> Model:
+    """Load a model as a stage of the report, to compute blocks in a type. Raises InputError without a name."""
     name = check_named(name)
     with report.stage("load model") as progress:
         from vggtjax.pretrained.load import load_model
 
-        return load_model(name, config=read_config(config), progress=progress)
+        return load_model(name, config=read_config(config), compute_dtype=compute_dtype, progress=progress)
 
 
 def check_named(name: str | None) -> str:
@@ -62,21 +62,25 @@ class ModelFiles:
     fusion: InWords[Path | None] = None
     """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""
 
-    def load(self, report: Report, options: Options, methods: Sequence[str]) -> tuple[Model, FusionParams | None]:
+    def load(
+        self, report: Report, options: Options, methods: Sequence[str], *, runs_here: bool = True
+    ) -> tuple[Model, FusionParams | None]:
         """Load the model, and the fitted rule of fusion (None, the paper's rule, without a file).
 
+        A model that runs here has weights in the type in which its blocks are computed here.
         The rule is read first: InputError where it is invalid or none of the `methods` (in place of `options.method`)
         fuses. A warning is logged if the rule was fitted to another model or with other options.
         """
         name = at_revision(check_named(self.model), self.revision)
+        dtype = options.computed().compute_dtype if runs_here else None
         if self.fusion is None:
-            return load(report, name, self.config), None
+            return load(report, name, self.config, dtype), None
         from vggtjax.method.assembly import check_fuses
         from vggtjax.method.fusion_file import load_fusion, warn_if_fitted_otherwise
 
         params = load_fusion(self.fusion)
         check_fuses(params, *methods)
-        model = load(report, name, self.config)
+        model = load(report, name, self.config, dtype)
         fusing = next(name for name in methods if METHODS[name].depth == "fused")
         warn_if_fitted_otherwise(self.fusion, model, options.changed(method=fusing))
         return model, params

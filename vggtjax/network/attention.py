@@ -100,19 +100,7 @@ def _with_cudnn(q, k, v, visible):
 
 
 def _with_cudnn_forward(q, k, v, visible):
-    """Attend with even numbers of queries and keys: jax 0.10 takes no gradient of odd ones."""
-    T, K = q.shape[1], k.shape[1]
-    if T % 2 == K % 2 == 0:
-        return jax.vjp(lambda q, k, v: _packed(q, k, v, visible, implementation="cudnn"), q, k, v)
-    real = jnp.ones(k.shape[:2], bool) if visible is None else visible
-
-    def even(x):
-        return jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), *((0, 0),) * (x.ndim - 2)))
-
-    def attend(q, k, v):
-        return _packed(even(q), even(k), even(v), even(real), implementation="cudnn")[:, :T]
-
-    return jax.vjp(attend, q, k, v)
+    return jax.vjp(lambda q, k, v: evened(q, k, v, visible, implementation="cudnn"), q, k, v)
 
 
 def _with_cudnn_backward(pull, gradient):
@@ -138,6 +126,19 @@ def _in_one_kernel_backward(inputs, gradient):
 
 
 _in_one_kernel.defvjp(_in_one_kernel_forward, _in_one_kernel_backward)
+
+
+def evened(q, k, v, visible, *, implementation):
+    """Attend with even numbers of queries and keys: jax's cuDNN attention refuses gradients of odd ones."""
+    T, K = q.shape[1], k.shape[1]
+    if T % 2 == K % 2 == 0:
+        return _packed(q, k, v, visible, implementation=implementation)
+
+    def even(x):
+        return jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), *((0, 0),) * (x.ndim - 2)))
+
+    real = jnp.ones(k.shape[:2], bool) if visible is None else visible
+    return _packed(even(q), even(k), even(v), even(real), implementation=implementation)[:, :T]
 
 
 def _packed(q, k, v, visible, *, implementation):

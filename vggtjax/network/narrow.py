@@ -6,24 +6,32 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from vggtjax.network.layers import Params
 
-_BLOCKS = {("backbone", "blocks"), ("aggregator", "frame_blocks"), ("aggregator", "global_blocks")}
+_BLOCKS = ("backbone.blocks.", "aggregator.frame_blocks.", "aggregator.global_blocks.")
+_LAYERS = ("attention.qkv.", "attention.projection.", "mlp.fc1.", "mlp.fc2.")
+
+
+def is_multiplied(name: str) -> bool:
+    """Return whether the parameter of this dotted name is a kernel or bias that a block turns into its products' type.
+
+    Norms and heads are computed in float32.
+    """
+    return name.startswith(_BLOCKS) and any(layer in name for layer in _LAYERS)
 
 
 def narrowed(params: Params, compute_dtype: str) -> Params:
-    """Return parameters whose kernels and biases of the blocks have the type in which they are multiplied.
+    """Return parameters with kernels and biases of the blocks in the type of their products, if it is narrower.
 
-    A block turns them into that type anyway, so results are equal. Norms and heads, which are computed in float32, and
-    kernels in 8 bits stay as they are. Works on shapes too, under `jax.eval_shape`.
+    Results are equal. Kernels in 8 bits stay as they are. Works on shapes too, under `jax.eval_shape`.
     """
     dtype = jnp.dtype(compute_dtype)
 
-    def narrow(path: tuple[Any, ...], leaf: Any) -> Any:
-        names = tuple(entry.key for entry in path if hasattr(entry, "key"))
-        is_product = names[:2] in _BLOCKS and names[-1] in ("kernel", "bias") and "norm" not in names[-2]
-        smaller = jnp.issubdtype(leaf.dtype, jnp.floating) and leaf.dtype.itemsize > dtype.itemsize
-        return leaf.astype(dtype) if is_product and smaller and len(names) == len(path) else leaf
+    def narrow(name: str, leaf: jax.Array) -> jax.Array:
+        is_wider = isinstance(leaf, jax.Array) and leaf.dtype.itemsize > dtype.itemsize
+        return leaf.astype(dtype) if is_wider and is_multiplied(name) else leaf
 
-    return jax.tree_util.tree_map_with_path(narrow, params)
+    flat: dict[str, Any] = flatten_dict(params, sep=".")
+    return unflatten_dict({name: narrow(name, leaf) for name, leaf in flat.items()}, sep=".")

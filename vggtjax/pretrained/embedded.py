@@ -21,14 +21,14 @@ _NEAREST = np.float32(1e-3)  # metres
 _STEP = 5e-4  # of the logarithm of depth, stored in 16 bits
 
 
-def demo_model(dtype: LoadedDType = "float32") -> Model:
-    """Return the embedded model, trained on generated static scenes.
+def demo_model(dtype: LoadedDType = "float32", compute_dtype: str | None = None) -> Model:
+    """Return the embedded model, trained on generated static scenes; arguments as those of `read_model`.
 
     docs/research-notes/embedded-model.md has its training and accuracy. Raises CheckpointError if the file is missing.
     """
     if not MODEL.is_file():
         raise CheckpointError(f"the embedded model {MODEL} is missing; install vggtjax again")
-    return read_model(MODEL, dtype=dtype)
+    return read_model(MODEL, dtype=dtype, compute_dtype=compute_dtype)
 
 
 def demo_clip(path: Path = CLIP) -> Truth:

@@ -28,6 +28,7 @@ def load_model(
     *,
     config: VGGTConfig | None = None,
     dtype: LoadedDType | None = None,
+    compute_dtype: str | None = None,
     progress: Progress | None = None,
 ) -> Model:
     """Load a model by path or name.
@@ -44,6 +45,8 @@ def load_model(
             Weights that lack heads, as VGGT's trainer writes them, give a model without these heads.
         dtype: of the parameters; None for the types in the checkpoint, and float32 for PyTorch weights. "int8" rounds
             the kernels of the blocks to 8 bits as they are read: an approximation (docs/research-notes).
+        compute_dtype: type in which the blocks will be computed: "bfloat16" reads what they multiply in bfloat16, with
+            equal results there and half the memory.
         progress: called during a conversion with the number of steps done and the total.
 
     Raises:
@@ -51,7 +54,7 @@ def load_model(
             declared.
         MissingExtraError: the weights need torch or huggingface_hub, which is not installed.
     """
-    model = load_weights(name_or_path, config=config, dtype=dtype, progress=progress)
+    model = load_weights(name_or_path, config=config, dtype=dtype, compute_dtype=compute_dtype, progress=progress)
     if config is not None and dataclasses.replace(config, heads=model.heads) != model.config:
         raise CheckpointError(f"{name_or_path} has another configuration than the argument config; omit config")
     return model
@@ -62,19 +65,20 @@ def load_weights(
     *,
     config: VGGTConfig | None = None,
     dtype: LoadedDType | None = None,
+    compute_dtype: str | None = None,
     progress: Progress | None = None,
 ) -> Model:
     """Load a model as `load_model` does, but accept a checkpoint of this library with another configuration."""
     if dtype is not None:
         check_choice("dtype", dtype, get_args(LoadedDType))
     if str(name_or_path) == "demo":
-        return demo_model(dtype or "float32")
+        return demo_model(dtype or "float32", compute_dtype)
     weights = locate(name_or_path)
     path = weights.path
     if not is_checkpoint(path):
         stored = "float32" if dtype in (None, "int8") else dtype
         path = _converted(weights, config or vggt_1b(), stored, progress)
-    return read_model(path, dtype=dtype)
+    return read_model(path, dtype=dtype, compute_dtype=compute_dtype)
 
 
 def _converted(weights: Weights, config: VGGTConfig, dtype: DType, progress: Progress | None) -> Path:
