@@ -5,6 +5,8 @@
 # without what is not committed: the same wheel anywhere.
 # While you work: `make check`, which is lint and types beside the tests that run few networks, in two minutes.
 # `make coverage` counts the lines and branches that the tests run, and `make shuffled` runs them in a random order.
+# `make accelerator` compiles for GPUs that are not there and counts (5 GB of NVIDIA's libraries; ARGUMENTS="--top 10"),
+# `make accelerator-check` a tiny model in float32 with the compiler alone (0.5 GB), as CI does.
 # `make proofs` runs what takes long and rarely breaks; `make mutants` measures how many faults the tests notice.
 
 PYTHON ?= python3
@@ -15,6 +17,8 @@ TESTS ?= tests
 SEED ?= default
 SUPPLY := $(VENV)/supply
 MUTANTS := $(VENV)/mutants
+ACCELERATOR := $(VENV)/accelerator
+ARGUMENTS ?=
 COMPILE = $(SUPPLY)/bin/uv pip compile --no-config --quiet --upgrade --exclude-newer '7 days' --generate-hashes \
   --universal --python-version 3.11 --index-url https://pypi.org/simple --no-emit-index-url \
   --custom-compile-command 'make lock'
@@ -29,7 +33,7 @@ SLOW = parity network method pipeline training calibration learning commands ben
 # Processes of the tests read compiled Python files rather than compile them anew, whatever the shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo pictures docs test proofs mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
+.PHONY: demo pictures docs test proofs accelerator accelerator-check mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
@@ -48,6 +52,25 @@ test: $(VENV)/.development
 proofs: $(VENV)/.development
 	$(PYTEST) $(TESTS) -m proof --ignore tests/parity
 	$(if $(filter tests,$(TESTS)),$(BIN)/python -m pytest -n $(WORKERS) tests/parity -m "")
+
+# In folders of their own: where the compilers are, every program is traced for GPUs too.
+accelerator: $(ACCELERATOR)/.whole
+	JAX_PLATFORMS=cpu $(ACCELERATOR)/whole/bin/python -m benchmarks accelerator $(ARGUMENTS)
+
+accelerator-check: $(ACCELERATOR)/.compiler
+	JAX_PLATFORMS=cpu PYTHONPATH=$(ACCELERATOR)/compiler $(BIN)/python -m benchmarks accelerator --size tiny --frames 4 \
+	  --dtype float32 --precision highest --programs "image features" "first pass" "dynamic mask" "second pass" assemble
+
+$(ACCELERATOR)/.whole: pyproject.toml
+	$(PYTHON) -m venv $(ACCELERATOR)/whole
+	$(ACCELERATOR)/whole/bin/python -m pip install --quiet --editable '.[accelerator,train]'
+	touch $@
+
+$(ACCELERATOR)/.compiler: $(VENV)/.development
+	mkdir -p $(ACCELERATOR)
+	$(BIN)/python -m pip install --quiet --no-deps --target $(ACCELERATOR)/compiler $$($(BIN)/python -c \
+	  'import jax; print(*(f"jax-cuda12-{part}=={jax.__version__}" for part in ("plugin", "pjrt")))')
+	touch $@
 
 mutants: $(VENV)/.development $(MUTANTS)/.installed
 	rm -rf build/mutants
