@@ -96,3 +96,15 @@ def test_more_frames_than_fit(monkeypatch):
         load_clip(frames(*[(40, 20)] * 4), size=28)
     with pytest.raises(ClipError, match="frame 000001 is 900 x 2"):
         load_clip(frames((40, 20), (900, 2)), size=28)
+
+
+@pytest.mark.parametrize("mode", ["crop", "pad"])
+def test_floating_point_stays_as_it_is_where_nothing_is_resized(mode):
+    """As `infer` takes it; beside it white, and in 8 bits where it is resized."""
+    frames = np.random.default_rng(0).random((2, 28, 56, 3))
+    clip = load_clip(frames, size=56, mode=mode)
+    left, top, right, bottom = clip.valid_box[0]
+    assert np.array_equal(clip.images[:, top:bottom, left:right], frames.astype(np.float32))
+    assert (clip.images[:, :top] == 1).all()
+    resized = load_clip(frames, size=28, mode=mode).images
+    assert np.array_equal(resized, np.rint(resized * 255) / np.float32(255))

@@ -11,6 +11,7 @@ from PIL import Image
 from vggtjax.clips.preprocessing import Fit, Fitter
 from vggtjax.errors import ClipError, InputError
 from vggtjax.media.images import to_rgb
+from vggtjax.media.sampling import Frame
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "preprocess.npz"
 
@@ -21,7 +22,7 @@ def test_pixels_are_those_of_vggt(picture, mode):
     with np.load(GOLDEN, allow_pickle=False) as golden:
         image = to_rgb(Image.fromarray(golden[f"{picture}/input"]), picture)
         expected = golden[f"{picture}/{mode}"].transpose(1, 2, 0)
-    np.testing.assert_array_equal(Fitter(mode).fit(*image.size, picture).render(image), expected)
+    np.testing.assert_array_equal(Fitter(mode).fit(*image.size, picture).render(Frame("", image)), expected)
 
 
 def test_crop_makes_the_width_whole_and_cuts_the_height():

@@ -26,6 +26,7 @@ logger = logging.getLogger(__name__)
 _MOST_WORKERS = 4
 _LARGE_CUT = 0.1  # share of a picture's pixels; larger cuts are warned about
 _MOST_BYTES = 2**34  # of the images of one clip; over 5000 frames of 518 x 518
+Rendered = UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,8 @@ def load_clip(
     Args:
         source: a folder of images, a pattern such as "frames/*.png", an image or video file, a list of image paths,
             a list of PIL images or of arrays [H, W, 3], or one array [S, H, W, 3] (uint8, uint16, or floating point
-            in [0, 1], all brought to 8 bits), or a capture of an app (see `vggtjax.captures.find_capture`).
+            in [0, 1]; 8 bits are kept, but floating point stays as it is where it is not resized), or a capture of an
+            app (see `vggtjax.captures.find_capture`).
             Files of folders and patterns are taken in natural order (frame_2 before frame_10), hidden files and files
             that are not images left out; a list keeps its order.
         mode: "crop" makes frames `size` wide and cuts the height to at most `size`; "pad" makes the long side `size`
@@ -140,9 +142,9 @@ def read_clip(
     total = source.total(sampling)
     names: list[str] = []
     times: list[float] = []
-    pixels: list[UInt8[np.ndarray, "H W 3"]] = []
+    pixels: list[Rendered] = []
     fits: list[Fit] = []
-    rendering: deque[Future[UInt8[np.ndarray, "H W 3"]]] = deque()
+    rendering: deque[Future[Rendered]] = deque()
     workers = min(os.cpu_count() or 1, _MOST_WORKERS)
     with ThreadPoolExecutor(workers) as pool:  # Pillow resizes without holding the interpreter
         for frame in source.frames(sampling):
@@ -157,7 +159,7 @@ def read_clip(
             if frame.time is not None:
                 times.append(frame.time)
             fits.append(fit)
-            rendering.append(pool.submit(fit.render, frame.image))
+            rendering.append(pool.submit(fit.render, frame))
             if len(rendering) > workers:  # bounds the frames of the source's size in memory
                 pixels.append(rendering.popleft().result())
             (progress or no_progress)(len(fits), total)
@@ -194,9 +196,7 @@ def warn_of_left_out(source: Source) -> None:
             logger.warning("%s: %s", source.capture.path, note)
 
 
-def _joined(
-    pixels: list[UInt8[np.ndarray, "H W 3"]], fits: list[Fit], *, warn: bool
-) -> tuple[Float32[np.ndarray, "S H W 3"], list[Fit]]:
+def _joined(pixels: list[Rendered], fits: list[Fit], *, warn: bool) -> tuple[Float32[np.ndarray, "S H W 3"], list[Fit]]:
     """Return the frames in one array, smaller frames centred on white, and their new fits."""
     sizes = {fit.frame_size for fit in fits}
     width, height = max(size[0] for size in sizes), max(size[1] for size in sizes)
@@ -207,7 +207,8 @@ def _joined(
     widened = [fit.widen(width, height) for fit in fits]
     for image, frame, before, after in zip(images, pixels, fits, widened, strict=True):
         left, top = after.box[0] - before.box[0], after.box[1] - before.box[1]
-        image[top : top + frame.shape[0], left : left + frame.shape[1]] = frame / np.float32(255)
+        values = frame if frame.dtype == np.float32 else frame / np.float32(255)
+        image[top : top + frame.shape[0], left : left + frame.shape[1]] = values
     return images, widened
 
 

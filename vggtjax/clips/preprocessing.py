@@ -8,10 +8,11 @@ from typing import Annotated, Literal, get_args
 
 import numpy as np
 import tyro
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from vggtjax.errors import ClipError, InputError, check_choice, whole_number
+from vggtjax.media.sampling import Frame
 from vggtjax.storage.flags import InWords
 
 Mode = Literal["crop", "pad"]
@@ -123,10 +124,16 @@ class Fit:
         box = (left + right, top + down, ends[0] + right, ends[1] + down)
         return dataclasses.replace(self, frame_size=(width, height), box=box)
 
-    def render(self, image: Image.Image) -> UInt8[np.ndarray, "H W 3"]:
-        """Return the frame of an RGB image of `source_size`."""
+    def render(self, frame: Frame) -> UInt8[np.ndarray, "H W 3"] | Float32[np.ndarray, "H W 3"]:
+        """Return a frame of `source_size` as one of the clip, in 8 bits.
+
+        A frame that is given as floating point, and not resized, keeps its values in [0, 1].
+        """
         left, top, right, bottom = self.box
-        resized = np.asarray(image.resize(self.resized_size, Image.Resampling.BICUBIC))
-        frame = np.full((*self.frame_size[::-1], 3), 255, np.uint8)
-        frame[top:bottom, left:right] = resized[self.cut : self.cut + bottom - top]
-        return frame
+        if frame.exact is not None and self.resized_size == self.source_size:
+            pixels, white = frame.exact, 1
+        else:
+            pixels, white = np.asarray(frame.image.resize(self.resized_size, Image.Resampling.BICUBIC)), 255
+        fitted = np.full((*self.frame_size[::-1], 3), white, pixels.dtype)
+        fitted[top:bottom, left:right] = pixels[self.cut : self.cut + bottom - top]
+        return fitted

@@ -45,8 +45,10 @@ class ArrayFrames:
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes, named by their index."""
         for index in sampling.indices(len(self.arrays)):
-            name = frame_name(index)
-            yield Frame(name, Image.fromarray(eight_bit(self.arrays[index], name)))
+            name, values = frame_name(index), self.arrays[index]
+            image = Image.fromarray(eight_bit(values, name))
+            is_float = np.issubdtype(values.dtype, np.floating)
+            yield Frame(name, image, exact=values.astype(np.float32).clip(0, 1) if is_float else None)
 
 
 def frame_name(index: int) -> str:

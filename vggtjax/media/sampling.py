@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Protocol, TypeVar
 
+import numpy as np
+from jaxtyping import Float32
 from PIL import Image
 
 from vggtjax.errors import ClipError, InputError, whole_number
@@ -20,11 +22,15 @@ TIME_ROUNDING = 1e-3  # seconds; containers such as Matroska round presentation 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of a source: its name, its upright RGB image and, for a video or some captures, its time in seconds."""
+    """One frame of a source: its name, its upright RGB image and, for a video or some captures, its time in seconds.
+
+    Of frames that are given as floating point, `exact` has the values in [0, 1] before they are rounded to 8 bits.
+    """
 
     name: str
     image: Image.Image
     time: float | None = None
+    exact: Float32[np.ndarray, "H W 3"] | None = None
 
 
 @dataclass(frozen=True)
