@@ -143,10 +143,10 @@ def evaluate(
             from vggtjax.evaluation.run import Scoring
             from vggtjax.evaluation.run import evaluate as run
 
-            store = Records(out)
-            check_report(out, store)
             chosen = None if scores.sequences is None else _words(scores.sequences)
             found = find_sequences(dataset, root, sequences=chosen, sampling=sampling, gt=scores.gt)
+            store = Records(out)
+            check_report(out, store)
         named = ", ".join(one_line(name, 60) for name in list(found)[:_SHOWN])
         more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         report.note(f"{len(found)} sequence{'' if len(found) == 1 else 's'}: {named}{more}")
@@ -195,9 +195,12 @@ def _print(report: Report, out: Path, records: Sequence[Record], warnings: Seque
     from vggtjax.evaluation.records import summary
 
     report.means(summary(records))
+    failed: dict[tuple[str, str], list[str]] = {}  # methods of a sequence that fail for one reason
     for record in records:
         if record.status == "failed":
-            report.line(f"{record.name}, {record.method}: failed: {record.reason}")
+            failed.setdefault((record.name, record.reason), []).append(record.method)
+    for (name, reason), methods in failed.items():
+        report.line(f"{name}, {', '.join(methods)}: failed: {reason}")
     for note in dict.fromkeys(note for record in records for note in record.notes):
         report.line(f"note: {note}")
     for warning in warnings:

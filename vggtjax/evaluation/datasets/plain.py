@@ -35,7 +35,7 @@ _PER_METRE = 1000.0
 def plain(root: Path) -> dict[str, Opener]:
     """Find plain folders; a folder with several takes, between which the camera jumps, has a sequence for each take."""
     openers: dict[str, Opener] = {}
-    for name, folder in sequence_folders(root, _holds_pictures, "a folder rgb").items():
+    for name, folder in sequence_folders(root, _holds_pictures, "rgb/*.png").items():
         try:
             poses = _poses(folder)
         except InputError:  # the opener raises it
@@ -69,13 +69,17 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
     taken = [pictures[frame] for frame in chosen]
     depths, masks = files(folder / "depth", ".png"), files(folder / "mask", ".png")
     depth, notes = depth_reader(
-        taken, [depths.get(path.stem) for path in taken], partial(read_png, per_metre=_PER_METRE)
+        taken,
+        [depths.get(path.stem) for path in taken],
+        partial(read_png, per_metre=_PER_METRE),
+        folder / "depth" / "*.png",
     )
     mask = None
     if masks:
-        mask, more = mask_reader(taken, [masks.get(path.stem) for path in taken], read_mask)
+        mask, more = mask_reader(taken, [masks.get(path.stem) for path in taken], read_mask, folder / "mask" / "*.png")
         notes += more
-    notes += ("it has no world_from_camera.txt",) * (poses is None) + ("it has no K.txt",) * (intrinsics is None)
+    for file, read in (("world_from_camera.txt", poses), ("K.txt", intrinsics)):
+        notes += (f"it has no {file}; expected {folder / file}",) * (read is None)
     return LabelledSequence(
         name,
         tuple(taken),
