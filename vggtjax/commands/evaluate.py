@@ -69,7 +69,7 @@ class Folders:
     results: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FOLDER ...", help_behavior_hint="")] = ()
     """score results in these folders instead, NAME=FOLDER, each with a folder per sequence; no model is run"""
     format: InWords[ReadFormat | None] = None
-    """the program that wrote the folders; vggtjax by default"""
+    """the program whose files the folders of --results have; vggtjax by default"""
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None
     """order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw"""
 
@@ -96,7 +96,7 @@ class ScoreOptions:
 
     sequences: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME", help_behavior_hint="")] = None
     """names, with commas; the sequences of the published protocol, or all, by default"""
-    gt: InWords[str | None] = None
+    gt: Annotated[str | None, tyro.conf.arg(metavar="{easi3r,lidar}", help_behavior_hint="")] = None
     """ground truth to use, where a data set has several: for dycheck easi3r (the default) or lidar"""
     depth_align: Literal["metric", "median", "scale", "scale-shift"] = "scale"
     """how video depth is brought to metres"""
