@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import re
 import runpy
@@ -20,8 +21,11 @@ import vggtjax
 from tests.documented import LANGUAGES, NOTEBOOKS, PAGES, ROOT, blocks, commands, page_name
 from vggtjax.clips.truth import Truth
 from vggtjax.commands import main as cli
+from vggtjax.options import Options
 from vggtjax.pretrained import embedded
 from vggtjax.pretrained.embedded import demo_clip
+from vggtjax.results.saving import Saving
+from vggtjax.windows.plan import Windows
 
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 TARGETS = re.findall(r"^([\w ]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
@@ -178,8 +182,10 @@ def test_every_promise_names_a_test():
 
 def test_the_reference_has_every_option():
     hook = runpy.run_path(str(ROOT / "docs" / "hooks" / "command_line.py"))
-    flags = set(re.findall(r"^│ (--[a-z-]+)", hook["_help"]("reconstruct"), flags=re.MULTILINE))
     page = hook["_section"]("reconstruct")
+    fields = [*dataclasses.fields(Options), *dataclasses.fields(Saving), *dataclasses.fields(Windows)]
+    names = {"compute_dtype": "dtype"}
+    flags = {f"--{names.get(field.name, field.name).replace('_', '-')}" for field in fields}
     assert {flag for flag in flags if f"`{flag}" not in page} == set()
     assert "│" not in page
     assert "(required)" in page

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, NoReturn
 
 import jax
 import numpy as np
@@ -20,7 +20,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from msgspec import Meta
 
 from vggtjax.config import VGGTConfig
-from vggtjax.errors import CheckpointError, check_choice, problems_sentence
+from vggtjax.errors import CheckpointError, InputError, check_choice, problems_sentence
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
 from vggtjax.network.narrow import is_multiplied
@@ -103,6 +103,13 @@ class Model:
     def heads(self) -> tuple[str, ...]:
         """Names of the model's heads."""
         return self.config.heads
+
+    def __getitem__(self, name: str) -> NoReturn:
+        """Raise InputError: functions of parameters that are given a Model in their place end here."""
+        raise InputError(
+            "a Model is given in place of its parameters; give model.params, and model.config as config "
+            "(infer and reconstruct take the Model itself)"
+        )
 
     def summary(self) -> dict[str, Any]:
         """Return the model's facts for display, as plain values."""

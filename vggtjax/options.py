@@ -152,7 +152,8 @@ class Options:
     align_scale: Switch = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1
-    """odd number of frames to average the saliency over before its threshold; 1 does not (not in the papers)"""
+    """an odd number of frames, each with its neighbours, over which the score of motion is averaged before the mask is
+    cut from it, so that masks flicker less; 1: every frame by itself, as in the papers"""
     refine_mask: _RefineMask = None
     """remove pixels from the mask that agree with other frames; the method's own choice by default"""
     refine_cameras: Switch = False
@@ -162,10 +163,11 @@ class Options:
         ComputeDType | None,
         tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint=""),  # pyright: ignore
     ] = None
-    """type of the blocks' matrix products; by default bfloat16 on a GPU or TPU, else float32"""
+    """number type of the transformer's matrix products; by default bfloat16 on a GPU or TPU, else float32"""
     precision: InWords[Precision | None] = None
-    """of the convolutions of depth on a GPU or TPU: tf32, the default there, as PyTorch computes them; highest, float32
-    for them and, unless --dtype says otherwise, for the blocks; a CPU always computes in float32"""
+    """how exactly a GPU or TPU computes: tf32, the default there, fast, with about three decimal digits in the
+    convolutions that make depth, as PyTorch has it; highest, slower, with the seven digits of float32 there and,
+    without --dtype, in the transformer. A CPU always has seven"""
     attention: InWords[Attention] = "exact"
     """how frames attend to each other: exact; merged, an approximation that merges similar tokens: faster for
     long clips, with other numbers (its errors are in the docs)"""

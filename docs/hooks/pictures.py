@@ -94,7 +94,7 @@ def _demo_clip(model: Model) -> Clip:
     from vggtjax.pretrained.embedded import demo_clip
 
     truth, config = demo_clip(), model.config
-    clip = vggtjax.load_clip(truth.images, size=truth.images.shape[2], patch=config.patch_size)
+    clip = vggtjax.load_clip(truth.images, model=model, size=truth.images.shape[2])
     result = vggtjax.reconstruct(model, clip, size=truth.images.shape[2], keep_passes=True)
     gram = GramCues(config.motion, config.depth)
     sums = predict(
@@ -120,7 +120,7 @@ def _generated(model: Model) -> list[Clip]:
     found = []
     for number in range(SCENES):
         truth = Truth(*(getattr(scenes, name)[number] for name in Truth._fields))
-        clip = vggtjax.load_clip(truth.images, size=SCENE_SIDE, patch=model.config.patch_size)
+        clip = vggtjax.load_clip(truth.images, model=model, size=SCENE_SIDE)
         paper, by_matches = (vggtjax.reconstruct(model, clip, method=name) for name in ("4dvggt-d", "4dvggt-m"))
         found.append(Clip(truth, paper, {}, by_matches))
     return found

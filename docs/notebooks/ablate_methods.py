@@ -15,7 +15,7 @@ from vggtjax.pretrained.embedded import demo_clip
 
 model, truth = vggtjax.load_model("demo"), demo_clip()
 images = jnp.asarray(truth.images[None])  # [B, S, H, W, 3] in [0, 1]
-_, passes = vggtjax.infer(model.params, images, model.config)
+_, passes = vggtjax.infer(model, images)
 
 # %% [markdown]
 # `passes.first` and `passes.second` are what the network predicted, `passes.dynamic_mask` is the mask between them.
@@ -62,7 +62,7 @@ axes.legend(frameon=False, ncols=4)
 # Give the second pass the true mask instead of the mined one.
 
 # %%
-given, _ = vggtjax.infer(model.params, images, model.config, masks=truth.dynamic_mask[None])
+given, _ = vggtjax.infer(model, images, masks=truth.dynamic_mask[None])
 print("4dvggt-d with the mined mask:", round(scores["4dvggt-d"][0], 3))
 print("4dvggt-d with the true mask: ", round(abs_rel(np.asarray(given.depth[0]), regions["all"]), 3))
 

@@ -16,7 +16,7 @@ from vggtjax.pretrained.embedded import demo_clip
 
 model = vggtjax.load_model("demo")
 truth = demo_clip()  # a generated clip whose depth, masks and cameras are known exactly
-clip = vggtjax.load_clip(truth.images, size=model.config.image_size, patch=model.config.patch_size)
+clip = vggtjax.load_clip(truth.images, model=model)
 print(len(clip), "frames of", clip.images.shape[1:3], "pixels")
 
 # %% [markdown]

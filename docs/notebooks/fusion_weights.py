@@ -18,7 +18,7 @@ from vggtjax.pretrained.embedded import demo_clip
 
 model, truth = vggtjax.load_model("demo"), demo_clip()
 images, true_depth = jnp.asarray(truth.images[None]), jnp.asarray(truth.depth[None])
-_, passes = vggtjax.infer(model.params, images, model.config)
+_, passes = vggtjax.infer(model, images)
 seen = observe(passes)  # what a rule may look at
 
 # %% [markdown]

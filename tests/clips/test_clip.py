@@ -8,8 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from tests.tiny import tiny_model
 from vggtjax.clips.clip import load_clip
 from vggtjax.errors import ClipError, InputError
+from vggtjax.pipeline.inputs import read_inputs
+from vggtjax.progress import no_stage
 
 GREY = 100
 
@@ -32,6 +35,26 @@ def test_a_clip_by_hand():
     np.testing.assert_array_equal(clip.valid_box, [[0, 0, 28, 14]] * 2)
     np.testing.assert_allclose(clip.to_source(0, np.array([14.0, 7.0])), [20, 10])
     np.testing.assert_allclose(clip.from_source(1, np.array([[0, 0], [40, 20]])), [[0, 0], [28, 14]])
+
+
+def test_a_clip_for_a_model():
+    """Loaded as `reconstruct` loads it, though the caller knows no size of the model."""
+    model = tiny_model(image_size=56, patch_size=8)
+    clip = load_clip(frames((40, 20)), model=model)
+    read = read_inputs(model, frames((40, 20)), size=None, masks=None, tracks=None, known=None, on_stage=no_stage).clip
+    assert (
+        (clip.size, clip.patch, clip.images.shape)
+        == (read.size, read.patch, read.images.shape)
+        == (56, 8, (1, 32, 56, 3))
+    )
+    padded = load_clip(frames((40, 20)), model=model, size=32, mode="pad", patch=8)
+    assert padded.images.shape == (1, 32, 32, 3)
+    with pytest.raises(InputError, match="patch is 14; leave it out, as the model's patch size is 8"):
+        load_clip(frames((40, 20)), model=model, patch=14)
+    with pytest.raises(InputError, match="size is 28; expected a multiple of patch 8"):
+        load_clip(frames((40, 20)), model=model, size=28)
+    with pytest.raises(InputError, match="model is 'demo'; expected what load_model returned"):
+        load_clip(frames((40, 20)), model="demo")  # pyright: ignore[reportArgumentType]
 
 
 def test_frames_of_different_sizes_are_padded_with_white(caplog):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -110,6 +111,37 @@ def test_bad_input_is_one_sentence_and_exit_code_2(sequences, tmp_path, capsys, 
     assert last.startswith("vggtjax: ")
     assert sentence in last
     assert not (tmp_path / "out").exists()
+
+
+def test_what_is_missing_is_said_once_with_its_path(tmp_path, capsys):
+    """Whatever the number of methods; and the data set is looked at before matplotlib and the model are missed."""
+    (tmp_path / "data/training/final/alley_2").mkdir(parents=True)
+    arguments = (*MODEL, "--methods", "vggt,vggt4d,4dvggt-d", "--out", tmp_path / "out")
+    code, out, _ = run(capsys, "evaluate", "sintel", tmp_path / "data", *arguments)
+    expected = f"the sequence has no pictures; expected {tmp_path}/data/training/final/alley_2/*.png"
+    assert code == 2
+    assert out.count("failed:") == 1
+    assert f"alley_2, vggt, vggt4d, 4dvggt-d: failed: {expected}\n" in out
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("sintl", "data set 'sintl' is not known"),
+        ("tum", "holds no sequence; expected {root}/rgb.txt or {root}/SEQUENCE/rgb.txt"),
+        ("7scenes", "holds no sequence; expected {root}/*.color.png or {root}/SCENE/SEQUENCE/*.color.png"),
+        ("davis", "expected {root}/JPEGImages/480p/SEQUENCE/*.jpg"),
+        ("sintel", "expected {root}/training/final/SEQUENCE/frame_*.png"),
+        ("kitti", "expected {root}/val/DRIVE/proj_depth/groundtruth/image_02 or {root}/groundtruth_depth_gathered/DR"),
+        ("capture", "in {root} or in {root}/CAPTURE, or {root}/*.r3d"),
+    ],
+)
+def test_the_data_set_is_looked_at_before_the_extra(tmp_path, capsys, monkeypatch, name, sentence):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    (tmp_path / "data").mkdir()
+    code, _, err = run(capsys, "evaluate", name, tmp_path / "data", "--out", tmp_path / "out")
+    assert code == 2
+    assert sentence.format(root=tmp_path / "data") in err.splitlines()[-1]
 
 
 def test_files_of_others_are_never_replaced(sequences, tmp_path, capsys):

@@ -1,5 +1,6 @@
 """The page that all reconstructions call: who calls it, given masks, rules of one's own, and equal frames."""
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -11,10 +12,11 @@ from jax.sharding import Mesh
 from jax.tree_util import Partial
 
 from tests.tiny import tiny_model
-from vggtjax import Clips, Options, assemble, infer, load_clip, reconstruct, reconstruct_long
+from vggtjax import Clips, Options, assemble, encode, forward, infer, load_clip, reconstruct, reconstruct_long
 from vggtjax.batch.many import reconstruct_many
 from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth
+from vggtjax.config import MotionConfig
 from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
 from vggtjax.learning import paper_rule, reconstruct_soft, soft_masking
@@ -95,6 +97,27 @@ def test_masks_of_a_batch_are_those_of_its_clips(model):
     ):
         with pytest.raises(InputError, match=sentence):
             infer(model.params, IMAGES, model.config, masks=masks)
+
+
+def test_infer_takes_a_model(model):
+    depth, _ = infer(model, IMAGES, method="vggt")
+    expected, _ = infer(model.params, IMAGES, model.config, method="vggt")
+    for same in (depth, jax.jit(lambda images: infer(model, images, method="vggt")[0])(jnp.asarray(IMAGES))):
+        np.testing.assert_allclose(same.depth, expected.depth, rtol=1e-5)
+    with pytest.raises(InputError, match="config is not the configuration of the model; leave it out, or give model"):
+        infer(model, IMAGES, dataclasses.replace(model.config, motion=MotionConfig(floor=0.5)))
+    with pytest.raises(InputError, match=r"config is missing; give infer\(model, images\) or infer\(model\.params"):
+        infer(model.params, IMAGES)
+    with pytest.raises(InputError, match="config is a Model; give infer"):
+        infer(model.params, IMAGES, model)
+
+
+@pytest.mark.parametrize("call", [encode, forward, run_method, run_passes])
+def test_functions_of_parameters_say_what_to_give_for_a_model(model, call):
+    with pytest.raises(
+        InputError, match=r"in place of its parameters; give model\.params, and model\.config as config"
+    ):
+        call(model, jnp.asarray(IMAGES), model.config)
 
 
 def test_a_function_is_a_rule_of_fusion(model):

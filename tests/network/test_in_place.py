@@ -14,11 +14,11 @@ def test_values_and_gradients(flag, adds):
     """By what it keeps, by its input and by an array that the function closes over."""
 
     def loss(change, old, x, scale):
-        new = change(jnp.asarray(flag), old, lambda x: {"a": scale * x**2}, x)
+        new = change(jnp.asarray(flag), old, lambda x, times: {"a": times * scale * x**2}, x, jnp.int32(3))
         return (new["a"] * jnp.arange(3.0)).sum()
 
-    def conditional(flag, old, function, x):
-        return jax.lax.cond(flag, lambda: {"a": function(x)["a"] + (old["a"] if adds else 0)}, lambda: old)
+    def conditional(flag, old, function, *x):
+        return jax.lax.cond(flag, lambda: {"a": function(*x)["a"] + (old["a"] if adds else 0)}, lambda: old)
 
     inputs = ({"a": jnp.ones(3)}, jnp.array([1.0, 2.0, 3.0]), jnp.float32(2))
     change = added_if if adds else replaced_if

@@ -199,13 +199,12 @@ def run_job(job: Job, models: Models, limits: Limits) -> None:
         model = models.get(request.model, progress)
     with job.on_stage("load clip") as progress:
         from vggtjax.clips.clip import read_clip
-        from vggtjax.clips.preprocessing import Fitter
+        from vggtjax.clips.preprocessing import Framing
 
         if checked is None:
             clip = _demo_clip(model, request.frames)
         else:
-            fitter = Fitter("crop", model.config.image_size, model.config.patch_size)
-            clip = read_clip(*checked, fitter, progress)
+            clip = read_clip(*checked, Framing().fitter(model.config), progress)
     from vggtjax.app.outputs import write_outputs
     from vggtjax.pipeline.run import reconstruct
 
@@ -228,8 +227,7 @@ def _demo_clip(model: Model, frames: int) -> Clip:
     from vggtjax.pretrained.embedded import NOTE, demo_clip
 
     images = demo_clip().images[:frames]
-    size = images.shape[2] if model.note == NOTE else model.config.image_size
-    return load_clip(images, size=size, patch=model.config.patch_size)
+    return load_clip(images, model=model, size=images.shape[2] if model.note == NOTE else None)
 
 
 def _sentence(error: Exception, folders: tuple[Path, ...]) -> str:

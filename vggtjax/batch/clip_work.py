@@ -48,7 +48,7 @@ class ClipWork:
         self._placed = model  # with its weights on every device
         if mesh is not None:
             self._placed = dataclasses.replace(model, params=replicate(model.params, mesh))
-        self._fitter: Fitter = recipe.framing.fitter(size=model.config.image_size, patch=model.config.patch_size)
+        self._fitter: Fitter = recipe.framing.fitter(model.config)
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+import tyro
 
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.storage.flags import InWords
@@ -15,7 +17,7 @@ class Cluster:
 
     engine: Literal["local", "ray"] = "local"
     """local: in this process; ray: on a cluster of Ray"""
-    address: InWords[str | None] = None
+    address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto", help_behavior_hint="")] = None
     """of the cluster, as host:port; auto: the one that runs on this machine; RAY_ADDRESS, or a new one of this machine
     alone, by default"""
     workers: InWords[int | None] = None

@@ -42,7 +42,7 @@ class ClipOutcome(NamedTuple):
     frames: int = 0
 
 
-def _devices(devices: int = 1) -> int:
+def _devices(devices: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: 1)")] = 1) -> int:
     """Return the number.
 
     Args:
@@ -87,10 +87,10 @@ class ClipRecipe:
     sampling: Annotated[Sampling, tyro.conf.arg(name="input", help="")] = Sampling()
     framing: Annotated[Framing, tyro.conf.arg(name="input", help="")] = Framing()
     options: Annotated[Options, tyro.conf.arg(name="method", help="")] = Options()
-    devices: Annotated[int, tyro.conf.arg(constructor=_devices, name="method", prefix_name=False, help="")] = 1
+    devices: Annotated[int, tyro.conf.arg(constructor=_devices, name="limits", prefix_name=False, help="")] = 1
     known: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = KnownGeometry()
     unchecked: Annotated[
-        bool, tyro.conf.arg(constructor=_no_memory_check, name="long clip", prefix_name=False, help="")
+        bool, tyro.conf.arg(constructor=_no_memory_check, name="limits", prefix_name=False, help="")
     ] = False  # do not compare the memory that a clip needs with what is free
     saving: Annotated[Saving, tyro.conf.arg(name="output", help="")] = Saving()
 
@@ -131,10 +131,10 @@ class ClipRecipe:
 class BatchRecipe(ClipRecipe):
     """How all clips of a batch are read, reconstructed and written."""
 
-    pad_frames: Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="method", prefix_name=False, help="")] = (
+    pad_frames: Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="limits", prefix_name=False, help="")] = (
         False
     )
-    masks: Annotated[BatchMasks, tyro.conf.arg(constructor=_masks, name="method", prefix_name=False, help="")] = None
+    masks: Annotated[BatchMasks, tyro.conf.arg(constructor=_masks, name="input", prefix_name=False, help="")] = None
 
     def __post_init__(self) -> None:
         if isinstance(self.masks, str):

@@ -8,15 +8,17 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int, UInt8
 
 from vggtjax.captures.frames import CaptureFrames
-from vggtjax.clips.preprocessing import Fit, Fitter, Mode
+from vggtjax.clips.preprocessing import Fit, Fitter, Framing, Mode
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.clips.still import same_picture
-from vggtjax.errors import ClipError, InputError
+from vggtjax.config import VGGTConfig
+from vggtjax.errors import ClipError, InputError, one_line
 from vggtjax.media.images import ImageFiles
 from vggtjax.media.sampling import Sampling, Source
 from vggtjax.progress import Progress, no_progress
@@ -88,12 +90,20 @@ class Clip:
         return clip
 
 
+class Configured(Protocol):
+    """What has a configuration: the model that `load_model` returned."""
+
+    @property
+    def config(self) -> VGGTConfig: ...
+
+
 def load_clip(
     source: ClipSource,
     *,
+    model: Configured | None = None,
     mode: Mode = "crop",
-    size: int = 518,
-    patch: int = 14,
+    size: int | None = None,
+    patch: int | None = None,
     fps: float | None = None,
     stride: int = 1,
     start: int = 0,
@@ -102,6 +112,8 @@ def load_clip(
 ) -> Clip:
     """Load frames and bring them to the model's size the way VGGT was trained (Pillow's bicubic, 8 bits).
 
+    `load_clip("clip.mp4", model=model)` loads as `reconstruct(model, "clip.mp4")` does.
+
     Args:
         source: a folder of images, a pattern such as "frames/*.png", an image or video file, a list of image paths,
             a list of PIL images or of arrays [H, W, 3], or one array [S, H, W, 3] (uint8, uint16, or floating point
@@ -109,10 +121,11 @@ def load_clip(
             app (see `vggtjax.captures.find_capture`).
             Files of folders and patterns are taken in natural order (frame_2 before frame_10), hidden files and files
             that are not images left out; a list keeps its order.
+        model: what `load_model` returned: its own size and patch size are taken, but `size` wins where it is given.
         mode: "crop" makes frames `size` wide and cuts the height to at most `size`; "pad" makes the long side `size`
             and pads the frame with white to a square.
-        size: width, or side of the square; a multiple of `patch`.
-        patch: side of the model's patches; sides of frames are multiples of it.
+        size: width, or side of the square; a multiple of `patch`; the model's own, or VGGT-1B's 518 without a model.
+        patch: side of the model's patches; sides of frames are multiples of it. Left out with a model; else 14.
         fps: frames to take per second of a video, by presentation time: of every 1 / fps seconds the first frame.
         stride: take every stride-th frame; not together with `fps`.
         start: index of the first frame to take, counted in frames of the source, for video too.
@@ -123,11 +136,22 @@ def load_clip(
         The clip. Frames of different sizes are padded with white to the largest, as VGGT does, with a warning logged.
 
     Raises:
-        InputError: an argument out of range.
+        InputError: an argument out of range, something else than a model, or another patch size than the model's.
         ClipError: no frames, a source that is missing or cannot be read, or a frame that cannot be used.
     """
-    fitter, sampling = Fitter(mode, size, patch), Sampling(start, stride, fps, max_frames)
+    fitter, sampling = _fitter(model, mode, size, patch), Sampling(start, stride, fps, max_frames)
     return read_clip(open_source(source), sampling, fitter, progress)
+
+
+def _fitter(model: Configured | None, mode: Mode, size: int | None, patch: int | None) -> Fitter:
+    if model is None:
+        return Fitter(mode, Fitter.size if size is None else size, Fitter.patch if patch is None else patch)
+    config = getattr(model, "config", None)
+    if not isinstance(config, VGGTConfig):
+        raise InputError(f"model is {one_line(repr(model), 50)}; expected what load_model returned")
+    if patch not in (None, config.patch_size):
+        raise InputError(f"patch is {patch}; leave it out, as the model's patch size is {config.patch_size}")
+    return Framing(mode, size).fitter(config)
 
 
 def read_clip(

@@ -11,6 +11,7 @@ import tyro
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
+from vggtjax.config import VGGTConfig
 from vggtjax.errors import ClipError, InputError, check_choice, whole_number
 from vggtjax.media.sampling import Frame
 from vggtjax.storage.flags import InWords
@@ -35,9 +36,9 @@ class Framing:
         if self.size is not None:
             object.__setattr__(self, "size", whole_number("size", self.size, 1))
 
-    def fitter(self, *, size: int, patch: int) -> Fitter:
-        """Return the fitter for a model of this `size` and `patch` size in pixels; `self.size` wins over `size`."""
-        return Fitter(self.mode, size if self.size is None else self.size, patch)
+    def fitter(self, config: VGGTConfig) -> Fitter:
+        """Return the fitter for a model of this configuration: at its size, unless `size` is given, and its patches."""
+        return Fitter(self.mode, config.image_size if self.size is None else self.size, config.patch_size)
 
 
 @dataclass(frozen=True)

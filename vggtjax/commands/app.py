@@ -16,9 +16,9 @@ _Models = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODEL [MODEL ...]", 
 def app(
     *,
     model: _Models = (),
-    host: str = "127.0.0.1",
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1",
     port: int = 7860,
-    token: Annotated[str | None, tyro.conf.arg(help_behavior_hint="")] = None,
+    token: Annotated[str | None, tyro.conf.arg(metavar="TOKEN", help_behavior_hint="")] = None,
     limits: Annotated[Limits, tyro.conf.arg(name="limits")] = Limits(),
 ) -> None:
     """An app in the browser: drop a video, watch the stages, get viewer, film and files.

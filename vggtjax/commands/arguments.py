@@ -16,6 +16,7 @@ _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(req
 Sources = Annotated[tuple[str, ...], tyro.conf.Positional, _SOURCES]
 ResultPath = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RESULT")]
 ModelName = Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="(required)")]
+Revision = Annotated[str | None, tyro.conf.arg(metavar="COMMIT", help_behavior_hint="")]
 Size = Annotated[Framing, tyro.conf.arg(name="input", help="")]
 Method = Annotated[Options, tyro.conf.arg(name="method", help="")]
 
@@ -29,7 +30,7 @@ def _result_folder(out: Path) -> Path:
     return out
 
 
-def _batch_folder(out: str) -> str:
+def _batch_folder(out: Annotated[str, tyro.conf.arg(metavar="FOLDER|URL")]) -> str:
     """Return the folder.
 
     Args:

@@ -26,7 +26,7 @@ _KEYS = 0x63756573  # folded into the seed's key, so that no other use of a seed
 
 
 def calibrate_cues(
-    model: str,
+    model: Annotated[str, tyro.conf.arg(metavar="MODEL")],
     out: Path,
     *,
     scenes: int = 64,

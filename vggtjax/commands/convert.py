@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import tyro
 
+from vggtjax.commands.arguments import Revision
 from vggtjax.commands.models import at_revision, load, read_config
 from vggtjax.commands.report import Report
 from vggtjax.results.saving import ForeignFormat, Saving
@@ -14,13 +15,13 @@ from vggtjax.storage.flags import InWords
 
 
 def convert(
-    source: tyro.conf.Positional[str],
-    destination: tyro.conf.Positional[Path],
+    source: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SOURCE")],
+    destination: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="DESTINATION")],
     /,
     *,
-    revision: InWords[str | None] = None,
+    revision: Revision = None,
     config: InWords[Path | None] = None,
-    heads: InWords[str | None] = None,
+    heads: Annotated[str | None, tyro.conf.arg(metavar="HEAD,HEAD", help_behavior_hint="")] = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
 ) -> None:
     """Convert a PyTorch VGGT checkpoint to one .safetensors with Flax names, and say what was read and written.
@@ -44,7 +45,7 @@ def convert(
 
 
 def import_result(
-    source: tyro.conf.Positional[Path],
+    source: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FOLDER")],
     /,
     out: Path,
     *,
@@ -57,7 +58,7 @@ def import_result(
     Args:
         source: the folder.
         out: folder for our files; an earlier result in it is replaced.
-        format: the project that wrote the folder.
+        format: the program whose files the folder has.
         quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw.
         confidence_percentile: percent of the pixels, the least confident, to leave out of the point clouds.
     """
@@ -75,7 +76,12 @@ def import_result(
     report.summary(result, out)
 
 
-def info(model: tyro.conf.Positional[str] = "demo", /, *, config: InWords[Path | None] = None) -> None:
+def info(
+    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[MODEL]")] = "demo",
+    /,
+    *,
+    config: InWords[Path | None] = None,
+) -> None:
     """Print a model's configuration, heads, number of parameters and type.
 
     Args:

@@ -37,7 +37,7 @@ def demo(
 
             truth = demo_clip()
             size = truth.images.shape[2]
-            clip = load_clip(truth.images, size=size, patch=model.config.patch_size)
+            clip = load_clip(truth.images, model=model, size=size)
         from vggtjax.pipeline.run import reconstruct
 
         result = reconstruct(model, clip, options=Options(method), size=size, on_stage=report.stage)

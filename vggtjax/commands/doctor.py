@@ -101,13 +101,13 @@ def facts() -> dict[str, Any]:
 
 def _longest_clips() -> Iterator[dict[str, Any]]:
     """Yield the most frames that are predicted to fit at once for each known model, at its own size."""
-    from vggtjax.clips.preprocessing import Fitter
+    from vggtjax.clips.preprocessing import Framing
     from vggtjax.pipeline import memory
 
     room = memory.available()  # no model is loaded
     for name, model in _known_models():
         config = model.config
-        width, height = Fitter(size=config.image_size, patch=config.patch_size).fit(*_WIDE, "").frame_size
+        width, height = Framing().fitter(config).fit(*_WIDE, "").frame_size
         yield {
             "model": name,
             "weights": model.parameter_bytes,

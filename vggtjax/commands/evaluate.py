@@ -70,7 +70,7 @@ class Folders:
     results: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FOLDER ...", help_behavior_hint="")] = ()
     """score results in these folders instead, NAME=FOLDER, each with a folder per sequence; no model is run"""
     format: InWords[ReadFormat | None] = None
-    """the program that wrote the folders; vggtjax by default"""
+    """the program whose files the folders of --results have; vggtjax by default"""
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None
     """order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw"""
 
@@ -97,7 +97,7 @@ class ScoreOptions:
 
     sequences: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME", help_behavior_hint="")] = None
     """names, with commas; the sequences of the published protocol, or all, by default"""
-    gt: InWords[str | None] = None
+    gt: Annotated[str | None, tyro.conf.arg(metavar="{easi3r,lidar}", help_behavior_hint="")] = None
     """ground truth to use, where a data set has several: for dycheck easi3r (the default) or lidar"""
     depth_align: Literal["metric", "median", "scale", "scale-shift"] = "scale"
     """how video depth is brought to metres"""
@@ -144,10 +144,10 @@ def evaluate(
             from vggtjax.evaluation.run import Scoring
             from vggtjax.evaluation.run import evaluate as run
 
-            store = Records(out)
-            check_report(out, store)
             chosen = None if scores.sequences is None else _words(scores.sequences)
             found = find_sequences(dataset, root, sequences=chosen, sampling=sampling, gt=scores.gt)
+            store = Records(out)
+            check_report(out, store)
         named = ", ".join(one_line(name, 60) for name in list(found)[:_SHOWN])
         more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         report.note(f"{len(found)} sequence{'' if len(found) == 1 else 's'}: {named}{more}")
@@ -196,9 +196,12 @@ def _print(report: Report, out: Path, records: Sequence[Record], warnings: Seque
     from vggtjax.evaluation.records import summary
 
     report.means(summary(records))
+    failed: dict[tuple[str, str], list[str]] = {}  # methods of a sequence that fail for one reason
     for record in records:
         if record.status == "failed":
-            report.line(f"{record.name}, {record.method}: failed: {record.reason}")
+            failed.setdefault((record.name, record.reason), []).append(record.method)
+    for (name, reason), methods in failed.items():
+        report.line(f"{name}, {', '.join(methods)}: failed: {reason}")
     for note in dict.fromkeys(note for record in records for note in record.notes):
         report.line(f"note: {note}")
     for warning in warnings:

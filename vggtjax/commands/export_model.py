@@ -17,13 +17,13 @@ from vggtjax.storage.flags import InWords
 
 
 def export_model(
-    model: tyro.conf.Positional[str],
+    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="MODEL")],
     /,
     out: Path,
     *,
     frames: int,
     size: Annotated[str, tyro.conf.arg(metavar="WIDTHxHEIGHT")],
-    platforms: str = "cpu,cuda",
+    platforms: Annotated[str, tyro.conf.arg(metavar="PLATFORM,PLATFORM")] = "cpu,cuda",
     config: InWords[Path | None] = None,
     fusion: InWords[Path | None] = None,
     options: Method = Options(),

@@ -28,7 +28,7 @@ GENERATED = "generated"
 class Clips:
     """Clips with true depth. Raises InputError for an invalid value."""
 
-    data: tuple[str, ...] = ("generated=16",)
+    data: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATASET=FOLDER ...")] = ("generated=16",)
     """clips with true depth: "generated=N" for N generated scenes, or DATASET=FOLDER as for evaluate"""
     max_frames: InWords[Count | None] = None
     """largest number of frames to take of each clip; generated clips have 12 by default, and no fewer"""
@@ -120,8 +120,14 @@ def fit_fusion(
     out: Path,
     *,
     clips: Clips = Clips(),
-    model: str | None = None,
-    family: tuple[str, ...] = ("scale", "calibrated", "correlated", "features", "robust"),
+    model: Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="")] = None,
+    family: Annotated[tuple[str, ...], tyro.conf.arg(metavar="FAMILY ...")] = (
+        "scale",
+        "calibrated",
+        "correlated",
+        "features",
+        "robust",
+    ),
     fits: Fits = Fits(),
     options: Annotated[PassOptions, tyro.conf.arg(name="method")] = PassOptions(),
 ) -> None:
@@ -136,8 +142,9 @@ def fit_fusion(
         clips: clips
         model: a converted .safetensors, a PyTorch checkpoint, a hub id, or "demo"; required with DATASET=FOLDER, else
             "demo" by default.
-        family: free parts: scale, calibrated, correlated, features, robust, soft, full, gate, or parts such as
-            scale+power+floor+correlation+inflation+distrust+saliency+depth+boundary+dynamic+offset+temperature+gate.
+        family: families of rules: scale, calibrated, correlated, features, robust, soft, full, gate, or free parts
+            joined by +, such as scale+power, of scale, power, floor, correlation, inflation, distrust, saliency, depth,
+            boundary, dynamic, offset, temperature, gate.
         fits: fits
         options: how the passes run
     """

@@ -12,6 +12,7 @@ import io
 import logging
 import os
 import re
+import shutil
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -29,6 +30,7 @@ from vggtjax.commands.evaluate import evaluate
 from vggtjax.commands.export import export
 from vggtjax.commands.export_model import export_model
 from vggtjax.commands.fit_fusion import fit_fusion
+from vggtjax.commands.help_page import TYRO_WIDTH, Help, page, read_help
 from vggtjax.commands.overview import Command, overview
 from vggtjax.commands.process import check_limits, give_devices_threads
 from vggtjax.commands.reconstruct import reconstruct
@@ -99,6 +101,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         elif not arguments:
             sys.stderr.write(overview(COMMANDS))
             return 2
+        elif arguments[0] in COMMANDS and {"-h", "--help"} & set(arguments[1:]):
+            sys.stdout.write(page(command_help(arguments[0]), shutil.get_terminal_size().columns))
         else:
             command = _parsed(arguments)
             check_limits()
@@ -145,30 +149,16 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
     """Return the command with its arguments, ready to be called.
 
     tyro prints errors of the option dataclasses in a box. Find the error in the chain of exceptions and raise it.
-
-    tyro reads the command's signature through `ready`. An option that all commands take is one more parameter in
-    `ready.__signature__` and `ready.__annotations__`, which `ready` takes out of `options`.
     """
     name, *others = arguments
     if name not in COMMANDS:
         similar = difflib.get_close_matches(name, COMMANDS, n=1)
         guess = f"did you mean {similar[0]}? " if similar else ""
         raise InputError(f"there is no command {one_line(name, 40)!r}; {guess}vggtjax --help lists all")
-    command = COMMANDS[name].run
-
-    @functools.wraps(command)
-    def ready(*positional: object, **options: object) -> Callable[[], None]:
-        return functools.partial(command, *positional, **options)
-
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(
-                ready,
-                prog=f"vggtjax {name}",
-                args=[_renamed(argument) for argument in others],
-                config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
-            )
+            return _read_by_tyro(name, [_renamed(argument) for argument in others])
     except SystemExit as stop:
         error: BaseException | None = stop
         while error is not None:
@@ -176,5 +166,36 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
                 raise error from None
             error = error.__context__
         sys.stderr.write("\n".join(map(printable, complaint.getvalue().split("\n"))))
-        sys.stdout.flush()  # of a help page
         raise
+
+
+def _read_by_tyro(name: str, arguments: Sequence[str]) -> Callable[[], None]:
+    """Return the command with its arguments, as tyro reads them.
+
+    tyro reads the command's signature through `ready`. An option that all commands take is one more parameter in
+    `ready.__signature__` and `ready.__annotations__`, which `ready` takes out of `options`.
+    """
+    command = COMMANDS[name].run
+
+    @functools.wraps(command)
+    def ready(*positional: object, **options: object) -> Callable[[], None]:
+        return functools.partial(command, *positional, **options)
+
+    config = (tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
+    return tyro.cli(ready, prog=f"vggtjax {name}", args=arguments, config=config)
+
+
+def command_help(name: str) -> Help:
+    """Return the help of a command."""
+    text = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")  # tyro draws its boxes by the encoding
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(TYRO_WIDTH)
+    try:
+        with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
+            _read_by_tyro(name, ["--help"])
+    finally:
+        os.environ.pop("COLUMNS")
+        if before is not None:
+            os.environ["COLUMNS"] = before
+    text.seek(0)
+    return read_help(text.read())

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vggtjax.commands.arguments import ModelName
+from vggtjax.commands.arguments import ModelName, Revision
 from vggtjax.commands.report import Report
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
@@ -57,7 +57,7 @@ class ModelFiles:
     demonstration model, which is not for real footage"""
     config: InWords[Path | None] = None
     """JSON file with the configuration of a PyTorch checkpoint; needed unless it is VGGT-1B"""
-    revision: InWords[str | None] = None
+    revision: Revision = None
     """commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use"""
     fusion: InWords[Path | None] = None
     """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""

@@ -45,7 +45,7 @@ class OneClip:
         self._report, self._frames = report, frames
         self._source = open_source(frames) if source is None else source
         self._model, self._fusion, self._recipe, self._given, self._out = model, fusion, recipe, given, out
-        self._fitter = recipe.framing.fitter(size=model.config.image_size, patch=model.config.patch_size)
+        self._fitter = recipe.framing.fitter(model.config)
 
     def run(self, windows: Windows) -> Reconstruction:
         """Reconstruct the clip and write the result; where the memory runs out, once more in a smaller way.

@@ -23,8 +23,8 @@ def reconstruct(
     *,
     files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
     recipe: Annotated[ClipRecipe, tyro.conf.arg(name="", help="")] = ClipRecipe(),
-    given: Annotated[GivenInputs, tyro.conf.arg(name="mask and track", help="")] = GivenInputs(),
-    windows: Annotated[Windows, tyro.conf.arg(name="long clip", help="")] = Windows(),
+    given: Annotated[GivenInputs, tyro.conf.arg(name="input", help="")] = GivenInputs(),
+    windows: Annotated[Windows, tyro.conf.arg(name="limits", help="")] = Windows(),
     out: ResultFolder,
     view: View = False,
 ) -> None:

@@ -39,7 +39,7 @@ def render(
         fps: frames per second.
         out: the film, an .mp4, .gif or .webp; RESULT/preview/turntable.mp4 by default, RESULT/turntable.mp4 where
             the result has no previews.
-        format: the program that wrote the folder.
+        format: the program whose files the folder has.
         quaternion: for vggt4d and monst3r, order of the quaternions in pred_traj.txt.
     """
     sides = _sides(size)

@@ -25,7 +25,7 @@ def train(
     recipe: Path,
     out: Path,
     *,
-    init: InWords[str | None] = None,
+    init: Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="")] = None,
     steps: InWords[int | None] = None,
     options: Annotated[RunOptions, tyro.conf.arg(name="run", help="")] = RunOptions(),  # noqa: B008 (frozen)
 ) -> None:

@@ -28,7 +28,7 @@ _RESULTS = tyro.conf.arg(metavar="RESULT [RESULT ...]", help_behavior_hint="(req
 class Serving:
     """Where the viewer is served."""
 
-    host: str = "127.0.0.1"
+    host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
     """address to serve on: this machine alone by default; on any other address the viewer asks for a token, which is
     printed"""
     port: int = 8080
@@ -52,7 +52,7 @@ def view(
         results: folders of results, up to nine; several are shown side by side or swapped by a key.
         export: write this .html file, which holds everything and opens without a server, and end; or a .viser file of
             one result, for viser's own player (extra "view"); by default the viewer is served.
-        format: the program that wrote the folders.
+        format: the program whose files the folders have.
         quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw;
             only their formats need it.
         serving: where the viewer is served

@@ -51,7 +51,7 @@ class ModelSource:
 
         check_fuses(self.fusion, *self.names)
         config = self.model.config
-        self._fitter = self.framing.fitter(size=config.image_size, patch=config.patch_size)
+        self._fitter = self.framing.fitter(config)
         groups = groups_of_methods(self.names, self.options, config.motion)
         self.groups = [[each.method for each in group] for group in groups]
 

@@ -221,7 +221,7 @@ def _all_passes(
     common = {"model": model.identity.sha256, "size": size, "options": options.passes_settings(model.config.motion)}
 
     def passes(clip: _LabelledClip) -> ClipPasses:
-        frames = load_clip(clip.pictures(), size=size, patch=model.config.patch_size)
+        frames = load_clip(clip.pictures(), model=model, size=size)
         result = reconstruct(model, frames, options=options, size=size, keep_passes=True, on_stage=on_stage)
         return passes_of(result, *clip.truth(result))
 

@@ -47,15 +47,23 @@ def _forward(function, adds, flag, old, *inputs):
 
 def _backward(function, adds, residuals, gradient):
     flag, inputs = residuals
+    is_real = [jnp.issubdtype(x.dtype, jnp.inexact) for x in inputs]
+    real = [x for x, counts in zip(inputs, is_real, strict=True) if counts]
+
+    def of_real(*real: Array) -> Any:
+        given = iter(real)
+        return function(*(next(given) if counts else x for x, counts in zip(inputs, is_real, strict=True)))
 
     def changed(gradient: Any) -> Any:
         of_old = gradient if adds else jax.tree.map(jnp.zeros_like, gradient)
-        return of_old, *jax.vjp(function, *inputs)[1](gradient)
+        return of_old, jax.vjp(of_real, *real)[1](gradient)
 
     def unchanged(gradient: Any) -> Any:
-        return gradient, *jax.tree.map(jnp.zeros_like, inputs)
+        return gradient, tuple(map(jnp.zeros_like, real))
 
-    return None, *jax.lax.cond(flag, changed, unchanged, gradient)
+    of_old, of_inputs = jax.lax.cond(flag, changed, unchanged, gradient)
+    found = iter(of_inputs)
+    return None, of_old, *(next(found) if counts else None for counts in is_real)
 
 
 _updated.defvjp(_forward, _backward)

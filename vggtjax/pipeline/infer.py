@@ -13,6 +13,7 @@ from jax.core import Tracer
 from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
+from vggtjax.checkpoint import Model
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.method.algorithm import Clips, Masks, check_masks, compute_by, run_method
@@ -27,9 +28,9 @@ _SLACK = 1e-3  # largest distance of a value from [0, 1] that counts as rounding
 
 
 def infer(
-    params: Params,
+    params: Params | Model,
     images: Float[Array, "B S H W 3"],
-    config: VGGTConfig,
+    config: VGGTConfig | None = None,
     *,
     options: Options = Options(),
     masks: Masks = None,
@@ -40,11 +41,14 @@ def infer(
 ) -> tuple[Assembly, Passes]:
     """Run a method on a batch of clips as one compiled function: `run_method` under jit.
 
+    `infer(model, images)` is `infer(model.params, images, model.config)`. For gradients by parameters, or parameters
+    that a jit of your own traces, give the tree.
+
     Args:
-        params: the model's parameter tree.
+        params: the model's parameter tree, or the model.
         images: RGB in [0, 1]; H and W are multiples of the patch size. Floats outside [0, 1] are refused, unless the
             call is traced by jit.
-        config: the model's configuration.
+        config: the model's configuration; left out with a model.
         options: how the clips are reconstructed; masks are not refined.
         masks: what moves in each clip, as for `run_method`; mined if None.
         fusion: a rule of fusion, as for `assemble`. A function is compiled anew each time that another one is given:
@@ -57,6 +61,7 @@ def infer(
         The method's depth, confidence and cameras, and the passes they were made of. The mined mask of a clip whose
         frames are all one picture is empty.
     """
+    params, config = _network(params, config)
     _check_range(images)
     config = config if motion is None else dataclasses.replace(config, motion=motion)
     # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.
@@ -69,6 +74,18 @@ def infer(
     given, moves = (None, False) if masks is False else (masks, True)
     outputs = _infer(params, images, given, rule, config, options, frames, mesh, moves)
     return outputs if images.shape[1] == frames else jax.tree.map(lambda x: x[:, :frames], outputs)
+
+
+def _network(params: Params | Model, config: VGGTConfig | None) -> tuple[Params, VGGTConfig]:
+    """Return the parameters and the configuration. Raises InputError for none, or another one than the model's."""
+    if isinstance(params, Model):
+        if config not in (None, params.config):
+            raise InputError("config is not the configuration of the model; leave it out, or give model.params with it")
+        return params.params, params.config
+    if not isinstance(config, VGGTConfig):
+        given = "missing" if config is None else f"a {type(config).__name__}"
+        raise InputError(f"config is {given}; give infer(model, images) or infer(model.params, images, model.config)")
+    return params, config
 
 
 def _check_range(images: Float[Array, "B S H W 3"]) -> None:

@@ -12,6 +12,7 @@ from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, load_clip
 from vggtjax.clips.masks import load_masks, masks_at_clip_pixels
+from vggtjax.clips.preprocessing import Framing
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.sources import ClipSource
 from vggtjax.errors import InputError
@@ -63,22 +64,21 @@ def _fitted(
     model: Model, clip: Clip | ClipSource, size: int | None, tracks: Queries | None, on_stage: OnStage
 ) -> tuple[Clip, Queries | None]:
     """Return the clip at the model's size and patch size, and the points to track in its pixels."""
-    config = model.config
-    size = config.image_size if size is None else size
     if not isinstance(clip, Clip):
         if tracks is not None:
             raise InputError("tracks are points in pixels of a loaded clip; load the clip with load_clip first")
         with on_stage("load clip") as progress:
-            return load_clip(clip, size=size, patch=config.patch_size, progress=progress), None
+            return load_clip(clip, model=model, size=size, progress=progress), None
     if tracks is not None:
         if "tracks" not in model.heads:
             raise InputError(
                 f"tracks need a model that follows points; this one has the heads {', '.join(model.heads)}"
             )
         tracks.check(*clip.images.shape[:3])
-    if (clip.size, clip.patch) != (size, config.patch_size):
+    fitter = Framing(size=size).fitter(model.config)
+    if (clip.size, clip.patch) != (fitter.size, fitter.patch):
         with on_stage("fit clip to model"):
-            loaded, clip = clip, clip.refit(size, config.patch_size)
+            loaded, clip = clip, clip.refit(fitter.size, fitter.patch)
             tracks = None if tracks is None else tracks.moved(loaded, clip)
     return clip, tracks
 

@@ -60,7 +60,7 @@ class Saving:
     resolution: Resolution = "model"
     """size of the written files: model, or original, the source's own, with crop, scale and padding undone"""
     format: Format = "vggtjax"
-    """vggt4d writes, beside the files of vggtjax, a folder vggt4d/ as VGGT4D does"""
+    """the program whose files the folder has: vggtjax; or vggt4d, with its files in vggt4d/ beside ours"""
     only: InWords[Annotated[tuple[Group, ...] | None, _Groups]] = None
     """write only these groups of files: depth, confidence, cameras, masks, previews, clouds, scene,
     report; all by default. The archive, reconstruction.npz, is always written: vggtjax reads everything from it"""

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float32
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.masks import load_masks, masks_digest
-from vggtjax.clips.preprocessing import Fitter
+from vggtjax.clips.preprocessing import Fitter, Framing
 from vggtjax.clips.queries import Queries, check_queries, check_words, parse_queries
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError
@@ -113,8 +113,7 @@ def reconstruct_long(
     options = asked.resolved(model.config.motion)
     check_fuses(fusion, options.method)
     check_kept(fusion)
-    config = model.config
-    plan = long_run or LongRun(fitter=Fitter(size=config.image_size, patch=config.patch_size))
+    plan = long_run or LongRun(fitter=Framing().fitter(model.config))
     if isinstance(plan.tracks, str):
         check_words(plan.tracks)
     if options.refine_cameras:

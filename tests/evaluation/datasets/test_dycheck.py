@@ -94,14 +94,15 @@ def test_what_is_missing_is_noted_and_never_taken_from_the_other_truth(tmp_path)
     assert sequence.world_from_camera is sequence.intrinsics is None
     assert not sequence.depth(1).any()
     assert sequence.notes[2:] == (
-        "apple: 1 of 3 frames have no depth, 0_00010 first",
-        "apple: it has no flow3d_preprocessed/colmap/sparse/images.bin, so no cameras",
+        f"apple: 1 of 3 frames have no depth, 0_00010 first; expected {extra}/aligned_depth_anything_colmap/1x/*.npy",
+        f"apple: it has no cameras; expected {extra}/colmap/sparse/images.bin",
     )
     write(extra / "colmap" / "sparse" / "images.bin", images_bin([(1, (1, 0, 0, 0), (0, 0, 0), 1, "0_00000.png")]))
     assert "apple: 2 of 3 frames are not in" in opened("dycheck", folder)[0].notes[-1]
     (sequence,) = opened("dycheck", folder, gt="lidar")
     assert sequence.world_from_camera is None
-    assert sequence.notes[2:] == ("apple: 1 of 3 frames have no camera, 0_00020 first; no cameras",)
+    note = f"apple: 1 of 3 frames have no camera, so it has no cameras; expected {folder}/camera/0_00020.json"
+    assert sequence.notes[2:] == (note,)
 
 
 SPLIT, CAMERA = "splits/train.json", "camera/0_00000.json"

@@ -78,7 +78,7 @@ def test_kitti_takes_the_first_110_and_names_what_is_missing(tmp_path):
     (sequence,) = opened("kitti", tmp_path)
     assert [int(path.stem) for path in sequence.pictures] == [i for i in range(5, 115) if i not in (7, 9)]
     assert f"{DRIVE}: 2 of 110 frames have no picture and are skipped, 0000000007 first" in sequence.notes
-    assert f"{DRIVE}: it has no calib_cam_to_cam.txt, so no intrinsics" in sequence.notes
+    assert f"{DRIVE}: it has no intrinsics; expected {tmp_path}/2011_09_26/calib_cam_to_cam.txt" in sequence.notes
     assert np.allclose(sequence.depth(2)[0], [0, 1, 0.5, 265 / 256])  # frame 8
 
 
@@ -112,7 +112,8 @@ def test_seven_scenes(tmp_path):
     (folder / "frame-000001.pose.txt").unlink()
     (sequence,) = opened("7scenes", folder)
     assert (sequence.name, sequence.world_from_camera) == ("seq-02", None)
-    assert "seq-02: 1 of 3 frames have no pose, frame-000001 first; no poses" in sequence.notes
+    note = f"1 of 3 frames have no pose, so it has no poses; expected {folder}/frame-000001.pose.txt"
+    assert f"seq-02: {note}" in sequence.notes
     assert opened("7scenes", folder, stride=2)[0].world_from_camera.shape == (2, 4, 4)
 
 

@@ -115,10 +115,10 @@ def test_what_is_missing_is_noted(tmp_path):
         (folder / name).unlink()
     (sequence,) = opened("plain", folder)
     assert sequence.notes == (
-        "clip: 1 of 3 frames have no depth, 01 first",
-        "clip: 2 of 3 frames have a mask, so it has no masks",
-        "clip: it has no world_from_camera.txt",
-        "clip: it has no K.txt",
+        f"clip: 1 of 3 frames have no depth, 01 first; expected {folder}/depth/*.png",
+        f"clip: 2 of 3 frames have a mask, so it has no masks; expected {folder}/mask/*.png",
+        f"clip: it has no world_from_camera.txt; expected {folder}/world_from_camera.txt",
+        f"clip: it has no K.txt; expected {folder}/K.txt",
     )
     assert sequence.mask is sequence.world_from_camera is sequence.intrinsics is None
     assert not sequence.depth(1).any()

@@ -31,7 +31,10 @@ def captures(root: Path) -> dict[str, Opener]:
         found |= sequence_folders(root, lambda folder: capture_kind(folder) is not None, "a capture")
     except InputError:
         if not archives:
-            raise
+            raise InputError(
+                f"{root} holds no capture; expected files of Record3D, Polycam, nerfstudio, COLMAP or TUM in {root} or "
+                f"in {root / 'CAPTURE'}, or {root / f'*{RECORD3D_SUFFIX}'}"
+            ) from None
     found |= {path.name if path.stem in found else path.stem: path for path in archives}
     return {name: partial(_read, path, name) for name, path in found.items()}
 

@@ -65,9 +65,10 @@ def _read(folder: Path, name: str, gt: str, frames: FrameChoice) -> LabelledSequ
         raise InputError(f"{absent[0]} is missing, but {folder / _SPLIT} names its frame; get the sequence whole")
     easi3r = gt == EASI3R
     cameras = (_colmap_cameras if easi3r else _json_cameras)(folder, chosen, pictures)
-    maps = files(folder / (_ALIGNED if easi3r else _LIDAR), ".npy")
+    maps_folder = folder / (_ALIGNED if easi3r else _LIDAR)
+    maps = files(maps_folder, ".npy")
     read = _from_disparity([maps[frame] for frame in names if frame in maps]) if easi3r else read_npy
-    depth, notes = depth_reader(pictures, [maps.get(frame) for frame in chosen], read)
+    depth, notes = depth_reader(pictures, [maps.get(frame) for frame in chosen], read, maps_folder / "*.npy")
     return LabelledSequence(
         name,
         tuple(pictures),
@@ -110,7 +111,7 @@ def _inverse(path: Path) -> Float32[np.ndarray, "h w"]:
 def _colmap_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cameras:
     source = folder / _MODEL
     if not (source / "images.bin").is_file():
-        return _Cameras(None, None, (f"it has no {_MODEL}/images.bin, so no cameras",))
+        return _Cameras(None, None, (f"it has no cameras; expected {source / 'images.bin'}",))
     views = read_views(source)
     if missing := [frame for frame in frames if f"{frame}.png" not in views]:
         note = f"{len(missing)} of {len(frames)} frames are not in {_MODEL}, {missing[0]} first; no cameras"
@@ -127,8 +128,8 @@ def _colmap_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _C
 def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cameras:
     paths = [folder / "camera" / f"{frame}.json" for frame in frames]
     if missing := [path.stem for path in paths if not path.is_file()]:
-        note = f"{len(missing)} of {len(frames)} frames have no camera, {missing[0]} first; no cameras"
-        return _Cameras(None, None, (note,))
+        note = f"{len(missing)} of {len(frames)} frames have no camera, so it has no cameras"
+        return _Cameras(None, None, (f"{note}; expected {folder / 'camera' / missing[0]}.json",))
     poses, intrinsics, distorted = [], [], False
     for path, picture in zip(paths, pictures, strict=True):
         camera = read_json(path, dict[str, Any], "camera")

@@ -18,7 +18,7 @@ def sequence_folders(root: Path, holds: Callable[[Path], bool], expected: str, l
     Args:
         root: a sequence's folder, or a folder of such folders.
         holds: returns whether a folder is a sequence.
-        expected: content of such a folder, for the message.
+        expected: a path in such a folder, for the message.
         levels: depth of folders below `root`; names below the first level have a slash.
 
     Raises InputError if there is no sequence.
@@ -31,7 +31,8 @@ def sequence_folders(root: Path, holds: Callable[[Path], bool], expected: str, l
         folders |= {child.relative_to(root).as_posix(): child for child in children if holds(child)}
         parents = [child for child in children if not holds(child)]
     if not folders:
-        raise InputError(f"{root} holds no sequence; expected {expected}, or folders of that kind")
+        below = "/".join(("SCENE", "SEQUENCE")[-levels:])
+        raise InputError(f"{root} holds no sequence; expected {root / expected} or {root / below / expected}")
     return dict(in_order(folders.items(), lambda item: item[1]))
 
 

@@ -59,14 +59,21 @@ def davis(root: Path) -> dict[str, Opener]:
     folders = subfolders(root / "JPEGImages" / _RESOLUTION)
     if folders:
         return {folder.name: partial(_read_davis, root, folder.name) for folder in folders}
-    raise InputError(f"{root} holds no sequence of DAVIS; expected JPEGImages/{_RESOLUTION} with folders of frames")
+    raise InputError(f"{root} holds no sequence of DAVIS; expected {root / 'JPEGImages' / _RESOLUTION}/SEQUENCE/*.jpg")
 
 
 def _read_davis(root: Path, name: str, frames: FrameChoice) -> LabelledSequence:
-    pictures = frames.of(list(files(root / "JPEGImages" / _RESOLUTION / name, ".jpg").values()), name)
-    labels = files(root / "Annotations" / _RESOLUTION / name, ".png")
-    mask, notes = mask_reader(pictures, [labels.get(path.stem) for path in pictures], read_labels)
+    pictures = frames.of(_pictures(root / "JPEGImages" / _RESOLUTION / name, ".jpg"), name)
+    folder = root / "Annotations" / _RESOLUTION / name
+    labels = files(folder, ".png")
+    mask, notes = mask_reader(pictures, [labels.get(path.stem) for path in pictures], read_labels, folder / "*.png")
     return LabelledSequence(name, tuple(pictures), mask=mask, notes=notes)
+
+
+def _pictures(folder: Path, ending: str) -> list[Path]:
+    if pictures := list(files(folder, ending).values()):
+        return pictures
+    raise InputError(f"the sequence has no pictures; expected {folder / f'*{ending}'}")
 
 
 # Sintel
@@ -78,7 +85,7 @@ def sintel(root: Path) -> dict[str, Opener]:
     for folder in (root / "training", root):
         if names := [child.name for child in subfolders(folder / "final")]:
             return {name: partial(_read_sintel, folder, name) for name in names}
-    raise InputError(f"{root} holds no sequence of Sintel; expected training/final with folders of frames")
+    raise InputError(f"{root} holds no sequence of Sintel; expected {root}/training/final/SEQUENCE/frame_*.png")
 
 
 def read_cam(path: Path) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray, "3 4"]]:
@@ -94,15 +101,16 @@ def read_cam(path: Path) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray
 
 
 def _read_sintel(training: Path, name: str, frames: FrameChoice) -> LabelledSequence:
-    pictures = frames.of(list(files(training / "final" / name, ".png").values()), name)
-    depths = files(training / "depth" / name, ".dpt")
-    depth, notes = depth_reader(pictures, [depths.get(path.stem) for path in pictures], read_dpt)
-    cams = files(training / "camdata_left" / name, ".cam")
+    pictures = frames.of(_pictures(training / "final" / name, ".png"), name)
+    source = training / "camdata_left" / name
+    depths, cams = files(training / "depth" / name, ".dpt"), files(source, ".cam")
+    expected = training / "depth" / name / "*.dpt"
+    depth, notes = depth_reader(pictures, [depths.get(path.stem) for path in pictures], read_dpt, expected)
     poses = intrinsics = None
     if missing := [path.stem for path in pictures if path.stem not in cams]:
-        notes += (f"{len(missing)} of {len(pictures)} frames have no camera, {missing[0]} first; no cameras",)
+        count = f"{len(missing)} of {len(pictures)}"
+        notes += (f"{count} frames have no camera, so it has no cameras; expected {source / missing[0]}.cam",)
     else:
-        source = training / "camdata_left" / name
         matrices, camera_from_world = zip(*(read_cam(cams[path.stem]) for path in pictures), strict=True)
         intrinsics = checked_intrinsics(np.stack(matrices), source)
         intrinsics[:, :2, 2] += PIXEL_CENTRE
@@ -119,7 +127,7 @@ _PICTURE, _DEPTH, _POSE = ".color.png", ".depth.png", ".pose.txt"
 
 def seven_scenes(root: Path) -> dict[str, Opener]:
     """Find the sequences of a scene (names such as "seq-01") or of a folder of scenes ("chess/seq-01")."""
-    folders = sequence_folders(root, lambda folder: bool(files(folder, _PICTURE)), f"frames *{_PICTURE}", levels=2)
+    folders = sequence_folders(root, lambda folder: bool(files(folder, _PICTURE)), f"*{_PICTURE}", levels=2)
     return {name: partial(_read_seven_scenes, folder, name) for name, folder in folders.items()}
 
 
@@ -128,10 +136,11 @@ def _read_seven_scenes(folder: Path, name: str, frames: FrameChoice) -> Labelled
     chosen = frames.of(list(pictures), name)
     taken = [pictures[frame] for frame in chosen]
     read = partial(read_png, per_metre=_MILLIMETRES, invalid=_INVALID)
-    depth, notes = depth_reader(taken, [depths.get(frame) for frame in chosen], read)
+    depth, notes = depth_reader(taken, [depths.get(frame) for frame in chosen], read, folder / f"*{_DEPTH}")
     poses = None
     if missing := [frame for frame in chosen if frame not in pose_files]:
-        notes += (f"{len(missing)} of {len(chosen)} frames have no pose, {missing[0]} first; no poses",)
+        count = f"{len(missing)} of {len(chosen)}"
+        notes += (f"{count} frames have no pose, so it has no poses; expected {folder / missing[0]}{_POSE}",)
     else:
         poses = np.stack([_pose(pose_files[frame]) for frame in chosen])
     intrinsics = np.broadcast_to(intrinsics_matrix(*_CAMERA, first_pixel=0, source="7-Scenes"), (len(taken), 3, 3))
@@ -171,26 +180,29 @@ def kitti(root: Path) -> dict[str, Opener]:
             pictures = root / "image_gathered" / drive.name
             openers[name] = partial(_read_kitti, name, drive, pictures, root / _CALIBRATION)
     if not openers:
-        raise InputError(f"{root} holds no drive of KITTI; expected val/<drive>/{_TRUTH} or {_GATHERED}/<drive>_02")
+        places = f"{root / 'val' / 'DRIVE' / _TRUTH} or {root / _GATHERED}/DRIVE_02"
+        raise InputError(f"{root} holds no drive of KITTI; expected {places}")
     return openers
 
 
 def _read_kitti(name: str, truth: Path, folder: Path, calibration: Path, frames: FrameChoice) -> LabelledSequence:
     depths, pictures = files(truth, ".png"), files(folder, ".png")
     if not depths or not pictures:
-        raise InputError(f"{folder if depths else truth} holds no .png; the drive {name} needs pictures and depth")
+        kind, place = ("pictures", folder) if depths else ("depth", truth)
+        raise InputError(f"the drive has no {kind}; expected {place / '*.png'}")
     chosen = frames.of(list(depths), name)  # frames with depth: the first and the last few of a drive have none
     notes: tuple[str, ...] = ()
     if missing := [frame for frame in chosen if frame not in pictures]:
         notes += (f"{len(missing)} of {len(chosen)} frames have no picture and are skipped, {missing[0]} first",)
         chosen = [frame for frame in chosen if frame in pictures]
     taken = [pictures[frame] for frame in chosen]
-    depth, more = depth_reader(taken, [depths[frame] for frame in chosen], partial(read_png, per_metre=_PER_METRE))
+    maps, read = [depths[frame] for frame in chosen], partial(read_png, per_metre=_PER_METRE)
+    depth, more = depth_reader(taken, maps, read, truth / "*.png")
     intrinsics = None
     if calibration.is_file():
         intrinsics = np.broadcast_to(_projection(calibration), (len(taken), 3, 3))
     else:
-        notes += (f"it has no {calibration.name}, so no intrinsics",)
+        notes += (f"it has no intrinsics; expected {calibration}",)
     return LabelledSequence(name, tuple(taken), depth, intrinsics=intrinsics, notes=(*notes, *more, "it has no poses"))
 
 

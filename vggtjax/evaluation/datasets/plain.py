@@ -43,7 +43,7 @@ _MASK_FILES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 def plain(root: Path) -> dict[str, Opener]:
     """Find plain folders; a folder with several takes, between which the camera jumps, has a sequence for each take."""
     openers: dict[str, Opener] = {}
-    for name, folder in sequence_folders(root, _holds_pictures, "a folder rgb").items():
+    for name, folder in sequence_folders(root, _holds_pictures, "rgb/*.png").items():
         try:
             poses = _poses(folder)
         except InputError:  # the opener raises it
@@ -77,13 +77,15 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
     taken = [pictures[frame] for frame in chosen]
     depths, unread = _of_one_kind(folder / "depth", _DEPTH_FILES)
     masks, unread_masks = _of_one_kind(folder / "mask", _MASK_FILES)
-    depth, notes = depth_reader(taken, [depths.get(path.stem) for path in taken], _read_depth)
+    found = [depths.get(path.stem) for path in taken]
+    depth, notes = depth_reader(taken, found, _read_depth, folder / "depth" / "*.png")
     notes += unread + unread_masks
     mask = None
     if masks:
-        mask, more = mask_reader(taken, [masks.get(path.stem) for path in taken], read_mask)
+        mask, more = mask_reader(taken, [masks.get(path.stem) for path in taken], read_mask, folder / "mask" / "*.png")
         notes += more
-    notes += ("it has no world_from_camera.txt",) * (poses is None) + ("it has no K.txt",) * (intrinsics is None)
+    for file, read in (("world_from_camera.txt", poses), ("K.txt", intrinsics)):
+        notes += (f"it has no {file}; expected {folder / file}",) * (read is None)
     return LabelledSequence(
         name,
         tuple(taken),

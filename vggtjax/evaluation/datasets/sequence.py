@@ -99,16 +99,21 @@ Reader = Callable[..., Mapping[str, Opener]]  # of a root, and of a ground truth
 
 
 def depth_reader(
-    pictures: Sequence[Path], paths: Sequence[Path | None], read: Callable[[Path], Float32[np.ndarray, "h w"]]
+    pictures: Sequence[Path],
+    paths: Sequence[Path | None],
+    read: Callable[[Path], Float32[np.ndarray, "h w"]],
+    expected: Path,
 ) -> tuple[DepthReader | None, tuple[str, ...]]:
     """Return a reader of the frames' depth, 0 where it is unknown, and notes on frames without depth.
+
+    The notes say where the depth is `expected`.
 
     The reader is None if no frame has depth. It raises InputError for unreadable files and for maps of another size
     than their picture. Depth that is not finite or not above 0 counts as unknown.
     """
     missing = [picture.stem for picture, path in zip(pictures, paths, strict=True) if path is None]
     if len(missing) == len(pictures):
-        return None, ("it has no depth",)
+        return None, (f"it has no depth; expected {expected}",)
 
     def depth(frame: int) -> Float32[np.ndarray, "h w"]:
         path = paths[frame]
@@ -120,16 +125,20 @@ def depth_reader(
 
     if not missing:
         return depth, ()
-    return depth, (f"{len(missing)} of {len(pictures)} frames have no depth, {missing[0]} first",)
+    return depth, (f"{len(missing)} of {len(pictures)} frames have no depth, {missing[0]} first; expected {expected}",)
 
 
 def mask_reader(
-    pictures: Sequence[Path], paths: Sequence[Path | None], read: Callable[[Path], Bool[np.ndarray, "h w"]]
+    pictures: Sequence[Path],
+    paths: Sequence[Path | None],
+    read: Callable[[Path], Bool[np.ndarray, "h w"]],
+    expected: Path,
 ) -> tuple[MaskReader | None, tuple[str, ...]]:
-    """Return a reader of the frames' masks, or None and a note unless every frame has a mask."""
+    """Return a reader of the frames' masks, or None and a note unless every frame has a mask, `expected` there."""
     masks = [path for path in paths if path is not None]
     if len(masks) < len(pictures):
-        return None, (f"{len(masks) or 'none'} of {len(pictures)} frames have a mask, so it has no masks",)
+        count = f"{len(masks) or 'none'} of {len(pictures)}"
+        return None, (f"{count} frames have a mask, so it has no masks; expected {expected}",)
     return lambda frame: _of_picture_size(read(masks[frame]), masks[frame], pictures[frame]), ()
 
 

@@ -59,9 +59,7 @@ def bonn(root: Path) -> dict[str, Opener]:
 
 
 def _folders(root: Path, prefix: str) -> dict[str, Path]:
-    folders = sequence_folders(
-        root, lambda folder: (folder / "rgb.txt").is_file(), "rgb.txt, depth.txt, groundtruth.txt"
-    )
+    folders = sequence_folders(root, lambda folder: (folder / "rgb.txt").is_file(), "rgb.txt")
     return {name.removeprefix(prefix): folder for name, folder in folders.items()}
 
 
@@ -71,7 +69,7 @@ def _read_tum(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     notes: tuple[str, ...] = ()
     candidates = np.arange(len(pictures.paths))
     if poses is None or (posed < 0).all():
-        notes += (NO_POSES if poses is None else f"no frame has a pose within {TOLERANCE} s",)
+        notes += (_no_poses(folder) if poses is None else f"no frame has a pose within {TOLERANCE} s",)
         poses = None
     elif (lost := np.flatnonzero(posed < 0)).size:
         candidates = np.flatnonzero(posed >= 0)
@@ -93,7 +91,7 @@ def _read_bonn(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence
     notes = (*frames.shortage(len(pictures.paths)), DISTORTED)
     poses, posed = read_poses(folder, pictures.times)
     if poses is None:
-        notes += (NO_POSES,)
+        notes += (_no_poses(folder),)
     elif lost := [frame for frame in chosen if posed[frame] < 0]:
         first = pictures.paths[lost[0]].stem
         notes += (f"{len(lost)} of {len(chosen)} frames have no pose within {TOLERANCE} s, {first} first; no poses",)
@@ -106,6 +104,10 @@ def _read_bonn(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence
         notes += ("poses are of the markers, moved to the camera by the data set's calibration",)
     intrinsics = intrinsics_matrix(*_BONN, first_pixel=0, source="Bonn")
     return _sequence(folder, name, pictures, chosen, poses, intrinsics, notes)
+
+
+def _no_poses(folder: Path) -> str:
+    return f"{NO_POSES}; expected {folder / 'groundtruth.txt'}"
 
 
 def _sequence(
@@ -122,7 +124,7 @@ def _sequence(
     for path in taken:
         if not path.is_file():
             raise InputError(f"{path} is missing, but rgb.txt names it; get the sequence whole")
-    depth, more = depth_reader(taken, maps, partial(read_png, per_metre=PER_METRE))
+    depth, more = depth_reader(taken, maps, partial(read_png, per_metre=PER_METRE), folder / "depth.txt")
     return LabelledSequence(
         name,
         tuple(taken),
