@@ -18,6 +18,7 @@ SEED ?= default
 SUPPLY := $(VENV)/supply
 MUTANTS := $(VENV)/mutants
 ACCELERATOR := $(VENV)/accelerator
+COMPILERS = $$($(BIN)/python -c 'import jax; print(*(f"jax-cuda12-{part}=={jax.__version__}" for part in ("plugin", "pjrt")))')
 ARGUMENTS ?=
 COMPILE = $(SUPPLY)/bin/uv pip compile --no-config --quiet --upgrade --exclude-newer '7 days' --generate-hashes \
   --universal --python-version 3.11 --index-url https://pypi.org/simple --no-emit-index-url \
@@ -33,7 +34,7 @@ SLOW = parity network method pipeline training calibration learning commands ben
 # Processes of the tests read compiled Python files rather than compile them anew, whatever the shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo pictures docs test proofs accelerator accelerator-check mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
+.PHONY: demo pictures docs test proofs accelerator accelerator-check compiler-is-there mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
@@ -59,7 +60,11 @@ accelerator: $(ACCELERATOR)/.whole
 
 accelerator-check: $(ACCELERATOR)/.compiler
 	JAX_PLATFORMS=cpu PYTHONPATH=$(ACCELERATOR)/compiler $(BIN)/python -m benchmarks accelerator --size tiny --frames 4 \
-	  --dtype float32 --precision highest --programs "image features" "first pass" "dynamic mask" "second pass" assemble
+	  --targets h100 l4 --dtype float32 --precision highest \
+	  --programs "image features" "first pass" "dynamic mask" "second pass" assemble attention
+
+compiler-is-there: $(VENV)/.development
+	$(BIN)/python -m pip download --quiet --no-deps --dest $(ACCELERATOR)/wheels $(COMPILERS)
 
 $(ACCELERATOR)/.whole: pyproject.toml
 	$(PYTHON) -m venv $(ACCELERATOR)/whole
@@ -67,9 +72,9 @@ $(ACCELERATOR)/.whole: pyproject.toml
 	touch $@
 
 $(ACCELERATOR)/.compiler: $(VENV)/.development
+	rm -rf $(ACCELERATOR)/compiler
 	mkdir -p $(ACCELERATOR)
-	$(BIN)/python -m pip install --quiet --no-deps --target $(ACCELERATOR)/compiler $$($(BIN)/python -c \
-	  'import jax; print(*(f"jax-cuda12-{part}=={jax.__version__}" for part in ("plugin", "pjrt")))')
+	$(BIN)/python -m pip install --quiet --no-deps --target $(ACCELERATOR)/compiler $(COMPILERS)
 	touch $@
 
 mutants: $(VENV)/.development $(MUTANTS)/.installed

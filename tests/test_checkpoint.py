@@ -114,6 +114,7 @@ def test_weights_in_the_type_of_the_products_give_equal_results(saved_once, conf
     assert products > 0.3 * stored.parameter_bytes
     assert narrow.parameter_bytes == stored.parameter_bytes - products // 2
     assert narrow.identity == stored.identity
+    assert load_model("demo", compute_dtype="bfloat16").identity == load_model("demo").identity
     expected = narrowed(stored.params, "bfloat16")
     assert jax.tree.all(jax.tree.map(lambda a, b: a.dtype == b.dtype, expected, narrow.params))
     run = jax.jit(partial(forward, config=config, compute_dtype="bfloat16"))

@@ -67,13 +67,21 @@ class Model:
     revision: str = ""  # commit of the source files on the hub; empty if they are not from there
     untrained_heads: tuple[str, ...] = ()  # heads with random parameters
     note: str = ""  # for users of the model; part of the settings of its results
-    _file: _FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets it
+    _file: _FileFacts | None = field(default=None, init=False, repr=False)  # `dataclasses.replace` forgets both
+    _wide: Callable[[], Model] | None = field(default=None, init=False, repr=False)
 
     @cached_property
     def identity(self) -> ModelIdentity:
         """Name and digest of the model; the first use reads all parameters, or their file."""
         in_file = self._file is not None and self._file == _file_facts(self._file.path)
-        return ModelIdentity(self.name, _file_digest(self._file) if in_file else _params_digest(self))
+        return ModelIdentity(self.name, _file_digest(self._file) if in_file else _params_digest(self.widened()))
+
+    def widened(self) -> Model:
+        """Return the model as it is without weights in the type of the products: on the host, read again."""
+        if self._wide is None:
+            return self
+        with jax.default_device(jax.local_devices(backend="cpu")[0]):
+            return self._wide()
 
     @property
     def parameter_count(self) -> int:
@@ -176,6 +184,8 @@ def read_model(
     model = Model(config, unflatten_dict(flat, sep="."), path=path, **(stored_fields | fields))
     if is_as_stored:
         object.__setattr__(model, "_file", facts)
+    if compute_dtype == "bfloat16":
+        object.__setattr__(model, "_wide", partial(read_model, path, dtype=dtype, **fields))
     return model
 
 

@@ -24,7 +24,6 @@ _FREE = {
 }  # fmt: skip
 _ALIASES = {"bitcast", "convert", "copy", "transpose", "reshape"}
 _SCOPES = re.compile(r"jit\([^)]*\)/|while/body/|closed_call/|checkpoint/|shard_map/")
-_TF32 = ("DEFAULT", "HIGH")  # operand precisions of float32 products that tensor cores compute
 _HALVES = ("bf16", "f16")
 _BACKWARD = 2.5  # products of the gradient of fused attention, over those of attention
 
@@ -88,6 +87,8 @@ class _Counter:
 
     def __init__(self, program: Program, target: Target, shares: Shares) -> None:
         self._program, self._target, self._shares = program, target, shares
+        default = "tf32" if target.platform == "cuda" else "bfloat16"  # of float32 products without a precision
+        self._kinds = {"DEFAULT": default, "HIGH": "tf32"}
 
     def run(self) -> Count:
         total = Count()
@@ -102,6 +103,9 @@ class _Counter:
             if opcode == "while":
                 trips = self._share(instruction) if instruction.trips is None else instruction.trips
                 total.unknown_loops += trips is None
+                if instruction.trips is None:  # its condition is a kernel, once more than its body
+                    condition = re.search(r"condition=%([\w.\-]+)", instruction.text)
+                    self._visit(condition.group(1) if condition else "", times * (1 + (trips or 1)), total)
                 body = re.search(r"body=%([\w.\-]+)", instruction.text)
                 self._visit(body.group(1) if body else "", times * (1 if trips is None else trips), total)
             elif opcode == "conditional":
@@ -182,7 +186,7 @@ class _Counter:
         summed = 1
         for axis in re.findall(r"\d+", found.group(1) if found else ""):
             summed *= left.sides[int(axis)]
-        return Counter({_kind(left, instruction.text): 2.0 * instruction.result[0].size * summed})
+        return Counter({self._kind(left, instruction.text): 2.0 * instruction.result[0].size * summed})
 
     def _convolution(self, name: str, instruction: Instruction, output: Shape) -> Flop:
         """Count a convolution by its output, or a gradient by the gradient that it reads."""
@@ -193,7 +197,7 @@ class _Counter:
             return Counter()
         summed = kernel.size / max(kernel.sides[labels.group(1).index("o")], 1)
         read = self._program.operand(name, instruction, 0)
-        return Counter({_kind(read, instruction.text): 2.0 * output.size * summed})
+        return Counter({self._kind(read, instruction.text): 2.0 * output.size * summed})
 
     def _attention(self, name: str, instruction: Instruction) -> Flop:
         products = self._attended(name, instruction)
@@ -203,6 +207,13 @@ class _Counter:
         """Count both products of attention, whose operands are [B, T, N, D] and [B, K, N, D]."""
         queries, keys = (self._program.operand(name, instruction, i) for i in (0, 1))
         return 4.0 * queries.size * keys.sides[1]
+
+    def _kind(self, read: Shape, text: str) -> str:
+        """Return in which type a product is computed, by what it reads and by its precision."""
+        if read.dtype in _HALVES:
+            return "bfloat16"
+        found = re.search(r'operand_precision"?[=:][\[{]"?(\w+)', text)
+        return self._kinds.get(found.group(1).upper() if found else "DEFAULT", "float32")
 
     # Bytes.
 
@@ -267,11 +278,3 @@ def _only_converted(computation: Mapping[str, Instruction], inner: Instruction) 
     """Return whether a fusion's output is the instruction's own, in another type or order."""
     root = next((found for found in computation.values() if found.is_root), None)
     return root is not None and root.opcode in _ALIASES and root.operands[:1] == (inner.name,)
-
-
-def _kind(read: Shape, text: str) -> str:
-    """Return in which type a product is computed, by what it reads and by its precision."""
-    if read.dtype in _HALVES:
-        return "bfloat16"
-    found = re.search(r'operand_precision"?[=:][\[{]"?(\w+)', text)
-    return "tf32" if (found.group(1).upper() if found else "DEFAULT") in _TF32 else "float32"

@@ -24,6 +24,7 @@ from vggtjax.method.algorithm import Clips, run_method
 from vggtjax.method.fusion_family import paper_rule
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.passes import Passes
+from vggtjax.network.attention import attention
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import AXIS, BY_FRAME, REPLICATED, Frames, OnDevices
 from vggtjax.network.model import parameter_shapes, predict
@@ -178,11 +179,21 @@ def _plain(compiler: Compiler, setup: Setup) -> None:
     P = setup.grid[0] * setup.grid[1]
     tokens = jax.ShapeDtypeStruct((1, _images(setup).shape[1], P, setup.config.embed_dim), jnp.float32)
     batch = ClipBatch(_images(setup), tokens)  # type: ignore[arg-type]
-    for name, attention in (("plain pass", "exact"), ("merged pass", "merged")):
-        if attention == "exact" or setup.devices == 1:
-            compute = Compute(setup.dtype, setup.precision, attention=attention, frames=compiler.frames)
+    for name, how in (("plain pass", "exact"), ("merged pass", "merged")):
+        if how == "exact" or setup.devices == 1:
+            compute = Compute(setup.dtype, setup.precision, attention=how, frames=compiler.frames)
             run = compiler.frames.on_devices(predict, REPLICATED, ClipBatch(BY_FRAME, BY_FRAME, REPLICATED))  # type: ignore[arg-type]
             compiler.step(name, run)(_params(setup), batch, config=setup.config, compute=compute)
+
+
+def _attention(compiler: Compiler, setup: Setup) -> None:
+    """Compile attention and its gradient for the sizes of VGGT's heads, those of the blocks and of the camera head."""
+
+    def run(*heads: Any) -> Any:
+        return [jax.value_and_grad(lambda x: attention(x, x, x).astype(jnp.float32).sum())(x) for x in heads]
+
+    sizes = (64, 128)
+    compiler.step("attention", run)(*(jax.ShapeDtypeStruct((1, 301, 2, size), setup.dtype) for size in sizes))
 
 
 def _fusion_gradient(compiler: Compiler, setup: Setup) -> None:
@@ -231,6 +242,7 @@ _BUILDS: Mapping[Callable[[Compiler, Setup], None], tuple[str, ...]] = {
         "matches: first pass", "matches: dynamic mask",
     ),
     _plain: ("plain pass", "merged pass"),
+    _attention: ("attention",),
     _fusion_gradient: ("fusion gradient",),
     _training_step: ("training gradient", "optimiser"),
 }  # fmt: skip

@@ -177,3 +177,13 @@ def test_photos_in_hdr(tmp_path, caplog, transfer):
     difference = np.abs(np.asarray(frame.image).astype(int) - sdr)
     assert max(difference[4:28, 16 * number + 4 : 16 * number + 12].max() for number in range(6)) <= 8
     assert f"HDR ({'HLG' if transfer == HLG else 'PQ'})" in caplog.messages[0]
+
+
+def test_photos_in_hdr_are_read_alike_every_time(tmp_path):
+    codes = np.full((64, 64, 3), 30000, "<u2")
+    picture = pillow_heif.from_bytes("RGB;16", (64, 64), codes.tobytes())
+    tags = {"color_primaries": 9, "transfer_characteristics": PQ, "matrix_coefficients": 9, "full_range_flag": 1}
+    picture.save(tmp_path / "a.hif", quality=-1, chroma=444, **tags)
+    files = ImageFiles((tmp_path / "a.hif",))
+    read = [np.asarray(next(files.frames(Sampling())).image) for _ in range(5)]
+    assert all(np.ptp(pixels) <= 1 and np.array_equal(pixels, read[0]) for pixels in read)

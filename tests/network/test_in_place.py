@@ -1,5 +1,7 @@
 """What is changed in some layers only: values and gradients beside a conditional."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,12 +30,37 @@ def test_values_and_gradients(flag, adds):
     assert jax.tree.all(jax.tree.map(np.array_equal, made, wanted))
 
 
-def test_what_is_kept_is_not_copied():
-    def step(kept, flag):
-        return replaced_if(flag, kept, lambda: jnp.zeros_like(kept)), None
+def copies(new):
+    """Return whether a loop that replaces its state by `new` in some steps copies it."""
 
-    flags = jnp.zeros(3, bool)
-    text = (
-        jax.jit(lambda x: jax.lax.scan(step, x, flags)[0], donate_argnums=0).lower(jnp.ones(4096)).compile().as_text()
+    def run(state, flags):
+        return jax.lax.scan(lambda old, flag: (replaced_if(flag, old, lambda: new(old)), None), state, flags)[0]
+
+    text = jax.jit(run, donate_argnums=0).lower(jnp.ones(4096), jnp.zeros(3, bool)).compile().as_text()
+    return re.search(r"f32\[4096\]\S* copy\(", str(text)) is not None
+
+
+def test_what_is_kept_is_not_copied():
+    assert not copies(lambda old: jnp.arange(4096.0))
+    assert copies(jnp.sin)  # what is computed from the old value needs both
+
+
+def test_in_a_scan_with_remat_under_vmap():
+    """Gradients with remat and under vmap, by an array that the function reads."""
+
+    def loss(change, scale, x):
+        def step(total, flag):
+            return change(flag, total, lambda x: jnp.sin(scale * x), x), None
+
+        step = jax.checkpoint(step)
+        return jax.lax.scan(step, jnp.zeros(3), jnp.array([True, False, True]))[0].sum()
+
+    def conditional(flag, old, function, x):
+        return jax.lax.cond(flag, lambda: old + function(x), lambda: old)
+
+    x = jnp.arange(6.0).reshape(2, 3)
+    made, wanted = (
+        jax.vmap(jax.grad(lambda scale, x, f=f: loss(f, scale, x), (0, 1)), (None, 0))(jnp.float32(2), x)
+        for f in (added_if, conditional)
     )
-    assert "conditional" not in str(text)
+    assert jax.tree.all(jax.tree.map(lambda a, b: np.allclose(a, b, atol=1e-6), made, wanted))

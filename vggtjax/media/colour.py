@@ -89,10 +89,7 @@ def rgb_pixels(frame: VideoFrame, colours: Colours) -> np.ndarray:
     matrix = None if colours.matrix in (None, frame.colorspace) else _swscale(colours.matrix)
     if colours.is_plain:
         return frame.to_ndarray(format="rgb24", src_colorspace=matrix)
-    pixels = frame.to_ndarray(format="rgb48le", src_colorspace=matrix)
-    rows = max(1, _BAND // pixels.shape[1])
-    bands = [_to_srgb(pixels[row : row + rows], colours) for row in range(0, len(pixels), rows)]
-    return np.concatenate(bands)
+    return _to_srgb(frame.to_ndarray(format="rgb48le", src_colorspace=matrix), colours)
 
 
 def srgb_of_coded(pixels: np.ndarray, transfer: int, primaries: int) -> tuple[np.ndarray, str]:
@@ -106,8 +103,13 @@ def _swscale(matrix: int) -> int:
     return {6: 5, 10: _BT2020}.get(matrix, matrix)
 
 
-def _to_srgb(values: np.ndarray, colours: Colours) -> np.ndarray:
-    """Return coded values, uint16 [H, W, 3], as sRGB in 8 bits."""
+def _to_srgb(pixels: np.ndarray, colours: Colours) -> np.ndarray:
+    """Return coded pixels, uint16 [H, W, 3], as sRGB in 8 bits: some rows at a time, which bounds the memory."""
+    rows = max(1, _BAND // pixels.shape[1])
+    return np.concatenate([_band(pixels[row : row + rows], colours) for row in range(0, len(pixels), rows)])
+
+
+def _band(values: np.ndarray, colours: Colours) -> np.ndarray:
     light = _linear(colours.transfer)[values.reshape(-1, 3).T]  # [3, H * W]
     peak = np.float32(_PEAKS.get(colours.transfer, 1))
     if colours.transfer == _HLG:

@@ -122,7 +122,8 @@ def _without_hdr(picture: Image.Image, path: Path, profile: Any) -> tuple[Image.
     transfer, primaries = (int(profile[name]) for name in names) if profile else (0, 0)
     if transfer not in HDR:
         return picture, None
-    deep = np.asarray(pi_heif.open_heif(path, convert_hdr_to_8bit=False))
+    file = pi_heif.open_heif(path, convert_hdr_to_8bit=False)
+    deep = np.array(file)  # a copy: a view does not keep the file's memory
     pixels = deep[..., :3] if deep.dtype == np.uint16 else np.asarray(picture).astype(np.uint16) * np.uint16(257)
     pixels, note = srgb_of_coded(pixels, transfer, primaries)
     return Image.fromarray(pixels), note

@@ -78,7 +78,10 @@ class GramCues:
                 return _unit(patches) if self.gram == "cosine" else patches
 
             def one_clip(
-                rows: Float[Array, "S T N D"], columns: Float[Array, "S T N D"], weights: Float[Array, "S m"]
+                rows: Float[Array, "S T N D"],
+                columns: Float[Array, "S T N D"],
+                index: Int[Array, "S m"],
+                weights: Float[Array, "S m"],
             ) -> Float[Array, "S ..."]:
                 def mean_similarity(frame):
                     row, index, weights = frame
@@ -98,10 +101,10 @@ class GramCues:
                 near, first_near = self.frames.around(columns, reach, axis=0)
                 return _over_frames(of_gram, (rows, index - first_near, weights))
 
-            def summand(count, q, k):
+            def summand(count, index, weights, q, k):
                 rows, columns = ({"q": q, "k": k}[name] for name in (cue.rows, cue.columns))
                 with products(self.precision):
-                    return count * jax.vmap(one_clip)(rows, columns, weights)
+                    return count * jax.vmap(one_clip, (0, 0, None, 0))(rows, columns, index, weights)
 
             return summand
 
@@ -111,7 +114,7 @@ class GramCues:
             if totals:
                 is_read = self.frames.after(is_read, totals[-1])
             with jax.named_scope(f"cue-{cue.name}"):
-                total = added_if(is_read, total, of_pair(cue), counts[i], q, k)
+                total = added_if(is_read, total, of_pair(cue), counts[i], jnp.asarray(index), weights, q, k)
             total, (q, k) = self.frames.in_order(total, (q, k))  # in the gradient, the last cue communicates first
             totals.append(total)
         return tuple(totals)

@@ -130,7 +130,7 @@ def _read(path: str | Path) -> tuple[Mapping[str, StoredTensor], dict[str, Any]]
 
 def _weights_digest(model: Model) -> str:
     """Return a digest of configuration and parameters in float32: equal if values are equal, whatever their type."""
-    params = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model.params)
+    params = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), model.widened().params)
     return dataclasses.replace(model, params=params).identity.sha256
 
 

@@ -33,28 +33,20 @@ def attention(
     """
     branches: dict[str, Any] = {"cpu": attention_in_chunks, "default": _at_once_or_in_chunks}
     D = q.shape[-1]
+    is_local = bool(jax.sharding.get_abstract_mesh().manual_axes)  # in a shard_map
     # The platform that the program is compiled for chooses, whether or not one is plugged in.
     if q.dtype == jnp.bfloat16 and D % 8 == 0 and D <= 128 and cudnn_works():
         branches["cuda"] = _with_cudnn
-    if q.dtype == jnp.float32 and is_fused(D) and cuda_is_installed():
+    if q.dtype == jnp.float32 and is_fused(D) and (is_local or _is_whole("gpu")) and kernel_works():
         branches["cuda"] = _in_one_kernel
-    if (D <= 128 or D % 128 == 0) and _compiles_for_one_tpu():
+    if (D <= 128 or D % 128 == 0) and not is_local and _is_whole("tpu") and find_spec("libtpu"):
         branches["tpu"] = _on_tpu
     return jax.lax.platform_dependent(q, k, v, visible, **branches)
 
 
-def _compiles_for_one_tpu() -> bool:
-    """Return whether programs may be for a single TPU: jax cannot divide its kernel's work among several devices."""
-    if jax.sharding.get_abstract_mesh().manual_axes:
-        return False
-    is_here = jax.default_backend() == "tpu"
-    return jax.device_count() == 1 if is_here else find_spec("libtpu") is not None
-
-
-@functools.cache
-def cuda_is_installed() -> bool:
-    """Return whether jax compiles for NVIDIA GPUs here, plugged in or not; all branches are traced."""
-    return any(find_spec(f"jax_cuda{version}_plugin") for version in (12, 13))
+def _is_whole(backend: str) -> bool:
+    """Return whether arrays are on one device: jax cannot divide the work of a kernel among several."""
+    return jax.default_backend() != backend or jax.device_count() == 1
 
 
 @functools.cache
@@ -63,9 +55,23 @@ def cudnn_works() -> bool:
 
     Without a GPU, return whether cuDNN is installed: what is compiled for a GPU here runs on another machine.
     """
+    return _runs(_with_cudnn, jnp.bfloat16, 64)
+
+
+@functools.cache
+def kernel_works() -> bool:
+    """Return whether the kernel for float32 runs on the first NVIDIA GPU; tried once.
+
+    Without a GPU, return whether jax compiles for NVIDIA GPUs here: nothing else pays for tracing the kernel.
+    """
+    compiles = any(find_spec(f"jax_cuda{version}_plugin") for version in (12, 13))
+    return compiles and all(_runs(_in_one_kernel, jnp.float32, head_dim) for head_dim in (64, 128))
+
+
+def _runs(attend, dtype, head_dim: int) -> bool:
     visible = np.ones((2, 13), bool)
-    gradient = jax.grad(lambda x: _with_cudnn(x, x, x, jnp.asarray(visible)).sum())
-    x = jax.ShapeDtypeStruct((2, 13, 1, 64), jnp.bfloat16)
+    gradient = jax.grad(lambda x: attend(x, x, x, jnp.asarray(visible)).sum())
+    x = jax.ShapeDtypeStruct((2, 13, 1, head_dim), dtype)
     try:
         jax.eval_shape(gradient, x)
         try:
@@ -96,15 +102,29 @@ def _at_once(q, k, v, visible):
 
 @jax.custom_vjp
 def _with_cudnn(q, k, v, visible):
-    return _packed(q, k, v, visible, implementation="cudnn")
+    return _packed(*_batched_alike(q, k, v, visible), implementation="cudnn")
 
 
 def _with_cudnn_forward(q, k, v, visible):
-    return jax.vjp(lambda q, k, v: evened(q, k, v, visible, implementation="cudnn"), q, k, v)
+    q, k, v, visible = _batched_alike(q, k, v, visible)
+    out, pull = jax.vjp(lambda q, k, v: evened(q, k, v, visible, implementation="cudnn"), q, k, v)
+    return out, (q, pull)
 
 
-def _with_cudnn_backward(pull, gradient):
-    return *pull(gradient), None
+def _with_cudnn_backward(residuals, gradient):
+    q, pull = residuals
+    return *pull(_batched_alike(gradient, q)[0]), None
+
+
+def _batched_alike(*arrays):
+    """Return the arrays, each computed from all: jax's rule for vmap of cuDNN's attention takes no mixture."""
+    firsts = [x.reshape(len(x), -1)[:, 0] for x in arrays if x is not None]
+    never = functools.reduce(jnp.logical_or, [first != first for first in firsts]) & False  # XLA removes it
+
+    def computed(x):
+        return x if x is None else jnp.where(never.reshape(-1, *(1,) * (x.ndim - 1)), jnp.zeros_like(x), x)
+
+    return tuple(map(computed, arrays))
 
 
 _with_cudnn.defvjp(_with_cudnn_forward, _with_cudnn_backward)

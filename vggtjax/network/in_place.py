@@ -1,7 +1,7 @@
 """What a loop over layers carries and changes in some of them only, in place.
 
 A conditional copies what it returns unchanged, in every layer. A loop of one step or none leaves it where it is in
-memory; it has a gradient here.
+memory; it has a gradient here, in reverse mode only.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _Tree = TypeVar("_Tree")
 def replaced_if(flag: Bool[Array, ""], old: _Tree, function: Callable[..., _Tree], *inputs: Array) -> _Tree:
     """Return `function(*inputs)` if the flag is true, else `old`.
 
-    The function may read other arrays, by which it has gradients too.
+    The function may read other arrays of floats, by which it has gradients too; other integers have to be inputs.
     """
     function, others = jax.closure_convert(function, *inputs)
     return _updated(function, False, flag, old, *inputs, *others)

@@ -93,7 +93,10 @@ def test_other_kinds_of_depth_and_masks(tmp_path, depth, mask):
         depth in ("npz", "npy and png")
     )
     unread += ["clip: 2 files of its folder mask are not read, such as 00.npy"] * (mask == "npy")
-    assert list(sequence.notes) == ["clip: it has no depth"] * (depth == "npz") + unread
+    assert (
+        list(sequence.notes)
+        == [f"clip: it has no depth; expected {folder / 'depth' / '*.png'}"] * (depth == "npz") + unread
+    )
 
 
 def test_takes_split_where_the_camera_jumps(tmp_path):
