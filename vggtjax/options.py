@@ -166,8 +166,8 @@ class Options:
     """number type of the transformer's matrix products; by default bfloat16 on a GPU or TPU, else float32"""
     precision: InWords[Precision | None] = None
     """how exactly a GPU or TPU computes: tf32, the default there, fast, with about three decimal digits in the
-    convolutions that make depth, as PyTorch has it; highest, slower, with the seven digits of float32 there and,
-    without --dtype, in the transformer. A CPU always has seven"""
+    products that make depth and motion cues, as PyTorch has it in convolutions; highest, slower, with the seven digits
+    of float32 there and, without --dtype, in the transformer. A CPU always has seven"""
     attention: InWords[Attention] = "exact"
     """how frames attend to each other: exact; merged, an approximation that merges similar tokens: faster for
     long clips, with other numbers (its errors are in the docs)"""
