@@ -98,14 +98,17 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
 
 
 def _of_one_kind(folder: Path, endings: Iterable[str]) -> tuple[dict[str, Path], tuple[str, ...]]:
-    """Return the files of the first of the endings that is there, by the stems of their names, and a note on others."""
+    """Return the files of the first of the endings that is there, by the stems of their names, and a note on others.
+
+    The same frame in another kind, as generated data sets have it, needs no note.
+    """
     there = files(folder, "").values()
     for ending in endings:
         if found := {path.stem: path for path in there if path.suffix.lower() == ending}:
             break
     else:
         found = {}
-    others = [path.name for path in there if path not in found.values()]
+    others = [path.name for path in there if path.stem not in found]
     note = (
         f"{len(others)} files of its folder {folder.name} are not read, such as {one_line(others[0], 60)}"
         if others
