@@ -80,7 +80,9 @@ def _alike(frames: Frames) -> Frames:
 
 def _write_mp4(path: Path, frames: Frames, fps: float) -> None:
     import av
+    from av.video.reformatter import VideoReformatter
 
+    reformatter = VideoReformatter()  # keeps its tables from frame to frame
     codec = mp4_codec()
     if codec is None:
         raise OutputError("this PyAV has no encoder for an .mp4; write a .gif or a .webp")
@@ -97,7 +99,7 @@ def _write_mp4(path: Path, frames: Frames, fps: float) -> None:
                 coder = stream.codec_context
                 coder.colorspace = coder.color_primaries = coder.color_trc = _BT709
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame[:height, :width]), format="rgb24")
-            container.mux(stream.encode(picture.reformat(format="yuv420p", dst_colorspace=_BT709)))
+            container.mux(stream.encode(reformatter.reformat(picture, format="yuv420p", dst_colorspace=_BT709)))
         container.mux(stream.encode())
 
 
