@@ -22,7 +22,7 @@ from testing.make_checkpoint import make_checkpoint
 from testing.seeded import seeded_images, seeded_state_dict
 from vggtjax import load_model
 from vggtjax.checkpoint import Model, is_checkpoint, read_model, save_model
-from vggtjax.errors import CheckpointError, OutputError
+from vggtjax.errors import CheckpointError, InputError, OutputError
 from vggtjax.network.model import forward
 from vggtjax.network.narrow import is_multiplied, narrowed
 
@@ -120,6 +120,8 @@ def test_weights_in_the_type_of_the_products_give_equal_results(saved_once, conf
     run = jax.jit(partial(forward, config=config, compute_dtype="bfloat16"))
     made = [run(model.params, images) for model in (stored, narrow)]
     assert jax.tree.all(jax.tree.map(np.array_equal, *made))
+    with pytest.raises(InputError, match="compute_dtype is 'bf16'"):
+        load_model(saved_once, compute_dtype="bf16")
 
 
 @pytest.mark.skipif(

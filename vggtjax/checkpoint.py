@@ -155,8 +155,7 @@ def read_model(
         path: the file.
         dtype: of the parameters; None for the types in the file. "int8" rounds the kernels of the blocks to 8 bits and
             leaves the others as they are in the file: an approximation.
-        compute_dtype: type in which the blocks will be computed: what they multiply is read in it if it is narrower,
-            with equal results and half the memory. The model's identity stays that of its file.
+        compute_dtype: of the blocks; "bfloat16" reads what they multiply in it: equal results, half the memory.
         fields: fields of `Model` in place of those in the file: name, note, untrained_heads.
 
     Raises CheckpointError, which counts the problems and lists the first ones, unless the file is a whole checkpoint of

@@ -102,6 +102,7 @@ class Target:
         return _text(fields)
 
 
+_COMPILERS = {"cuda": ("jax_cuda12_plugin", "jax_cuda13_plugin"), "tpu": ("libtpu",)}
 _TPU_LAYOUTS = {1: "1x1", 4: "2x2", 8: "2x4"}
 _GB, _KB, _MB = 2**30, 2**10, 2**20
 
@@ -142,10 +143,7 @@ def target(name: str) -> Target:
 
 def _require(platform: Platform) -> None:
     """Raise InputError unless the compiler for a platform is installed; tell jax where that for TPUs is."""
-    package = {"cuda": "jax_cuda12_plugin", "tpu": "libtpu"}[platform]
-    other = {"cuda": "jax_cuda13_plugin", "tpu": "libtpu"}[platform]
-    found = find_spec(package) or find_spec(other)
-    if found is None:
+    if not any(map(find_spec, _COMPILERS[platform])):
         raise InputError(f"the compiler for {platform} is not installed; pip install 'vggtjax[accelerator]'")
     if platform == "tpu":
         os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")  # of the cloud, about the machine: there is no TPU here

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.__main__ import main
 from benchmarks.accelerator.count import LAUNCH, count
 from benchmarks.accelerator.hlo import parse
-from benchmarks.accelerator.targets import TARGETS, Target
+from benchmarks.accelerator.targets import _COMPILERS, TARGETS, Target
 
 # ruff: noqa: E501  (an instruction of XLA is a line)
 # A chip of 1 FLOP/s and 1 byte/s, so that seconds are FLOP or bytes.
@@ -84,7 +84,7 @@ def test_what_is_unknown_is_named(arguments, said, capsys):
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.skipif(find_spec("jax_cuda12_plugin") is not None, reason="the compiler is installed")
+@pytest.mark.skipif(any(map(find_spec, _COMPILERS["cuda"])), reason="the compiler is installed")
 def test_a_compiler_that_is_absent_is_named(capsys):
     assert main(["accelerator", "--size", "tiny", "--frames", "2"]) == 2
     assert "vggtjax[accelerator]" in capsys.readouterr().err

@@ -14,7 +14,7 @@ from converters.files import weight_files
 from converters.locate import Weights, locate
 from converters.torch_to_flax import convert_weights
 from vggtjax.checkpoint import VERSION, DType, LoadedDType, Model, is_checkpoint, read_model
-from vggtjax.config import VGGTConfig, vggt_1b
+from vggtjax.config import ComputeDType, VGGTConfig, vggt_1b
 from vggtjax.errors import CheckpointError, check_choice
 from vggtjax.pretrained.embedded import demo_model
 from vggtjax.progress import Progress
@@ -71,6 +71,8 @@ def load_weights(
     """Load a model as `load_model` does, but accept a checkpoint of this library with another configuration."""
     if dtype is not None:
         check_choice("dtype", dtype, get_args(LoadedDType))
+    if compute_dtype is not None:
+        check_choice("compute_dtype", compute_dtype, get_args(ComputeDType))
     if str(name_or_path) == "demo":
         return demo_model(dtype or "float32", compute_dtype)
     weights = locate(name_or_path)
