@@ -16,7 +16,7 @@ In the folder, with a frame's number as its file name:
     intrinsics.txt          fx fy cx cy of every frame, in pixels of depth/ and mask/
     static.ply              the static points of all frames
     frames/                 .ply of all points of a frame
-    scene.glb               the clouds and the cameras for a viewer, y up
+    scene.glb               the clouds and the cameras for a viewer, y up, and a camera that moves as the clip's did
 
 `Saving.only` names the groups of these files that are written; the archive always is.
 
@@ -60,6 +60,7 @@ from vggtjax.progress import Progress, no_progress
 from vggtjax.results import foreign, previews, tracks
 from vggtjax.results.frame import LeastConfidence, ResultFrame, frame_of
 from vggtjax.results.glb import glb_bytes, result_scene
+from vggtjax.results.gltf_animation import add_camera
 from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, least_confidence, write_ply
 from vggtjax.results.report import REPORT_NAME, RunFacts, report_page
 from vggtjax.results.result import Result
@@ -110,7 +111,8 @@ def write_files(
     if saving.format == "vggt4d":
         foreign.write_cameras(folder / "vggt4d", result.world_from_camera, [frame.intrinsics for frame in written])
     if saving.writes("scene"):
-        (folder / "scene.glb").write_bytes(glb_bytes(result_scene(result, saving.confidence_percentile)))
+        scene = result_scene(result, saving.confidence_percentile)
+        (folder / "scene.glb").write_bytes(glb_bytes(scene, partial(add_camera, result)))
     advance()
     if saving.writes("previews"):
         _write_png(folder / "preview/sheet.png", previews.contact_sheet(result))

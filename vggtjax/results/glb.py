@@ -13,6 +13,7 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import ColorVisuals
 
 from vggtjax.cameras import FRUSTUM_EDGES, frustum_corners
+from vggtjax.results.gltf_animation import TO_GLTF
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.result import Result
 from vggtjax.results.shown import POINT_LIMIT, shown_points
@@ -27,7 +28,6 @@ _UNLIT = {
 }
 _MAPPED_LIMIT = 400_000  # of a mapped result: a point takes up to 100 bytes of memory while the file is made
 _STATIC_SHARE = 0.8  # of these points
-_TO_GLTF = np.array([1, -1, -1], np.float32)  # half a turn about x: y down and z forward become y up and z backward
 _CAMERA_SIZE = 0.06  # of the median distance from the middle of the cameras to the points
 _MOST_DISTANCES = 200_000  # of a cloud, of which the median is taken
 _BAR_SIZE = 0.015  # of a camera: half the thickness of its edges
@@ -62,7 +62,7 @@ def build_scene(result: Result, static: PointCloud, moving: Sequence[PointCloud]
     clouds = {"static": static} | {f"dynamic_{frame:06d}": cloud for frame, cloud in enumerate(moving)}
     shown = {name: cloud for name, cloud in clouds.items() if len(cloud)}
     for name, cloud in shown.items():
-        scene.add_geometry(trimesh.PointCloud(cloud.points * _TO_GLTF, cloud.colors), node_name=name, geom_name=name)
+        scene.add_geometry(trimesh.PointCloud(cloud.points * TO_GLTF, cloud.colors), node_name=name, geom_name=name)
     mesh = _camera_mesh(result, _camera_size(result, shown.values()))
     scene.add_geometry(mesh, node_name="cameras", geom_name="cameras")
     return scene
@@ -104,7 +104,7 @@ def _camera_mesh(result: Result, size: float) -> trimesh.Trimesh:
     roof_faces = np.concatenate([roof_faces, roof_faces[:, ::-1]])  # seen from both sides
     vertex_frames = np.concatenate([np.repeat(edge_frames[bar_edges], 8), np.repeat(np.arange(frames), 3)])
     vertices, faces = np.concatenate([bars, roofs]), np.concatenate([bar_faces, roof_faces + len(bars)])
-    mesh = trimesh.Trimesh(vertices * _TO_GLTF, faces, process=False)
+    mesh = trimesh.Trimesh(vertices * TO_GLTF, faces, process=False)
     mesh.visual = ColorVisuals(mesh, vertex_colors=colors[vertex_frames])
     return mesh
 
