@@ -9,7 +9,9 @@ from msgspec import Meta
 
 from vggtjax.storage.json_values import check_fields
 
-ExportFormat = Literal["colmap", "colmap-text", "gsplat", "nerfstudio", "rerun", "glb-animated", "exr", "tum", "kitti"]
+ExportFormat = Literal[
+    "colmap", "colmap-text", "gsplat", "nerfstudio", "rerun", "glb-animated", "blender", "exr", "tum", "kitti"
+]
 
 
 class Format(NamedTuple):
@@ -27,6 +29,7 @@ FORMATS: dict[ExportFormat, Format] = {
     "nerfstudio": Format(None),
     "rerun": Format("rerun", ("rerun",), ".rrd"),
     "glb-animated": Format(None, (), ".glb"),
+    "blender": Format(None),
     "exr": Format("exr", ("OpenEXR",)),
     "tum": Format(None, (), ".txt"),
     "kitti": Format(None, (), ".txt"),

@@ -94,6 +94,11 @@ def _write(result: Result, path: Path, form: ExportFormat, items: Iterator[View]
             most_moving = min(exporting.points, POINT_LIMIT // len(result.depth))
             static, moving = _shown(result, exporting, most_moving)
             write_animated_glb(path, result, static.cloud(result), [points.cloud(result) for points in moving])
+        case "blender":
+            from vggtjax.exports.blender import write_blender
+
+            static, moving = _shown(result, exporting)
+            write_blender(path, items, result, static.cloud(result), [points.cloud(result) for points in moving])
         case "exr":
             from vggtjax.exports.exr import write_exr
 
