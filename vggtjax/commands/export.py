@@ -21,7 +21,7 @@ def export(
     pictures: Annotated[str | None, tyro.conf.arg(metavar="SOURCE", help_behavior_hint="")] = None,
     exporting: Annotated[Exporting, tyro.conf.arg(name="points")] = Exporting(),
 ) -> None:
-    """Write a result for another program: COLMAP, nerfstudio, gsplat, rerun, a glTF animation, OpenEXR, TUM, KITTI.
+    """Write a result for COLMAP, nerfstudio, gsplat, rerun, Blender, glTF, OpenEXR, TUM or KITTI, or as a mesh.
 
     Args:
         result: the folder of a result.

@@ -7,10 +7,11 @@ from typing import Annotated, Literal, NamedTuple
 
 from msgspec import Meta
 
+from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import check_fields
 
 ExportFormat = Literal[
-    "colmap", "colmap-text", "gsplat", "nerfstudio", "rerun", "glb-animated", "blender", "exr", "tum", "kitti"
+    "colmap", "colmap-text", "gsplat", "nerfstudio", "rerun", "glb-animated", "blender", "mesh", "exr", "tum", "kitti"
 ]
 
 
@@ -19,7 +20,7 @@ class Format(NamedTuple):
 
     extra: str | None  # of the installation
     modules: tuple[str, ...] = ()
-    suffix: str = ""  # of its one file; empty for a folder
+    suffixes: tuple[str, ...] = ()  # of its one file; none for a folder
 
 
 FORMATS: dict[ExportFormat, Format] = {
@@ -27,23 +28,27 @@ FORMATS: dict[ExportFormat, Format] = {
     "colmap-text": Format("colmap", ("pycolmap",)),
     "gsplat": Format("colmap", ("pycolmap",)),
     "nerfstudio": Format(None),
-    "rerun": Format("rerun", ("rerun",), ".rrd"),
-    "glb-animated": Format(None, (), ".glb"),
+    "rerun": Format("rerun", ("rerun",), (".rrd",)),
+    "glb-animated": Format(None, (), (".glb",)),
     "blender": Format(None),
+    "mesh": Format(None, (), (".glb", ".ply")),
     "exr": Format("exr", ("OpenEXR",)),
-    "tum": Format(None, (), ".txt"),
-    "kitti": Format(None, (), ".txt"),
+    "tum": Format(None, (), (".txt",)),
+    "kitti": Format(None, (), (".txt",)),
 }
 
 
 @dataclass(frozen=True)
 class Exporting:
-    """Which points an export holds. Raises InputError for a value out of range."""
+    """Which points an export holds, and how fine a mesh is. Raises InputError for a value out of range."""
 
     points: Annotated[int, Meta(ge=1)] = 100_000
     """most static points to write; moving points get as many in each frame"""
     confidence_percentile: Annotated[float, Meta(ge=0, lt=100)] = 20.0
     """percent of the pixels, the least confident, to leave out of the points"""
+    voxel_size: InWords[Annotated[float, Meta(gt=0, le=1e9)] | None] = None
+    """edge of the voxels of a mesh, in units of the result; by default as wide as a pixel on the surfaces, or wider
+    where the frames differ by more"""
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -29,9 +29,10 @@ def check_export(out: Path, form: ExportFormat) -> None:
     needs = FORMATS[form]
     if needs.extra:
         check_extra(f"the format {form}", needs.extra, *needs.modules)
-    if needs.suffix and out.suffix != needs.suffix:
-        raise InputError(f"{out} is one file of the format {form}; give it a name that ends with {needs.suffix}")
-    if os.path.lexists(out) and not (out.is_dir() and not needs.suffix and not any(out.iterdir())):
+    if needs.suffixes and out.suffix not in needs.suffixes:
+        ends = " or ".join(needs.suffixes)
+        raise InputError(f"{out} is one file of the format {form}; give it a name that ends with {ends}")
+    if os.path.lexists(out) and not (out.is_dir() and not needs.suffixes and not any(out.iterdir())):
         raise OutputError(f"{out} exists and is not replaced; choose another name, or move it away")
 
 
@@ -51,11 +52,11 @@ def export_result(
         out: the folder or file, which must not exist; a folder may be empty.
         form: the format.
         source: the clip's pictures, from `open_source`, for an export at their size; by default the model's size.
-        exporting: the points.
+        exporting: the points, and the voxels of a mesh.
         progress: called with the number of frames done, and of all.
 
     Raises:
-        InputError: an unknown format, or a name without the format's suffix.
+        InputError: an unknown format, a name without the format's suffix, or a mesh that is too fine or of nothing.
         MissingExtraError: the format's library is not installed.
         ClipError: the source lacks a frame of the result, or has pictures of another size.
         OutputError: `out` exists or cannot be written.
@@ -65,8 +66,13 @@ def export_result(
     if out.is_dir():
         out.rmdir()
     with writing(out) as path:
-        if not FORMATS[form].suffix:
+        if not FORMATS[form].suffixes:
             path.mkdir()
+        if form == "mesh":
+            from vggtjax.exports.mesh import write_mesh
+
+            write_mesh(path, result, exporting, progress)
+            return
         _write(result, path, form, _counted(views(result, source), len(result.depth), progress), exporting)
 
 

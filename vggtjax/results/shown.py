@@ -83,7 +83,7 @@ def shown_points(
         frame = frame_of(result, number)
         pixels = frame.confident(least)
         if edges is not None:
-            pixels &= ~_on_edges(frame, edges)
+            pixels &= ~on_edges(frame, edges)
         positions = frame.world_points().reshape(-1, 3)
         pixels &= np.isfinite(positions).all(axis=-1).reshape(pixels.shape)  # too far away for float32
         points = _points(positions, number, pixels & frame.dynamic_mask)
@@ -129,7 +129,7 @@ def relative_steps(frame: ResultFrame) -> Float32[np.ndarray, "h w"]:
     return steps
 
 
-def _on_edges(frame: ResultFrame, edges: float) -> Bool[np.ndarray, "h w"]:
+def on_edges(frame: ResultFrame, edges: float) -> Bool[np.ndarray, "h w"]:
     """Return the pixels beside a step of depth, on both of its sides, and the static pixels beside moving ones."""
     found, moving = relative_steps(frame) > edges, frame.dynamic_mask
     for before, after in _NEIGHBOURS:
