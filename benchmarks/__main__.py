@@ -18,6 +18,7 @@ from benchmarks.memory import memory
 from benchmarks.refine_cameras import refine_cameras
 from benchmarks.second_pass import second_pass
 from benchmarks.speed import speed
+from benchmarks.static_mesh import mesh_distance
 from benchmarks.suite.command import suite
 from vggtjax.errors import VggtjaxError
 
@@ -33,6 +34,7 @@ COMMANDS = {
     "refine-cameras": refine_cameras,
     "second-pass": second_pass,
     "speed": speed,
+    "static-mesh": mesh_distance,
     "suite": suite,
 }
 

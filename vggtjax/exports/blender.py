@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from vggtjax.errors import InputError
-from vggtjax.exports.views import View
+from vggtjax.exports.views import View, of_one_size
 from vggtjax.results.gltf_animation import frame_times
 from vggtjax.results.point_cloud import PointCloud, write_ply
 from vggtjax.results.result import Result
@@ -39,14 +38,9 @@ def write_blender(
         (folder / name).mkdir()
     frames: list[dict[str, Any]] = []
     size, suffix = (0, 0), ""
-    for number, view in enumerate(items, start=1):
+    for number, view in enumerate(of_one_size(items, "a scene of Blender"), start=1):
         if number == 1:
             size, suffix = view.size, ".png" if view.name.endswith(".png") else ".jpg"
-        if view.size != size:
-            raise InputError(
-                f"frame {number} has {view.size[1]} x {view.size[0]} pixels and the first {size[1]} x {size[0]}; "
-                "a scene of Blender has one size: leave out the pictures, to write them at the model's size"
-            )
         view = view._replace(name=f"{number:06d}{suffix}")  # Blender counts the digits of a sequence on
         view.write_picture(folder / "pictures")
         frames.append(_frame(view))

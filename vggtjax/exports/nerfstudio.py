@@ -39,19 +39,24 @@ def write_nerfstudio(folder: Path, items: Iterator[View], points: PointCloud) ->
     (folder / "transforms.json").write_text(json.dumps(scene, indent=1), encoding="utf-8")
 
 
-def _frame(view: View, stem: str) -> dict[str, Any]:
+def lens_of(view: View) -> dict[str, Any]:
+    """Return size, focal lengths, principal point and a distortion of 0, as a frame of transforms.json has them."""
     K, (height, width) = view.frame.intrinsics, view.size
+    sizes = {"w": width, "h": height, "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    return sizes | dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
+
+
+def transform_matrix(view: View) -> list[list[float]]:
+    """Return world from camera in OpenGL's axes."""
+    return (view.world_from_camera @ _FROM_OPENCV).tolist()
+
+
+def _frame(view: View, stem: str) -> dict[str, Any]:
     return {
         "file_path": f"images/{view.name}",
         "depth_file_path": f"depth/{stem}.npy",
         "mask_path": f"masks/{stem}.png",
-        "w": width,
-        "h": height,
-        "fl_x": K[0, 0],
-        "fl_y": K[1, 1],
-        "cx": K[0, 2],
-        "cy": K[1, 2],
-        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+        **lens_of(view),
         "time": view.time,
-        "transform_matrix": (view.world_from_camera @ _FROM_OPENCV).tolist(),
+        "transform_matrix": transform_matrix(view),
     }

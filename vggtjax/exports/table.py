@@ -11,7 +11,18 @@ from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import check_fields
 
 ExportFormat = Literal[
-    "colmap", "colmap-text", "gsplat", "nerfstudio", "rerun", "glb-animated", "blender", "mesh", "exr", "tum", "kitti"
+    "colmap",
+    "colmap-text",
+    "gsplat",
+    "nerfstudio",
+    "rerun",
+    "glb-animated",
+    "dynamic-splats",
+    "blender",
+    "mesh",
+    "exr",
+    "tum",
+    "kitti",
 ]
 
 
@@ -30,6 +41,7 @@ FORMATS: dict[ExportFormat, Format] = {
     "nerfstudio": Format(None),
     "rerun": Format("rerun", ("rerun",), (".rrd",)),
     "glb-animated": Format(None, (), (".glb",)),
+    "dynamic-splats": Format(None),
     "blender": Format(None),
     "mesh": Format(None, (), (".glb", ".ply")),
     "exr": Format("exr", ("OpenEXR",)),

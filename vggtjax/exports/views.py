@@ -13,7 +13,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from vggtjax.cameras import world_from_camera
-from vggtjax.errors import ClipError
+from vggtjax.errors import ClipError, InputError
 from vggtjax.media.images import ImageFiles
 from vggtjax.media.sampling import Sampling, Source
 from vggtjax.results.frame import ResultFrame, frame_of
@@ -75,6 +75,19 @@ def views(result: Result, source: Source | None) -> Iterator[View]:
     for number, picture in enumerate(_pictures(result, source)):
         frame = frame_of(result, number, "original", picture=picture)
         yield View(names[number], float(times[number]), frame)
+
+
+def of_one_size(items: Iterator[View], what: str) -> Iterator[View]:
+    """Yield the frames. Raises InputError for a frame of another size than the first, as `what` has one."""
+    size = None
+    for number, view in enumerate(items, start=1):
+        size = size or view.size
+        if view.size != size:
+            raise InputError(
+                f"frame {number} has {view.size[1]} x {view.size[0]} pixels and the first {size[1]} x {size[0]}; "
+                f"{what} has one size: leave out the pictures, to write them at the model's size"
+            )
+        yield view
 
 
 def view_names(result: Result, source: Source | None) -> list[str]:

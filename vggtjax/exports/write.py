@@ -100,6 +100,12 @@ def _write(result: Result, path: Path, form: ExportFormat, items: Iterator[View]
             most_moving = min(exporting.points, POINT_LIMIT // len(result.depth))
             static, moving = _shown(result, exporting, most_moving)
             write_animated_glb(path, result, static.cloud(result), [points.cloud(result) for points in moving])
+        case "dynamic-splats":
+            from vggtjax.exports.dynamic_splats import write_dynamic_splats
+
+            static, moving = _shown(result, exporting)
+            clouds = [points.cloud(result) for points in moving]
+            write_dynamic_splats(path, items, result, static.cloud(result), clouds)
         case "blender":
             from vggtjax.exports.blender import write_blender
 
