@@ -30,7 +30,7 @@ from vggtjax.storage.writing import staging, writing
 
 _TRUE_POINTS, _SAMPLES, _MEASURED = 150_000, 200_000, 20_000  # of a clip
 _CELLS = 100  # of the points' extent along its longest side: one point of each
-_ROWS = {
+ROWS = {
     "points, to the truth": "points",
     "the mesh nearest to each of these points": "mesh_at_points",
     "points, one a cell": "even_points",
@@ -133,7 +133,7 @@ def _table(rows: list[dict[str, Any]]) -> Iterator[str]:
     """Yield the lines of a table: medians of the clips' mean distances."""
     yield "| mean distance (m), median of clips | |"
     yield "|---|---:|"
-    for words, name in _ROWS.items():
+    for words, name in ROWS.items():
         yield f"| {words} | {np.median([row[name] for row in rows]):.3f} |"
     for words, ours, theirs in (
         ("mesh nearer, at the points", "mesh_at_points", "points"),

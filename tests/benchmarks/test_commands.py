@@ -17,6 +17,7 @@ from benchmarks import (
     known_clips,
     long_clips,
     refine_cameras,
+    static_mesh,
 )
 from tests.benchmarks.scenes import SIDE, drawn_scenes, tiny_file
 from vggtjax.checkpoint import read_model
@@ -34,7 +35,7 @@ def tiny(tmp_path_factory):
 @pytest.fixture
 def run(monkeypatch, capsys):
     """Run a command in this process, on scenes that are not rendered; return what it prints."""
-    for module in (approximations, embed, known_clips, refine_cameras):
+    for module in (approximations, embed, known_clips, refine_cameras, static_mesh):
         monkeypatch.setattr(module, "held_out_scenes", drawn_scenes)
     for module in (known, refine_cameras):
         monkeypatch.setattr(module, "ProcessPoolExecutor", lambda workers, context: ThreadPoolExecutor(workers))
@@ -93,6 +94,16 @@ def test_refine_cameras(run, tiny, tmp_path):
 
 
 @pytest.mark.proof
+def test_static_mesh(run, tmp_path):
+    shown = run("static-mesh", "--clips", 1, "--frames", 4, "--side", 96, "--out", tmp_path / "out")
+    assert shown.strip() == (tmp_path / "out/report.md").read_text().strip()
+    (row,) = json.loads((tmp_path / "out/rows.json").read_text())
+    assert all(0 < row[name] < 3 for name in static_mesh.ROWS.values())
+    assert row["faces"] > 0
+    assert set(static_mesh.ROWS) < set(cells(shown))
+
+
+@pytest.mark.proof
 def test_long_clips(run, tiny, tmp_path, monkeypatch):
     def walk(kind, count, frames, side, seed):
         config = long_clips.SceneConfig(height=side, width=side, frames=frames)
@@ -137,6 +148,7 @@ def test_embed(run, tiny, tmp_path, monkeypatch):
         ("gpu-day --out {tmp}", "is not empty; choose a new folder"),
         ("long-clips --out {tmp}/out --frames 16", "expected at least 0 walks, longer than a window"),
         ("refine-cameras --frames 2", "frames is 2; expected at least 3"),
+        ("static-mesh --clips 0", "clips is 0; expected at least 1"),
         ("speed --weights {tmp}/a --converted {tmp}/b --peer {tmp}", "a does not exist"),
         ("suite --against {tmp}/file", "is not a run that --out wrote"),
     ],

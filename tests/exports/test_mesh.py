@@ -1,6 +1,7 @@
 """The mesh of the static part: where it lies, what it leaves out, and how large it may become."""
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +28,10 @@ def walls(*depths, weights=(1, 1)):
     )
 
 
+def colors_of(mesh: Any) -> np.ndarray:
+    return mesh.visual.vertex_colors[:, :3]
+
+
 def test_frames_count_by_their_precision():
     mesh = static_mesh(walls(5.0, 5.1, weights=(3, 1)), 0, 0.05)
     np.testing.assert_allclose(mesh.vertices[:, 2], (3 * 5 + 5.1) / 4, atol=1e-5)
@@ -44,7 +49,7 @@ def test_static_surfaces_alone_in_colour_and_facing_the_cameras():
     mesh = static_mesh(room, 0)
     np.testing.assert_allclose(mesh.vertices[:, 2], WALL, atol=2e-3)
     assert (mesh.face_normals[:, 2] < -0.9).all()
-    colors = mesh.visual.vertex_colors[:, :3]
+    colors = colors_of(mesh)
     assert 60 <= colors.min() <= colors.max() <= 100
     assert np.ptp(colors, axis=0).min() > 30
 
@@ -68,7 +73,7 @@ def test_files(tmp_path):
     turned = scene.geometry["static"]
     np.testing.assert_allclose(turned.vertices, plain.vertices * [1, -1, -1], atol=1e-6)
     np.testing.assert_array_equal(turned.faces, plain.faces)
-    assert plain.visual.vertex_colors[:, :3].min() >= 60
+    assert colors_of(plain).min() >= 60
     assert scene.has_camera
 
 

@@ -68,15 +68,18 @@ def export_result(
     with writing(out) as path:
         if not FORMATS[form].suffixes:
             path.mkdir()
-        if form == "mesh":
-            from vggtjax.exports.mesh import write_mesh
-
-            write_mesh(path, result, exporting, progress)
-            return
-        _write(result, path, form, _counted(views(result, source), len(result.depth), progress), exporting)
+        items = _counted(views(result, source), len(result.depth), progress)
+        _write(result, path, form, items, exporting, progress)
 
 
-def _write(result: Result, path: Path, form: ExportFormat, items: Iterator[View], exporting: Exporting) -> None:
+def _write(
+    result: Result,
+    path: Path,
+    form: ExportFormat,
+    items: Iterator[View],
+    exporting: Exporting,
+    progress: Progress | None,
+) -> None:
     match form:
         case "colmap" | "colmap-text" | "gsplat":
             from vggtjax.exports.colmap import write_colmap
@@ -111,6 +114,10 @@ def _write(result: Result, path: Path, form: ExportFormat, items: Iterator[View]
 
             static, moving = _shown(result, exporting)
             write_blender(path, items, result, static.cloud(result), [points.cloud(result) for points in moving])
+        case "mesh":
+            from vggtjax.exports.mesh import write_mesh
+
+            write_mesh(path, result, exporting, progress)
         case "exr":
             from vggtjax.exports.exr import write_exr
 
