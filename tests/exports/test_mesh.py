@@ -11,8 +11,10 @@ from tests.room import WALL, make_room
 from vggtjax.errors import InputError
 from vggtjax.exports.mesh import static_mesh
 from vggtjax.exports.table import Exporting
+from vggtjax.exports.volume import MOST_VOXELS, StaticSurfaces
 from vggtjax.exports.write import export_result
 
+ALL = Exporting(confidence_percentile=0)
 STILL = np.tile(np.eye(4, dtype=np.float32)[:3], (2, 1, 1))
 
 
@@ -33,20 +35,20 @@ def colors_of(mesh: Any) -> np.ndarray:
 
 
 def test_frames_count_by_their_precision():
-    mesh = static_mesh(walls(5.0, 5.1, weights=(3, 1)), 0, 0.05)
+    mesh = static_mesh(walls(5.0, 5.1, weights=(3, 1)), Exporting(confidence_percentile=0, voxel_size=0.05))
     np.testing.assert_allclose(mesh.vertices[:, 2], (3 * 5 + 5.1) / 4, atol=1e-5)
     # between the centres of the outer pixels, seen 5.025 away
     np.testing.assert_allclose(mesh.bounds[1, :2], 5.025 * np.array([20.5, 13.5]) / 37.8, atol=0.05)
 
 
 def test_what_lies_behind_the_reach_is_not_mixed_in():
-    mesh = static_mesh(walls(5.0, 8.0), 0, 0.1)
+    mesh = static_mesh(walls(5.0, 8.0), Exporting(confidence_percentile=0, voxel_size=0.1))
     np.testing.assert_allclose(mesh.vertices[:, 2], 8, atol=1e-4)  # the second camera looks through the first wall
 
 
 def test_static_surfaces_alone_in_colour_and_facing_the_cameras():
     room = make_room(4, 56, 84)
-    mesh = static_mesh(room, 0)
+    mesh = static_mesh(room, ALL)
     np.testing.assert_allclose(mesh.vertices[:, 2], WALL, atol=2e-3)
     assert (mesh.face_normals[:, 2] < -0.9).all()
     colors = colors_of(mesh)
@@ -58,7 +60,7 @@ def test_noise_of_frames_is_averaged():
     room = make_room(8, 56, 84)
     noise = np.random.default_rng(0).normal(scale=0.05, size=room.depth.shape)
     noisy = make_room(8, 56, 84, depth=(room.depth + noise).astype(np.float32))
-    mesh = static_mesh(noisy, 0)
+    mesh = static_mesh(noisy, ALL)
     points = noisy.world_points()[~noisy.dynamic_mask]
     assert np.abs(mesh.vertices[:, 2] - WALL).mean() < 0.5 * np.abs(points[:, 2] - WALL).mean()
 
@@ -79,11 +81,16 @@ def test_files(tmp_path):
 
 def test_what_cannot_be_a_mesh_is_one_sentence(tmp_path):
     room = make_room()
-    with pytest.raises(InputError, match=r"voxels of 0.001 need \d+ x \d+ x \d+ of them, more than 67108864") as found:
+    with pytest.raises(
+        InputError, match=r"voxels of 0.001 need \d+ x \d+ x \d+ of them, more than 67108864 in all"
+    ) as found:
         export_result(room, tmp_path / "out.glb", "mesh", exporting=Exporting(voxel_size=0.001))
     smallest = re.search(r"the smallest that fit are (\S+)", str(found.value))
     assert smallest is not None
-    assert 0.001 < float(smallest[1]) < 0.1
+    surfaces = StaticSurfaces(room, 20.0)
+    assert 0.9 * MOST_VOXELS < np.prod(surfaces.grid(float(smallest[1])).shape) <= MOST_VOXELS
+    with pytest.raises(InputError, match="voxels of 1e-200 need"):
+        surfaces.grid(1e-200)
     moving = make_room(dynamic_mask=np.ones((3, 28, 42), bool))
     with pytest.raises(InputError, match="no pixel is static"):
         export_result(moving, tmp_path / "out.glb", "mesh")

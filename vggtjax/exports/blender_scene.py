@@ -1,4 +1,4 @@
-"""Build the scene of this folder in Blender 3.6 or newer: the clip's camera, its pictures behind it, and its points.
+"""Build the scene of this folder in Blender 4.2 or newer: the clip's camera, its pictures behind it, and its points.
 
     blender --python scene.py                                     opens Blender with the scene
     blender --background --python scene.py -- clip.blend          saves it as a file
@@ -148,12 +148,8 @@ def point_style(radius):
     tree.links.new(light.outputs[0], tree.nodes.new("ShaderNodeOutputMaterial").inputs["Surface"])
 
     group = bpy.data.node_groups.new("points", "GeometryNodeTree")
-    if hasattr(group, "interface"):  # Blender 4 and newer
-        for way in ("INPUT", "OUTPUT"):
-            group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-    else:
-        group.inputs.new("NodeSocketGeometry", "Geometry")
-        group.outputs.new("NodeSocketGeometry", "Geometry")
+    for way in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
     names = ("NodeGroupInput", "GeometryNodeMeshToPoints", "GeometryNodeSetMaterial", "NodeGroupOutput")
     chain = [group.nodes.new(name) for name in names]
     for before, after in pairwise(chain):

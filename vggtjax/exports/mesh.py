@@ -27,7 +27,7 @@ _LEAST_FACES = 100  # of a connected part: smaller ones are noise
 
 def write_mesh(path: Path, result: Result, exporting: Exporting, progress: Progress | None = None) -> None:
     """Write `static_mesh` by the suffix of the path: .glb has the clip's camera too, .ply the mesh alone."""
-    mesh = static_mesh(result, exporting.confidence_percentile, exporting.voxel_size, progress)
+    mesh = static_mesh(result, exporting, progress)
     if path.suffix == ".ply":
         path.write_bytes(export_ply(mesh))
         return
@@ -38,30 +38,25 @@ def write_mesh(path: Path, result: Result, exporting: Exporting, progress: Progr
 
 
 def static_mesh(
-    result: Result,
-    confidence_percentile: float = 20.0,
-    voxel_size: float | None = None,
-    progress: Progress | None = None,
+    result: Result, exporting: Exporting = Exporting(), progress: Progress | None = None
 ) -> trimesh.Trimesh:
     """Return the mesh of the surfaces that stand still, in the world's axes, with colours; it has holes where none saw.
 
     Args:
         result: of a clip.
-        confidence_percentile: percent of the static pixels, the least confident, to leave out.
-        voxel_size: edge of a voxel in units of the result; by default as wide as a pixel on the surfaces, or half of
-            the median difference between frames where that is more.
+        exporting: percent of the static pixels, the least confident, to leave out, and the edge of a voxel: by default
+            as wide as a pixel on the surfaces, or half of the median difference between frames where that is more.
         progress: called with the number of frames read, and of all; each is read several times.
 
-    Raises InputError where nothing static is seen, or where voxels of that size are more than 2 ** 26.
+    Raises InputError where nothing static is seen, or where voxels of that size are more than 2 ** 26, or too large.
     """
-    surfaces = StaticSurfaces(result, confidence_percentile, progress)
-    grid = surfaces.grid(voxel_size)
+    surfaces = StaticSurfaces(result, exporting.confidence_percentile, progress)
+    grid = surfaces.grid(exporting.voxel_size)
     distance, known = surfaces.distances(grid)
-    cubes = _whole_cubes(known)
-    crossed = cubes.any() and distance[known].min() < 0 < distance[known].max()
-    if not crossed:
-        raise InputError(f"voxels of {grid.voxel:.3g} find no surface; give a smaller --voxel-size")
-    vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=cubes, gradient_direction="descent")
+    try:
+        vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=_whole_cubes(known), gradient_direction="descent")
+    except (RuntimeError, ValueError) as error:  # no change of sign, in whole cubes or at all
+        raise InputError(f"voxels of {grid.voxel:.3g} find no surface; give a smaller --voxel-size") from error
     faces = faces[_large_parts(faces.astype(np.int64), len(vertices))]
     mesh = trimesh.Trimesh(grid.low + grid.voxel * vertices.astype(np.float64), faces, process=False)
     mesh.remove_unreferenced_vertices()

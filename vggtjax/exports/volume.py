@@ -88,7 +88,8 @@ class StaticFrame:
             ]
             return (mixed[0] + mixed[1]) + (mixed[2] + mixed[3])
 
-        before = 1 / between(self._disparity.ravel()) - z[places]
+        with np.errstate(divide="ignore", over="ignore"):
+            before = 1 / between(self._disparity.ravel()) - z[places]
         weight = between(self._frame.confidence.ravel())
         colors = between(self._frame.image.reshape(-1, 3)) if color else np.zeros((0, 3), np.float32)
         return Readings(places, before, weight, colors)
@@ -140,22 +141,26 @@ class StaticSurfaces:
         low, high = low - _MARGIN * (high - low), high + _MARGIN * (high - low)
         footprint, spread = float(np.median(np.concatenate(footprints))), self._spread(points)
 
-        def fitted(voxel: float) -> Grid:
-            reach = max(_REACH_VOXELS * voxel, _REACH_SPREADS * spread)
-            sides = np.ceil((high - low + 2 * reach) / voxel).astype(int) + 1
-            return Grid(low - reach, tuple(sides.tolist()), voxel, reach)
+        def reach(voxel: float) -> float:
+            return max(_REACH_VOXELS * voxel, _REACH_SPREADS * spread)
+
+        def sides(voxel: float) -> Float64[np.ndarray, " 3"]:
+            return np.ceil((high - low + 2 * reach(voxel)) / voxel) + 1
 
         voxel = max(footprint, spread / 2) if voxel_size is None else voxel_size
         room = voxel
-        while np.prod(np.asarray(fitted(room).shape, float)) > MOST_VOXELS:
-            room *= 1.02
+        with np.errstate(over="ignore"):
+            while sides(room).prod() > MOST_VOXELS:
+                room *= 1.02
         if voxel_size is not None and room > voxel:
-            sides = " x ".join(map(str, fitted(voxel).shape))
+            needed = " x ".join(f"{side:.6g}" for side in sides(voxel))
+            digit = 10.0 ** (np.floor(np.log10(room)) - 2)
             raise InputError(
-                f"voxels of {voxel:g} need {sides} of them, more than {MOST_VOXELS}; "
-                f"the smallest that fit are {room:.3g}"
+                f"voxels of {voxel:g} need {needed} of them, more than {MOST_VOXELS} in all; "
+                f"the smallest that fit are {np.ceil(room / digit) * digit:.3g}"
             )
-        return fitted(room)
+        width, height, depth = sides(room).astype(int).tolist()
+        return Grid(low - reach(room), (width, height, depth), room, reach(room))
 
     def distances(self, grid: Grid) -> tuple[Float32[np.ndarray, "X Y Z"], Bool[np.ndarray, "X Y Z"]]:
         """Return signed distances, above 0 before the surfaces, and where they are known."""
