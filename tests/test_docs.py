@@ -190,7 +190,7 @@ def test_the_signatures_of_the_reference_are_those_of_the_code(site):
         page for page in pages if site["with_overview"](site["with_signatures"](page, package)) != page.read_text()
     ]
     assert stale == []
-    assert "method: MethodName = '4dvggt-d'" in (ROOT / "docs" / "reference" / "configuration.md").read_text()
+    assert 'method: MethodName = "4dvggt-d"' in (ROOT / "docs" / "reference" / "configuration.md").read_text()
 
 
 def test_the_pictures_are_of_this_model():

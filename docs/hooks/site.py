@@ -68,24 +68,29 @@ def block(name: str, page: Path, package: griffe.Module) -> str:
     kind = "Arguments, returns and errors" if found.is_function else "All of it"
     parts = [
         f'<!-- site: ::: {name} -->\n<a id="{name}"></a>\n\n### {found.name}',
-        f"```py\n{_signature(found)}\n```",
+        f"```py\n{_double_quoted(_signature(found))}\n```",
         sentence,
         f"{kind}: [{source}]({here}{source})\n<!-- /site -->",
     ]
     return "\n\n".join(filter(None, parts))
 
 
+def _double_quoted(text: str) -> str:
+    """Return code with the quotes of the source, where griffe has changed them."""
+    return text if '"' in text else text.replace("'", '"')
+
+
 def _signature(found: Any) -> str:
     if found.is_attribute:
-        return f"{found.name}: {found.annotation}" if found.annotation else found.name
-    if found.is_module:
-        return f"import {found.path}"
+        value = f" = {found.value}" if found.value is not None and len(str(found.value)) < _WIDEST else ""
+        return found.name + (f": {found.annotation}" if found.annotation else "") + value
     start = f"class {found.name}" if found.is_class else f"def {found.name}"
     parameters, returns = list(found.parameters), f" -> {found.returns}" if found.is_function and found.returns else ""
     fields = [
         f"{'    '}{name}: {a.annotation}" for name, a in found.attributes.items() if found.is_class and a.annotation
     ]
     if found.is_class and not [p for p in parameters if p.name != "self"]:
+        start += f"({', '.join(map(str, found.bases))})" if found.bases else ""
         return "\n".join([f"{start}:", *fields]) if fields else start
     words = list(_words(parameters))
     line = f"{start}({', '.join(words)}){returns}"
