@@ -14,8 +14,9 @@ from tests.glb_files import split_glb
 from tests.room import make_room
 from vggtjax.captures.colmap_model import read_views
 from vggtjax.clips.sources import open_source
+from vggtjax.commands.main import command_help
 from vggtjax.errors import ClipError, InputError, OutputError
-from vggtjax.exports.table import Exporting
+from vggtjax.exports.table import FORMATS, Exporting
 from vggtjax.exports.write import export_result
 from vggtjax.results.gltf_animation import frame_times
 
@@ -157,3 +158,9 @@ def test_bad_input_is_refused_and_nothing_is_written(tmp_path, result, pictures)
     assert sorted(tmp_path.rglob("*")) == before
     with pytest.raises(InputError, match="points"):
         Exporting(points=0)
+
+
+def test_the_help_names_every_format():
+    rows = [row for group in command_help("export").groups for row in group.rows]
+    (text,) = [text for flag, text in rows if flag.startswith("--to")]
+    assert set(re.findall(r"[a-z-]+", text.partition("one of ")[2].partition(" (")[0])) == set(FORMATS)

@@ -17,7 +17,7 @@ def export(
     /,
     out: Annotated[Path, tyro.conf.arg(metavar="OUT")],
     *,
-    to: ExportFormat,
+    to: Annotated[ExportFormat, tyro.conf.arg(metavar="FORMAT")],
     pictures: Annotated[str | None, tyro.conf.arg(metavar="SOURCE", help_behavior_hint="")] = None,
     exporting: Annotated[Exporting, tyro.conf.arg(name="points")] = Exporting(),
 ) -> None:
@@ -26,7 +26,8 @@ def export(
     Args:
         result: the folder of a result.
         out: folder or file to write; it must not exist.
-        to: the format.
+        to: one of colmap, colmap-text, gsplat, nerfstudio, dynamic-splats, rerun, blender, glb-animated, mesh, exr,
+            tum, kitti.
         pictures: the source that the result was made from, to write pictures, depth and cameras at its size; by default
             those of the model's size are written.
         exporting: the points
