@@ -33,20 +33,17 @@ class CaptureFrames(ImageFiles):
         """The time of the capture's first frame by its own clock, in seconds; times of frames count from it."""
         return None if self.capture.timestamps is None else float(self.capture.timestamps[0])
 
-    def total(self, sampling: Sampling) -> int:
-        """Return how many frames `sampling` takes."""
-        return len(self._taken(sampling))
-
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes. Raises ClipError for a file that cannot be read."""
         times = self.capture.timestamps
-        for index in self._taken(sampling):
+        for index in self.taken(sampling):
             time = None if times is None else float(times[index] - times[0])
             with self.capture.naming_files():
                 image = read_image(self.paths[index], self._said)
             yield Frame(self.frame_names[index], image, time)
 
-    def _taken(self, sampling: Sampling) -> list[int]:
+    def taken(self, sampling: Sampling) -> list[int]:
+        """Return the indices of the pictures that `sampling` takes, with `fps` by their times."""
         times = self.capture.timestamps
         if sampling.fps is None or times is None:
             return list(sampling.indices(len(self.paths)))

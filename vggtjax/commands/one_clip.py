@@ -15,6 +15,7 @@ from vggtjax.clips.sources import open_source
 from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.report import Report
 from vggtjax.errors import DeviceMemoryError, one_line
+from vggtjax.known.stated import disagreement, focal_stated
 from vggtjax.media.sampling import Sampling, Source
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.pipeline.run import reconstruct
@@ -144,7 +145,9 @@ class OneClip:
             announce(self._out, forecast_bytes(clip.images.shape[:3], clip.source_size, saving))
             masks = False if given.no_masks else None if given.masks is None else load_masks(given.masks, clip)
             queries = None if given.tracks is None else parse_queries(given.tracks, clip)
-        self._report.note(_taken(clip, self._source.total(Sampling())))
+        stated = focal_stated(clip)
+        lens = "" if stated is None else f"; the camera states {stated.words}, {stated.pixels:.4g} pixels"
+        self._report.note(_taken(clip, self._source.total(Sampling())) + lens)
         result = reconstruct(
             self._model,
             clip,
@@ -157,6 +160,8 @@ class OneClip:
             devices=recipe.devices,
             on_stage=self._report.stage,
         )
+        if stated is not None and recipe.known.intrinsics is None and (words := disagreement(stated, result)):
+            self._report.note(words)
         with self._report.stage("write") as progress:
             pictures = clip.pictures() if saving.resolution == "original" else None
             facts = RunFacts(self._report.seconds)

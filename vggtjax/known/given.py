@@ -14,8 +14,9 @@ from vggtjax.clips.clip import Clip
 from vggtjax.errors import InputError
 from vggtjax.known.depths import MOST_FILE_BYTES, DepthSamples, check_depths, read_depths
 from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
-from vggtjax.known.options import SOURCE, Baseline, KnownGeometry, parse_baseline
+from vggtjax.known.options import EXIF, SOURCE, Baseline, KnownGeometry, parse_baseline
 from vggtjax.known.poses import checked_known_poses, pose_table, read_poses
+from vggtjax.known.stated import stated_intrinsics
 from vggtjax.results.result import Result
 from vggtjax.storage.csv_file import read_csv
 
@@ -40,7 +41,7 @@ def check_readable(known: KnownGeometry) -> None:
         if path not in (None, SOURCE) and not os.path.lexists(path):
             flag = f"--{name.replace('_', '-')}"
             raise InputError(f"{flag} is {str(path)!r}, and there is no such file; expected a file or {SOURCE!r}")
-    if known.intrinsics not in (None, SOURCE):
+    if known.intrinsics not in (None, SOURCE, EXIF):
         read_intrinsics(known.intrinsics)
     if known.poses not in (None, SOURCE):
         pose_table(known.poses, known.quaternion)
@@ -84,8 +85,7 @@ def read_known(
     intrinsics = poses = baseline = depths = None
     poses_name = ""
     if known.intrinsics is not None:
-        matrices = _recorded(capture, "intrinsics") if known.intrinsics == SOURCE else read_intrinsics(known.intrinsics)
-        intrinsics = at_clip_pixels(matrices, frames, "intrinsics")
+        intrinsics = at_clip_pixels(_matrices(known.intrinsics, frames, capture), frames, "intrinsics")
     if known.poses is not None:
         from_source = known.poses == SOURCE
         poses = (
@@ -106,6 +106,17 @@ def read_known(
     elif known.known_depths is not None:
         depths = read_depths(known.known_depths, frames)
     return Given(known, intrinsics, poses, poses_name, baseline, depths, leave_out, capture)
+
+
+def _matrices(text: str, frames: Clip | Result, capture: Capture | None) -> Float64[np.ndarray, "F 3 3"]:
+    """Return the intrinsics that the option names, in pixels of the source."""
+    if text == EXIF:
+        if not isinstance(frames, Clip):
+            raise InputError(
+                "intrinsics is 'exif', and a result has no files; expected a clip that was loaded from files"
+            )
+        return stated_intrinsics(frames)
+    return _recorded(capture, "intrinsics") if text == SOURCE else read_intrinsics(text)
 
 
 def _recorded(capture: Capture | None, name: str) -> Float64[np.ndarray, "S n n"]:

@@ -14,6 +14,7 @@ from vggtjax.storage.json_values import check_fields
 from vggtjax.storage.trajectories import Quaternion
 
 SOURCE = "source"  # in place of a file: what the capture that the clip comes from says
+EXIF = "exif"  # in place of a file of intrinsics: what the camera wrote into the pictures, or the video
 
 
 class Baseline(NamedTuple):
@@ -32,9 +33,10 @@ def _words(metavar: str):
 class KnownGeometry:
     """Known cameras and lengths. Raises InputError for an invalid value, or for options that exclude each other."""
 
-    intrinsics: Annotated[str | None, _words("FX,FY,CX,CY|FILE|source")] = None
+    intrinsics: Annotated[str | None, _words("FX,FY,CX,CY|FILE|source|exif")] = None
     """known focal lengths and principal point in pixels of the source: four numbers, or a file with a 3 x 3 matrix or
-    with four numbers or nine a line, for all frames or for each; source: those of the capture's folder"""
+    with four numbers or nine a line, for all frames or for each; source: those of the capture's folder; exif: the focal
+    length that the camera wrote into the pictures or the video"""
     shared_focal: Switch = False
     """one focal length for the whole clip, the median of the predicted ones"""
     poses: Annotated[str | None, _words("FILE|source")] = None
