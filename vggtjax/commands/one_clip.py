@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vggtjax.batch.recipe import ClipRecipe
+from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.masks import load_masks
@@ -43,8 +44,8 @@ class OneClip:
         out: Path,
         source: Source | None = None,  # of these frames, where it is open: what is odd about it is said once
     ) -> None:
-        self._report, self._frames = report, frames
-        self._source = open_source(frames) if source is None else source
+        self._report = report
+        self._source = open_source(frames, undistort=recipe.undistort) if source is None else source
         self._model, self._fusion, self._recipe, self._given, self._out = model, fusion, recipe, given, out
         self._fitter = recipe.framing.fitter(model.config)
 
@@ -135,7 +136,7 @@ class OneClip:
         plan = LongRun(count, recipe.sampling, self._fitter, recipe.saving, given.tracks, self._report.stage)
         masks = False if given.no_masks else given.masks
         how: dict[str, Any] = {"options": recipe.options, "long_run": plan, "fusion": self._fusion, "masks": masks}
-        return reconstruct_long(self._model, self._frames, self._out, windows, **how)
+        return reconstruct_long(self._model, self._source, self._out, windows, **how)
 
     def _together(self) -> Reconstruction:
         """Reconstruct all frames at once, and write the result."""
@@ -175,7 +176,9 @@ def _taken(clip: Clip, available: int | None) -> str:
     count, height, width = clip.images.shape[:3]
     source_height, source_width = clip.source_size[0]
     frames = f"{count}" if available in (None, count) else f"{count} of {available}"
-    text = f"{frames} frames of {source_width} x {source_height} pixels, fitted to {width} x {height}"
+    lenses = clip.source.lenses_undone if isinstance(clip.source, CaptureFrames) else ""
+    undone = f", undistorted ({lenses})" if lenses else ""
+    text = f"{frames} frames of {source_width} x {source_height} pixels{undone}, fitted to {width} x {height}"
     if clip.sampling.max_frames == count and available is not None and clip.sampling.start + count < available:
         spread = -(-(available - clip.sampling.start) // count)
         if clip.sampling.step < spread and clip.sampling.fps is None:

@@ -7,6 +7,7 @@ from contextlib import suppress
 import numpy as np
 from jaxtyping import Float64
 
+from vggtjax.captures.frames import CaptureFrames
 from vggtjax.clips.clip import Clip
 from vggtjax.errors import ClipError, InputError
 from vggtjax.media.focal import StatedFocal, picture_focal, video_focal
@@ -54,6 +55,11 @@ def disagreement(stated: StatedFocal, result: Result) -> str | None:
 
 
 def _stated(clip: Clip) -> list[StatedFocal]:
+    if isinstance(clip.source, CaptureFrames) and clip.source.lenses_undone:
+        raise InputError(
+            f"intrinsics is 'exif', and the frames of {clip.source.capture.path} are undistorted, so that they are not "
+            "those of its files; give 'source', or --no-undistort"
+        )
     if isinstance(clip.source, ImageFiles):
         return [picture_focal(clip.source.paths[index]) for index in clip.source.taken(clip.sampling)]
     if isinstance(clip.source, VideoFile):
