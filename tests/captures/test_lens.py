@@ -18,6 +18,7 @@ from vggtjax.clips.masks import load_masks, masks_at_clip_pixels
 from vggtjax.clips.sources import open_source
 from vggtjax.errors import ClipError, InputError, MissingExtraError
 from vggtjax.exports.write import export_result
+from vggtjax.known.depth_maps import read_depth_maps
 from vggtjax.known.options import KnownGeometry
 from vggtjax.media.sampling import Sampling
 
@@ -151,6 +152,10 @@ def test_masks_and_depth_go_with_the_frames(tmp_path):
     np.testing.assert_array_equal(made[y, x], 1 + np.arange(len(POINTS)))
 
     clip = load_clip(folder, size=224, mode="pad")
+    (tmp_path / "maps").mkdir()
+    np.save(tmp_path / "maps/a.npy", np.nan_to_num(depth))  # metres, of the pictures as they are stored
+    x, y = clip.from_source(0, (POINTS @ capture.intrinsics[0].T)[:, :2]).astype(int).T
+    assert read_depth_maps(tmp_path / "maps", clip)[0, y, x].tolist() == list(range(1, 13))
     mask = np.zeros((HEIGHT, WIDTH), bool)
     for u, v in pixels[:6].astype(int):
         mask[v - 5 : v + 6, u - 5 : u + 6] = True

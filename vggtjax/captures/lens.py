@@ -46,6 +46,7 @@ _FISHEYES = (
 )  # without coefficients
 _OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # in the order of COLMAP's FULL_OPENCV, and of OpenCV
 _STEPS = 33  # points along each side of a picture at which a lens is checked
+_MOST_PIXELS = 2**28  # of an undistorted picture
 _CLOSE = 0.1  # pixels by which a point may miss itself on its way through the lens and back
 
 
@@ -144,6 +145,12 @@ class Undistortion:
         flat = np.asarray(points, np.float64).reshape(-1, 2)
         return _through(self._pinhole, self._camera, flat).reshape(np.shape(points))
 
+    def is_stored(self, size: tuple[int, ...]) -> bool:
+        """Return whether a map of (width, height) is of the stored picture, not the undistorted one, by its shape."""
+        if size == self.size and size != self.stored:
+            return False
+        return abs(size[0] * self.stored[1] - size[1] * self.stored[0]) <= max(size)
+
     def nearest(self, values: Shaped[np.ndarray, "h w"]) -> Shaped[np.ndarray, "H W"]:
         """Return a map of the stored picture, such as depth, at the undistorted one: values are never mixed.
 
@@ -158,6 +165,11 @@ class Undistortion:
 
     def check(self, source: Path) -> None:
         """Raise InputError, which names `source`, for coefficients that fold the picture or leave no view of it."""
+        if self.size[0] * self.size[1] > _MOST_PIXELS:
+            raise InputError(
+                f"{source} has a lens whose pictures of {self.stored[0]} x {self.stored[1]} become {self.size[0]} x "
+                f"{self.size[1]} undistorted; expected at most {_MOST_PIXELS} pixels, so make the pictures smaller"
+            )
         points = self.stored_points(_grid(self.size))
         steps = np.diff(points, axis=1)[:-1], np.diff(points, axis=0)[:, :-1]
         with np.errstate(all="ignore"):

@@ -153,9 +153,7 @@ def _mask(path: Path, clip: Clip, frame: int, turns: dict[str, int]) -> Bool[np.
 def _is_stored(size: tuple[int, int], clip: Clip, frame: int) -> bool:
     """Return whether a mask of (width, height) is of the picture of an undistorted frame as it was, by its shape."""
     undone = _undistortion(clip, frame)
-    if undone is None or (size == undone.size and size != undone.stored):
-        return False
-    return abs(size[0] * undone.stored[1] - size[1] * undone.stored[0]) <= max(size)
+    return undone is not None and undone.is_stored(size)
 
 
 def _to_mask(mask: np.ndarray, clip: Clip, frame: int) -> Callable[[np.ndarray], np.ndarray]:

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from vggtjax.captures.capture import Capture
 from vggtjax.clips.clip import Clip
 from vggtjax.errors import InputError
+from vggtjax.known.depth_maps import depth_files, read_depth_maps
 from vggtjax.known.depths import MOST_FILE_BYTES, DepthSamples, check_depths, read_depths
 from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
 from vggtjax.known.options import EXIF, SOURCE, Baseline, KnownGeometry, parse_baseline
@@ -30,6 +31,7 @@ class Given(NamedTuple):
     poses_name: str = ""  # where the poses come from
     baseline: Baseline | None = None
     depths: DepthSamples | None = None  # of a file
+    depth_maps: Float32[np.ndarray, "S H W"] | None = None  # of a folder: metres, 0 where it is unknown
     leave_out: Bool[np.ndarray, "S H W"] | None = None
     capture: Capture | None = None  # of the clip's frames, where an option asks for it
 
@@ -46,7 +48,10 @@ def check_readable(known: KnownGeometry) -> None:
     if known.poses not in (None, SOURCE):
         pose_table(known.poses, known.quaternion)
     if known.known_depths not in (None, SOURCE):
-        read_csv(Path(known.known_depths), most_bytes=MOST_FILE_BYTES)
+        if os.path.isdir(known.known_depths):  # noqa: PTH112 - False for an over-long name
+            depth_files(Path(known.known_depths))
+        else:
+            read_csv(Path(known.known_depths), most_bytes=MOST_FILE_BYTES)
     if known.leave_out is not None and not os.path.isdir(known.leave_out):  # noqa: PTH112 - False for an over-long name
         raise InputError(f"leave_out is {str(known.leave_out)!r}; expected a folder of pictures")
 
@@ -82,7 +87,7 @@ def read_known(
         )
     else:
         capture = capture.for_frames(frames.frame_names)
-    intrinsics = poses = baseline = depths = None
+    intrinsics = poses = baseline = depths = maps = None
     poses_name = ""
     if known.intrinsics is not None:
         intrinsics = at_clip_pixels(_matrices(known.intrinsics, frames, capture), frames, "intrinsics")
@@ -103,9 +108,11 @@ def read_known(
             )
     if known.known_depths == SOURCE and capture is not None:
         check_depths(capture)
+    elif known.known_depths is not None and os.path.isdir(known.known_depths):  # noqa: PTH112
+        maps = read_depth_maps(Path(known.known_depths), frames, known.depths_per_metre)
     elif known.known_depths is not None:
         depths = read_depths(known.known_depths, frames)
-    return Given(known, intrinsics, poses, poses_name, baseline, depths, leave_out, capture)
+    return Given(known, intrinsics, poses, poses_name, baseline, depths, maps, leave_out, capture)
 
 
 def _matrices(text: str, frames: Clip | Result, capture: Capture | None) -> Float64[np.ndarray, "F 3 3"]:
