@@ -1,5 +1,6 @@
 # Everything in two commands on a machine with Python and git: `make demo` and `make test`.
-# The docs site, in site/: `make docs`; its pictures of the demo: `make pictures`.
+# The docs site, in site/: `make docs`; its pictures, of the embedded model: `make pictures`, some two minutes; the
+# signatures that the reference shows as plain Markdown: `make reference`.
 # The environment of the lock, every file by its hash: `make locked`, before the others. `make lock` makes the lock anew,
 # from releases at least a week old; `make audit` and `make sbom` look into it. `make dist` builds the last commit,
 # without what is not committed: the same wheel anywhere.
@@ -34,13 +35,16 @@ SLOW = parity network method pipeline training calibration learning commands ben
 # Processes of the tests read compiled Python files rather than compile them anew, whatever the shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo pictures docs test proofs accelerator accelerator-check compiler-is-there mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
+.PHONY: demo pictures reference docs test proofs accelerator accelerator-check compiler-is-there mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
 
-pictures: demo
+pictures: demo $(VENV)/.docs
 	$(BIN)/python docs/pictures/make.py demo-output
+
+reference: $(VENV)/.docs
+	$(BIN)/python docs/hooks/site.py
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -1,7 +1,8 @@
 """The code blocks of the README and of the pages of docs/, and what pages say about them.
 
-A comment right before a block is a rule for it: `<!-- not run: needs VGGT-1B -->`, with any reason, for Python that is
-only compiled; `<!-- run -->` for commands that are run and not only parsed.
+A block of "py" is a signature in the reference. A comment right before a block is a rule for it:
+`<!-- not run: needs VGGT-1B -->`, with any reason, for Python that is only compiled; `<!-- run -->` for commands that
+are run and not only parsed.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.py"))
-LANGUAGES = ("python", "sh", "text", "json", "toml", "bibtex", "csv")
+LANGUAGES = ("python", "sh", "text", "json", "toml", "bibtex", "csv", "py")
 _FENCE = re.compile(r"^([ >]*)```([^\n]*)\n(.*?)^\1```", flags=re.MULTILINE | re.DOTALL)
 _RULE = re.compile(r"<!-- (run|not run: [^>]*\S) -->$")
 

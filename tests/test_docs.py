@@ -167,10 +167,36 @@ def test_blocks_and_links(page):
 
 
 def _leads_somewhere(page: Path, link: str) -> bool:
-    """Tell whether a file is there; notebooks are pages that the build makes, and so are pictures in made/."""
-    target = page.parent / link
-    notebook = target.parent.name == "notebooks" and target.with_suffix(".py")
-    return target.exists() or target.parent.name == "made" or (bool(notebook) and notebook.exists())
+    return (page.parent / link).exists()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_a_page_reads_as_plain_markdown(page):
+    """Where it is not the site that shows it, no line of the site's own language stands in the way."""
+    text = re.sub(r"```.*?```|`[^`\n]*`|<!--.*?-->", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    assert re.findall(r"^ *(?::::|!!!|\?\?\?|===|-+8<-).*|:material-[\w-]+:|\]\[", text, flags=re.MULTILINE) == []
+
+
+@pytest.fixture(scope="module")
+def site():
+    return runpy.run_path(str(ROOT / "docs" / "hooks" / "site.py"))
+
+
+def test_the_signatures_of_the_reference_are_those_of_the_code(site):
+    """`make reference` writes them."""
+    package = site["read_package"]()
+    pages = sorted((ROOT / "docs" / "reference").glob("*.md"))
+    stale = [
+        page for page in pages if site["with_overview"](site["with_signatures"](page, package)) != page.read_text()
+    ]
+    assert stale == []
+    assert 'method: MethodName = "4dvggt-d"' in (ROOT / "docs" / "reference" / "configuration.md").read_text()
+
+
+def test_the_pictures_are_of_this_model():
+    """`make pictures` makes them."""
+    made_of = runpy.run_path(str(ROOT / "docs" / "pictures" / "concepts.py"))["made_of"]()
+    assert (ROOT / "docs" / "pictures" / "made" / "made-of.txt").read_text() == made_of
 
 
 def test_every_promise_names_a_test():
@@ -195,7 +221,7 @@ def test_the_reference_has_every_public_name():
     names = set(dir(vggtjax)) - {"__version__"}
     assert len(names) <= 24
     pages = {path.name: path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md")}
-    shown = re.findall(r"^::: vggtjax\.(\w+)$", "\n".join(pages.values()), flags=re.MULTILINE)
+    shown = re.findall(r"<!-- site: ::: vggtjax\.(\w+) -->", "\n".join(pages.values()), flags=re.MULTILINE)
     assert names - set(shown) == set()
     levels = pages["index.md"].split("| level | names |")[1].split("\n\n")[0]
     assert sorted(re.findall(r"`(\w+)`", levels)) == sorted(names)

@@ -8,7 +8,7 @@ from vggtjax.commands.help_page import Group
 from vggtjax.commands.main import COMMANDS, command_help
 from vggtjax.commands.overview import overview
 
-MARK = "<!-- the help of every command -->"
+MARK = "HELP OF EVERY COMMAND"  # in place of what plain Markdown shows: site.py
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:

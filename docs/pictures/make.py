@@ -1,8 +1,9 @@
-"""Make the pictures of the README and the site from the demo: `make pictures`."""
+"""Make the pictures of the README and of the pages from the embedded model: `make pictures`."""
 
 import sys
 from pathlib import Path
 
+import concepts
 from PIL import Image
 
 from vggtjax import Reconstruction
@@ -13,13 +14,14 @@ WIDTH = 1280  # of the sheets
 
 
 def main(folder: Path) -> None:
-    """Write turntable.gif, sheet.png and truth.png of the demo's result."""
+    """Write room.webp, sheet.webp and truth.webp of the demo's result, and the pictures of the concepts."""
     result = Reconstruction.load(folder)
-    write_film(PICTURES / "turntable.gif", film_frames(result, seconds=5, fps=10, size=(480, 270)), 10)
-    for name in ("sheet.png", "truth.png"):
-        with Image.open(folder / "preview" / name) as picture:
+    write_film(PICTURES / "room.webp", film_frames(result, seconds=4, fps=8, size=(400, 225)), 8)
+    for name in ("sheet", "truth"):
+        with Image.open(folder / "preview" / f"{name}.png") as picture:
             picture.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
-            picture.save(PICTURES / name, optimize=True)
+            picture.save(PICTURES / f"{name}.webp", quality=88)
+    concepts.make()
 
 
 if __name__ == "__main__":

@@ -123,3 +123,18 @@ def test_two_results_side_by_side_and_swapped_by_a_key(page, room, tmp_path):
     assert page.locator("h1").inner_text() == "theirs"
     assert "pass" not in page.locator("#color option").all_inner_texts()
     assert page.complaints == []
+
+
+def test_the_first_view_swings_and_what_moves_glows_until_the_first_touch(browser, room, tmp_path):
+    page = browser.new_page(viewport=SCREEN, reduced_motion="no-preference")
+    open_page(page, tmp_path, [room])
+    page.evaluate("window.vggtjax.viewer.adapt = () => {}")  # however slowly this machine draws
+    first = page.evaluate("window.vggtjax.viewer.orbit.yaw")
+    turned = f"Math.abs(window.vggtjax.viewer.orbit.yaw - {first}) > 0.02"
+    page.evaluate(until(f"{turned} && window.vggtjax.viewer.glow > 0"))
+    page.keyboard.press("h")
+    yaw, glow = page.evaluate("[window.vggtjax.viewer.orbit.yaw, window.vggtjax.viewer.glow]")
+    page.evaluate("new Promise(done => setTimeout(done, 200))")
+    assert page.evaluate("window.vggtjax.viewer.orbit.yaw") == yaw
+    assert glow == 0
+    page.close()

@@ -4,10 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from tests.room import make_room
 from vggtjax.results.shown import middle_and_radius
-from vggtjax.viewer.scene import Budget, Place, place_beside, scene_of
+from vggtjax.viewer.scene import Budget, Place, home_view, place_beside, scene_of
 
 SAME = Place(1.0, np.eye(3), np.zeros(3))
 
@@ -31,6 +32,31 @@ def test_moving_points_lie_on_the_box_of_their_frame():
         assert distances.max() < 1e-3 * radius
     assert len(positions) == scene["offsets"][-1]
     assert all(len(color["values"]) in (len(positions), 3 * len(positions)) for color in scene["colors"])
+
+
+def test_points_are_as_wide_as_their_footprint_at_any_distance():
+    result = make_room(4)
+    scene = scene_of(result, "room", SAME, budget=Budget())
+    narrowest, doublings = scene["widths"]
+    widths = narrowest * 2 ** (doublings * scene["quality"].reshape(-1, 3)[:, 2] / 255)
+    positions, points = positions_of(scene), result.world_points().reshape(-1, 3)
+    _, nearest = KDTree(points).query(positions)
+    footprints = (result.depth / result.intrinsics[:, 0, 0, None, None]).ravel()[nearest]
+    assert footprints.max() > 1.5 * footprints.min()
+    assert (widths > 1.3 * footprints).all()
+    assert (widths < 3 * footprints).all()
+
+
+def test_the_first_view_has_the_framing_of_the_middle_picture_and_the_cameras_below_the_subject():
+    result = make_room(5)
+    view, W = home_view(result, SAME), result.depth.shape[2]
+    eye, target = np.array(view["eye"]), np.array(view["target"])
+    ahead = (target - eye) / np.linalg.norm(target - eye)
+    depth = np.median(result.depth[2])
+    wide = view["tangents"][0] * np.linalg.norm(target - eye)
+    assert wide == pytest.approx(depth * W / 2 / result.intrinsics[2, 0, 0], rel=1e-5)
+    below = (result.camera_centres[2] - eye) @ -np.array(view["up"])
+    assert 0.5 < below / ((result.camera_centres[2] - eye) @ ahead) / view["tangents"][1] < 1.5
 
 
 def test_a_second_result_is_placed_on_the_first_camera_at_its_scale():

@@ -34,7 +34,7 @@ from vggtjax.network.track_head import Tracks
 from vggtjax.options import Options
 
 Images = Float[Array, "B S H W 3"]
-Masks = Bool[Array, "B S H W"] | Float[Array, "B S H W"] | SoftMasking | Literal[False] | None
+Masks = Bool[Array | np.ndarray, "B S H W"] | Float[Array | np.ndarray, "B S H W"] | SoftMasking | Literal[False] | None
 FIRST_OUTPUTS = ("camera", "depth")
 _CLIPS = ClipBatch(BY_FRAME, BY_FRAME, REPLICATED)  # type: ignore[arg-type]
 _Parameters = ParamSpec("_Parameters")

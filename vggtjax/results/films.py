@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
-import scipy
 from jaxtyping import Float32, Int32, UInt8
 
 from vggtjax.cameras import FRUSTUM_EDGES, Cameras, frustum_corners, project
@@ -18,14 +16,12 @@ from vggtjax.rendering.paths import fitted_intrinsics, follow, middle_camera, or
 from vggtjax.rendering.splats import BACKGROUND, Splats, draw_splats
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, shown_points
+from vggtjax.results.widths import point_widths
 
 Path = Literal["orbit", "camera"]
 MOST_SIDE, MOST_FRAMES = 4096, 10_000
 _PATHS = {"orbit": orbit, "camera": follow}
 _PLAYED = 10.0  # frames of the clip per second, where its times are not known
-_OVERLAP = 1.42  # width of a disc over the distance of neighbours: four discs of a square leave no gap
-_SPARSEST = 2.0  # pixels of its own picture: the widest that a disc gets where neighbours are far
-_NEIGHBOURS = 4
 _WIDE = 6.0  # pixels; discs that are wider take long to draw, and are coarser than any edge: they are not supersampled
 _LEFT_OUT = 10.0  # percent of the pixels, the least confident: holes look worse than unsure points
 _MIDDLE = 40  # percentile of the depths that is the scene's middle: objects are nearer than walls
@@ -141,31 +137,7 @@ def middle_depth(cameras: Cameras, points: list[ShownPoints]) -> float:
 
 
 def _splats(result: Result, points: ShownPoints) -> Splats:
-    """Return discs that reach the neighbouring points in the picture and in the cloud, within limits."""
-    pixel, reach = np.zeros((2, len(points.pixels)), np.float32)
-    frames, starts = np.unique(points.frames, return_index=True)
-    for frame, (start, end) in zip(frames, pairwise([*starts, len(points.frames)]), strict=True):
-        own = points.pixels[start:end]
-        focal = result.intrinsics[frame, [0, 1], [0, 1]].min()
-        pixel[start:end] = result.depth[frame].ravel()[own] / focal
-        reach[start:end] = np.hypot(pixel[start:end], _steps(result.depth[frame]).ravel()[own])
-    if len(points.positions) > _NEIGHBOURS:
-        distance = scipy.spatial.KDTree(points.positions).query(points.positions, _NEIGHBOURS + 1, workers=-1)[0]
-        reach = np.maximum(reach, distance[:, -1])
-    width = _OVERLAP * np.clip(reach, pixel, _SPARSEST * pixel)
-    return Splats(points.positions, points.values(result.images), width.astype(np.float32))
-
-
-@np.errstate(invalid="ignore", over="ignore")
-def _steps(depth: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "H W"]:
-    """Return the largest difference of each pixel's depth to its four neighbours'."""
-    steps = np.zeros_like(depth)
-    for axis in range(2):
-        step = np.nan_to_num(np.abs(np.diff(depth, axis=axis)))
-        before, after = (np.s_[:-1], np.s_[1:]) if axis == 0 else (np.s_[:, :-1], np.s_[:, 1:])
-        steps[before] = np.maximum(steps[before], step)
-        steps[after] = np.maximum(steps[after], step)
-    return steps
+    return Splats(points.positions, points.values(result.images), point_widths(result, points))
 
 
 def _cameras(result: Result, depth: float) -> Float32[np.ndarray, "S L 3"]:

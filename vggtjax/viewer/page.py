@@ -26,7 +26,7 @@ from vggtjax.viewer.scene import SAME_PLACE, Budget, place_beside, scene_of
 _FARTHEST = 1e30
 MOST_RESULTS = 9  # the keys 1 to 9 choose one
 # In the order in which they build on each other; joined to one script.
-_SCRIPTS = ("maths", "data", "shaders", "painter", "targets", "camera", "viewer", "controls", "main")
+_SCRIPTS = ("maths", "data", "shaders", "painter", "targets", "camera", "viewer", "welcome", "controls", "main")
 
 
 def viewer_page(

@@ -14,7 +14,7 @@ from vggtjax.progress import Progress
 from vggtjax.results.result import Result
 from vggtjax.results.shown import middle_and_radius, shown_points
 from vggtjax.storage.writing import writing
-from vggtjax.viewer.scene import FRUSTUM, SAME_PLACE, Budget, frame_rate, home_view, spacing
+from vggtjax.viewer.scene import FRUSTUM, SAME_PLACE, Budget, frame_rate, home_view, shown_widths
 
 
 def write_recording(
@@ -39,12 +39,14 @@ def write_recording(
             start.up, start.position, start.look_at = home["up"], home["eye"], home["target"]
             server.scene.set_up_direction(home["up"])
             recording = server.get_scene_serializer()
-            size = spacing(static, radius)
+            sizes = [
+                float(np.median(widths)) if widths.size else 0.0 for widths in shown_widths(result, static, moving)
+            ]
             colors = static.values(result.images)
-            server.scene.add_point_cloud("/static", static.positions, colors, point_size=size)
+            server.scene.add_point_cloud("/static", static.positions, colors, point_size=sizes[0])
             nodes = []
             for frame, points in enumerate(moving):
-                colors, size = points.values(result.images), spacing(points, radius)
+                colors, size = points.values(result.images), sizes[1 + frame]
                 rotation = Rotation.from_matrix(result.world_from_camera[frame, :3, :3])
                 camera = server.scene.add_camera_frustum(
                     f"/frame/{frame:06d}/camera",

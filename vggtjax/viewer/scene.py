@@ -11,7 +11,6 @@ import numpy as np
 from cmap import Colormap
 from jaxtyping import Float, Float32, Float64, UInt8, UInt16
 from PIL import Image
-from scipy.spatial import KDTree
 
 from vggtjax.cameras import frustum_corners
 from vggtjax.errors import one_line
@@ -20,13 +19,13 @@ from vggtjax.results.frame import frame_of
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, middle_and_radius, relative_steps, shown_points
 from vggtjax.results.tracks import SEEN
+from vggtjax.results.widths import point_widths
 from vggtjax.viewer.colors import TIME_RAMP, confidence_ranks, lacks, offered_colors
 
 LARGEST_STEP = 0.3  # of depth between neighbours, as a share; pixels beside larger ones are never shown
 _LEAST_MOVING = 200  # points of a frame
 FRUSTUM = 0.045  # of the scene's radius
-_BEHIND, _ABOVE = 0.18, 0.11  # of the median depth: where the first view stands from a camera
-_SPLAT = 1.2  # distances to the fourth neighbour: a point's width
+_BEHIND, _ABOVE = 0.35, 0.16  # of the median depth: where the first view stands from a camera
 _PLAIN_RATE = 10.0  # frames a second without timestamps
 _TILE, _SHEET = 256, 4096  # pixels: the longer side of a small picture; a side of the sheet that every browser takes
 
@@ -77,15 +76,21 @@ def scene_of(
         progress=progress,
     )
     random = np.random.default_rng(0)
-    parts = [_shuffled(part, random) for part in (static, *moving)]
+    orders = [random.permutation(len(part.pixels)) for part in (static, *moving)]  # the first of any number cover all
+    parts = [
+        ShownPoints(*(field[order] for field in part)) for part, order in zip((static, *moving), orders, strict=True)
+    ]
     positions, frames, pixels = (np.concatenate(fields) for fields in zip(*parts, strict=True))
     points = ShownPoints(positions, frames, pixels)
     middle, radius = middle_and_radius(result)
+    all_widths = shown_widths(result, static, moving)
+    widths = place.scale * np.concatenate([widths[order] for widths, order in zip(all_widths, orders, strict=True)])
     centre, radius = place.points(middle), radius * place.scale
     positions = place.points(points.positions)
     corners = frustum_corners(result.intrinsics, result.camera_from_world, H, W, 1)
     corners = place.points(corners[:, :1] + (corners - corners[:, :1]) * (FRUSTUM * radius / place.scale))
-    busiest = max(moving, key=lambda part: len(part.pixels))
+    coded, narrowest, doublings = _in_logarithms(widths)
+    quality = [confidence_ranks(result, points), _steps(result, points), coded]
     return {
         "name": one_line(name, 80),
         "facts": _facts(result),
@@ -96,12 +101,11 @@ def scene_of(
         "centre": centre.tolist(),
         "scale": radius,
         "positions": contracted(positions, centre, radius).ravel(),
-        "quality": np.stack([confidence_ranks(result, points), _steps(result, points)], axis=-1).ravel(),
+        "quality": np.stack(quality, axis=-1).ravel(),
+        "widths": [narrowest, doublings],
         "staticCount": len(static.pixels),
         "offsets": len(static.pixels) + np.cumsum([0, *(len(part.pixels) for part in moving)], dtype=np.uint32),
         "largestStep": LARGEST_STEP,
-        "pointSize": place.scale * spacing(static, radius / place.scale),
-        "movingSize": place.scale * spacing(busiest, radius / place.scale),
         "colors": offered_colors(result, points),
         "corners": corners.ravel(),
         "frustumSize": FRUSTUM * radius,
@@ -120,12 +124,6 @@ def contracted(
     offsets = np.nan_to_num(positions).astype(np.float64) - centre
     inside = offsets / (scale + np.linalg.norm(offsets, axis=-1, keepdims=True))
     return ((inside + 1) * 32767.5).round().astype(np.uint16)
-
-
-def _shuffled(points: ShownPoints, random: np.random.Generator) -> ShownPoints:
-    """Return the points in random order: the first ones of any number cover the scene."""
-    order = random.permutation(len(points.pixels))
-    return ShownPoints(points.positions[order], points.frames[order], points.pixels[order])
 
 
 def _median_depth(result: Result, number: int = 0) -> float:
@@ -147,13 +145,22 @@ def frame_rate(result: Result) -> float:
     return float(np.clip(1 / step, 0.5, 60)) if step > 0 else _PLAIN_RATE
 
 
-def spacing(points: ShownPoints, radius: float) -> float:
-    """Return the width of a point that lets neighbours touch."""
-    if len(points.pixels) < 5:
-        return 0.005 * radius
-    chosen = points.positions[:: max(1, len(points.pixels) // 2000)]
-    distances, _ = KDTree(points.positions).query(chosen, 5)
-    return float(np.clip(_SPLAT * np.median(distances[:, 4]), 1e-4 * radius, 0.05 * radius))
+def shown_widths(result: Result, static: ShownPoints, moving: list[ShownPoints]) -> list[Float32[np.ndarray, " N"]]:
+    """Return the widths of the static points and of the moving ones of each frame, thinned as they are."""
+    is_moving = result.valid_pixels & result.dynamic_mask
+    pixels = [np.count_nonzero(result.valid_pixels & ~result.dynamic_mask), *np.count_nonzero(is_moving, axis=(1, 2))]
+    parts = zip((static, *moving), pixels, strict=True)
+    return [point_widths(result, part, thinning=count / max(len(part.pixels), 1)) for part, count in parts]
+
+
+def _in_logarithms(widths: Float[np.ndarray, " N"]) -> tuple[UInt8[np.ndarray, " N"], float, float]:
+    """Return numbers v of positive widths, and (a, b) of width = a * 2 ** (b * v / 255)."""
+    if widths.size == 0:
+        return np.zeros(0, np.uint8), 1.0, 0.0
+    logarithms = np.log2(np.clip(np.nan_to_num(widths), 1e-30, 1e30).astype(np.float64))
+    low, high = float(logarithms.min()), float(logarithms.max())
+    shares = (logarithms - low) / max(high - low, 1e-9)
+    return (255 * shares).round().astype(np.uint8), 2.0**low, high - low
 
 
 def _steps(result: Result, points: ShownPoints) -> UInt8[np.ndarray, " N"]:
@@ -191,7 +198,11 @@ def _tangents(result: Result) -> Float[np.ndarray, "S 2"]:
 
 
 def home_view(result: Result, place: Place) -> dict[str, Any]:
-    """Return the first view: slightly behind and above the middle camera, along its axis, as wide as its picture."""
+    """Return the first view: behind and above the middle camera, along its axis.
+
+    At the median depth it is as wide as the picture of that camera, so the film's framing fills the canvas, and the
+    cameras lie low in the view, in front of what is near rather than of the subject.
+    """
     number = len(result.depth) // 2
     axes = result.camera_from_world[number, :, :3].astype(np.float64) @ place.rotation.T
     centres = place.points(result.camera_centres).astype(np.float64)
@@ -200,7 +211,8 @@ def home_view(result: Result, place: Place) -> dict[str, Any]:
     behind = _BEHIND * depth + np.clip(farthest_back, 0, depth / 2)
     eye = centres[number] - behind * axes[2] - _ABOVE * depth * axes[1]
     target = centres[number] + depth * axes[2]
-    view = {"eye": eye, "target": target, "up": -axes[1], "tangents": _tangents(result)[number]}
+    tangents = _tangents(result)[number] * depth / max(float(np.linalg.norm(target - eye)), 1e-12)
+    view = {"eye": eye, "target": target, "up": -axes[1], "tangents": tangents}
     return {name: np.nan_to_num(value).tolist() for name, value in view.items()}
 
 

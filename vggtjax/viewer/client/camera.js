@@ -1,6 +1,6 @@
 // The viewer's camera: it turns about a target, or follows the camera of the clip.
 
-const [NARROWEST, WIDEST] = [0.2, 0.8]; // tangents of half a field of view
+const [NARROWEST, WIDEST] = [0.1, 0.8]; // tangents of half a field of view
 const STEEPEST = 1.5; // radians
 
 class Orbit {
@@ -52,6 +52,12 @@ class Orbit {
     const { right, down } = this.pose();
     const step = (2 * this.tallOn(clientWidth / clientHeight) * this.distance) / clientHeight;
     this.target = subtract(this.target, add(scaled(right, x * step), scaled(down, y * step)));
+  }
+
+  // The yaw of the first view plus this, in radians.
+  swing(angle) {
+    this.look(this.home.eye, this.home.target);
+    this.yaw += angle;
   }
 
   zoom(factor) {

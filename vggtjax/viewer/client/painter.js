@@ -30,19 +30,25 @@ class Painter {
   }
 
   // limits: least rank of the confidence, largest step of the depth, both in [0, 1].
-  drawPoints(model, first, count, view, { limits, size, smallest = 1, fading = 0 }) {
+  // size: of a point, over its width. blend: a colour, and how much of it the points take on.
+  drawPoints(model, first, count, view, { limits, size, smallest = 1, blend = [0, 0, 0, 0] }) {
     if (count <= 0) return;
     const { gl, points: { uniforms } } = this;
     this.use(this.points, view);
     gl.bindVertexArray(model.points);
-    gl.uniform1f(uniforms.size, (size * view.height) / (2 * view.tall));
+    const [narrowest, doublings] = model.result.widths;
+    const pixels = view.height / (2 * view.tall); // of a length at distance 1
+    gl.uniform1f(uniforms.pixels, pixels);
+    gl.uniform1f(uniforms.near, view.near);
+    gl.uniform1f(uniforms.size, size * narrowest * pixels);
+    gl.uniform1f(uniforms.doublings, doublings);
     gl.uniform1f(uniforms.smallest, smallest);
     gl.uniform2f(uniforms.limits, ...limits);
-    gl.uniform4f(uniforms.fading, ...BACKGROUND, fading);
+    gl.uniform4f(uniforms.blend, ...blend);
     gl.drawArrays(gl.POINTS, first, count);
   }
 
-  drawLines(model, { first, count }, view, width) {
+  drawLines(model, { first, count }, view, width, blend = [0, 0, 0, 0]) {
     if (count <= 0) return;
     const { gl, lines: { uniforms } } = this;
     this.use(this.lines, view);
@@ -51,6 +57,7 @@ class Painter {
     for (let i = 0; i < 3; i++) gl.vertexAttribPointer(i, 3, gl.FLOAT, false, LINE_BYTES, first * LINE_BYTES + 12 * i);
     gl.uniform2f(uniforms.screen, view.width, view.height);
     gl.uniform1f(uniforms.width, width);
+    gl.uniform4f(uniforms.blend, ...blend);
     gl.uniform1f(uniforms.near, view.near);
     gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, count);
   }
@@ -80,7 +87,7 @@ class Model {
     gl.bindVertexArray(this.points);
     attribute(gl, 0, result.positions, 3, gl.FLOAT, false);
     this.colorBuffer = attribute(gl, 1, result.colors[0].values, 3, gl.UNSIGNED_BYTE, true);
-    attribute(gl, 2, result.quality, 2, gl.UNSIGNED_BYTE, true);
+    attribute(gl, 2, result.quality, 3, gl.UNSIGNED_BYTE, true);
   }
 
   // color: an entry of result.colors, of colours or of numbers in [0, 255] with their ramp.

@@ -6,33 +6,42 @@ const HIDING = `#version 300 es
     uniform highp sampler2D depths;  // of the background
     uniform bool isHidden;  // behind the background
     out vec4 pixel;
-    bool behind() { return isHidden && gl_FragCoord.z > texelFetch(depths, ivec2(gl_FragCoord.xy), 0).r; }`;
+    bool behind(highp float depth) { return isHidden && depth > texelFetch(depths, ivec2(gl_FragCoord.xy), 0).r; }`;
 
 const POINTS = {
   vertex: `#version 300 es
     layout(location = 0) in vec3 position;
     layout(location = 1) in vec3 color;
-    layout(location = 2) in vec2 quality;  // rank of the confidence, step of the depth
+    layout(location = 2) in vec3 quality;  // rank of the confidence, step of the depth, logarithm of the width
     uniform mat4 matrix;
-    uniform float size;  // of a point at distance 1, in pixels
+    uniform float size;  // of the narrowest point at distance 1, in pixels
+    uniform float doublings;  // from the narrowest point to the widest
     uniform float smallest;
     uniform vec2 limits;  // least rank, largest step
-    uniform vec4 fading;  // towards this colour, by this much
+    uniform vec4 blend;  // towards this colour, by this much
+    uniform float pixels;  // of a length at distance 1
     out vec3 shade;
     flat out float roundness;
+    flat out highp vec2 reach;  // distance from the eye, and half the width
     void main() {
       gl_Position = matrix * vec4(position, 1.0);
-      gl_PointSize = clamp(size / gl_Position.w, smallest, 48.0);
+      gl_PointSize = clamp(size * exp2(doublings * quality.z) / gl_Position.w, smallest, 64.0);
       if (quality.x < limits.x || quality.y > limits.y) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-      shade = mix(color, fading.rgb, fading.a);
+      shade = mix(color, blend.rgb, blend.a);
       roundness = gl_PointSize > 4.0 ? 0.25 : 1.0;  // small points are squares: discs would leave holes
+      reach = vec2(gl_Position.w, 0.5 * gl_PointSize * gl_Position.w / pixels);
     }`,
   fragment: `${HIDING}
     in vec3 shade;
     flat in float roundness;
+    flat in highp vec2 reach;
+    uniform highp float near;
     void main() {
       vec2 side = gl_PointCoord - 0.5;
-      if (dot(side, side) > roundness || behind()) discard;
+      // A disc bulges towards the eye: where discs overlap, every pixel shows the point whose middle is nearest to it.
+      highp float depth = 1.0 - near / (reach.x + 4.0 * dot(side, side) * reach.y);
+      if (dot(side, side) > roundness || behind(depth)) discard;
+      gl_FragDepth = depth;
       pixel = vec4(shade, 1.0);
     }`,
 };
@@ -46,6 +55,7 @@ const LINES = {
     uniform vec2 screen;  // pixels
     uniform float width;
     uniform float near;
+    uniform vec4 blend;
     out vec3 shade;
     void main() {
       vec4 a = matrix * vec4(from, 1.0), b = matrix * vec4(to, 1.0);
@@ -56,11 +66,11 @@ const LINES = {
       vec4 end = (gl_VertexID & 1) == 0 ? a : b;
       gl_Position = end + vec4(across * ((gl_VertexID & 2) == 0 ? 1.0 : -1.0) * end.w, 0.0, 0.0);
       if (a.w < near && b.w < near) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-      shade = color;
+      shade = mix(color, blend.rgb, blend.a);
     }`,
   fragment: `${HIDING}
     in vec3 shade;
-    void main() { if (behind()) discard; pixel = vec4(shade, 1.0); }`,
+    void main() { if (behind(gl_FragCoord.z)) discard; pixel = vec4(shade, 1.0); }`,
 };
 
 const PICTURES = {
@@ -73,7 +83,7 @@ const PICTURES = {
   fragment: `${HIDING}
     uniform sampler2D sheet;
     in vec2 uv;
-    void main() { if (behind()) discard; pixel = vec4(texture(sheet, uv).rgb, 1.0); }`,
+    void main() { if (behind(gl_FragCoord.z)) discard; pixel = vec4(texture(sheet, uv).rgb, 1.0); }`,
 };
 
 function program(gl, { vertex, fragment }) {

@@ -1,6 +1,8 @@
 // What is shown, and when it is drawn again.
 
 const BACKGROUND = [38 / 255, 38 / 255, 46 / 255];
+const GLOW = [1, 90 / 255, 130 / 255]; // of moving points in the first seconds
+const FAINT = 0.5; // how much of the background's colour the cameras of other moments take on
 const SLOW = 42, FAST = 24; // milliseconds of a picture, above and below which fewer and more points are drawn
 const STILL = 160; // milliseconds without a change of the view, after which all points are drawn
 const FEWEST = 6000; // points of the background while the view moves
@@ -21,6 +23,7 @@ class Viewer {
       color: 0, size: 1, leastStatic: 20, leastMoving: 20, steps: 0.08, trail: 0, static: true, moving: true,
       cameras: true, pictures: true, path: true, tracks: true, fly: false, active: 0, side: false, loop: true, speed: 1,
     };
+    this.glow = 0; // how much of its colour moving points take on
     this.time = 0; // in frames
     this.playing = false;
     this.budget = 60000; // points of the background while the view moves
@@ -115,7 +118,7 @@ class Viewer {
 
   keyOf(views) {
     const { size, leastStatic, steps, fly } = this.settings;
-    const shown = ["static", "cameras", "pictures", "path"].map((name) => this.settings[name]);
+    const shown = ["static", "cameras", "path"].map((name) => this.settings[name]);
     return JSON.stringify([size, leastStatic, steps, fly, shown, views.map(({ model, left, width, height, matrix }) => [this.models.indexOf(model), left, width, height, ...matrix])]);
   }
 
@@ -144,7 +147,7 @@ class Viewer {
     gl.enable(gl.SCISSOR_TEST);
   }
 
-  // All cameras and the first points, which are spread over the scene; fewer points are drawn larger.
+  // Cameras as thin lines, and the first points, which are spread over the scene; fewer points are drawn larger.
   drawBackground(views, target, isCoarse) {
     this.painter.hideBehind(null);
     this.targets.begin(target);
@@ -161,18 +164,15 @@ class Viewer {
   drawStatic(view, first, count, growth) {
     const { result } = view.model;
     const { size, leastStatic, steps } = this.settings;
-    const options = { limits: [leastStatic / 100, steps / result.largestStep], size: size * result.pointSize * growth };
+    const options = { limits: [leastStatic / 100, steps / result.largestStep], size: size * growth };
     if (this.settings.static) this.painter.drawPoints(view.model, first, count, view, options);
   }
 
   drawCameras(view) {
     const { model } = view;
-    const { cameras, pictures, path } = this.settings;
-    if (path) this.painter.drawLines(model, model.path, view, 2);
-    for (const frame of cameras ? model.frusta : []) {
-      this.painter.drawLines(model, model.frustumLines[frame], view, 1.5);
-      if (pictures) this.painter.drawPicture(model, frame, view);
-    }
+    const { cameras, path } = this.settings;
+    if (path) this.painter.drawLines(model, model.path, view, 1.5);
+    for (const frame of cameras ? model.frusta : []) this.painter.drawLines(model, model.frustumLines[frame], view, 1, [...BACKGROUND, FAINT]);
   }
 
   // Draws the background whole, some of it in every call, and shows it when it is done.
@@ -214,8 +214,9 @@ class Viewer {
     const frame = Math.min(this.frame, result.frames - 1);
     for (let past = Math.min(trail, frame); moving && past >= 0; past--) {
       const [first, end] = result.offsets.subarray(frame - past, frame - past + 2);
-      const options = { limits: [leastMoving / 100, steps / result.largestStep], size: size * result.movingSize };
-      this.painter.drawPoints(model, first, end - first, view, { ...options, fading: past ? 0.25 + (0.6 * past) / (trail + 1) : 0 });
+      const options = { limits: [leastMoving / 100, steps / result.largestStep], size };
+      const blend = past ? [...BACKGROUND, 0.25 + (0.6 * past) / (trail + 1)] : [...GLOW, this.glow];
+      this.painter.drawPoints(model, first, end - first, view, { ...options, blend });
     }
     for (let past = 0; tracks && result.tracks && past < Math.max(trail, 8) && past < frame; past++)
       this.painter.drawLines(model, model.trackLines[frame - past], view, 1.6);

@@ -1,13 +1,11 @@
 """The pictures of the concepts and the gallery, made from the embedded clip and generated scenes.
 
-mkdocs runs this before every build. Pictures are kept in docs/pictures/made, which git ignores, and are made again only
-when this file, the model, the clip or the version of vggtjax changes. By hand: python docs/hooks/pictures.py
+`make pictures` makes them when this file, the model, the clip or the version of vggtjax has changed; a test tells.
 """
 
 from __future__ import annotations
 
 import hashlib
-import logging
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -21,13 +19,11 @@ if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
     from vggtjax.clips.truth import Truth
 
-logger = logging.getLogger("mkdocs.hooks.pictures")
-
-FOLDER = Path(__file__).resolve().parents[1] / "pictures" / "made"
+FOLDER = Path(__file__).resolve().parent / "made"
 SCENES, SCENE_SEED = 4, 200  # of the gallery: the first of the seed, whatever came out
 MATCHED_SCENE = 1  # of the gallery, whose matches are shown
 SCENE_FRAMES, SCENE_SIDE = 12, 96
-_TURNTABLE: dict[str, Any] = {"seconds": 5.0, "fps": 10.0, "size": (480, 300)}
+_TURNTABLE: dict[str, Any] = {"seconds": 4.0, "fps": 8.0, "size": (384, 240)}
 _BACKGROUND, _TEXT, _FAINT = "#14141a", "#ececf0", "#9696a0"
 _FIRST, _SECOND, _FUSED, _TRUE = "#6db7ff", "#ff9a4a", "#7ddc8b", "#f5f5f5"
 _STYLE: dict[Any, Any] = {
@@ -47,25 +43,16 @@ class Clip(NamedTuple):
     by_matches: Reconstruction | None = None  # the result with masks by matches
 
 
-def on_pre_build(config: Any) -> None:
-    """Make the pictures unless they are there (a hook of mkdocs)."""
-    make()
-
-
 def make(folder: Path = FOLDER) -> None:
     """Make all pictures in `folder`, unless those there are of this code, model and clip."""
+    import matplotlib
+
     import vggtjax
-    from vggtjax.pretrained.embedded import CLIP, MODEL
     from vggtjax.results.films import film_frames, write_film
 
-    made_of = hashlib.sha256(vggtjax.__version__.encode())
-    for path in (Path(__file__), MODEL, CLIP):
-        made_of.update(path.read_bytes())
     stamp = folder / "made-of.txt"
-    if stamp.is_file() and stamp.read_text() == made_of.hexdigest():
+    if stamp.is_file() and stamp.read_text() == made_of():
         return
-    logger.info("Making the pictures of the concepts and the gallery, about a minute and only once")
-    import matplotlib
 
     vggtjax.enable_compilation_cache()
     matplotlib.use("agg")
@@ -81,7 +68,17 @@ def make(folder: Path = FOLDER) -> None:
         for number, scene in enumerate(scenes):
             _save(gallery_sheet(scene, number), folder / f"scene-{number}.webp")
             write_film(folder / f"turntable-{number}.webp", film_frames(scene.result, **_TURNTABLE), _TURNTABLE["fps"])
-    stamp.write_text(made_of.hexdigest())
+    stamp.write_text(made_of())
+
+
+def made_of() -> str:
+    """Return a digest of all that the pictures are made of."""
+    import vggtjax
+
+    digest, embedded = hashlib.sha256(vggtjax.__version__.encode()), Path(vggtjax.__file__).parent / "pretrained"
+    for path in (Path(__file__), embedded / "model.safetensors", embedded / "clip.npz"):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 def _demo_clip(model: Model) -> Clip:
@@ -373,8 +370,3 @@ def _save(figure: Figure, path: Path) -> None:
 
     figure.savefig(path, dpi=130, pil_kwargs={"quality": 88})
     pyplot.close(figure)
-
-
-if __name__ == "__main__":
-    logging.basicConfig(level=logging.INFO)
-    make()
