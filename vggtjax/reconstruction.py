@@ -100,11 +100,12 @@ class Reconstruction(Result):
 
         Args:
             path: the folder or file.
-            format: "vggtjax", or "vggt4d", "monst3r", "cut3r", "da3" (vggtjax.results.foreign). Fields that such a
-                folder lacks get plain values (confidence 1, nothing moves, grey pictures), with a warning logged, and
-                are named in `settings["missing"]`; the saliency is None.
-            quaternion: for "vggt4d" and "monst3r", the order of the quaternions in pred_traj.txt: "wxyz" as these
-                programs and this library write it, "xyzw" as earlier versions of this library did.
+            format: "vggtjax", or "vggt4d", "monst3r", "easi3r", "das3r", "pomato", "cut3r", "da3", "spatialtrackerv2"
+                (vggtjax.results.foreign). Fields that such a folder lacks get plain values (confidence 1, nothing
+                moves, grey pictures), with a warning logged, and are named in `settings["missing"]`; the saliency is
+                None.
+            quaternion: for formats with a pred_traj.txt ("vggt4d" to "pomato"), the order of its quaternions: "wxyz"
+                as these programs and this library write it, "xyzw" as earlier versions of this library did.
 
         Raises:
             ResultError: anything but a whole result, of a known version.

@@ -7,6 +7,9 @@ import sys
 import numpy as np
 import pytest
 
+from tests.dataset_files import write_plain
+from tests.results.foreign_writers import ROOM, WITH_MASKS, WRITERS
+from vggtjax.clips.truth import Truth
 from vggtjax.commands import main as cli
 
 MODEL = ("--model", "demo")
@@ -94,6 +97,30 @@ def test_results_of_a_folder(sequences, tmp_path, capsys):
             assert again[name] == pytest.approx(value, rel=1e-3, abs=1e-4), name
 
 
+@pytest.mark.usefixtures("no_plots")
+def test_the_truth_as_each_other_program_writes_it_scores_zero_in_one_table(tmp_path, capsys):
+    truth = Truth(
+        ROOM.images.astype(np.float32) / 255, ROOM.depth, ROOM.dynamic_mask, ROOM.camera_from_world, ROOM.intrinsics
+    )
+    write_plain(tmp_path / "data/walk", truth)
+    for name, write in WRITERS.items():
+        write(tmp_path / name / "walk")
+    (tmp_path / "spatialtrackerv2/walk/clip_result.npz").rename(tmp_path / "spatialtrackerv2/walk.npz")
+    (tmp_path / "spatialtrackerv2/walk").rmdir()
+    results = [f"{name.upper()}={name}:{tmp_path / name}" for name in WRITERS]
+    arguments = ("--results", *results, "--quaternion", "wxyz", "--out", tmp_path / "out")
+    code, _, err = run(capsys, "evaluate", "plain", tmp_path / "data", *arguments)
+    assert code == 0, err
+    values = json.loads((tmp_path / "out/results.json").read_text())["sequences"]
+    assert sorted(entry["method"].lower() for entry in values) == sorted(WRITERS)
+    for entry in values:
+        metrics, name = entry["metrics"], entry["method"]
+        assert max(metrics["ate"], metrics["rte"], metrics["rre"]) < 1e-4, name
+        assert metrics["abs_rel"] < 2e-4, name  # true depth is in whole millimetres
+        assert metrics["distance_paired_mean"] < 2e-3, name
+        assert metrics.get("j_mean") == (1 if name.lower() in WITH_MASKS else None), name
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -101,6 +128,10 @@ def test_results_of_a_folder(sequences, tmp_path, capsys):
         (["plain", "{data}", "--sequences", "third"], "sequence 'third'"),
         (["plain", "{data}", "--results", "{data}", "--methods", "vggt"], "exclude each other"),
         (["plain", "{data}", "--results", "{data}", "--format", "da3", "--quaternion", "wxyz"], "none for others"),
+        (
+            ["plain", "{data}", "--results", "a=easi4r:{data}"],
+            "NAME=FORMAT:FOLDER, where FORMAT is one of vggtjax, vggt4d",
+        ),
     ],
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(sequences, tmp_path, capsys, arguments, sentence):

@@ -52,6 +52,9 @@ def test_vggt4d_does_as_load_clip(width, height):
         ("da3", (1920, 1080), (504, 280), (1920 / 504, 1080 / 280), (0, 0)),  # stretches
         ("monst3r", (1000, 600), (512, 304), 1000 / 512, (0, 1 * 600 / 307)),  # 307 rows, of which 304 about the middle
         ("monst3r", (1024, 1024), (512, 384), 2, (0, 2 * 64)),  # squares are cut to 4 : 3
+        ("pomato", (1000, 600), (512, 304), 1000 / 512, (0, 1 * 600 / 307)),
+        ("spatialtrackerv2", (854, 480), (336, 190), (854 / 336, 480 / 190), (0, 0)),  # 518 x 294, then shrunk
+        ("spatialtrackerv2", (480, 854), (336, 336), (480 / 336, 854 / 924 * 518 / 336), (0, 203 * 854 / 924)),
     ],
 )
 def test_others_cut_about_the_middle_or_stretch(layout, picture, frame, scale, offset):
@@ -60,7 +63,7 @@ def test_others_cut_about_the_middle_or_stretch(layout, picture, frame, scale, o
     np.testing.assert_allclose(made.source_offset[0], offset, atol=1e-9)
 
 
-@pytest.mark.parametrize("layout", ["vggt4d", "monst3r", "cut3r", "da3"])
+@pytest.mark.parametrize("layout", ["vggt4d", "monst3r", "das3r", "cut3r", "da3", "spatialtrackerv2"])
 def test_frames_of_the_pictures_own_size_are_those_and_others_are_refused(layout):
     made = placed(of_size(854, 480), layout, [(854, 480)] * 2, ["a", "b"])
     np.testing.assert_array_equal(made.source_scale, np.ones((2, 2)))

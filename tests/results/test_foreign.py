@@ -4,71 +4,18 @@ import logging
 
 import numpy as np
 import pytest
-from PIL import Image
-from scipy.spatial.transform import Rotation
 
-from tests.room import make_room
+from tests.results.foreign_writers import (
+    QUATERNIONS,
+    ROOM,
+    WITH_MASKS,
+    WRITERS,
+    rearrange,
+    write_da3,
+    write_spatialtracker,
+)
 from vggtjax.errors import InputError, ResultError
 from vggtjax.reconstruction import Reconstruction
-
-ROOM = make_room(3)
-
-
-def write_flat(folder, padded, logarithmic):
-    """VGGT4D's `process_scene` pads all numbers, MonST3R's `save_*` those of frame_ alone; quaternions have w first."""
-    folder.mkdir()
-    poses = ROOM.world_from_camera.astype(float)
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=True)
-    with (folder / "pred_traj.txt").open("w") as file:
-        for number, (pose, turn) in enumerate(zip(poses, quaternions, strict=True)):
-            file.write(" ".join(str(value) for value in (float(number), *pose[:3, 3], *turn)) + "\n")
-    np.savetxt(folder / "pred_intrinsics.txt", ROOM.intrinsics.reshape(-1, 9), fmt="%.6f")
-    for number in range(3):
-        short = f"{number:04d}" if padded else str(number)
-        Image.fromarray(ROOM.images[number]).save(folder / f"frame_{number:04d}.png")
-        np.save(folder / f"frame_{number:04d}.npy", ROOM.depth[number])
-        confidence = ROOM.depth_confidence[number]
-        np.save(folder / f"conf_{short}.npy", np.log(confidence) if logarithmic else confidence)
-        Image.fromarray(255 * ROOM.dynamic_mask[number].astype(np.uint8)).save(folder / f"dynamic_mask_{short}.png")
-        Image.fromarray(np.full((28, 42), 255, np.uint8)).save(folder / f"enlarged_dynamic_mask_{short}.png")
-    Image.fromarray(np.zeros((9, 9), np.uint8)).save(folder / "dynamic_mask_bw.png")  # of MonST3R's pair viewer
-
-
-def write_cut3r(folder):
-    """CUT3R's `prepare_output`."""
-    for name in ("depth", "conf", "color", "camera"):
-        (folder / name).mkdir(parents=True)
-    for number in range(3):
-        np.save(folder / f"depth/{number:06d}.npy", ROOM.depth[number])
-        np.save(folder / f"conf/{number:06d}.npy", ROOM.depth_confidence[number])
-        Image.fromarray(ROOM.images[number]).save(folder / f"color/{number:06d}.png")
-        pose, intrinsics = ROOM.world_from_camera[number], ROOM.intrinsics[number]
-        np.savez(folder / f"camera/{number:06d}.npz", pose=pose, intrinsics=intrinsics)
-
-
-def write_da3(folder, kind="npz", rows=3):
-    """Depth Anything 3's exporters npz and mini_npz: camera-from-world, with a last row or without."""
-    poses = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
-    poses[:, :3] = ROOM.camera_from_world
-    arrays = {
-        "depth": ROOM.depth,
-        "conf": ROOM.depth_confidence,
-        "extrinsics": poses[:, :rows],
-        "intrinsics": ROOM.intrinsics,
-    }
-    (folder / "exports" / kind).mkdir(parents=True)
-    if kind == "npz":
-        arrays["image"] = ROOM.images
-    np.savez_compressed(folder / "exports" / kind / "results.npz", allow_pickle=True, **arrays)
-
-
-WRITERS = {
-    "vggt4d": lambda folder: write_flat(folder, padded=True, logarithmic=False),
-    "monst3r": lambda folder: write_flat(folder, padded=False, logarithmic=True),
-    "cut3r": write_cut3r,
-    "da3": write_da3,
-}
-QUATERNIONS = {"vggt4d": "wxyz", "monst3r": "wxyz", "cut3r": None, "da3": None}
 
 
 @pytest.mark.parametrize("layout", WRITERS)
@@ -81,12 +28,32 @@ def test_everything_comes_back(tmp_path, layout):
     np.testing.assert_allclose(result.intrinsics, ROOM.intrinsics, rtol=1e-6)
     np.testing.assert_array_equal(result.images, ROOM.images)
     np.testing.assert_allclose(result.world_points(), ROOM.world_points(), atol=1e-4)
-    masks = layout in ("vggt4d", "monst3r")
+    masks = layout in WITH_MASKS
     np.testing.assert_array_equal(result.dynamic_mask, ROOM.dynamic_mask & masks)
     assert result.settings["missing"] == ([] if masks else ["dynamic_mask"])
     assert (result.saliency, result.method) == (None, layout)
     result.save(tmp_path / "ours", only=("cameras",))
     np.testing.assert_array_equal(Reconstruction.load(tmp_path / "ours").depth, ROOM.depth)
+
+
+def test_what_das3r_trains_on(tmp_path):
+    rearrange(tmp_path / "x")
+    result = Reconstruction.load(tmp_path / "x", format="das3r", quaternion="wxyz")
+    np.testing.assert_array_equal(result.depth, ROOM.depth)
+    np.testing.assert_allclose(result.depth_confidence, ROOM.depth_confidence, rtol=1e-6)
+    np.testing.assert_array_equal(result.dynamic_mask, ROOM.dynamic_mask)
+    np.testing.assert_array_equal(result.images, ROOM.images)
+
+
+def test_the_file_of_spatialtracker_is_found_and_two_are_refused(tmp_path):
+    write_spatialtracker(tmp_path / "results", "walk_result.npz")
+    for path in (tmp_path, tmp_path / "results", tmp_path / "results/walk_result.npz"):
+        np.testing.assert_array_equal(Reconstruction.load(path, format="spatialtrackerv2").depth, ROOM.depth)
+    write_spatialtracker(tmp_path / "results", "run_result.npz")
+    with pytest.raises(
+        ResultError, match=r"run_result\.npz and walk_result\.npz may both be the result; give one file"
+    ):
+        Reconstruction.load(tmp_path / "results", format="spatialtrackerv2")
 
 
 def test_small_files_of_da3(tmp_path, caplog):
@@ -134,7 +101,7 @@ def changed(name, **changes):
     return change
 
 
-CAMERA, DA3 = "camera/000001.npz", "exports/npz/results.npz"
+CAMERA, DA3, TRACKED = "camera/000001.npz", "exports/npz/results.npz", "clip_result.npz"
 SHAPES = r"'extrinsics' of results.npz is float64 \(1, 3, 4\); expected floating point \(3, 3, 4\)"
 
 
@@ -155,6 +122,15 @@ SHAPES = r"'extrinsics' of results.npz is float64 \(1, 3, 4\); expected floating
         ("cut3r", remove(CAMERA), r"frame 1 has depth, but no camera/000001\.npz"),
         ("da3", changed(DA3, image=np.ones((3, 28, 42, 3), np.uint16)), "'image' of .* is uint16 .* expected uint8"),
         ("da3", changed(DA3, extrinsics=np.ones((1, 3, 4))), SHAPES),
+        ("easi3r", remove("conf_1.npy"), r"frame 1 has depth, but no file like conf_0\.npy"),
+        (
+            "das3r",
+            lambda folder: [path.unlink() for path in folder.glob("frame_*.npy")],
+            "frame_0000.npy or depth_maps",
+        ),
+        ("spatialtrackerv2", changed(TRACKED, depths=None), "'depths' of clip_result.npz is missing"),
+        ("spatialtrackerv2", changed(TRACKED, video=ROOM.images), r"'video' of .* is uint8 .* expected floating point"),
+        ("spatialtrackerv2", remove(TRACKED), "it has no result.npz; inference.py writes it"),
     ],
 )
 def test_what_is_broken_is_named(tmp_path, layout, change, message):

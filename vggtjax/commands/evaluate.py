@@ -17,7 +17,7 @@ from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
 from vggtjax.media.sampling import Sampling
 from vggtjax.options import METHODS, MethodName, Options, find_method
-from vggtjax.results.saving import ReadFormat
+from vggtjax.results.saving import READ_FORMATS, ReadFormat
 from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
@@ -67,10 +67,11 @@ class Candidates(ModelFiles):
 class Folders:
     """Results of other programs, or earlier ones of ours."""
 
-    results: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=FOLDER ...", help_behavior_hint="")] = ()
-    """score results in these folders instead, NAME=FOLDER, each with a folder per sequence; no model is run"""
+    results: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=[FORMAT:]FOLDER ...", help_behavior_hint="")] = ()
+    """score results in these folders instead, each with a folder per sequence; no model is run. FORMAT is the program
+    that wrote a folder, as of --format"""
     format: InWords[ReadFormat | None] = None
-    """the program whose files the folders of --results have; vggtjax by default"""
+    """the program whose files the folders of --results have that name none; vggtjax by default"""
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None
     """order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw"""
 
@@ -79,16 +80,22 @@ class Folders:
         from vggtjax.evaluation.sources import FolderSource
 
         folders: dict[str, Path] = {}
+        formats: dict[str, str] = {}
         for text in self.results:
-            name, equals, folder = text.rpartition("=")
-            path = Path(folder)
+            name, equals, rest = text.rpartition("=")
+            form, colon, folder = rest.partition(":")
+            known = bool(colon) and form in READ_FORMATS and not Path(rest).is_dir()
+            path = Path(folder if known else rest)
             if not path.is_dir():
-                raise InputError(f"--results has {text}, which names no folder; expected NAME=FOLDER")
+                raise InputError(
+                    f"--results has {text}, which names no folder; expected NAME=FOLDER or NAME=FORMAT:FOLDER, where "
+                    f"FORMAT is one of {', '.join(READ_FORMATS)}"
+                )
             name = name if equals else folder_name(path)
             if name in folders:
                 raise InputError(f"--results has two folders named {name}; give them different names: NAME=FOLDER")
-            folders[name] = path
-        return FolderSource(folders, self.format or "vggtjax", self.quaternion)
+            folders[name], formats[name] = path, form if known else self.format or "vggtjax"
+        return FolderSource(folders, formats, self.quaternion)
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,8 @@ def render(
         out: the film, an .mp4, .gif or .webp; RESULT/preview/turntable.mp4 by default, RESULT/turntable.mp4 where
             the result has no previews.
         format: the program whose files the folder has.
-        quaternion: for vggt4d and monst3r, order of the quaternions in pred_traj.txt.
+        quaternion: order of the quaternions in pred_traj.txt, where the format has one: wxyz as MonST3R and VGGT4D
+            write it, or xyzw.
     """
     sides = _sides(size)
     report = Report()

@@ -14,6 +14,7 @@ from vggtjax.reconstruction import Reconstruction
 Place = tuple[tuple[float, float], tuple[float, float]]  # scale and offset: source (x, y) = scale * (x, y) + offset
 _SAME: Place = ((1.0, 1.0), (0.0, 0.0))
 _MULTIPLE = 16  # MonST3R and CUT3R cut the sides of their frames to multiples of it
+_TRACKED_WIDTH, _TRACKED_SIDE = 518, 336  # of SpatialTrackerV2's frames, and the longest side of what it saves
 
 
 def placed(
@@ -22,9 +23,9 @@ def placed(
     """Return a result with the place of its frames in pictures of these sizes.
 
     Folders of other projects do not record this place; it follows from the project: VGGT4D resizes to a width and cuts
-    tall frames; Depth Anything 3 resizes both sides; MonST3R and CUT3R resize the long side and cut both sides to
-    multiples of 16 about the middle. Results of vggtjax record the place themselves; pictures of exactly their frames'
-    size are taken for the frames.
+    tall frames; Depth Anything 3 resizes both sides; MonST3R, those that build on it and CUT3R resize the long side
+    and cut both sides to multiples of 16 about the middle; SpatialTrackerV2 does as VGGT, and then shrinks. Results
+    of vggtjax record the place themselves; pictures of exactly their frames' size are taken for the frames.
 
     Args:
         result: the loaded result.
@@ -99,9 +100,22 @@ def _cut_about_the_middle(width: int, height: int, W: int, H: int) -> Place | No
     return scale, (cut[0] * scale[0], cut[1] * scale[1])
 
 
+def _cut_and_shrunk(width: int, height: int, W: int, H: int) -> Place | None:
+    """VGGT's way to a width of 518, which then shrinks until no side is above 336; sides are cut to whole pixels."""
+    try:
+        fit = Fitter("crop", _TRACKED_WIDTH, 14).fit(width, height, "0")
+    except ClipError:
+        return None
+    shrink = _TRACKED_SIDE / max(fit.frame_size)
+    if any(abs(shrink * side - own) > 1 for side, own in zip(fit.frame_size, (W, H), strict=True)):
+        return None
+    (x, y), (wide, high) = fit.scale, fit.frame_size
+    return (x * wide / W, y * high / H), fit.offset
+
+
 _PLACES: dict[str, Callable[[int, int, int, int], Place | None]] = {
     "vggt4d": _resized_and_cut,
     "da3": _stretched,
-    "monst3r": _cut_about_the_middle,
-    "cut3r": _cut_about_the_middle,
+    **dict.fromkeys(("monst3r", "easi3r", "das3r", "pomato", "cut3r"), _cut_about_the_middle),
+    "spatialtrackerv2": _cut_and_shrunk,
 }

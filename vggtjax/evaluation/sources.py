@@ -17,7 +17,7 @@ from vggtjax.evaluation.records import shown_name
 from vggtjax.options import METHODS, Options
 from vggtjax.progress import OnStage
 from vggtjax.reconstruction import Reconstruction
-from vggtjax.results.foreign import check_format
+from vggtjax.results.foreign import check_format, needs_quaternion
 from vggtjax.storage.file_digest import file_digest
 from vggtjax.storage.trajectories import Quaternion
 
@@ -103,19 +103,24 @@ class ModelSource:
 
 @dataclass(frozen=True)
 class FolderSource:
-    """Results in folders: `folders[name] / sequence` holds one result.
+    """Results in folders: `folders[name] / sequence` holds one result, or is its one file, SEQUENCE.npz.
 
     Raises:
-        InputError: a name that is not printable or too long, or an order of quaternions that `format` lacks or needs.
+        InputError: a name that is not printable or too long, or an order of quaternions that a format lacks, or that no
+            format needs.
     """
 
     folders: Mapping[str, Path]
-    format: str = "vggtjax"  # of the program that wrote the folders
-    quaternion: Quaternion | None = None
+    formats: Mapping[str, str] = field(default_factory=dict)  # by name, of the program that wrote it; else "vggtjax"
+    quaternion: Quaternion | None = None  # of the formats that need one
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        check_format(self.format, self.quaternion)
+        formats = [self._format(name) for name in self.folders]
+        for form in formats:
+            check_format(form, self.quaternion if needs_quaternion(form) else None)
+        if self.quaternion is not None and not any(map(needs_quaternion, formats)):
+            check_format(formats[0], self.quaternion)
         if wrong := [name for name in self.folders if shown_name(name) != name]:
             raise InputError(f"results cannot be named {shown_name(wrong[0])}; expected a short printable name")
 
@@ -130,11 +135,19 @@ class FolderSource:
     @property
     def settings(self) -> dict[str, Any]:
         """What the numbers depend on besides the files, as JSON values."""
-        return {"format": self.format, "quaternion": self.quaternion}
+        return {"formats": {name: self._format(name) for name in self.folders}, "quaternion": self.quaternion}
+
+    def _format(self, name: str) -> str:
+        return self.formats.get(name, "vggtjax")
+
+    def _path(self, name: str, sequence: LabelledSequence) -> Path:
+        folder = self.folders[name] / sequence.name
+        file = folder.with_name(f"{folder.name}.npz")
+        return file if file.is_file() and not folder.exists() else folder
 
     def fingerprint(self, name: str, sequence: LabelledSequence) -> str:
         """Return a digest of the names, sizes and dates of the result's files; "" where there are none."""
-        folder = self.folders[name] / sequence.name
+        folder = self._path(name, sequence)
         try:
             paths = list(islice(folder.rglob("*"), _MOST_FILES + 1)) if folder.is_dir() else [folder]
             if len(paths) > _MOST_FILES:
@@ -151,9 +164,10 @@ class FolderSource:
         sizes = [picture_size(path) for path in sequence.pictures]
         results = {}
         for name in names:
-            folder = self.folders[name] / sequence.name
-            result = Reconstruction.load(folder, format=self.format, quaternion=self.quaternion)
-            results[name] = placed(result, self.format, sizes, sequence.frame_names)
+            form = self._format(name)
+            quaternion = self.quaternion if needs_quaternion(form) else None
+            result = Reconstruction.load(self._path(name, sequence), format=form, quaternion=quaternion)
+            results[name] = placed(result, form, sizes, sequence.frame_names)
         return results
 
 

@@ -1,15 +1,20 @@
-"""Result folders of other programs: VGGT4D's written and read; MonST3R's, CUT3R's and Depth Anything 3's read.
+"""Result folders of other programs: VGGT4D's written and read; those of seven others read.
 
 Files and units are those of their public code:
 
     vggt4d    frame_0000.png, frame_0000.npy (depth), conf_0000.npy, dynamic_mask_0000.png, and for all frames
               pred_intrinsics.txt (nine numbers a line), pred_traj.txt (world-from-camera, qw before qx qy qz;
               folders of earlier versions of this library have qw last: read these with quaternion="xyzw")
-    monst3r   the same with conf_0.npy, dynamic_mask_0.png; the confidence is a logarithm, -inf where it was 0
+    monst3r   the same with conf_0.npy, dynamic_mask_0.png; the confidence is a logarithm, -inf where it was 0;
+              easi3r, das3r and pomato, which build on MonST3R, write the same
+    das3r     also as its training takes it: depth_maps/frame_0000.npy, confidence_maps/conf_0000.npy,
+              dynamic_masks/dynamic_mask_0000.png, images/frame_0000.png
     cut3r     depth/000000.npy, conf/000000.npy, color/000000.png, camera/000000.npz (pose: world-from-camera;
               intrinsics)
     da3       exports/npz/results.npz or exports/mini_npz/results.npz: depth, conf, extrinsics (camera-from-world),
               intrinsics, and image in the former
+    spatialtrackerv2  result.npz, NAME_result.npz or NAME.npz: depths (0 where it is not sure), unc_metric (the
+              confidence), extrinsics (camera-from-world), intrinsics, and video, [S, 3, H, W] of shares of white
 
 All have depth along z, dynamic = bright, and intrinsics in pixels of their depth. Does not import jax.
 """
@@ -58,7 +63,7 @@ def write_cameras(
 
 
 class _Folder(NamedTuple):
-    """The paths of the first frame's files, and the reader of the cameras."""
+    """A file for each array and frame: the paths of the first frame's files, and the reader of the cameras."""
 
     depth: str
     picture: str
@@ -68,15 +73,26 @@ class _Folder(NamedTuple):
     logarithmic: bool = False  # confidence
 
 
+class _Archive(NamedTuple):
+    """One .npz file for all frames: the patterns that may name it in a folder, and the names of its arrays."""
+
+    files: tuple[str, ...]
+    depth: str
+    confidence: str
+    images: str
+    shares: bool  # pictures are [S, 3, H, W] in [0, 1], or [S, H, W, 3] of 8 bits
+    remedy: str
+
+
 def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict[str, Any]:
     """Read the result folder of another program as fields of a `Result`; see `Reconstruction.load`.
 
     Raises ClipError or ResultError, without the path, for anything but a whole folder; else what `check_format` raises.
     """
-    if not path.exists() or (format != "da3" and not path.is_dir()):
-        raise ResultError("there is no such folder")
     check_format(format, quaternion)
-    fields = _read_da3(path) if format == "da3" else _read_folder(path, _FOLDERS[format], quaternion)
+    if not path.exists() or (format in _FOLDERS and not path.is_dir()):
+        raise ResultError("there is no such folder")
+    fields = _read_archive(path, _ARCHIVES[format]) if format in _ARCHIVES else _read_folder(path, format, quaternion)
     S, H, W = fields["depth"].shape
     plain = {
         "depth_confidence": np.ones((S, H, W), np.float32),
@@ -108,20 +124,28 @@ def check_format(format: str, quaternion: str | None) -> None:
     if quaternion is None and format in _WITH_TRAJECTORY:
         raise InputError(
             f"pred_traj.txt of {format} does not say the order of its quaternions; give quaternion 'wxyz' "
-            "(--quaternion wxyz), as VGGT4D, MonST3R, CUT3R, Easi3R and vggtjax write them, or 'xyzw', as TUM and "
-            "earlier vggtjax do"
+            "(--quaternion wxyz), as VGGT4D, MonST3R, CUT3R, Easi3R, DAS3R, POMATO and vggtjax write them, or 'xyzw', "
+            "as TUM and earlier vggtjax do"
         )
     if quaternion is not None and (quaternion not in get_args(Quaternion) or format not in _WITH_TRAJECTORY):
         raise InputError(
             f"quaternion is {quaternion!r} for {format}; expected 'xyzw' or 'wxyz' for "
-            f"{' and '.join(_WITH_TRAJECTORY)}, and none for others, which keep matrices"
+            f"{', '.join(_WITH_TRAJECTORY)}, and none for others, which keep matrices"
         )
 
 
-def _read_folder(folder: Path, files: _Folder, quaternion: Quaternion | None) -> dict[str, Any]:
+def needs_quaternion(format: str) -> bool:
+    """Return whether a format has a trajectory, whose order of quaternions has to be given."""
+    return format in _WITH_TRAJECTORY
+
+
+def _read_folder(folder: Path, format: str, quaternion: Quaternion | None) -> dict[str, Any]:
+    files = next((files for files in _FOLDERS[format] if _numbered(folder, files.depth)), None)
+    if files is None:
+        raise ResultError(
+            f"it has no depth; expected files like {' or '.join(each.depth for each in _FOLDERS[format])}"
+        )
     depth_files = _numbered(folder, files.depth)
-    if not depth_files:
-        raise ResultError(f"it has no depth; expected files like {files.depth}")
     numbers = sorted(depth_files)
     cameras = files.cameras(folder, numbers, quaternion)
     depth = _stacked(depth_files, numbers, _read_map, None)
@@ -215,51 +239,95 @@ def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | 
     return Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
 
 
-def _read_da3(path: Path) -> dict[str, Any]:
-    folders = [path / name for name in ("", "exports/npz", "exports/mini_npz", "npz", "mini_npz")]
-    file = next((file for file in (path, *(folder / "results.npz" for folder in folders)) if file.is_file()), None)
-    if file is None:
-        raise ResultError("it has no results.npz; export with the format 'npz' or 'mini_npz'")
-    shape = read_headers(file).get("depth", Header(np.dtype(float), ())).shape
+def _read_archive(path: Path, names: _Archive) -> dict[str, Any]:
+    file = path if path.is_file() else _only_archive(path, names)
+    shape = read_headers(file).get(names.depth, Header(np.dtype(float), ())).shape
     if len(shape) != 3 or 0 in shape:
-        raise ResultError(f"'depth' of {file.name} is missing or has shape {shape}; expected (N, H, W)")
+        raise ResultError(f"{names.depth!r} of {file.name} is missing or has shape {shape}; expected (S, H, W)")
     S, H, W = shape
-    wanted = {"depth": ((S, H, W),), "extrinsics": ((S, 3, 4), (S, 4, 4)), "intrinsics": ((S, 3, 3),)}
-    arrays = _read_some(file, wanted, {"conf": ((S, H, W),), "image": ((S, H, W, 3),)})
+    pictures = (S, 3, H, W) if names.shares else (S, H, W, 3)
+    wanted = {names.depth: ((S, H, W),), "extrinsics": ((S, 3, 4), (S, 4, 4)), "intrinsics": ((S, 3, 3),)}
+    eight_bits = () if names.shares else (names.images,)
+    arrays = _read_some(file, wanted, {names.confidence: ((S, H, W),), names.images: (pictures,)}, eight_bits)
+    images = arrays.get(names.images)
+    if images is not None and names.shares:
+        shares = np.nan_to_num(images).astype(np.float32).transpose(0, 2, 3, 1)
+        images = np.clip(255 * shares + 0.5, 0, 255).astype(np.uint8)
     with np.errstate(over="ignore"):
-        depth = arrays["depth"].astype(np.float32)
+        depth = arrays[names.depth].astype(np.float32)
     return {
         "depth": depth,
-        "depth_confidence": arrays.get("conf"),
-        "images": arrays.get("image"),
+        "depth_confidence": arrays.get(names.confidence),
+        "images": images,
         "camera_from_world": arrays["extrinsics"][:, :3],
         "intrinsics": arrays["intrinsics"],
     }
 
 
+def _only_archive(folder: Path, names: _Archive) -> Path:
+    """Return the one file of a folder that may be the result: of the first pattern that any file fits."""
+    for pattern in names.files:
+        with reading(folder, ResultError):
+            found = sorted(path for path in folder.glob(pattern) if path.is_file())
+        if len(found) > 1:
+            raise ResultError(f"{found[0].name} and {found[1].name} may both be the result; give one file")
+        if found:
+            return found[0]
+    raise ResultError(f"it has no {names.files[0]}; {names.remedy}")
+
+
 def _read_some(
-    file: Path, needed: Mapping[str, tuple[tuple[int, ...], ...]], others: Mapping[str, tuple[tuple[int, ...], ...]]
+    file: Path,
+    needed: Mapping[str, tuple[tuple[int, ...], ...]],
+    others: Mapping[str, tuple[tuple[int, ...], ...]],
+    eight_bits: Sequence[str] = (),
 ) -> dict[str, np.ndarray]:
     """Return the arrays of these names, each of one of its shapes; the `others` may be missing.
 
-    Headers are checked first, so that no larger array is read. All arrays are floating point but `image`, 8 bits.
+    Headers are checked first, so that no larger array is read. All arrays are floating point but those of 8 bits.
     """
     headers = read_headers(file)
     for name, shapes in {**needed, **others}.items():
-        header, kind = headers.get(name), "uint8" if name == "image" else "floating point"
+        header, kind = headers.get(name), "uint8" if name in eight_bits else "floating point"
         if header is None and name in needed:
             raise ResultError(f"{file.name} has no {name!r}; expected {kind} {shapes[0]}")
-        right = header is None or (header.dtype == np.uint8 if name == "image" else header.dtype.kind == "f")
+        right = header is None or (header.dtype == np.uint8 if name in eight_bits else header.dtype.kind == "f")
         if header is not None and (header.shape not in shapes or not right):
             raise ResultError(f"{name!r} of {file.name} is {header.dtype} {header.shape}; expected {kind} {shapes[0]}")
     return read_arrays(file, {*needed, *others})
 
 
 _VGGT4D = _Folder("frame_0000.npy", "frame_0000.png", "conf_0000.npy", "dynamic_mask_0000.png", _text_cameras)
-_FOLDERS = {
-    "vggt4d": _VGGT4D,
-    "monst3r": _VGGT4D._replace(logarithmic=True),
-    "cut3r": _Folder("depth/000000.npy", "color/000000.png", "conf/000000.npy", None, _npz_cameras),
+_MONST3R = _VGGT4D._replace(logarithmic=True)
+_REARRANGED = _Folder(
+    "depth_maps/frame_0000.npy",
+    "images/frame_0000.png",
+    "confidence_maps/conf_0000.npy",
+    "dynamic_masks/dynamic_mask_0000.png",
+    _text_cameras,
+    logarithmic=True,
+)
+_CUT3R = _Folder("depth/000000.npy", "color/000000.png", "conf/000000.npy", None, _npz_cameras)
+_FOLDERS: dict[str, tuple[_Folder, ...]] = {
+    "vggt4d": (_VGGT4D,),
+    "monst3r": (_MONST3R,),
+    "easi3r": (_MONST3R,),
+    "das3r": (_MONST3R, _REARRANGED),
+    "pomato": (_MONST3R,),
+    "cut3r": (_CUT3R,),
 }
-FORMATS = (*_FOLDERS, "da3")
-_WITH_TRAJECTORY = tuple(name for name, files in _FOLDERS.items() if files.cameras is _text_cameras)
+_DA3 = _Archive(
+    tuple(f"{folder}results.npz" for folder in ("", "exports/npz/", "exports/mini_npz/", "npz/", "mini_npz/")),
+    *("depth", "conf", "image"),
+    shares=False,
+    remedy="export with the format 'npz' or 'mini_npz'",
+)
+_SPATIALTRACKER = _Archive(
+    ("result.npz", "*_result.npz", "*.npz", "results/*_result.npz"),
+    *("depths", "unc_metric", "video"),
+    shares=True,
+    remedy="inference.py writes it, or NAME_result.npz",
+)
+_ARCHIVES = {"da3": _DA3, "spatialtrackerv2": _SPATIALTRACKER}
+FORMATS = (*_FOLDERS, *_ARCHIVES)
+_WITH_TRAJECTORY = tuple(name for name, (files, *_) in _FOLDERS.items() if files.cameras is _text_cameras)
