@@ -1,5 +1,7 @@
 """The truth of a small room, written as other programs write their results."""
 
+from typing import Any
+
 import numpy as np
 from PIL import Image
 from scipy.spatial.transform import Rotation
@@ -102,4 +104,4 @@ WRITERS = {
     "spatialtrackerv2": write_spatialtracker,
 }
 WITH_MASKS = ("vggt4d", "monst3r", "easi3r", "das3r", "pomato")
-QUATERNIONS = dict.fromkeys(WRITERS) | dict.fromkeys(WITH_MASKS, "wxyz")
+QUATERNIONS: dict[str, Any] = dict.fromkeys(WRITERS) | dict.fromkeys(WITH_MASKS, "wxyz")

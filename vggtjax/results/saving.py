@@ -15,7 +15,7 @@ from vggtjax.storage.json_values import check_fields
 Resolution = Literal["model", "original"]
 Format = Literal["vggtjax", "vggt4d"]  # of a folder of files
 # Of folders of other programs that are read.
-ForeignFormat = Literal["vggt4d", "monst3r", "cut3r", "da3", "easi3r", "das3r", "pomato", "spatialtrackerv2"]
+ForeignFormat = Literal["vggt4d", "monst3r", "easi3r", "das3r", "pomato", "cut3r", "da3", "spatialtrackerv2"]
 ReadFormat = Literal["vggtjax", ForeignFormat]
 READ_FORMATS: tuple[ReadFormat, ...] = get_args(ReadFormat)
 Group = Literal["depth", "confidence", "cameras", "masks", "previews", "clouds", "scene", "report"]
