@@ -1,5 +1,7 @@
 """The focal length that cameras write into their files: EXIF of pictures, QuickTime's metadata of videos."""
 
+from contextlib import suppress
+
 import av
 import numpy as np
 import pillow_heif
@@ -113,6 +115,16 @@ def test_what_no_camera_has_is_refused_when_asked_for_and_ignored_else(tmp_path,
     with pytest.raises(InputError, match=words) as problem:
         read_known(EXIF, clip)
     assert "\n" not in str(problem.value)
+
+
+def test_broken_exif_data_state_nothing_and_warn_of_nothing(tmp_path):
+    """Pillow warns of tags that end early, and warnings are errors here."""
+    whole = write(tmp_path / "a.jpg", SENSOR).read_bytes()
+    start = whole.index(b"Exif")
+    for place in range(start + 4, start + 60):
+        (tmp_path / "a.jpg").write_bytes(whole[:place] + b"\xff" + whole[place + 1 :])
+        with suppress(InputError):
+            assert 40 <= picture_focal(tmp_path / "a.jpg").pixels <= 20_000
 
 
 def test_arrays_and_results_have_no_files():

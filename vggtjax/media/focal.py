@@ -48,10 +48,11 @@ def picture_focal(path: Path) -> StatedFocal:
     """
     tags: dict[int, Any] = {}
     size = (0, 0)
-    with warnings.catch_warnings(), suppress(*UNREADABLE), Image.open(path, formats=known_formats()) as image:
+    with warnings.catch_warnings(), suppress(*UNREADABLE):
         warnings.simplefilter("ignore")  # of broken tags, which count as missing
-        size = image.size
-        tags = dict(image.getexif().get_ifd(_SUBFOLDER))
+        with Image.open(path, formats=known_formats()) as image:
+            size = image.size
+            tags = dict(image.getexif().get_ifd(_SUBFOLDER))
     film, focal, plane = (_number(tags.get(tag)) for tag in (_FOCAL_35, _FOCAL, _PLANE_X))
     if not max(film, focal):
         raise InputError(f"{path} states no focal length in its EXIF data; give fx,fy,cx,cy or a file of them")
