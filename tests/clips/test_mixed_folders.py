@@ -214,6 +214,15 @@ def test_other_files_of_several_pictures(tmp_path, caplog, name):
     assert "holds 3 pictures; the first is read" in caplog.messages[0]
 
 
+def test_panoramas_are_warned_of_once(tmp_path, caplog):
+    xmp = b'<rdf:Description xmlns:GPano="x" GPano:ProjectionType="equirectangular"/>'
+    for number in range(2):
+        Image.new("RGB", (112, 56)).save(tmp_path / f"{number}.jpg", xmp=xmp)
+    load_clip(tmp_path, size=28)
+    (said,) = caplog.messages
+    assert "0.jpg is a panorama of 360 degrees (equirectangular)" in said
+
+
 def test_a_cover_beside_two_frames(tmp_path, caplog):
     load_clip(folder(tmp_path, "1.png", "2.png", "album_cover.jpg", "thumb.png"), size=28)
     (said,) = caplog.messages

@@ -107,6 +107,18 @@ def test_sources_that_are_none(source, message):
         open_source(source)
 
 
+def test_a_pattern_with_a_number_in_c_is_a_pattern(tmp_path):
+    for name in ("img0001", "img0002", "img10000", "img3", "img0004_depth", "other0001"):
+        Image.new("RGB", (8, 8)).save(tmp_path / f"{name}.png")
+    for pattern, names in (
+        ("img%04d.png", ["img0001", "img0002", "img10000"]),
+        ("img%d.png", ["img0001", "img0002", "img3", "img10000"]),
+    ):
+        assert [frame.name for frame in open_source(str(tmp_path / pattern)).frames(Sampling())] == names
+    with pytest.raises(ClipError, match=r"pattern .*img%06d\.png matches no images"):
+        open_source(str(tmp_path / "img%06d.png"))
+
+
 def test_a_list_of_pil_images_is_read_like_their_files():
     transparent = Image.new("RGBA", (28, 14), (255, 0, 0, 0))
     frames = list(open_source([transparent, Image.new("L", (28, 14), 7)]).frames(Sampling()))

@@ -35,6 +35,13 @@ def test_what_is_no_frame():
             list(ArrayFrames.from_arrays(arrays).frames(Sampling()))
 
 
+def test_colours_first_and_batches_are_named_with_the_remedy():
+    with pytest.raises(ClipError, match=r"colours first; .*: array\.transpose\(0, 2, 3, 1\), or tensor\.permute"):
+        ArrayFrames.from_arrays(np.zeros((4, 3, 28, 42), np.float32))
+    with pytest.raises(ClipError, match=r"shape \(1, 4, 28, 42, 3\); give the clips of a batch one by one"):
+        ArrayFrames.from_arrays(np.zeros((1, 4, 28, 42, 3), np.float32))
+
+
 def test_frames_are_named_by_their_index_in_the_source():
     arrays = (np.arange(5, dtype=np.uint8)[:, None, None, None] * np.ones((1, 2, 3, 3), np.uint8))[:, :, ::-1]
     source = ArrayFrames.from_arrays(arrays)

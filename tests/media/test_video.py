@@ -154,6 +154,20 @@ def test_sound_and_a_cover_are_no_video(tmp_path):
         read(path)
 
 
+def test_of_two_videos_the_one_that_is_read_is_said(tmp_path, caplog):
+    path = tmp_path / "two.mp4"
+    with av.open(str(path), "w") as container:
+        streams = [container.add_stream("mpeg4", rate=10) for _ in range(2)]
+        for stream in streams:
+            stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for stream in streams:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture(0), format="rgb24")))
+            container.mux(stream.encode())
+    read(path)
+    sizes = f"{WIDTH} x {HEIGHT}"
+    assert f"holds 2 videos ({sizes}, {sizes}); that of {sizes} is read" in caplog.text
+
+
 def test_frames_are_let_go(even):
     """A frame of the decoder must not wait for the garbage collector: at 4K each is 12 MB."""
     gc.collect()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,6 +27,8 @@ from vggtjax.media.order import in_order
 from vggtjax.media.sampling import Source
 from vggtjax.media.video import VideoFile, is_video_name
 from vggtjax.storage.remote import check_url, download, is_url, list_url, local_path, shown, url_name
+
+_NUMBERED = re.compile(r"%0?(\d?)d")  # a number of at least so many digits, in C's words
 
 Name: TypeAlias = str | os.PathLike[str]
 ClipSource: TypeAlias = Name | Sequence[Name] | Sequence[Image.Image] | Sequence[np.ndarray] | np.ndarray | Source
@@ -140,11 +143,21 @@ def _from_path(name: str, undistort: bool) -> Source:
             return _from_file(path)
         if path.exists():
             raise ClipError(f"{path} is neither a file nor a folder; expected images or a video")
+        if _NUMBERED.search(path.name) and not glob.has_magic(name):
+            return _images(_numbered(path), f"pattern {name} matches", "expected images")
         if glob.has_magic(name) and "://" not in name:
             found = glob.glob(_pattern(path), recursive=True)  # noqa: PTH207 - absolute patterns too
             matches = [Path(match) for match in found]
             return _images(matches, f"pattern {name} matches", "expected images")
     raise _missing(name)
+
+
+def _numbered(path: Path) -> list[Path]:
+    """Return the files of a pattern such as img%04d.png, as FFmpeg writes it: a number in the name."""
+    before, digits, after = _NUMBERED.split(path.name, maxsplit=1)
+    number = rf"\d{{{digits or 1},}}"
+    name = re.compile(re.escape(before) + number + re.escape(after))
+    return [entry for entry in path.parent.iterdir() if name.fullmatch(entry.name)] if path.parent.is_dir() else []
 
 
 def _pattern(path: Path) -> str:

@@ -28,7 +28,13 @@ class ArrayFrames:
         if not isinstance(arrays, Sequence):
             stacked = np.asarray(arrays)
             if stacked.ndim != 4:
-                raise ClipError(f"the array has shape {stacked.shape}; expected frames [S, H, W, 3]")
+                remedy = "give the clips of a batch one by one" if stacked.ndim == 5 else "expected frames [S, H, W, 3]"
+                raise ClipError(f"the array has shape {stacked.shape}; {remedy}")
+            if stacked.shape[3] != 3 and stacked.shape[1] == 3:
+                raise ClipError(
+                    f"the array has shape {stacked.shape}, colours first; expected frames [S, H, W, 3]: "
+                    "array.transpose(0, 2, 3, 1), or tensor.permute(0, 2, 3, 1)"
+                )
             arrays = stacked
         frames = tuple(np.asarray(array) for array in arrays)
         if not frames:

@@ -31,6 +31,8 @@ _MOST_PIXELS_A_BYTE, _ALWAYS_PIXELS = 10_000, 2**24
 _LITTLE_SHRUNK: dict[str, int] = dict.fromkeys(("PNG", "JPEG", "MPO", "BMP", "PPM", "TGA"), 2**22)
 
 ORIENTATION = 0x0112  # of EXIF; from 5 on, width and height are swapped
+_PANORAMA = "is a panorama of 360 degrees (equirectangular), and the network knows pictures of plain lenses"
+_MOST_XMP = 1 << 16  # bytes
 _DARK = 16  # of 255: the most that a picture of 12 bits has when it is stored in 16
 _SEVERAL = ("MPO",)  # formats whose further pictures are previews of the first
 
@@ -102,6 +104,8 @@ def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
             _say(path, hdr, "hdr", said)
         if said is not None and count > 1:
             _say(path, f"holds {count} pictures; the first is read, write the others as files", "several", said)
+        if said is not None and _is_panorama(image):
+            _say(path, f"{_PANORAMA}; cut views out of it, such as with FFmpeg's v360=e:flat", "panorama", said)
         if said is not None and is_deep and 0 < np.asarray(picture).max() <= _DARK:
             bits = "has 16 bits a value and uses at most 12 of them, so it is nearly black; if all pictures are"
             _say(path, f"{bits}, multiply their values by 16 (for 12 bits) or 64 (for 10)", "deep", said)
@@ -131,6 +135,12 @@ def _without_hdr(picture: Image.Image, path: Path, profile: Any) -> tuple[Image.
     pixels = deep[..., :3] if deep.dtype == np.uint16 else np.asarray(picture).astype(np.uint16) * np.uint16(257)
     pixels, note = srgb_of_coded(pixels, transfer, primaries)
     return Image.fromarray(pixels), note
+
+
+def _is_panorama(image: Image.Image) -> bool:
+    """Return whether XMP data say that a picture shows the whole sphere (Google's Photo Sphere metadata)."""
+    xmp = image.info.get("xmp", b"")
+    return b"equirectangular" in (xmp if isinstance(xmp, bytes) else str(xmp).encode())[:_MOST_XMP]
 
 
 def _say(path: Path, note: str, kind: str, said: set[str]) -> None:

@@ -205,6 +205,10 @@ def _video_stream(container: InputContainer, path: Path, said: set[str]) -> Vide
         raise ClipError(f"video {path} says it has {shown}; expected at most {most} pixels, in a whole file")
     decoder.options = {"max_pixels": str(most)}  # also of sizes that the frames themselves say
     stream.thread_type = "AUTO"
+    others = [each for each in container.streams.video if not each.disposition & Disposition.attached_pic]
+    if len(others) > 1:
+        sizes = ", ".join(f"{each.width} x {each.height}" for each in others)
+        _say(path, f"holds {len(others)} videos ({sizes}); that of {stream.width} x {stream.height} is read", said)
     aspect = stream.sample_aspect_ratio
     if aspect not in (None, 0, 1):
         _say(path, f"has pixels of aspect {aspect}; they are taken as square", said)
