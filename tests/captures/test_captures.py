@@ -110,6 +110,14 @@ def test_polycam_s_own_cameras_stand_in_for_optimised_ones(tmp_path):
     assert capture.distorted
     assert capture.notes == ("its poses are ARKit's own: Polycam did not optimise them", DISTORTED)
     np.testing.assert_allclose(capture.world_from_camera, TRUTH.world_from_camera, atol=1e-12)
+    assert capture.undistorted() is capture  # its coefficients are unknown
+    first = next((tmp_path / "keyframes/cameras").iterdir())
+    edited(first, k1=0.1, p2=0.01)
+    K = TRUTH.intrinsics[0] if first.stem == capture.frame_names[0] else None
+    lens = next(filter(None, read(tmp_path).lenses))
+    assert lens.model == "OPENCV"
+    assert lens.params[4:] == (0.1, 0, 0, 0.01)
+    assert K is None or lens.params[:4] == (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
 
 
 def test_numbers_at_the_top_of_transforms_json(tmp_path):
@@ -273,7 +281,7 @@ BROKEN = [
     ("nerfstudio", edit(SCENE, transform_matrix=np.ones((4, 4)).tolist()), "invalid poses"),
     ("nerfstudio", edit(SCENE, fl_x=0), "focal lengths above 0"),
     ("nerfstudio", edit(SCENE, w=HEIGHT, h=WIDTH), "expected the same shape"),
-    ("nerfstudio", edit(SCENE, camera_model="OPENCV_FISHEYE"), "undistort the pictures"),
+    ("nerfstudio", edit(SCENE, camera_model="EQUIRECTANGULAR"), "model EQUIRECTANGULAR; expected one of FULL_OPENCV"),
     ("record3d", edit("metadata", dw=10**9), "has depth of 1000000000 x 36 pixels"),
     ("colmap", text(IMAGES, "1 1 0 0 0 0 0 0 1 ../a.png"), "expected a path inside"),
     ("colmap", text(CAMERAS, f"1 PINHOLE {'9' * 400} 9 1 1 1 1"), "expected sides of 1 to 1000000"),

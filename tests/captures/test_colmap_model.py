@@ -33,7 +33,7 @@ def test_colmap_models(tmp_path, number, values, focal, distorted):
     views = read_views(tmp_path)
     view = views["a.png"]
     assert np.array_equal(view.intrinsics, [[focal[0], 0, 2], [0, focal[1], 1], [0, 0, 1]])
-    assert (view.size, view.distorted) == ((4, 3), distorted)
+    assert (view.size, view.lens is not None) == ((4, 3), distorted)
     assert np.array_equal(view.camera_from_world, np.column_stack([np.eye(3), [1, 2, 3]]))
     assert views["b/ü.png"].size == (100, 100)
     assert np.allclose(views["b/ü.png"].camera_from_world[:, :3], QUARTER_ABOUT_Y)
@@ -50,7 +50,7 @@ LONG = struct.pack("<Q", 2**64 - 1)  # says that it has so many images
         (CAMERA, images_bin([(*IMAGE[:3], 9, "a.png")]), "of camera 9; cameras.bin has no such camera"),
         (CAMERA, images_bin([(7, (2, 0, 0, 0), *IMAGE[2:])]), "a quaternion of length 1"),
         (CAMERA, images_bin([(7, (1, 0, 0, 0), (float("nan"), 0, 0), *IMAGE[3:])]), "an invalid pose of 'a.png'"),
-        ((5, 5, 4, 3, [1] * 8), images_bin([IMAGE]), "a camera of kind OPENCV_FISHEYE"),
+        ((5, 16, 4, 3, [1] * 8), images_bin([IMAGE]), "a camera of kind 16; expected one of SIMPLE_PINHOLE"),
     ],
 )
 def test_broken_colmap_models_are_refused(tmp_path, camera, images, message):

@@ -66,6 +66,7 @@ class ClipWork:
             "fusion": fusion_digest(self._fusion),
             **({"known": known_values(recipe.known)} if recipe.known else {}),
             "pad_frames": recipe.pad_frames,
+            **({} if recipe.undistort else {"undistort": False}),
             **recipe.masks_setting(),
         }
 
@@ -74,7 +75,8 @@ class ClipWork:
 
         Raises DeviceMemoryError for a clip that cannot fit and cannot be cut.
         """
-        opened, recipe = open_source(source), self._recipe
+        recipe = self._recipe
+        opened = open_source(source, undistort=recipe.undistort)
         if not recipe.unchecked:
             how: Load = {"method": recipe.options.method, "clips": clips, "devices": recipe.devices}
             choice = choose_windows(self._model, opened, recipe.sampling, self._fitter, **how)
@@ -86,7 +88,7 @@ class ClipWork:
 
     def load(self, source: ClipSource) -> Clip:
         """Read a clip of this machine."""
-        return read_clip(open_source(source), self._recipe.sampling, self._fitter)
+        return read_clip(open_source(source, undistort=self._recipe.undistort), self._recipe.sampling, self._fitter)
 
     def run_long(self, name: str, source: ClipSource, clip: LongClip) -> ClipOutcome:
         """Reconstruct a clip in windows, and write its result."""
@@ -100,7 +102,8 @@ class ClipWork:
                 raise InputError(
                     f"masks of {name} is an array, and the clip is run in windows; give a folder of pictures"
                 )
-            reconstruct_long(self._model, source, folder, clip.windows, **how)
+            opened = open_source(source, undistort=recipe.undistort)
+            reconstruct_long(self._model, opened, folder, clip.windows, **how)
 
         self._out.write(name, run)
         return ClipOutcome(name, "done", clip.reason, clip.frames)

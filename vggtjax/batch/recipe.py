@@ -60,6 +60,16 @@ def _no_memory_check(no_memory_check: Switch = False) -> bool:
     return no_memory_check
 
 
+def _undistort(no_undistort: Switch = False) -> bool:
+    """Return whether frames are undistorted.
+
+    Args:
+        no_undistort: leave the frames of a capture as they are and ignore the coefficients of its lens; by default they
+            become those of a pinhole camera
+    """
+    return not no_undistort
+
+
 def _pad_frames(pad_frames: Switch = False) -> bool:
     """Return the choice.
 
@@ -86,6 +96,7 @@ class ClipRecipe:
 
     sampling: Annotated[Sampling, tyro.conf.arg(name="input", help="")] = Sampling()
     framing: Annotated[Framing, tyro.conf.arg(name="input", help="")] = Framing()
+    undistort: Annotated[bool, tyro.conf.arg(constructor=_undistort, name="input", prefix_name=False, help="")] = True
     options: Annotated[Options, tyro.conf.arg(name="method", help="")] = Options()
     devices: Annotated[int, tyro.conf.arg(constructor=_devices, name="limits", prefix_name=False, help="")] = 1
     known: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = KnownGeometry()

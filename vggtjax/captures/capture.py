@@ -17,7 +17,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from vggtjax.captures.cameras import TURNED, resized_intrinsics
+from vggtjax.captures.cameras import DISTORTED, TURNED, resized_intrinsics
+from vggtjax.captures.lens import Lens, Undistortion, undistortion
 from vggtjax.captures.pictures import picture_size
 from vggtjax.captures.unpacked import Unpacked
 from vggtjax.errors import InputError
@@ -39,7 +40,9 @@ class Capture:
     sizes: tuple[tuple[int, int], ...] = field(repr=False)  # width and height of each picture
     intrinsics: Float64[np.ndarray, "S 3 3"] | None = field(default=None, repr=False)
     world_from_camera: Float64[np.ndarray, "S 4 4"] | None = field(default=None, repr=False)
-    distorted: bool = False  # the lens has a distortion, which the intrinsics lack
+    lenses: tuple[Lens | None, ...] | None = field(default=None, repr=False)  # with distortion
+    has_unknown_lens: bool = False  # it has a distortion of unknown coefficients
+    undone: tuple[Undistortion | None, ...] | None = field(default=None, repr=False)  # distortion; see `undistorted`
     metric: bool = False  # poses and depth are in metres, not in a unit of the program's own
     depth_files: tuple[Path | None, ...] | None = field(default=None, repr=False)
     read_depth_file: Callable[[Path], Float32[np.ndarray, "h w"]] | None = field(default=None, repr=False)
@@ -61,6 +64,34 @@ class Capture:
 
     def __len__(self) -> int:
         return len(self.pictures)
+
+    @property
+    def distorted(self) -> bool:
+        """Whether the lens has a distortion, which the intrinsics lack."""
+        return self.lenses is not None or self.has_unknown_lens
+
+    def undistorted(self) -> Capture:
+        """Return the capture with the sizes, intrinsics and depth of undistorted pictures, where its lenses are known.
+
+        `pictures` are the files as they are; `CaptureFrames` undistorts what it reads of them. Raises InputError for
+        coefficients of no lens, and MissingExtraError where there are some and pycolmap is not installed.
+        """
+        if self.lenses is None or self.intrinsics is None:
+            return self
+        lenses = zip(self.lenses, self.sizes, strict=True)
+        undone = tuple(None if lens is None else undistortion(lens, size, self.path) for lens, size in lenses)
+        known = zip(undone, self.sizes, self.intrinsics, strict=True)
+        fitted = [(size, K) if made is None else (made.size, made.intrinsics) for made, size, K in known]
+        capture = dataclasses.replace(
+            self,
+            sizes=tuple(size for size, _ in fitted),
+            intrinsics=np.stack([K for _, K in fitted]),
+            lenses=None,
+            undone=undone,
+            notes=tuple(note for note in self.notes if note != DISTORTED),
+        )
+        capture.__dict__["frame_names"] = self.frame_names
+        return capture
 
     @cached_property
     def frame_names(self) -> tuple[str, ...]:
@@ -95,7 +126,16 @@ class Capture:
                 return tuple(values[place] for place in chosen)
             return None if values is None else values[chosen]
 
-        fields = ("pictures", "sizes", "intrinsics", "world_from_camera", "depth_files", "timestamps")
+        fields = (
+            "pictures",
+            "sizes",
+            "intrinsics",
+            "world_from_camera",
+            "depth_files",
+            "timestamps",
+            "lenses",
+            "undone",
+        )
         capture = dataclasses.replace(self, **{name: taken(getattr(self, name)) for name in fields})
         capture.__dict__["frame_names"] = tuple(names)  # of the whole capture, also where fewer would be unique
         return capture
@@ -114,14 +154,16 @@ class Capture:
             return None
         with self.naming_files():
             values = self.read_depth_file(path)
-            (width, height), (rows, columns) = self.sizes[frame], values.shape
+            undone = None if self.undone is None else self.undone[frame]
+            (width, height), (rows, columns) = self.sizes[frame] if undone is None else undone.stored, values.shape
             if abs(columns * height - rows * width) > max(width, height):  # more than one pixel of rounding
                 turned = TURNED if abs(rows * height - columns * width) <= max(width, height) else ""
                 raise InputError(
                     f"{path} has {columns} x {rows} pixels and its picture {width} x {height}; expected the same shape"
                     f"{turned}"
                 )
-        return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+        values = np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+        return values if undone is None else undone.nearest(values)
 
 
 def checked_sizes(pictures: Sequence[Path], source: Path) -> tuple[tuple[int, int], ...]:
@@ -141,6 +183,12 @@ def fitted_intrinsics(
     """Return intrinsics of cameras of (width, height) at the pictures' sizes; raises InputError for another shape."""
     cameras = zip(intrinsics, camera_sizes, sizes, strict=True)
     return np.stack([resized_intrinsics(matrix, size, picture, source) for matrix, size, picture in cameras])
+
+
+def lenses_of(lenses: Iterable[Lens | None]) -> tuple[Lens | None, ...] | None:
+    """Return the lenses of pictures, or None where none has a distortion."""
+    found = tuple(lenses)
+    return found if any(found) else None
 
 
 def left_out(missing: Sequence[str], count: int, what: str) -> tuple[str, ...]:

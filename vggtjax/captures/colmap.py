@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vggtjax.captures.cameras import DISTORTED, world_from_camera_of
-from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out
+from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out, lenses_of
 from vggtjax.captures.colmap_model import Suffix, read_views
 from vggtjax.captures.files import inside
 from vggtjax.errors import InputError
@@ -44,7 +44,7 @@ def find_model(folder: Path) -> _Model | None:
 def read_colmap(folder: Path) -> Capture:
     """Read a folder with a model and its pictures, or the model's own folder with the pictures beside it.
 
-    Pictures that the model did not register are left out. Of cameras with distortion the intrinsics alone are kept.
+    Pictures that the model did not register are left out.
     """
     if (model := find_model(folder)) is None:
         raise InputError(f"{folder} has no COLMAP model; expected sparse/0 with cameras and images, .bin or .txt")
@@ -60,7 +60,6 @@ def read_colmap(folder: Path) -> Capture:
     found = {path for path in place.rglob("*") if is_image_name(path) and not path.name.startswith(".")}
     lost = in_order(found - set(pictures)) if place.name == "images" else []
     missing = left_out([path.stem for path in lost], len(found), "pose")
-    distorted = any(view.distorted for view in taken)
     return Capture(
         "colmap",
         folder,
@@ -68,9 +67,9 @@ def read_colmap(folder: Path) -> Capture:
         sizes,
         fitted_intrinsics([view.intrinsics for view in taken], [view.size for view in taken], sizes, model.folder),
         world_from_camera_of(np.stack([view.camera_from_world for view in taken]), model.folder),
-        distorted=distorted,
+        lenses=(lenses := lenses_of(view.lens for view in taken)),
         left_out=missing,
-        notes=missing + (DISTORTED,) * distorted,
+        notes=missing + (DISTORTED,) * (lenses is not None),
     )
 
 

@@ -18,6 +18,7 @@ from jaxtyping import Float64
 
 from vggtjax.captures.cameras import PIXEL_CENTRE, intrinsics_matrix
 from vggtjax.captures.files import read_bytes, read_text
+from vggtjax.captures.lens import MODELS, Lens, lens_of
 from vggtjax.errors import InputError, one_line
 
 Suffix = Literal[".bin", ".txt"]
@@ -27,22 +28,12 @@ _NAMES = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
-# Numbers of focal lengths and of all parameters; the principal point follows the focal lengths. Without fisheye models:
-# K alone does not describe their cameras.
-_MODELS = {
-    "SIMPLE_PINHOLE": (1, 3),
-    "PINHOLE": (2, 4),
-    "SIMPLE_RADIAL": (1, 4),
-    "RADIAL": (1, 5),
-    "OPENCV": (2, 8),
-    "FULL_OPENCV": (2, 12),
-}
 _POINT_BYTES = 24  # of an observation in images.bin: x, y, the point's number
 _IMAGE_WORDS = 10  # of the first line of an image in images.txt
 _MOST_SIDE = 10**6  # pixels of a picture
 
 
-_Camera: TypeAlias = tuple[Float64[np.ndarray, "3 3"], tuple[int, int], bool]  # the first fields of ColmapView
+_Camera: TypeAlias = tuple[Float64[np.ndarray, "3 3"], tuple[int, int], Lens | None]  # the first fields of ColmapView
 
 
 class ColmapView(NamedTuple):
@@ -50,7 +41,7 @@ class ColmapView(NamedTuple):
 
     intrinsics: Float64[np.ndarray, "3 3"]
     size: tuple[int, int]  # width, height
-    distorted: bool  # the lens has a distortion, which the intrinsics lack
+    lens: Lens | None  # with a distortion, which the intrinsics lack
     camera_from_world: Float64[np.ndarray, "3 4"]
 
 
@@ -75,21 +66,18 @@ def read_views(folder: Path, suffix: Suffix = ".bin") -> dict[str, ColmapView]:
 
 
 def _camera(path: Path, kind: str, width: int, height: int, values: Sequence[float]) -> _Camera:
-    focal, _ = _MODELS[kind]
+    focal, _ = MODELS[kind]
     if not 0 < min(width, height) <= max(width, height) <= _MOST_SIDE:
         size = one_line(f"{width} x {height}", 60)
         raise InputError(f"{path} has a camera of {size} pixels; expected sides of 1 to {_MOST_SIDE}")
     fx, fy, (cx, cy) = values[0], values[focal - 1], values[focal : focal + 2]
     intrinsics = intrinsics_matrix(fx, fy, cx, cy, first_pixel=PIXEL_CENTRE, source=path)
-    return intrinsics, (width, height), any(values[focal + 2 :])
+    return intrinsics, (width, height), lens_of(kind, values, (width, height), path)
 
 
 def _check_model(path: Path, kind: str) -> None:
-    if kind not in _MODELS:
-        raise InputError(
-            f"{path} has a camera of kind {one_line(kind, 40)}; expected one of {', '.join(_MODELS)}: undistort the "
-            "pictures first (colmap image_undistorter)"
-        )
+    if kind not in MODELS:
+        raise InputError(f"{path} has a camera of kind {one_line(kind, 40)}; expected one of {', '.join(MODELS)}")
 
 
 def _binary_cameras(path: Path) -> Mapping[int, _Camera]:
@@ -99,7 +87,7 @@ def _binary_cameras(path: Path) -> Mapping[int, _Camera]:
         number, model, width, height = reader.next("<iiQQ")
         kind = _NAMES[model] if 0 <= model < len(_NAMES) else str(model)
         _check_model(path, kind)
-        cameras[number] = _camera(path, kind, width, height, reader.next(f"<{_MODELS[kind][1]}d"))
+        cameras[number] = _camera(path, kind, width, height, reader.next(f"<{MODELS[kind][1]}d"))
     return cameras
 
 
@@ -115,8 +103,8 @@ def _text_cameras(path: Path) -> Mapping[int, _Camera]:
         except (ValueError, IndexError):
             raise InputError(f"{path} has {line[:80]!r}; expected CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]") from None
         _check_model(path, kind)
-        if len(values) != _MODELS[kind][1]:
-            raise InputError(f"{path} has {len(values)} parameters of a {kind}; expected {_MODELS[kind][1]}")
+        if len(values) != MODELS[kind][1]:
+            raise InputError(f"{path} has {len(values)} parameters of a {kind}; expected {MODELS[kind][1]}")
         cameras[number] = _camera(path, kind, width, height, values)
     return cameras
 

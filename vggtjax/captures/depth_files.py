@@ -9,8 +9,8 @@ from jaxtyping import Float32
 
 from vggtjax.captures.files import read_bytes
 from vggtjax.captures.pictures import PNG, opening
-from vggtjax.errors import InputError, check_extra, check_regular, one_line
-from vggtjax.storage.arrays import read_array
+from vggtjax.errors import InputError, ResultError, check_extra, check_regular, one_line
+from vggtjax.storage.arrays import read_array, read_arrays, read_headers
 
 SINTEL_TAG = b"PIEH"  # the float 202021.25, little-endian: the first bytes of .dpt and .cam
 _DPT_HEADER = 12  # bytes: the tag, width, height
@@ -46,15 +46,38 @@ def read_dpt(path: Path) -> Float32[np.ndarray, "h w"]:
 
 
 def read_npy(path: Path, per_unit: float = 1) -> Float32[np.ndarray, "h w"]:
-    """Read an .npy of shape (h, w) or (h, w, 1) without a unit; whole numbers are `per_unit` a unit.
+    """Read an .npy of shape (h, w), beside axes of length 1, without a unit; whole numbers are `per_unit` a unit.
 
     Raises InputError for anything else.
     """
-    values = read_array(path)
-    if values.ndim == 3 and values.shape[2] == 1:
-        values = values[..., 0]
+    return _one_map(read_array(path), path, per_unit)
+
+
+def read_npz(path: Path, per_unit: float = 1) -> Float32[np.ndarray, "h w"]:
+    """Read the array `depth` of an .npz, or its only array, as `read_npy` reads one.
+
+    Raises InputError for anything else.
+    """
+    try:
+        names = list(read_headers(path))
+        if "depth" not in names and len(names) != 1:
+            raise InputError(
+                f"{path} has the arrays {one_line(', '.join(names), 80)}; expected one, or one named depth"
+            )
+        name = "depth" if "depth" in names else names[0]
+        values = read_arrays(path, [name])[name]
+    except ResultError as error:
+        raise InputError(f"{path} cannot be read: {error}") from error
+    return _one_map(values, path, per_unit)
+
+
+def _one_map(values: np.ndarray, path: Path, per_unit: float) -> Float32[np.ndarray, "h w"]:
+    shape = values.shape
+    for axis in reversed(range(values.ndim)):
+        if values.ndim > 2 and values.shape[axis] == 1:
+            values = values.squeeze(axis)
     if values.ndim != 2 or values.dtype.kind not in "fiu":
-        raise InputError(f"{path} has shape {values.shape} of {values.dtype}; expected (h, w) or (h, w, 1) of numbers")
+        raise InputError(f"{path} has shape {shape} of {values.dtype}; expected numbers of shape (h, w)")
     return values.astype(np.float32) / np.float32(1 if values.dtype.kind == "f" else per_unit)
 
 

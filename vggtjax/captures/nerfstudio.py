@@ -17,11 +17,12 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from vggtjax.captures.cameras import DISTORTED, PIXEL_CENTRE, from_opengl, intrinsics_matrix
-from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics
+from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, lenses_of
 from vggtjax.captures.depth_files import read_npy, read_png
 from vggtjax.captures.files import inside
+from vggtjax.captures.lens import opencv_lens
 from vggtjax.captures.numbers import number, numbers
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, one_line
 from vggtjax.media.images import is_image_name
 from vggtjax.media.order import in_order
 from vggtjax.storage.json_values import read_json
@@ -30,7 +31,7 @@ NAMES = ("transforms.json", "transforms_train.json")
 _MOST_BYTES = 2**26
 _PER_UNIT = 1000.0
 _PINHOLES = {"OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE"}
-_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_FISHEYE = "OPENCV_FISHEYE"
 _SUFFIXES = (".png", ".jpg", ".jpeg")  # of names without one, as Blender's scenes have
 
 
@@ -51,11 +52,13 @@ def read_nerfstudio(folder: Path) -> Capture:
     sizes = checked_sizes(pictures, path)
     # Numbers of a frame come before those of all.
     merged = [{**{key: scene[key] for key in scene if key != "frames"}, **frame} for _, frame in found]
-    for camera in merged:
-        _check_model(camera, path)
+    models = [_model(camera, path) for camera in merged]
     cameras = [_camera(camera, size, path) for camera, size in zip(merged, sizes, strict=True)]
+    lenses = lenses_of(
+        opencv_lens(camera, matrix, size, path, model=model)
+        for camera, model, (matrix, size) in zip(merged, models, cameras, strict=True)
+    )
     depths = [_depth_file(folder, frame, path) for _, frame in found]
-    distorted = any(camera.get(name, 0) != 0 for camera in merged for name in _DISTORTION)
     return Capture(
         "nerfstudio",
         folder,
@@ -63,10 +66,10 @@ def read_nerfstudio(folder: Path) -> Capture:
         sizes,
         fitted_intrinsics([matrix for matrix, _ in cameras], [size for _, size in cameras], sizes, path),
         from_opengl(_original(scene, [frame for _, frame in found], path), path),
-        distorted=distorted,
+        lenses=lenses,
         depth_files=tuple(depths) if any(depths) else None,
         read_depth_file=_read_depth,
-        notes=(DISTORTED,) * distorted,
+        notes=(DISTORTED,) * (lenses is not None),
     )
 
 
@@ -81,13 +84,14 @@ def _picture(folder: Path, frame: Mapping[str, Any], source: Path) -> Path:
     return next((path for path in named if path.is_file()), named[0])
 
 
-def _check_model(camera: Mapping[str, Any], source: Path) -> None:
+def _model(camera: Mapping[str, Any], source: Path) -> str:
+    """Return the camera's model, in COLMAP's words; instant-ngp tells a fisheye by a field of its own."""
     model = camera.get("camera_model", "PINHOLE")
-    if not isinstance(model, str) or model.upper() not in _PINHOLES or camera.get("is_fisheye"):
-        shown = "fisheye" if camera.get("is_fisheye") else repr(model)[:40]
-        raise InputError(
-            f"{source} has a camera of the model {shown}; expected a pinhole: undistort the pictures first"
-        )
+    model = model.upper() if isinstance(model, str) else repr(model)
+    if model not in (*_PINHOLES, _FISHEYE):
+        expected = ", ".join(sorted((*_PINHOLES, _FISHEYE)))
+        raise InputError(f"{source} has a camera of the model {one_line(model, 40)}; expected one of {expected}")
+    return _FISHEYE if camera.get("is_fisheye") else model
 
 
 def _camera(

@@ -11,15 +11,16 @@ https://github.com/PolyCam/polyform
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
 from vggtjax.captures.cameras import DISTORTED, PIXEL_CENTRE, from_opengl, intrinsics_matrix
-from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out
+from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out, lenses_of
 from vggtjax.captures.depth_files import read_png
 from vggtjax.captures.files import files
+from vggtjax.captures.lens import Lens, opencv_lens
 from vggtjax.captures.numbers import number
 from vggtjax.captures.pictures import PNG, opening
 from vggtjax.errors import InputError
@@ -59,9 +60,10 @@ def read_polycam(folder: Path) -> Capture:
         folder,
         paths,
         sizes,
-        fitted_intrinsics([matrix for matrix, _, _ in read], [size for _, size, _ in read], sizes, root),
-        from_opengl(np.stack([pose for _, _, pose in read]), root),
-        distorted=not corrected,
+        fitted_intrinsics([camera.intrinsics for camera in read], [camera.size for camera in read], sizes, root),
+        from_opengl(np.stack([camera.pose for camera in read]), root),
+        lenses=None if corrected else lenses_of(camera.lens for camera in read),
+        has_unknown_lens=not corrected and not any(camera.lens for camera in read),
         metric=True,
         depth_files=tuple(depths.get(name) for name in cameras) if depths else None,
         read_depth_file=_read_depth,
@@ -77,7 +79,14 @@ def _pictures(folder: Path) -> dict[str, Path]:
     return {path.stem: path for path in in_order(paths)}
 
 
-def _camera(path: Path) -> tuple[Float64[np.ndarray, "3 3"], tuple[int, int], Float64[np.ndarray, "4 4"]]:
+class _Camera(NamedTuple):
+    intrinsics: Float64[np.ndarray, "3 3"]
+    size: tuple[int, int]  # width, height
+    pose: Float64[np.ndarray, "4 4"]
+    lens: Lens | None  # of OpenCV's coefficients, where the file has some
+
+
+def _camera(path: Path) -> _Camera:
     values = read_json(path, dict[str, Any], "camera")
     width, height = int(number(values, "width", path)), int(number(values, "height", path))
     if min(width, height) < 1:
@@ -85,7 +94,8 @@ def _camera(path: Path) -> tuple[Float64[np.ndarray, "3 3"], tuple[int, int], Fl
     fx, fy, cx, cy = (number(values, key, path) for key in ("fx", "fy", "cx", "cy"))
     rows = [[number(values, f"t_{row}{column}", path) for column in range(4)] for row in range(3)]
     matrix = intrinsics_matrix(fx, fy, cx, cy, first_pixel=PIXEL_CENTRE, source=path)
-    return matrix, (width, height), np.array([*rows, [0, 0, 0, 1]], np.float64)
+    lens = opencv_lens(values, matrix, (width, height), path)
+    return _Camera(matrix, (width, height), np.array([*rows, [0, 0, 0, 1]], np.float64), lens)
 
 
 def _read_depth(path: Path) -> Float32[np.ndarray, "h w"]:

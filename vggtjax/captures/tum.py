@@ -117,7 +117,7 @@ def read_tum(folder: Path) -> Capture:
         sizes,
         None if intrinsics is None else np.tile(intrinsics, (len(pictures), 1, 1)),
         None if poses is None else poses[posed[frames]],
-        distorted=DISTORTED in more,
+        has_unknown_lens=DISTORTED in more,
         metric=True,
         depth_files=depth_files(folder, listed.times, frames),
         read_depth_file=partial(read_png, per_metre=PER_METRE),

@@ -118,7 +118,8 @@ def load_clip(
         source: a folder of images, a pattern such as "frames/*.png", an image or video file, a list of image paths,
             a list of PIL images or of arrays [H, W, 3], or one array [S, H, W, 3] (uint8, uint16, or floating point
             in [0, 1]; 8 bits are kept, but floating point stays as it is where it is not resized), or a capture of an
-            app (see `vggtjax.captures.find_capture`).
+            app (see `vggtjax.captures.find_capture`), whose frames are undistorted where it has coefficients of its
+            lens; or what `open_source` returned.
             Files of folders and patterns are taken in natural order (frame_2 before frame_10), hidden files and files
             that are not images left out; a list keeps its order.
         model: what `load_model` returned: its own size and patch size are taken, but `size` wins where it is given.
@@ -218,6 +219,8 @@ def warn_of_left_out(source: Source) -> None:
     if isinstance(source, CaptureFrames):
         for note in source.capture.left_out:
             logger.warning("%s: %s", source.capture.path, note)
+        if source.capture.lenses is not None:
+            logger.warning("%s: the coefficients of its lens are ignored; its frames are not undistorted", source.name)
 
 
 def _joined(pixels: list[Rendered], fits: list[Fit], *, warn: bool) -> tuple[Float32[np.ndarray, "S H W 3"], list[Fit]]:

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Bool
 from PIL import Image, ImageOps
 
+from vggtjax.captures.frames import CaptureFrames
+from vggtjax.captures.lens import Undistortion
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.sources import open_source
 from vggtjax.clips.truth import at_clip_pixels
@@ -47,7 +49,8 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
     A pixel moves where a grey or coloured picture is bright and not transparent, where a picture with a palette, as
     DAVIS has them, or of 16 bits, as KITTI has them, holds an object (any value but 0), or where a cut-out is opaque.
     Crop, scale and padding are those of the frames: every pixel takes the value at the place in the source that its
-    centre shows, and padding is static. Frames that are turned by EXIF have masks of the shown or the stored pixels.
+    centre shows, and padding is static. Frames that are turned by EXIF have masks of the shown or the stored pixels,
+    and frames that are undistorted have those of the pictures as they were or, by their size, of the undistorted ones.
 
     Args:
         folder: a picture per frame, matched by name (`frame_3.png` for `frame_3.jpg`). If no picture is named like a
@@ -103,6 +106,13 @@ def masks_at_clip_pixels(
         return masks
     if masks.dtype == bool and masks.shape == loaded.images.shape[:3]:
         return np.stack([_resampled(mask, clip, i, partial(loaded.from_source, i)) for i, mask in enumerate(masks)])
+    if (
+        masks.dtype == bool
+        and masks.ndim == 3
+        and len(masks) == len(clip)
+        and all(_is_stored(masks.shape[:0:-1], clip, frame) for frame in range(len(clip)))
+    ):
+        return np.stack([_resampled(mask, clip, i, _to_mask(mask, clip, i)) for i, mask in enumerate(masks)])
     if masks.dtype == bool and masks.ndim == 3 and len(masks) == len(clip) and {masks.shape[1:]} == sizes:
         return at_clip_pixels(clip, masks)
     turns = [_turns(clip).get(name, 1) for name in clip.frame_names]
@@ -125,6 +135,8 @@ def _turns(clip: Clip) -> dict[str, int]:
 
 def _mask(path: Path, clip: Clip, frame: int, turns: dict[str, int]) -> Bool[np.ndarray, "H W"]:
     picture = read_mask(path)
+    if _is_stored(picture.shape[::-1], clip, frame):
+        return _resampled(picture, clip, frame, _to_mask(picture, clip, frame))
     height, width = clip.source_size[frame]
     turn = turns.get(clip.frame_names[frame], 1)
     is_stored = abs(picture.shape[1] * width - picture.shape[0] * height) <= max(picture.shape)
@@ -135,7 +147,25 @@ def _mask(path: Path, clip: Clip, frame: int, turns: dict[str, int]) -> Bool[np.
             f"mask {path.name} is {picture.shape[1]} x {picture.shape[0]} and its frame {width} x {height}; "
             "expected the same shape"
         )
-    return _resampled(picture, clip, frame, lambda places: places / [width, height] * picture.shape[::-1])
+    return _resampled(picture, clip, frame, _to_mask(picture, clip, frame))
+
+
+def _is_stored(size: tuple[int, int], clip: Clip, frame: int) -> bool:
+    """Return whether a mask of (width, height) is of the picture of an undistorted frame as it was, by its shape."""
+    undone = _undistortion(clip, frame)
+    return undone is not None and undone.is_stored(size)
+
+
+def _to_mask(mask: np.ndarray, clip: Clip, frame: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function that gives a mask's coordinates of places in the source."""
+    undone = _undistortion(clip, frame)
+    if undone is not None and _is_stored(mask.shape[::-1], clip, frame):
+        return lambda places: undone.stored_points(places) / undone.stored * mask.shape[::-1]
+    return lambda places: places / clip.source_size[frame, ::-1] * mask.shape[::-1]
+
+
+def _undistortion(clip: Clip, frame: int) -> Undistortion | None:
+    return clip.source.undistortion(clip.frame_names[frame]) if isinstance(clip.source, CaptureFrames) else None
 
 
 def _resampled(

@@ -15,6 +15,7 @@ from PIL import Image, ImageOps
 
 from vggtjax.captures.files import folder_name
 from vggtjax.captures.frames import CaptureFrames
+from vggtjax.captures.lens import check_no_fisheye
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, find_capture
 from vggtjax.clips.manifest import MOST_BYTES, is_manifest, read_manifest, source_name
 from vggtjax.clips.mixture import check_frames, odd_ones
@@ -30,16 +31,22 @@ from vggtjax.storage.remote import check_url, download, is_url, list_url, local_
 _NUMBERED = re.compile(r"%0?(\d?)d")  # a number of at least so many digits, in C's words
 
 Name: TypeAlias = str | os.PathLike[str]
-ClipSource: TypeAlias = Name | Sequence[Name] | Sequence[Image.Image] | Sequence[np.ndarray] | np.ndarray
+ClipSource: TypeAlias = Name | Sequence[Name] | Sequence[Image.Image] | Sequence[np.ndarray] | np.ndarray | Source
+
+_OPENED = (ImageFiles, VideoFile, Animation, ArrayFrames)
 
 
-def open_source(source: ClipSource) -> Source:
+def open_source(source: ClipSource, *, undistort: bool = True) -> Source:
     """Return the source of frames that `source` names, without reading the frames; `load_clip` lists what it can be.
 
-    Raises ClipError for a missing source, or one without frames.
+    With `undistort` the frames of a capture that has coefficients of its lens are those that a pinhole would see.
+    Raises ClipError for a missing source, one without frames, or lenses that no pinhole stands for, and
+    MissingExtraError where frames are to be undistorted and pycolmap is not installed.
     """
+    if isinstance(source, _OPENED):
+        return source
     if isinstance(source, (str, os.PathLike)):
-        return _from_path(os.fspath(source))
+        return _from_path(os.fspath(source), undistort)
     if hasattr(source, "__array__"):
         return ArrayFrames.from_arrays(source)
     if isinstance(source, Sequence) and not isinstance(source, bytes):
@@ -122,12 +129,12 @@ def _is_clip(entry: Path) -> bool:
     return not entry.name.startswith(".") and (entry.is_dir() or is_video_name(entry) or bool(capture_kind(entry)))
 
 
-def _from_path(name: str) -> Source:
+def _from_path(name: str, undistort: bool) -> Source:
     path = Path(name)
     with reading(name, ClipError):
         if not name or "\0" in name:
             raise ClipError(f"{name!r} is not a path; expected a folder, a pattern, or an image or video file")
-        if (capture := _capture(path)) is not None:
+        if (capture := _capture(path, undistort)) is not None:
             return capture
         if path.is_dir():
             entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
@@ -161,9 +168,13 @@ def _pattern(path: Path) -> str:
     return os.path.join(glob.escape(str(there)), path.relative_to(there))  # noqa: PTH118
 
 
-def _capture(path: Path) -> CaptureFrames | None:
+def _capture(path: Path, undistort: bool) -> CaptureFrames | None:
     try:
         capture = find_capture(path)
+        if capture is not None and undistort:
+            capture = capture.undistorted()
+        elif capture is not None:
+            check_no_fisheye(capture.lenses, path)
     except InputError as error:
         raise ClipError(f"{error}; name the folder of the pictures to leave its cameras out") from error
     return None if capture is None else CaptureFrames(tuple(path.absolute() for path in capture.pictures), capture)

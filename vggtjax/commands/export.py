@@ -37,15 +37,15 @@ def export(
         from vggtjax.exports.write import check_export, export_result
 
         check_export(out, to)
-        source = None
-        if pictures is not None:
-            from vggtjax.clips.sources import open_source
-
-            source = open_source(pictures)
         from vggtjax.reconstruction import Reconstruction
 
         with report.stage("read"):
             loaded = Reconstruction.load(result)
+        source = None
+        if pictures is not None:
+            from vggtjax.clips.sources import open_source
+
+            source = open_source(pictures, undistort="undistorted" in loaded.settings)
         with report.stage("write") as progress:
             export_result(loaded, out, to, source=source, exporting=exporting, progress=progress)
     report.line(f"{to}: {out}")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vggtjax.batch.recipe import ClipRecipe
+from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.masks import load_masks
@@ -15,6 +16,7 @@ from vggtjax.clips.sources import open_source
 from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.report import Report
 from vggtjax.errors import DeviceMemoryError, one_line
+from vggtjax.known.stated import disagreement, focal_stated
 from vggtjax.media.sampling import Sampling, Source
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.pipeline.run import reconstruct
@@ -42,8 +44,8 @@ class OneClip:
         out: Path,
         source: Source | None = None,  # of these frames, where it is open: what is odd about it is said once
     ) -> None:
-        self._report, self._frames = report, frames
-        self._source = open_source(frames) if source is None else source
+        self._report = report
+        self._source = open_source(frames, undistort=recipe.undistort) if source is None else source
         self._model, self._fusion, self._recipe, self._given, self._out = model, fusion, recipe, given, out
         self._fitter = recipe.framing.fitter(model.config)
 
@@ -134,7 +136,7 @@ class OneClip:
         plan = LongRun(count, recipe.sampling, self._fitter, recipe.saving, given.tracks, self._report.stage)
         masks = False if given.no_masks else given.masks
         how: dict[str, Any] = {"options": recipe.options, "long_run": plan, "fusion": self._fusion, "masks": masks}
-        return reconstruct_long(self._model, self._frames, self._out, windows, **how)
+        return reconstruct_long(self._model, self._source, self._out, windows, **how)
 
     def _together(self) -> Reconstruction:
         """Reconstruct all frames at once, and write the result."""
@@ -144,7 +146,9 @@ class OneClip:
             announce(self._out, forecast_bytes(clip.images.shape[:3], clip.source_size, saving))
             masks = False if given.no_masks else None if given.masks is None else load_masks(given.masks, clip)
             queries = None if given.tracks is None else parse_queries(given.tracks, clip)
-        self._report.note(_taken(clip, self._source.total(Sampling())))
+        stated = focal_stated(clip)
+        lens = "" if stated is None else f"; the camera states {stated.words}, {stated.pixels:.4g} pixels"
+        self._report.note(_taken(clip, self._source.total(Sampling())) + lens)
         result = reconstruct(
             self._model,
             clip,
@@ -157,6 +161,8 @@ class OneClip:
             devices=recipe.devices,
             on_stage=self._report.stage,
         )
+        if stated is not None and recipe.known.intrinsics is None and (words := disagreement(stated, result)):
+            self._report.note(words)
         with self._report.stage("write") as progress:
             pictures = clip.pictures() if saving.resolution == "original" else None
             facts = RunFacts(self._report.seconds)
@@ -170,7 +176,9 @@ def _taken(clip: Clip, available: int | None) -> str:
     count, height, width = clip.images.shape[:3]
     source_height, source_width = clip.source_size[0]
     frames = f"{count}" if available in (None, count) else f"{count} of {available}"
-    text = f"{frames} frames of {source_width} x {source_height} pixels, fitted to {width} x {height}"
+    lenses = clip.source.lenses_undone if isinstance(clip.source, CaptureFrames) else ""
+    undone = f", undistorted ({lenses})" if lenses else ""
+    text = f"{frames} frames of {source_width} x {source_height} pixels{undone}, fitted to {width} x {height}"
     if clip.sampling.max_frames == count and available is not None and clip.sampling.start + count < available:
         spread = -(-(available - clip.sampling.start) // count)
         if clip.sampling.step < spread and clip.sampling.fps is None:

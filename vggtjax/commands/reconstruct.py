@@ -51,7 +51,7 @@ def reconstruct(
         from vggtjax.results.folder import check_folder
 
         given.check(recipe, windows)
-        opened = open_source(frames)
+        opened = open_source(frames, undistort=recipe.undistort)
         opened.total(recipe.sampling)
         next(opened.frames(Sampling()))  # finds a broken source before the model is loaded, which takes longer
         check_refinement(recipe.options.refine_cameras, recipe.known.poses is not None)

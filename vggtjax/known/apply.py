@@ -11,7 +11,7 @@ import numpy as np
 
 from vggtjax.cameras import world_from_camera
 from vggtjax.known.consistency import consistent_with_poses
-from vggtjax.known.depths import captured_depths
+from vggtjax.known.depths import captured_depths, sampled_depths
 from vggtjax.known.given import Given
 from vggtjax.known.intrinsics import shared_focal
 from vggtjax.known.metric import MetricScale, from_baseline, from_camera_height, from_depths
@@ -114,11 +114,12 @@ def _metric_scale(result: Result, given: Given) -> MetricScale | None:
         return from_baseline(result, given.baseline)
     if known.camera_height is not None:
         return from_camera_height(result, known.camera_height)
-    if given.depths is not None:
-        return from_depths(result, given.depths, str(known.known_depths))
-    if known.known_depths == SOURCE and given.capture is not None:
-        return from_depths(result, captured_depths(given.capture, result), str(given.capture.path))
-    return None
+    name, depths = str(known.known_depths), given.depths
+    if given.depth_maps is not None:
+        depths = sampled_depths(given.depth_maps, result, name)
+    elif known.known_depths == SOURCE and given.capture is not None:
+        name, depths = str(given.capture.path), captured_depths(given.capture, result)
+    return None if depths is None else from_depths(result, depths, name, robust=known.robust)
 
 
 def _unit(given: Given, scale: MetricScale | None) -> str:

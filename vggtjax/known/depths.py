@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 
 from vggtjax.captures.capture import Capture
 from vggtjax.clips.truth import Placed
@@ -64,6 +64,23 @@ def check_depths(capture: Capture) -> None:
     maps = [capture.depth(frame) is not None for frame in range(len(capture))]
     if not any(maps):
         raise InputError(f"{capture.path} has no depth maps for these frames; give known depths as a file")
+
+
+def sampled_depths(maps: Float32[np.ndarray, "S H W"], result: Result, name: str) -> DepthSamples:
+    """Return depth maps at the result's pixels at up to 10000 valid static ones of each frame.
+
+    Raises InputError, which says `name`, where the maps know no depth there.
+    """
+    usable = result.valid_pixels & ~result.dynamic_mask & (maps > 0)
+    found = []
+    for frame, places in enumerate(usable):
+        rows, columns = np.nonzero(places)
+        step = max(1, -(-len(rows) // _FRAME_DEPTHS))
+        found.append(np.stack([np.full(len(rows), frame), rows, columns])[:, ::step])
+    frames, rows, columns = np.concatenate(found, axis=1)
+    if not len(frames):
+        raise InputError(f"the depth maps of {name} know nothing of the static pixels; give others, or a baseline")
+    return DepthSamples(frames, rows, columns, maps[frames, rows, columns].astype(np.float64))
 
 
 def captured_depths(capture: Capture, result: Result) -> DepthSamples:

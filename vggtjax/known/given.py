@@ -7,15 +7,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from vggtjax.captures.capture import Capture
 from vggtjax.clips.clip import Clip
 from vggtjax.errors import InputError
+from vggtjax.known.depth_maps import depth_files, read_depth_maps
 from vggtjax.known.depths import MOST_FILE_BYTES, DepthSamples, check_depths, read_depths
 from vggtjax.known.intrinsics import at_clip_pixels, read_intrinsics
-from vggtjax.known.options import SOURCE, Baseline, KnownGeometry, parse_baseline
+from vggtjax.known.options import EXIF, SOURCE, Baseline, KnownGeometry, parse_baseline
 from vggtjax.known.poses import checked_known_poses, pose_table, read_poses
+from vggtjax.known.stated import stated_intrinsics
 from vggtjax.results.result import Result
 from vggtjax.storage.csv_file import read_csv
 
@@ -29,6 +31,7 @@ class Given(NamedTuple):
     poses_name: str = ""  # where the poses come from
     baseline: Baseline | None = None
     depths: DepthSamples | None = None  # of a file
+    depth_maps: Float32[np.ndarray, "S H W"] | None = None  # of a folder: metres, 0 where it is unknown
     leave_out: Bool[np.ndarray, "S H W"] | None = None
     capture: Capture | None = None  # of the clip's frames, where an option asks for it
 
@@ -40,12 +43,15 @@ def check_readable(known: KnownGeometry) -> None:
         if path not in (None, SOURCE) and not os.path.lexists(path):
             flag = f"--{name.replace('_', '-')}"
             raise InputError(f"{flag} is {str(path)!r}, and there is no such file; expected a file or {SOURCE!r}")
-    if known.intrinsics not in (None, SOURCE):
+    if known.intrinsics not in (None, SOURCE, EXIF):
         read_intrinsics(known.intrinsics)
     if known.poses not in (None, SOURCE):
         pose_table(known.poses, known.quaternion)
     if known.known_depths not in (None, SOURCE):
-        read_csv(Path(known.known_depths), most_bytes=MOST_FILE_BYTES)
+        if os.path.isdir(known.known_depths):  # noqa: PTH112 - False for an over-long name
+            depth_files(Path(known.known_depths))
+        else:
+            read_csv(Path(known.known_depths), most_bytes=MOST_FILE_BYTES)
     if known.leave_out is not None and not os.path.isdir(known.leave_out):  # noqa: PTH112 - False for an over-long name
         raise InputError(f"leave_out is {str(known.leave_out)!r}; expected a folder of pictures")
 
@@ -81,11 +87,10 @@ def read_known(
         )
     else:
         capture = capture.for_frames(frames.frame_names)
-    intrinsics = poses = baseline = depths = None
+    intrinsics = poses = baseline = depths = maps = None
     poses_name = ""
     if known.intrinsics is not None:
-        matrices = _recorded(capture, "intrinsics") if known.intrinsics == SOURCE else read_intrinsics(known.intrinsics)
-        intrinsics = at_clip_pixels(matrices, frames, "intrinsics")
+        intrinsics = at_clip_pixels(_matrices(known.intrinsics, frames, capture), frames, "intrinsics")
     if known.poses is not None:
         from_source = known.poses == SOURCE
         poses = (
@@ -103,9 +108,22 @@ def read_known(
             )
     if known.known_depths == SOURCE and capture is not None:
         check_depths(capture)
+    elif known.known_depths is not None and os.path.isdir(known.known_depths):  # noqa: PTH112
+        maps = read_depth_maps(Path(known.known_depths), frames, known.depths_per_metre)
     elif known.known_depths is not None:
         depths = read_depths(known.known_depths, frames)
-    return Given(known, intrinsics, poses, poses_name, baseline, depths, leave_out, capture)
+    return Given(known, intrinsics, poses, poses_name, baseline, depths, maps, leave_out, capture)
+
+
+def _matrices(text: str, frames: Clip | Result, capture: Capture | None) -> Float64[np.ndarray, "F 3 3"]:
+    """Return the intrinsics that the option names, in pixels of the source."""
+    if text == EXIF:
+        if not isinstance(frames, Clip):
+            raise InputError(
+                "intrinsics is 'exif', and a result has no files; expected a clip that was loaded from files"
+            )
+        return stated_intrinsics(frames)
+    return _recorded(capture, "intrinsics") if text == SOURCE else read_intrinsics(text)
 
 
 def _recorded(capture: Capture | None, name: str) -> Float64[np.ndarray, "S n n"]:

@@ -11,11 +11,11 @@ from jaxtyping import Float64
 
 from vggtjax.clips.truth import Placed, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError, one_line
-from vggtjax.known.options import SOURCE, KnownGeometry
+from vggtjax.known.options import EXIF, SOURCE, KnownGeometry
+from vggtjax.media.focal import FOCAL_RANGE
 from vggtjax.results.result import Result
 from vggtjax.storage.trajectories import read_numbers
 
-_FOCAL_RANGE = (0.1, 50.0)  # in long sides of the picture
 _MOST_SKEW = 1e-3  # of the focal length
 _OFF_CENTRE, _FAR_OFF = 0.2, 0.45  # of the picture's sides from its middle: warned about, and refused
 
@@ -38,8 +38,8 @@ def read_intrinsics(text: str) -> Float64[np.ndarray, "F 3 3"]:
             numbers = []
         if len(numbers) != 4 or not np.isfinite(numbers).all():
             raise InputError(
-                f"intrinsics is {one_line(text)!r}; expected fx,fy,cx,cy, four numbers in pixels, 'source', or a "
-                "file that is there"
+                f"intrinsics is {one_line(text)!r}; expected fx,fy,cx,cy, four numbers in pixels, 'source', 'exif', or "
+                "a file that is there"
             )
         return _matrices(np.array([numbers]))
     rows = read_numbers(text, (3, 4, 9))
@@ -53,7 +53,7 @@ def read_intrinsics(text: str) -> Float64[np.ndarray, "F 3 3"]:
 def known_values(known: KnownGeometry) -> dict[str, Any]:
     """Return what is given, as JSON values, with the intrinsics of a file as numbers: the file may change."""
     values = known.to_json()
-    if known.intrinsics not in (None, SOURCE):
+    if known.intrinsics not in (None, SOURCE, EXIF):
         values["intrinsics"] = read_intrinsics(known.intrinsics).tolist()
     return values
 
@@ -78,7 +78,7 @@ def at_clip_pixels(intrinsics: Float64[np.ndarray, "F 3 3"], clip: Placed, name:
                 f"{name} has {shown}: the principal point lies at the border of the picture or outside; expected "
                 "intrinsics in pixels of these pictures, so scale those of another size"
             )
-        low, high = (share * max(width, height) for share in _FOCAL_RANGE)
+        low, high = (share * max(width, height) for share in FOCAL_RANGE)
         if not (low <= fx <= high and low <= fy <= high):
             raise InputError(f"{name} has {shown}; expected focal lengths of {low:g} to {high:g} pixels")
     share = K[:, :2, 2] / clip.source_size[:, ::-1]

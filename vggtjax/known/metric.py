@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,13 @@ _REFINEMENTS = 5
 _THICK = 0.05  # of the floor on either side, in heights of the cameras above it
 _TILT = 30.0  # degrees between the floor's normal and the cameras' mean down
 _LEAST_FLOOR = 0.03  # share of the points
+_MANY, _FALLING = 1000, -0.3  # known depths, and the correlation of their logarithms with the predicted ones
+_TUKEY = 4.685  # standard deviations from which on values count nothing: 95 % as efficient as the mean
+_QUARTILE = 0.6745  # standard deviations, between which and its negative half of a normal distribution lies
+_LEAST_SPREAD = 1e-6  # of logarithms: that of a few exact depths may be 0
+_ROUNDS, _SETTLED = 100, 1e-6  # of the weights; and the step, in reaches, after which they stay
+
+logger = logging.getLogger(__name__)
 
 
 class MetricScale(NamedTuple):
@@ -79,19 +87,49 @@ def from_camera_height(result: Result, height: float) -> MetricScale:
     )
 
 
-def from_depths(result: Result, known: DepthSamples, name: str) -> MetricScale:
-    """Return the median of known over predicted depth. Raises InputError where none is predicted at these places."""
+def from_depths(result: Result, known: DepthSamples, name: str, *, robust: bool = False) -> MetricScale:
+    """Return the median of known over predicted depth; with `robust` the mean of those that agree.
+
+    A median moves with outliers on one side: with 30 % of them it is the 71st hundredth of the others. Tukey's biweight
+    gives values far from the others no weight (Beaton and Tukey, 1974); it starts in the shortest interval with half of
+    all values, and takes their spread from its length (Rousseeuw and Leroy, 1988).
+
+    Raises InputError where no depth is predicted at these places.
+    """
     predicted = result.depth[known.frames, known.rows, known.columns].astype(np.float64)
     used = result.valid_pixels[known.frames, known.rows, known.columns]
     if not used.any():
         raise InputError(f"{name} has no depth where one is predicted; expected places with points in the result")
-    ratio = np.log(known.depth[used] / predicted[used])
-    middle = float(np.median(ratio))
-    spread = float(np.median(np.abs(ratio - middle)))
+    depths, predicted = np.log(known.depth[used]), np.log(predicted[used])
+    if len(depths) >= _MANY and np.corrcoef(depths, predicted)[0, 1] < _FALLING:
+        logger.warning("the depths of %s fall where the prediction rises; are they disparities, not metres?", name)
+    ratio = depths - predicted
+    middle, weights = _biweight(ratio) if robust else (float(np.median(ratio)), np.ones(len(ratio)))
+    counted = weights > 0
+    spread = float(np.median(np.abs(ratio[counted] - middle)))
+    outliers = f"; {1 - counted.mean():.0%} of them are outliers, which do not count" if robust else ""
     return MetricScale(
         float(np.exp(middle)),
-        f"{int(used.sum())} known depths, from which the scaled ones differ by {spread:.1%} (median)",
+        f"{len(ratio)} known depths, from which the scaled ones differ by {spread:.1%} (median){outliers}",
     )
+
+
+def _biweight(values: Float64[np.ndarray, " N"]) -> tuple[float, Float64[np.ndarray, " N"]]:
+    """Return the place around which most values lie, and the weight of each, 0 for outliers."""
+    ordered = np.sort(values)
+    half = len(values) // 2
+    lengths = ordered[half:] - ordered[: len(values) - half]
+    first = int(np.argmin(lengths))
+    place = float(ordered[first] + lengths[first] / 2)
+    reach = _TUKEY * max(lengths[first] / 2 / _QUARTILE, _LEAST_SPREAD)
+    weights = np.ones(len(values))
+    for _ in range(_ROUNDS):
+        weights = np.maximum(1 - ((values - place) / reach) ** 2, 0) ** 2
+        moved = float(np.average(values, weights=weights)) - place
+        place += moved
+        if abs(moved) < _SETTLED * reach:
+            break
+    return place, weights
 
 
 def _reliable_pixels(result: Result) -> Bool[np.ndarray, "S H W"]:

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 import tyro
 
 from vggtjax.errors import InputError, one_line
@@ -14,6 +15,7 @@ from vggtjax.storage.json_values import check_fields
 from vggtjax.storage.trajectories import Quaternion
 
 SOURCE = "source"  # in place of a file: what the capture that the clip comes from says
+EXIF = "exif"  # in place of a file of intrinsics: what the camera wrote into the pictures, or the video
 
 
 class Baseline(NamedTuple):
@@ -32,9 +34,10 @@ def _words(metavar: str):
 class KnownGeometry:
     """Known cameras and lengths. Raises InputError for an invalid value, or for options that exclude each other."""
 
-    intrinsics: Annotated[str | None, _words("FX,FY,CX,CY|FILE|source")] = None
+    intrinsics: Annotated[str | None, _words("FX,FY,CX,CY|FILE|source|exif")] = None
     """known focal lengths and principal point in pixels of the source: four numbers, or a file with a 3 x 3 matrix or
-    with four numbers or nine a line, for all frames or for each; source: those of the capture's folder"""
+    with four numbers or nine a line, for all frames or for each; source: those of the capture's folder; exif: the focal
+    length that the camera wrote into the pictures or the video"""
     shared_focal: Switch = False
     """one focal length for the whole clip, the median of the predicted ones"""
     poses: Annotated[str | None, _words("FILE|source")] = None
@@ -47,9 +50,16 @@ class KnownGeometry:
     """metric scale: the distance between the cameras of frames I and J, such as 0,7,0.85"""
     camera_height: InWords[float | None] = None
     """metric scale: the mean height of the cameras above the floor, in metres"""
-    known_depths: Annotated[str | None, _words("FILE|source")] = None
-    """metric scale: a CSV file with columns frame, x, y and depth, in pixels of the source and metres; source: the
-    depth maps of the capture's folder"""
+    known_depths: Annotated[
+        str | None, tyro.conf.arg(metavar="FILE|FOLDER|source", help_behavior_hint="", aliases=("--depths",))
+    ] = None
+    """metric scale: a folder of depth maps, of a depth model or a lidar, named like the frames (.npz, .npy or .exr in
+    metres, .png of 16 bits); a CSV file with columns frame, x, y and depth, in pixels of the source and metres; source:
+    the depth maps of the capture's folder"""
+    depths_per_metre: InWords[float | None] = None
+    """steps of 16-bit pictures and of whole numbers in a folder of depth maps to the metre; 1000 by default"""
+    robust: Switch = False
+    """known depths that differ from most others count nothing: for maps with many wrong values, such as a third"""
     leave_out: InWords[Path | None] = None
     """folder of pictures, one per frame, bright where depth is left out, such as in the sky"""
 
@@ -69,6 +79,12 @@ class KnownGeometry:
         given = [flag for flag, value in scales.items() if value is not None]
         if len(given) > 1:
             raise InputError(f"{' and '.join(given)} each set the scale; give one of them")
+        if self.known_depths in (None, SOURCE) and self.depths_per_metre is not None:
+            raise InputError("--depths-per-metre is of a folder of depth maps; give the folder with --known-depths")
+        if self.depths_per_metre is not None and not 0 < self.depths_per_metre < np.inf:
+            raise InputError(f"depths_per_metre is {self.depths_per_metre}; expected a number above 0")
+        if self.known_depths is None and self.robust:
+            raise InputError("--robust is about known depths; give them with --known-depths")
         if self.baseline is not None:
             parse_baseline(self.baseline)
         if self.camera_height is not None and not 0.01 <= self.camera_height <= 10_000:

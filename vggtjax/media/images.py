@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -64,11 +64,15 @@ class ImageFiles:
 
     def total(self, sampling: Sampling) -> int:
         """Return how many frames `sampling` takes."""
-        return len(sampling.indices(len(self.paths)))
+        return len(self.taken(sampling))
+
+    def taken(self, sampling: Sampling) -> Sequence[int]:
+        """Return the indices of the files that `sampling` takes."""
+        return sampling.indices(len(self.paths))
 
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes. Raises ClipError for a file that cannot be read."""
-        for index in sampling.indices(len(self.paths)):
+        for index in self.taken(sampling):
             path = self.paths[index]
             yield Frame(path.stem, read_image(path, self._said))
 

@@ -72,6 +72,18 @@ class VideoFile:
         except (av.error.FFmpegError, OSError, EOFError) as error:
             raise _unreadable(self.path, 0, error) from error
 
+    def tags(self) -> dict[str, str]:
+        """Return what the file and its video stream say of themselves. Raises ClipError as `frames` does."""
+        import av
+        import av.error
+
+        try:
+            with _opened(self.path, av) as container:
+                stream = _video_stream(container, self.path, self._said)
+                return {**container.metadata, **stream.metadata}
+        except (av.error.FFmpegError, OSError, EOFError) as error:
+            raise _unreadable(self.path, 0, error) from error
+
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes; decoding stops after the last of them.
 

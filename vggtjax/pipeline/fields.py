@@ -82,6 +82,8 @@ def settings_of(
     settings |= {"clip": clip.source.name} if clip.source.name else {}
     if isinstance(clip.source, CaptureFrames) and clip.source.first_time is not None:
         settings["first_time"] = clip.source.first_time
+    if isinstance(clip.source, CaptureFrames) and clip.source.lenses_undone:
+        settings["undistorted"] = clip.source.lenses_undone
     return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}
 
 

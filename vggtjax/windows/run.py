@@ -13,6 +13,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float32
 
+from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.masks import load_masks, masks_digest
@@ -192,6 +193,8 @@ def run_windows(
         "fitter": dataclasses.asdict(plan.fitter),
         "windows": [frames, windows.window, windows.shared],
     }
+    if isinstance(opened, CaptureFrames) and opened.lenses_undone:
+        decides["undistorted"] = opened.lenses_undone
     clips = window_clips(opened, plan.sampling, plan.fitter, cut)
     first = next(clips)  # what is wrong with it is found before anything is written
     shape = (frames, *first.images.shape[1:3])

@@ -10,6 +10,7 @@ from jaxtyping import Float32
 
 from vggtjax.captures.capture import Capture
 from vggtjax.captures.files import files
+from vggtjax.captures.lens import check_no_fisheye
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, read_capture
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
@@ -42,6 +43,7 @@ def captures(root: Path) -> dict[str, Opener]:
 def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     whole = read_capture(path)
     capture = whole.for_frames(frames.of(whole.frame_names, name))
+    check_no_fisheye(capture.lenses, path)
     maps = capture.depth_files or (None,) * len(capture)
     missing = [frame for frame, file in zip(capture.frame_names, maps, strict=True) if file is None]
     notes = capture.notes + (() if capture.metric else (_OWN_UNIT,))

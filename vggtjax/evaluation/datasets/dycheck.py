@@ -28,6 +28,7 @@ from vggtjax.captures.cameras import (
 from vggtjax.captures.colmap_model import read_views
 from vggtjax.captures.depth_files import read_npy
 from vggtjax.captures.files import files, inside
+from vggtjax.captures.lens import check_no_fisheye
 from vggtjax.captures.numbers import numbers
 from vggtjax.captures.pictures import picture_size
 from vggtjax.errors import InputError
@@ -117,12 +118,13 @@ def _colmap_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _C
         note = f"{len(missing)} of {len(frames)} frames are not in {_MODEL}, {missing[0]} first; no cameras"
         return _Cameras(None, None, (note,))
     taken = [views[f"{frame}.png"] for frame in frames]
+    check_no_fisheye((view.lens for view in taken), source)
     intrinsics = [
         resized_intrinsics(view.intrinsics, view.size, picture_size(path), source)
         for view, path in zip(taken, pictures, strict=True)
     ]
     poses = world_from_camera_of(np.stack([view.camera_from_world for view in taken]), source)
-    return _Cameras(poses, np.stack(intrinsics), (DISTORTED,) * any(view.distorted for view in taken))
+    return _Cameras(poses, np.stack(intrinsics), (DISTORTED,) * any(view.lens for view in taken))
 
 
 def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cameras:
