@@ -243,7 +243,11 @@ def _keys_of_other_heads(config: VGGTConfig) -> set[str]:
 
 
 def _hint(tensors: Mapping[str, Tensor], config: VGGTConfig) -> str:
-    """Return advice if the source lacks whole heads, else an empty text."""
+    """Return advice if the source is of another width or lacks whole heads, else an empty text."""
+    token = tensors.get("aggregator.camera_token")
+    if token is not None and token.shape and token.shape[-1] != config.embed_dim:
+        widths = f"embed_dim is {token.shape[-1]} in it and {config.embed_dim} in the configuration"
+        return f" ({widths}: give its own by --config FILE.json)"
     modules = {name.split(".")[0] for name in tensors}
     expected = dict.fromkeys(name.split(".")[0] for name in source_shapes(config))
     absent = [name for name in expected if name not in modules]

@@ -24,7 +24,7 @@ from vggtjax.errors import CheckpointError, InputError, check_choice, problems_s
 from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
 from vggtjax.network.narrow import is_multiplied
-from vggtjax.network.quantised import Quantised, is_quantised, quantise
+from vggtjax.network.quantised import Halves, Quantised, halves, is_quantised, is_stored, quantise
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.programs import kept_text
 from vggtjax.storage.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
@@ -86,8 +86,8 @@ class Model:
     @property
     def parameter_count(self) -> int:
         """Number of parameters."""
-        leaves = jax.tree.leaves(self.params, is_leaf=lambda leaf: isinstance(leaf, Quantised))
-        return sum((leaf.values if isinstance(leaf, Quantised) else leaf).size for leaf in leaves)
+        leaves = jax.tree.leaves(self.params, is_leaf=is_stored)
+        return sum((leaf[0] if is_stored(leaf) else leaf).size for leaf in leaves)
 
     @property
     def parameter_bytes(self) -> int:
@@ -98,8 +98,9 @@ class Model:
     def dtype(self) -> str:
         """Type of most parameters."""
         sizes = Counter[str]()
-        for leaf in jax.tree.leaves(self.params):
-            sizes[str(leaf.dtype)] += leaf.size
+        for leaf in jax.tree.leaves(self.params, is_leaf=lambda leaf: isinstance(leaf, Halves)):
+            values = leaf.bits if isinstance(leaf, Halves) else leaf
+            sizes["bfloat16" if isinstance(leaf, Halves) else str(values.dtype)] += values.size
         return sizes.most_common(1)[0][0]
 
     @property
@@ -155,7 +156,8 @@ def read_model(
         path: the file.
         dtype: of the parameters; None for the types in the file. "int8" rounds the kernels of the blocks to 8 bits and
             leaves the others as they are in the file: an approximation.
-        compute_dtype: of the blocks; "bfloat16" reads what they multiply in it: equal results, half the memory.
+        compute_dtype: of the blocks; "bfloat16" reads what they multiply in it: equal results, half the memory. On a
+            CPU kernels are `Halves`, by which there is no gradient.
         fields: fields of `Model` in place of those in the file: name, note, untrained_heads.
 
     Raises CheckpointError, which counts the problems and lists the first ones, unless the file is a whole checkpoint of
@@ -179,6 +181,9 @@ def read_model(
         is_as_stored &= tensor.dtype == stored.dtype
         if compute_dtype == "bfloat16" and is_multiplied(key):
             tensor = tensor.astype(numpy_dtype("bfloat16"), copy=False)
+            if key.endswith(".kernel") and jax.default_backend() == "cpu":
+                flat[key] = jax.block_until_ready(halves(tensor))
+                continue
         flat[key] = jax.device_put(tensor).block_until_ready()  # on a CPU, a view of the file if aligned
     model = Model(config, unflatten_dict(flat, sep="."), path=path, **(stored_fields | fields))
     if is_as_stored:
@@ -191,13 +196,17 @@ def read_model(
 def check_finite(model: Model) -> None:
     """Raise CheckpointError, which names the first parameter that is not finite; reads all of them."""
     flat: dict[str, Any] = flatten_dict(model.params, sep=".")
-    parts = ((path, part) for path, leaf in flat.items() for part in jax.tree.leaves(leaf))
+    parts = ((path, part) for path, leaf in flat.items() for part in jax.tree.leaves(_whole(leaf)))
     for path, part in parts:
         values = np.asarray(part).astype(np.float32, copy=False)
         if lost := values.size - np.count_nonzero(np.isfinite(values)):
             raise CheckpointError(
                 f"{lost} of {values.size} values of {path} of the model {model.name} are not finite; get it again"
             )
+
+
+def _whole(leaf: Any) -> Any:
+    return np.asarray(leaf.bits).view(numpy_dtype("bfloat16")) if isinstance(leaf, Halves) else leaf
 
 
 def save_model(path: str | Path, params: Params, config: VGGTConfig, **labels: Any) -> Path:
@@ -207,7 +216,7 @@ def save_model(path: str | Path, params: Params, config: VGGTConfig, **labels: A
     CheckpointError, which counts the problems and lists the first ones, if the parameters do not fit the configuration,
     and OutputError if the file cannot be written.
     """
-    flat: dict[str, Any] = flatten_dict(params, sep=".")
+    flat: dict[str, Any] = {name: _whole(leaf) for name, leaf in flatten_dict(params, sep=".").items()}
     if any(isinstance(leaf, Quantised) for leaf in flat.values()):
         raise CheckpointError("the parameters are int8; expected float32 or bfloat16: save the model as it was before")
     check_parameters("the parameters do not fit the configuration", flat, config)

@@ -174,7 +174,10 @@ class VGGTConfig:
                 f"dpt_features {self.dpt_features} is not a multiple of 8, or dpt_channels {self.dpt_channels} of 4"
             )
         if list(self.taps) != sorted(set(self.taps)) or self.taps[-1] >= self.depth:
-            raise InputError(f"taps is {self.taps}; expected rising pair indices below depth {self.depth}")
+            raise InputError(
+                f"taps is {self.taps}; expected four rising indices of pairs below depth {self.depth}, so depth is at "
+                "least 4"
+            )
 
     @property
     def tap_dim(self) -> int:

@@ -92,6 +92,12 @@ def test_values_that_are_not_finite_are_refused_by_name(state_dict, config):
         convert_state_dict({**state_dict, key: changed}, config)
 
 
+def test_a_checkpoint_of_another_width_names_the_option(state_dict, config):
+    wider = dataclasses.replace(config, embed_dim=2 * config.embed_dim)
+    with pytest.raises(CheckpointError, match=r"embed_dim is 32 in it and 64 in the .*: give its own by --config FILE"):
+        convert_state_dict(state_dict, wider)
+
+
 def test_all_problems_at_once(state_dict, config):
     beyond = "aggregator.frame_blocks.24.norm1.weight"
     both = VIRTUAL_TRACKS.replace("virual", "virtual")

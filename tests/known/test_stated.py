@@ -1,5 +1,6 @@
 """The focal length that cameras write into their files: EXIF of pictures, QuickTime's metadata of videos."""
 
+import dataclasses
 from contextlib import suppress
 
 import av
@@ -139,7 +140,11 @@ def test_a_prediction_that_is_far_off_is_said(tmp_path):
     stated = picture_focal(write(tmp_path / "a.jpg", {FILM: 26}))
     said = disagreement(stated._replace(pixels=75.6 / 0.79), room)
     assert said == (
-        "the predicted focal length, 75.6 pixels, is -21% off what the camera states; --intrinsics exif takes the "
-        "camera's"
+        "the predicted focal length, 75.6 pixels across, is -21% off what the camera states; --intrinsics exif takes "
+        "the camera's"
     )
+    taller = room.intrinsics.copy()
+    taller[:, 1, 1] *= 1.3
+    unequal = dataclasses.replace(room, intrinsics=taller)
+    assert "98.28 pixels down, is +30%" in str(disagreement(stated._replace(pixels=75.6), unequal))
     assert disagreement(stated._replace(pixels=75.6 / 0.81), room) is None

@@ -106,6 +106,10 @@ def test_infer_takes_a_model(model):
         np.testing.assert_allclose(same.depth, expected.depth, rtol=1e-5)
     with pytest.raises(InputError, match="config is not the configuration of the model; leave it out, or give model"):
         infer(model, IMAGES, dataclasses.replace(model.config, motion=MotionConfig(floor=0.5)))
+    with pytest.raises(InputError, match=r"a model is no argument of jit; close over it, or give model\.params"):
+        jax.jit(lambda traced: infer(traced, IMAGES))(jnp.zeros(3))
+    with pytest.raises(InputError, match=r"masks have values from 0 to 2; expected shares in \[0, 1\]"):
+        infer(model, IMAGES, masks=jnp.zeros(IMAGES.shape[:4]).at[0, 0].set(2))
     with pytest.raises(InputError, match=r"config is missing; give infer\(model, images\) or infer\(model\.params"):
         infer(model.params, IMAGES)
     with pytest.raises(InputError, match="config is a Model; give infer"):

@@ -45,6 +45,17 @@ def test_what_is_kept_is_not_copied():
     assert copies(jnp.sin)  # what is computed from the old value needs both
 
 
+def test_a_function_that_is_left_out_is_not_computed():
+    """XLA moves what does not change in a loop out of it, in front of a loop of no step too."""
+    x, flag = jnp.ones((64, 64)), jnp.asarray(False)
+    for change in (replaced_if, added_if):
+        run = jax.jit(lambda flag, x, change=change: change(flag, x, lambda y: y @ x, x))
+        text = str(run.lower(flag, x).compile().as_text())
+        entry = text[text.index("ENTRY") :]
+        assert "dot_general" in text
+        assert "dot_general" not in entry
+
+
 def test_in_a_scan_with_remat_under_vmap():
     """Gradients with remat and under vmap, by an array that the function reads."""
 

@@ -7,7 +7,7 @@ from vggtjax import load_model
 from vggtjax.checkpoint import save_model
 from vggtjax.clips.clip import load_clip
 from vggtjax.errors import CheckpointError
-from vggtjax.network.quantised import Quantised, dequantised, quantise
+from vggtjax.network.quantised import Quantised, as_multiplied, quantise
 from vggtjax.pipeline.run import reconstruct
 
 
@@ -16,7 +16,7 @@ def test_the_rounding_by_hand():
     values, scale = quantise(kernel)
     assert np.asarray(values).tolist() == [[[50, 0, -127], [-127, 0, 66]]]
     assert np.allclose(scale, [[[0.02, 1, 0.5 / 127]]])
-    back = dequantised({"kernel": Quantised(values, scale), "bias": kernel})
+    back = as_multiplied({"kernel": Quantised(values, scale), "bias": kernel})
     assert np.abs(np.asarray(back["kernel"]) - kernel).max() <= np.asarray(scale).max() / 2
     assert back["bias"] is kernel
 

@@ -62,6 +62,9 @@ def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None)
     return dataclasses.replace(result, settings=settings), unit
 
 
+_UNEQUAL = 0.02  # share by which focal lengths across and down a picture have to differ to be told apart
+
+
 def scaled(result: R, factor: float) -> R:
     """Return the result with depth and camera centres times a factor."""
     poses = result.camera_from_world.astype(np.float64)
@@ -76,11 +79,12 @@ def _with_intrinsics(result: R, given: Given, notes: dict[str, str]) -> R:
     intrinsics = shared_focal(result) if given.intrinsics is None else given.intrinsics
     if given.options.intrinsics == SOURCE and given.capture is not None and given.capture.distorted:
         logger.warning("the lens of %s has a distortion, which its intrinsics leave out", given.capture.path)
-    change = np.log(intrinsics[:, 0, 0] / result.intrinsics[:, 0, 0])
+    change = np.log(intrinsics[:, [0, 1], [0, 1]] / result.intrinsics[:, [0, 1], [0, 1]])
     focal = np.median(intrinsics[:, 0, 0] * result.source_scale[:, 0])
-    notes[name] = (
-        f"focal length {focal:.5g} pixels of the source, {np.expm1(np.median(change)):+.1%} against the prediction"
-    )
+    across, down = np.expm1(np.median(change, axis=0))
+    notes[name] = f"focal length {focal:.5g} pixels of the source, {across:+.1%} against the prediction"
+    if abs(across - down) > _UNEQUAL:
+        notes[name] += f" (down the picture {down:+.1%})"
     return dataclasses.replace(result, intrinsics=intrinsics.astype(np.float32))
 
 

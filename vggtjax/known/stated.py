@@ -44,13 +44,15 @@ def focal_stated(clip: Clip) -> StatedFocal | None:
 
 def disagreement(stated: StatedFocal, result: Result) -> str | None:
     """Return a sentence where the predicted focal length is far from the stated one, else None."""
-    predicted = float(np.median(result.intrinsics[:, 0, 0] * result.source_scale[:, 0]))
-    change = predicted / stated.pixels - 1
-    if abs(change) <= _FAR:
+    by_axis = np.median(result.intrinsics[:, [0, 1], [0, 1]] * result.source_scale, axis=0)  # across, down
+    changes = by_axis / stated.pixels - 1
+    worst = int(np.abs(changes).argmax())
+    if abs(changes[worst]) <= _FAR:
         return None
+    axis = ("across", "down")[worst]
     return (
-        f"the predicted focal length, {predicted:.4g} pixels, is {change:+.0%} off what the camera states; "
-        "--intrinsics exif takes the camera's"
+        f"the predicted focal length, {by_axis[worst]:.4g} pixels {axis}, is {changes[worst]:+.0%} off what the camera "
+        "states; --intrinsics exif takes the camera's"
     )
 
 

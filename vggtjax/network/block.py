@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from vggtjax.network.cpu_attention import ATTENDED
 from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, Params, apply
 from vggtjax.network.pieces import map_chunks, map_chunks_in_place
-from vggtjax.network.quantised import dequantised
+from vggtjax.network.quantised import as_multiplied
 from vggtjax.network.rope import Rope, apply_rope
 from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
 
@@ -51,6 +51,7 @@ class Projections(nn.Module):
         q, k, v = (y[:, i] for i in range(3))
         if self.qk_norm:
             q, k = self.q_norm(q), self.k_norm(k)
+        q, k, v = (y.astype(self.dtype) for y in (q, k, v))
         return (q, k, v) if rope is None else (apply_rope(q, rope), apply_rope(k, rope), v)
 
     def project(self, y: Float[Array, "R C"]) -> Float[Array, "R C"]:
@@ -114,5 +115,5 @@ class Block(nn.Module):
 def apply_block(
     block: Block, params: Params, x: Float[Array, "B L C"], *inputs: Any, **options: Any
 ) -> tuple[Array, Array, Array]:
-    """Run a block with one layer of a stack of parameters, whose kernels may be `Quantised`."""
-    return apply(block, dequantised(params), x, *inputs, **options)
+    """Run a block with one layer of a stack of parameters, whose kernels may be in another form."""
+    return apply(block, as_multiplied(params), x, *inputs, **options)

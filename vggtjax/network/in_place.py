@@ -34,8 +34,9 @@ def added_if(flag: Bool[Array, ""], old: _Tree, function: Callable[..., _Tree], 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _updated(function, adds, flag, old, *inputs):
-    def step(_, old):
-        new = function(*inputs)
+    def step(number, old):
+        own, _ = jax.lax.optimization_barrier((inputs, number))  # else XLA moves the function out, into every layer
+        new = function(*own)
         return jax.tree.map(jnp.add, old, new) if adds else new
 
     return jax.lax.fori_loop(0, flag.astype(jnp.int32), step, old)

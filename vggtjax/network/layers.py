@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from flax.linen.dtypes import promote_dtype
 from jaxtyping import Array, Float
 
 from vggtjax.network.cpu_convolution import same_convolution
@@ -18,10 +19,31 @@ DType = Any
 _State = TypeVar("_State")
 
 
-class Dense(nn.Dense):
-    """A linear layer. `init_params` draws its kernel: flax would trace a generator at every declaration and call."""
+class Dense(nn.Module):
+    """A linear layer, whose kernel `init_params` draws. Products in bfloat16 have outputs in float32."""
 
-    kernel_init: Any = nn.initializers.zeros
+    features: int
+    dtype: DType = None  # of the product; None: the wider type of inputs and parameters
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "... I"]) -> Float[Array, "... F"]:
+        kernel = self.param("kernel", nn.initializers.zeros, (x.shape[-1], self.features), jnp.float32)
+        bias = self.param("bias", nn.initializers.zeros, (self.features,), jnp.float32)
+        x, kernel, bias = promote_dtype(x, kernel, bias, dtype=self.dtype)
+        bias = bias.reshape((1,) * (x.ndim - 1) + (-1,))
+        if x.dtype != jnp.bfloat16:
+            return x @ kernel + bias
+        return jax.lax.platform_dependent(x, kernel, bias, cpu=_wide_linear, default=_narrow_linear)
+
+
+def _wide_linear(x: Array, kernel: Array, bias: Array) -> Array:
+    """A CPU multiplies bfloat16 twice as fast with sums and outputs in float32."""
+    return jnp.matmul(x, kernel, preferred_element_type=jnp.float32) + bias.astype(jnp.float32)
+
+
+def _narrow_linear(x: Array, kernel: Array, bias: Array) -> Array:
+    """An accelerator writes bfloat16, and widens it in the kernel that reads it."""
+    return (x @ kernel + bias).astype(jnp.float32)
 
 
 class Conv(nn.Conv):
@@ -49,7 +71,7 @@ class MLP(nn.Module):
 
     hidden: int
     features: int
-    dtype: DType = None  # None: the wider type of inputs and parameters
+    dtype: DType = None  # as of `Dense`
 
     @nn.compact
     def __call__(self, x: Float[Array, "... C"]) -> Float[Array, "... F"]:

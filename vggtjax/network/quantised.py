@@ -1,7 +1,6 @@
-"""Weights in 8 bits: the kernels of the blocks, symmetric, with a scale for every output channel. An approximation.
+"""Kernels that are stored in another form than they are multiplied in: in 8 bits, or as the bits of bfloat16.
 
-Products are computed in the blocks' own type: a block's kernels are turned back when it runs, so one layer at a time is
-in memory at full width.
+A block's kernels are turned back when it runs, so one layer at a time is in memory in that form.
 """
 
 from __future__ import annotations
@@ -10,18 +9,30 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int8
+from jaxtyping import Array, Float, Int8, UInt16
 
 LARGEST = 127
 _BLOCKS = ("backbone.blocks.", "aggregator.frame_blocks.", "aggregator.global_blocks.", "camera_head.trunk.")
 
 
+class Halves(NamedTuple):
+    """A kernel of bfloat16 as whole numbers: in a loop over layers XLA for CPUs widens stacks of bfloat16, whole."""
+
+    bits: UInt16[Array, "*L I O"]
+
+
 class Quantised(NamedTuple):
-    """A kernel as `values` times `scale`: each weight is off by at most half of its channel's scale."""
+    """A kernel in 8 bits, an approximation: symmetric, with a scale for every output channel.
+
+    It is `values` times `scale`: each weight is off by at most half of its channel's scale."""
 
     values: Int8[Array, "*L I O"]
     scale: Float[Array, "*L 1 O"]
+
+
+STORED = (Quantised, Halves)
 
 
 def is_quantised(name: str) -> bool:
@@ -40,10 +51,22 @@ def quantise(kernel: Float[np.ndarray, "*L I O"]) -> Quantised:
     return Quantised(jax.device_put(values), jax.device_put(scales))
 
 
-def dequantised(params: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a block's parameters with kernels in float32; others are returned as they are."""
+def halves(kernel: np.ndarray) -> Halves:
+    """Store a kernel of bfloat16."""
+    return Halves(jax.device_put(kernel.view(np.uint16)))
 
-    def widen(leaf: Any) -> Any:
-        return leaf.values.astype(leaf.scale.dtype) * leaf.scale if isinstance(leaf, Quantised) else leaf
 
-    return jax.tree.map(widen, dict(params), is_leaf=lambda leaf: isinstance(leaf, Quantised))
+def is_stored(leaf: Any) -> bool:
+    """Return whether a parameter is a kernel in another form."""
+    return isinstance(leaf, STORED)
+
+
+def as_multiplied(params: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a block's parameters with kernels of 8 bits in float32, halves in bfloat16, and others as they are."""
+
+    def turned(leaf: Any) -> Any:
+        if isinstance(leaf, Quantised):
+            return leaf.values.astype(leaf.scale.dtype) * leaf.scale
+        return jax.lax.bitcast_convert_type(leaf.bits, jnp.bfloat16) if isinstance(leaf, Halves) else leaf
+
+    return jax.tree.map(turned, dict(params), is_leaf=is_stored)

@@ -19,6 +19,7 @@ from vggtjax.errors import InputError
 from vggtjax.method.algorithm import Clips, Masks, check_masks, compute_by, run_method
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree
 from vggtjax.method.passes import Passes
+from vggtjax.method.soft_mask import SoftMasking
 from vggtjax.network.frames import Frames
 from vggtjax.network.layers import Params
 from vggtjax.options import Options
@@ -62,11 +63,13 @@ def infer(
         frames are all one picture is empty.
     """
     params, config = _network(params, config)
-    _check_range(images)
+    _check_range(images, "images", "expected RGB in [0, 1]: divide bytes by 255")
     config = config if motion is None else dataclasses.replace(config, motion=motion)
     # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.
     options = dataclasses.replace(options.changed(**changes).resolved(config.motion), refine_mask=False)
     check_masks(masks, images, Frames(mesh))  # before frames are added
+    if masks is not None and masks is not False and not isinstance(masks, SoftMasking):
+        _check_range(masks, "masks", "expected shares in [0, 1]")
     frames, rule = images.shape[1], as_tree(fusion)
     if mesh is not None:
         masks = masks if masks is None or masks is False else by_frame_padded(masks, mesh)  # type: ignore[arg-type]
@@ -82,21 +85,23 @@ def _network(params: Params | Model, config: VGGTConfig | None) -> tuple[Params,
         if config not in (None, params.config):
             raise InputError("config is not the configuration of the model; leave it out, or give model.params with it")
         return params.params, params.config
+    if config is None and isinstance(params, Tracer):
+        raise InputError("a model is no argument of jit; close over it, or give model.params and model.config")
     if not isinstance(config, VGGTConfig):
         given = "missing" if config is None else f"a {type(config).__name__}"
         raise InputError(f"config is {given}; give infer(model, images) or infer(model.params, images, model.config)")
     return params, config
 
 
-def _check_range(images: Float[Array, "B S H W 3"]) -> None:
+def _check_range(values: Array | np.ndarray, name: str, remedy: str) -> None:
     """Raise InputError for values outside [0, 1]; they are unknown while jit traces."""
-    if isinstance(images, Tracer) or not images.size or not jnp.issubdtype(images.dtype, jnp.floating):
+    if isinstance(values, Tracer) or not values.size or not jnp.issubdtype(values.dtype, jnp.floating):
         return
-    library = np if isinstance(images, np.ndarray) else jnp
+    library = np if isinstance(values, np.ndarray) else jnp
     with jax.ensure_compile_time_eval():  # also where a caller's jit has closed over them
-        low, high = float(library.min(images)), float(library.max(images))
+        low, high = float(library.min(values)), float(library.max(values))
     if not (low >= -_SLACK and high <= 1 + _SLACK):  # so NaN, too, is refused
-        raise InputError(f"images have values from {low:g} to {high:g}; expected RGB in [0, 1]: divide bytes by 255")
+        raise InputError(f"{name} have values from {low:g} to {high:g}; {remedy}")
 
 
 @partial(jax.jit, static_argnames=("config", "options", "frames", "mesh", "moves"))

@@ -21,7 +21,7 @@ from vggtjax.method.witnesses import Seen
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import OnDevices
 from vggtjax.network.model import Predictions
-from vggtjax.network.quantised import Quantised
+from vggtjax.network.quantised import STORED
 from vggtjax.network.track_head import Tracks
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.storage.programs import keep_type, program
@@ -33,7 +33,7 @@ _COLLECTIVE = re.compile(
     r" (all-gather|all-reduce|all-to-all|ragged-all-to-all|reduce-scatter|collective-\w+|send|recv)(?:-start)?\("
 )
 # What kept programs take and return.
-for _kind in (ClipBatch, Predictions, Passes, Seen, Matches, Mined, Cameras, Assembly, Tracks, SoftMasking, Quantised):
+for _kind in (ClipBatch, Predictions, Passes, Seen, Matches, Mined, Cameras, Assembly, Tracks, SoftMasking, *STORED):
     keep_type(_kind)
 
 
