@@ -1,8 +1,9 @@
 """One side of a comparison: a process that holds a model and runs one or both passes on request.
 
-python -m benchmarks.worker ours WEIGHTS, or python -m benchmarks.worker peer WEIGHTS CHECKOUT [mapped]; then a line of
-JSON on standard input for every run: {"work": "pass", "vggt4d" or "4dvggt-d", "frames", "height", "width", "keep": a
-file for the outputs or null, "mask": a file with the mask of the second pass, or null}.
+python -m benchmarks.worker ours WEIGHTS [bfloat16], or python -m benchmarks.worker peer WEIGHTS CHECKOUT [mapped]
+[bfloat16]: blocks in bfloat16 here, autocast there. Then a line of JSON on standard input for every run: {"work":
+"pass", "vggt4d" or "4dvggt-d", "frames", "height", "width", "keep": a file for the outputs or null, "mask": a file with
+the mask of the second pass, or null}.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ Outputs = dict[str, np.ndarray]
 Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S, 3, H, W] in [0, 1], mask [S, H, W]
 
 
-def ours(weights: Path) -> Run:
+def ours(weights: Path, dtype: str) -> Run:
     """Return this library's passes: a plain one, or a whole method."""
     from vggtjax.storage.kept_memory import keep_freed_memory
 
@@ -37,21 +38,22 @@ def ours(weights: Path) -> Run:
     from vggtjax import forward, infer, load_model
     from vggtjax.method.mask import dynamic_tokens
 
-    model = load_model(weights)
+    model = load_model(weights, compute_dtype=None if dtype == "float32" else dtype)
     compiled: dict[tuple, Any] = {}
 
     def call(function, *arrays, **options):
         key = (function, *(x.shape for x in arrays), *options.items())
         if key not in compiled:
-            lowered = jax.jit(function, static_argnames=("config", *options)).lower(
-                model.params, arrays[0], model.config, *arrays[1:], **options
+            lowered = jax.jit(function, static_argnames=("config", "compute_dtype", *options)).lower(
+                model.params, arrays[0], model.config, *arrays[1:], compute_dtype=dtype, **options
             )
             compiled[key] = lowered.compile()
         return jax.block_until_ready(compiled[key](model.params, *arrays))
 
-    def masked(params, images, config, mask):
+    def masked(params, images, config, mask, compute_dtype):
         tokens = dynamic_tokens(mask, config.patch_size)
-        return forward(params, images, config, dynamic_tokens=tokens, suppress="drop", outputs=("camera",))
+        masking = {"dynamic_tokens": tokens, "suppress": "drop"}
+        return forward(params, images, config, outputs=("camera",), compute_dtype=compute_dtype, **masking)
 
     def run(work: str, images: np.ndarray, mask: np.ndarray | None) -> Outputs:
         x = jnp.asarray(images.transpose(0, 2, 3, 1)[None])
@@ -71,12 +73,12 @@ def ours(weights: Path) -> Run:
     return run
 
 
-def peer(weights: Path, checkout: Path, *, mapped: bool) -> Run:
+def peer(weights: Path, checkout: Path, *, mapped: bool, dtype: str) -> Run:
     """Return the passes of the public PyTorch code, from a checkout: VGGT's, or stages 1 and 2 of VGGT4D.
 
     The plain pass runs the same heads as ours and no others; VGGT4D runs its own model and its own functions, with
     the CPU in place of CUDA. The weights of all heads are loaded as by `from_pretrained`; with `mapped` they are mapped
-    as ours, and for a plain pass only those of its heads.
+    as ours, and for a plain pass only those of its heads. In bfloat16 all of it runs under PyTorch's autocast.
     """
     sys.path.insert(0, str(checkout))
     import torch
@@ -109,7 +111,7 @@ def peer(weights: Path, checkout: Path, *, mapped: bool) -> Run:
         tokens, start = model.aggregator(x)[:2]
         pose = model.camera_head(tokens)[-1]
         depth, confidence = model.depth_head(tokens, images=x, patch_start_idx=start)
-        return _outputs(pose.numpy(), depth.numpy()[..., 0], confidence.numpy())
+        return _outputs(pose.float().numpy(), depth.float().numpy()[..., 0], confidence.float().numpy())
 
     def two_passes(images: np.ndarray, mask: np.ndarray | None) -> Outputs:
         from vggt4d.masks import dynamic_mask as maps  # pyright: ignore[reportMissingImports]
@@ -137,7 +139,8 @@ def peer(weights: Path, checkout: Path, *, mapped: bool) -> Run:
         return {"saliency": saliency.numpy(), "mask": found.numpy()} | made
 
     def run(work: str, images: np.ndarray, mask: np.ndarray | None) -> Outputs:
-        with torch.inference_mode():
+        autocast = torch.autocast("cpu", torch.bfloat16, enabled=dtype == "bfloat16")
+        with torch.inference_mode(), autocast:
             return one_pass(images) if work == "pass" else two_passes(images, mask)
 
     return run
@@ -145,7 +148,9 @@ def peer(weights: Path, checkout: Path, *, mapped: bool) -> Run:
 
 def _outputs(pose, depth, confidence) -> Outputs:
     names = ("pose_encoding", "depth", "confidence")
-    return {name: np.asarray(value[0]) for name, value in zip(names, (pose, depth, confidence), strict=True)}
+    return {
+        name: np.asarray(value[0], np.float32) for name, value in zip(names, (pose, depth, confidence), strict=True)
+    }
 
 
 class PeakMemory:
@@ -179,7 +184,11 @@ def disk_reads() -> int:
 
 def main(side: str, weights: str, *rest: str) -> None:
     """Load a model, report it, and run passes until standard input ends."""
-    run = ours(Path(weights)) if side == "ours" else peer(Path(weights), Path(rest[0]), mapped="mapped" in rest[1:])
+    dtype = "bfloat16" if "bfloat16" in rest else "float32"
+    if side == "ours":
+        run = ours(Path(weights), dtype)
+    else:
+        run = peer(Path(weights), Path(rest[0]), mapped="mapped" in rest[1:], dtype=dtype)
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # other prints must not mix with answers
     answers.write('{"ready": true}\n')
