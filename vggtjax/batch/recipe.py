@@ -60,14 +60,14 @@ def _no_memory_check(no_memory_check: Switch = False) -> bool:
     return no_memory_check
 
 
-def _undistort(no_undistort: Switch = False) -> bool:
+def _undistort(undistort: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True) -> bool:
     """Return whether frames are undistorted.
 
     Args:
-        no_undistort: leave the frames of a capture as they are and ignore the coefficients of its lens; by default they
-            become those of a pinhole camera
+        undistort: make the frames of a capture with coefficients of its lens those of a pinhole camera (the default), or
+            leave them as they are and ignore the coefficients
     """
-    return not no_undistort
+    return undistort
 
 
 def _pad_frames(pad_frames: Switch = False) -> bool:
