@@ -64,7 +64,7 @@ def _undistort(undistort: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] 
     """Return whether frames are undistorted.
 
     Args:
-        undistort: make the frames of a capture with coefficients of its lens those of a pinhole camera (the default), or
+        undistort: make frames of a capture with coefficients of its lens those of a pinhole camera (the default), or
             leave them as they are and ignore the coefficients
     """
     return undistort
