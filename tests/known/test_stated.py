@@ -1,6 +1,7 @@
 """The focal length that cameras write into their files: EXIF of pictures, QuickTime's metadata of videos."""
 
 import dataclasses
+import re
 from contextlib import suppress
 
 import av
@@ -12,6 +13,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from tests.room import make_room
 from vggtjax import load_clip
+from vggtjax.commands import main as cli
 from vggtjax.errors import InputError
 from vggtjax.known.given import read_known
 from vggtjax.known.options import KnownGeometry
@@ -133,6 +135,19 @@ def test_arrays_and_results_have_no_files():
         read_known(EXIF, load_clip(np.zeros((2, 56, 56, 3), np.uint8), size=56))
     with pytest.raises(InputError, match="a result has no files"):
         read_known(EXIF, make_room())
+
+
+def test_the_command_info_says_what_a_clip_is(tmp_path, capsys):
+    for number in range(2):
+        write(tmp_path / f"{number}.jpg", {FILM: 26})
+    assert cli.main(["info", str(tmp_path)]) == 0
+    shown = capsys.readouterr().out
+    assert "400 x 300 pixels of the first frame, upright" in shown
+    assert "26 mm as on 35 mm film, 300.5 pixels; --intrinsics exif takes it" in shown
+    assert re.search(r"frames +2\n", shown)
+    write(tmp_path / "0.jpg", {FILM: 60000})
+    assert cli.main(["info", str(tmp_path)]) == 0
+    assert "0.jpg" in capsys.readouterr().out
 
 
 def test_a_prediction_that_is_far_off_is_said(tmp_path):

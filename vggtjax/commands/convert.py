@@ -77,19 +77,25 @@ def import_result(
 
 
 def info(
-    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[MODEL]")] = "demo",
+    model: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="[MODEL|CLIP]")] = "demo",
     /,
     *,
     config: InWords[Path | None] = None,
 ) -> None:
-    """Print a model's configuration, heads, number of parameters and type.
+    """Print a model's configuration, heads, number of parameters and type; or what a clip is.
 
     Args:
-        model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id.
+        model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id; or a video, a folder of pictures, or
+            a capture: frames, size, length, the focal length that the camera states, the lens.
         config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
     """
     report = Report()
     with report.running():
+        from vggtjax.commands.clip_facts import clip_facts, is_clip
+
+        if is_clip(Path(model)):
+            report.table(clip_facts(model))
+            return
         network = load(report, model, config)
     summary = network.summary()
     if network.path is not None:

@@ -54,7 +54,7 @@ COMMANDS = {
     "app": Command(app, _RESULTS, "a page to drop a video on"),
     "export": Command(export, _RESULTS, "a result as files of another program"),
     "import": Command(import_result, _RESULTS, "a result of another program as ours"),
-    "info": Command(info, _MODELS, "what a model is made of"),
+    "info": Command(info, _MODELS, "what a model is made of, or a clip is"),
     "convert": Command(convert, _MODELS, "a PyTorch checkpoint of VGGT as one .safetensors"),
     "train": Command(train, _MODELS, "train a model on generated scenes, or finetune one"),
     "calibrate-cues": Command(calibrate_cues, _MODELS, "choose a model's motion cues"),

@@ -42,6 +42,16 @@ def focal_stated(clip: Clip) -> StatedFocal | None:
     return None
 
 
+def stated_focal(clip: Clip) -> str:
+    """Return in words what the files of a clip state of the focal length, or why that cannot be used."""
+    try:
+        stated = sorted(_stated(clip))
+    except InputError as error:
+        return str(error)
+    middle = stated[len(stated) // 2]
+    return f"{middle.words}, {middle.pixels:.4g} pixels; --intrinsics exif takes it"
+
+
 def disagreement(stated: StatedFocal, result: Result) -> str | None:
     """Return a sentence where the predicted focal length is far from the stated one, else None."""
     by_axis = np.median(result.intrinsics[:, [0, 1], [0, 1]] * result.source_scale, axis=0)  # across, down
