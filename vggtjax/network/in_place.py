@@ -32,11 +32,19 @@ def added_if(flag: Bool[Array, ""], old: _Tree, function: Callable[..., _Tree], 
     return _updated(function, True, flag, old, *inputs, *others)
 
 
+def _known_within(x: Array, number: Array) -> Array:
+    """Return x, which is known when the loop runs: else XLA moves the function out of it, and computes it always.
+
+    Integers stay as they are: with devices that share frames, they have to stay equal on all.
+    """
+    is_float = jnp.issubdtype(x.dtype, jnp.inexact) and x.ndim > 0
+    return jax.lax.optimization_barrier((x, number))[0] if is_float else x
+
+
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
 def _updated(function, adds, flag, old, *inputs):
     def step(number, old):
-        own, _ = jax.lax.optimization_barrier((inputs, number))  # else XLA moves the function out, into every layer
-        new = function(*own)
+        new = function(*(_known_within(x, number) for x in inputs))
         return jax.tree.map(jnp.add, old, new) if adds else new
 
     return jax.lax.fori_loop(0, flag.astype(jnp.int32), step, old)
