@@ -352,7 +352,7 @@ def _params_digest(model: Model) -> str:
     digest = hashlib.sha256(model.config.to_json().encode())
     flat: dict[str, Any] = flatten_dict(model.params, sep=".")
     for name, leaf in sorted(flat.items()):
-        for part in jax.tree.leaves(leaf):  # two of a quantised kernel
+        for part in jax.tree.leaves(_whole(leaf)):  # two of a quantised kernel
             values = np.ascontiguousarray(part)
             digest.update(f"{name} {values.dtype} {values.shape}".encode())
             digest.update(values.reshape(-1).view(np.uint8).data)

@@ -17,7 +17,7 @@ from vggtjax.clips.sources import open_source
 from vggtjax.commands.main import command_help
 from vggtjax.errors import ClipError, InputError, OutputError
 from vggtjax.exports.table import FORMATS, Exporting
-from vggtjax.exports.write import export_result
+from vggtjax.exports.write import check_export, export_result
 from vggtjax.results.gltf_animation import frame_times
 
 FRAMES, H, W = 4, 84, 126
@@ -164,3 +164,15 @@ def test_the_help_names_every_format():
     rows = [row for group in command_help("export").groups for row in group.rows]
     (text,) = [text for flag, text in rows if flag.startswith("--to")]
     assert set(re.findall(r"[a-z-]+", text.partition("one of ")[2].partition(" (")[0])) == set(FORMATS)
+
+
+def test_a_repeated_time_keeps_the_rate_of_the_others():
+    times = np.arange(12) / 30
+    times[5] = times[4]
+    np.testing.assert_allclose(frame_times(make_room(12, timestamps=times)), np.arange(13) / 30)
+
+
+def test_formats_without_pictures_refuse_their_source(tmp_path):
+    with pytest.raises(InputError, match="mesh has no pictures, and is made at the model's size; leave --pictures out"):
+        check_export(tmp_path / "a.ply", "mesh", pictures=True)
+    check_export(tmp_path / "ROOM.PLY", "mesh")

@@ -65,6 +65,14 @@ def test_noise_of_frames_is_averaged():
     assert np.abs(mesh.vertices[:, 2] - WALL).mean() < 0.5 * np.abs(points[:, 2] - WALL).mean()
 
 
+@pytest.mark.parametrize("confidence", [0.0, 3.4e38])
+def test_confidence_of_any_size_gives_finite_vertices_with_colours(confidence):
+    mesh = static_mesh(make_room(depth_confidence=np.full((3, 28, 42), confidence, np.float32)), ALL)
+    assert len(mesh.vertices) > 100
+    assert np.isfinite(mesh.vertices).all()
+    assert colors_of(mesh).max(axis=1).min() >= 50  # the darkest square of the wall has 60
+
+
 def test_files(tmp_path):
     room, steps = make_room(), []
     export_result(room, tmp_path / "mesh.ply", "mesh", progress=lambda done, total: steps.append((done, total)))
@@ -94,7 +102,7 @@ def test_what_cannot_be_a_mesh_is_one_sentence(tmp_path):
     moving = make_room(dynamic_mask=np.ones((3, 28, 42), bool))
     with pytest.raises(InputError, match="no pixel is static"):
         export_result(moving, tmp_path / "out.glb", "mesh")
-    with pytest.raises(InputError, match=r"voxels of 99 find no surface; give a smaller --voxel-size"):
+    with pytest.raises(InputError, match=r"voxels of 99 find no surface: they are too large"):
         export_result(room, tmp_path / "out.glb", "mesh", exporting=Exporting(voxel_size=99))
     with pytest.raises(InputError, match=r"ends with \.glb or \.ply"):
         export_result(room, tmp_path / "out.obj", "mesh")

@@ -14,7 +14,8 @@ import pytest
 
 from testing.seeded import seeded_images
 from tests.tiny import tiny_model
-from vggtjax import infer
+from vggtjax import infer, load_model
+from vggtjax.checkpoint import save_model
 from vggtjax.pipeline import serve
 from vggtjax.pipeline.artefact import write_artefact
 
@@ -80,6 +81,17 @@ def test_a_program_for_gpus_alone_has_their_precision_wherever_it_is_written(mod
         convolutions = "\n".join(line for line in program.splitlines() if "stablehlo.convolution" in line)
         found = set(re.findall(r"<precision (\w+)>", convolutions))
         assert found == ({"HIGH", "HIGHEST"} if has_tf32 else {"HIGHEST"})
+
+
+def test_kernels_that_are_kept_as_bits_are_written_and_read(model, tmp_path):
+    path = save_model(tmp_path / "model.safetensors", model.params, model.config)
+    narrow = load_model(path, compute_dtype="bfloat16")
+    frames, height, width = SHAPE
+    options = {"method": "vggt", "compute_dtype": "bfloat16"}
+    folder = write_artefact(narrow, tmp_path / "it", frames=frames, height=height, width=width, **options)
+    images = jax.numpy.asarray(clip(0)[None].astype(np.float32) / np.float32(255))
+    assembly, _ = infer(model.params, images, model.config, **options)
+    np.testing.assert_allclose(serve.load(folder)(clip(0))["depth"], np.asarray(assembly.depth)[0], rtol=1e-3)
 
 
 def test_jax_alone_gives_the_numbers_of_infer(written, site, tmp_path, model):

@@ -61,6 +61,7 @@ def test_valid_text_becomes_the_dataclass():
         ('{"first": {"steps": 1, "kind": "wide"}}', "first.kind is 'wide'; expected one of ('long', 'short')"),
         ('{"scores": {"a": NaN}}', "has NaN, which is no number; expected finite numbers"),
         ('{"scores": {"a": -Infinity}}', "has -Infinity, which is no number"),
+        ('{"note": "mean, nan", "b": tru}', "is not JSON that can be read"),
         ('{"scores": {"a": 1' + "0" * 400 + "}}", "scores.a is a number of more than 64 bits"),
         ('{"notes": {"a b": [1, 1' + "0" * 400 + "]}}", "notes['a b'][1] is a number of more than 64 bits"),
         ('{"notes": {"a": ' + "[" * 100 + "]" * 100 + "}}", f"is nested more than {MOST_LEVELS} levels deep"),

@@ -76,8 +76,10 @@ def _one_map(values: np.ndarray, path: Path, per_unit: float) -> Float32[np.ndar
     for axis in reversed(range(values.ndim)):
         if values.ndim > 2 and values.shape[axis] == 1:
             values = values.squeeze(axis)
-    if values.ndim != 2 or values.dtype.kind not in "fiu":
+    if values.ndim != 2 or 0 in shape or values.dtype.kind not in "fiu":
         raise InputError(f"{path} has shape {shape} of {values.dtype}; expected numbers of shape (h, w)")
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, which is unknown
+        values = values.astype(np.float32) if values.dtype.kind == "f" else values
     return values.astype(np.float32) / np.float32(1 if values.dtype.kind == "f" else per_unit)
 
 

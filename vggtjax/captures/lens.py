@@ -171,8 +171,8 @@ class Undistortion:
                 f"{self.size[1]} undistorted; expected at most {_MOST_PIXELS} pixels, so make the pictures smaller"
             )
         points = self.stored_points(_grid(self.size))
-        steps = np.diff(points, axis=1)[:-1], np.diff(points, axis=0)[:, :-1]
         with np.errstate(all="ignore"):
+            steps = np.diff(points, axis=1)[:-1], np.diff(points, axis=0)[:, :-1]
             turns = steps[0][..., 0] * steps[1][..., 1] - steps[0][..., 1] * steps[1][..., 0]
         inside = (points > -1).all() and (points < np.array(self.stored) + 1).all()  # False for NaN
         if inside and (turns > 0).all() and (self.lens.is_fisheye or self._comes_back()):

@@ -143,7 +143,7 @@ def _from_path(name: str, undistort: bool) -> Source:
             return _from_file(path)
         if path.exists():
             raise ClipError(f"{path} is neither a file nor a folder; expected images or a video")
-        if _NUMBERED.search(path.name) and not glob.has_magic(name):
+        if _NUMBERED.search(path.name) and not glob.has_magic(path.name):
             return _images(_numbered(path), f"pattern {name} matches", "expected images")
         if glob.has_magic(name) and "://" not in name:
             found = glob.glob(_pattern(path), recursive=True)  # noqa: PTH207 - absolute patterns too

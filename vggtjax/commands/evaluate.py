@@ -86,7 +86,7 @@ class Folders:
             form, colon, folder = rest.partition(":")
             known = bool(colon) and form in READ_FORMATS and not Path(rest).is_dir()
             path = Path(folder if known else rest)
-            if not path.is_dir():
+            if not (folder if known else rest) or not path.is_dir():
                 raise InputError(
                     f"--results has {text}, which names no folder; expected NAME=FOLDER or NAME=FORMAT:FOLDER, where "
                     f"FORMAT is one of {', '.join(READ_FORMATS)}"

@@ -36,7 +36,7 @@ def export(
     with report.running():
         from vggtjax.exports.write import check_export, export_result
 
-        check_export(out, to)
+        check_export(out, to, pictures=pictures is not None)
         from vggtjax.reconstruction import Reconstruction
 
         with report.stage("read"):

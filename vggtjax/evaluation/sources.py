@@ -120,7 +120,7 @@ class FolderSource:
         for form in formats:
             check_format(form, self.quaternion if needs_quaternion(form) else None)
         if self.quaternion is not None and not any(map(needs_quaternion, formats)):
-            check_format(formats[0], self.quaternion)
+            check_format(next(iter(formats), "vggtjax"), self.quaternion)
         if wrong := [name for name in self.folders if shown_name(name) != name]:
             raise InputError(f"results cannot be named {shown_name(wrong[0])}; expected a short printable name")
 

@@ -148,7 +148,7 @@ def _write_scene(
     _dump(folder / "scene.json", {"scale": scale, "center": center.tolist(), "near": near, "far": far})
     times = frame_times(result)
     extra = {"factor": 1, "fps": 1 / float(np.median(np.diff(times))), "bbox": ((box - center) * scale).tolist()}
-    _dump(folder / "extra.json", extra | {"lookat": [0.0] * 3, "up": (up / np.linalg.norm(up)).tolist()})
+    _dump(folder / "extra.json", extra | {"lookat": [0.0] * 3, "up": (up / max(np.linalg.norm(up), 1e-12)).tolist()})
 
 
 def _write_with_normals(path: Path, cloud: PointCloud) -> None:

@@ -28,7 +28,7 @@ _LEAST_FACES = 100  # of a connected part: smaller ones are noise
 def write_mesh(path: Path, result: Result, exporting: Exporting, progress: Progress | None = None) -> None:
     """Write `static_mesh` by the suffix of the path: .glb has the clip's camera too, .ply the mesh alone."""
     mesh = static_mesh(result, exporting, progress)
-    if path.suffix == ".ply":
+    if path.suffix.lower() == ".ply":
         path.write_bytes(export_ply(mesh))
         return
     mesh.vertices = mesh.vertices * TO_GLTF
@@ -56,7 +56,10 @@ def static_mesh(
     try:
         vertices, faces, _, _ = marching_cubes(distance, 0.0, mask=_whole_cubes(known), gradient_direction="descent")
     except (RuntimeError, ValueError) as error:  # no change of sign, in whole cubes or at all
-        raise InputError(f"voxels of {grid.voxel:.3g} find no surface; give a smaller --voxel-size") from error
+        raise InputError(
+            f"voxels of {grid.voxel:.3g} find no surface: they are too large (--voxel-size), or the cameras are far "
+            "apart for the depth that they see"
+        ) from error
     faces = faces[_large_parts(faces.astype(np.int64), len(vertices))]
     mesh = trimesh.Trimesh(grid.low + grid.voxel * vertices.astype(np.float64), faces, process=False)
     mesh.remove_unreferenced_vertices()

@@ -32,6 +32,7 @@ class Format(NamedTuple):
     extra: str | None  # of the installation
     modules: tuple[str, ...] = ()
     suffixes: tuple[str, ...] = ()  # of its one file; none for a folder
+    has_pictures: bool = True  # or maps, at the size of the source where that is given
 
 
 FORMATS: dict[ExportFormat, Format] = {
@@ -40,13 +41,13 @@ FORMATS: dict[ExportFormat, Format] = {
     "gsplat": Format("colmap", ("pycolmap",)),
     "nerfstudio": Format(None),
     "rerun": Format("rerun", ("rerun",), (".rrd",)),
-    "glb-animated": Format(None, (), (".glb",)),
+    "glb-animated": Format(None, (), (".glb",), has_pictures=False),
     "dynamic-splats": Format(None),
     "blender": Format(None),
-    "mesh": Format(None, (), (".glb", ".ply")),
+    "mesh": Format(None, (), (".glb", ".ply"), has_pictures=False),
     "exr": Format("exr", ("OpenEXR",)),
-    "tum": Format(None, (), (".txt",)),
-    "kitti": Format(None, (), (".txt",)),
+    "tum": Format(None, (), (".txt",), has_pictures=False),
+    "kitti": Format(None, (), (".txt",), has_pictures=False),
 }
 
 
@@ -58,7 +59,7 @@ class Exporting:
     """most static points to write; moving points get as many in each frame"""
     confidence_percentile: Annotated[float, Meta(ge=0, lt=100)] = 20.0
     """percent of the pixels, the least confident, to leave out of the points, or of a mesh"""
-    voxel_size: InWords[Annotated[float, Meta(gt=0, le=1e9)] | None] = None
+    voxel_size: InWords[Annotated[float, Meta(ge=1e-30, le=1e9)] | None] = None
     """edge of the voxels of a mesh, in units of the result; by default as wide as a pixel on the surfaces, or wider
     where the frames differ by more"""
 

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy import ndimage
+from scipy.spatial import KDTree
 
 from vggtjax.cameras import project
 from vggtjax.errors import InputError
@@ -33,6 +34,11 @@ _REACH_VOXELS, _REACH_SPREADS = 3.0, 3.0  # of the reach: voxels, and median dif
 _SAME_PLACE = 0.1  # of the scene's distance: frames whose depths differ by less are taken to see one surface
 
 
+def _weights(confidence: Float32[np.ndarray, "H W"], unit: float) -> Float32[np.ndarray, "H W"]:
+    """Return weights whose sums over frames stay finite and above 0; of a confidence its ratio to `unit` counts."""
+    return np.clip(np.nan_to_num(confidence / np.float32(unit if unit > 0 else 1)), 1e-6, 1e12).astype(np.float32)
+
+
 class Readings(NamedTuple):
     """What a frame says of those places that it sees."""
 
@@ -51,8 +57,9 @@ class StaticFrame:
             frame.confident(least) & ~frame.dynamic_mask & ~on_edges(frame, SAME_SURFACE)
         )
         self.usable &= np.isfinite(frame.world_points()).all(axis=-1)  # too far away for float32
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore", over="ignore"):
             self._disparity = np.where(self.usable, 1 / frame.depth, 0).astype(np.float32)
+        self._weight = _weights(frame.confidence, least.static).ravel()
         whole = np.zeros_like(self.usable)  # the pixel and those to its right and below it
         usable = self.usable
         whole[:-1, :-1] = usable[:-1, :-1] & usable[1:, :-1] & usable[:-1, 1:] & usable[1:, 1:]
@@ -90,7 +97,7 @@ class StaticFrame:
 
         with np.errstate(divide="ignore", over="ignore"):
             before = 1 / between(self._disparity.ravel()) - z[places]
-        weight = between(self._frame.confidence.ravel())
+        weight = between(self._weight)
         colors = between(self._frame.image.reshape(-1, 3)) if color else np.zeros((0, 3), np.float32)
         return Readings(places, before, weight, colors)
 
@@ -189,10 +196,14 @@ class StaticSurfaces:
         for frame in self._frames():
             for start in range(0, len(points), _CHUNK):
                 read = frame.read(points[start : start + _CHUNK], color=True)
-                weights = read.weight * np.maximum(1 - np.abs(read.before) / np.float32(reach), 0)
+                weights = read.weight * np.maximum(1 - np.abs(read.before) / np.float32(reach), np.float32(1e-3))
                 weight[start + read.places] += weights
                 total[start + read.places] += weights[:, None] * read.color
-        return total / np.maximum(weight, np.finfo(np.float32).tiny)[:, None]
+        colors = total / np.maximum(weight, np.finfo(np.float32).tiny)[:, None]
+        seen = weight > 0
+        if seen.any() and not seen.all():
+            colors[~seen] = colors[seen][KDTree(points[seen]).query(points[~seen])[1]]
+        return colors
 
     def _near(self, grid: Grid) -> Int64[np.ndarray, " M"]:
         """Return the flat indices of the voxels within reach of a point, by blocks: all others stay unknown."""

@@ -20,16 +20,18 @@ from vggtjax.storage.trajectories import write_trajectory
 from vggtjax.storage.writing import writing
 
 
-def check_export(out: Path, form: ExportFormat) -> None:
+def check_export(out: Path, form: ExportFormat, *, pictures: bool = False) -> None:
     """Check what can be checked before the result is read.
 
     Raises InputError for an unknown format or a wrong suffix, MissingExtraError, and OutputError where `out` exists.
     """
     check_choice("format", form, get_args(ExportFormat))
     needs = FORMATS[form]
+    if pictures and not needs.has_pictures:
+        raise InputError(f"{form} has no pictures, and is made at the model's size; leave --pictures out")
     if needs.extra:
         check_extra(f"the format {form}", needs.extra, *needs.modules)
-    if needs.suffixes and out.suffix not in needs.suffixes:
+    if needs.suffixes and out.suffix.lower() not in needs.suffixes:
         ends = " or ".join(needs.suffixes)
         raise InputError(f"{out} is one file of the format {form}; give it a name that ends with {ends}")
     if os.path.lexists(out) and not (out.is_dir() and not needs.suffixes and not any(out.iterdir())):

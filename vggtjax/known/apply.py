@@ -22,6 +22,7 @@ from vggtjax.results.result import Result
 R = TypeVar("R", bound=Result)
 _LARGE_TURN = 15.0  # degrees between predicted and known poses, in the middle
 _LARGE_OFFSET = 0.25  # of the path
+_UNEQUAL = 0.02  # share by which focal lengths across and down a picture have to differ to be told apart
 
 logger = logging.getLogger(__name__)
 
@@ -60,9 +61,6 @@ def apply_known(result: R, given: Given, refine: Callable[[R], R] | None = None)
         notes["scale"] = f"{scale.factor:.4g} {words} per unit: {scale.note}"
     settings = result.settings | {"known": known.to_json() | {"found": notes, "lengths": lengths}}
     return dataclasses.replace(result, settings=settings), unit
-
-
-_UNEQUAL = 0.02  # share by which focal lengths across and down a picture have to differ to be told apart
 
 
 def scaled(result: R, factor: float) -> R:

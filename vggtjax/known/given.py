@@ -42,7 +42,8 @@ def check_readable(known: KnownGeometry) -> None:
         path = getattr(known, name)
         if path not in (None, SOURCE) and not os.path.lexists(path):
             flag = f"--{name.replace('_', '-')}"
-            raise InputError(f"{flag} is {str(path)!r}, and there is no such file; expected a file or {SOURCE!r}")
+            kinds = "a file, a folder" if name == "known_depths" else "a file"
+            raise InputError(f"{flag} is {str(path)!r}, and there is no such file; expected {kinds} or {SOURCE!r}")
     if known.intrinsics not in (None, SOURCE, EXIF):
         read_intrinsics(known.intrinsics)
     if known.poses not in (None, SOURCE):
@@ -110,6 +111,11 @@ def read_known(
         check_depths(capture)
     elif known.known_depths is not None and os.path.isdir(known.known_depths):  # noqa: PTH112
         maps = read_depth_maps(Path(known.known_depths), frames, known.depths_per_metre)
+    elif known.known_depths is not None and known.depths_per_metre is not None:
+        raise InputError(
+            f"--depths-per-metre is of a folder of depth maps, and {known.known_depths} is a file; leave it out, as "
+            "depths of a CSV file are metres"
+        )
     elif known.known_depths is not None:
         depths = read_depths(known.known_depths, frames)
     return Given(known, intrinsics, poses, poses_name, baseline, depths, maps, leave_out, capture)

@@ -101,7 +101,8 @@ def from_depths(result: Result, known: DepthSamples, name: str, *, robust: bool 
     if not used.any():
         raise InputError(f"{name} has no depth where one is predicted; expected places with points in the result")
     depths, predicted = np.log(known.depth[used]), np.log(predicted[used])
-    if len(depths) >= _MANY and np.corrcoef(depths, predicted)[0, 1] < _FALLING:
+    varies = min(np.ptp(depths), np.ptp(predicted)) > 0  # of a constant there is no correlation
+    if len(depths) >= _MANY and varies and np.corrcoef(depths, predicted)[0, 1] < _FALLING:
         logger.warning("the depths of %s fall where the prediction rises; are they disparities, not metres?", name)
     ratio = depths - predicted
     middle, weights = _biweight(ratio) if robust else (float(np.median(ratio)), np.ones(len(ratio)))

@@ -41,7 +41,9 @@ class ArrayFrames:
             raise ClipError("the array holds no frames; expected at least one")
         for index, frame in enumerate(frames):
             if frame.ndim != 3 or frame.shape[2] != 3 or frame.size == 0:
-                raise ClipError(f"frame {frame_name(index)} has shape {frame.shape}; expected [H, W, 3], none empty")
+                first = frame.ndim == 3 and frame.shape[0] == 3
+                remedy = ": put colours last, array.transpose(1, 2, 0)" if first else ", none empty"
+                raise ClipError(f"frame {frame_name(index)} has shape {frame.shape}; expected [H, W, 3]{remedy}")
         return cls(frames)
 
     def total(self, sampling: Sampling) -> int:

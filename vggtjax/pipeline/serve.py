@@ -30,7 +30,7 @@ import numpy as np
 FORMAT, VERSION = "vggtjax-artefact", 1
 MANIFEST, PROGRAM, WEIGHTS = "manifest.json", "program.bin", "weights.safetensors"
 
-_DTYPES = {"F32": "float32", "BF16": "bfloat16", "F16": "float16", "I8": "int8"}  # of safetensors
+_DTYPES = {"F32": "float32", "BF16": "bfloat16", "F16": "float16", "I8": "int8", "U16": "uint16"}  # of safetensors
 _MOST_BYTES = 1 << 24  # of the manifest, and of the header of the weights
 _MOST_LETTERS = 480  # of a message
 _MOST_WORD = 200  # letters of a text in the manifest that is used

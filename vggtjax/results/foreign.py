@@ -39,6 +39,7 @@ from vggtjax.results.frame import ResultFrame
 from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, read_headers
 from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory
 
+_WHITE = 1.01  # of shares, with rounding
 _GREY = 128  # of pictures that a format does not keep
 
 logger = logging.getLogger(__name__)
@@ -251,6 +252,10 @@ def _read_archive(path: Path, names: _Archive) -> dict[str, Any]:
     arrays = _read_some(file, wanted, {names.confidence: ((S, H, W),), names.images: (pictures,)}, eight_bits)
     images = arrays.get(names.images)
     if images is not None and names.shares:
+        if not np.abs(images).max() <= _WHITE:
+            raise ResultError(
+                f"{names.images!r} of {file.name} has values up to {images.max():g}; expected shares of white"
+            )
         shares = np.nan_to_num(images).astype(np.float32).transpose(0, 2, 3, 1)
         images = np.clip(255 * shares + 0.5, 0, 255).astype(np.uint8)
     with np.errstate(over="ignore"):

@@ -23,11 +23,13 @@ _NEAR = 1e-3  # of the distance of the scene
 def frame_times(result: Result) -> Float64[np.ndarray, " S+1"]:
     """Return when each frame is shown, in seconds from the first, and when the last one ends.
 
-    Frames of clips without times are a tenth of a second apart.
+    Frames of clips without times are a tenth of a second apart; frames whose times do not all grow, their median step.
     """
     count = len(result.depth)
-    if result.timestamps is None or count < 2 or not (np.diff(result.timestamps) > 0).all():
-        return np.arange(count + 1) / _FRAMES_A_SECOND
+    steps = np.zeros(0) if result.timestamps is None else np.diff(result.timestamps)
+    if result.timestamps is None or not steps.size or not (steps > 0).all():
+        step = float(np.median(steps)) if steps.size else 0.0
+        return np.arange(count + 1) * (step if step > 0 else 1 / _FRAMES_A_SECOND)
     times = result.timestamps - result.timestamps[0]
     return np.append(times, times[-1] + np.median(np.diff(times)))
 

@@ -37,6 +37,7 @@ T = TypeVar("T")
 _type_info = lru_cache(maxsize=512)(kinds.type_info)
 
 _ANY = kinds.AnyType()
+_TEXT = re.compile(rb'"(?:[^"\\]|\\.)*"')
 _NO_NUMBER = re.compile(rb"[\[:,]\s*(-?(?:NaN|Infinity|nan|inf))\b")  # as Python writes them
 _MARK = b"\xef\xbb\xbf"  # of the byte order, which Windows puts first
 _ITEMS = (kinds.VarTupleType, kinds.ListType)
@@ -73,7 +74,8 @@ def parse_json(
     try:
         value = msgspec.json.decode(text.removeprefix(_MARK) if isinstance(text, bytes) else text)
     except (ValueError, RecursionError) as problem:
-        if found := _NO_NUMBER.search(text if isinstance(text, bytes) else text.encode()):
+        encoded = text if isinstance(text, bytes) else text.encode(errors="replace")
+        if found := _NO_NUMBER.search(_TEXT.sub(b'""', encoded)):
             raise error(f"{what} has {found[1].decode()}, which is no number; expected finite numbers") from None
         raise error(f"{what} is not JSON that can be read: {problem}") from None
     try:

@@ -1,6 +1,6 @@
 // The viewer's camera: it turns about a target, or follows the camera of the clip.
 
-const [NARROWEST, WIDEST] = [0.1, 0.8]; // tangents of half a field of view
+const [NARROWEST, WIDEST] = [0.02, 2]; // tangents of half a field of view
 const STEEPEST = 1.5; // radians
 
 class Orbit {
