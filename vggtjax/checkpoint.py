@@ -172,14 +172,18 @@ def read_model(
     flat: dict[str, Any] = {}
     is_as_stored = dtype != "int8"
     for key, stored in tensors.items():
-        tensor = stored.within(content)
-        if dtype == "int8" and is_quantised(key):
+        is_narrowed = compute_dtype == "bfloat16" and is_multiplied(key)
+        # What is read in another type is mapped by itself: its pages leave the memory with it.
+        in_eight_bits = dtype == "int8" and is_quantised(key)
+        is_other = in_eight_bits or (dtype not in (None, "int8") and numpy_dtype(dtype) != stored.dtype)
+        tensor = np.asarray(stored) if is_narrowed or is_other else stored.within(content)
+        if in_eight_bits:
             flat[key] = jax.block_until_ready(quantise(tensor))
             continue
         if dtype not in (None, "int8"):
             tensor = tensor.astype(numpy_dtype(dtype), copy=False)
         is_as_stored &= tensor.dtype == stored.dtype
-        if compute_dtype == "bfloat16" and is_multiplied(key):
+        if is_narrowed:
             tensor = tensor.astype(numpy_dtype("bfloat16"), copy=False)
             if key.endswith(".kernel") and jax.default_backend() == "cpu":
                 flat[key] = jax.block_until_ready(halves(tensor))
