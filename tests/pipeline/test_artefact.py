@@ -7,6 +7,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -87,7 +88,7 @@ def test_kernels_that_are_kept_as_bits_are_written_and_read(model, tmp_path):
     path = save_model(tmp_path / "model.safetensors", model.params, model.config)
     narrow = load_model(path, compute_dtype="bfloat16")
     frames, height, width = SHAPE
-    options = {"method": "vggt", "compute_dtype": "bfloat16"}
+    options: dict[str, Any] = {"method": "vggt", "compute_dtype": "bfloat16"}
     folder = write_artefact(narrow, tmp_path / "it", frames=frames, height=height, width=width, **options)
     images = jax.numpy.asarray(clip(0)[None].astype(np.float32) / np.float32(255))
     assembly, _ = infer(model.params, images, model.config, **options)
