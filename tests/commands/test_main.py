@@ -112,7 +112,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
         (["reconstruct", "{tmp}/a.mp4", "--out", "{tmp}/out"], "cannot read video"),
         (["convert", "demo", "{tmp}/out.safetensors"], "demo is the embedded model, which needs no conversion"),
         (["convert", "{frames}/00000.png", "{tmp}/out.safetensors", "--heads", "camera,nose"], "heads has ['nose']"),
-        (["info", "{frames}/00000.png"], "00000.png"),
+        (["info", "{tmp}/a.mp4"], "a.mp4"),
     ],
 )
 def test_bad_input_is_one_sentence_and_exit_code_2(tmp_path, capsys, frames, arguments, sentence):
