@@ -85,8 +85,8 @@ def info(
     """Print a model's configuration, heads, number of parameters and type; or what a clip is.
 
     Args:
-        model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id; or a video, a picture, a folder of pictures, or
-            a capture: frames, size, length, the focal length that the camera states, the lens.
+        model: "demo", a converted .safetensors, a PyTorch checkpoint, or a hub id; or a video, a picture, a folder of
+            pictures, or a capture: frames, size, length, the focal length that the camera states, the lens.
         config: JSON file with the configuration of a PyTorch checkpoint that is not VGGT-1B.
     """
     report = Report()
