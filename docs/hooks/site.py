@@ -20,14 +20,15 @@ BLOCK = re.compile(r"<!-- site: (.*?) -->.*?<!-- /site -->", flags=re.DOTALL)
 _DIRECTIVE = re.compile(r"<!-- site: ::: (\S+) -->.*?<!-- /site -->", flags=re.DOTALL)
 EVERY_COMMAND = "HELP OF EVERY COMMAND"  # command_line.py puts it there
 _WIDEST = 100  # columns of a signature in one line
-
-
-SETTINGS = {"index.md": {"hide": ["navigation", "toc"]}, "reference/changes.md": {"search": {"exclude": True}}}
+_SETTINGS = {  # of pages, which as front matter plain Markdown would show
+    "index.md": {"hide": ["navigation", "toc"]},
+    "reference/changes.md": {"search": {"exclude": True}},
+}
 
 
 def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     """Put the site's text in place of what a plain reader sees, and the settings of a page (a hook of mkdocs)."""
-    page.meta.update(SETTINGS.get(page.file.src_uri, {}))
+    page.meta.update(_SETTINGS.get(page.file.src_uri, {}))
     markdown = re.sub(r"(notebooks/\w+)\.py\)", r"\1.md)", markdown)
     return BLOCK.sub(lambda found: found[1], markdown)
 
@@ -86,9 +87,7 @@ def _signature(found: Any) -> str:
         return found.name + (f": {found.annotation}" if found.annotation else "") + value
     start = f"class {found.name}" if found.is_class else f"def {found.name}"
     parameters, returns = list(found.parameters), f" -> {found.returns}" if found.is_function and found.returns else ""
-    fields = [
-        f"{'    '}{name}: {a.annotation}" for name, a in found.attributes.items() if found.is_class and a.annotation
-    ]
+    fields = [f"    {name}: {a.annotation}" for name, a in found.attributes.items() if found.is_class and a.annotation]
     if found.is_class and not [p for p in parameters if p.name != "self"]:
         start += f"({', '.join(map(str, found.bases))})" if found.bases else ""
         return "\n".join([f"{start}:", *fields]) if fields else start

@@ -9,7 +9,7 @@ from vggtjax.captures.table import capture_kind
 from vggtjax.clips.clip import read_clip
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sources import open_source
-from vggtjax.known.stated import stated_focal
+from vggtjax.known.stated import focal_in_words
 from vggtjax.media.images import is_image_name
 from vggtjax.media.sampling import Sampling
 from vggtjax.media.video import VideoFile, is_video_name
@@ -34,7 +34,7 @@ def clip_facts(path: str) -> dict[str, str]:
     facts = {"size": f"{width} x {height} pixels of the first frame, upright"}
     facts |= {} if frames is None else {"frames": str(frames)}
     facts |= {} if seconds is None else {"length": f"{seconds:.2f} s, as the file states it"}
-    facts["focal length"] = stated_focal(clip)
+    facts["focal length"] = focal_in_words(clip)
     if isinstance(source, CaptureFrames):
         capture = source.capture
         known = {

@@ -21,7 +21,7 @@ from PIL import Image
 from vggtjax.exports.nerfstudio import lens_of, transform_matrix
 from vggtjax.exports.views import View, of_one_size
 from vggtjax.results.gltf_animation import frame_times
-from vggtjax.results.point_cloud import PointCloud, write_ply
+from vggtjax.results.point_cloud import PointCloud, ply_header, write_ply
 from vggtjax.results.result import Result
 
 _HELD_OUT = 8  # every so many frames one is for testing
@@ -29,20 +29,6 @@ _POINTS = "points3D_downsample2.ply"  # the name that 4DGaussians reads
 _OUTLIERS = (1.0, 99.0)  # percentiles of the static points, between which the box lies
 _NEAR, _FAR = 0.75, 1.25  # of the nearest and the farthest depth, but for a thousandth
 _WITH_NORMALS = np.dtype([("points", "<f4", 3), ("normals", "<f4", 3), ("colors", "u1", 3)])
-_HEADER = """ply
-format binary_little_endian 1.0
-element vertex {count}
-property float x
-property float y
-property float z
-property float nx
-property float ny
-property float nz
-property uchar red
-property uchar green
-property uchar blue
-end_header
-"""
 
 
 def write_dynamic_splats(
@@ -155,7 +141,7 @@ def _write_with_normals(path: Path, cloud: PointCloud) -> None:
     """Write a cloud with normals of 0, which readers of splats ask for and do not use."""
     vertices = np.zeros(len(cloud), _WITH_NORMALS)
     vertices["points"], vertices["colors"] = cloud.points, cloud.colors
-    path.write_bytes(_HEADER.format(count=len(cloud)).encode() + vertices.tobytes())
+    path.write_bytes(ply_header(_WITH_NORMALS, len(cloud)) + vertices.tobytes())
 
 
 def _dump(path: Path, value: dict[str, Any]) -> None:

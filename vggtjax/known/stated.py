@@ -15,10 +15,10 @@ from vggtjax.media.images import ImageFiles
 from vggtjax.media.video import VideoFile
 from vggtjax.results.result import Result
 
-_FAR = 0.2  # share of the stated focal length by which a predicted one has to differ to be worth a word
-"""A stated one may be off itself: by 2 %, as it is rounded to whole millimetres (26); by 5 to 9 % where the width was
-meant, or where the picture is the part of 16:9 of a sensor of 4:3; by 10 % or so where a stabilised video shows less
-than the lens sees."""
+# Share of the stated focal length by which a predicted one has to differ to be worth a word. A stated one may be off
+# itself: by 2 %, as it is rounded to whole millimetres (26); by 5 to 9 % where the width was meant, or where the
+# picture is the part of 16:9 of a sensor of 4:3; by 10 % or so where a stabilised video shows less than the lens sees.
+_FAR = 0.2
 
 
 def stated_intrinsics(clip: Clip) -> Float64[np.ndarray, "F 3 3"]:
@@ -37,18 +37,16 @@ def stated_intrinsics(clip: Clip) -> Float64[np.ndarray, "F 3 3"]:
 def focal_stated(clip: Clip) -> StatedFocal | None:
     """Return the focal length that the files of a clip state, the middle one of all pictures; None without a word."""
     with suppress(InputError):
-        stated = sorted(_stated(clip))
-        return stated[len(stated) // 2]
+        return _middle(clip)
     return None
 
 
-def stated_focal(clip: Clip) -> str:
+def focal_in_words(clip: Clip) -> str:
     """Return in words what the files of a clip state of the focal length, or why that cannot be used."""
     try:
-        stated = sorted(_stated(clip))
+        middle = _middle(clip)
     except InputError as error:
         return str(error)
-    middle = stated[len(stated) // 2]
     return f"{middle.words}, {middle.pixels:.4g} pixels; --intrinsics exif takes it"
 
 
@@ -64,6 +62,11 @@ def disagreement(stated: StatedFocal, result: Result) -> str | None:
         f"the predicted focal length, {by_axis[worst]:.4g} pixels {axis}, is {changes[worst]:+.0%} off what the camera "
         "states; --intrinsics exif takes the camera's"
     )
+
+
+def _middle(clip: Clip) -> StatedFocal:
+    stated = sorted(_stated(clip))
+    return stated[len(stated) // 2]
 
 
 def _stated(clip: Clip) -> list[StatedFocal]:

@@ -14,6 +14,7 @@ from vggtjax.progress import Progress, no_progress
 from vggtjax.rendering.film import write_film as write_film
 from vggtjax.rendering.paths import fitted_intrinsics, follow, middle_camera, orbit
 from vggtjax.rendering.splats import BACKGROUND, Splats, draw_splats
+from vggtjax.results.frame import PLAIN_RATE
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, shown_points
 from vggtjax.results.widths import point_widths
@@ -21,7 +22,6 @@ from vggtjax.results.widths import point_widths
 Path = Literal["orbit", "camera"]
 MOST_SIDE, MOST_FRAMES = 4096, 10_000
 _PATHS = {"orbit": orbit, "camera": follow}
-_PLAYED = 10.0  # frames of the clip per second, where its times are not known
 _WIDE = 6.0  # pixels; discs that are wider take long to draw, and are coarser than any edge: they are not supersampled
 _LEFT_OUT = 10.0  # percent of the pixels, the least confident: holes look worse than unsure points
 _MIDDLE = 40  # percentile of the depths that is the scene's middle: objects are nearer than walls
@@ -78,7 +78,7 @@ def film_frames(
 def due_frames(result: Result, seconds: float, count: int, *, loops: bool) -> Int32[np.ndarray, " count"]:
     """Return which frame of the clip each of the `count` frames of a film of so many seconds shows."""
     frames, times = len(result.depth), result.timestamps
-    duration = frames / _PLAYED
+    duration = frames / PLAIN_RATE
     if times is not None and frames > 1 and (np.diff(times) > 0).all():
         duration = float(times[-1] - times[0]) * frames / (frames - 1)
     plays = max(1, round(seconds / duration)) if loops else 1

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
+from vggtjax.results.frame import PLAIN_RATE
 from vggtjax.results.result import Result
 from vggtjax.results.shown import middle_and_radius
 
 TO_GLTF = np.array([1, -1, -1], np.float32)  # half a turn about x: y down and z forward become y up and z backward
 CAMERA_NAME = "camera"  # of the node
-_FRAMES_A_SECOND = 10.0  # of clips without times
 _FLOAT = 5126  # glTF's names
 _KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 _POINTER = "KHR_animation_pointer"
@@ -29,7 +29,7 @@ def frame_times(result: Result) -> Float64[np.ndarray, " S+1"]:
     steps = np.zeros(0) if result.timestamps is None else np.diff(result.timestamps)
     if result.timestamps is None or not steps.size or not (steps > 0).all():
         step = float(np.median(steps)) if steps.size else 0.0
-        return np.arange(count + 1) * (step if step > 0 else 1 / _FRAMES_A_SECOND)
+        return np.arange(count + 1) * (step if step > 0 else 1 / PLAIN_RATE)
     times = result.timestamps - result.timestamps[0]
     return np.append(times, times[-1] + np.median(np.diff(times)))
 

@@ -14,18 +14,20 @@ from vggtjax.results.result import Result
 from vggtjax.storage.arrays import spread_frames
 
 _VERTEX = np.dtype([("points", "<f4", 3), ("colors", "u1", 3), ("alpha", "u1")])
-_HEADER = """ply
-format binary_little_endian 1.0
-element vertex {count}
-property float x
-property float y
-property float z
-property uchar red
-property uchar green
-property uchar blue
-property uchar alpha
-end_header
-"""
+_PROPERTIES = {
+    "points": "float x y z",
+    "normals": "float nx ny nz",
+    "colors": "uchar red green blue",
+    "alpha": "uchar alpha",
+}
+
+
+def ply_header(vertex: np.dtype, count: int) -> bytes:
+    """Return the header of a binary PLY file of `count` vertices, whose fields are points, normals, colors or alpha."""
+    rows = (_PROPERTIES[field].split() for field in vertex.names or ())
+    properties = [f"property {kind} {name}" for kind, *names in rows for name in names]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header", ""]
+    return "\n".join(lines).encode()
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +89,7 @@ class PlyWriter:
         self._file.close()
         if kind is None:  # the header holds the number of points, so it is written last
             with self._path.open("wb") as file, self._body.open("rb") as body:
-                file.write(_HEADER.format(count=self._count).encode())
+                file.write(ply_header(_VERTEX, self._count))
                 shutil.copyfileobj(body, file, 1 << 20)
         self._body.unlink(missing_ok=True)
 

@@ -15,7 +15,7 @@ from PIL import Image
 from vggtjax.cameras import frustum_corners
 from vggtjax.errors import one_line
 from vggtjax.progress import Progress
-from vggtjax.results.frame import frame_of
+from vggtjax.results.frame import PLAIN_RATE, frame_of
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, middle_and_radius, relative_steps, shown_points
 from vggtjax.results.tracks import SEEN
@@ -26,7 +26,6 @@ LARGEST_STEP = 0.3  # of depth between neighbours, as a share; pixels beside lar
 _LEAST_MOVING = 200  # points of a frame
 FRUSTUM = 0.045  # of the scene's radius
 _BEHIND, _ABOVE = 0.35, 0.16  # of the median depth: where the first view stands from a camera
-_PLAIN_RATE = 10.0  # frames a second without timestamps
 _TILE, _SHEET = 256, 4096  # pixels: the longer side of a small picture; a side of the sheet that every browser takes
 
 
@@ -140,9 +139,9 @@ def _facts(result: Result) -> str:
 def frame_rate(result: Result) -> float:
     """Return frames a second."""
     if result.timestamps is None or len(result.timestamps) < 2:
-        return _PLAIN_RATE
+        return PLAIN_RATE
     step = float(np.median(np.diff(result.timestamps)))
-    return float(np.clip(1 / step, 0.5, 60)) if step > 0 else _PLAIN_RATE
+    return float(np.clip(1 / step, 0.5, 60)) if step > 0 else PLAIN_RATE
 
 
 def shown_widths(result: Result, static: ShownPoints, moving: list[ShownPoints]) -> list[Float32[np.ndarray, " N"]]:
