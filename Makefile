@@ -7,7 +7,8 @@
 # While you work: `make check`, which is lint and types beside the tests that run few networks, in two minutes.
 # `make coverage` counts the lines and branches that the tests run, and `make shuffled` runs them in a random order.
 # `make accelerator` compiles for GPUs that are not there and counts (5 GB of NVIDIA's libraries; ARGUMENTS="--top 10"),
-# `make accelerator-check` a tiny model in float32 with the compiler alone (0.5 GB), as CI does.
+# `make accelerator-check` a tiny model in float32, and the memory of a large one, with the compiler alone (0.5 GB), as CI
+# does.
 # `make proofs` runs what takes long and rarely breaks; `make mutants` measures how many faults the tests notice.
 
 PYTHON ?= python3
@@ -66,6 +67,8 @@ accelerator-check: $(ACCELERATOR)/.compiler
 	JAX_PLATFORMS=cpu PYTHONPATH=$(ACCELERATOR)/compiler $(BIN)/python -m benchmarks accelerator --size tiny --frames 4 \
 	  --targets h100 l4 --dtype float32 --precision highest \
 	  --programs "image features" "first pass" "dynamic mask" "second pass" assemble attention
+	JAX_PLATFORMS=cpu PYTHONPATH=$(ACCELERATOR)/compiler $(BIN)/python -m benchmarks accelerator --frames 200 \
+	  --programs "first pass" --most 7.5
 
 compiler-is-there: $(VENV)/.development
 	$(BIN)/python -m pip download --quiet --no-deps --dest $(ACCELERATOR)/wheels $(COMPILERS)

@@ -22,6 +22,7 @@ import numpy as np
 
 from testing.process_memory import process_bytes
 from testing.seeded import seeded_images
+from vggtjax.storage.cores import core_count
 
 Outputs = dict[str, np.ndarray]
 Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S, 3, H, W] in [0, 1], mask [S, H, W]
@@ -84,7 +85,7 @@ def peer(weights: Path, checkout: Path, *, mapped: bool, dtype: str) -> Run:
     import torch
     from safetensors.torch import load_file, load_model
 
-    torch.set_num_threads(os.cpu_count() or 1)
+    torch.set_num_threads(core_count())
     models: dict[str, Any] = {}
 
     def model_for(work: str) -> Any:

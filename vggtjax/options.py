@@ -163,7 +163,8 @@ class Options:
         ComputeDType | None,
         tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint=""),  # pyright: ignore
     ] = None
-    """number type of the transformer's matrix products; by default bfloat16 on a GPU or TPU, else float32"""
+    """number type of the transformer's matrix products; by default bfloat16 on a GPU or TPU, and on a CPU float32, or
+    bfloat16 if reconstruct runs a large model and a short trial finds it faster there"""
     precision: InWords[Precision | None] = None
     """how exactly a GPU or TPU computes: tf32, the default there, fast, with about three decimal digits in the
     products that make depth and motion cues, as PyTorch has it in convolutions; highest, slower, with the seven digits
@@ -232,7 +233,7 @@ class Options:
         """
         dtype, precision = self.compute_dtype, self.precision
         if dtype is None or precision != "highest":
-            narrow = precision != "highest" and (_has_accelerator() if on_accelerator is None else on_accelerator)
+            narrow = precision != "highest" and (has_accelerator() if on_accelerator is None else on_accelerator)
             dtype, precision = dtype or ("bfloat16" if narrow else "float32"), "tf32" if narrow else "highest"
         return dataclasses.replace(self, compute_dtype=dtype, precision=precision)
 
@@ -265,7 +266,8 @@ class Options:
         return values
 
 
-def _has_accelerator() -> bool:
+def has_accelerator() -> bool:
+    """Return whether jax has a GPU or TPU."""
     import jax  # it takes a second, and a command line that is refused needs none
 
     return jax.default_backend() != "cpu"

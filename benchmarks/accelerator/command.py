@@ -41,6 +41,7 @@ def accelerator(
     precision: Precision = "tf32",
     devices: int = 1,
     top: int = 0,
+    most: float | None = None,
     out: Path | None = None,
 ) -> None:
     """Compile the programs of a reconstruction for accelerators that are not there, and count their kernels.
@@ -58,6 +59,7 @@ def accelerator(
         precision: of the heads' products.
         devices: 1, 8, or for a TPU 4: frames are in equal shares on all.
         top: how many kernels of each program to list.
+        most: fail if a program needs more temporary memory and outputs than so many GB.
         out: JSON file for the results.
     """
     names = _chosen("targets", targets, tuple(TARGETS))
@@ -77,6 +79,13 @@ def accelerator(
         for setup, compiled in rows if top else []:
             _kernels(setup, compiled, top).show(screen)
         found += [_record(name, setup, compiled) for setup, compiled in rows]
+        for setup, compiled in rows:
+            needed = (compiled.temporary + compiled.outputs) / 1e9
+            if most is not None and needed > most:
+                raise InputError(
+                    f"{compiled.name} of {setup.frames} frames on {name} needs {needed:.2f} GB of temporary memory and "
+                    f"outputs; expected at most {most:g}"
+                )
     screen.print(_NOTE)
     if out is not None:
         with writing(out) as temporary:

@@ -12,10 +12,11 @@ import pytest
 from testing.seeded import seeded_images
 from tests.tiny import tiny_config
 from vggtjax import VGGTConfig, forward
-from vggtjax.config import HEAD_NAMES, VGGT_HEADS
+from vggtjax.config import HEAD_NAMES, VGGT_HEADS, vggt_1b
 from vggtjax.errors import InputError
 from vggtjax.network.dpt_head import DENSE_HEADS, DenseMap
 from vggtjax.network.model import FIELDS, HEADS, init_params, parameter_shapes
+from vggtjax.network.narrow import narrowed
 from vggtjax.network.suppression import Suppression
 
 SIZE = (28, 42)
@@ -54,6 +55,18 @@ def test_keys_are_suppressed_in_the_pairs_that_the_model_recommends(params, conf
             for c, given in ((other, {}), (config, {"mask_pairs": 1}), (config, {}))]  # fmt: skip
     assert close(made[0], made[1])
     assert not close(made[0], made[2])
+
+
+def test_the_program_of_an_accelerator_gives_the_same(monkeypatch, params, config, images, mask):
+    """Rows padded to a multiple of eight, taps captured for one frame at a time; a CPU runs what is for others."""
+    given = {"config": config, "dynamic_tokens": mask, "outputs": ("camera", "depth")}
+    wanted = _forward(params, images, **given)
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *inputs, default, **_: default(*inputs))
+    monkeypatch.setattr("vggtjax.network.pieces._rows_on_cpu", lambda rows: 1)
+    monkeypatch.setattr("vggtjax.network.aggregator._CAPTURED_ROWS", 1)
+    made = forward(params, images, **given)
+    for name in ("pose_encoding", "depth", "depth_confidence"):
+        assert close(getattr(made, name), getattr(wanted, name)), name
 
 
 def test_permuting_later_frames_permutes_the_outputs(params, config, images, mask):
@@ -170,6 +183,15 @@ def test_a_row_of_the_table_is_a_dense_head(monkeypatch, config):
     monkeypatch.delitem(DENSE_HEADS, "sky")
     with pytest.raises(KeyError, match="sky"):
         run()
+
+
+def test_weights_that_a_gpu_holds_of_vggt_1b():
+    """Without the heads of points and tracks, which a reconstruction does not read."""
+    held = jax.eval_shape(partial(narrowed, compute_dtype="bfloat16"), parameter_shapes(vggt_1b()))
+    sizes = {
+        head: sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree)) for head, tree in held.items()
+    }
+    assert 2.3e9 < sum(sizes[head] for head in ("backbone", "aggregator", "camera_head", "depth_head")) < 2.6e9
 
 
 def test_full_size_parameters():

@@ -11,7 +11,7 @@ from vggtjax.commands.arguments import ModelName, Revision
 from vggtjax.commands.report import Report
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.options import METHODS, Options
+from vggtjax.options import METHODS, Options, has_accelerator
 from vggtjax.storage.cache import enable_compilation_cache
 from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import read_json
@@ -24,10 +24,16 @@ if TYPE_CHECKING:
 _MOST_CONFIG_BYTES = 1 << 20
 
 
-def load(report: Report, name: str | None, config: Path | None = None, compute_dtype: str | None = None) -> Model:
+def load(
+    report: Report,
+    name: str | None,
+    config: Path | None = None,
+    compute_dtype: str | None = None,
+    stage: str = "load model",
+) -> Model:
     """Load a model as a stage of the report, to compute blocks in a type. Raises InputError without a name."""
     name = check_named(name)
-    with report.stage("load model") as progress:
+    with report.stage(stage) as progress:
         from vggtjax.pretrained.load import load_model
 
         return load_model(name, config=read_config(config), compute_dtype=compute_dtype, progress=progress)
@@ -84,6 +90,29 @@ class ModelFiles:
         fusing = next(name for name in methods if METHODS[name].depth == "fused")
         warn_if_fitted_otherwise(self.fusion, model, options.changed(method=fusing))
         return model, params
+
+    def load_fastest(
+        self, report: Report, options: Options, methods: Sequence[str]
+    ) -> tuple[Model, FusionParams | None, Options]:
+        """Load the model and the rule of fusion; return them, and options with a type that this CPU multiplies fast.
+
+        A type or precision that is given stays. Without one, a trial chooses bfloat16 or float32 for a large model on a
+        CPU, and the report says which and why.
+        """
+        model, params = self.load(report, options, methods)
+        if options.compute_dtype is not None or options.precision is not None or has_accelerator():
+            return model, params, options
+        from vggtjax.pipeline.processor import choose_dtype
+
+        choice = choose_dtype(model.config.embed_dim)
+        if choice is None:
+            return model, params, options
+        exact = "" if choice.dtype == "float32" else "; --dtype float32 is slower and exact"
+        report.note(f"computing in {choice.dtype}: {choice.reason}{exact}")
+        if choice.dtype != "float32":
+            name = at_revision(check_named(self.model), self.revision)
+            model = load(report, name, self.config, choice.dtype, stage=f"weights in {choice.dtype}")
+        return model, params, options.changed(compute_dtype=choice.dtype)
 
 
 def load_on_worker(files: ModelFiles, options: Options) -> tuple[Model, FusionParams | None]:

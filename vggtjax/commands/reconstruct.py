@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Annotated
 
 import tyro
@@ -58,7 +59,8 @@ def reconstruct(
         check_readable(recipe.known)
         frames_mesh(recipe.devices)
         check_folder(out, recipe.saving.names(tracks=given.tracks is not None))
-        network, fitted = files.load(report, recipe.options, [recipe.options.method])
+        network, fitted, options = files.load_fastest(report, recipe.options, [recipe.options.method])
+        recipe = dataclasses.replace(recipe, options=options)
         from vggtjax.commands.one_clip import OneClip
 
         result = OneClip(report, frames, network, fitted, recipe, given, out, opened).run(windows)

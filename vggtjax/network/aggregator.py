@@ -19,11 +19,13 @@ from vggtjax.network.frames import Frames
 from vggtjax.network.in_place import replaced_if
 from vggtjax.network.layers import Params, apply, stack
 from vggtjax.network.merging import merged_attention
+from vggtjax.network.pieces import largest_divisor
 from vggtjax.network.precision import Compute, full_precision, upcast
 from vggtjax.network.rope import rope_table
 from vggtjax.network.suppression import Attend, SuppressedKeys, Suppression, suppressed_attention
 
 REGISTERS = 4
+_CAPTURED_ROWS = 2**16  # at once: they take 0.5 GB in float32
 SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
 
 # (S, grid, special tokens) -> attention over the S frames of a clip
@@ -198,12 +200,27 @@ def _global_attention(compute: Compute, S: int, grid: tuple[int, int]) -> Attend
 
 
 def _joined(capture: Capture, shape: tuple[int, int, int, int]) -> Callable[[Array, Array], Any]:
-    """Return what captures a tapped pair: its frame and global outputs, joined."""
+    """Return what captures a tapped pair: its frame and global outputs, joined; on an accelerator some frames at once.
+
+    The rows of many frames, joined and normalised in float32, would be the most that a pass holds.
+    """
+    B, S, T = shape[:3]
+    at_once = largest_divisor(S, max(_CAPTURED_ROWS // (B * T), 1))
 
     def captured(frame: Array, x: Array) -> Any:
         return capture(jnp.concatenate([frame.reshape(shape), x.reshape(shape)], axis=-1))
 
-    return captured
+    def in_pieces(frame: Array, x: Array) -> Any:
+        def of_piece(start: Array) -> Any:
+            pieces = (jax.lax.dynamic_slice_in_dim(a.reshape(shape), start, at_once, axis=1) for a in (frame, x))
+            return capture(jnp.concatenate(list(pieces), axis=-1))
+
+        captures = jax.lax.map(of_piece, at_once * jnp.arange(S // at_once))  # [pieces, B, at once, ...]
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1).reshape(B, S, *leaf.shape[3:]), captures)
+
+    if at_once == S:
+        return captured
+    return lambda frame, x: jax.lax.platform_dependent(frame, x, cpu=captured, default=in_pieces)
 
 
 def _empty(capture: Capture, shape: tuple[int, ...], dtype: Any) -> Any:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from vggtjax.network.cpu_attention import attention_in_chunks
 from vggtjax.network.gpu_attention import fused_attention, is_fused
+from vggtjax.network.gpu_kernels import compiles_for_gpus, is_in_shard_map, is_on_one, runs
 from vggtjax.network.pieces import largest_divisor
 
 LOGITS_AT_ONCE = 2**28  # maximum of all clips and heads in memory, except on a CPU
@@ -33,20 +34,14 @@ def attention(
     """
     branches: dict[str, Any] = {"cpu": attention_in_chunks, "default": _at_once_or_in_chunks}
     D = q.shape[-1]
-    is_local = bool(jax.sharding.get_abstract_mesh().manual_axes)  # in a shard_map
     # The platform that the program is compiled for chooses, whether or not one is plugged in.
     if q.dtype == jnp.bfloat16 and D % 8 == 0 and D <= 128 and cudnn_works():
         branches["cuda"] = _with_cudnn
-    if q.dtype == jnp.float32 and is_fused(D) and (is_local or _is_whole("gpu")) and kernel_works():
+    if q.dtype == jnp.float32 and is_fused(D) and is_on_one("gpu") and kernel_works():
         branches["cuda"] = _in_one_kernel
-    if (D <= 128 or D % 128 == 0) and not is_local and _is_whole("tpu") and find_spec("libtpu"):
+    if (D <= 128 or D % 128 == 0) and not is_in_shard_map() and is_on_one("tpu") and find_spec("libtpu"):
         branches["tpu"] = _on_tpu
     return jax.lax.platform_dependent(q, k, v, visible, **branches)
-
-
-def _is_whole(backend: str) -> bool:
-    """Return whether arrays are on one device: jax cannot divide the work of a kernel among several."""
-    return jax.default_backend() != backend or jax.device_count() == 1
 
 
 @functools.cache
@@ -55,7 +50,7 @@ def cudnn_works() -> bool:
 
     Without a GPU, return whether cuDNN is installed: what is compiled for a GPU here runs on another machine.
     """
-    return _runs(_with_cudnn, jnp.bfloat16, 64)
+    return _attends(_with_cudnn, jnp.bfloat16, 64)
 
 
 @functools.cache
@@ -64,25 +59,13 @@ def kernel_works() -> bool:
 
     Without a GPU, return whether jax compiles for NVIDIA GPUs here: nothing else pays for tracing the kernel.
     """
-    compiles = any(find_spec(f"jax_cuda{version}_plugin") for version in (12, 13))
-    return compiles and all(_runs(_in_one_kernel, jnp.float32, head_dim) for head_dim in (64, 128))
+    return compiles_for_gpus() and all(_attends(_in_one_kernel, jnp.float32, head_dim) for head_dim in (64, 128))
 
 
-def _runs(attend, dtype, head_dim: int) -> bool:
+def _attends(attend, dtype, head_dim: int) -> bool:
     visible = np.ones((2, 13), bool)
     gradient = jax.grad(lambda x: attend(x, x, x, jnp.asarray(visible)).sum())
-    x = jax.ShapeDtypeStruct((2, 13, 1, head_dim), dtype)
-    try:
-        jax.eval_shape(gradient, x)
-        try:
-            device = jax.local_devices(backend="cuda")[0]
-        except RuntimeError:
-            return True
-        with jax.ensure_compile_time_eval(), jax.default_device(device):
-            jax.block_until_ready(gradient(jnp.ones(x.shape, x.dtype)))
-    except (RuntimeError, NotImplementedError, ValueError):  # no cuDNN, or too old, or too old a GPU
-        return False
-    return True
+    return runs(gradient, jax.ShapeDtypeStruct((2, 13, 1, head_dim), dtype))
 
 
 def _at_once_or_in_chunks(q, k, v, visible):

@@ -11,8 +11,11 @@ from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.network.cpu_attention import ATTENDED
+from vggtjax.network.gpu_heads import heads_work, is_fused, normed_heads
+from vggtjax.network.gpu_kernels import is_on_one
 from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, Params, apply
 from vggtjax.network.pieces import map_chunks, map_chunks_in_place
+from vggtjax.network.precision import upcast
 from vggtjax.network.quantised import as_multiplied
 from vggtjax.network.rope import Rope, apply_rope
 from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
@@ -45,14 +48,28 @@ class Projections(nn.Module):
         if self.qk_norm:
             self.q_norm, self.k_norm = LayerNorm(dtype=self.dtype), LayerNorm(dtype=self.dtype)
 
-    def heads(self, x: Float[Array, "R C"], rope: Rope | None) -> tuple[Array, Array, Array]:
-        """Return q, k and v [R, N, D]; q and k after norm, and rotated by the angles of their rows."""
+    def heads(self, x: Float[Array, "R C"], rope: Rope | None, count: int) -> tuple[Array, Array, Array]:
+        """Return q, k and v [count, N, D] of the first rows; q and k after norm, and rotated by their rows' angles."""
         y = self.qkv(x).reshape(-1, 3, self.num_heads, self.channels // self.num_heads)
-        q, k, v = (y[:, i] for i in range(3))
+        q, k, v = (y[:count, i] for i in range(3))
         if self.qk_norm:
             q, k = self.q_norm(q), self.k_norm(k)
         q, k, v = (y.astype(self.dtype) for y in (q, k, v))
-        return (q, k, v) if rope is None else (apply_rope(q, rope), apply_rope(k, rope), v)
+        if rope is None:
+            return q, k, v
+        rope = Rope(rope.cos[:count], rope.sin[:count])
+        q, k = apply_rope(q, rope), apply_rope(k, rope)
+        if not (self.qk_norm and is_fused(*q.shape[1:]) and is_on_one("gpu") and heads_work()):
+            return q, k, v
+        norms = [norm.variables["params"] for norm in (self.q_norm, self.k_norm)]
+        norms = jnp.stack([jnp.stack([norm["scale"], norm["bias"]]) for norm in norms])
+
+        def in_one_kernel(y, norms, rope, *_):
+            return normed_heads(y.astype(self.dtype), upcast(norms), rope)
+
+        return jax.lax.platform_dependent(
+            y, norms, rope, q, k, v, cuda=in_one_kernel, default=lambda y, norms, rope, *heads: heads
+        )
 
     def project(self, y: Float[Array, "R C"]) -> Float[Array, "R C"]:
         """Return what attention adds to the residual stream."""
@@ -93,10 +110,10 @@ class Block(nn.Module):
         scale1, scale2 = (self.param(name, nn.initializers.ones, (C,)) for name in ("scale1", "scale2"))
         mlp = MLP(4 * C, C, self.dtype, name="mlp")
 
-        def before(rows):
+        def before(rows, count):
             x, place = rows
             angles = None if rope is None else Rope(rope.cos[place], rope.sin[place])
-            return attention.heads(norm1(x), angles)
+            return attention.heads(norm1(x), angles, count)
 
         def after(x, y):
             x = add(x, scale1, attention.project(y))

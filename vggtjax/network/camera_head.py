@@ -25,6 +25,7 @@ def predict_pose(
     *,
     frame_count: Int[Array, " B"] | None = None,
     stop_gradient: bool = True,
+    compute_dtype: str = "float32",
     frames: Frames = Frames(),
 ) -> Float[Array, "B S 9"]:
     """Return the pose encoding [t(3), quaternion xyzw(4), fov_h, fov_w] of every frame.
@@ -35,9 +36,11 @@ def predict_pose(
         config: the model's configuration.
         frame_count: number of real frames of each clip, its first ones; None for all.
         stop_gradient: treat the previous estimate as a constant in each iteration, as in VGGT's training.
+        compute_dtype: type of the products of the trunk's blocks; all else is float32.
         frames: where the frames are; every device computes the poses of all frames, which takes little.
     """
-    return apply(CameraHead(config, stop_gradient), params["camera_head"], camera_tokens, frame_count, frames)
+    head = CameraHead(config, stop_gradient, compute_dtype)
+    return apply(head, params["camera_head"], camera_tokens, frame_count, frames)
 
 
 class CameraHead(nn.Module):
@@ -45,6 +48,7 @@ class CameraHead(nn.Module):
 
     config: VGGTConfig
     stop_gradient: bool = True
+    compute_dtype: str = "float32"
 
     @nn.compact
     def __call__(
@@ -60,7 +64,7 @@ class CameraHead(nn.Module):
         is_real = None if is_real is None else frames.gather(is_real)
         camera_tokens = frames.gather(camera_tokens)
         E = config.tap_dim
-        block = Block(config.camera_num_heads, dtype=camera_tokens.dtype)
+        block = Block(config.camera_num_heads, dtype=jnp.dtype(self.compute_dtype))
         tokens = LayerNorm(name="token_norm")(camera_tokens)
         normed = LayerNorm(1e-6, use_bias=False, use_scale=False)(tokens)
         empty = self.param("empty_pose", nn.initializers.zeros, (1, 1, POSE_SIZE))

@@ -163,8 +163,16 @@ def predict(
 
     def made_by(name: str) -> tuple[Array, ...]:
         if name == "camera":
-            computing = {"stop_gradient": compute.stop_camera_gradient, "frames": compute.frames}
-            return (predict_pose(params, camera_tokens, config, frame_count=clips.frame_count, **computing),)
+            pose = predict_pose(
+                params,
+                camera_tokens,
+                config,
+                frame_count=clips.frame_count,
+                stop_gradient=compute.stop_camera_gradient,
+                compute_dtype=compute.compute_dtype,
+                frames=compute.frames,
+            )
+            return (pose,)
         head, projected = params[HEADS[name]], [tap[HEADS[name]] for tap in taps]
         if name == "tracks":
             return predict_tracks(head, projected, query_points, config, grid, compute.frames)  # type: ignore[arg-type]

@@ -10,14 +10,14 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 
 from vggtjax.network.layers import Params
 
-_BLOCKS = ("backbone.blocks.", "aggregator.frame_blocks.", "aggregator.global_blocks.")
+_BLOCKS = ("backbone.blocks.", "aggregator.frame_blocks.", "aggregator.global_blocks.", "camera_head.trunk.")
 _LAYERS = ("attention.qkv.", "attention.projection.", "mlp.fc1.", "mlp.fc2.")
 
 
 def is_multiplied(name: str) -> bool:
     """Return whether the parameter of this dotted name is a kernel or bias that a block turns into its products' type.
 
-    Norms and heads are computed in float32.
+    Norms are computed in float32, and so are the heads but for the blocks of the camera head.
     """
     return name.startswith(_BLOCKS) and any(layer in name for layer in _LAYERS)
 

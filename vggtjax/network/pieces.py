@@ -13,26 +13,29 @@ from vggtjax.storage.cores import core_count
 
 NUMBERS_ON_CPU = 1600 * 1024  # of a piece on two cores: an MLP's hidden rows (26 MB) stay in the cache
 ROWS_ELSEWHERE = 2**18  # an MLP's hidden rows take 2 GB in bfloat16; smaller pieces cost kernels and copies
+_MULTIPLE = 8  # of rows on an accelerator: cuBLAS takes no others, and XLA pads the inputs of each product
 _MOST_TIMES = 8  # as large as on two cores are the pieces of more, at most: it bounds their memory
 
 _Rows = TypeVar("_Rows")
 _Outputs = TypeVar("_Outputs")
 
 
-def map_chunks(function: Callable[[_Rows], _Outputs], rows: _Rows) -> _Outputs:
-    """Return `function(rows)` for a tree of arrays [R, C], ..., with the intermediate values of one piece at a time.
+def map_chunks(function: Callable[[_Rows, int], _Outputs], rows: _Rows) -> _Outputs:
+    """Return `function(rows, R)` for a tree of arrays [R, C], ..., with the intermediate values of a piece at a time.
 
-    The function must treat every row independently. Few rows take a single call, without a loop.
+    The function must treat every row independently. Few rows take a single call, without a loop. On an accelerator it
+    is given up to seven rows of zeros more than the number that it is given, and returns that number of rows.
     """
     if _count(rows) <= _rows_on_cpu(rows):  # the code below is traced for every platform
-        return function(rows)
+        return function(rows, _count(rows))
 
-    def at_most(most: int) -> Callable[[_Rows], _Outputs]:
+    def at_most(most: int, multiple: int) -> Callable[[_Rows], _Outputs]:
         def mapped(rows):
-            if (size := piece_size(_count(rows), most)) is None:
-                return function(rows)
-            outputs = jax.lax.map(function, _cut(rows, size))
-            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: _count(rows)], outputs)
+            count = _count(rows)
+            if (size := piece_size(count, most)) is None:
+                return function(_padded(rows, multiple), count)
+            outputs = jax.lax.map(lambda piece: function(piece, size), _cut(rows, size))
+            return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], outputs)
 
         return mapped
 
@@ -46,10 +49,10 @@ def map_chunks_in_place(
     if len(x) <= _rows_on_cpu(x):
         return function(x, others)
 
-    def at_most(most: int):
+    def at_most(most: int, multiple: int):
         def replaced(rows):
             if (size := piece_size(len(x), most)) is None:
-                return function(*rows)
+                return function(*_padded(rows, multiple))[: len(x)]
             pieces, others = _cut(rows, size)
 
             def step(pieces, index_and_others):
@@ -87,7 +90,8 @@ def piece_size(count: int, most: int) -> int | None:
 
 
 def _by_platform(at_most, rows):
-    return jax.lax.platform_dependent(rows, cpu=at_most(_rows_on_cpu(rows)), default=at_most(ROWS_ELSEWHERE))
+    elsewhere = at_most(ROWS_ELSEWHERE, _MULTIPLE)
+    return jax.lax.platform_dependent(rows, cpu=at_most(_rows_on_cpu(rows), 1), default=elsewhere)
 
 
 def _rows_on_cpu(rows) -> int:
@@ -99,9 +103,14 @@ def _count(rows) -> int:
 
 
 def _cut(rows, size: int):
-    def cut(x):
-        padding = -x.shape[0] % size
-        x = jnp.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1))) if padding else x
-        return x.reshape(-1, size, *x.shape[1:])
+    return jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), _padded(rows, size))
 
-    return jax.tree.map(cut, rows)
+
+def _padded(rows, multiple: int):
+    """Return the rows with rows of zeros after them, up to a multiple."""
+
+    def padded(x):
+        padding = -x.shape[0] % multiple
+        return jnp.pad(x, ((0, padding), *((0, 0),) * (x.ndim - 1))) if padding else x
+
+    return jax.tree.map(padded, rows)

@@ -1,0 +1,89 @@
+"""Where the commands compute in bfloat16 by themselves: a unit of the processor, a trial, and a sentence."""
+
+import jax
+import pytest
+
+from vggtjax.commands.models import ModelFiles
+from vggtjax.commands.report import Report
+from vggtjax.network.quantised import Halves, is_stored
+from vggtjax.options import Options
+from vggtjax.pipeline import processor
+from vggtjax.pipeline.processor import choose_dtype
+
+NARROW_AND_WIDE = {"twice": (1.0, 2.0), "hardly": (1.0, 1.4)}  # seconds
+
+
+@pytest.fixture
+def cpu(monkeypatch, tmp_path):
+    """Make up what Linux says of the processor, and the seconds of the trial."""
+
+    def made_up(text: str | None, seconds=NARROW_AND_WIDE["twice"]):
+        info = tmp_path / "cpuinfo"
+        if text is not None:
+            info.write_text(text)
+        monkeypatch.setattr(processor, "_CPU_INFO", info)
+        monkeypatch.setattr(processor, "_seconds", lambda channels: seconds)
+
+    return made_up
+
+
+@pytest.mark.parametrize(
+    ("text", "dtype"),
+    [
+        ("model name\t: AMD EPYC\nflags\t\t: fpu avx512f avx512_bf16 sha_ni\n", "bfloat16"),
+        ("flags\t\t: fpu amx_tile amx_bf16\n", "bfloat16"),
+        ("processor\t: 0\nFeatures\t: fp asimd bf16 i8mm\n", "bfloat16"),
+        ("flags\t\t: fpu avx2\nbugs\t\t: avx512_bf16\n", "float32"),
+        ("flags", "float32"),
+        (None, "float32"),  # no Linux
+    ],
+)
+def test_only_a_processor_with_a_unit_is_tried(cpu, text, dtype):
+    cpu(text)
+    choice = choose_dtype(1024)
+    assert choice is not None
+    assert choice.dtype == dtype
+    assert ("2.0 times as fast" if dtype == "bfloat16" else "no known unit") in choice.reason
+    assert choose_dtype(64) is None
+
+
+def test_a_trial_that_gains_little_or_fails_leaves_float32(cpu, monkeypatch):
+    flags = "flags : amx_bf16\n"
+    cpu(flags, NARROW_AND_WIDE["hardly"])
+    choice = choose_dtype(1024)
+    assert choice is not None
+    assert choice == ("float32", "this processor multiplies bfloat16 1.4 times as fast as float32")
+
+    def fails(channels):
+        raise jax.errors.JaxRuntimeError("UNIMPLEMENTED: no such product\nmore")
+
+    monkeypatch.setattr(processor, "_seconds", fails)
+    assert choose_dtype(1024) == ("float32", "the trial of bfloat16 failed: UNIMPLEMENTED: no such product")
+
+
+def test_the_trial_takes_the_time_of_both_products():
+    narrow, wide = processor._seconds(64)
+    assert 0 < narrow < 1
+    assert 0 < wide < 1
+
+
+def test_a_model_is_loaded_in_the_type_that_is_chosen(cpu, monkeypatch, tiny_demo, capsys):
+    cpu("flags : avx512_bf16\n")
+    monkeypatch.setattr(processor, "_FEWEST_CHANNELS", 0)
+
+    def loaded(**given):
+        files = ModelFiles(model="demo")
+        model, _, options = files.load_fastest(Report(), Options(**given), ["4dvggt-d"])
+        leaves = jax.tree.leaves(model.params, is_leaf=is_stored)
+        return options, sum(isinstance(leaf, Halves) for leaf in leaves), capsys.readouterr().err
+
+    options, kernels, said = loaded()
+    assert options == Options(compute_dtype="bfloat16")
+    assert kernels
+    assert "computing in bfloat16: this processor multiplies bfloat16 2.0 times as fast as float32" in said
+    assert "--dtype float32 is slower and exact" in said
+    for given in ({"compute_dtype": "float32"}, {"precision": "highest"}):
+        options, kernels, said = loaded(**given)
+        assert options == Options(**given)
+        assert not kernels
+        assert "computing in" not in said
