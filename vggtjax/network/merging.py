@@ -121,12 +121,14 @@ def _groups(metric: Float[Array, "T C"], kept: Int[np.ndarray, " G"], real: Bool
     groups = jnp.zeros(T, jnp.int32).at[kept].set(np.arange(len(kept), dtype=np.int32))
     if not len(others):
         return groups
-    metric = upcast(metric)
-    metric = metric * jax.lax.rsqrt(jnp.maximum(jnp.sum(metric * metric, axis=1, keepdims=True), 1e-24))
+    # A token's own length does not change which key is the most similar one, so it divides only the kept keys' columns.
     targets = metric[kept].T
+    lengths = jnp.maximum(jnp.linalg.norm(upcast(targets), axis=0), 1e-12)
+    is_real = real[kept][None]
 
     def most_similar(rows: Float[Array, "R C"]) -> Int[Array, " R"]:
-        return jnp.argmax(jnp.where(real[kept][None], rows @ targets, -jnp.inf), axis=1).astype(jnp.int32)
+        products = jnp.matmul(rows, targets, preferred_element_type=lengths.dtype) / lengths[None]
+        return jnp.argmax(jnp.where(is_real, products, -jnp.inf), axis=1).astype(jnp.int32)
 
     chunks = math.ceil(len(others) / _ROWS_AT_ONCE)
     rows = jnp.pad(metric[others], ((0, -len(others) % chunks), (0, 0))).reshape(chunks, -1, metric.shape[1])
