@@ -29,6 +29,7 @@ from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import full_precision
 from vggtjax.network.quantised import is_quantised, quantise
 from vggtjax.network.rope import rope_table
+from vggtjax.network.sampled import sampled_attention
 from vggtjax.network.suppression import suppressed_attention
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
@@ -39,6 +40,7 @@ WAYS: dict[str, str | Callable] = {
     "merged, 2 x 2": "merged",
     "merged, 3 x 3": partial(merged_attention, region=3, stride=None),
     "merged, 4 x 4": partial(merged_attention, region=4, stride=None),
+    "sampled": "sampled",
     "exact, int8 weights": "exact",
 }
 _HEADS, _WIDTH = 16, 1024
@@ -164,7 +166,7 @@ def _times(frames: int, grid: tuple[int, int], repeats: int) -> Table:
         inputs = _weights(name, params, "aggregator.global_blocks."), x
         return partial(jax.jit(full_precision(run)).lower(*inputs).compile(), *inputs)
 
-    named = {"exact": lambda *_: suppressed_attention, "merged": merged_attention}
+    named = {"exact": lambda *_: suppressed_attention, "merged": merged_attention, "sampled": sampled_attention}
     ways: dict[str, Any] = {"a frame": None}
     ways |= {name: way if callable(way) else named[way] for name, way in WAYS.items()}
     programs = {name: compiled(name, way) for name, way in ways.items()}

@@ -30,6 +30,7 @@ from vggtjax.network.frames import AXIS, BY_FRAME, REPLICATED, Frames, OnDevices
 from vggtjax.network.model import parameter_shapes, predict
 from vggtjax.network.narrow import narrowed
 from vggtjax.network.precision import Compute
+from vggtjax.network.sampled import early_pairs
 from vggtjax.options import Options
 
 _BLIND = {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False}  # nothing can be timed
@@ -137,6 +138,7 @@ def shares_of(config: VGGTConfig) -> Shares:
         **cues,
         "matches": len(motion.matching_layers(depth)) / depth,
         "suppress": motion.mask_pairs / depth,
+        "early": early_pairs(depth).mean(),
     }
 
 
@@ -179,7 +181,7 @@ def _plain(compiler: Compiler, setup: Setup) -> None:
     P = setup.grid[0] * setup.grid[1]
     tokens = jax.ShapeDtypeStruct((1, _images(setup).shape[1], P, setup.config.embed_dim), jnp.float32)
     batch = ClipBatch(_images(setup), tokens)  # type: ignore[arg-type]
-    for name, how in (("plain pass", "exact"), ("merged pass", "merged")):
+    for name, how in (("plain pass", "exact"), ("merged pass", "merged"), ("sampled pass", "sampled")):
         if how == "exact" or setup.devices == 1:
             compute = Compute(setup.dtype, setup.precision, attention=how, frames=compiler.frames)
             run = compiler.frames.on_devices(predict, REPLICATED, ClipBatch(BY_FRAME, BY_FRAME, REPLICATED))  # type: ignore[arg-type]
@@ -241,7 +243,7 @@ _BUILDS: Mapping[Callable[[Compiler, Setup], None], tuple[str, ...]] = {
         "image features", "first pass", "dynamic mask", "second pass", "assemble", "tracks",
         "matches: first pass", "matches: dynamic mask",
     ),
-    _plain: ("plain pass", "merged pass"),
+    _plain: ("plain pass", "merged pass", "sampled pass"),
     _attention: ("attention",),
     _fusion_gradient: ("fusion gradient",),
     _training_step: ("training gradient", "optimiser"),

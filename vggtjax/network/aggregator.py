@@ -22,6 +22,7 @@ from vggtjax.network.merging import merged_attention
 from vggtjax.network.pieces import largest_divisor
 from vggtjax.network.precision import Compute, full_precision, upcast
 from vggtjax.network.rope import rope_table
+from vggtjax.network.sampled import early_pairs, frames_alone, sampled_attention
 from vggtjax.network.suppression import Attend, SuppressedKeys, Suppression, suppressed_attention
 
 REGISTERS = 4
@@ -32,6 +33,7 @@ SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
 GLOBAL_ATTENTION: Mapping[str, Callable[[int, tuple[int, int], int], Attend]] = {
     "exact": lambda S, grid, special_tokens: suppressed_attention,
     "merged": merged_attention,
+    "sampled": sampled_attention,
 }
 
 Capture = Callable[[Float[Array, "B S T E"]], Any]
@@ -132,7 +134,8 @@ class Aggregator(nn.Module):
         B, S, P, C = patch_tokens.shape
         T = SPECIAL_TOKENS + P
         block = Block(config.num_heads, qk_norm=True, dtype=jnp.dtype(compute.compute_dtype))
-        global_block = block.clone(attend=_global_attention(compute, S, grid))
+        attend = _global_attention(compute, S, grid)
+        global_block = block.clone(attend=attend)
         rope = rope_table(grid, SPECIAL_TOKENS, C // config.num_heads)
         frames = compute.frames
         real = frames.are_real(frame_count, B, S)
@@ -144,12 +147,11 @@ class Aggregator(nn.Module):
 
         def pair(carry, layer):
             x, _, taps, sums = carry
-            frame_params, global_params, active, tapped, counts = layer
+            frame_params, global_params, active, tapped, counts, early = layer
             x, _, _ = apply_block(block, frame_params, x.reshape(B * S, T, C), rope, suppressed(active, B * S))
             frame = x
-            x, q, k = apply_block(
-                global_block, global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens
-            )
+            here = global_block if early is None else global_block.clone(attend=frames_alone(S, attend, early))
+            x, q, k = apply_block(here, global_params, x.reshape(B, S * T, C), rope, suppressed(active, B), real_tokens)
             if accumulator is not None:
                 q, k = (a.reshape(B, S, T, *a.shape[2:]) for a in (q, k))
                 x, (q, k) = frames.in_order(x, (q, k))  # in the gradient, cues communicate before attention does
@@ -170,6 +172,7 @@ class Aggregator(nn.Module):
             suppression.active(config.depth, config.motion.mask_pairs),
             jnp.asarray(np.arange(config.depth)[:, None] == np.asarray(config.taps)[None]),
             None if accumulator is None else jnp.asarray(accumulator.layer_counts()),
+            jnp.asarray(early_pairs(config.depth)) if compute.attention == "sampled" else None,
         )
         sums = None if accumulator is None else frames.varying(accumulator.zeros(B, S, P))
         camera = frames.varying(jnp.zeros((B, S, 2 * C), tokens.dtype))
