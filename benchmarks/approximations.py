@@ -57,7 +57,7 @@ def approximations(
     width: int = 518,
     repeats: int = 2,
 ) -> None:
-    """Measure errors of a plain pass and the time of blocks, with exact and merged global attention.
+    """Measure errors of a plain pass and the time of blocks, with exact global attention and its approximations.
 
     Args:
         model: "demo", or weights as for vggtjax reconstruct.

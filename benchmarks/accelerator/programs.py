@@ -177,7 +177,7 @@ def _method(compiler: Compiler, setup: Setup) -> None:
 
 
 def _plain(compiler: Compiler, setup: Setup) -> None:
-    """Compile a pass without cues: exact, and with merged attention on one device."""
+    """Compile a pass without cues: exact, and with each approximation on one device."""
     P = setup.grid[0] * setup.grid[1]
     tokens = jax.ShapeDtypeStruct((1, _images(setup).shape[1], P, setup.config.embed_dim), jnp.float32)
     batch = ClipBatch(_images(setup), tokens)  # type: ignore[arg-type]

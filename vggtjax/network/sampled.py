@@ -1,8 +1,8 @@
 """Sampled keys in global attention (after AVGGT, arXiv 2512.02541): an approximation, the faster the more frames.
 
 In the first pairs of blocks global attention sees the own frame alone. In later pairs every query sees the whole first
-frame, and of every other frame the special tokens and one patch of each square. Queries are not sampled, so every token
-keeps an output of its own. Motion cues read queries and keys before they are sampled.
+frame, and of every other frame the special tokens, one patch of each square and every tenth token. Queries are not
+sampled, so every token keeps an output of its own. Motion cues read queries and keys before they are sampled.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_atten
 
 EARLY = 9 / 24  # share of the pairs, from the first, whose global attention sees the own frame alone
 SQUARE = 2  # patches a side of the squares of which one patch is seen
+STRIDE = 10  # every tenth token is seen as well
 
 
 def sampled_attention(S: int, grid: tuple[int, int], special_tokens: int, *, square: int = SQUARE) -> Attend:
@@ -47,7 +48,9 @@ def sampled_attention(S: int, grid: tuple[int, int], special_tokens: int, *, squ
     return attend
 
 
-def sampled_tokens(S: int, grid: tuple[int, int], special_tokens: int, square: int = SQUARE) -> Int[np.ndarray, " K"]:
+def sampled_tokens(
+    S: int, grid: tuple[int, int], special_tokens: int, square: int = SQUARE, stride: int | None = STRIDE
+) -> Int[np.ndarray, " K"]:
     """Return the tokens whose keys are seen, in rising order; those of a frame do not depend on later frames.
 
     The grid moves from frame to frame, through all patches of a square: one that stays would hide the others.
@@ -57,6 +60,8 @@ def sampled_tokens(S: int, grid: tuple[int, int], special_tokens: int, square: i
     for number, frame in enumerate(kept[1:, special_tokens:], start=1):
         row, column = (start % square for start in (number // square, number))
         frame.reshape(grid)[row::square, column::square] = True
+    if stride is not None:
+        kept.reshape(-1)[::stride] = True
     return np.flatnonzero(kept)
 
 
@@ -76,13 +81,13 @@ def frames_alone(S: int, attend: Attend, early: Bool[Array, ""]) -> Attend:
         inputs = (q, k, v, None if suppressed is None else (suppressed.hidden, suppressed.active))
 
         def keys(hidden: Any) -> SuppressedKeys | None:
-            return None if suppress is None else SuppressedKeys(*hidden, suppress)
+            return None if suppress is None else SuppressedKeys(hidden[0], hidden[1], suppress)
 
         def alone(q, k, v, hidden):
-            by_frame = [x.reshape(-1, x.shape[1] // S, *x.shape[2:]) for x in (q, k, v)]
+            queries, own, values = (x.reshape(-1, x.shape[1] // S, *x.shape[2:]) for x in (q, k, v))
             if hidden is not None:
-                hidden = (hidden[0].reshape(by_frame[0].shape[:2]), hidden[1])
-            return suppressed_attention(*by_frame, keys(hidden)).reshape(q.shape)
+                hidden = (hidden[0].reshape(queries.shape[:2]), hidden[1])
+            return suppressed_attention(queries, own, values, keys(hidden)).reshape(q.shape)
 
         def together(q, k, v, hidden):
             return attend(q, k, v, keys(hidden), is_real)
