@@ -78,8 +78,9 @@ def predicted_bytes(
     """Return how much memory a method takes on all frames of a clip at once, with the model and the process.
 
     On a GPU that is the memory of one device, and the process is not counted; on a CPU the devices of this process
-    share its memory; `accelerator` tells which it is, by default by what jax has. `clips` such clips are held at the same time: in a batch one is computed while the next is read
-    and the last is written. The frames are shared by `devices`, each with a copy of the weights.
+    share its memory. `accelerator` tells which it is, by default by what jax has. `clips` such clips are held at the
+    same time: in a batch one is computed while the next is read and the last is written. The frames are shared by
+    `devices`, each with a copy of the weights.
     """
     host = on_cpu() if accelerator is None else not accelerator
     here = min(devices, jax.local_device_count()) if host else 1  # devices that share one memory
