@@ -57,15 +57,11 @@ class Sized(Protocol):
 
 
 class Load(TypedDict, total=False):
-    """What is in memory beside a clip's frames: passes of the method, more clips at the same time, more devices.
-
-    `accelerator` tells whether it is a GPU's or TPU's; by default, whether jax has one.
-    """
+    """What is in memory beside a clip's frames: passes of the method, more clips at the same time, more devices."""
 
     method: str
     clips: int
     devices: int
-    accelerator: bool | None
 
 
 def predicted_bytes(
@@ -82,7 +78,7 @@ def predicted_bytes(
     """Return how much memory a method takes on all frames of a clip at once, with the model and the process.
 
     On a GPU that is the memory of one device, and the process is not counted; on a CPU the devices of this process
-    share its memory. `clips` such clips are held at the same time: in a batch one is computed while the next is read
+    share its memory; `accelerator` tells which it is, by default by what jax has. `clips` such clips are held at the same time: in a batch one is computed while the next is read
     and the last is written. The frames are shared by `devices`, each with a copy of the weights.
     """
     host = on_cpu() if accelerator is None else not accelerator
@@ -140,15 +136,17 @@ def room_of_gpu(name: str) -> Room:
     return Room(share * GPUS[name], f"of an {name}")
 
 
-def most_frames(model: Sized, height: int, width: int, size: float, **how: Unpack[Load]) -> int:
+def most_frames(
+    model: Sized, height: int, width: int, size: float, *, accelerator: bool | None = None, **how: Unpack[Load]
+) -> int:
     """Return the most frames that are predicted to fit in `size` bytes when they are run together; maybe 0.
 
-    `how` are the options of `predicted_bytes`.
+    `accelerator` and `how` are the options of `predicted_bytes`.
     """
     low, high = 0, max(1, _MOST_IMAGES // (3 * _FLOAT * height * width)) + 1  # the first fits, the last does not
     while high - low > 1:
         middle = (low + high) // 2
-        fits = predicted_bytes(model, middle, height, width, **how) <= size
+        fits = predicted_bytes(model, middle, height, width, accelerator=accelerator, **how) <= size
         low, high = (middle, high) if fits else (low, middle)
     return low
 
