@@ -9,6 +9,7 @@
 # `make accelerator` compiles for GPUs that are not there and counts (5 GB of NVIDIA's libraries; ARGUMENTS="--top 10"),
 # `make accelerator-check` a tiny model in float32, and the memory of a large one, with the compiler alone (0.5 GB), as CI
 # does.
+# `make gpu-day-wheels` fetches what gpu-day needs beside jax, for a machine that has jax alone and no index.
 # `make proofs` runs what takes long and rarely breaks; `make mutants` measures how many faults the tests notice.
 
 PYTHON ?= python3
@@ -22,6 +23,8 @@ MUTANTS := $(VENV)/mutants
 ACCELERATOR := $(VENV)/accelerator
 COMPILERS = $$($(BIN)/python -c 'import jax; print(*(f"jax-cuda12-{part}=={jax.__version__}" for part in ("plugin", "pjrt")))')
 ARGUMENTS ?=
+FOR_PYTHON ?= 3.12
+WHEELS := gpu-day-wheels
 COMPILE = $(SUPPLY)/bin/uv pip compile --no-config --quiet --upgrade --exclude-newer '7 days' --generate-hashes \
   --universal --python-version 3.11 --index-url https://pypi.org/simple --no-emit-index-url \
   --custom-compile-command 'make lock'
@@ -36,7 +39,7 @@ SLOW = parity network method pipeline training calibration learning commands ben
 # Processes of the tests read compiled Python files rather than compile them anew, whatever the shell says.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: demo pictures reference docs test proofs accelerator accelerator-check compiler-is-there mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
+.PHONY: demo pictures reference docs test proofs accelerator accelerator-check compiler-is-there gpu-day-wheels mutants check fast coverage shuffled lint format clean locked lock audit sbom dist
 
 demo: $(VENV)/.runtime
 	$(BIN)/vggtjax demo --out demo-output
@@ -72,6 +75,10 @@ accelerator-check: $(ACCELERATOR)/.compiler
 
 compiler-is-there: $(VENV)/.development
 	$(BIN)/python -m pip download --quiet --no-deps --dest $(ACCELERATOR)/wheels $(COMPILERS)
+
+gpu-day-wheels: $(SUPPLY)/.installed
+	rm -rf $(WHEELS)
+	$(SUPPLY)/bin/python benchmarks/gpu_day/wheels.py $(FOR_PYTHON) $(WHEELS)
 
 $(ACCELERATOR)/.whole: pyproject.toml
 	$(PYTHON) -m venv $(ACCELERATOR)/whole
@@ -139,7 +146,7 @@ dist: $(SUPPLY)/.installed
 	rm -rf build
 
 clean:
-	rm -rf $(VENV) build dist site demo-output sbom.json *.egg-info
+	rm -rf $(VENV) build dist site demo-output $(WHEELS) sbom.json *.egg-info
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -3,52 +3,49 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pkgutil import resolve_name
 
 import tyro
 
-from benchmarks.accelerator.command import accelerator
-from benchmarks.approximations import approximations
-from benchmarks.demo_model import demo_model
-from benchmarks.embed import embed
-from benchmarks.gpu_day.command import gpu_day
-from benchmarks.known import known
-from benchmarks.long_clips import long_clips
-from benchmarks.memory import memory
-from benchmarks.refine_cameras import refine_cameras
-from benchmarks.second_pass import second_pass
-from benchmarks.speed import speed
-from benchmarks.static_mesh import mesh_distance
-from benchmarks.suite.command import suite
 from vggtjax.errors import VggtjaxError
 
-COMMANDS = {
-    "accelerator": accelerator,
-    "approximations": approximations,
-    "demo-model": demo_model,
-    "embed": embed,
-    "gpu-day": gpu_day,
-    "known": known,
-    "long-clips": long_clips,
-    "memory": memory,
-    "refine-cameras": refine_cameras,
-    "second-pass": second_pass,
-    "speed": speed,
-    "static-mesh": mesh_distance,
-    "suite": suite,
+COMMANDS = {  # imported where it is called, so that one command needs no other's packages
+    "accelerator": "benchmarks.accelerator.command:accelerator",
+    "approximations": "benchmarks.approximations:approximations",
+    "demo-model": "benchmarks.demo_model:demo_model",
+    "embed": "benchmarks.embed:embed",
+    "gpu-day": "benchmarks.gpu_day.command:gpu_day",
+    "known": "benchmarks.known:known",
+    "long-clips": "benchmarks.long_clips:long_clips",
+    "memory": "benchmarks.memory:memory",
+    "refine-cameras": "benchmarks.refine_cameras:refine_cameras",
+    "second-pass": "benchmarks.second_pass:second_pass",
+    "speed": "benchmarks.speed:speed",
+    "static-mesh": "benchmarks.static_mesh:mesh_distance",
+    "suite": "benchmarks.suite.command:suite",
 }
+_PROGRAM = "python -m benchmarks"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a benchmark; return the exit code: 0, or 2 for bad input or output."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS, prog="python -m benchmarks", description="Measurements of vggtjax.", args=arguments
-        )
+        if given and given[0] in COMMANDS:
+            tyro.cli(_command(given[0]), prog=f"{_PROGRAM} {given[0]}", args=given[1:])
+        else:
+            every = {name: _command(name) for name in COMMANDS}
+            about = "Measurements of vggtjax."
+            tyro.extras.subcommand_cli_from_dict(every, prog=_PROGRAM, description=about, args=given)
     except VggtjaxError as error:
         sys.stderr.write(f"benchmarks: {error}\n")
         return 2
     return 0
+
+
+def _command(name: str) -> Callable[..., None]:
+    return resolve_name(COMMANDS[name])
 
 
 if __name__ == "__main__":

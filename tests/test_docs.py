@@ -28,9 +28,9 @@ from vggtjax.results.saving import Saving
 from vggtjax.windows.plan import Windows
 
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-TARGETS = re.findall(r"^([\w ]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+TARGETS = re.findall(r"^([\w -]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
 BENCHMARKS = re.findall(
-    r'^    "([\w-]+)": \w+,$', (ROOT / "benchmarks" / "__main__.py").read_text(), flags=re.MULTILINE
+    r'^    "([\w-]+)": "[\w.:]+",$', (ROOT / "benchmarks" / "__main__.py").read_text(), flags=re.MULTILINE
 )
 FRAMES = 8
 OTHERS = ("git", "hf", "ssh")  # programs that a reader has or does not have

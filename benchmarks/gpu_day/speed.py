@@ -1,15 +1,14 @@
-"""Times and memory beside their targets and VGGT's published figures."""
+"""Times and memory beside their targets, the bounds of the same programs, and VGGT's published figures."""
 
 from __future__ import annotations
 
 import jax
 
+from benchmarks.gpu_day.bounds import bound
 from benchmarks.gpu_day.lines import Cell, Lines
 from benchmarks.suite.cases import Case, DType, Size, config_of, frame_size, load
-from benchmarks.suite.command import measured_rows
-from benchmarks.suite.measure import compiling_anew
-from benchmarks.suite.report import Row
-from benchmarks.suite.workloads import WORKLOADS
+from benchmarks.suite.measure import Measured, compiling_anew, measure_program, without_memory
+from benchmarks.suite.workloads import aggregator, depth_head, two_passes
 
 FRAME = (392, 518)  # of targets and published figures; by number of frames
 TARGETS = {  # for an H200, the full model in bfloat16
@@ -27,6 +26,7 @@ HEADINGS = {
     "depth-head": "depth head (ms a frame)",
     "two-passes": "two passes (s)",
 }
+_PROGRAMS = {"aggregator": aggregator, "depth-head": depth_head, "two-passes": two_passes}
 _REPEATS = 3
 _JOBS = {  # in the order of what they tell: a cut-off run has the first ones
     "tiny": (("aggregator", 2), ("depth-head", 2)),
@@ -42,38 +42,66 @@ def speed(size: Size, lines: Lines) -> None:
     config, params = load(size)
     height, width = full_frame(size)
     dtype: DType = "float32" if size == "tiny" else "bfloat16"
-    wanted = TARGETS if "H200" in jax.local_devices()[0].device_kind and size == "full" else {}
+    device = jax.local_devices()[0].device_kind
+    wanted = TARGETS if "H200" in device and size == "full" else {}
     published = PUBLISHED if size == "full" else {}
-    title = f"{size}, {width} x {height} pixels, {dtype}: medians of {_REPEATS} runs; published: VGGT on an H100"
+    title = (
+        f"{size}, {width} x {height} pixels, {dtype}: medians of {_REPEATS} runs; bound: counted in the same program; "
+        "published: VGGT on an H100"
+    )
     with compiling_anew():
         for name, frames in _JOBS["tiny" if size == "tiny" else "full"]:
             case = Case(size, config, params, frames, height, width, dtype)
-            (row,) = measured_rows(name, WORKLOADS[name], case, _REPEATS)
+            measured, text = _measured(name, case)
             cells: dict[str, Cell] = {"work": HEADINGS[name], "frames": frames}
-            if row.measured.failure:
-                lines.row(title, **cells, measured=row.measured.failure, holds=False)
+            if measured.failure:
+                lines.row(title, **cells, measured=measured.failure, holds=False)
                 continue
-            value, target = figure(name, row), wanted.get(name, {}).get(frames)
-            cells |= {"measured": value, "target": target, "published": published.get(name, {}).get(frames)}
+            value, target = figure(name, measured, frames), wanted.get(name, {}).get(frames)
+            cells |= {"measured": value, **beside_bound(name, frames, value, bound(text, config, device))}
+            cells |= {"target": target, "published": published.get(name, {}).get(frames)}
             if target is not None:
                 cells["holds"] = value is not None and value <= target
-            memory = figure("memory", row)
-            cells |= {"compile_s": row.measured.compile_seconds, "memory_GB": memory}
+            memory = figure("memory", measured, frames)
+            cells |= {"compile_s": measured.compile_seconds, "memory_GB": memory}
             cells["memory_target"] = wanted.get("memory", {}).get(frames) if name == "aggregator" else None
             lines.row(title, **cells)
 
 
-def figure(name: str, row: Row) -> float | None:
-    """Return a figure of a measured row in the unit of its heading, or its "memory"; None: unknown.
+def _measured(name: str, case: Case) -> tuple[Measured, str]:
+    """Measure a program; return also its optimised text, empty where memory ran out before."""
+    texts = [""]
+
+    def measure() -> dict[str, Measured]:
+        function, arguments = _PROGRAMS[name](case)
+        read = lambda compiled: texts.append(compiled.as_text() or "")  # noqa: E731
+        return {"": measure_program(function, arguments, range(_REPEATS), read)}
+
+    return without_memory(measure)[""], texts[-1]
+
+
+def figure(name: str, measured: Measured, frames: int) -> float | None:
+    """Return a measured figure in the unit of its heading, or its "memory"; None: unknown.
 
     Memory is beyond weights and inputs: the device's own count, or XLA's analysis where there is none.
     """
-    measured = row.measured
     if name == "memory":
         size = measured.xla_bytes if measured.device_bytes is None else measured.device_bytes
         return None if size is None else size / 1e9
-    scale = {"aggregator": 1e3, "depth-head": 1e3 / (row.frames or 1), "two-passes": 1.0}[name]
-    return None if measured.median is None else scale * measured.median
+    return None if measured.median is None else _scale(name, frames) * measured.median
+
+
+def beside_bound(name: str, frames: int, value: float | None, least: float | str) -> dict[str, Cell]:
+    """Return the bound in the unit of its heading and the time over it; of an unknown one, why."""
+    if isinstance(least, str):
+        return {"bound": least}
+    shown = _scale(name, frames) * least
+    return {"bound": shown, "over_bound": None if value is None else value / shown}
+
+
+def _scale(name: str, frames: int) -> float:
+    """Return what makes seconds the unit of a heading."""
+    return {"aggregator": 1e3, "depth-head": 1e3 / frames, "two-passes": 1.0}[name]
 
 
 def full_frame(size: Size) -> tuple[int, int]:

@@ -43,9 +43,18 @@ class Measured:
         return None if self.temp_bytes is None or self.output_bytes is None else self.temp_bytes + self.output_bytes
 
 
-def measure_program(function: Callable[..., Any], arguments: tuple, rounds: Iterable[int]) -> Measured:
-    """Compile a function of arrays, run it once for its memory, then time one run per round."""
+def measure_program(
+    function: Callable[..., Any],
+    arguments: tuple,
+    rounds: Iterable[int],
+    read: Callable[[Any], None] = lambda compiled: None,
+) -> Measured:
+    """Compile a function of arrays, run it once for its memory, then time one run per round.
+
+    `read` is given the compiled program before it runs.
+    """
     (compiled,), compile_seconds = timed(lambda: (jax.jit(function).lower(*arguments).compile(),))
+    read(compiled)
     temp, output = analysed(compiled)
 
     def run() -> None:

@@ -86,10 +86,12 @@ def two_passes(case: Case) -> Program:
 
 
 def depth_head(case: Case) -> Program:
-    """Depth and confidence from the outputs of four pairs of blocks."""
+    """Depth and confidence from the outputs of four pairs of blocks; in TF32 beside blocks in bfloat16, as in a run."""
+    precision = "tf32" if case.dtype == "bfloat16" else "highest"
 
     def run(params, tokens, shifts):
-        return predict_dense(params, _taps(params, tokens, shifts, case), case.config, case.grid, "depth")
+        taps = _taps(params, tokens, shifts, case, precision)
+        return predict_dense(params, taps, case.config, case.grid, "depth", precision)
 
     return run, (case.params["depth_head"], *_tapped(case))
 
@@ -99,9 +101,9 @@ def _tapped(case: Case) -> tuple[Any, Any]:
     return tokens, jnp.arange(4) / 10
 
 
-def _taps(params, tokens, shifts, case: Case) -> list[Any]:
+def _taps(params, tokens, shifts, case: Case, precision: str) -> list[Any]:
     """Return four different taps from one array; equal taps would share one norm in the compiled program."""
-    return [project_tap(params, tokens + shifts[slot], slot, case.config) for slot in range(4)]
+    return [project_tap(params, tokens + shifts[slot], slot, case.config, precision) for slot in range(4)]
 
 
 def _start_up(case: Case, rounds: Iterable[int]) -> dict[str, Measured]:

@@ -1,10 +1,37 @@
-"""gpu-day: all parts at small size on a CPU."""
+"""gpu-day: all parts at small size on a CPU; a bound beside a time; the start without an index."""
+
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
 
 import pytest
 
-from benchmarks.gpu_day import command
+from benchmarks.accelerator.count import LAUNCH
+from benchmarks.gpu_day import alone, command, wheels
+from benchmarks.gpu_day.bounds import bound
 from benchmarks.gpu_day.lines import Lines, read_lines
 from benchmarks.gpu_day.parts import PARTS
+from benchmarks.gpu_day.speed import beside_bound
+from benchmarks.suite.cases import TINY
+
+PROGRAM = """
+ENTRY %main (a: f32[1000,1000]) -> f32[1000,1000] {
+  %a = f32[1000,1000]{1,0} parameter(0)
+  ROOT %b = f32[1000,1000]{1,0} add(%a, %a)
+}
+"""
+PYTHON = "cp{}{}".format(*sys.version_info)
+IMPORTED = """
+import jax, sys
+before = {name.split(".")[0] for name in sys.modules}
+import benchmarks.__main__, benchmarks.gpu_day.command
+from importlib.metadata import packages_distributions
+packages = packages_distributions()
+new = {name.split(".")[0] for name in sys.modules} - before
+print(*{name.lower().replace("_", "-") for top in new for name in packages.get(top, ())})
+"""
 
 
 @pytest.mark.proof
@@ -22,5 +49,76 @@ def test_all_parts_at_small_size(tmp_path):
     paths = {row["path"] for row in told["attention"] if row.get("holds")}
     assert paths >= {"chosen here", "chosen here, gradient", "at once"}
     assert all(row["measured"] > 0 and row["memory GB"] > 0 for row in told["speed"])
+    assert {row["bound"] for row in told["speed"]} == {"no bound: unknown device"}
     times = [row["ms"] for row in told["kernels"][:-1]]  # the last row sums up all others
     assert times == sorted(times, reverse=True)
+
+
+def test_a_bound_beside_a_time():
+    """A sum reads 4 MB twice and writes 4 MB, at 4.8 TB/s on an H200."""
+    least = bound(PROGRAM, TINY, "NVIDIA H200")
+    assert isinstance(least, float)
+    assert least == pytest.approx(12e6 / 4.8e12 + LAUNCH)
+    beside = beside_bound("depth-head", 8, 1.0, least)
+    assert beside == {"bound": pytest.approx(1e3 * least / 8), "over_bound": pytest.approx(8 / (1e3 * least))}
+    assert str(bound("no program", TINY, "NVIDIA H200")).startswith("no bound: KeyError")
+    unknown = bound(PROGRAM, TINY, "cpu")
+    assert beside_bound("depth-head", 8, 1.0, unknown) == {"bound": "no bound: unknown device"}
+
+
+@pytest.mark.parametrize(
+    ("tags", "fits"),
+    [
+        ("py3-none-any", True),
+        ("py2.py3-none-any", True),
+        ("cp39-abi3-manylinux_2_17_{machine}.manylinux2014_{machine}", True),
+        (f"{PYTHON}-{PYTHON}-manylinux_2_28_{{machine}}", True),
+        (f"{PYTHON}-{PYTHON}-win_amd64", False),
+        (f"{PYTHON}-{PYTHON}-manylinux_2_28_riscv64", False),
+        ("cp39-cp39-manylinux_2_28_{machine}", False),
+        ("cp399-abi3-manylinux_2_28_{machine}", False),
+    ],
+)
+@pytest.mark.skipif(sys.platform != "linux", reason="the wheels are for Linux")
+def test_wheels_that_fit(tags, fits):
+    assert alone.fits(f"package-1.0-{tags.format(machine=os.uname().machine)}.whl") is fits
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("none", "has no wheels; make them where there is an index: make gpu-day-wheels"),
+        ("package-1.0-cp39-cp39-win32.whl", "package-1.0-cp39-cp39-win32.whl does not fit Python 3."),
+        ("package-1.0-py3-none-any.whl", "cannot be unpacked: File is not a zip file"),
+    ],
+)
+def test_what_cannot_start_says_why(tmp_path, capsys, monkeypatch, name, sentence):
+    (tmp_path / name).touch()
+    assert alone.main([str(tmp_path), "--out", "report"]) == 2
+    assert sentence in capsys.readouterr().err
+    monkeypatch.setattr(alone, "find_spec", lambda module: None)
+    assert alone.main([str(tmp_path)]) == 2
+    assert f"{sys.executable} has no jax; expected" in capsys.readouterr().err
+
+
+def test_wheels_come_before_what_is_installed(tmp_path, monkeypatch):
+    with zipfile.ZipFile(tmp_path / "package-1.0-py3-none-any.whl", "w") as wheel:
+        wheel.writestr("package/__init__.py", "")
+
+    def call(command, env):
+        root, unpacked, *_ = env["PYTHONPATH"].split(os.pathsep)
+        assert (Path(root) / "benchmarks/__main__.py").is_file()
+        assert (Path(unpacked) / "package/__init__.py").is_file()
+        assert command[1:] == ["-P", "-m", "benchmarks", "gpu-day", "--out", "report", "--size", "small"]
+        return 7
+
+    monkeypatch.setattr(subprocess, "call", call)
+    assert alone.main([str(tmp_path), "--out", "report", "--size", "small"]) == 7
+
+
+def test_the_wheels_are_what_is_imported_beside_jax():
+    done = subprocess.run([sys.executable, "-c", IMPORTED], capture_output=True, text=True, check=True)
+    assert set(done.stdout.split()) - {"vggtjax"} <= set(wheels.PACKAGES)
+    for python in ("3.11", "3.12", "3.13"):
+        pins = wheels.locked(wheels.LOCK.read_text(encoding="utf-8"), python)
+        assert all(f"{name}==" in pin and " --hash=sha256:" in pin and ";" not in pin for name, pin in pins.items())

@@ -1,6 +1,7 @@
 """What `vggtjax doctor` prints, and the cache that it clears."""
 
 import json
+import re
 
 import jax
 import numpy as np
@@ -78,6 +79,18 @@ def test_the_longest_clip_of_a_gpu_leaves_room_for_the_weights(monkeypatch):
     assert doctor._longest(small["float32"]) == "no clip of 518 x 294 pixels fits"
     assert doctor._longest({**small["bfloat16"], "frames": 1}) == "1 frame of 518 x 294 pixels"
     assert doctor._longest(unknown["float32"]) == "unknown: this system does not tell its memory"
+
+
+def test_the_longest_clip_of_a_gpu_that_is_not_here(monkeypatch, capsys):
+    assert cli.main(["doctor", "--device", "h100"]) == 0
+    found = re.findall(r"VGGT-1B on h100, \S+ +(\d+) frames of 518 x (\d+) pixels", capsys.readouterr().out)
+    frames = {int(height): int(count) for count, height in found}
+    assert sorted(frames, reverse=True) == [518, 392, 294]
+    assert 1000 < frames[392] < frames[294]
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.9")
+    assert memory.room_of_gpu("h100").size == pytest.approx(72e9)
+    more = {clip["height"]: clip["frames"] for clip in doctor._longest_on("h100")}
+    assert all(more[height] > frames[height] for height in frames)
 
 
 def test_the_weights_of_a_loaded_model_are_counted_once(monkeypatch):

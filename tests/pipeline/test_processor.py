@@ -71,19 +71,18 @@ def test_a_model_is_loaded_in_the_type_that_is_chosen(cpu, monkeypatch, tiny_dem
     cpu("flags : avx512_bf16\n")
     monkeypatch.setattr(processor, "_FEWEST_CHANNELS", 0)
 
-    def loaded(**given):
-        files = ModelFiles(model="demo")
-        model, _, options = files.load_fastest(Report(), Options(**given), ["4dvggt-d"])
+    def loaded(given):
+        model, _, options = ModelFiles(model="demo").load_fastest(Report(), given, ["4dvggt-d"])
         leaves = jax.tree.leaves(model.params, is_leaf=is_stored)
         return options, sum(isinstance(leaf, Halves) for leaf in leaves), capsys.readouterr().err
 
-    options, kernels, said = loaded()
+    options, kernels, said = loaded(Options())
     assert options == Options(compute_dtype="bfloat16")
     assert kernels
     assert "computing in bfloat16: this processor multiplies bfloat16 2.0 times as fast as float32" in said
     assert "--dtype float32 is slower and exact" in said
-    for given in ({"compute_dtype": "float32"}, {"precision": "highest"}):
-        options, kernels, said = loaded(**given)
-        assert options == Options(**given)
+    for given in (Options(compute_dtype="float32"), Options(precision="highest")):
+        options, kernels, said = loaded(given)
+        assert options == given
         assert not kernels
         assert "computing in" not in said

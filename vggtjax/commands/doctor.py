@@ -10,7 +10,7 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from math import prod
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 
@@ -18,6 +18,7 @@ from vggtjax import __version__
 from vggtjax.commands.report import Report
 from vggtjax.errors import VggtjaxError, one_line
 from vggtjax.storage.cache import CONVERTED, cache_folder, cache_parts, clear_cache, size_of
+from vggtjax.storage.flags import InWords
 from vggtjax.storage.free_memory import in_gigabytes
 
 PACKAGES = ("jax", "jaxlib", "flax", "numpy", "scipy", "pillow", "av", "safetensors", "tyro")
@@ -39,24 +40,27 @@ EXTRAS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 _HARDWARE = "cuda"  # no use to most, so it is not advised
 _WIDE = (1920, 1080)  # pixels of a video, for the longest clips
+_SHAPES = {"16:9": (518, 294), "4:3": (518, 392), "square": (518, 518)}  # width and height of the model's frames
 _MEGA = 1e6
 
 
 _AsJson = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(name="json", help_behavior_hint="")]
+_Device = InWords[Literal["h100", "h200", "a100", "l4", "rtx4090", "rtx3090"] | None]  # of `memory.GPUS`
 _Clear = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(name="clear-cache", help_behavior_hint="")]
 
 
-def doctor(*, as_json: _AsJson = False, clear: _Clear = False) -> None:
+def doctor(*, device: _Device = None, as_json: _AsJson = False, clear: _Clear = False) -> None:
     """Print versions, devices, memory, the longest clips that fit, extras, and the cache.
 
     Args:
+        device: the longest clips for this GPU, which need not be here, in place of this computer
         as_json: print everything as one JSON object.
         clear: first remove compiled and traced programs, converted weights and kept passes from the cache.
     """
     cleared = clear_cache() if clear else None
     report = Report()
     with report.running(), report.stage("look around"):
-        found = facts()
+        found = facts(device)
     if cleared is not None:
         found["cache"]["cleared_bytes"] = cleared
     if as_json:
@@ -65,8 +69,11 @@ def doctor(*, as_json: _AsJson = False, clear: _Clear = False) -> None:
         _print(report, found)
 
 
-def facts() -> dict[str, Any]:
-    """Return what the command prints, as JSON values; sizes in bytes, None for what the system does not tell."""
+def facts(gpu: str | None = None) -> dict[str, Any]:
+    """Return what the command prints, as JSON values; sizes in bytes, None for what the system does not tell.
+
+    `gpu` names a GPU for the longest clips; by default they are those of this computer.
+    """
     import jax
 
     from vggtjax.storage.free_memory import own_limits, rooms, total_bytes
@@ -90,7 +97,7 @@ def facts() -> dict[str, Any]:
             "room": [{"bytes": room.size, "limit": room.limit} for room in rooms()],
             "limits": [{"name": name, "bytes": limit, "used": used} for name, limit, used in own_limits()],
         },
-        "clips": list(_longest_clips()),
+        "clips": list(_longest_clips() if gpu is None else _longest_on(gpu)),
         "extras": [
             {"name": name, "for": purpose, "missing": [module for module in modules if find_spec(module) is None]}
             for name, (purpose, modules) in EXTRAS.items()
@@ -114,6 +121,29 @@ def _longest_clips() -> Iterator[dict[str, Any]]:
             "width": width,
             "height": height,
             "frames": None if room is None else memory.most_frames(model, height, width, room.size),
+        }
+
+
+def _longest_on(gpu: str) -> Iterator[dict[str, Any]]:
+    """Yield the most frames that are predicted to fit on a GPU, of VGGT-1B with blocks in bfloat16, by size."""
+    import jax
+
+    from vggtjax.config import vggt_1b
+    from vggtjax.network.model import parameter_shapes
+    from vggtjax.network.narrow import narrowed
+    from vggtjax.pipeline import memory
+    from vggtjax.windows.choice import Planned
+
+    shapes = jax.eval_shape(lambda params: narrowed(params, "bfloat16"), parameter_shapes(vggt_1b()))
+    size = sum(prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
+    model, room = Planned(vggt_1b(), size), memory.room_of_gpu(gpu)
+    for shape, (width, height) in _SHAPES.items():
+        yield {
+            "model": f"VGGT-1B on {gpu}, {shape}",
+            "weights": size,
+            "width": width,
+            "height": height,
+            "frames": memory.most_frames(model, height, width, room.size, accelerator=True),
         }
 
 

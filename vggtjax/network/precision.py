@@ -25,11 +25,12 @@ class Compute:
     """How the network is computed; static under jit.
 
     Attributes:
-        compute_dtype: "float32" or "bfloat16" for the blocks' matrix products; norms, residuals and heads are float32.
+        compute_dtype: "float32" or "bfloat16" for the matrix products of the blocks, the camera head's among them;
+            norms, residuals and the rest of the heads are float32.
             "float64" is for checks of gradients; it requires parameters and images in float64 and jax.enable_x64.
         precision: of the products of the dense heads and of the motion cues on accelerators: "highest" for float32;
-            "tf32" as PyTorch computes convolutions on an NVIDIA GPU (on a TPU, three passes in bfloat16). The camera
-            head's products are float32 always.
+            "tf32" as PyTorch computes convolutions on an NVIDIA GPU (on a TPU, three passes in bfloat16). What the
+            camera head multiplies outside of its blocks is float32 always.
         remat: compute activations of blocks and dense heads again in the backward pass: less memory, more time.
         stop_camera_gradient: treat the previous estimate as a constant in every iteration of the camera head, as in
             VGGT's training.

@@ -2,14 +2,16 @@
 
 It is the weights, the process, and the larger of two: what the compiler takes of programs that are compiled side by
 side, and what the passes hold: the blocks of every frame, the dense head of the frames that it computes at once, and
-pictures and results. Devices that share the frames hold keys and values of all of them, too. The rates are fitted to
-XLA's own counts of both passes on a CPU, and to measured peaks of processes that compile their programs
-(`python -m benchmarks memory`).
+pictures and results. Devices that share the frames hold keys and values of all of them, too. On a CPU the rates are
+fitted to XLA's own counts of both passes, and to measured peaks of processes that compile their programs
+(`python -m benchmarks memory`); on a GPU to XLA's counts alone (`python -m benchmarks accelerator`).
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol, TypedDict, Unpack
+import os
+from contextlib import suppress
+from typing import Any, NamedTuple, Protocol, TypedDict, Unpack
 
 import jax
 
@@ -25,11 +27,23 @@ ERROR = 0.15  # of a measured peak: predictions are as near
 _FLOAT = 4  # bytes
 _PROCESS = 0.54e9  # Python, libraries, the compiler of one pass
 _COMPILING = 0.26e9  # more than that, where the second pass has a program of its own
-_ROWS = 12.5  # copies of a frame's tokens, in and between the blocks
 _LOGITS = 1  # copies of the attention of short frames, whose heads are computed at once
-_MAPS = 0.5  # copies of the dense head's maps at full resolution
-_PIXEL = 150.0  # bytes of a pixel: pictures, the results of both passes, and what is made of them before it is written
 _MOST_IMAGES = 2**34  # bytes of the images of a clip that is loaded as a whole
+
+
+class Rates(NamedTuple):
+    """What a platform holds."""
+
+    rows: float  # copies of a frame's tokens, in and between the blocks
+    maps: float  # copies of the dense head's maps at full resolution
+    pixel: float  # bytes: pictures, the results of both passes, and what is made of them before it is written
+
+
+_CPU = Rates(rows=12.5, maps=0.5, pixel=150.0)
+_ACCELERATOR = Rates(rows=7.9, maps=0.6, pixel=60.0)  # blocks in bfloat16; what is written is on the host
+
+_GB = 1e9
+GPUS = {"h100": 80 * _GB, "h200": 141 * _GB, "a100": 80 * _GB, "l4": 24 * _GB, "rtx4090": 24 * _GB, "rtx3090": 24 * _GB}
 
 
 class Sized(Protocol):
@@ -59,34 +73,42 @@ def predicted_bytes(
     method: str = "4dvggt-d",
     clips: int = 1,
     devices: int = 1,
+    accelerator: bool | None = None,
 ) -> float:
     """Return how much memory a method takes on all frames of a clip at once, with the model and the process.
 
     On a GPU that is the memory of one device, and the process is not counted; on a CPU the devices of this process
-    share its memory. `clips` such clips are held at the same time: in a batch one is computed while the next is read
-    and the last is written. The frames are shared by `devices`, each with a copy of the weights.
+    share its memory. `accelerator` tells which it is, by default by what jax has. `clips` such clips are held at the
+    same time: in a batch one is computed while the next is read and the last is written. The frames are shared by
+    `devices`, each with a copy of the weights.
     """
-    here = min(devices, jax.local_device_count()) if on_cpu() else 1  # devices that share one memory
-    held = frames if on_cpu() else -(-frames // devices)  # every process loads the whole clip and returns all of it
-    pictures = clips * held * _PIXEL * height * width
-    run = here * pass_bytes(model.config, frames, height, width, devices=devices) + pictures
-    if on_cpu():
+    host = on_cpu() if accelerator is None else not accelerator
+    here = min(devices, jax.local_device_count()) if host else 1  # devices that share one memory
+    held = frames if host else -(-frames // devices)  # every process loads the whole clip and returns all of it
+    pictures = clips * held * (_CPU if host else _ACCELERATOR).pixel * height * width
+    run = here * pass_bytes(model.config, frames, height, width, devices=devices, accelerator=not host) + pictures
+    if host:
         run = _PROCESS + max(run, _COMPILING if _second_is_another(find_method(method)) else 0)
     return here * model.parameter_bytes + run
 
 
-def pass_bytes(config: VGGTConfig, frames: int, height: int, width: int, *, devices: int = 1) -> float:
+def pass_bytes(
+    config: VGGTConfig, frames: int, height: int, width: int, *, devices: int = 1, accelerator: bool | None = None
+) -> float:
     """Return what the passes hold on each device beside weights, pictures and results: XLA's count, within a third."""
+    host = on_cpu() if accelerator is None else not accelerator
+    rates = _CPU if host else _ACCELERATOR
     share = -(-frames // devices)
     tokens = SPECIAL_TOKENS + height * width // config.patch_size**2
-    rows = _ROWS * tokens * config.embed_dim
-    logits = _LOGITS * config.num_heads * tokens**2 if tokens**2 <= LOGITS_OF_ALL_HEADS else 0
+    rows = rates.rows * tokens * config.embed_dim
+    is_short = host and tokens**2 <= LOGITS_OF_ALL_HEADS
+    logits = _LOGITS * config.num_heads * tokens**2 if is_short else 0
     at_once = min(share, max(PIXELS_AT_ONCE // (height * width), 1))  # frames of the dense head, at most
-    maps = _MAPS * max(config.dpt_features // 2, HIDDEN) * height * width
+    maps = rates.maps * max(config.dpt_features // 2, HIDDEN) * height * width
     largest = at_once * maps
     if devices > 1:  # gathered keys and values, and on a CPU the logits of a chunk of queries to all of these keys
         keys = share * devices * tokens
-        chunk = share * tokens / chunk_count(share * tokens, keys) * keys if on_cpu() else 0
+        chunk = share * tokens / chunk_count(share * tokens, keys) * keys if host else 0
         largest = max(largest, 2 * min(keys * config.embed_dim, GATHERED_AT_ONCE) + chunk)
     return _FLOAT * (share * (rows + logits) + largest)
 
@@ -107,15 +129,25 @@ def available(params: Any = None) -> Room | None:
     return Room(free + held, "of the device")
 
 
-def most_frames(model: Sized, height: int, width: int, size: float, **how: Unpack[Load]) -> int:
+def room_of_gpu(name: str) -> Room:
+    """Return what jax takes of the memory of a GPU of `GPUS`, which need not be here."""
+    share = 0.75  # jax's default
+    with suppress(ValueError):
+        share = float(os.environ.get("XLA_PYTHON_CLIENT_MEM_FRACTION", share))
+    return Room(share * GPUS[name], f"of an {name}")
+
+
+def most_frames(
+    model: Sized, height: int, width: int, size: float, *, accelerator: bool | None = None, **how: Unpack[Load]
+) -> int:
     """Return the most frames that are predicted to fit in `size` bytes when they are run together; maybe 0.
 
-    `how` are the options of `predicted_bytes`.
+    `accelerator` and `how` are the options of `predicted_bytes`.
     """
     low, high = 0, max(1, _MOST_IMAGES // (3 * _FLOAT * height * width)) + 1  # the first fits, the last does not
     while high - low > 1:
         middle = (low + high) // 2
-        fits = predicted_bytes(model, middle, height, width, **how) <= size
+        fits = predicted_bytes(model, middle, height, width, accelerator=accelerator, **how) <= size
         low, high = (middle, high) if fits else (low, middle)
     return low
 
