@@ -23,7 +23,6 @@ from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.block import Block, apply_block
 from vggtjax.network.layers import Params
-from vggtjax.network.merging import merged_attention
 from vggtjax.network.model import forward
 from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import full_precision
@@ -37,9 +36,6 @@ from vggtjax.storage.kept_memory import keep_freed_memory
 
 WAYS: dict[str, str | Callable] = {
     "exact": "exact",
-    "merged, 2 x 2": "merged",
-    "merged, 3 x 3": partial(merged_attention, region=3, stride=None),
-    "merged, 4 x 4": partial(merged_attention, region=4, stride=None),
     "sampled": "sampled",
     "exact, int8 weights": "exact",
 }
@@ -166,7 +162,7 @@ def _times(frames: int, grid: tuple[int, int], repeats: int) -> Table:
         inputs = _weights(name, params, "aggregator.global_blocks."), x
         return partial(jax.jit(full_precision(run)).lower(*inputs).compile(), *inputs)
 
-    named = {"exact": lambda *_: suppressed_attention, "merged": merged_attention, "sampled": sampled_attention}
+    named = {"exact": lambda *_: suppressed_attention, "sampled": sampled_attention}
     ways: dict[str, Any] = {"a frame": None}
     ways |= {name: way if callable(way) else named[way] for name, way in WAYS.items()}
     programs = {name: compiled(name, way) for name, way in ways.items()}

@@ -17,7 +17,7 @@ LARGEST = 1_000_000  # size of one part of a network
 Size = Annotated[int, Meta(ge=1, le=LARGEST)]
 Gram = Literal["cosine", "dot"]
 Suppress = Literal["zero", "drop"]
-Attention = Literal["exact", "merged", "sampled"]
+Attention = Literal["exact", "sampled"]
 ComputeDType = Literal["float32", "bfloat16", "float64"]
 Precision = Literal["highest", "tf32"]
 Threshold = Literal["otsu", "multi-otsu"]

@@ -170,9 +170,8 @@ class Options:
     products that make depth and motion cues, as PyTorch has it in convolutions; highest, slower, with the seven digits
     of float32 there and, without --dtype, in the transformer. A CPU always has seven"""
     attention: InWords[Attention] = "exact"
-    """how frames attend to each other: exact; merged and sampled, approximations that are faster for long
-    clips, with other numbers (their errors are in the docs): merged merges similar tokens; sampled sees a third of the
-    tokens of other frames, and is the faster one on a GPU"""
+    """how frames attend to each other: exact; sampled, an approximation that sees a third of the tokens of other
+    frames: faster for long clips, with other numbers (its errors are in the docs)"""
 
     def __post_init__(self) -> None:
         find_method(self.method)

@@ -177,11 +177,11 @@ def _method(compiler: Compiler, setup: Setup) -> None:
 
 
 def _plain(compiler: Compiler, setup: Setup) -> None:
-    """Compile a pass without cues: exact, and with each approximation on one device."""
+    """Compile a pass without cues: exact, and with sampled keys on one device."""
     P = setup.grid[0] * setup.grid[1]
     tokens = jax.ShapeDtypeStruct((1, _images(setup).shape[1], P, setup.config.embed_dim), jnp.float32)
     batch = ClipBatch(_images(setup), tokens)  # type: ignore[arg-type]
-    for name, how in (("plain pass", "exact"), ("merged pass", "merged"), ("sampled pass", "sampled")):
+    for name, how in (("plain pass", "exact"), ("sampled pass", "sampled")):
         if how == "exact" or setup.devices == 1:
             compute = Compute(setup.dtype, setup.precision, attention=how, frames=compiler.frames)
             run = compiler.frames.on_devices(predict, REPLICATED, ClipBatch(BY_FRAME, BY_FRAME, REPLICATED))  # type: ignore[arg-type]
@@ -243,7 +243,7 @@ _BUILDS: Mapping[Callable[[Compiler, Setup], None], tuple[str, ...]] = {
         "image features", "first pass", "dynamic mask", "second pass", "assemble", "tracks",
         "matches: first pass", "matches: dynamic mask",
     ),
-    _plain: ("plain pass", "merged pass", "sampled pass"),
+    _plain: ("plain pass", "sampled pass"),
     _attention: ("attention",),
     _fusion_gradient: ("fusion gradient",),
     _training_step: ("training gradient", "optimiser"),

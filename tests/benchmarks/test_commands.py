@@ -60,7 +60,7 @@ def cells(text: str) -> dict[str, list[str]]:
 
 @pytest.mark.proof
 def test_approximations(run, tiny, monkeypatch):
-    monkeypatch.setattr(approximations, "WAYS", {"exact": "exact", "merged, 2 x 2": "merged"})
+    monkeypatch.setattr(approximations, "WAYS", {"exact": "exact", "sampled": "sampled"})
     monkeypatch.setattr(approximations, "_HEADS", 2)
     monkeypatch.setattr(approximations, "_WIDTH", 16)
     small = ["--scenes", "1", "--frames", "4", "--speed", "1", "--height", "28", "--width", "28", "--repeats", "1"]
@@ -68,7 +68,7 @@ def test_approximations(run, tiny, monkeypatch):
     exact, timed = [row for row in rows if row[0] == "exact"]
     assert exact[4:] == ["0.00%", "0.00°", "0.00%"]
     assert timed[3::2] == ["1.00", "1.00"]
-    assert next(row for row in rows if row[0] == "merged,")[-3] != "0.00%"
+    assert next(row for row in rows if row[0] == "sampled")[-3] != "0.00%"
 
 
 @pytest.mark.proof

@@ -18,7 +18,6 @@ from vggtjax.network.block import Block, apply_block, with_remat_policy
 from vggtjax.network.frames import Frames
 from vggtjax.network.in_place import replaced_if
 from vggtjax.network.layers import Params, apply, stack
-from vggtjax.network.merging import merged_attention
 from vggtjax.network.pieces import largest_divisor
 from vggtjax.network.precision import Compute, full_precision, upcast
 from vggtjax.network.rope import rope_table
@@ -32,7 +31,6 @@ SPECIAL_TOKENS = 1 + REGISTERS  # camera token, registers
 # (S, grid, special tokens) -> attention over the S frames of a clip
 GLOBAL_ATTENTION: Mapping[str, Callable[[int, tuple[int, int], int], Attend]] = {
     "exact": lambda S, grid, special_tokens: suppressed_attention,
-    "merged": merged_attention,
     "sampled": sampled_attention,
 }
 

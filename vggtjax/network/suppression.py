@@ -138,7 +138,6 @@ def suppressed_attention(
     def plain(q, k, v, hidden):
         return attention(q, k, v, is_real)
 
-    # `network.merging` merges before it suppresses, so it has a table of its own: `IS_ZEROED`.
     masked = {"zero": zero, "drop": drop}[suppressed.suppress]
     with jax.named_scope("suppress"):
         return jax.lax.cond(suppressed.active, masked, plain, q, k, v, suppressed.hidden)
