@@ -15,6 +15,7 @@ import platform
 import subprocess
 import sys
 import zipfile
+import zlib
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -49,6 +50,8 @@ def fitting(folder: Path) -> list[Path]:
     missing = [name for name in ("jax", "jaxlib") if find_spec(name) is None]
     if missing:
         raise RefusedError(f"{sys.executable} has no {missing[0]}; expected a Python with jax for the accelerator")
+    if not folder.is_dir():
+        raise RefusedError(f"{folder} is no folder; expected the folder of wheels that make gpu-day-wheels writes")
     wheels = sorted(folder.glob("*.whl"))
     if not wheels:
         raise RefusedError(f"{folder} has no wheels; make them where there is an index: make gpu-day-wheels")
@@ -86,7 +89,7 @@ def unpack(wheels: Sequence[Path], folder: Path) -> None:
         try:
             with zipfile.ZipFile(wheel) as files:
                 files.extractall(folder)
-        except (OSError, zipfile.BadZipFile) as error:
+        except (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:  # damaged, or encrypted
             raise RefusedError(f"{wheel} cannot be unpacked: {error}") from None
 
 

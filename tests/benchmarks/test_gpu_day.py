@@ -122,3 +122,14 @@ def test_the_wheels_are_what_is_imported_beside_jax():
     for python in ("3.11", "3.12", "3.13"):
         pins = wheels.locked(wheels.LOCK.read_text(encoding="utf-8"), python)
         assert all(f"{name}==" in pin and " --hash=sha256:" in pin and ";" not in pin for name, pin in pins.items())
+
+
+def test_a_wheel_that_is_damaged_within(tmp_path):
+    wheel = tmp_path / "package-1.0-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as files:
+        files.writestr("package/data.txt", "".join(str(i * i) for i in range(5000)))
+    content = bytearray(wheel.read_bytes())
+    content[200:260] = bytes(60)
+    wheel.write_bytes(content)
+    with pytest.raises(alone.RefusedError, match="cannot be unpacked"):
+        alone.unpack([wheel], tmp_path / "unpacked")

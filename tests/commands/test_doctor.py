@@ -20,7 +20,14 @@ from vggtjax.windows.choice import Planned
 def cache(tmp_path, monkeypatch):
     """A cache folder with an entry of every kind, and with files of someone else."""
     monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path / "cache"))
-    for name in ("compiled/a-cache", "lowered/b.bin", "passes/c.npz", f"m-{'0' * 16}.safetensors", "mine.safetensors"):
+    for name in (
+        "compiled/a-cache",
+        "lowered/b.bin",
+        "passes/c.npz",
+        "trials/d.json",
+        f"m-{'0' * 16}.safetensors",
+        "mine.safetensors",
+    ):
         path = tmp_path / "cache" / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"four")
@@ -31,7 +38,7 @@ def test_facts_as_json(cache, capsys):
     assert cli.main(["doctor", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["versions"]["jax"].count(".") == 2
-    assert found["cache"] == {"folder": str(cache), "bytes": 16, "parts": dict.fromkeys(cache_parts(), 4)}
+    assert found["cache"] == {"folder": str(cache), "bytes": 20, "parts": dict.fromkeys(cache_parts(), 4)}
     assert found["devices"][0]["platform"] == "cpu"
     clip = {clip["model"]: clip for clip in found["clips"]}["demo"]
     assert (clip["width"], clip["height"]) == (96, 56)
@@ -91,6 +98,9 @@ def test_the_longest_clip_of_a_gpu_that_is_not_here(monkeypatch, capsys):
     assert memory.room_of_gpu("h100").size == pytest.approx(72e9)
     more = {clip["height"]: clip["frames"] for clip in doctor._longest_on("h100")}
     assert all(more[height] > frames[height] for height in frames)
+    monkeypatch.setenv("XLA_PYTHON_CLIENT_MEM_FRACTION", "2")
+    assert cli.main(["doctor", "--device", "h100"]) == 2
+    assert "XLA_PYTHON_CLIENT_MEM_FRACTION is '2'" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_weights_of_a_loaded_model_are_counted_once(monkeypatch):

@@ -17,6 +17,8 @@ NARROW_AND_WIDE = {"twice": (1.0, 2.0), "hardly": (1.0, 1.4)}  # seconds
 def cpu(monkeypatch, tmp_path):
     """Make up what Linux says of the processor, and the seconds of the trial."""
 
+    monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path / "cache"))
+
     def made_up(text: str | None, seconds=NARROW_AND_WIDE["twice"]):
         info = tmp_path / "cpuinfo"
         if text is not None:
@@ -54,11 +56,27 @@ def test_a_trial_that_gains_little_or_fails_leaves_float32(cpu, monkeypatch):
     assert choice is not None
     assert choice == ("float32", "this processor multiplies bfloat16 1.4 times as fast as float32")
 
-    def fails(channels):
-        raise jax.errors.JaxRuntimeError("UNIMPLEMENTED: no such product\nmore")
+    for error, said in ((jax.errors.JaxRuntimeError("UNIMPLEMENTED: none\nmore"), "UNIMPLEMENTED: none more"),
+                        (MemoryError(), "MemoryError")):  # fmt: skip
 
-    monkeypatch.setattr(processor, "_seconds", fails)
-    assert choose_dtype(1024) == ("float32", "the trial of bfloat16 failed: UNIMPLEMENTED: no such product")
+        def fails(channels, error=error):
+            raise error
+
+        monkeypatch.setattr(processor, "_seconds", fails)
+        assert choose_dtype(2048) == ("float32", f"the trial of bfloat16 failed: {said}")
+
+
+def test_a_later_run_computes_in_the_same_type(cpu):
+    """On the same processor with the same cores, however busy it is by then."""
+    text = "processor : 0\nmodel name : {}\nflags : amx_bf16\n\nprocessor : 1\n"
+    cpu(text.format("A"))
+    first = choose_dtype(1024)
+    cpu(text.format("A"), NARROW_AND_WIDE["hardly"])
+    assert choose_dtype(1024) == first
+    cpu(text.format("B"), NARROW_AND_WIDE["hardly"])
+    other = choose_dtype(1024)
+    assert other is not None
+    assert other.dtype == "float32"
 
 
 def test_the_trial_takes_the_time_of_both_products():

@@ -110,6 +110,7 @@ class ModelFiles:
         exact = "" if choice.dtype == "float32" else "; --dtype float32 is slower and exact"
         report.note(f"computing in {choice.dtype}: {choice.reason}{exact}")
         if choice.dtype != "float32":
+            del model  # its weights are read again, narrower
             name = at_revision(check_named(self.model), self.revision)
             model = load(report, name, self.config, choice.dtype, stage=f"weights in {choice.dtype}")
         return model, params, options.changed(compute_dtype=choice.dtype)

@@ -18,7 +18,6 @@ from vggtjax.network.block import Block, apply_block, with_remat_policy
 from vggtjax.network.frames import Frames
 from vggtjax.network.in_place import replaced_if
 from vggtjax.network.layers import Params, apply, stack
-from vggtjax.network.pieces import largest_divisor
 from vggtjax.network.precision import Compute, full_precision, upcast
 from vggtjax.network.rope import rope_table
 from vggtjax.network.sampled import early_pairs, frames_alone, sampled_attention
@@ -206,20 +205,27 @@ def _joined(capture: Capture, shape: tuple[int, int, int, int]) -> Callable[[Arr
     The rows of many frames, joined and normalised in float32, would be the most that a pass holds.
     """
     B, S, T = shape[:3]
-    at_once = largest_divisor(S, max(_CAPTURED_ROWS // (B * T), 1))
+    pieces = -(-S // max(_CAPTURED_ROWS // (B * T), 1))
+    at_once = -(-S // pieces)
+    starts = np.minimum(at_once * np.arange(pieces), S - at_once)  # the last piece overlaps the one before it
+    owner = np.minimum(np.arange(S) // at_once, pieces - 1)
+    taken = at_once * owner + np.arange(S) - starts[owner]  # of every frame, among those of all pieces
 
     def captured(frame: Array, x: Array) -> Any:
         return capture(jnp.concatenate([frame.reshape(shape), x.reshape(shape)], axis=-1))
 
     def in_pieces(frame: Array, x: Array) -> Any:
         def of_piece(start: Array) -> Any:
-            pieces = (jax.lax.dynamic_slice_in_dim(a.reshape(shape), start, at_once, axis=1) for a in (frame, x))
-            return capture(jnp.concatenate(list(pieces), axis=-1))
+            some = [jax.lax.dynamic_slice_in_dim(a.reshape(shape), start, at_once, axis=1) for a in (frame, x)]
+            return capture(jnp.concatenate(some, axis=-1))
 
-        captures = jax.lax.map(of_piece, at_once * jnp.arange(S // at_once))  # [pieces, B, at once, ...]
-        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1).reshape(B, S, *leaf.shape[3:]), captures)
+        def of_frames(leaf: Array) -> Array:
+            leaf = jnp.moveaxis(leaf, 0, 1).reshape(B, pieces * at_once, *leaf.shape[3:])
+            return leaf if pieces * at_once == S else leaf[:, taken]
 
-    if at_once == S:
+        return jax.tree.map(of_frames, jax.lax.map(of_piece, jnp.asarray(starts)))  # [pieces, B, at once, ...]
+
+    if pieces == 1:
         return captured
     return lambda frame, x: jax.lax.platform_dependent(frame, x, cpu=captured, default=in_pieces)
 

@@ -59,7 +59,8 @@ class Projections(nn.Module):
             return q, k, v
         rope = Rope(rope.cos[:count], rope.sin[:count])
         q, k = apply_rope(q, rope), apply_rope(k, rope)
-        if not (self.qk_norm and is_fused(*q.shape[1:]) and is_on_one("gpu") and heads_work()):
+        is_known = self.dtype in (jnp.bfloat16, jnp.float32)
+        if not (self.qk_norm and is_known and is_fused(*q.shape[1:]) and is_on_one("gpu") and heads_work()):
             return q, k, v
         norms = [norm.variables["params"] for norm in (self.q_norm, self.k_norm)]
         norms = jnp.stack([jnp.stack([norm["scale"], norm["bias"]]) for norm in norms])

@@ -25,7 +25,7 @@ def predict_pose(
     *,
     frame_count: Int[Array, " B"] | None = None,
     stop_gradient: bool = True,
-    compute_dtype: str = "float32",
+    compute_dtype: str | None = None,
     frames: Frames = Frames(),
 ) -> Float[Array, "B S 9"]:
     """Return the pose encoding [t(3), quaternion xyzw(4), fov_h, fov_w] of every frame.
@@ -36,7 +36,7 @@ def predict_pose(
         config: the model's configuration.
         frame_count: number of real frames of each clip, its first ones; None for all.
         stop_gradient: treat the previous estimate as a constant in each iteration, as in VGGT's training.
-        compute_dtype: type of the products of the trunk's blocks; all else is float32.
+        compute_dtype: type of the products of the trunk's blocks; by default that of the tokens, as all else.
         frames: where the frames are; every device computes the poses of all frames, which takes little.
     """
     head = CameraHead(config, stop_gradient, compute_dtype)
@@ -48,7 +48,7 @@ class CameraHead(nn.Module):
 
     config: VGGTConfig
     stop_gradient: bool = True
-    compute_dtype: str = "float32"
+    compute_dtype: str | None = None
 
     @nn.compact
     def __call__(
@@ -64,7 +64,7 @@ class CameraHead(nn.Module):
         is_real = None if is_real is None else frames.gather(is_real)
         camera_tokens = frames.gather(camera_tokens)
         E = config.tap_dim
-        block = Block(config.camera_num_heads, dtype=jnp.dtype(self.compute_dtype))
+        block = Block(config.camera_num_heads, dtype=jnp.dtype(self.compute_dtype or camera_tokens.dtype))
         tokens = LayerNorm(name="token_norm")(camera_tokens)
         normed = LayerNorm(1e-6, use_bias=False, use_scale=False)(tokens)
         empty = self.param("empty_pose", nn.initializers.zeros, (1, 1, POSE_SIZE))

@@ -102,7 +102,7 @@ gelu.defvjp(lambda x: (gelu(x), x), _gelu_backward)
 
 @jax.custom_vjp
 def _fused_gelu(x: Array) -> Array:
-    """Return GELU by tanh, off by at most 5e-4, less than bfloat16 rounds: cuBLAS applies it as it writes a product."""
+    """Return GELU by tanh, off by at most 5e-4: cuBLAS applies it as it writes a product."""
     return jax.nn.gelu(x, approximate=True)
 
 

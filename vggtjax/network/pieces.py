@@ -34,6 +34,7 @@ def map_chunks(function: Callable[[_Rows, int], _Outputs], rows: _Rows) -> _Outp
             count = _count(rows)
             if (size := piece_size(count, most)) is None:
                 return function(_padded(rows, multiple), count)
+            size += -size % multiple
             outputs = jax.lax.map(lambda piece: function(piece, size), _cut(rows, size))
             return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], outputs)
 
@@ -53,7 +54,7 @@ def map_chunks_in_place(
         def replaced(rows):
             if (size := piece_size(len(x), most)) is None:
                 return function(*_padded(rows, multiple))[: len(x)]
-            pieces, others = _cut(rows, size)
+            pieces, others = _cut(rows, size + -size % multiple)
 
             def step(pieces, index_and_others):
                 index, others = index_and_others

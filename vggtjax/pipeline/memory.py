@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, Protocol, TypedDict, Unpack
 import jax
 
 from vggtjax.config import VGGTConfig
+from vggtjax.errors import InputError
 from vggtjax.network.aggregator import SPECIAL_TOKENS
 from vggtjax.network.cpu_attention import LOGITS_OF_ALL_HEADS, chunk_count
 from vggtjax.network.dpt_head import HIDDEN, PIXELS_AT_ONCE
@@ -130,10 +131,17 @@ def available(params: Any = None) -> Room | None:
 
 
 def room_of_gpu(name: str) -> Room:
-    """Return what jax takes of the memory of a GPU of `GPUS`, which need not be here."""
-    share = 0.75  # jax's default
+    """Return what jax takes of the memory of a GPU of `GPUS`, which need not be here.
+
+    Raises InputError for a share of it in the environment that is no number above 0 and up to 1.
+    """
+    given, share = os.environ.get("XLA_PYTHON_CLIENT_MEM_FRACTION", ".75"), 0.0  # jax's default
     with suppress(ValueError):
-        share = float(os.environ.get("XLA_PYTHON_CLIENT_MEM_FRACTION", share))
+        share = float(given)
+    if not 0 < share <= 1:
+        raise InputError(
+            f"XLA_PYTHON_CLIENT_MEM_FRACTION is {given!r}; expected a number above 0 and up to 1, or unset"
+        )
     return Room(share * GPUS[name], f"of an {name}")
 
 

@@ -1,13 +1,24 @@
-"""Whether this computer's CPU multiplies bfloat16 faster than float32: a trial of a few products."""
+"""Whether this computer's CPU multiplies bfloat16 faster than float32: a trial of a few products, made once and kept.
+
+A run that is stopped and started again has to compute in the same type, however busy the computer is by then.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+
+from vggtjax.errors import VggtjaxError, one_line
+from vggtjax.storage.cache import TRIALS, cache_folder
+from vggtjax.storage.cores import core_count
+from vggtjax.storage.writing import writing
 
 _UNITS = {"amx_bf16", "avx512_bf16", "bf16"}  # as Linux names them: Intel's AMX; Intel and AMD; ARM
 _CPU_INFO = Path("/proc/cpuinfo")
@@ -26,30 +37,44 @@ class Choice(NamedTuple):
 def choose_dtype(channels: int) -> Choice | None:
     """Return bfloat16 where this CPU multiplies it much faster, else float32; None for a model too small to gain.
 
-    `channels` are those of the transformer's tokens. The trial takes about a third of a second, mostly to compile.
+    `channels` are those of the transformer's tokens. The trial takes about a third of a second, mostly to compile; the
+    user's cache keeps its outcome for this processor, number of cores and version of jax.
     """
     if channels < _FEWEST_CHANNELS:
         return None
-    if not _has_unit():
+    facts = _facts()
+    if not any(_UNITS & set(values.split()) for name, values in facts if name in ("flags", "features")):
         return Choice("float32", "this processor has no known unit for bfloat16")
     try:
-        narrow, wide = _seconds(channels)
-    except (RuntimeError, MemoryError) as error:
-        return Choice("float32", f"the trial of bfloat16 failed: {str(error).splitlines()[0]}")
-    gain = f"this processor multiplies bfloat16 {wide / narrow:.1f} times as fast as float32"
-    return Choice("bfloat16" if wide >= _FASTER * narrow else "float32", gain)
+        gain = _kept_gain(facts, channels)
+    except Exception as error:  # whatever fails, float32 works
+        return Choice("float32", f"the trial of bfloat16 failed: {one_line(str(error)) or type(error).__name__}")
+    reason = f"this processor multiplies bfloat16 {gain:.1f} times as fast as float32"
+    return Choice("bfloat16" if gain >= _FASTER else "float32", reason)
 
 
-def _has_unit() -> bool:
-    """Return whether Linux names a unit for bfloat16; False on other systems."""
-    try:
-        text = _CPU_INFO.read_text(encoding="utf-8", errors="replace")
-    except OSError:
-        return False
-    rows = (line.partition(":") for line in text.splitlines())
-    return any(
-        _UNITS & set(values.split()) for name, _, values in rows if name.strip().lower() in ("flags", "features")
-    )
+def _facts() -> list[tuple[str, str]]:
+    """Return what Linux says of the first processor, as names and values; nothing on other systems."""
+    with suppress(OSError):
+        first = _CPU_INFO.read_text(encoding="utf-8", errors="replace").partition("\n\n")[0]
+        rows = (line.partition(":") for line in first.splitlines())
+        return [(name.strip().lower(), value.strip()) for name, _, value in rows]
+    return []
+
+
+def _kept_gain(facts: list[tuple[str, str]], channels: int) -> float:
+    """Return how many times as fast bfloat16 is, as an earlier run measured it, or measured now and kept."""
+    named = [value for name, value in facts if name in ("model name", "cpu implementer", "cpu part")]
+    text = json.dumps([named, core_count(), jax.__version__, channels])
+    path = cache_folder() / TRIALS / f"{hashlib.sha256(text.encode()).hexdigest()[:16]}.json"
+    with suppress(OSError, ValueError, TypeError, KeyError):
+        return float(json.loads(path.read_text(encoding="utf-8"))["gain"])
+    narrow, wide = _seconds(channels)
+    with suppress(VggtjaxError, OSError):  # a cache that cannot be written costs the next run a third of a second
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with writing(path) as temporary:
+            temporary.write_text(json.dumps({"gain": wide / narrow}), encoding="utf-8")
+    return wide / narrow
 
 
 def _seconds(channels: int) -> tuple[float, float]:

@@ -18,7 +18,13 @@ from vggtjax.storage.writing import write_errors
 
 COMPILED_BYTES = 2 * 2**30  # of kept compiled programs; the least recently used go first
 CONVERTED = "converted weights"
-_KINDS = {"compiled programs": "compiled", "traced programs": "lowered", "passes for fits": "passes"}
+TRIALS = "trials"  # of what this computer does fast
+_KINDS = {
+    "compiled programs": "compiled",
+    "traced programs": "lowered",
+    "passes for fits": "passes",
+    "trials of the processor": TRIALS,
+}
 _CONVERTED = re.compile(r"-[0-9a-f]{16}\.safetensors$")  # weights that were converted for `load_model`
 _DAMAGED = re.compile(r"Error (reading|writing) persistent compilation cache entry for '([^']+)'")
 _FOLDER = "jax_compilation_cache_dir"

@@ -118,7 +118,7 @@ def objective(
         return aggregate(model, tokens, config, grid, captures=captures, **settings)
 
     camera_tokens, taps, sums = (jax.checkpoint(network) if remat else network)(model)
-    pose = predict_pose(model, camera_tokens, config)
+    pose = predict_pose(model, camera_tokens, config, compute_dtype=compute_dtype)
     terms = _camera_terms(pose, truth.pose_encoding, weights)
     metrics = _camera_metrics(pose, truth.pose_encoding)
     goals = {"depth": truth.depth[..., None], "points": truth.points}
