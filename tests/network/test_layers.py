@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.stats import norm
 
 from vggtjax.network import pieces
@@ -36,3 +37,12 @@ def test_rows_on_an_accelerator_are_a_multiple_of_eight(monkeypatch):
     assert np.array_equal(pieces.map_chunks(doubled, x), 2 * x)
     assert np.array_equal(pieces.map_chunks_in_place(lambda x, others: doubled(x) + others, x, x), 3 * x)
     assert seen == [((16, 2), 11), ((16, 2), None)]
+
+
+@pytest.mark.parametrize(
+    ("frames", "rows"),  # of 1041 tokens
+    [(251, None), (252, 131166), (300, 156150), (400, 208200), (1000, 208200)],
+)
+def test_pieces_of_long_clips_on_an_accelerator(frames, rows):
+    """Multiples of 8 where a divisor is one."""
+    assert pieces.piece_size(1041 * frames, pieces.ROWS_ELSEWHERE, 8) == rows

@@ -32,9 +32,8 @@ def map_chunks(function: Callable[[_Rows, int], _Outputs], rows: _Rows) -> _Outp
     def at_most(most: int, multiple: int) -> Callable[[_Rows], _Outputs]:
         def mapped(rows):
             count = _count(rows)
-            if (size := piece_size(count, most)) is None:
+            if (size := piece_size(count, most, multiple)) is None:
                 return function(_padded(rows, multiple), count)
-            size += -size % multiple
             outputs = jax.lax.map(lambda piece: function(piece, size), _cut(rows, size))
             return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], outputs)
 
@@ -52,9 +51,9 @@ def map_chunks_in_place(
 
     def at_most(most: int, multiple: int):
         def replaced(rows):
-            if (size := piece_size(len(x), most)) is None:
+            if (size := piece_size(len(x), most, multiple)) is None:
                 return function(*_padded(rows, multiple))[: len(x)]
-            pieces, others = _cut(rows, size + -size % multiple)
+            pieces, others = _cut(rows, size)
 
             def step(pieces, index_and_others):
                 index, others = index_and_others
@@ -78,16 +77,18 @@ def largest_divisor(count: int, most: int) -> int:
     return max(n for n in range(1, min(count, most) + 1) if count % n == 0)
 
 
-def piece_size(count: int, most: int) -> int | None:
+def piece_size(count: int, most: int, multiple: int = 1) -> int | None:
     """Return the size of equal pieces of `count` rows, or None for a single piece.
 
-    A divisor between `most` / 3 and `most`, which avoids a padded copy, or else the size of the fewest pieces.
+    A divisor between `most` / 3 and `most`, which avoids a padded copy, or else the size of the fewest pieces. The
+    divisor is a multiple of `multiple` where there is one: a padded copy would cost more than products of other sizes.
     """
     if count <= most:
         return None
     fewest = -(-count // most)
-    divisors = (count // n for n in range(fewest, 3 * fewest + 1) if count % n == 0)
-    return next(divisors, -(-count // fewest))
+    divisors = [count // n for n in range(fewest, 3 * fewest + 1) if count % n == 0]
+    best = [size for size in divisors if size % multiple == 0] or divisors or [-(-count // fewest)]
+    return best[0]
 
 
 def _by_platform(at_most, rows):
