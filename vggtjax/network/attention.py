@@ -161,8 +161,32 @@ def _packed(q, k, v, visible, *, implementation):
     )
 
 
+@jax.custom_vjp
 def _on_tpu(q, k, v, visible):
     """Run jax's flash attention for TPUs; invisible keys, and the padding of the last block, are another segment."""
+    with _products_of(q.dtype):
+        return _flash(q, k, v, visible)
+
+
+def _on_tpu_forward(q, k, v, visible):
+    with _products_of(q.dtype):
+        return jax.vjp(lambda q, k, v: _flash(q, k, v, visible), q, k, v)
+
+
+def _on_tpu_backward(pull, gradient):
+    with _products_of(gradient.dtype):  # the gradient's products are traced here
+        return *pull(gradient), None
+
+
+_on_tpu.defvjp(_on_tpu_forward, _on_tpu_backward)
+
+
+def _products_of(dtype):
+    """Return a context for the kernel's products: those in bfloat16 have only the default precision."""
+    return jax.default_matmul_precision("highest" if dtype == jnp.float32 else "default")
+
+
+def _flash(q, k, v, visible):
     from jax.experimental.pallas.ops.tpu.flash_attention import SegmentIds, flash_attention
 
     T, K = q.shape[1], k.shape[1]
@@ -173,7 +197,5 @@ def _on_tpu(q, k, v, visible):
     queries, keys, values = (padded(x).swapaxes(1, 2) for x in (q, k, v))
     segment = padded(jnp.ones((len(k), K), jnp.int32) if visible is None else visible.astype(jnp.int32))
     segments = SegmentIds(jnp.ones((len(q), queries.shape[2]), jnp.int32), segment)
-    exact = "highest" if q.dtype == jnp.float32 else "default"  # bfloat16 products have only the default precision
-    with jax.default_matmul_precision(exact):
-        out = flash_attention(queries, keys, values, segment_ids=segments, sm_scale=q.shape[-1] ** -0.5)
+    out = flash_attention(queries, keys, values, segment_ids=segments, sm_scale=q.shape[-1] ** -0.5)
     return out.swapaxes(1, 2)[:, :T]
