@@ -20,7 +20,7 @@ from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.evaluation.metrics.depth import median_scale
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
-from vggtjax.network.aggregator import SPECIAL_TOKENS
+from vggtjax.network.aggregator import GLOBAL_ATTENTION, SPECIAL_TOKENS
 from vggtjax.network.block import Block, apply_block
 from vggtjax.network.layers import Params
 from vggtjax.network.model import forward
@@ -28,13 +28,11 @@ from vggtjax.network.pose import decode_pose
 from vggtjax.network.precision import full_precision
 from vggtjax.network.quantised import is_quantised, quantise
 from vggtjax.network.rope import rope_table
-from vggtjax.network.sampled import sampled_attention
-from vggtjax.network.suppression import suppressed_attention
 from vggtjax.pretrained.load import load_model
 from vggtjax.scenes import SceneConfig, held_out_scenes
 from vggtjax.storage.kept_memory import keep_freed_memory
 
-WAYS: dict[str, str | Callable] = {
+WAYS: dict[str, str] = {
     "exact": "exact",
     "sampled": "sampled",
     "exact, int8 weights": "exact",
@@ -86,7 +84,7 @@ def _weights(name: str, params: Params, prefix: str = "") -> Params:
     return unflatten_dict(rounded, sep=".")
 
 
-def _run(params: Params, images: Any, config: VGGTConfig, way: str | Callable) -> Callable[..., Any]:
+def _run(params: Params, images: Any, config: VGGTConfig, way: str) -> Callable[..., Any]:
     compute: Any = {"attention": way}
     return jax.jit(lambda params, images: forward(params, images, config, **compute)).lower(params, images).compile()
 
@@ -162,9 +160,7 @@ def _times(frames: int, grid: tuple[int, int], repeats: int) -> Table:
         inputs = _weights(name, params, "aggregator.global_blocks."), x
         return partial(jax.jit(full_precision(run)).lower(*inputs).compile(), *inputs)
 
-    named = {"exact": lambda *_: suppressed_attention, "sampled": sampled_attention}
-    ways: dict[str, Any] = {"a frame": None}
-    ways |= {name: way if callable(way) else named[way] for name, way in WAYS.items()}
+    ways = {"a frame": None} | {name: GLOBAL_ATTENTION[way] for name, way in WAYS.items()}
     programs = {name: compiled(name, way) for name, way in ways.items()}
     best = dict.fromkeys(programs, (np.inf, np.inf))
     for repeat in range(repeats + 1):
