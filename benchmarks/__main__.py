@@ -13,6 +13,7 @@ from vggtjax.errors import VggtjaxError
 COMMANDS = {  # imported where it is called, so that one command needs no other's packages
     "accelerator": "benchmarks.accelerator.command:accelerator",
     "approximations": "benchmarks.approximations:approximations",
+    "consistent-depth": "benchmarks.consistent_depth:consistent_depth",
     "demo-model": "benchmarks.demo_model:demo_model",
     "embed": "benchmarks.embed:embed",
     "gpu-day": "benchmarks.gpu_day.command:gpu_day",

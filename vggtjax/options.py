@@ -98,7 +98,7 @@ def pairs_to_try(pairs: Sequence[int], depth: int | None = None) -> tuple[int, .
     return numbers
 
 
-_READ_AFTER_THE_PASSES = ("method", "align_scale", "refine_mask", "refine_cameras")
+_READ_AFTER_THE_PASSES = ("method", "align_scale", "refine_mask", "refine_cameras", "consistent_depth")
 
 
 def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) -> bool | None:
@@ -116,6 +116,7 @@ def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) ->
 _LATER = {
     "cameras": "predicted",
     "refine_cameras": False,
+    "consistent_depth": False,
     "attention": "exact",
     "precision": "highest",
 }  # as in older results
@@ -159,6 +160,9 @@ class Options:
     refine_cameras: Switch = False
     """adjust cameras and focal length to matches between the source's pictures, where nothing moves (bundle adjustment;
     needs the extra colmap)"""
+    consistent_depth: Switch = False
+    """fit depth, cameras and focal length to the pixels of the source, and join what several frames see, where nothing
+    moves (not in the papers); with the extra colmap its points are fitted too"""
     compute_dtype: Annotated[
         ComputeDType | None,
         tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint=""),  # pyright: ignore

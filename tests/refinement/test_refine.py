@@ -27,7 +27,7 @@ def camera_errors(result, corner):
 def test_cameras_converge_to_the_truth(wrong):
     corner = make_corner()
     result = corner_result(corner)
-    refined, report = adjust_to_tracks(result, exact_tracks(corner, wrong))
+    refined, report, _ = adjust_to_tracks(result, exact_tracks(corner, wrong))
     assert (np.array(camera_errors(result, corner)) > [0.05, 2, 0.05]).all()
     assert (np.array(camera_errors(refined, corner)) < [1e-4, 0.005, 2e-4]).all()
     assert report.refined
@@ -92,9 +92,9 @@ def test_two_frames_and_one():
     K = corner.intrinsics.copy()
     K[:, :2] /= SCALE
     result = dataclasses.replace(corner_result(corner, degrees=3), intrinsics=K.astype(np.float32))
-    refined, report = adjust_to_tracks(result, exact_tracks(corner), fixed_intrinsics=True)
+    refined, report, _ = adjust_to_tracks(result, exact_tracks(corner), fixed_intrinsics=True)
     np.testing.assert_allclose(refined.intrinsics, result.intrinsics, rtol=1e-6)
-    refined, report = adjust_to_tracks(result, exact_tracks(corner))
+    refined, report, _ = adjust_to_tracks(result, exact_tracks(corner))
     assert report.refined
     assert rotation_error(refined.camera_from_world, corner.camera_from_world) < 0.01
     np.testing.assert_allclose(refined.intrinsics, result.intrinsics, rtol=1e-6)  # two frames do not hold it

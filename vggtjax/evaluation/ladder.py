@@ -167,7 +167,16 @@ def ladder(
 
 def _check_options(options: Options) -> None:
     """Raise InputError for options that are arguments of the ladder, or that it does not read."""
-    for name in ("method", "mask", "mask_pairs", "suppress", "align_scale", "refine_mask", "refine_cameras"):
+    for name in (
+        "method",
+        "mask",
+        "mask_pairs",
+        "suppress",
+        "align_scale",
+        "refine_mask",
+        "refine_cameras",
+        "consistent_depth",
+    ):
         if getattr(options, name) != getattr(Options(), name):
             raise InputError(
                 f"options have {name} {getattr(options, name)!r}; leave it out: methods, masks, mask_pairs and "

@@ -62,6 +62,10 @@ def check_artefact(out: Path, frames: int, height: int, width: int, platforms: S
         check_choice("platforms", platform, PLATFORMS)
     if options.refine_cameras:
         raise InputError("refine_cameras is True; leave it out: bundle adjustment is not a part of the program")
+    if options.consistent_depth:
+        raise InputError(
+            "consistent_depth is True; leave it out: it reads the source's pictures, which a program cannot"
+        )
     if options.row.refine:
         raise InputError(
             f"method {options.method} refines its mask on the host, which a program cannot; give refine_mask=False "

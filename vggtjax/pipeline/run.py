@@ -25,6 +25,7 @@ from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.passes import Passes
 from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.options import Options
+from vggtjax.pipeline.agreement import agree_with_pixels, agrees_with_pixels
 from vggtjax.pipeline.devices import frames_mesh, on_host, replicate, shard_frames
 from vggtjax.pipeline.fields import (
     assembled_fields,
@@ -41,7 +42,7 @@ from vggtjax.pipeline.running import Running, changed
 from vggtjax.pipeline.steps import Compile, Execute, StageMemory
 from vggtjax.progress import OnStage, Progress
 from vggtjax.reconstruction import Reconstruction
-from vggtjax.refinement.refine import check_refinement, refine_cameras
+from vggtjax.refinement.refine import check_refinement
 from vggtjax.results.not_finite import warn_of_not_finite
 from vggtjax.storage.cache import hint_compilation_cache
 
@@ -266,19 +267,25 @@ def _result(
 def _with_geometry(
     result: Reconstruction, inputs: Inputs, options: Options, on_stage: OnStage
 ) -> tuple[Reconstruction, float]:
-    """Return the result with refined cameras and what is known, and how long the prediction's unit is in its own."""
+    """Return the result by pixels and by what is known, and how long the prediction's unit is in its own."""
     geometry = inputs.geometry
-    if geometry is None and not options.refine_cameras:
-        return result, 1.0
-    with on_stage("refine cameras" if options.refine_cameras else "known geometry") as progress:
 
-        def refine(result: Reconstruction) -> Reconstruction:
-            fixed = geometry is not None and geometry.intrinsics is not None
-            return refine_cameras(result, inputs.clip.pictures(), fixed_intrinsics=fixed, progress=progress)[0]
+    def agree(result: Reconstruction) -> Reconstruction:
+        return agree_with_pixels(
+            result,
+            inputs.clip.pictures,
+            options,
+            known_poses=geometry is not None and geometry.poses is not None,
+            known_intrinsics=geometry is not None and geometry.intrinsics is not None,
+            on_stage=on_stage,
+        )
 
-        if geometry is None:
-            return refine(result), 1.0
-        return apply_known(result, geometry, refine if options.refine_cameras else None)
+    if geometry is None:
+        return agree(result), 1.0
+    if agrees_with_pixels(options):
+        return apply_known(result, geometry, agree)
+    with on_stage("known geometry"):
+        return apply_known(result, geometry)
 
 
 def _points_by_frame(queries: Queries) -> dict[int, Float[Array, "1 Q 2"]]:

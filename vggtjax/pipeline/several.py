@@ -14,6 +14,7 @@ from vggtjax.errors import InputError
 from vggtjax.method.assembly import FusionRule, as_tree, assemble, check_fuses
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.options import Options
+from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.fields import assembled_fields
 from vggtjax.pipeline.run import reconstruct, refined
 from vggtjax.pipeline.steps import Execute
@@ -52,10 +53,12 @@ def reconstruct_methods(
         raise InputError("refine_cameras is for one method; reconstruct with each method by itself")
     results: dict[str, Reconstruction] = {}
     for group in groups_of_methods(methods, options, model.config.motion):
-        shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(refine_mask=False)
+        shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(
+            refine_mask=False, consistent_depth=False
+        )
         result = reconstruct(model, clip, options=shared, size=size, keep_passes=True, on_stage=on_stage)
         for each in group:
-            results[each.method] = _as_method(result, each, fusion, on_stage or no_stage)
+            results[each.method] = _as_method(result, each, fusion, clip, on_stage or no_stage)
     return {name: results[name] for name in methods}
 
 
@@ -69,7 +72,7 @@ def groups_of_methods(methods: Sequence[str], options: Options, motion: MotionCo
 
 
 def _as_method(
-    result: Reconstruction, options: Options, fusion: FusionRule | None, on_stage: OnStage
+    result: Reconstruction, options: Options, fusion: FusionRule | None, clip: Clip, on_stage: OnStage
 ) -> Reconstruction:
     """Return what another method makes of the passes that a result keeps."""
     method, passes = options.row, result.passes
@@ -77,6 +80,7 @@ def _as_method(
     how = {name: getattr(options, name) for name in ("method", "align_scale", "cameras")}
     assembly = Execute()("assemble", assemble)(passes, as_tree(fusion), **how)
     settings = result.settings | {"refine_mask": method.refine}
+    settings |= {"consistent_depth": True} if options.consistent_depth else {}
     with warnings.catch_warnings():
         if result.method == options.method:  # the warning about clamped cameras has been given already
             warnings.simplefilter("ignore", FieldOfViewWarning)
@@ -87,6 +91,7 @@ def _as_method(
             settings=settings if fusion is None else settings | {"fusion": fusion_digest(fusion)},
             passes=None,
         )
+    result = agree_with_pixels(result, clip.pictures, options, on_stage=on_stage)
     if method.refine:
         with on_stage("refine mask") as progress:
             result = refined(result, progress)

@@ -10,7 +10,7 @@ import scipy
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from PIL import Image
 
-from vggtjax.errors import ClipError
+from vggtjax.refinement.cells import check_number, check_size
 from vggtjax.results.result import Result
 
 WORKING_SIDE = 1600  # pixels; larger pictures are searched at this size
@@ -65,10 +65,8 @@ def find_features(
     for frame, picture in enumerate(pictures):
         if frame == len(static):
             break
-        height, width = result.source_size[frame].tolist()
-        if picture.shape[:2] != (height, width):
-            size = "{1} x {0}".format(*picture.shape)
-            raise ClipError(f"picture {frame} has {size} pixels; the result was made from {width} x {height}")
+        check_size(result, frame, picture)
+        height, width = picture.shape[:2]
         image = Image.fromarray(picture).convert("L")
         image.thumbnail((WORKING_SIDE, WORKING_SIDE))
         keypoints, descriptors = extractor.extract_from_uint8_array(np.asarray(image))
@@ -79,8 +77,7 @@ def find_features(
         described /= np.maximum(np.linalg.norm(described, axis=1, keepdims=True), 1)
         features.append(Features(positions[kept], described))
         on_step()
-    if len(features) < len(static):
-        raise ClipError(f"the source gives {len(features)} pictures of the {len(static)} frames; load the clip anew")
+    check_number(result, len(features))
     return features
 
 

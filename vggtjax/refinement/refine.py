@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import count
-from typing import Any, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
@@ -16,8 +16,10 @@ from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError, check_extra
 from vggtjax.progress import Progress, no_progress
 from vggtjax.refinement.adjust import Adjusted, adjust, quiet, reprojection_errors
+from vggtjax.refinement.field import Measured
 from vggtjax.refinement.mapping import Matched, map_globally, nearest_to_rays
 from vggtjax.refinement.matches import find_features, frame_pairs, match_pairs, working_unit
+from vggtjax.refinement.points import measured_at_points
 from vggtjax.refinement.tracks import Tracks, dense_depth_at, join_matches, starting_points
 from vggtjax.results.result import Result
 
@@ -57,6 +59,14 @@ class RefinementReport:
         )
 
 
+class Refined(NamedTuple, Generic[R]):
+    """A result whose cameras were refined, or kept."""
+
+    result: R
+    report: RefinementReport
+    points: Measured | None  # the depths of its points over the result's; None where the cameras were kept
+
+
 def check_refinement(wanted: bool, known_poses: bool = False) -> None:
     """Raise MissingExtraError without pycolmap, and InputError for known poses; call it before long work."""
     if wanted:
@@ -74,12 +84,34 @@ def refine_cameras(
 ) -> tuple[R, RefinementReport]:
     """Return the result with cameras that agree with matches between its pictures, and a report.
 
+    `refine_with_points` says more, and returns the depths of the matched points too.
+    """
+    refined = refine_with_points(result, pictures, fixed_intrinsics=fixed_intrinsics, progress=progress)
+    warn_of_kept(refined.report)
+    return refined.result, refined.report
+
+
+def warn_of_kept(report: RefinementReport) -> None:
+    """Log a warning if the network's cameras were kept."""
+    if not report.refined:
+        logger.warning("%s", report.sentence)
+
+
+def refine_with_points(
+    result: R,
+    pictures: Iterable[UInt8[np.ndarray, "h w 3"]],
+    *,
+    fixed_intrinsics: bool = False,
+    progress: Progress | None = None,
+) -> Refined[R]:
+    """Return the result with cameras that agree with matches between its pictures, a report, and the points' depths.
+
     SIFT features on static pixels are matched between frames; their tracks start where the dense depth puts them. A
     bundle adjustment with a Cauchy loss then moves cameras, points and one focal length. It is run from several starts:
     the network's cameras, with the loss from narrow to wide, and those of COLMAP's global mapper; the one that agrees
     best with the matches is taken. The depth, the first camera and the principal points stay, and the others come to
-    the depth's scale. The network's cameras are kept, with a warning logged, where the matches are too few, the error
-    does not fall, or the adjusted points contradict the dense depth.
+    the depth's scale. The network's cameras are kept where the matches are too few, the error does not fall, or the
+    adjusted points contradict the dense depth.
 
     Args:
         result: cameras, depth and dynamic mask; the mask decides which pixels are matched.
@@ -106,13 +138,11 @@ def refine_cameras(
         matches = match_pairs(features, pairs, unit, step)
     matched = Matched([each.positions for each in features], matches)
     tracks = join_matches(*matched, min(frames, 3))
-    refined, report = adjust_to_tracks(
+    refined = adjust_to_tracks(
         result, tracks, matched=matched, unit=unit, fixed_intrinsics=fixed_intrinsics, on_round=step
     )
     progress(total, total)  # rounds that were not needed, too
-    if not report.refined:
-        logger.warning("%s", report.sentence)
-    return refined, report
+    return refined
 
 
 def adjust_to_tracks(
@@ -123,8 +153,8 @@ def adjust_to_tracks(
     unit: float = 1.0,
     fixed_intrinsics: bool = False,
     on_round: Callable[[], object] = lambda: None,
-) -> tuple[R, RefinementReport]:
-    """Return what `refine_cameras` does, for given tracks.
+) -> Refined[R]:
+    """Return what `refine_with_points` does, for given tracks.
 
     Args:
         result: as there.
@@ -157,7 +187,7 @@ def adjust_to_tracks(
         "error_before": before if np.isfinite(before) else None,
         "error_after": after,
     }
-    poses, spread = _fitted(adjusted, tracks, result)
+    poses, scale, spread = _fitted(adjusted, tracks, result)
     if after >= before:
         reason = f"the reprojection error did not fall from {before:.2f} pixels"
     elif spread > _MOST_SPREAD:
@@ -172,14 +202,15 @@ def adjust_to_tracks(
         camera_from_world=poses.astype(np.float32),
         intrinsics=K.astype(np.float32),
     )
-    return _reported(refined, RefinementReport(True, **numbers))
+    points = measured_at_points(adjusted, tracks, result, scale)
+    return _reported(refined, RefinementReport(True, **numbers), points)
 
 
-def _fitted(adjusted: Adjusted, tracks: Tracks, result: Result) -> tuple[Float64[np.ndarray, "S 3 4"], float]:
+def _fitted(adjusted: Adjusted, tracks: Tracks, result: Result) -> tuple[Float64[np.ndarray, "S 3 4"], float, float]:
     """Return the adjusted cameras in the world of the result, whose first camera and dense depth decide.
 
-    Depths agree in the middle at the scale of these cameras. The second value is the factor, at least 1, by which
-    adjusted and dense depth then still differ in the middle.
+    Depths agree in the middle at the scale of these cameras, the second value. The third is the factor, at least 1, by
+    which adjusted and dense depth then still differ in the middle.
     """
     poses, kept = adjusted.cameras.camera_from_world, adjusted.kept
     seen_by = poses[tracks.frames[kept]]
@@ -187,14 +218,14 @@ def _fitted(adjusted: Adjusted, tracks: Tracks, result: Result) -> tuple[Float64
     with np.errstate(divide="ignore", invalid="ignore"):
         logs = np.log(z / dense_depth_at(result, tracks)[kept])  # of unscaled adjusted depth by dense depth
     known = np.isfinite(logs)
-    scale = np.exp(-np.median(logs[known]))
+    scale = float(np.exp(-np.median(logs[known])))
     spread = float(np.exp(np.median(np.abs(logs[known] + np.log(scale)))))
     first = result.camera_from_world[0].astype(np.float64)
     turn = poses[:, :, :3] @ poses[0, :, :3].T
     moved = scale * (poses[:, :, 3] - turn @ poses[0, :, 3])
     placed = np.concatenate([turn @ first[:, :3], (turn @ first[:, 3] + moved)[:, :, None]], axis=2)
     placed[0] = first  # to the last bit
-    return placed, spread
+    return placed, scale, spread
 
 
 def _best(
@@ -216,9 +247,9 @@ def _best(
     return best
 
 
-def _reported(result: R, report: RefinementReport) -> tuple[R, RefinementReport]:
+def _reported(result: R, report: RefinementReport, points: Measured | None = None) -> Refined[R]:
     settings = result.settings | {"refined_cameras": {"sentence": report.sentence, **dataclasses.asdict(report)}}
-    return dataclasses.replace(result, settings=settings), report
+    return Refined(dataclasses.replace(result, settings=settings), report, points)
 
 
 def _too_few(tracks: Tracks, kept: Bool[np.ndarray, " M"], frames: int) -> str:

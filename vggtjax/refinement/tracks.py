@@ -25,6 +25,10 @@ class Tracks(NamedTuple):
         """Number of points."""
         return int(self.points.max()) + 1 if len(self.points) else 0
 
+    def chosen(self, chosen: Bool[np.ndarray, " M"]) -> Tracks:
+        """Return some of the observations."""
+        return Tracks(self.points[chosen], self.frames[chosen], self.positions[chosen])
+
     def long_enough(self, chosen: Bool[np.ndarray, " M"], least: int) -> Bool[np.ndarray, " M"]:
         """Return the chosen observations of points that have at least `least` of them."""
         return chosen & (np.bincount(self.points[chosen], minlength=self.number)[self.points] >= least)
@@ -56,7 +60,7 @@ def join_matches(
 
 def dense_depth_at(result: Result, tracks: Tracks) -> Float64[np.ndarray, " M"]:
     """Return the result's depth at each observation."""
-    at = _at_result_pixels(result, tracks)
+    at = at_result_pixels(result, tracks)
     height, width = result.depth.shape[1:]
     column, row = np.clip(np.floor(at).astype(int), 0, [width - 1, height - 1]).T
     return result.depth[tracks.frames, row, column].astype(np.float64)
@@ -65,7 +69,7 @@ def dense_depth_at(result: Result, tracks: Tracks) -> Float64[np.ndarray, " M"]:
 def starting_points(result: Result, tracks: Tracks) -> Float64[np.ndarray, "N 3"]:
     """Return the median, over its frames, of where the result's depth and cameras put each point."""
     K, pose = result.intrinsics[tracks.frames].astype(np.float64), result.camera_from_world[tracks.frames]
-    rays = (_at_result_pixels(result, tracks) - K[:, :2, 2]) / K[:, [0, 1], [0, 1]]
+    rays = (at_result_pixels(result, tracks) - K[:, :2, 2]) / K[:, [0, 1], [0, 1]]
     in_camera = np.column_stack([rays, np.ones(len(rays))]) * dense_depth_at(result, tracks)[:, None]
     placed = np.einsum("mji,mj->mi", pose[:, :, :3].astype(np.float64), in_camera - pose[:, :, 3])
     order = np.argsort(tracks.points, kind="stable")
@@ -73,5 +77,6 @@ def starting_points(result: Result, tracks: Tracks) -> Float64[np.ndarray, "N 3"
     return np.stack([np.median(of_point, axis=0) for of_point in np.split(placed[order], ends)])
 
 
-def _at_result_pixels(result: Result, tracks: Tracks) -> Float64[np.ndarray, "M 2"]:
+def at_result_pixels(result: Result, tracks: Tracks) -> Float64[np.ndarray, "M 2"]:
+    """Return the positions in pixels of the result."""
     return (tracks.positions - result.source_offset[tracks.frames]) / result.source_scale[tracks.frames]

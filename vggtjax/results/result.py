@@ -211,9 +211,10 @@ class Result:
 
     @property
     def known_facts(self) -> dict[str, str]:
-        """How the cameras were refined and brought to known ones and to lengths: a sentence by step, none without."""
-        refined, found = self.settings.get("refined_cameras"), self._known.get("found")
-        facts = {"cameras": refined.get("sentence")} if isinstance(refined, dict) else {}
+        """How cameras and depth were refined and brought to known ones and to lengths: a sentence by step."""
+        found = self._known.get("found")
+        done = {"cameras": self.settings.get("refined_cameras"), "depth": self.settings.get("consistency")}
+        facts = {name: outcome.get("sentence") for name, outcome in done.items() if isinstance(outcome, dict)}
         facts |= found if isinstance(found, dict) else {}
         return {name: text for name, text in facts.items() if isinstance(text, str)}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float32
+from jaxtyping import Array, Float32, UInt8
 
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
@@ -35,6 +35,7 @@ from vggtjax.pipeline.run import reconstruct
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, StageSeconds, no_stage
 from vggtjax.reconstruction import Reconstruction
+from vggtjax.refinement.consistent import consistent_depth
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
 from vggtjax.results.report import RunFacts, versions
@@ -109,6 +110,7 @@ def reconstruct_long(
         DeviceMemoryError: a window does not fit in the memory of the device.
     """
     asked = options.changed(**changes)
+    consistent = asked.consistent_depth
     if masks is not None:
         asked.check_given_masks()
     options = asked.resolved(model.config.motion)
@@ -119,6 +121,7 @@ def reconstruct_long(
         check_words(plan.tracks)
     if options.refine_cameras:
         raise InputError("refine_cameras is for clips that are run at once; leave it out, or take fewer frames")
+    options, asked = (each.changed(consistent_depth=False) for each in (options, asked))
     tools = tools_of(model, asked, plan.fitter.size, fusion=fusion, masks=masks)
     settings = {
         "model": model.identity.to_json(),
@@ -127,7 +130,7 @@ def reconstruct_long(
         "masks": masks_digest(masks),
         "versions": versions(),
     }
-    return run_windows(source, Path(out), windows, plan, tools, settings)
+    return run_windows(source, Path(out), windows, plan, tools, settings, consistent=consistent)
 
 
 def tools_of(
@@ -169,7 +172,14 @@ def tools_of(
 
 
 def run_windows(
-    source: ClipSource, out: Path, windows: Windows, plan: LongRun, tools: Tools, settings: dict[str, Any]
+    source: ClipSource,
+    out: Path,
+    windows: Windows,
+    plan: LongRun,
+    tools: Tools,
+    settings: dict[str, Any],
+    *,
+    consistent: bool = False,
 ) -> Reconstruction:
     """Run, join and write the windows of a clip; `reconstruct_long` says more.
 
@@ -180,6 +190,7 @@ def run_windows(
         plan: how the clip is read, joined and written.
         tools: what runs and describes the frames of a window.
         settings: all else that decides the windows, as JSON values; stored windows of other settings are not used.
+        consistent: make the depth of the joined clip consistent, by its pixels alone.
     """
     opened, seconds = open_source(source), StageSeconds()
     check_folder(out, plan.saving.names(tracks=plan.tracks is not None))
@@ -225,12 +236,17 @@ def run_windows(
                 tracks = whole.tracks(queries, tools.follow, progress)
         with seconds.stage("join and blend"):
             result = whole.result(clip, loops=not windows.no_loops, tracks=tracks)
+
+        def pictures() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+            return (np.asarray(frame.image) for frame in opened.frames(plan.sampling))
+
+        if consistent:
+            with seconds.stage("consistent depth"), plan.on_stage("consistent depth") as progress:
+                result, _ = consistent_depth(result, pictures(), progress=progress)
         with plan.on_stage("write") as progress:
-            pictures = None
-            if plan.saving.resolution == "original":
-                pictures = (np.asarray(frame.image) for frame in opened.frames(plan.sampling))
+            shown = pictures() if plan.saving.resolution == "original" else None
             facts = RunFacts(seconds.seconds)
-            result.save(out, saving=plan.saving, pictures=pictures, progress=progress, facts=facts)
+            result.save(out, saving=plan.saving, pictures=shown, progress=progress, facts=facts)
         del result
         store.remove()
     return Reconstruction.load(out)
