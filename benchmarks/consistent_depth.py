@@ -97,20 +97,20 @@ def _generated(kind: Kind, clips: int, frames: int, side: int, seed: int) -> Ite
     config = SceneConfig(height=side, width=side, frames=frames, samples=2)
     truth = batched_truth(held_out_scenes(kind, clips, config, seed=seed))
     for number in range(clips):
-        of_clip = Truth(*(values[number] for values in truth))
+        of_clip = Truth(*(getattr(truth, name)[number] for name in Truth._fields))
         yield Job(f"{kind} {number}", np.rint(255 * of_clip.images).astype(np.uint8), of_clip)
 
 
 def _filmed(folder: Path, config: Any, frames: int) -> Iterator[Job]:
     windows = load_windows(folder, config, frames)
     for number, name in enumerate(windows.names):
-        truth = Truth(*(values[number] for values in windows.truth))
+        truth = Truth(*(getattr(windows.truth, field)[number] for field in Truth._fields))
         yield Job(name, np.rint(255 * truth.images).astype(np.uint8), truth)
 
 
 def _at_pixels(clip: Any, truth: Truth) -> Truth:
-    maps = (at_clip_pixels(clip, values) for values in (truth.depth, truth.dynamic_mask))
-    return Truth(clip.images, *maps, truth.camera_from_world, intrinsics_at_clip_pixels(clip, truth.intrinsics))
+    depth, moving = (at_clip_pixels(clip, values) for values in (truth.depth, truth.dynamic_mask))
+    return Truth(clip.images, depth, moving, truth.camera_from_world, intrinsics_at_clip_pixels(clip, truth.intrinsics))
 
 
 def _shrunk(result: Reconstruction, truth: Truth, share: float) -> Reconstruction:
@@ -155,7 +155,7 @@ def _errors(result: Reconstruction, truth: Truth) -> dict[str, float]:
 
 
 def _table(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield a table for each share: means, their change with its paired standard error, and how many clips got better."""
+    """Yield a table for each share: means, their change with its paired standard error, and how many got better."""
     for share in dict.fromkeys(row["share"] for row in rows):
         of = {}
         for row in (row for row in rows if row["share"] == share):

@@ -41,14 +41,17 @@ def test_the_passes_depend_on_all_options_but_those_of_the_assembly():
     other |= {"attention": "sampled"}
     fields = {field.name for field in dataclasses.fields(Options)}
     key = Options().passes_settings(MOTION)
-    named = fields - {"method", "align_scale", "refine_mask", "refine_cameras"} | {"clusters"}
+    named = fields - {"method", "align_scale", "refine_mask", "refine_cameras", "consistent_depth"} | {"clusters"}
     assert set(key) == named - {"attention", "precision", "mask", "cameras"}
     assert set(Options(attention="sampled").passes_settings(MOTION)) == named - {"precision", "mask", "cameras"}
     assert Options("4dvggt-m").passes_settings(MOTION) == Options(mask="matches").passes_settings(MOTION)
     assert Options("4dvggt-m", mask="gram").passes_settings(MOTION) == key
     assert "attention" not in Options().to_json()
     assert all(Options(**{name: value}).passes_settings(MOTION) != key for name, value in other.items())
-    assert Options(align_scale=True, refine_mask=True, refine_cameras=True).passes_settings(MOTION) == key
+    assert (
+        Options(align_scale=True, refine_mask=True, refine_cameras=True, consistent_depth=True).passes_settings(MOTION)
+        == key
+    )
     same = {name for name in METHODS if Options(name).passes_settings(MOTION) == key}  # pyright: ignore[reportArgumentType]
     assert same == set(METHODS) - {"vggt4d", "4dvggt-m"}
 
