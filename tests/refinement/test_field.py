@@ -59,4 +59,4 @@ def test_grids_have_square_cells_and_at_least_two_nodes_a_side(height, width, no
 @pytest.mark.parametrize("error", [0.03, 0.3])
 def test_priors_follow_the_error_of_the_depth(error):
     prior = FieldPrior.of_error(error)
-    assert (prior.step, prior.offset) == (error, 2 * error)
+    assert (prior.step, prior.offset) == (1.5 * error, 3 * error)

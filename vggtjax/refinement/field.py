@@ -42,7 +42,7 @@ class FieldPrior:
     @classmethod
     def of_error(cls, error: float) -> FieldPrior:
         """Return the prior for depth whose log has this standard deviation."""
-        return cls(step=error, offset=2 * error, robust=1.5 * error)
+        return cls(step=1.5 * error, offset=3 * error, robust=2.25 * error)
 
 
 def fit_field(
