@@ -17,8 +17,8 @@ from itertools import count
 from typing import TypeVar
 
 import numpy as np
+import scipy
 from jaxtyping import UInt8
-from scipy.spatial.transform import Rotation
 
 from vggtjax.known.intrinsics import shared_focal
 from vggtjax.progress import Progress, no_progress
@@ -166,7 +166,10 @@ def _adjusted(result: R, grey: np.ndarray, priors: CameraPriors, step: Callable[
 
 def _turned(result: Result, world: DenseWorld) -> float:
     """Return how far the adjustment turned the cameras of the frames, in degrees, on average."""
-    before, after = (Rotation.from_matrix(x[:, :, :3]) for x in (result.camera_from_world, world.camera_from_world))
+    before, after = (
+        scipy.spatial.transform.Rotation.from_matrix(x[:, :, :3])
+        for x in (result.camera_from_world, world.camera_from_world)
+    )
     return float(np.degrees((after * before.inv()).magnitude().mean()))
 
 
