@@ -162,7 +162,7 @@ class Options:
     needs the extra colmap)"""
     consistent_depth: Switch = False
     """fit depth, cameras and focal length to the pixels of the source, and join what several frames see, where nothing
-    moves (not in the papers); with the extra colmap its points are fitted too"""
+    moves (not in the papers); with --refine-cameras its points are fitted too"""
     compute_dtype: Annotated[
         ComputeDType | None,
         tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint=""),  # pyright: ignore

@@ -104,13 +104,14 @@ def consistent_depth(
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
         reason = f"the clip has {frames} frames; {FEWEST_FRAMES} to {MOST_FRAMES} are adjusted together"
         return _kept(result, reason)
-    cells = cells_of(result)
+    start = result if priors.focal is None else _with_one_focal_length(result)
+    cells = cells_of(start)
     if (share := cells.is_static.mean()) < _FEWEST_MATCHED:
         return _kept(
             result, f"{share:.1%} of the picture shows what does not move; at least {_FEWEST_MATCHED:.0%} is needed"
         )
     grey = grey_pictures(result, pictures, cells.grid)
-    start, world = _adjusted(result, grey, priors, step)
+    world = adjust_to_pixels(cells, grey, priors, on_round=step)
     if points is not None and _turned(start, world) > _MOST_TURNED:
         points = None  # the bundle adjustment ended in a wrong place
     known = world.information > _KNOWN
@@ -154,14 +155,9 @@ def _measured(cells: Cells, world: DenseWorld) -> Measured:
     return measured.of(information > 0)
 
 
-def _adjusted(result: R, grey: np.ndarray, priors: CameraPriors, step: Callable[[], None]) -> tuple[R, DenseWorld]:
-    """Return the result from which an adjustment starts, with one focal length unless they are known, and its outcome.
-
-    Errors of single focal lengths would hold the other cameras in wrong places.
-    """
-    if priors.focal is not None:
-        result = dataclasses.replace(result, intrinsics=shared_focal(result).astype(np.float32))
-    return result, adjust_to_pixels(cells_of(result), grey, priors, on_round=step)
+def _with_one_focal_length(result: R) -> R:
+    """Return the result with one focal length: errors of single ones would hold other cameras in wrong places."""
+    return dataclasses.replace(result, intrinsics=shared_focal(result).astype(np.float32))
 
 
 def _turned(result: Result, world: DenseWorld) -> float:
