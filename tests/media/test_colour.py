@@ -109,7 +109,11 @@ def first(path):
     ],
 )
 def test_colours_come_out_as_srgb(tmp_path, caplog, transfer, primaries, ending, codec, pixel):
-    quality = {"libx264": {"crf": "0"}, "libx265": {"x265-params": "lossless=1:log-level=0"}, "libsvtav1": {"crf": "5"}}
+    quality = {
+        "libx264": {"crf": "0"},
+        "libx265": {"x265-params": "lossless=1:log-level=0:pools=none"},
+        "libsvtav1": {"crf": "5"},
+    }
     path, matrix = tmp_path / f"a.{ending}", 9 if primaries == 9 else 1
     sdr = chart()
     write(
