@@ -10,6 +10,7 @@ from tests.corner import HEIGHT, SCALE, WIDTH, corner_result, make_corner, paint
 from vggtjax.errors import ClipError
 from vggtjax.evaluation.metrics.depth import depth_errors
 from vggtjax.evaluation.metrics.trajectory import rotation_error
+from vggtjax.refinement import consistent
 from vggtjax.refinement.consistent import consistent_depth
 from vggtjax.refinement.dense import KNOWN
 
@@ -68,6 +69,16 @@ def test_its_own_small_pictures_are_enough_to_get_better(corner, pictures, truth
     assert report.joined == 0
     before, after = (np.array(errors(each, truth, corner)) for each in (predicted, made))
     assert (after < 0.8 * before).all()
+
+
+def test_cameras_change_alone_where_frames_agree_less_after_the_fields(corner, pictures, truth, predicted, monkeypatch):
+    monkeypatch.setattr(consistent, "_MOST_WORSE", 0.0)
+    only_turned = dataclasses.replace(predicted, depth=truth.depth)
+    made, report = consistent_depth(only_turned, iter(pictures), join=False)
+    assert report.changed
+    assert report.change == 0
+    np.testing.assert_array_equal(made.depth, only_turned.depth)
+    assert errors(made, truth, corner)[1] < 0.2 * errors(only_turned, truth, corner)[1]
 
 
 def test_known_cameras_stay(corner, pictures, truth, predicted):

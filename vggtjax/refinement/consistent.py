@@ -18,7 +18,7 @@ from typing import TypeVar
 
 import numpy as np
 import scipy
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 
 from vggtjax.known.intrinsics import shared_focal
 from vggtjax.progress import Progress, no_progress
@@ -34,7 +34,7 @@ R = TypeVar("R", bound=Result)
 FEWEST_FRAMES, MOST_FRAMES = 3, 512
 _FEWEST_MATCHED = 0.05  # share of the cells whose depth is known from matches
 _KNOWN = 4.0  # a deviation of a log depth of 0.5 is the largest that is known
-_MOST_WORSE = 1.1  # factor by which frames may differ more after the field, before they are joined
+_MOST_WORSE = 1.6  # factor by which frames may differ more after the field, before they are joined
 _MOST_TURNED = 0.3  # degrees by which pixels may turn bundle-adjusted cameras
 _BEST = 400.0  # no log depth of a cell is known better than by a deviation of 0.05
 
@@ -121,9 +121,13 @@ def consistent_depth(
     measured = _measured(cells, world)
     field = field or FieldPrior.of_error(world.error)
     fields = fit_field(measured if points is None else joined_to(measured, points), frames, size, field)
+    before = differences(result, step)
     made, change = _by_field(start, world, fields, step)
-    before, after = differences(result, step), differences(made, step)
-    if not len(after) or np.median(after) > _MOST_WORSE * np.median(before):
+    after, most = differences(made, step), _MOST_WORSE
+    if not _agree(before, after, most):  # cameras alone
+        made, change = _by_field(start, world, 0 * fields, lambda: None)
+        after, most = differences(made), 1.0
+    if not _agree(before, after, most):
         return _kept(result, "no depth was found by which the frames agree better")
     share = 0.0
     if join:
@@ -133,6 +137,11 @@ def consistent_depth(
     layers = (float(np.median(before)), float(np.median(after)))
     observations = 0 if points is None else len(points.frame)
     return _reported(made, ConsistencyReport(True, "", float(known.mean()), observations, change, *layers, share))
+
+
+def _agree(before: Float32[np.ndarray, " N"], after: Float32[np.ndarray, " M"], most: float) -> bool:
+    """Return whether the frames differ by at most so many times as before, in the middle."""
+    return len(after) > 0 and bool(np.median(after) <= most * np.median(before))
 
 
 def joined_to(first: Measured, second: Measured) -> Measured:

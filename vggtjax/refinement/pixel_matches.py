@@ -19,9 +19,9 @@ from vggtjax.method.matches import FramePairs, frame_pairs, patch_centres
 
 _LOWEST, _HIGHEST = 0.4, 0.8  # ZNCC of weight 0, and from which a match has its full weight
 _CYCLE = 0.3  # patches; matches that come back further away count little
-_CURVATURE = 0.02  # of the ZNCC's peak by the pixel, across its flattest direction, from which a match has full weight
+_CURVATURE = 0.002  # of the ZNCC's peak by the pixel, across its flattest direction, from which a match has full weight
 _INSIDE = 0.8  # share of a window that must be inside the picture
-_NOISE = 1e-4  # variance of the colours in [0, 1] that is no texture
+_NOISE = 1.3e-6  # variance of rounding to 8 bits, for colours in [0, 1]; windows of less show nothing
 _MOST_STRETCH = 2.0  # of a window
 _MOST_MOVE = 0.75  # pixels by which a parabola moves the best whole shift
 _NEAREST = 1e-3  # depth over the median; points behind a camera are projected as if they were here
