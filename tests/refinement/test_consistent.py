@@ -77,6 +77,7 @@ def test_cameras_change_alone_where_frames_agree_less_after_the_fields(corner, p
     made, report = consistent_depth(only_turned, iter(pictures), join=False)
     assert report.changed
     assert report.change == 0
+    assert "not changed; only the cameras fit pixels in" in report.sentence
     np.testing.assert_array_equal(made.depth, only_turned.depth)
     assert errors(made, truth, corner)[1] < 0.2 * errors(only_turned, truth, corner)[1]
 

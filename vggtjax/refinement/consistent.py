@@ -61,8 +61,9 @@ class ConsistencyReport:
             return f"depth and cameras stay as they were: {self.reason}"
         points = f" and {self.points} observations of points" if self.points else ""
         joined = f"; {self.joined:.0%} of the static pixels are joined" if self.joined else ""
+        by = f"changed by {self.change:.1%} on average, to fit" if self.change else "not changed; only the cameras fit"
         return (
-            f"changed by {self.change:.1%} on average, to fit pixels in {self.cells:.0%} of the picture{points}; "
+            f"{by} pixels in {self.cells:.0%} of the picture{points}; "
             f"frames differ by {self.layers_after:.1%} in the middle, {self.layers_before:.1%} before{joined}"
         )
 
@@ -79,8 +80,9 @@ def consistent_depth(
 ) -> tuple[R, ConsistencyReport]:
     """Return the result with depth and cameras that agree with its pictures, and a report.
 
-    Pixels that move take the field's value and keep their shape. Mask and confidence stay. Depth and cameras stay, with
-    a warning logged, where too little is matched or the frames would not agree better.
+    Pixels that move take the field's value and keep their shape. Mask and confidence stay. Where the frames agree less
+    after the fields, the cameras change alone. Depth and cameras stay, with a warning logged, where too little is
+    matched or the frames would not agree better.
 
     Args:
         result: cameras, depth and dynamic mask.
@@ -126,7 +128,7 @@ def consistent_depth(
     after, most = differences(made, step), _MOST_WORSE
     if not _agree(before, after, most):  # cameras alone
         made, change = _by_field(start, world, 0 * fields, lambda: None)
-        after, most = differences(made), 1.0
+        after, most, points = differences(made), 1.0, None
     if not _agree(before, after, most):
         return _kept(result, "no depth was found by which the frames agree better")
     share = 0.0
