@@ -139,7 +139,8 @@ def test_pictures_of_another_clip_are_refused(predicted, pictures):
 
 def first_frames(result, count):
     arrays = {
-        name: getattr(result, name) for name in ("depth", "depth_confidence", "saliency", "dynamic_mask", "images")
+        name: getattr(result, name)
+        for name in ("depth", "depth_confidence", "saliency", "motion", "dynamic_mask", "images")
     }
     arrays |= {name: getattr(result, name) for name in ("camera_from_world", "intrinsics", "frame_names", "timestamps")}
     arrays |= {name: getattr(result, name) for name in ("source_size", "source_scale", "source_offset", "valid_box")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -65,11 +66,7 @@ def mine_matched_mask(
     score = frames.share(score, S)
     pixels = motion_pixels(score, images)
 
-    def is_dynamic(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
-        median = jnp.median(frames.gather(pixels, axis=0)[:counted])
-        return pixels >= jnp.maximum(otsu_threshold(pixels, frames=frames), _TIMES_MEDIAN * median)
-
-    mask = jax.vmap(is_dynamic)(pixels)
+    mask = jax.vmap(partial(is_moving, frames=frames))(pixels)
     if (is_counted := frames.are_counted(S)) is not None:
         mask = mask & is_counted[None, :, None, None]
     mask = jnp.where(found.is_matched[:, None, None, None], mask, gram_mask)
@@ -80,3 +77,9 @@ def motion_pixels(motion: Float[Array, "B S h w"], images: Float[Array, "B S H W
     """Return the motion of patches at pixels, ending where colours change. A mask is where it is above a threshold."""
     H, W = images.shape[2:4]
     return follow_edges(upsample(motion, (H, W)), images, H // motion.shape[2])
+
+
+def is_moving(pixels: Float[Array, "S H W"], frames: Frames = Frames()) -> Bool[Array, "S H W"]:
+    """Return where the motion of a clip's pixels is above Otsu's threshold, and above 2.5 times its median."""
+    median = jnp.median(frames.gather(pixels, axis=0)[: frames.counted(len(pixels))])
+    return pixels >= jnp.maximum(otsu_threshold(pixels, frames=frames), _TIMES_MEDIAN * median)

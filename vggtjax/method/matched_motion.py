@@ -25,7 +25,8 @@ _MARGIN = 0.25  # patches by which it may be outside
 _OFFSET, _EXPONENT, _FLOOR = 0.25, 0.6, 0.1  # score = log(difference + offset) + exponent x log(Gram + floor)
 _ROUNDS = 2  # what moves by the first counts less in the second
 _STILL, _STEEPNESS = float(np.log(0.8)), 4.0  # of the weights in the second round
-_VOTES, _VOTE, _VOTE_CYCLE, _VOTE_FRAMES = 2, 0.3, 0.625, 6.0
+VOTE = 0.3  # of a sure match
+_VOTES, _VOTE_CYCLE, _VOTE_FRAMES = 2, 0.625, 6.0
 
 
 class Motion(NamedTuple):
@@ -62,7 +63,8 @@ def motion(
         world = adjust(depth, cameras, matches.position, weight * trust[:, None], grid)
         difference = _difference(matches.position, weight, world, pairs, grid)
         score = jnp.log(difference + _OFFSET) + _EXPONENT * jnp.log(saliency + _FLOOR)
-        score = _voted(score, matches, pairs, grid)
+        votes = VOTE * matches.confidence * jnp.exp(-((matches.cycle / _VOTE_CYCLE) ** 2))
+        score = voted(score, matches.position, votes, pairs, grid)
         return jax.nn.sigmoid(_STEEPNESS * (_STILL - score)), (world, score)
 
     _, rounds = jax.lax.scan(fitted, 1.05 - saliency, length=_ROUNDS)  # a loop: it is compiled once
@@ -88,14 +90,18 @@ def _difference(
     return total / jnp.maximum(weight.sum(axis=1), 1e-6)
 
 
-def _voted(
-    score: Float[Array, "S P"], matches: Matches, pairs: FramePairs, grid: tuple[int, int]
+def voted(
+    score: Float[Array, "S P"],
+    position: Float[Array, "S M P 2"],
+    votes: Float[Array, "S M P"],
+    pairs: FramePairs,
+    grid: tuple[int, int],
 ) -> Float[Array, "S P"]:
-    """Return scores averaged along matches: the same surface moves in the other frames too."""
-    place = jnp.floor(matches.position).astype(int)
+    """Return scores averaged along matches at positions in patches: the same surface moves in the other frames too."""
+    place = jnp.floor(position).astype(int)
     column, row = (jnp.clip(place[..., i], 0, grid[1 - i] - 1) for i in range(2))
     near_in_time = np.exp(-((np.array(pairs.offsets) / _VOTE_FRAMES) ** 2)).astype(np.float32)[None, :, None]
-    votes = _VOTE * matches.confidence * jnp.exp(-((matches.cycle / _VOTE_CYCLE) ** 2)) * near_in_time
+    votes = votes * near_in_time
     for _ in range(_VOTES):
         theirs = jnp.take_along_axis(score[pairs.others], row * grid[1] + column, axis=2)
         score = (score + jnp.sum(votes * theirs, axis=1)) / (1 + votes.sum(axis=1))

@@ -13,6 +13,7 @@ from vggtjax.options import Options
 from vggtjax.progress import OnStage, no_stage
 from vggtjax.refinement.consistent import consistent_depth
 from vggtjax.refinement.dense import KNOWN, PREDICTED
+from vggtjax.refinement.pixel_mask import mask_by_pixels
 from vggtjax.refinement.refine import refine_with_points, warn_of_kept
 from vggtjax.results.result import Result
 
@@ -36,7 +37,8 @@ def agree_with_pixels(
 ) -> R:
     """Return the result with refined cameras and consistent depth, if the options say so.
 
-    Consistent depth starts from refined cameras, and takes their points, if both are wanted.
+    Consistent depth starts from refined cameras, and takes their points, if both are wanted. A mask that was mined by
+    matches is mined by pixels after it.
 
     Args:
         result: of the passes.
@@ -58,4 +60,7 @@ def agree_with_pixels(
         with on_stage("consistent depth") as progress:
             points = None if refined is None else refined.points
             result, _ = consistent_depth(result, pictures(), points=points, priors=priors, progress=progress)
+        if result.motion is not None:  # pixels match better than the network does, around better cameras
+            with on_stage("mask by pixels"):
+                result = mask_by_pixels(result, pictures())
     return result

@@ -34,6 +34,7 @@ R = TypeVar("R", bound=Result)
 FEWEST_FRAMES, MOST_FRAMES = 3, 512
 _FEWEST_MATCHED = 0.05  # share of the cells whose depth is known from matches
 _KNOWN = 4.0  # a deviation of a log depth of 0.5 is the largest that is known
+_LEAST_PARALLAX = 0.3  # cells; with less, a wrong lens or shutter says more than depth does
 _MOST_WORSE = 1.6  # factor by which frames may differ more after the field, before they are joined
 _MOST_TURNED = 0.3  # degrees by which pixels may turn bundle-adjusted cameras
 _BEST = 400.0  # no log depth of a cell is known better than by a deviation of 0.05
@@ -80,9 +81,9 @@ def consistent_depth(
 ) -> tuple[R, ConsistencyReport]:
     """Return the result with depth and cameras that agree with its pictures, and a report.
 
-    Pixels that move take the field's value and keep their shape. Mask and confidence stay. Where the frames agree less
-    after the fields, the cameras change alone. Depth and cameras stay, with a warning logged, where too little is
-    matched or the frames would not agree better.
+    Pixels that move take the field's value and keep their shape. Mask and confidence stay. The cameras change alone
+    where there is hardly any parallax, or where the fields make the frames agree less. Depth and cameras stay, with a
+    warning logged, where too little is matched or the frames would not agree better.
 
     Args:
         result: cameras, depth and dynamic mask.
@@ -126,7 +127,7 @@ def consistent_depth(
     before = differences(result, step)
     made, change = _by_field(start, world, fields, step)
     after, most = differences(made, step), _MOST_WORSE
-    if not _agree(before, after, most):  # cameras alone
+    if world.parallax < _LEAST_PARALLAX or not _agree(before, after, most):  # cameras alone
         made, change = _by_field(start, world, 0 * fields, lambda: None)
         after, most, points = differences(made), 1.0, None
     if not _agree(before, after, most):

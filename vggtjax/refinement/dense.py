@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Float32, Float64, UInt8
 
 from vggtjax.cameras import Cameras
 from vggtjax.method.adjustment import Adjustment, Static, adjust
+from vggtjax.method.matches import frame_pairs
 from vggtjax.refinement.cells import Cells, at_scale
 from vggtjax.refinement.pixel_matches import Window, expected_matches, match_pixels
 
@@ -63,6 +64,7 @@ class DenseWorld(NamedTuple):
     depth: Float32[np.ndarray, "S P"]  # what matches alone say of each, cameras given
     information: Float32[np.ndarray, "S P"]  # inverse variance of its log
     error: float  # standard deviation of the network's log depth, as far as measured
+    parallax: float  # cells by which the middle cell moves in the frame that sees it move most, for a log depth of 1
 
 
 @partial(jax.jit, static_argnames=("grid", "priors"))
@@ -115,17 +117,26 @@ def adjust_to_pixels(
         weight = found.weight * cells.is_static[:, None]
         if not weight.any():
             nothing = np.zeros_like(cells.depth)
-            return DenseWorld(poses.astype(np.float64), 1.0, cells.depth, nothing, _ERRORS[0])
+            return DenseWorld(poses.astype(np.float64), 1.0, cells.depth, nothing, _ERRORS[0], 0.0)
         arrays = (depth, cameras, found.position, weight, cells.depth, np.float32(each.sigma))
         made = jax.tree.map(np.asarray, _adjust(*arrays, cells.grid, priors))
         poses, depth, factor = made.camera_from_world, made.depth, factor * float(made.focal)
         with np.errstate(over="ignore"):
             measured = np.clip(depth * np.exp(made.pull), *_DEPTHS)
         error = _error(cells.depth, measured, made.information)
-        world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, error)
+        parallax = _parallax(depth, Cameras(poses, _zoomed(K, factor)), cells.grid)
+        world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, error, parallax)
         on_round()
     assert world is not None
     return world
+
+
+def _parallax(depth: Float32[np.ndarray, "S P"], cameras: Cameras, grid: tuple[int, int]) -> float:
+    """Return how many cells the middle cell moves for a log depth of 1, in the frame that sees it move most."""
+    step = np.float32(0.05)
+    (nearer, _), (further, _) = (expected_matches(depth * np.exp(by), cameras, grid) for by in (-step, step))
+    moved = np.linalg.norm(further - nearer, axis=-1) / (2 * step)
+    return float(np.median(np.max(moved * frame_pairs(len(depth)).exist[:, :, None], axis=1)))
 
 
 def _error(

@@ -36,6 +36,7 @@ from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, StageSeconds, no_stage
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.consistent import consistent_depth
+from vggtjax.refinement.pixel_mask import mask_by_pixels
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
 from vggtjax.results.report import RunFacts, versions
@@ -243,6 +244,8 @@ def run_windows(
         if consistent:
             with seconds.stage("consistent depth"), plan.on_stage("consistent depth") as progress:
                 result, _ = consistent_depth(result, pictures(), progress=progress)
+            if result.motion is not None:
+                result = mask_by_pixels(result, pictures())
         with plan.on_stage("write") as progress:
             shown = pictures() if plan.saving.resolution == "original" else None
             facts = RunFacts(seconds.seconds)
