@@ -37,7 +37,8 @@ _OFFSET, _FLOOR = 0.25, 0.1  # score = log(difference + offset) + log(Gram + flo
 def mask_by_pixels(result: R, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None) -> R:
     """Return the result with the motion and the dynamic mask that its pixels tell, around its cameras and depth.
 
-    Stays as it is: a clip of fewer than three frames or more than 512, or whose mask was not mined by matches.
+    Stays as it is: a clip of fewer than three frames or more than 512, or of equal frames, or whose mask was not mined
+    by matches.
 
     Args:
         result: cameras and depth that agree with the pixels, with the Gram saliency and the motion by matches.
@@ -46,6 +47,8 @@ def mask_by_pixels(result: R, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | N
     Raises ClipError for pictures that are missing, or of another size than the result's.
     """
     if not FEWEST_FRAMES <= len(result.depth) <= MOST_FRAMES or result.saliency is None or result.motion is None:
+        return result
+    if all((image == result.images[0]).all() for image in result.images):
         return result
     cells = cells_of(result)
     grey = grey_pictures(result, pictures, cells.grid)
@@ -83,7 +86,7 @@ def pixel_motion(
 
 
 def _difference(expected: Float32[np.ndarray, "S M P 2"], found: PixelMatches) -> Float32[np.ndarray, "S P"]:
-    """Return how far cells match from where they are expected, over the clip's median; 1 where it is not known."""
+    """Return how far cells match from where they are expected, over the clip's median; the middle where unknown."""
     distance, weight = np.linalg.norm(found.position - expected, axis=-1), found.weight
     sure = distance[weight > _SURE]
     scale = max(float(np.median(sure)) if len(sure) else 0.0, _SMALLEST_SCALE)

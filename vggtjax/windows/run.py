@@ -245,7 +245,8 @@ def run_windows(
             with seconds.stage("consistent depth"), plan.on_stage("consistent depth") as progress:
                 result, _ = consistent_depth(result, pictures(), progress=progress)
             if result.motion is not None:
-                result = mask_by_pixels(result, pictures())
+                with seconds.stage("mask by pixels"), plan.on_stage("mask by pixels"):
+                    result = mask_by_pixels(result, pictures())
         with plan.on_stage("write") as progress:
             shown = pictures() if plan.saving.resolution == "original" else None
             facts = RunFacts(seconds.seconds)
