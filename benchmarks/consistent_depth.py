@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
+from rich.progress import Progress as Bars
 
 from benchmarks.real_clips import load_windows
 from vggtjax.cameras import world_from_camera
@@ -19,6 +20,7 @@ from vggtjax.clips.truth import Truth, at_clip_pixels, batched_truth, intrinsics
 from vggtjax.errors import InputError, check_extra
 from vggtjax.evaluation.metrics.depth import depth_errors, measured, median_scale
 from vggtjax.evaluation.metrics.trajectory import rotation_error, trajectory_errors
+from vggtjax.options import MethodName
 from vggtjax.pretrained.load import load_model
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.consistent import consistent_depth as make_consistent
@@ -45,9 +47,9 @@ class Job(NamedTuple):
 def consistent_depth(
     *, model: str = "demo", out: Path = Path("consistent-depth-benchmark"), kind: Kind = "dynamic", clips: int = 24,
     frames: int = 12, side: int = 288, seed: int = 0, filmed: Path | None = None, points: bool = False,
-    shares: tuple[float, ...] = (1.0,),
+    shares: tuple[float, ...] = (1.0,), method: MethodName = "4dvggt-m",
 ) -> None:  # fmt: skip
-    """Compare depth and cameras of 4dvggt-m with the truth, before and after they are made consistent.
+    """Compare depth and cameras of a method with the truth, before and after they are made consistent.
 
     Rows: as predicted; by the network's own pixels; by the source's; and by these and bundle-adjusted points.
     Layers are the median |log| between the depths of frames that see one place, by the result's own cameras.
@@ -63,6 +65,7 @@ def consistent_depth(
         filmed: a folder of filmed clips with truth, in plain folders, in windows of `frames`; their source is not read.
         points: a row with bundle adjustment; needs the extra colmap.
         shares: the predicted depth's log errors are shrunk to these shares first, as a better network has them.
+        method: that predicts.
     """
     if clips < 1 or not all(0 < share <= 1 for share in shares):
         raise InputError(f"clips is {clips} and shares are {list(shares)}; expected at least 1, and shares in (0, 1]")
@@ -74,10 +77,19 @@ def consistent_depth(
 
     logging.disable(logging.WARNING)  # reasons stand in the rows
     network, console, rows = load_model(model), Console(stderr=True), []
-    jobs = _filmed(filmed, network.config, frames) if filmed else _generated(kind, clips, frames, side, seed)
+    if filmed:
+        jobs = _filmed(filmed, network.config, frames)
+    else:
+        with Bars(console=console) as bars:
+            task = bars.add_task("render", total=2 * clips)
+            scenes = SceneConfig(height=side, width=side, frames=frames, samples=2)
+            rendered = held_out_scenes(
+                kind, clips, scenes, seed=seed, progress=lambda done, total: bars.update(task, completed=done)
+            )
+        jobs = _generated(kind, batched_truth(rendered))
     for job in jobs:
         clip = load_clip(job.pictures, size=network.config.image_size, patch=network.config.patch_size)
-        result = reconstruct(network, clip, method="4dvggt-m")
+        result = reconstruct(network, clip, method=method)
         truth = job.truth if filmed else _at_pixels(clip, job.truth)
         for share in shares:
             for way, made, sentence in _ways(_shrunk(result, truth, share), None if filmed else job.pictures, points):
@@ -93,10 +105,8 @@ def consistent_depth(
     Console().print(text, markup=False, highlight=False, soft_wrap=True)
 
 
-def _generated(kind: Kind, clips: int, frames: int, side: int, seed: int) -> Iterator[Job]:
-    config = SceneConfig(height=side, width=side, frames=frames, samples=2)
-    truth = batched_truth(held_out_scenes(kind, clips, config, seed=seed))
-    for number in range(clips):
+def _generated(kind: Kind, truth: Truth) -> Iterator[Job]:
+    for number in range(len(truth.images)):
         of_clip = Truth(*(getattr(truth, name)[number] for name in Truth._fields))
         yield Job(f"{kind} {number}", np.rint(255 * of_clip.images).astype(np.uint8), of_clip)
 

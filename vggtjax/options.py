@@ -160,9 +160,9 @@ class Options:
     refine_cameras: Switch = False
     """adjust cameras and focal length to matches between the source's pictures, where nothing moves (bundle adjustment;
     needs the extra colmap)"""
-    consistent_depth: Switch = False
+    consistent_depth: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = False
     """fit depth, cameras and focal length to the pixels of the source, and join what several frames see, where nothing
-    moves (not in the papers); with --refine-cameras its points are fitted too"""
+    moves (not in the papers; the default of reconstruct and batch); with --refine-cameras its points are fitted too"""
     compute_dtype: Annotated[
         ComputeDType | None,
         tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint=""),  # pyright: ignore

@@ -45,6 +45,7 @@ class Clip(NamedTuple):
 
 def make(folder: Path = FOLDER) -> None:
     """Make all pictures in `folder`, unless those there are of this code, model and clip."""
+    import consistency
     import matplotlib
 
     import vggtjax
@@ -65,6 +66,9 @@ def make(folder: Path = FOLDER) -> None:
             _save(draw(clip), folder / f"{name}.webp")
         scenes = _generated(model)
         _save(matches(model, scenes[MATCHED_SCENE]), folder / "matches.webp")
+        fitted = consistency.fitted(model, MATCHED_SCENE, SCENE_SEED, SCENE_FRAMES)
+        _save(consistency.steps(fitted), folder / "consistency.webp")
+        _save(consistency.surfaces(fitted), folder / "surfaces.webp")
         for number, scene in enumerate(scenes):
             _save(gallery_sheet(scene, number), folder / f"scene-{number}.webp")
             write_film(folder / f"turntable-{number}.webp", film_frames(scene.result, **_TURNTABLE), _TURNTABLE["fps"])
@@ -76,7 +80,7 @@ def made_of() -> str:
     import vggtjax
 
     digest, embedded = hashlib.sha256(vggtjax.__version__.encode()), Path(vggtjax.__file__).parent / "pretrained"
-    for path in (Path(__file__), embedded / "model.safetensors", embedded / "clip.npz"):
+    for path in (Path(__file__), Path(__file__).with_name("consistency.py"), embedded / "model.safetensors", embedded / "clip.npz"):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

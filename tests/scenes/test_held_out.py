@@ -43,7 +43,7 @@ def test_fewer_scenes_of_another_size_are_the_same_scenes(dynamic):
     assert dynamic.dynamic_mask.any(axis=(1, 2, 3)).all()
     np.testing.assert_allclose(larger.camera_from_world, dynamic.camera_from_world[:2], atol=1e-5)
     np.testing.assert_allclose(larger.world_from_part, dynamic.world_from_part[:2], atol=1e-5)
-    assert calls[-1] == (2, 2)
+    assert calls[-1] == (4, 4)
 
     found, judged = hardness(larger), hardness(dynamic)  # other pixels sample the same things
     for name, few, all_ in zip(found._fields, found, judged, strict=True):
@@ -69,7 +69,7 @@ def test_nothing_moves_in_static_scenes_and_batches_do_not_matter(monkeypatch):
     found = [done for done, _ in calls]
     assert len(calls) > 1
     assert found == sorted(found)
-    assert calls[-1] == (3, 3)
+    assert calls[-1] == (6, 6)
     assert len({clip.tobytes() for clip in clips.camera_from_world}) == 3
 
 

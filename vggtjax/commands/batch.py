@@ -11,7 +11,7 @@ import tyro
 
 from vggtjax.batch.cluster_options import Cluster
 from vggtjax.batch.recipe import BatchRecipe, ClipOutcome
-from vggtjax.commands.arguments import BatchFolder, Shards, Sources
+from vggtjax.commands.arguments import CONSISTENT, BatchFolder, Shards, Sources
 from vggtjax.commands.models import ModelFiles, check_named, load_on_worker
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
@@ -23,7 +23,7 @@ def batch(
     /,
     *,
     files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
-    recipe: Annotated[BatchRecipe, tyro.conf.arg(name="", help="")] = BatchRecipe(),
+    recipe: Annotated[BatchRecipe, tyro.conf.arg(name="", help="")] = BatchRecipe(options=CONSISTENT),
     out: BatchFolder,
     shard: Shards = None,
     cluster: Annotated[Cluster, tyro.conf.arg(name="cluster", help="")] = Cluster(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from vggtjax.commands.arguments import CONSISTENT
 from vggtjax.commands.models import load
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
@@ -19,6 +20,8 @@ def demo(
     view: Switch = False,
 ) -> None:
     """Reconstruct the embedded clip with the embedded model, and measure the ladder of methods against its truth.
+
+    The result's depth and cameras are consistent; the viewer has them as they were predicted, too.
 
     Args:
         out: folder for the results.
@@ -38,14 +41,18 @@ def demo(
             truth = demo_clip()
             size = truth.images.shape[2]
             clip = load_clip(truth.images, model=model, size=size)
+        from vggtjax.pipeline.agreement import agree_with_pixels
         from vggtjax.pipeline.run import reconstruct
 
-        result = reconstruct(model, clip, options=Options(method), size=size, on_stage=report.stage)
-        result = replace(result, settings=result.settings | {"clip": "Embedded clip"})
+        predicted = reconstruct(model, clip, options=Options(method), size=size, on_stage=report.stage)
+        predicted = replace(predicted, settings=predicted.settings | {"clip": "Embedded clip"})
+        result = agree_with_pixels(predicted, clip.pictures, CONSISTENT, on_stage=report.stage)
         with report.stage("measure") as progress:
-            from vggtjax.evaluation.ladder import error_table, ladder
+            from vggtjax.evaluation.ladder import error_table, ladder, score_result
 
-            errors = error_table(ladder(model, truth, masks=("mined", "matches", "true"), progress=progress))
+            rows = ladder(model, truth, masks=("mined", "matches", "true"), progress=progress)
+            source = "mined" if result.motion is None else "pixels"
+            errors = error_table(rows, score_result(result, truth, source))
         with report.stage("write") as progress:
             from PIL import Image
 
@@ -53,16 +60,16 @@ def demo(
             from vggtjax.results.report import RunFacts
             from vggtjax.storage.writing import writing
 
-            beside = truth_sheet(result, truth)
+            beside = truth_sheet(result, truth, predicted)
             result.save(out, progress=progress, facts=RunFacts(report.seconds, errors, beside))
             sheet = out / "preview" / "truth.png"
             with writing(sheet) as temporary:
                 Image.fromarray(beside).save(temporary)
             page = out / "preview" / "viewer.html"
-            result.view(names=["demo"]).save(page)
+            result.view(predicted, names=["consistent depth", "as predicted"]).save(page)
     report.summary(result, out, model)
     report.errors(errors)
     report.line(f"Next to the truth: {sheet}")
     report.line(f"Double-click to see it move: {page}")
     if view:
-        serve(report, [result], ["demo"])
+        serve(report, [result, predicted], ["consistent depth", "as predicted"])

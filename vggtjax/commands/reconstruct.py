@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from vggtjax.batch.recipe import ClipRecipe
-from vggtjax.commands.arguments import ResultFolder, Sources, View
+from vggtjax.commands.arguments import CONSISTENT, ResultFolder, Sources, View
 from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
@@ -23,7 +23,7 @@ def reconstruct(
     /,
     *,
     files: Annotated[ModelFiles, tyro.conf.arg(name="model", help="")] = ModelFiles(),
-    recipe: Annotated[ClipRecipe, tyro.conf.arg(name="", help="")] = ClipRecipe(),
+    recipe: Annotated[ClipRecipe, tyro.conf.arg(name="", help="")] = ClipRecipe(options=CONSISTENT),
     given: Annotated[GivenInputs, tyro.conf.arg(name="input", help="")] = GivenInputs(),
     windows: Annotated[Windows, tyro.conf.arg(name="limits", help="")] = Windows(),
     out: ResultFolder,

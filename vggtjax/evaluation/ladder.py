@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, count, product
 from typing import Any, Literal, NamedTuple, get_args
@@ -30,6 +30,7 @@ from vggtjax.method.passes import Passes
 from vggtjax.options import ABLATION, CamerasFrom, Options, find_method
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import Progress
+from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.report import ErrorTable
 
 MaskSource = Literal["mined", "matches", "true"]
@@ -46,7 +47,7 @@ class LadderRow:
 
     clip: int  # index in the batch
     method: str
-    mask_source: MaskSource | None
+    mask_source: MaskSource | Literal["pixels"] | None
     mask_pairs: int | None
     suppress: Suppress | None
     abs_rel: float | None  # of depth, after one median scale per clip
@@ -74,7 +75,7 @@ class _Scene(NamedTuple):
 class _Setting(NamedTuple):
     """The settings of a second pass."""
 
-    mask_source: MaskSource | None = None
+    mask_source: MaskSource | Literal["pixels"] | None = None
     mask_pairs: int | None = None
     suppress: Suppress | None = None
 
@@ -165,6 +166,19 @@ def ladder(
     return sorted(rows, key=lambda row: row.clip)
 
 
+def score_result(result: Reconstruction, truth: ClipTruth, mask_source: Literal["mined", "pixels"]) -> LadderRow:
+    """Return the scores of a result of any method whose frames are those of a clip with exact truth.
+
+    Raises InputError for truth of another shape.
+    """
+    truth, motion = batched_truth(truth), result.saliency if result.motion is None else result.motion
+    if truth.depth.shape != (1, *result.depth.shape):
+        raise InputError(f"the truth has depth of shape {truth.depth.shape[1:]}; expected {result.depth.shape}")
+    pixels = result.dynamic_mask if motion is None else np.asarray(upsample(motion[None], result.depth.shape[1:]))[0]
+    fields = (result.depth, result.intrinsics, result.camera_from_world, result.dynamic_mask, pixels)
+    return _row(_scene(0, truth), result.method, _Setting(mask_source), *fields)
+
+
 def _check_options(options: Options) -> None:
     """Raise InputError for options that are arguments of the ladder, or that it does not read."""
     for name in (
@@ -201,8 +215,9 @@ _COLUMNS = {
 }
 
 
-def error_table(rows: Sequence[LadderRow]) -> ErrorTable:
-    """Return the scores to print or to show on a page, a row per method and mask."""
+def error_table(rows: Sequence[LadderRow], consistent: LadderRow | None = None) -> ErrorTable:
+    """Return the scores to print or to show on a page, a row per method and mask, and one of consistent depth."""
+    listed = rows if consistent is None else [*rows, replace(consistent, method="consistent")]
     cells = [
         (
             row.method,
@@ -212,10 +227,14 @@ def error_table(rows: Sequence[LadderRow]) -> ErrorTable:
                 for name, (_, form) in _COLUMNS.items()
             ),
         )
-        for row in rows
+        for row in listed
     ]
-    note = (
-        f"{second_pass_in_words(rows)}\nAbsRel: of depth after one median scale. Rotation: mean, relative to the first "
+    lines = [second_pass_in_words(rows)]
+    if consistent is not None:
+        words = _change_in_words(next(row for row in rows if row.method == "vggt"), consistent)
+        lines.append(f"Depth and cameras fitted to the clip's pixels, compared with the first pass: {words}.")
+    note = "\n".join(lines) + (
+        "\nAbsRel: of depth after one median scale. Rotation: mean, relative to the first "
         "frame. Centres: RMSE after Sim(3), in median depths. Mask: mined from the first pass as in the paper, by "
         "matches between its frames too, or the true one."
     )
@@ -229,7 +248,7 @@ def second_pass_in_words(rows: Sequence[LadderRow]) -> str:
     """
     first = next((row for row in rows if row.method == "vggt"), None)
     return "\n".join(
-        f"{_WORDS[source]}: {_change_in_words(first, row)}."
+        f"{_WORDS[source]}: the second pass {_steadies(first, row)} ({_change_in_words(first, row)})."
         for source in get_args(MaskSource)
         for row in rows
         if first is not None and row.method == "4dvggt-d" and row.mask_source == source
@@ -248,9 +267,12 @@ def _change_in_words(first: LadderRow, second: LadderRow) -> str:
         word = "unchanged" if after == before else "better" if after < before else "worse"
         return f"{heading} {word}, {form.format(before)} -> {form.format(after)}"
 
+    return "; ".join(map(change, (*_CAMERA_SCORES, "abs_rel")))
+
+
+def _steadies(first: LadderRow, second: LadderRow) -> str:
     is_steadier = all(getattr(second, name) < getattr(first, name) for name in _CAMERA_SCORES)
-    effect = "steadies the cameras" if is_steadier else "does not steady the cameras"
-    return f"the second pass {effect} ({'; '.join(map(change, (*_CAMERA_SCORES, 'abs_rel')))})"
+    return "steadies the cameras" if is_steadier else "does not steady the cameras"
 
 
 def _batches(count: int, size: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:

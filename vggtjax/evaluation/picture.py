@@ -15,18 +15,23 @@ from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_depth, inver
 _FRAMES = 6
 _SIDE = 220  # of a picture, in pixels
 _MARGIN, _GAP, _LABEL, _PLOT = 24, 6, 130, 460
-_TRUE, _FOUND = (120, 200, 255), (255, 150, 60)
+_TRUE, _FOUND, _PREDICTED = (120, 200, 255), (255, 150, 60), (150, 150, 160)
 
 
-def truth_sheet(result: Reconstruction, truth: Truth) -> UInt8[np.ndarray, "height width 3"]:
+def truth_sheet(
+    result: Reconstruction, truth: Truth, predicted: Reconstruction | None = None
+) -> UInt8[np.ndarray, "height width 3"]:
     """Draw frames of a result with exact truth: pictures, depth and masks (found and true), cameras from above.
 
-    The result's depth is scaled to the truth by the median ratio, its cameras are aligned by a similarity.
+    Depth is scaled to the truth by the median ratio, cameras are aligned by a similarity. `predicted` is the result
+    before depth and cameras were made consistent, to draw beside it.
     """
     S, H, W = result.depth.shape
     shown = np.linspace(0, S - 1, min(S, _FRAMES)).round().astype(int)
     size = (_SIDE, round(_SIDE * H / W))
-    rows = ("Picture", "Depth found", "Depth true", "Moving found", "Moving true")
+    depths = {} if predicted is None else {"Depth predicted": predicted.depth}
+    depths |= {"Depth found": result.depth, "Depth true": np.asarray(truth.depth)}
+    rows = ("Picture", *depths, "Moving found", "Moving true")
     left, top = _MARGIN + _LABEL, _MARGIN + 40
     plot_left = left + len(shown) * (size[0] + _GAP) + 2 * _MARGIN
     height = top + len(rows) * (size[1] + _GAP) + _MARGIN
@@ -36,7 +41,7 @@ def truth_sheet(result: Reconstruction, truth: Truth) -> UInt8[np.ndarray, "heig
 
     everywhere = np.ones(result.depth.shape, bool)
     true_depth = np.asarray(truth.depth, np.float32)
-    found_depth = (result.depth * median_scale(result.depth, true_depth)).astype(np.float32)
+    scaled = [(depth * median_scale(depth, true_depth)).astype(np.float32) for depth in depths.values()]
     inverse_range = inverse_depth_range(true_depth, everywhere)
     for row, label in enumerate(rows):
         draw.text((_MARGIN, top + row * (size[1] + _GAP)), label, TEXT, small)
@@ -44,15 +49,16 @@ def truth_sheet(result: Reconstruction, truth: Truth) -> UInt8[np.ndarray, "heig
         image = result.images[frame]
         pictures = (
             image,
-            color_depth(found_depth[frame], everywhere[frame], inverse_range),
-            color_depth(true_depth[frame], everywhere[frame], inverse_range),
+            *(color_depth(depth[frame], everywhere[frame], inverse_range) for depth in scaled),
             overlay(image, result.dynamic_mask[frame]),
             overlay(image, truth.dynamic_mask[frame]),
         )
         for row, picture in enumerate(pictures):
             place = left + column * (size[0] + _GAP), top + row * (size[1] + _GAP)
             sheet.paste(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC), place)
-    _draw_cameras(draw, (plot_left, top), small, result.camera_from_world, np.asarray(truth.camera_from_world))
+    found = {} if predicted is None else {"predicted": (predicted.camera_from_world, _PREDICTED)}
+    found |= {"found": (result.camera_from_world, _FOUND)}
+    _draw_cameras(draw, (plot_left, top), small, found, np.asarray(truth.camera_from_world))
     return np.asarray(sheet)
 
 
@@ -60,14 +66,16 @@ def _draw_cameras(
     draw: ImageDraw.ImageDraw,
     corner: tuple[int, int],
     font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
-    found: Float[np.ndarray, "S 3 4"],
+    found: dict[str, tuple[Float[np.ndarray, "S 3 4"], tuple[int, int, int]]],
     true: Float[np.ndarray, "S 3 4"],
 ) -> None:
-    """Plot centres from above, x to the right and z up, in the axes of the true first camera."""
+    """Plot centres from above, x to the right and z up, in the axes of the true first camera; `found` by name."""
     true_rotation, origin = true[0, :, :3], centres(true)[0]
     ways = {"true": (centres(true), _TRUE)}
-    if moves(centres(true)) and moves(centres(found)):
-        ways["found"] = (umeyama_sim3(centres(found), centres(true), allow_line=True).apply(centres(found)), _FOUND)
+    for name, (poses, colour) in found.items():
+        if moves(centres(true)) and moves(centres(poses)):
+            aligned = umeyama_sim3(centres(poses), centres(true), allow_line=True).apply(centres(poses))
+            ways[name] = (aligned, colour)
     flat = {name: ((way - origin) @ true_rotation.T)[:, [0, 2]] for name, (way, _) in ways.items()}
     points = np.concatenate(list(flat.values()))
     middle, span = (points.max(0) + points.min(0)) / 2, max(np.ptp(points, axis=0).max(), 1e-9)

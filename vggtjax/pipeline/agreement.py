@@ -63,4 +63,5 @@ def agree_with_pixels(
         if result.motion is not None:  # pixels match better than the network does, around better cameras
             with on_stage("mask by pixels"):
                 result = mask_by_pixels(result, pictures())
+        result = dataclasses.replace(result, settings=result.settings | {"consistent_depth": True})
     return result

@@ -80,7 +80,6 @@ def _as_method(
     how = {name: getattr(options, name) for name in ("method", "align_scale", "cameras")}
     assembly = Execute()("assemble", assemble)(passes, as_tree(fusion), **how)
     settings = result.settings | {"refine_mask": method.refine}
-    settings |= {"consistent_depth": True} if options.consistent_depth else {}
     with warnings.catch_warnings():
         if result.method == options.method:  # the warning about clamped cameras has been given already
             warnings.simplefilter("ignore", FieldOfViewWarning)

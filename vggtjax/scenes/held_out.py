@@ -64,7 +64,7 @@ def held_out_scenes(
             of scenes depends on the other fields, the seed and the kind, not on the image size or `frozen`: it is made
             on square frames.
         seed: of the set; different seeds share no scene.
-        progress: called with the number of selected scenes and `count`.
+        progress: called with the number of scenes selected and rendered, and of both: 2 x `count`.
 
     Raises:
         InputError: an unknown kind, a count below 1, or fewer than 12 frames.
@@ -76,9 +76,10 @@ def held_out_scenes(
         raise InputError(f"test scenes have {config.frames} frames; expected at least {MIN_FRAMES}")
     config = dataclasses.replace(config, dynamic=float(kind == "dynamic"))
     textures = load_textures("test")
-    keys = _hard_keys(kind, count, config, seed, textures, progress)
-    groups = [keys[start : start + _AT_ONCE] for start in range(0, count, _AT_ONCE)]
-    clips = [jax.device_get(_generate(group, textures, config)) for group in groups]
+    keys, tell, clips = _hard_keys(kind, count, config, seed, textures, progress), progress or no_progress, []
+    for start in range(0, count, _AT_ONCE):
+        clips.append(jax.device_get(_generate(keys[start : start + _AT_ONCE], textures, config)))
+        tell(count + min(start + _AT_ONCE, count), 2 * count)
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *clips)
 
 
@@ -128,7 +129,7 @@ def _hard_keys(kind: Kind, count: int, config: SceneConfig, seed: int, textures:
         hard = hardness(jax.device_get(_generate(keys, textures, small))).kept(kind)
         selected += [keys[i] for i in np.flatnonzero(hard)]
         candidate += _AT_ONCE
-        (progress or no_progress)(min(len(selected), count), count)
+        (progress or no_progress)(min(len(selected), count), 2 * count)
     return jax.numpy.stack(selected[:count])
 
 
