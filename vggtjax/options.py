@@ -26,7 +26,6 @@ from vggtjax.storage.json_values import check_fields, without_defaults
 
 Pass = Literal["first", "second"]
 _ShownDType = Literal["float32", "bfloat16"]  # on the command line
-CamerasFrom = Literal["predicted", "adjusted"]
 MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d", "4dvggt-m"]
 
 
@@ -114,7 +113,6 @@ def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) ->
 
 
 _LATER = {
-    "cameras": "predicted",
     "refine_cameras": False,
     "consistent_depth": False,
     "attention": "exact",
@@ -147,9 +145,6 @@ class Options:
     mask: InWords[Witness | None] = None
     """what tells motion: gram, the similarity of tokens, as in the papers; matches, the same and the matches between
     frames that do not fit a static world (not in the papers); by default matches for 4dvggt-m, else gram"""
-    cameras: InWords[CamerasFrom] = "predicted"
-    """of the result: predicted, the passes' own; adjusted, the same, moved until what is static is seen where the
-    matches between frames show it (not in the papers)"""
     align_scale: Switch = False
     """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1
@@ -207,11 +202,6 @@ class Options:
             refine=method.refine if self.refine_mask is None else self.refine_mask,
             mask=self.mask or method.mask,
         )
-
-    @property
-    def witness(self) -> Witness:
-        """What the first pass gathers: matches too, for the mask or for the cameras."""
-        return "matches" if self.cameras == "adjusted" else self.row.mask
 
     def resolved(self, motion: MotionConfig, on_accelerator: bool | None = None) -> Options:
         """Return the options with the values of the method, the model and the platform in place of None.

@@ -80,7 +80,8 @@ def made_of() -> str:
     import vggtjax
 
     digest, embedded = hashlib.sha256(vggtjax.__version__.encode()), Path(vggtjax.__file__).parent / "pretrained"
-    for path in (Path(__file__), Path(__file__).with_name("consistency.py"), embedded / "model.safetensors", embedded / "clip.npz"):
+    code = (Path(__file__), Path(__file__).with_name("consistency.py"))
+    for path in (*code, embedded / "model.safetensors", embedded / "clip.npz"):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 

@@ -64,11 +64,11 @@ def steps(scene: Fitted) -> Figure:
     cells, matched, weight, ratio = _matched(scene)
     predicted, fields, joined, true = scene.predicted, scene.fields, scene.joined, scene.truth.depth
     scaled = [of.depth * median_scale(of.depth, true) for of in (predicted, joined)]
-    titles = ("1  matches,\n2 frames later", "2  depths of cells,\nmeasured", "3  fields", f"4  joining,\nx {_STRONGER}",
-              "predicted depth", "depth found", "true depth", "5  mask")  # fmt: skip
+    titles = ("1  matches,\n2 frames later", "2  depths of cells,\nmeasured", "3  fields",
+              f"4  joining,\nx {_STRONGER}", "predicted depth", "depth found", "true depth", "5  mask")  # fmt: skip
     frames, side = (2, 5, 8), SIDE / cells.grid[1]
     figure, axes = pyplot.subplots(len(frames), len(titles), figsize=(11.5, 4.9), layout="constrained")
-    drawn = None
+    drawn = {}
     for row, frame in zip(axes, frames, strict=True):
         changes = (np.log(fields.depth / predicted.depth), np.log(joined.depth / fields.depth))
         shown = (
@@ -80,25 +80,23 @@ def steps(scene: Fitted) -> Figure:
             overlay(joined.images[frame], joined.dynamic_mask[frame]),
         )
         for column, (cell, picture, title) in enumerate(zip(row, shown, titles, strict=True)):
-            how = _CHANGE if column in (1, 2, 3) else {}
-            label = f"frame {frame}" if column == 0 else ""
-            drawn = _image(cell, picture, title if frame == frames[0] else "", label, **how) if how else drawn
-            if not how:
-                _image(cell, picture, title if frame == frames[0] else "", label)
+            how, label = _CHANGE if column in (1, 2, 3) else {}, f"frame {frame}" if column == 0 else ""
+            drawn[column] = _image(cell, picture, title if frame == frames[0] else "", label, **how)
         start = np.stack(np.meshgrid(*(np.arange(n) + 0.5 for n in cells.grid[::-1])), axis=-1).reshape(-1, 2)
         sure = weight[frame] > 0.3
         lines = np.stack([start[sure], matched[frame][sure]], axis=1).transpose(2, 1, 0)
         row[0].plot(*(lines * side - 0.5), color="#ffe94a", linewidth=0.7)
         row[0].set(xlim=(-0.5, SIDE - 0.5), ylim=(SIDE - 0.5, -0.5))
-    figure.colorbar(drawn, ax=list(axes[:, 1:4].ravel()), location="bottom", label="change of log depth",
+    figure.colorbar(drawn[1], ax=list(axes[:, 1:4].ravel()), location="bottom", label="change of log depth",
                     fraction=0.05, aspect=36, pad=0.03)  # fmt: skip
     return figure
 
 
 def _matched(scene: Fitted) -> tuple[Cells, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the cells, their matches two frames later and the weights, and the log of measured over predicted depth."""
+    """Return the cells, their matches two frames later with weights, and the log of measured over predicted depth."""
     import dataclasses
 
+    from vggtjax.cameras import Cameras
     from vggtjax.known.intrinsics import shared_focal
     from vggtjax.method.matches import frame_pairs
     from vggtjax.refinement.cells import at_scale, cells_of, grey_pictures
@@ -112,9 +110,7 @@ def _matched(scene: Fitted) -> tuple[Cells, np.ndarray, np.ndarray, np.ndarray]:
     world = adjust_to_pixels(cells, grey, PREDICTED)
     intrinsics = cells.cameras.intrinsics.copy()
     intrinsics[:, [0, 1], [0, 1]] *= world.focal
-    expected, warp = expected_matches(
-        world.depth, cells.cameras._replace(camera_from_world=world.camera_from_world, intrinsics=intrinsics), cells.grid
-    )
+    expected, warp = expected_matches(world.depth, Cameras(world.camera_from_world, intrinsics), cells.grid)
     last = ROUNDS[-1]
     found = match_pixels(at_scale(grey, cells.grid, last.pixels), expected.astype(np.float32), warp, cells.grid,
                          last.window)  # fmt: skip
@@ -152,6 +148,7 @@ def surfaces(scene: Fitted) -> Figure:
         cell.set(title=name, xlabel="metres")
         cell.set_aspect("equal", "box")
     shown = np.concatenate([np.asarray(each.get_offsets()) for each in axes[2].collections])
-    (left, low), (right, high) = np.percentile(shown, (0.5, 99.5), axis=0) + [[-_MARGIN], [_MARGIN]]
-    axes[0].set(ylabel="metres", xlim=(left, right), ylim=(low, high))
+    low, high = np.percentile(shown, (0.5, 99.5), axis=0)
+    (left, right), (below, above) = np.transpose([low - _MARGIN, high + _MARGIN])
+    axes[0].set(ylabel="metres", xlim=(left, right), ylim=(below, above))
     return figure

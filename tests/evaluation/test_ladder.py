@@ -2,8 +2,6 @@
 
 import re
 from dataclasses import replace
-from functools import partial
-from typing import Any
 
 import jax
 import numpy as np
@@ -130,15 +128,6 @@ def point_distances(depth, intrinsics, poses, clip) -> list[float]:
         apart = similarity.apply(points[0][None])[0] - points[1], scale * seen[0] - seen[1]
         distances.append(np.linalg.norm(apart, axis=1))
     return np.mean(distances, axis=0).tolist()
-
-
-def test_the_plain_row_does_not_depend_on_the_masks_of_others(model, truth):
-    """Cameras are adjusted to what is static by the paper's mask, whatever else is asked for."""
-    first = type(truth)(*(array[:1] for array in truth))
-    run: Any = partial(ladder, model, first, methods=("vggt", "4dvggt-d"), cameras="adjusted")
-    plain = [run(masks=masks)[0] for masks in (("mined",), ("true", "matches"))]
-    assert plain[0] == plain[1]
-    assert [row.mask_source for row in run(masks=("true", "matches"))] == [None, "true", "matches"]
 
 
 def test_suppressing_nothing_is_the_plain_pass(rows):

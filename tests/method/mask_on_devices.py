@@ -1,7 +1,6 @@
 """What tests/method/test_mask.py runs in a process with several devices: masks, here and on eight devices.
 
-It prints JSON: for each method, the share of dynamic pixels, and whether the masks are equal; for "4dvggt-m" the
-cameras that are adjusted to matches too.
+It prints JSON: for each method, the share of dynamic pixels, and whether the masks are equal.
 """
 
 import json
@@ -12,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from tests.static_world import GRID, PATCH, StaticWorld
-from vggtjax.method.adjusted_cameras import adjusted_cameras
 from vggtjax.method.mask import mine_mask
 from vggtjax.method.matched_mask import mine_matched_mask
 from vggtjax.network.frames import BY_FRAME, Frames
@@ -47,8 +45,7 @@ for method, options in METHODS.items():
 
 def by_matches(frames, depth, cameras, matches, gram_mask, saliency, images):
     pose_encoding = encode_pose(cameras.camera_from_world, cameras.intrinsics, (GRID[0] * PATCH, GRID[1] * PATCH))
-    mined = mine_matched_mask(matches, gram_mask, saliency, images, depth, pose_encoding, frames=frames)
-    return mined, adjusted_cameras(cameras, depth, matches, mined.dynamic_mask, GRID, frames=frames)
+    return mine_matched_mask(matches, gram_mask, saliency, images, depth, pose_encoding, frames=frames)
 
 
 world = StaticWorld(COUNT)
@@ -66,5 +63,5 @@ shared = jax.jit(frames.on_devices(partial(by_matches, frames), *(BY_FRAME,) * 6
 is_equal = all(
     np.allclose(a, b[:, :COUNT], atol=1e-4) for a, b in zip(*map(jax.tree.leaves, (alone, shared)), strict=True)
 )
-found["4dvggt-m"] = float(np.mean(alone[0].dynamic_mask)), is_equal and bool(alone[0].is_matched.all())
+found["4dvggt-m"] = float(np.mean(alone.dynamic_mask)), is_equal and bool(alone.is_matched.all())
 print(json.dumps(found))  # noqa: T201

@@ -6,9 +6,8 @@ import jax
 import numpy as np
 import pytest
 
-from tests.static_world import GRID, PATCH, StaticWorld
+from tests.static_world import GRID, StaticWorld
 from vggtjax.cameras import Cameras
-from vggtjax.method.adjusted_cameras import adjusted_cameras
 from vggtjax.method.adjustment import Adjustment, adjust
 
 FREE = Adjustment(depth_prior=100.0, rotation_prior=100.0, translation_prior=100.0)
@@ -51,27 +50,3 @@ def test_two_fifths_of_movers_do_not_turn_the_cameras(clip):
     error = np.linalg.norm(made.position - matched, axis=-1)
     still, moving = (np.median(error[(clip.weight > 0) & which[:, None]]) for which in (~moves, moves))
     assert moving > 10 * still
-
-
-@pytest.mark.parametrize("come_back", [True, False])
-def test_cameras_are_adjusted_to_what_does_not_move_if_matches_come_back(clip, come_back):
-    depth, poses = clip.disturbed()
-    moves = np.random.default_rng(1).random(clip.depth.shape) < 0.4
-
-    def pixels(patches):
-        return np.kron(patches.reshape(-1, *GRID), np.ones((1, PATCH, PATCH), patches.dtype))[None]
-
-    given = Cameras(poses[None], (clip.K * np.array([[PATCH], [PATCH], [1]])).astype(np.float32)[None])
-    adjusted = jax.jit(adjusted_cameras, static_argnames="grid")
-    made = []
-    for matches in (clip.matches(moves), clip.matches()):
-        matches = matches._replace(cycle=matches.cycle + (0 if come_back else 2))
-        every = jax.tree.map(lambda x: x[None], matches)
-        made.append(adjusted(given, pixels(depth), every, pixels(moves), GRID))
-    assert all(np.array_equal(made[0].intrinsics, cameras.intrinsics) for cameras in (given, made[1]))
-    poses_made = made[0].camera_from_world
-    assert np.allclose(poses_made, made[1].camera_from_world, atol=1e-5)  # what moves does not count
-    if come_back:
-        assert turned(poses_made[0], clip.poses)[1:].mean() < 0.85 * turned(poses, clip.poses)[1:].mean()
-    else:
-        assert np.array_equal(poses_made, given.camera_from_world)

@@ -163,31 +163,6 @@ def test_pictures_of_another_range_are_refused(params, config, images):
         infer(params, (255 * images).astype(np.uint8), config)
 
 
-def test_adjusted_cameras_reach_the_result(params, config, images, monkeypatch):
-    """The adjustment is replaced by a shift: random weights match nothing."""
-
-    def shifted(cameras, depth, matches, dynamic_mask, grid, *, frames):
-        assert matches.position.shape[:2] == depth.shape[:2]
-        return cameras._replace(camera_from_world=cameras.camera_from_world + 1)
-
-    monkeypatch.setattr("vggtjax.method.assembly.adjusted_cameras", shifted)
-    run = partial(infer, params, images, config)
-    (plain, _), (made, passes) = run(method="4dvggt-m"), run(method="4dvggt-m", cameras="adjusted")
-    assert np.allclose(made.camera_from_world, plain.camera_from_world + 1, atol=1e-4)
-    assert np.allclose(made.camera_from_world, assemble(passes, cameras="adjusted").camera_from_world, atol=1e-4)
-    with pytest.raises(InputError, match="the passes have no matches"):
-        assemble(passes._replace(matches=None), cameras="adjusted")
-
-
-@pytest.mark.parametrize("frames", [1, 3])
-def test_a_result_says_where_cameras_stayed(params, config, images, frames):
-    clip = load_clip(images[0, :frames], size=140)
-    masks = np.zeros(clip.images.shape[:3], bool)
-    made = reconstruct(Model(config, params), clip, method="4dvggt-m", cameras="adjusted", masks=masks)
-    assert made.settings["cameras"] == "predicted, as matches between frames cannot be used"
-    assert made.motion is None
-
-
 def test_equal_programs_are_compiled_once(params, config, images, monkeypatch):
     static = "vggtjax.pipeline.infer._infer"  # its options are static under jit
     monkeypatch.setattr(static, lambda *arguments: arguments[5])

@@ -27,7 +27,7 @@ from vggtjax.method.assembly import Assembly, assemble
 from vggtjax.method.mask import upsample
 from vggtjax.method.matched_mask import motion_pixels
 from vggtjax.method.passes import Passes
-from vggtjax.options import ABLATION, CamerasFrom, Options, find_method
+from vggtjax.options import ABLATION, Options, find_method
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import Progress
 from vggtjax.reconstruction import Reconstruction
@@ -80,8 +80,8 @@ class _Setting(NamedTuple):
     suppress: Suppress | None = None
 
 
-def _assemble(passes: Passes, *, methods: tuple[str, ...], cameras: CamerasFrom) -> list[Assembly]:
-    return [assemble(passes, method=method, cameras=cameras) for method in methods]
+def _assemble(passes: Passes, *, methods: tuple[str, ...]) -> list[Assembly]:
+    return [assemble(passes, method=method) for method in methods]
 
 
 def ladder(
@@ -108,7 +108,7 @@ def ladder(
             masks, an upper bound for any mining.
         mask_pairs: numbers of pairs in which the keys of dynamic tokens are suppressed; the model's own if None.
         suppress: ways to suppress them, in place of the methods' own.
-        options: the other settings, such as `cameras` or the threshold of mined masks.
+        options: the other settings, such as `gram` or the threshold of mined masks.
         batch_size: number of clips that go through the network together.
         progress: called with the number of passes done and of all passes.
         changes: fields of `options` by name, such as `gram="dot"`.
@@ -157,10 +157,10 @@ def ladder(
             passes = run(batch, options=own, masks=true_masks if setting.mask_source == "true" else None, shared=shared)
             shared = shared or passes
             pixels = _seen_motion(execute, passes, batch.images)
-            by_setting[setting] = list(_scored(passes, masked, scenes, pixels, setting, options.cameras))
+            by_setting[setting] = list(_scored(passes, masked, scenes, pixels, setting))
             advance()
         passes = run(batch, options=options.changed(method="vggt", mask="gram"), shared=shared)
-        rows += _scored(passes, plain, scenes, _seen_motion(execute, passes, batch.images), _Setting(), options.cameras)
+        rows += _scored(passes, plain, scenes, _seen_motion(execute, passes, batch.images), _Setting())
         advance()
         rows += chain.from_iterable(by_setting[setting] for setting in settings)
     return sorted(rows, key=lambda row: row.clip)
@@ -171,10 +171,12 @@ def score_result(result: Reconstruction, truth: ClipTruth, mask_source: Literal[
 
     Raises InputError for truth of another shape.
     """
-    truth, motion = batched_truth(truth), result.saliency if result.motion is None else result.motion
+    truth, motion = batched_truth(truth), result.motion if result.motion is not None else result.saliency
     if truth.depth.shape != (1, *result.depth.shape):
         raise InputError(f"the truth has depth of shape {truth.depth.shape[1:]}; expected {result.depth.shape}")
-    pixels = result.dynamic_mask if motion is None else np.asarray(upsample(motion[None], result.depth.shape[1:]))[0]
+    pixels = result.dynamic_mask
+    if motion is not None:
+        pixels = np.asarray(upsample(jax.numpy.asarray(motion[None]), result.depth.shape[1:]))[0]
     fields = (result.depth, result.intrinsics, result.camera_from_world, result.dynamic_mask, pixels)
     return _row(_scene(0, truth), result.method, _Setting(mask_source), *fields)
 
@@ -295,13 +297,11 @@ def _scored(
     scenes: list[_Scene],
     motion: Float[np.ndarray, "B S H W"],
     setting: _Setting,
-    cameras_from: CamerasFrom,
 ) -> Iterator[LadderRow]:
     mask = np.asarray(passes.dynamic_mask)
     join = Execute()("assemble", _assemble)
-    matches = passes.matches if cameras_from == "adjusted" else None
-    read = passes._replace(patch_tokens=None, motion=None, is_matched=None, matches=matches)
-    for method, assembly in zip(methods, join(read, methods=methods, cameras=cameras_from), strict=True):
+    read = passes._replace(patch_tokens=None, motion=None, is_matched=None, matches=None)
+    for method, assembly in zip(methods, join(read, methods=methods), strict=True):
         depth, intrinsics = np.asarray(assembly.depth), np.asarray(assembly.intrinsics)
         cameras = np.asarray(assembly.camera_from_world)
         for i, scene in enumerate(scenes):

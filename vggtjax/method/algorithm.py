@@ -146,10 +146,9 @@ def run_method(
         params, clips, config, options, masks=masks, both_outputs=both_outputs, compute=compute, step=step
     )
     frames = clips.real(compute.frames)
-    cameras = "adjusted" if _adjusts(options, clips.counted) else "predicted"
     join = step("assemble", frames.on_devices(assemble, BY_FRAME, REPLICATED))
     arrays = (passes._replace(patch_tokens=None, tracks=None), as_tree(fusion))
-    made = join(*arrays, method=options.method, align_scale=options.align_scale, cameras=cameras, frames=frames)
+    made = join(*arrays, method=options.method, align_scale=options.align_scale, frames=frames)
     return made, passes
 
 
@@ -183,7 +182,7 @@ def run_passes(
     if masks is None and counted == 1:
         masks = False  # nothing moves in a single frame
     mines_by_matches = masks is None and method.mask == "matches" and counted >= FEWEST_FRAMES
-    witness = "matches" if mines_by_matches or _adjusts(options, counted) else "gram"
+    witness = "matches" if mines_by_matches else "gram"
 
     if shared is None:
         # Features of the backbone, which both passes share.
@@ -253,11 +252,6 @@ def _follow(
     return tracks
 
 
-def _adjusts(options: Options, frames: int) -> bool:
-    """Return whether cameras are adjusted to matches: a single frame has none."""
-    return options.cameras == "adjusted" and frames > 1
-
-
 def check_masks(masks: Masks, images: Images, frames: Frames = Frames()) -> None:
     """Raise InputError for masks of another shape or type, and for soft ones on several devices."""
     if isinstance(masks, SoftMasking):
@@ -282,6 +276,6 @@ def _check_shared(shared: Passes, masks: Masks, witness: Witness) -> None:
     if shared.patch_tokens is None:
         raise InputError("shared has no patch tokens; expected what run_passes returned")
     if witness == "matches" and shared.matches is None:
-        raise InputError("shared has no matches between frames; run its passes with the same mask and cameras")
+        raise InputError("shared has no matches between frames; run its passes with the same mask")
     if isinstance(masks, SoftMasking):
         raise InputError("masks are soft and change the first pass; leave shared out")

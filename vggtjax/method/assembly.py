@@ -12,14 +12,13 @@ from jaxtyping import Array, Float
 
 from vggtjax.cameras import Cameras
 from vggtjax.errors import InputError
-from vggtjax.method.adjusted_cameras import adjusted_cameras
 from vggtjax.method.fusion import fuse_depth, replace_depth, scale_between
 from vggtjax.method.fusion_family import FusionParams, Observations, fuse, paper_rule
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.passes import Passes, present
 from vggtjax.network.frames import Frames
 from vggtjax.network.pose import decode_pose
-from vggtjax.options import METHODS, CamerasFrom, find_method
+from vggtjax.options import METHODS, find_method
 
 Depth = Float[Array, "B S H W"]
 
@@ -64,7 +63,6 @@ def assemble(
     *,
     method: str = "4dvggt-d",
     align_scale: bool = False,
-    cameras: CamerasFrom = "predicted",
     frames: Frames = Frames(),
 ) -> Assembly:
     """Return a method's depth, confidence and cameras from two passes; the methods of `ABLATION` share one run of them.
@@ -77,7 +75,6 @@ def assemble(
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
             pixels before it is used. Not in the paper.
-        cameras: adjust the cameras to the matches of static pixels, which the passes must have. Not in the paper.
         frames: where the frames of the passes are; those after `frames.count` are left out, or meaningless.
     """
     row = find_method(method)
@@ -102,8 +99,6 @@ def assemble(
         "second": Cameras(of_second, intrinsics),
     }
     chosen = Cameras(of_pass[row.extrinsics].camera_from_world, of_pass[row.intrinsics].intrinsics)
-    if cameras == "adjusted":
-        chosen = _adjusted(chosen, depth, passes, frames)
     return Assembly(depth, confidence, chosen)
 
 
@@ -140,11 +135,3 @@ def _by_rule(fusion: FusionRule, seen: Observations) -> tuple[Depth, Depth]:
             f"{seen.depth1.shape}"
         )
     return made
-
-
-def _adjusted(chosen: Cameras, depth: Depth, passes: Passes, frames: Frames) -> Cameras:
-    """Return cameras for which static pixels are seen where they are matched. Not in the papers."""
-    if passes.matches is None:
-        raise InputError("the passes have no matches to adjust cameras to; run them with cameras='adjusted'")
-    grid = (passes.saliency.shape[2], passes.saliency.shape[3])
-    return adjusted_cameras(chosen, depth, passes.matches, passes.dynamic_mask, grid, frames=frames)

@@ -14,7 +14,6 @@ from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
 from vggtjax.method.assembly import Assembly, FusionRule
 from vggtjax.method.fusion_file import fusion_digest
-from vggtjax.method.matches import come_back, frame_pairs
 from vggtjax.method.passes import Passes
 from vggtjax.network.model import Predictions
 from vggtjax.network.track_head import Tracks
@@ -87,17 +86,6 @@ def settings_of(
     return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}
 
 
-def camera_source(options: Options, passes: Passes) -> dict[str, str]:
-    """Return the setting of adjusted cameras; it tells where matches could not be used, and the cameras stayed."""
-    if options.cameras == "predicted":
-        return {}
-    used = False
-    if passes.matches is not None:
-        matches = jax.tree.map(lambda x: x[0], passes.matches)
-        used = bool(come_back(matches, frame_pairs(len(matches.cycle))))
-    return {} if used else {"cameras": "predicted, as matches between frames cannot be used"}
-
-
-def kept_passes(passes: Passes, options: Options) -> Passes:
+def kept_passes(passes: Passes) -> Passes:
     """Return passes without what the result has, and without matches that nothing reads any more."""
-    return passes._replace(tracks=None, matches=passes.matches if options.cameras == "adjusted" else None)
+    return passes._replace(tracks=None, matches=None)

@@ -119,5 +119,4 @@ def _infer(
     compute = compute_by(options, Frames(mesh, None if mesh is None else frames))
     how = {"masks": masks if moves else False, "fusion": fusion, "compute": compute}
     assembly, passes = run_method(params, Clips(images, frames=frames), config, options, **how)
-    matches = passes.matches if options.cameras == "adjusted" else None
-    return assembly, passes._replace(matches=matches, patch_tokens=None)
+    return assembly, passes._replace(matches=None, patch_tokens=None)

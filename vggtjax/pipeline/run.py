@@ -29,7 +29,6 @@ from vggtjax.pipeline.agreement import agree_with_pixels, agrees_with_pixels
 from vggtjax.pipeline.devices import frames_mesh, on_host, replicate, shard_frames
 from vggtjax.pipeline.fields import (
     assembled_fields,
-    camera_source,
     clip_fields,
     kept_passes,
     motion_by_matches,
@@ -185,8 +184,6 @@ def _check(
     check_fuses(fusion, options.method)
     poses_are_known = known is not None and known.poses is not None
     check_refinement(options.refine_cameras, poses_are_known)
-    if options.cameras == "adjusted" and poses_are_known:
-        raise InputError("cameras is 'adjusted' and poses are given, which would replace them; leave one of them out")
 
 
 def _run(
@@ -256,8 +253,8 @@ def _result(
             dynamic_mask=np.asarray(passes.dynamic_mask[0]),
             method=options.method,
             model_name=model.name,
-            settings=settings_of(model, clip, options, mask_source, fusion) | camera_source(options, passes),
-            passes=kept_passes(passes, options) if running.keep_passes else None,
+            settings=settings_of(model, clip, options, mask_source, fusion),
+            passes=kept_passes(passes) if running.keep_passes else None,
         )
     except ResultError:
         check_finite(model)  # they may be the reason

@@ -77,7 +77,7 @@ def _as_method(
     """Return what another method makes of the passes that a result keeps."""
     method, passes = options.row, result.passes
     fusion = fusion if method.depth == "fused" else None
-    how = {name: getattr(options, name) for name in ("method", "align_scale", "cameras")}
+    how = {name: getattr(options, name) for name in ("method", "align_scale")}
     assembly = Execute()("assemble", assemble)(passes, as_tree(fusion), **how)
     settings = result.settings | {"refine_mask": method.refine}
     with warnings.catch_warnings():
