@@ -46,6 +46,9 @@ def test_demo(tmp_path, capsys, monkeypatch):
     is_matched = result.settings["masks"] == "mined: matches between frames and Gram similarities"
     assert is_matched == (result.motion is not None)  # those of a tiny network need not come back
     assert "Masks by matches: the second pass" in out
+    assert re.search(r"(?m)^consistent +(pixels|mined) ", out)
+    assert "Depth and cameras fitted to the clip's pixels, compared with the first pass: rotation" in out
+    assert result.settings["consistent_depth"] is True
     assert (tmp_path / "result" / "scene.glb").stat().st_size > 1000
 
 
@@ -81,6 +84,7 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     result = Reconstruction.load(tmp_path / "out")
     assert result.settings["model_note"].startswith("small demonstration model")
     assert (result.settings["masks"], result.settings["refine_mask"]) == ("given", True)
+    assert result.settings["consistent_depth"] is True  # the command's default
     assert np.asarray(result.track_frames).tolist() == [0, 1]
     assert (tmp_path / "out/preview/tracks.png").stat().st_size > 1000
     with Image.open(tmp_path / "out/vggt4d/frame_0001.png") as shown, Image.open(frames / "00001.png") as picture:
@@ -95,12 +99,14 @@ def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames)
     again = Reconstruction.load(tmp_path / "again")
     assert np.allclose(again.camera_from_world, result.camera_from_world, atol=1e-5)
 
-    arguments = ("--model", "demo", "--out", tmp_path / "still", "--no-masks", "--only", "cameras")
+    arguments = ("--model", "demo", "--out", tmp_path / "still", "--no-masks", "--only", "cameras",
+                 "--no-consistent-depth")  # fmt: skip
     code, _, err = run(capsys, "reconstruct", frames, *arguments)
     assert code == 0, err
     still = Reconstruction.load(tmp_path / "still")
     assert not still.dynamic_mask.any()
     assert still.settings["refine_mask"] is False
+    assert "consistent_depth" not in still.settings
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from testing.seeded import seeded_images
 from tests.tiny import tiny_config
-from vggtjax import assemble, infer, init_params
+from vggtjax import Reconstruction, assemble, infer, init_params, load_clip
 from vggtjax.checkpoint import Model
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import InputError
-from vggtjax.evaluation.ladder import LadderRow, error_table, ladder, second_pass_in_words
+from vggtjax.evaluation.ladder import LadderRow, error_table, ladder, score_result, second_pass_in_words
 from vggtjax.evaluation.metrics.depth import depth_errors, median_scale
 from vggtjax.evaluation.metrics.masks import auc, jaccard
 from vggtjax.evaluation.metrics.trajectory import centre_error, rotation_error
@@ -22,6 +22,7 @@ from vggtjax.geometry.similarity import centres, umeyama_sim3
 from vggtjax.method.mask import upsample
 from vggtjax.method.passes import Passes
 from vggtjax.options import ABLATION
+from vggtjax.pipeline.fields import clip_fields
 
 CLIPS, FRAMES, SIZE = 3, 4, (28, 42)
 SETTING = ("method", "mask_source", "mask_pairs", "suppress")
@@ -113,6 +114,23 @@ def test_a_row_is_what_the_passes_give(truth, rows, passes, method):
     mined = np.asarray(passes.dynamic_mask[1])
     expected = None if method == "vggt" else pytest.approx(jaccard(mined, clip.dynamic_mask), abs=1e-3)
     assert row.mask_jaccard == expected
+
+
+def test_a_result_is_scored_as_its_row(truth, rows, passes):
+    clip, made = Truth(*(array[1] for array in truth)), assemble(passes, method="4dvggt-d")
+    fields = {"depth": made.depth, "depth_confidence": made.confidence, "camera_from_world": made.camera_from_world}
+    fields |= {"intrinsics": made.intrinsics, "saliency": passes.saliency, "dynamic_mask": passes.dynamic_mask}
+    arrays = {name: np.asarray(array[1]) for name, array in fields.items()}
+    of_clip = clip_fields(load_clip(clip.images, size=SIZE[1], patch=14))
+    result = Reconstruction(**arrays, **of_clip, method="4dvggt-d", model_name="tiny", settings={})
+    row = score_result(result, clip, "mined")
+    assert (row.method, row.mask_source) == ("4dvggt-d", "mined")
+    assert close(replace(only(rows, clip=1, method="4dvggt-d", mask_source="mined", mask_pairs=2)), row)
+    with pytest.raises(InputError, match="the truth has depth of shape"):
+        score_result(result, Truth(*(array[:2] for array in clip)), "mined")
+    table = error_table([only(rows, clip=1, method="vggt")], replace(row, mask_source="pixels"))
+    assert table.rows[-1][:2] == ("consistent", "pixels")
+    assert "Depth and cameras fitted to the clip's pixels, compared with the first pass: rotation" in table.note
 
 
 def point_distances(depth, intrinsics, poses, clip) -> list[float]:

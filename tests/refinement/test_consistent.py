@@ -115,7 +115,7 @@ def test_what_moves_has_no_vote(corner, pictures, truth, predicted):
             "0.0% of the picture shows",
         ),
         (lambda r, p: (first_frames(r, 2), p[:2]), "the clip has 2 frames; 3 to 512 are adjusted together"),
-        (lambda r, p: (first_frames(r, 1), p[:1]), "the clip has 1 frames"),
+        (lambda r, p: (first_frames(r, 1), p[:1]), "the clip has 1 frame;"),
     ],
     ids=["no texture", "a camera that stands", "all moves", "two frames", "one frame"],
 )
@@ -124,7 +124,7 @@ def test_depth_stays_where_pixels_say_too_little(predicted, pictures, caplog, ch
     made, report = consistent_depth(result, iter(shown))
     assert not report.changed
     assert words in report.sentence
-    assert report.sentence in caplog.text
+    assert (report.sentence in caplog.text) == (len(shown) > 2)  # a photograph needs no warning
     np.testing.assert_array_equal(made.depth, result.depth)
     np.testing.assert_array_equal(made.camera_from_world, result.camera_from_world)
     np.testing.assert_array_equal(made.intrinsics, result.intrinsics)

@@ -5,11 +5,13 @@ import pytest
 
 pytest.importorskip("pycolmap", reason="needs the extra colmap")
 
-from tests.corner import make_corner, paint
+from tests.corner import corner_result, make_corner, paint
 from tests.tiny import tiny_model
 from vggtjax import load_clip, reconstruct
+from vggtjax.evaluation.metrics.trajectory import rotation_error
 from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
+from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.progress import StageSeconds
 
 
@@ -34,3 +36,14 @@ def test_the_option_and_its_outcome_reach_the_result(model, tmp_path):
     result.save(tmp_path / "out", only=("report",))
     assert outcome["sentence"] in (tmp_path / "out" / "report.html").read_text().replace("-&gt;", "->")
     assert "refine_cameras" not in Options().to_json()
+
+
+def test_refined_points_are_fitted_by_consistent_depth_too():
+    corner = make_corner(4, 0.7)
+    pictures, predicted = paint(corner), corner_result(corner, degrees=2)
+    options = Options(refine_cameras=True, consistent_depth=True)
+    made = agree_with_pixels(predicted, lambda: iter(pictures), options)
+    assert made.settings["consistency"]["points"] > 100
+    assert list(made.known_facts) == ["cameras", "depth"]
+    before, after = (rotation_error(each.camera_from_world, corner.camera_from_world) for each in (predicted, made))
+    assert after < 0.1 * before

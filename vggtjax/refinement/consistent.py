@@ -83,7 +83,7 @@ def consistent_depth(
 
     Pixels that move take the field's value and keep their shape. Mask and confidence stay. The cameras change alone
     where there is hardly any parallax, or where the fields make the frames agree less. Depth and cameras stay, with a
-    warning logged, where too little is matched or the frames would not agree better.
+    warning logged, where too little is matched or the frames would not agree better. Clips of one or two frames stay.
 
     Args:
         result: cameras, depth and dynamic mask.
@@ -105,8 +105,9 @@ def consistent_depth(
 
     step()
     if not FEWEST_FRAMES <= frames <= MOST_FRAMES:
-        reason = f"the clip has {frames} frames; {FEWEST_FRAMES} to {MOST_FRAMES} are adjusted together"
-        return _kept(result, reason)
+        counted = "1 frame" if frames == 1 else f"{frames} frames"
+        reason = f"the clip has {counted}; {FEWEST_FRAMES} to {MOST_FRAMES} are adjusted together"
+        return _kept(result, reason, warns=frames > MOST_FRAMES)
     start = result if priors.focal is None else _with_one_focal_length(result)
     cells = cells_of(start)
     if (share := cells.is_static.mean()) < _FEWEST_MATCHED:
@@ -208,9 +209,10 @@ def _joined(result: R, tolerance: float, step: Callable[[], None]) -> tuple[R, f
     return dataclasses.replace(result, depth=depth), joined / max(static, 1)
 
 
-def _kept(result: R, reason: str) -> tuple[R, ConsistencyReport]:
+def _kept(result: R, reason: str, warns: bool = True) -> tuple[R, ConsistencyReport]:
+    """Return the result as it is. Clips of one or two frames are kept without a warning: nothing else is expected."""
     report = ConsistencyReport(False, reason)
-    logger.warning("%s", report.sentence)
+    logger.log(logging.WARNING if warns else logging.INFO, "%s", report.sentence)
     return _reported(result, report)
 
 
