@@ -36,7 +36,8 @@ def make_corner(frames: int = 6, span: float = 1) -> Corner:
 def hits(corner: Corner, frame: int, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the points [..., 3] that pixels [..., 2] of a picture show, and their planes."""
     K, pose = corner.intrinsics[frame], corner.camera_from_world[frame]
-    rays = np.concatenate([(pixels - K[:2, 2]) / FOCAL, np.ones((*pixels.shape[:-1], 1))], axis=-1) @ pose[:, :3]
+    rays = (pixels - K[:2, 2]) / K[[0, 1], [0, 1]]
+    rays = np.concatenate([rays, np.ones((*pixels.shape[:-1], 1))], axis=-1) @ pose[:, :3]
     centre = camera_centres(pose[None])[0]
     with np.errstate(divide="ignore"):
         lengths = np.stack([(place - centre[axis]) / rays[..., axis] for axis, place in _PLANES], axis=-1)

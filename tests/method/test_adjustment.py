@@ -50,3 +50,10 @@ def test_two_fifths_of_movers_do_not_turn_the_cameras(clip):
     error = np.linalg.norm(made.position - matched, axis=-1)
     still, moving = (np.median(error[(clip.weight > 0) & which[:, None]]) for which in (~moves, moves))
     assert moving > 10 * still
+
+
+def test_without_iterations_only_the_differences_are_measured(clip):
+    how = dataclasses.replace(FREE, annealed=())
+    made = fast(clip.depth, Cameras(clip.poses, clip.K), clip.matched, clip.weight, GRID, how)
+    np.testing.assert_allclose(made.depth, clip.depth, rtol=1e-5)
+    assert np.linalg.norm(made.position - clip.matched, axis=-1)[clip.weight > 0].max() < 1e-3

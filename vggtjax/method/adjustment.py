@@ -36,7 +36,7 @@ class Adjustment:
     """How cameras and depths are adjusted. Lengths in the picture are in patches, in the world in median depths."""
 
     sigma: float = 0.375  # of the Geman-McClure loss
-    annealed: tuple[float, ...] = (2.0, 1.5, 1, 1, 1, 1, 1, 1)  # sigma is multiplied by this in each iteration
+    annealed: tuple[float, ...] = (2.0, 1.5, 1, 1, 1, 1, 1, 1)  # factor of sigma in each iteration; none: no iteration
     depth_prior: float = 0.15  # standard deviation of a log depth from its prior
     rotation_prior: float = float(np.radians(6))
     translation_prior: float = 0.1
@@ -193,7 +193,7 @@ def adjust(
     still = jnp.concatenate([0 * translation, 0 * translation], axis=-1)  # on several devices, as the others are
     state = _State(rotation, translation, -jnp.log(depth / unit), 0 * unit, still)
     state, _ = jax.lax.scan(step, state, how.sigma * jnp.array(how.annealed))
-    last = jnp.asarray(how.sigma * how.annealed[-1])
+    last = jnp.asarray(how.sigma * (how.annealed or (1.0,))[-1])
 
     def outcome(s: Array) -> tuple[Array, ...]:
         world = seen(state, last, s)

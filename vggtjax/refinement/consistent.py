@@ -35,6 +35,7 @@ FEWEST_FRAMES, MOST_FRAMES = 3, 512
 _FEWEST_MATCHED = 0.05  # share of the cells whose depth is known from matches
 _KNOWN = 4.0  # a deviation of a log depth of 0.5 is the largest that is known
 _LEAST_PARALLAX = 0.3  # cells; with less, a wrong lens or shutter says more than depth does
+_MOST_ZOOM = 3e-5  # a frame; with more, a single focal length spoils depth
 _MOST_WORSE = 1.6  # factor by which frames may differ more after the field, before they are joined
 _MOST_TURNED = 0.3  # degrees by which pixels may turn bundle-adjusted cameras
 _BEST = 400.0  # no log depth of a cell is known better than by a deviation of 0.05
@@ -82,8 +83,9 @@ def consistent_depth(
     """Return the result with depth and cameras that agree with its pictures, and a report.
 
     Pixels that move take the field's value and keep their shape. Mask and confidence stay. The cameras change alone
-    where there is hardly any parallax, or where the fields make the frames agree less. Depth and cameras stay, with a
-    warning logged, where too little is matched or the frames would not agree better. Clips of one or two frames stay.
+    where there is hardly any parallax, where the lens zooms, or where the fields make the frames agree less. Depth and
+    cameras stay, with a warning logged, where too little is matched or the frames would not agree better. Clips of one
+    or two frames stay.
 
     Args:
         result: cameras, depth and dynamic mask.
@@ -128,7 +130,8 @@ def consistent_depth(
     before = differences(result, step)
     made, change = _by_field(start, world, fields, step)
     after, most = differences(made, step), _MOST_WORSE
-    if world.parallax < _LEAST_PARALLAX or not _agree(before, after, most):  # cameras alone
+    zooms = priors.focal is not None and abs(world.zoom) > _MOST_ZOOM
+    if zooms or world.parallax < _LEAST_PARALLAX or not _agree(before, after, most):  # cameras alone
         made, change = _by_field(start, world, 0 * fields, lambda: None)
         after, most, points = differences(made), 1.0, None
     if not _agree(before, after, most):

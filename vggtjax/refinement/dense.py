@@ -65,6 +65,7 @@ class DenseWorld(NamedTuple):
     information: Float32[np.ndarray, "S P"]  # inverse variance of its log
     error: float  # standard deviation of the network's log depth, as far as measured
     parallax: float  # cells by which the middle cell moves in the frame that sees it move most, for a log depth of 1
+    zoom: float  # by which matches are further from the middle than one focal length puts them, for each frame of time
 
 
 @partial(jax.jit, static_argnames=("grid", "priors"))
@@ -117,7 +118,7 @@ def adjust_to_pixels(
         weight = found.weight * cells.is_static[:, None]
         if not weight.any():
             nothing = np.zeros_like(cells.depth)
-            return DenseWorld(poses.astype(np.float64), 1.0, cells.depth, nothing, _ERRORS[0], 0.0)
+            return DenseWorld(poses.astype(np.float64), 1.0, cells.depth, nothing, _ERRORS[0], 0.0, 0.0)
         arrays = (depth, cameras, found.position, weight, cells.depth, np.float32(each.sigma))
         made = jax.tree.map(np.asarray, _adjust(*arrays, cells.grid, priors))
         poses, depth, factor = made.camera_from_world, made.depth, factor * float(made.focal)
@@ -125,7 +126,8 @@ def adjust_to_pixels(
             measured = np.clip(depth * np.exp(made.pull), *_DEPTHS)
         error = _error(cells.depth, measured, made.information)
         parallax = _parallax(depth, Cameras(poses, _zoomed(K, factor)), cells.grid)
-        world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, error, parallax)
+        zoom = _zoom(found.position, weight, made.position, each.sigma, cells.grid)
+        world = DenseWorld(poses.astype(np.float64), factor, measured, made.information, error, parallax, zoom)
         on_round()
     assert world is not None
     return world
@@ -137,6 +139,26 @@ def _parallax(depth: Float32[np.ndarray, "S P"], cameras: Cameras, grid: tuple[i
     (nearer, _), (further, _) = (expected_matches(depth * np.exp(by), cameras, grid) for by in (-step, step))
     moved = np.linalg.norm(further - nearer, axis=-1) / (2 * step)
     return float(np.median(np.max(moved * frame_pairs(len(depth)).exist[:, :, None], axis=1)))
+
+
+def _zoom(
+    matched: Float32[np.ndarray, "S M P 2"],
+    weight: Float32[np.ndarray, "S M P"],
+    position: Float32[np.ndarray, "S M P 2"],
+    sigma: float,
+    grid: tuple[int, int],
+) -> float:
+    """Return how much what matches leave over grows from the middle of the picture, for each frame of time.
+
+    A lens that zooms leaves it, as cameras and depths take only a part of it.
+    """
+    pairs = frame_pairs(len(matched))
+    error, place = matched - position, position - np.array(grid[::-1], np.float32) / 2
+    weight = weight * pairs.exist[:, :, None] / (1 + np.sum(error**2, axis=-1) / sigma**2) ** 2
+    steps = np.array(pairs.offsets, np.float32)[None, :, None]
+    grown, size = (np.sum(weight * factor * np.sum(values * place, axis=-1), dtype=np.float64)
+                   for values, factor in ((error, steps), (place, steps**2)))  # fmt: skip
+    return float(grown / size) if size > 0 else 0.0
 
 
 def _error(
