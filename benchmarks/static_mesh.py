@@ -42,7 +42,7 @@ ROWS = {
 
 def mesh_distance(
     *, model: str = "demo", out: Path = Path("static-mesh-benchmark"), kind: Kind = "dynamic", clips: int = 16,
-    frames: int = 12, side: int = 256,
+    frames: int = 12, side: int = 256, consistent_depth: bool = True,
 ) -> None:  # fmt: skip
     """Measure distances of the static points and of the static mesh of generated clips to the true static surfaces.
 
@@ -57,6 +57,7 @@ def mesh_distance(
         clips: their number.
         frames: of a clip.
         side: of the rendered pictures, in pixels.
+        consistent_depth: fit depth and cameras to the pixels first, as vggtjax reconstruct does.
     """
     if clips < 1:
         raise InputError(f"clips is {clips}; expected at least 1")
@@ -71,7 +72,7 @@ def mesh_distance(
         true = Truth(*(getattr(truth, name)[number] for name in Truth._fields))
         pictures = np.rint(255 * true.images).astype(np.uint8)
         clip = load_clip(pictures, size=network.config.image_size, patch=network.config.patch_size)
-        result = reconstruct(network, clip)
+        result = reconstruct(network, clip, consistent_depth=consistent_depth)
         depth, moving = (at_clip_pixels(clip, maps) for maps in (true.depth, true.dynamic_mask))
         points = _points(depth, intrinsics_at_clip_pixels(clip, true.intrinsics), true.camera_from_world)
         surface = _points(true.depth, true.intrinsics, true.camera_from_world)[~true.dynamic_mask]

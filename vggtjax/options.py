@@ -157,7 +157,8 @@ class Options:
     needs the extra colmap)"""
     consistent_depth: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = False
     """fit depth, cameras and focal length to the pixels of the source, and join what several frames see, where nothing
-    moves (not in the papers; the default of reconstruct and batch); with --refine-cameras its points are fitted too"""
+    moves (not in the papers; the default of the commands reconstruct and batch); with --refine-cameras its points are
+    fitted too"""
     compute_dtype: Annotated[
         ComputeDType | None,
         tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint=""),  # pyright: ignore

@@ -129,7 +129,7 @@ def test_the_demo_clip_leaves_everything_to_download(tmp_path, monkeypatch):
     asked = []  # the network has tests of its own
 
     def reconstruct(model, clip, **options):
-        asked.append((clip.images.shape, options["method"]))
+        asked.append((clip.images.shape, options["method"], options["consistent_depth"]))
         return make_room(len(clip.images))
 
     monkeypatch.setattr("vggtjax.pipeline.run.reconstruct", reconstruct)
@@ -144,7 +144,7 @@ def test_the_demo_clip_leaves_everything_to_download(tmp_path, monkeypatch):
             names = {Path(name).name for name in archive.namelist()}
     finally:
         made.close()
-    assert asked == [((4, 96, 96, 3), "vggt")]
+    assert asked == [((4, 96, 96, 3), "vggt", True)]
     assert names >= {"reconstruction.npz", "report.html", "scene.glb", "film.mp4", "layers.mp4", "sheet.png"}
 
 

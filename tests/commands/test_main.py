@@ -15,6 +15,7 @@ from vggtjax import Reconstruction, __main__, load_model
 from vggtjax.clips.truth import Truth
 from vggtjax.commands import main as cli
 from vggtjax.pretrained import embedded
+from vggtjax.refinement.pixel_mask import SOURCE
 
 pytestmark = [pytest.mark.filterwarnings("ignore:the field of view"), pytest.mark.usefixtures("tiny_demo")]
 
@@ -43,7 +44,7 @@ def test_demo(tmp_path, capsys, monkeypatch):
     assert page.stat().st_size > 100_000
     result = Reconstruction.load(tmp_path / "result")
     assert result.method == "4dvggt-m"
-    is_matched = result.settings["masks"] == "mined: matches between frames and Gram similarities"
+    is_matched = result.settings["masks"] in (SOURCE, "mined: matches between frames and Gram similarities")
     assert is_matched == (result.motion is not None)  # those of a tiny network need not come back
     assert "Masks by matches: the second pass" in out
     assert re.search(r"(?m)^consistent +(pixels|mined) ", out)

@@ -125,7 +125,7 @@ def test_a_result_is_scored_as_its_row(truth, rows, passes):
     result = Reconstruction(**arrays, **of_clip, method="4dvggt-d", model_name="tiny", settings={})
     row = score_result(result, clip, "mined")
     assert (row.method, row.mask_source) == ("4dvggt-d", "mined")
-    assert close(replace(only(rows, clip=1, method="4dvggt-d", mask_source="mined", mask_pairs=2)), row)
+    assert close(only(rows, clip=1, method="4dvggt-d", mask_source="mined", mask_pairs=2), row)
     with pytest.raises(InputError, match="the truth has depth of shape"):
         score_result(result, Truth(*(array[:2] for array in clip)), "mined")
     table = error_table([only(rows, clip=1, method="vggt")], replace(row, mask_source="pixels"))

@@ -6,11 +6,12 @@ import pytest
 from tests.corner import make_corner, paint
 from tests.tiny import tiny_model
 from tests.windows.walk import CONFIG, FRAMES, SETTINGS, plan_of, tools_of, walk, window_result, windows_of
-from vggtjax import load_clip, reconstruct
+from vggtjax import Reconstruction, load_clip, reconstruct
 from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
 from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.progress import StageSeconds
+from vggtjax.refinement.consistent import ConsistencyReport
 from vggtjax.windows import run as windows
 
 
@@ -40,7 +41,7 @@ def test_a_long_clip_is_made_consistent_after_its_windows_are_joined(tmp_path, m
 
     def recorded(result, pictures, *, progress):
         seen.append((len(result.depth), len(list(pictures))))
-        return result, None
+        return result, ConsistencyReport(False)
 
     def run(clip):
         return window_result(clip, 0, np.zeros((FRAMES, CONFIG.height, CONFIG.width), bool))
@@ -50,3 +51,5 @@ def test_a_long_clip_is_made_consistent_after_its_windows_are_joined(tmp_path, m
         plan, out = plan_of(masks=True), tmp_path / str(consistent)
         windows.run_windows(images, out, windows_of(loops=False), plan, tools_of(run), SETTINGS, consistent=consistent)
     assert seen == [(FRAMES, FRAMES)]
+    made = [Reconstruction.load(tmp_path / str(consistent)) for consistent in (False, True)]
+    assert ["consistent_depth" in each.settings for each in made] == [False, True]

@@ -143,6 +143,8 @@ def test_a_lens_that_zooms_is_noticed_unless_it_is_known(corner, monkeypatch):
     one = dataclasses.replace(result, intrinsics=np.repeat(result.intrinsics[:1], len(zoomed), axis=0))
     fields = [consistent_depth(one, iter(pictures)), consistent_depth(result, iter(pictures), priors=KNOWN)]
     assert [report.change > 0 for _, report in fields] == [False, True]
+    monkeypatch.setattr(consistent, "_MOST_ZOOM", 1.0)
+    assert consistent_depth(one, iter(pictures))[1].change > 0  # so it was the guard
 
 
 def test_pictures_of_another_clip_are_refused(predicted, pictures):

@@ -216,6 +216,7 @@ def run_job(job: Job, models: Models, limits: Limits) -> None:
         pad_frames=True,
         on_stage=job.on_stage,
         method=request.method,
+        consistent_depth=True,
     )
     name = f"{safe_stem(request.files[0].name) if request.files else 'demo-clip'}-{request.method}"
     job.outputs = write_outputs(result, job.folder, name, job.on_stage)

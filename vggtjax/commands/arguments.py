@@ -21,7 +21,7 @@ Size = Annotated[Framing, tyro.conf.arg(name="input", help="")]
 Method = Annotated[Options, tyro.conf.arg(name="method", help="")]
 
 CONSISTENT = Options(consistent_depth=True)
-"""What `reconstruct` and `batch` do unless told otherwise; functions keep to the papers."""
+"""What the commands `reconstruct` and `batch` do unless told otherwise; functions keep to the papers."""
 
 
 def _result_folder(out: Path) -> Path:

@@ -232,13 +232,14 @@ def error_table(rows: Sequence[LadderRow], consistent: LadderRow | None = None) 
         for row in listed
     ]
     lines = [second_pass_in_words(rows)]
-    if consistent is not None:
-        words = _change_in_words(next(row for row in rows if row.method == "vggt"), consistent)
+    first = next((row for row in rows if row.method == "vggt"), None)
+    if consistent is not None and first is not None:
+        words = _change_in_words(first, consistent)
         lines.append(f"Depth and cameras fitted to the clip's pixels, compared with the first pass: {words}.")
     note = "\n".join(lines) + (
         "\nAbsRel: of depth after one median scale. Rotation: mean, relative to the first "
         "frame. Centres: RMSE after Sim(3), in median depths. Mask: mined from the first pass as in the paper, by "
-        "matches between its frames too, or the true one."
+        "matches between its frames too, by the clip's pixels after the fit, or the true one."
     )
     return ErrorTable(("method", "mask", *(heading for heading, _ in _COLUMNS.values())), cells, note.lstrip())
 

@@ -84,7 +84,7 @@ def _draw_cameras(
         colour = ways[name][1]
         draw.text((corner[0] + 90 * i, corner[1] + 22), name, colour, font)
         pixels = (way - middle) / span * (_PLOT - 80) * [1, -1] + [corner[0] + _PLOT / 2, corner[1] + 40 + _PLOT / 2]
-        draw.line([tuple(p) for p in pixels], fill=colour, width=3)
+        draw.line([tuple(p) for p in pixels], fill=colour, width=9 if name == "true" else 3)  # seen below the others
         for x, y in pixels:
             draw.ellipse((x - 4, y - 4, x + 4, y + 4), fill=colour)
         x, y = pixels[0]

@@ -217,7 +217,8 @@ def _all_passes(
     """Yield names and passes of `count` clips; None stands for a clip that is left out."""
     size = model.config.image_size if size is None else size
     options = options if isinstance(options, Options) else Options(**(options or {}))
-    options = options.changed(method=METHOD, align_scale=False, refine_mask=False)
+    as_in_the_paper = {"align_scale": False, "refine_mask": False, "refine_cameras": False, "consistent_depth": False}
+    options = options.changed(method=METHOD, **as_in_the_paper)
     common = {"model": model.identity.sha256, "size": size, "options": options.passes_settings(model.config.motion)}
 
     def passes(clip: _LabelledClip) -> ClipPasses:

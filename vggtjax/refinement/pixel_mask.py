@@ -54,7 +54,7 @@ def mask_by_pixels(result: R, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | N
     grey = grey_pictures(result, pictures, cells.grid)
     motion = pixel_motion(cells, grey, result.saliency, result.motion)
     pixels = np.stack([_pixels(*each) for each in zip(motion, result.images, strict=True)])
-    mask = np.asarray(_mask(pixels)) & result.inside_pictures
+    mask = np.asarray(_mask(pixels)) & result.inside_pictures & (result.depth != 0)
     settings = result.settings | {"masks": SOURCE}
     return dataclasses.replace(result, motion=motion / np.median(motion), dynamic_mask=mask, settings=settings)
 

@@ -1,4 +1,7 @@
-"""A long clip and a model -> a result on disk, window by window: memory does not depend on the clip's length."""
+"""A long clip and a model -> a result on disk, window by window: memory does not depend on the clip's length.
+
+Consistent depth is the exception: it fits the joined clip, of up to 512 frames, as a whole.
+"""
 
 from __future__ import annotations
 
@@ -86,6 +89,8 @@ def reconstruct_long(
     **changes: Any,
 ) -> Reconstruction:
     """Reconstruct a clip in windows, which are joined, and write the result: memory does not depend on the length.
+
+    Consistent depth is the exception: it fits the joined clip, of up to 512 frames, as a whole.
 
     Each window is run by `reconstruct`. What is done is kept in a folder inside `out`, so that the same call goes on
     where a killed run stopped; the folder is removed at the end.
@@ -243,8 +248,9 @@ def run_windows(
 
         if consistent:
             with seconds.stage("consistent depth"), plan.on_stage("consistent depth") as progress:
-                result, _ = consistent_depth(result, pictures(), progress=progress)
-            if result.motion is not None:
+                result, report = consistent_depth(result, pictures(), progress=progress)
+            result = dataclasses.replace(result, settings=result.settings | {"consistent_depth": True})
+            if report.changed and result.motion is not None:
                 with seconds.stage("mask by pixels"), plan.on_stage("mask by pixels"):
                     result = mask_by_pixels(result, pictures())
         with plan.on_stage("write") as progress:
