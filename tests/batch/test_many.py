@@ -252,7 +252,9 @@ def test_masks_by_clip(model, clips, tmp_path):
     ]
     words += ["--model", str(save_model(tmp_path / "m.safetensors", model.params, model.config))]
     assert cli.main(words) == 0
-    assert (Reconstruction.load(tmp_path / "b/clip4").dynamic_mask == made["clip4"].dynamic_mask).all()
+    again = Reconstruction.load(tmp_path / "b/clip4")
+    assert (again.dynamic_mask == made["clip4"].dynamic_mask).all()
+    assert again.settings["consistent_depth"] is True  # the command's default
     Image.fromarray(~masks[0]).save(tmp_path / "masks/clip4/0.png")
     assert cli.main(words) == 2
 

@@ -65,7 +65,8 @@ def test_a_second_run_adds_a_sequence_and_does_nothing_again(sequences, evaluate
 
 @pytest.mark.usefixtures("no_plots")
 def test_results_of_a_folder(sequences, tmp_path, capsys):
-    arguments = (*MODEL, "--out", tmp_path / "theirs/clip0", "--format", "vggt4d", "--only", "depth")
+    arguments = (*MODEL, "--out", tmp_path / "theirs/clip0", "--format", "vggt4d", "--only", "depth",
+                 "--no-consistent-depth")  # fmt: skip
     code, _, err = run(capsys, "reconstruct", sequences / "clip0/rgb", *arguments)
     assert code == 0, err
     score = ("evaluate", "plain", sequences, "--sequences")

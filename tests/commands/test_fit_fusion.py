@@ -81,7 +81,7 @@ def test_the_file_is_what_reconstruct_batch_and_evaluate_fuse_by(
     frames = sequences / "clip0" / "rgb"
     (tmp_path / "link.safetensors").symlink_to(tiny_demo_file)
     model = ["--model", tmp_path / "link.safetensors"]
-    common = ["--only", "cameras", *model]
+    common = ["--only", "cameras", "--no-consistent-depth", *model]
     results = {}
     save_fusion(tmp_path / "paper.safetensors", paper_rule())
     files = {"none": [], "paper": ["--fusion", tmp_path / "paper.safetensors"]}

@@ -79,7 +79,7 @@ def video(tmp_path_factory):
     return write_video(tmp_path_factory.mktemp("video") / "clip.mp4", range(0, 1600, 100), size=(SIDE, SIDE))
 
 
-_WORDS = ["--model", "demo", "--method", "vggt", "--only", "cameras", "--no-loops"]
+_WORDS = ["--model", "demo", "--method", "vggt", "--only", "cameras", "--no-loops", "--no-consistent-depth"]
 
 
 @pytest.fixture(scope="module")

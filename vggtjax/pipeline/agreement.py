@@ -60,9 +60,7 @@ def agree_with_pixels(
         with on_stage("consistent depth") as progress:
             points = None if refined is None else refined.points
             result, report = consistent_depth(result, pictures(), points=points, priors=priors, progress=progress)
-        if (
-            report.changed and result.motion is not None
-        ):  # pixels match better than the network
+        if report.changed and result.motion is not None:  # pixels match better than the network
             with on_stage("mask by pixels"):
                 result = mask_by_pixels(result, pictures())
         result = dataclasses.replace(result, settings=result.settings | {"consistent_depth": True})
