@@ -9,6 +9,7 @@ from tests.windows.walk import CONFIG, FRAMES, SETTINGS, plan_of, tools_of, walk
 from vggtjax import Reconstruction, load_clip, reconstruct
 from vggtjax.known.options import KnownGeometry
 from vggtjax.options import Options
+from vggtjax.pipeline import agreement
 from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.progress import StageSeconds
 from vggtjax.refinement.consistent import ConsistencyReport
@@ -39,14 +40,14 @@ def test_the_option_and_its_outcome_reach_the_result(tmp_path):
 def test_a_long_clip_is_made_consistent_after_its_windows_are_joined(tmp_path, monkeypatch):
     images, seen = np.asarray(walk().images), []
 
-    def recorded(result, pictures, *, progress):
+    def recorded(result, pictures, **_):
         seen.append((len(result.depth), len(list(pictures))))
         return result, ConsistencyReport(False)
 
     def run(clip):
         return window_result(clip, 0, np.zeros((FRAMES, CONFIG.height, CONFIG.width), bool))
 
-    monkeypatch.setattr(windows, "consistent_depth", recorded)
+    monkeypatch.setattr(agreement, "consistent_depth", recorded)
     for consistent in (False, True):
         plan, out = plan_of(masks=True), tmp_path / str(consistent)
         windows.run_windows(images, out, windows_of(loops=False), plan, tools_of(run), SETTINGS, consistent=consistent)

@@ -148,9 +148,9 @@ def _zoom(
     sigma: float,
     grid: tuple[int, int],
 ) -> float:
-    """Return how much what matches leave over grows from the middle of the picture, for each frame of time.
+    """Return how much further from the middle of the picture cells match than the world shows them, for each frame.
 
-    A lens that zooms leaves it, as cameras and depths take only a part of it.
+    A share of their distance from the middle. A lens that zooms leaves it: cameras and depths explain only a part.
     """
     pairs = frame_pairs(len(matched))
     error, place = matched - position, position - np.array(grid[::-1], np.float32) / 2

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -34,12 +35,11 @@ from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.track_head import check_track_size
 from vggtjax.options import Options
+from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.run import reconstruct
 from vggtjax.pipeline.steps import Execute
-from vggtjax.progress import OnStage, StageSeconds, no_stage
+from vggtjax.progress import OnStage, Progress, StageSeconds, no_stage
 from vggtjax.reconstruction import Reconstruction
-from vggtjax.refinement.consistent import consistent_depth
-from vggtjax.refinement.pixel_mask import mask_by_pixels
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
 from vggtjax.results.report import RunFacts, versions
@@ -246,13 +246,12 @@ def run_windows(
         def pictures() -> Iterator[UInt8[np.ndarray, "h w 3"]]:
             return (np.asarray(frame.image) for frame in opened.frames(plan.sampling))
 
-        if consistent:
-            with seconds.stage("consistent depth"), plan.on_stage("consistent depth") as progress:
-                result, report = consistent_depth(result, pictures(), progress=progress)
-            result = dataclasses.replace(result, settings=result.settings | {"consistent_depth": True})
-            if report.changed and result.motion is not None:
-                with seconds.stage("mask by pixels"), plan.on_stage("mask by pixels"):
-                    result = mask_by_pixels(result, pictures())
+        @contextmanager
+        def stage(name: str) -> Iterator[Progress | None]:
+            with seconds.stage(name), plan.on_stage(name) as progress:
+                yield progress
+
+        result = agree_with_pixels(result, pictures, Options(consistent_depth=consistent), on_stage=stage)
         with plan.on_stage("write") as progress:
             shown = pictures() if plan.saving.resolution == "original" else None
             facts = RunFacts(seconds.seconds)
