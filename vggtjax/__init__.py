@@ -2,6 +2,10 @@
 
 import lazy_loader
 
+from vggtjax.storage.load_order import load_in_order
+
+load_in_order()
+
 __version__ = "0.1.0"
 
 # Names and their modules stand in __init__.pyi; each is imported when it is first used.

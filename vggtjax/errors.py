@@ -49,6 +49,10 @@ class ClusterError(VggtjaxError, RuntimeError):
     """A cluster that is not there, is too small, has died, or runs other code."""
 
 
+class LoadOrderError(VggtjaxError, ImportError):
+    """A library that was imported before this one, and breaks what this one needs."""
+
+
 class MissingExtraError(VggtjaxError, ImportError):
     """A missing optional dependency; the message names the extra that installs it."""
 
