@@ -15,7 +15,9 @@ print("saved")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere libraries do not share symbols by name")
-@pytest.mark.parametrize("order", [("vggtjax", "pycolmap"), ("PIL.Image", "pycolmap", "vggtjax"), ("pycolmap", "vggtjax")])
+@pytest.mark.parametrize(
+    "order", [("vggtjax", "pycolmap"), ("PIL.Image", "pycolmap", "vggtjax"), ("pycolmap", "vggtjax")]
+)
 def test_pictures_and_archives_are_saved_or_the_order_of_imports_is_refused(order):
     """What must not happen is an abort or a hang while a result is written, after all the work."""
     pytest.importorskip("PIL")

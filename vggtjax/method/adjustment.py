@@ -235,7 +235,8 @@ def _change(
     is_free = np.arange(6 * S) >= 6
     H = jnp.zeros((S, S, 6, 6), of.blocks.dtype).at[seen_by[:, :, None], seen_by[:, None, :]].add(of.blocks)
     H = H.swapaxes(1, 2).reshape(6 * S, 6 * S) + jnp.diag(jnp.tile(prior, S))
-    g = (jnp.zeros((S, 6), of.blocks.dtype).at[seen_by].add(of.gradient) + prior[None] * state.moved).ravel() * is_free
+    g = (jnp.zeros((S, 6), of.blocks.dtype).at[seen_by].add(of.gradient) + prior[None] * state.moved).ravel()
+    g = jnp.where(is_free, g, 0)
     H = jnp.where(is_free[:, None] & is_free[None], H, np.eye(6 * S))
     if how.focal_prior is not None:
         column = jnp.zeros((S, 6), H.dtype).at[seen_by].add(of.focal_cameras).ravel() * is_free

@@ -7,7 +7,7 @@ backbone features -> first pass, with motion cues -> dynamic mask -> second pass
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal, ParamSpec, Protocol, TypeVar
 
@@ -27,6 +27,7 @@ from vggtjax.method.witnesses import Seen
 from vggtjax.network.backbone import encode
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
+from vggtjax.network.given import as_array, as_images
 from vggtjax.network.layers import Params
 from vggtjax.network.model import Predictions
 from vggtjax.network.precision import Compute
@@ -73,6 +74,13 @@ class Clips:
     images: Images
     query_points: Mapping[int, Float[Array, "B Q 2"]] = field(default_factory=dict)
     frames: int | None = None
+
+    @classmethod
+    def given(cls, clips: Clips | Images) -> Clips:
+        """Return clips, or images, as a caller gives them. Raises InputError for images that are not finite."""
+        clips = clips if isinstance(clips, cls) else cls(clips)  # type: ignore[arg-type]
+        points = {frame: as_array("query_points", points) for frame, points in clips.query_points.items()}
+        return replace(clips, images=as_images(clips.images), query_points=points)
 
     @property
     def counted(self) -> int:
@@ -139,7 +147,7 @@ def run_method(
 
     Returns depth, confidence and cameras, and the passes they were made of.
     """
-    clips = clips if isinstance(clips, Clips) else Clips(clips)
+    clips = Clips.given(clips)
     compute = compute or compute_by(options)
     check_fuses(fusion, options.method)
     passes = run_passes(
@@ -173,7 +181,8 @@ def run_passes(
         shared: passes over the same clips whose features and first pass are taken; they mined with the same `gram`,
             and have matches if the options read them.
     """
-    clips = clips if isinstance(clips, Clips) else Clips(clips)
+    clips = Clips.given(clips)
+    masks = given_masks(masks)
     compute = compute or compute_by(options)
     method, images, on_devices = options.row, clips.images, compute.frames.on_devices
     clips.check(compute.frames)
@@ -250,6 +259,11 @@ def _follow(
     if 0 in query_points:
         tracks[0] = Tracks(first.tracks, first.track_visibility, first.track_confidence)  # type: ignore[arg-type]
     return tracks
+
+
+def given_masks(masks: Masks) -> Masks:
+    """Return masks of any library as an array."""
+    return masks if masks is None or masks is False or isinstance(masks, SoftMasking) else as_array("masks", masks)
 
 
 def check_masks(masks: Masks, images: Images, frames: Frames = Frames()) -> None:

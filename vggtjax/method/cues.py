@@ -104,7 +104,9 @@ class GramCues:
             def summand(count, index, weights, q, k):
                 rows, columns = ({"q": q, "k": k}[name] for name in (cue.rows, cue.columns))
                 with products(self.precision):
-                    return count * jax.vmap(one_clip, (0, 0, None, 0))(rows, columns, index, weights)
+                    return count.astype(weights.dtype) * jax.vmap(one_clip, (0, 0, None, 0))(
+                        rows, columns, index, weights
+                    )
 
             return summand
 

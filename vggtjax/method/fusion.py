@@ -69,6 +69,6 @@ def scale_between(
 
     A pixel is static where its share is below 1/2, if the mask has shares.
     """
-    ratio = jnp.where(dynamic_mask >= 0.5, jnp.nan, depth1 / depth2)
+    ratio = jnp.where(dynamic_mask.astype(depth1.dtype) >= 0.5, jnp.nan, depth1 / depth2)
     median = median_over_frames(ratio, frames)
     return jnp.where(jnp.isfinite(median), median, 1.0)

@@ -35,8 +35,8 @@ def otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS, frames: Fram
     if is_counted is not None:  # others fall into a bin of their own
         index = jnp.where(jnp.repeat(is_counted, values.size // len(values)), index, bins)
     counts = frames.sum(jnp.bincount(index, length=bins + 1)[:bins])
-    counts = counts / counts.sum()
-    offsets = jnp.arange(bins) + 0.5  # means in units of bins, which keeps every sum of order one
+    counts = counts.astype(values.dtype) / counts.sum().astype(values.dtype)
+    offsets = jnp.arange(bins, dtype=values.dtype) + 0.5  # means in units of bins, which keeps every sum of order one
     below, above = jnp.cumsum(counts), jnp.cumsum(counts[::-1])[::-1]
     mean_below = jnp.cumsum(counts * offsets) / jnp.maximum(below, 1e-12)
     mean_above = jnp.cumsum((counts * offsets)[::-1])[::-1] / jnp.maximum(above, 1e-12)
@@ -152,7 +152,8 @@ def smooth_over_time(
     S, reach = saliency.shape[1], smooth_frames // 2
     every = frames.gather(saliency)[:, : frames.counted(S)]
     near = jnp.abs(jnp.asarray(frames.numbers(S))[:, None] - jnp.arange(every.shape[1])[None]) <= reach
-    weights = near / jnp.maximum(near.sum(axis=1, keepdims=True), 1)
+    near = near.astype(saliency.dtype)
+    weights = near / near.sum(axis=1, keepdims=True).clip(1)
     return jnp.einsum("st,bthw->bshw", weights, every, precision="highest")
 
 
@@ -189,7 +190,9 @@ def _binned(
     """
     width = (high - low) / bins
     index = jnp.nan_to_num((values.ravel() - low) / jnp.maximum(width, _SMALLEST_WIDTH))
-    return jnp.minimum(jnp.floor(index), bins - 1).astype(jnp.int32), low + width * (jnp.arange(bins) + 0.5)
+    return jnp.minimum(jnp.floor(index), bins - 1).astype(jnp.int32), low + width * (
+        jnp.arange(bins, dtype=values.dtype) + 0.5
+    )
 
 
 def multi_otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS) -> Float[Array, ""]:
@@ -202,13 +205,13 @@ def multi_otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS) -> Flo
     low, high = values.min(), values.max()
     index, centres = _binned(values, low, high, bins)
     counts = jnp.bincount(index, length=bins)
-    between = _between_classes(counts / values.size)
+    between = _between_classes(counts.astype(values.dtype) / values.size)
     best, best_score = high, jnp.asarray(-jnp.inf)
     for classes in range(2, MOST_CLASSES + 1):
         thresholds = centres[_partition(between, classes)]
         region = (values[..., None] >= thresholds[(None,) * values.ndim]).sum(axis=-1)
         sizes, sums = zip(*(_size_and_sum(values, region == i) for i in range(classes)), strict=True)
-        mean = jnp.stack(sums) / jnp.maximum(jnp.stack(sizes), 1)
+        mean = jnp.stack(sums) / jnp.maximum(jnp.stack(sizes), 1).astype(values.dtype)
         score = jnp.where(jnp.stack(sizes).all(), mean.var() / classes**0.5, -jnp.inf)
         wins = (jnp.count_nonzero(counts) >= classes) & (score > best_score)
         best, best_score = jnp.where(wins, thresholds[-1], best), jnp.where(wins, score, best_score)
@@ -221,7 +224,9 @@ def _between_classes(shares: Float[Array, " n"]) -> Float[Array, "n n"]:
     As in scikit-image, bin 0 counts as bin 1 does, and adds nothing as a class of its own.
     """
     n = len(shares)
-    mass, moment = (jnp.pad(jnp.cumsum(x), (1, 0)) for x in (shares, jnp.maximum(jnp.arange(n), 1) * shares))
+    mass, moment = (
+        jnp.pad(jnp.cumsum(x), (1, 0)) for x in (shares, jnp.arange(n, dtype=shares.dtype).clip(1) * shares)
+    )
     mass, moment = (x[None, 1:] - x[:n, None] for x in (mass, moment))
     is_class = (mass > 0) & (jnp.arange(n)[:, None] <= jnp.arange(n)[None])
     return jnp.where(is_class, moment**2 / jnp.where(is_class, mass, 1), 0).at[0, 0].set(0)

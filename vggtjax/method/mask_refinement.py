@@ -48,7 +48,8 @@ class ClusterLosses(NamedTuple):
     def total(self) -> Float[Array, "S K"]:
         """Depth plus mean over channels of colour; TOO_FEW for too few comparable projections."""
         S = self.depth.shape[0]
-        enough = (self.counted >= LEAST_SHARE * (S - 1) * self.points) & (self.counted > 0)
+        counted, points = (x.astype(self.depth.dtype) for x in (self.counted, self.points))
+        enough = (counted >= LEAST_SHARE * (S - 1) * points) & (counted > 0)
         return jnp.where(enough, self.depth + self.rgb / 3, TOO_FEW)
 
 
@@ -138,7 +139,11 @@ def cluster_points(
     def one_frame(frame: tuple[Array, Array, Array]) -> Int[Array, " N"]:
         key, points, is_real = frame
         count = jnp.maximum(is_real.sum(), 1)  # real points come first
-        drawn = jnp.where(count > fitted, (jnp.arange(fitted) * (count / fitted)).astype(jnp.int32), jnp.arange(fitted))
+        drawn = jnp.where(
+            count > fitted,
+            (jnp.arange(fitted, dtype=points.dtype) * (count / fitted)).astype(jnp.int32),
+            jnp.arange(fitted),
+        )
         centres = kmeans(key, points[drawn], clusters, is_real[drawn], restarts=RESTARTS).centres
         return nearest_centre(points, centres)
 
@@ -179,7 +184,7 @@ def cluster_losses(
         points = unproject(depth[frame], intrinsics[frame], camera_from_world[frame], pixel_offset=0.5)
         world = points.reshape(-1, 3)[pixels]
         colour = images[frame].reshape(-1, 3)[pixels]
-        member = jax.nn.one_hot(label, clusters) * is_real[:, None]
+        member = jax.nn.one_hot(label, clusters) * is_real[:, None].astype(jnp.float32)
 
         def one_target(target):
             number, shown, target_depth, pose, camera = target

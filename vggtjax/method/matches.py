@@ -58,8 +58,9 @@ def frame_pairs(S: int, steps: tuple[int, ...] = STEPS) -> FramePairs:
 def come_back(matches: Matches, pairs: FramePairs) -> Bool[Array, ""]:
     """Return whether enough of a clip's matches with the next frames come back; else matches say nothing."""
     next_ones = np.abs(pairs.offsets) == min(map(abs, pairs.offsets))
-    number = jnp.sum((matches.cycle < CYCLE) & (matches.confidence > 0), axis=(0, 2)) @ next_ones
-    return number > MATCHED_SHARE * pairs.exist[:, next_ones].sum() * matches.cycle.shape[2]
+    number = jnp.sum(((matches.cycle < CYCLE) & (matches.confidence > 0))[:, next_ones])
+    possible = jnp.sum(pairs.exist[:, next_ones]) * matches.cycle.shape[2]
+    return number.astype(jnp.float32) > MATCHED_SHARE * possible.astype(jnp.float32)
 
 
 def patch_centres(grid: tuple[int, int]) -> Float[np.ndarray, "P 2"]:
@@ -145,7 +146,7 @@ class DenseMatches:
             of_other = position_near[jnp.asarray(pairs.others) - first, back[None]]  # [S, M, P, 2]
             returned = jnp.take_along_axis(of_other, best[..., None], axis=2)
             squared = jnp.sum((returned - patch_centres(self.grid)[None, None]) ** 2, axis=-1)
-            return Matches(position, confidence * exist[..., None], jnp.sqrt(squared + _EPSILON))
+            return Matches(position, jnp.where(exist[..., None], confidence, 0), jnp.sqrt(squared + _EPSILON))
 
         return jax.lax.map(one_clip, (q, k, exist))
 
@@ -168,7 +169,7 @@ def _soft_argmax(
     best = jnp.argmax(logits, axis=-1)
     window, inside = _windows(grid)
     near = jnp.take_along_axis(logits, jnp.asarray(window)[best], axis=-1)  # [P, 9]
-    mass = jnp.exp(near - jax.nn.logsumexp(logits, axis=-1, keepdims=True)) * jnp.asarray(inside)[best]
+    mass = jnp.where(jnp.asarray(inside)[best], jnp.exp(near - jax.nn.logsumexp(logits, axis=-1, keepdims=True)), 0)
     confidence = mass.sum(axis=-1)
     position = jnp.einsum("pn,pnc->pc", mass, jnp.asarray(patch_centres(grid))[jnp.asarray(window)[best]])
     return position / jnp.maximum(confidence, _EPSILON)[:, None], confidence, best

@@ -47,4 +47,5 @@ def _values_of_ranks(flat: Array, order: Array, valid: Array, ranks: Int[Array, 
 
     found = jax.lax.fori_loop(0, _BITS, bit, jnp.zeros(ranks.shape, jnp.uint32))
     equal = valid[None] & (order[None] == found[..., None])
-    return frames.sum(jnp.where(equal, flat[None], 0).sum(axis=-1)) / jnp.maximum(frames.sum(equal.sum(axis=-1)), 1)
+    number = frames.sum(equal.sum(axis=-1)).astype(flat.dtype)
+    return frames.sum(jnp.where(equal, flat[None], 0).sum(axis=-1)) / jnp.maximum(number, 1)

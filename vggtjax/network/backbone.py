@@ -86,7 +86,9 @@ def patch_grid(images: Float[Array, "B S H W 3"], config: VGGTConfig) -> tuple[i
     """Return the rows and columns of patches. Raises InputError unless these are whole numbers of at least 1."""
     size = config.patch_size
     if images.ndim != 5 or images.shape[-1] != 3 or 0 in images.shape:
-        raise InputError(f"images have shape {tuple(images.shape)}; expected [B, S, H, W, 3] with at least one frame")
+        is_torch_like = images.ndim == 5 and images.shape[2] == 3 and 0 not in images.shape
+        remedy = ": np.moveaxis(images, 2, -1)" if is_torch_like else " with at least one frame"
+        raise InputError(f"images have shape {tuple(images.shape)}; expected [B, S, H, W, 3]{remedy}")
     H, W = images.shape[2:4]
     if H % size or W % size:
         raise InputError(f"images are {H} x {W} pixels; expected multiples of the patch size {size}")

@@ -21,6 +21,7 @@ from vggtjax.network.camera_head import ITERATIONS, CameraHead, predict_pose
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.dpt_head import DENSE_HEADS, DenseHead, predict_dense, project_tap
 from vggtjax.network.frames import Frames
+from vggtjax.network.given import as_array, as_images
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
@@ -102,14 +103,18 @@ def forward(
             `stop_camera_gradient`, `attention`, `frames`).
 
     Raises:
-        InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing.
+        InputError: shapes that do not fit, or unknown names. Shapes are static, so this happens while tracing. NaN or
+            infinity in images, unless the call is traced.
         TypeError: an unknown keyword.
     """
     if unknown := changes.keys() - ForwardChanges.__annotations__.keys():
         raise TypeError(f"forward() got unexpected keyword arguments: {', '.join(sorted(unknown))}")
     masking = {name: value for name, value in changes.items() if name in Suppression.__dataclass_fields__}
     computing: Any = {name: value for name, value in changes.items() if name not in masking}
-    clips = ClipBatch(images, patch_tokens, frame_count)
+    for name in masking.keys() & {"dynamic_tokens", "strength"}:
+        masking[name] = masking[name] if masking[name] is None else as_array(name, masking[name])
+    query_points = query_points if query_points is None else as_array("query_points", query_points)
+    clips = ClipBatch(as_images(images), patch_tokens, frame_count)
     suppression, compute = dataclasses.replace(suppression, **masking), Compute(**computing)
     options = {"outputs": outputs, "query_points": query_points, "accumulator": cues}
     return predict(params, clips, config, **options, suppression=suppression, compute=compute)

@@ -73,12 +73,13 @@ def products(precision: str) -> AbstractContextManager[None]:
 def full_precision(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
     """Trace `function` with every matrix product and convolution at the highest precision (never TF32).
 
-    The setting holds only while `function` is traced; nothing global changes.
+    Types are promoted as jax does by default, whatever the program has set: weights in bfloat16 meet float32. The
+    settings hold only while `function` is traced; nothing global changes.
     """
 
     @functools.wraps(function)
     def wrapped(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
-        with jax.default_matmul_precision("highest"):
+        with jax.default_matmul_precision("highest"), jax.numpy_dtype_promotion("standard"):
             return function(*args, **kwargs)
 
     return wrapped

@@ -21,4 +21,4 @@ def neighbours(
     """Return the pixels x, y before and after positions inside an image of H x W, and the share of those after."""
     last = jnp.asarray([size[1] - 1, size[0] - 1]).reshape((1,) * (positions.ndim - 1) + (2,))
     low = jnp.clip(jnp.floor(positions).astype(jnp.int32), 0, jnp.maximum(last - 1, 0))
-    return low, jnp.minimum(low + 1, last), positions - low
+    return low, jnp.minimum(low + 1, last), positions - low.astype(positions.dtype)

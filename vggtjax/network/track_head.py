@@ -96,7 +96,7 @@ class TrackHead(TapHead):
         maps = self._feature_maps(taps, grid)  # [B, S, H, W, F]
         size = (maps.shape[2], maps.shape[3])
         query = query_points / STRIDE
-        inside = jnp.clip(query, 0, jnp.asarray([[[size[1] - 1, size[0] - 1]]]))
+        inside = jnp.clip(query, 0, jnp.asarray([[[size[1] - 1, size[0] - 1]]], query.dtype))
         features = frames.of_first(jax.vmap(bilinear)(maps[:, 0], inside))  # [B, Q, F]
         features = jnp.broadcast_to(features[:, None], (B, S, *features.shape[1:]))
         pyramid = _pyramid(maps, config.track_corr_levels, config.track_corr_radius)

@@ -16,11 +16,12 @@ from jaxtyping import Array, Float
 from vggtjax.checkpoint import Model
 from vggtjax.config import MotionConfig, VGGTConfig
 from vggtjax.errors import InputError
-from vggtjax.method.algorithm import Clips, Masks, check_masks, compute_by, run_method
+from vggtjax.method.algorithm import Clips, Masks, check_masks, compute_by, given_masks, run_method
 from vggtjax.method.assembly import Assembly, FusionRule, as_tree
 from vggtjax.method.passes import Passes
 from vggtjax.method.soft_mask import SoftMasking
 from vggtjax.network.frames import Frames
+from vggtjax.network.given import as_images
 from vggtjax.network.layers import Params
 from vggtjax.options import Options
 from vggtjax.pipeline.devices import by_frame_padded, replicate
@@ -63,6 +64,7 @@ def infer(
         frames are all one picture is empty.
     """
     params, config = _network(params, config)
+    images, masks = as_images(images), given_masks(masks)
     _check_range(images, "images", "expected RGB in [0, 1]: divide bytes by 255")
     config = config if motion is None else dataclasses.replace(config, motion=motion)
     # Equal programs have equal options: the method's own values are filled in, and masks are not refined here.
