@@ -19,7 +19,8 @@ _LIGHTNESS_ONLY = (14, 15)  # ICtCp and IPT, as in Dolby Vision's profile 5, are
 _HD_LINES, _HD_COLUMNS = 720, 1280  # from either on, a video without tags is BT.709; below, swscale takes BT.601
 
 _WHITE = 203  # nits of SDR's white in HDR (ITU-R BT.2408)
-HDR = (_HLG, _PQ)
+HDR = (_HLG, _PQ)  # transfer
+WIDE = (_BT2020, _P3)  # primaries
 _PEAKS = {_HLG: 1000 / _WHITE, _PQ: 10000 / _WHITE}  # brightest value; HLG as on BT.2100's display of 1000 nits
 _NAMES = {_HLG: "HLG", _PQ: "PQ"}
 _HLG_GAMMA = 1.2  # of that display
@@ -46,7 +47,7 @@ class Colours:
     @property
     def is_plain(self) -> bool:
         """Whether values are shown as they are: SDR in the primaries of sRGB, or in such as are close to them."""
-        return self.transfer not in _PEAKS and self.primaries not in (_BT2020, _P3)
+        return self.transfer not in _PEAKS and self.primaries not in WIDE
 
     @property
     def note(self) -> str | None:
@@ -115,7 +116,7 @@ def _band(values: np.ndarray, colours: Colours) -> np.ndarray:
     if colours.transfer == _HLG:
         luminance = np.array(_XYZ.get(colours.primaries, _XYZ[_BT709])[1], np.float32) @ light
         light *= luminance ** np.float32(_HLG_GAMMA - 1) * peak
-    if colours.primaries in (_BT2020, _P3):
+    if colours.primaries in WIDE:
         light = _to_bt709(colours.primaries) @ light
     if colours.transfer in _PEAKS:
         _roll_off(light, peak)

@@ -17,7 +17,8 @@ from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 
 from vggtjax.errors import ClipError, InputError, check_regular
 from vggtjax.media.arrays import eight_bit
-from vggtjax.media.colour import HDR, srgb_of_coded
+from vggtjax.media.colour import HDR, WIDE, srgb_of_coded
+from vggtjax.media.profiles import in_srgb, profile_of
 from vggtjax.media.sampling import Frame, Sampling
 
 logger = logging.getLogger(__name__)
@@ -85,7 +86,7 @@ def is_image_name(path: Path) -> bool:
 def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
     """Read an image file as upright RGB.
 
-    The orientation of its EXIF data is applied, transparency is composited over white, 16-bit values are scaled to
+    The orientation of its EXIF data is applied, colours are converted to sRGB by its ICC profile, transparency is composited over white, 16-bit values are scaled to
     8 bits and floating-point values must lie in [0, 1]. With `said`, the kinds of warnings that were given, pictures
     that use few of their bits or have others behind them are warned of.
 
@@ -99,9 +100,10 @@ def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
             check_pixels(image, path)
             is_deep, count = _has_sixteen_bits(image), 1 if image.format in _SEVERAL else getattr(image, "n_frames", 1)
             picture = to_rgb(ImageOps.exif_transpose(image), path.name)
-            picture, hdr = _without_hdr(picture, path, image.info.get("nclx_profile"))
-        if said is not None and hdr is not None:
-            _say(path, hdr, "hdr", said)
+            note = profile_of(image).note
+            picture, coded_note = _by_code(picture, path, image.info.get("nclx_profile"), has_profile=note is not None)
+        if said is not None and (coded_note or note):
+            _say(path, str(coded_note or note), "colours", said)
         if said is not None and count > 1:
             _say(path, f"holds {count} pictures; the first is read, write the others as files", "several", said)
         if said is not None and _is_panorama(image):
@@ -121,14 +123,14 @@ def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
         raise ClipError(f"cannot read image {path}: {reason}; leave it out or write it anew") from error
 
 
-def _without_hdr(picture: Image.Image, path: Path, profile: Any) -> tuple[Image.Image, str | None]:
-    """Return a picture as SDR, by the colours that its HEIF file states, and what was done, if anything was.
+def _by_code(picture: Image.Image, path: Path, coded: Any, *, has_profile: bool) -> tuple[Image.Image, str | None]:
+    """Return a picture as sRGB, by the code of colours that its HEIF file states, and what was done, if anything was.
 
     The file is read again for its 10 or 12 bits, of which Pillow's pictures have 8.
     """
     names = ("transfer_characteristics", "color_primaries")
-    transfer, primaries = (int(profile[name]) for name in names) if profile else (0, 0)
-    if transfer not in HDR:
+    transfer, primaries = (int(coded[name]) for name in names) if coded else (0, 0)
+    if transfer not in HDR and (has_profile or primaries not in WIDE):
         return picture, None
     file = pi_heif.open_heif(path, convert_hdr_to_8bit=False)
     deep = np.array(file)  # a copy: a view does not keep the file's memory
@@ -186,7 +188,7 @@ def has_transparency(image: Image.Image) -> bool:
 
 
 def to_rgb(image: Image.Image, name: str) -> Image.Image:
-    """Return an image of any mode as RGB, as `read_image` does; errors say `name`."""
+    """Return an image of any mode and ICC profile as RGB in sRGB, as `read_image` does; errors say `name`."""
     if image.mode == "I" or image.mode == "F" or image.mode.startswith("I;16"):
         values = np.asarray(image)
         if image.mode == "I":  # 32 bits that hold 16
@@ -194,10 +196,13 @@ def to_rgb(image: Image.Image, name: str) -> Image.Image:
                 raise ClipError(f"frame {name} has values from {values.min()} to {values.max()}; expected 16 bits")
             values = values.astype(np.uint16)
         return Image.fromarray(eight_bit(values, name)).convert("RGB")
-    if has_transparency(image):
-        image = image.convert("RGBA")
+    if has_transparency(image):  # white is white in sRGB, too
+        stored, image = image, image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-    return image.convert("RGB")
+        image.info = stored.info
+    elif image.mode not in ("L", "CMYK"):
+        image = image.convert("RGB")
+    return in_srgb(image if image.mode != "RGBA" else image.convert("RGB")).convert("RGB")
 
 
 def _has_sixteen_bits(image: ImageFile.ImageFile) -> bool:

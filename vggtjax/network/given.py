@@ -28,8 +28,8 @@ def as_array(name: str, value: Any) -> Any:
     if array.dtype.kind not in "biuf":
         kind = f"{type(value).__module__}.{type(value).__qualname__}".removeprefix("builtins.")
         raise InputError(
-            f"{name}: numpy cannot read this {kind} ({one_line(problem, 120)}); expected an array of jax or numpy: of a "
-            "tensor give tensor.detach().float().cpu().numpy()"
+            f"{name}: numpy cannot read this {kind} ({one_line(problem, 120)}); expected an array of jax or numpy: "
+            "of a tensor give tensor.detach().float().cpu().numpy()"
         )
     return array
 
@@ -51,7 +51,7 @@ def as_images(images: Any) -> Float[Array, "B S H W 3"]:
         if not is_finite.all():
             place = ", ".join(map(str, np.argwhere(~is_finite)[0]))
             raise InputError(
-                f"images have {np.sum(~is_finite)} values that are NaN or infinite, the first at [{place}]; one of them "
-                "would spoil the depth of all frames: repair them, or leave out their frames"
+                f"images have {np.sum(~is_finite)} values that are NaN or infinite, the first at [{place}]; one of "
+                "them would spoil the depth of all frames: repair them, or leave out their frames"
             )
     return images
