@@ -15,6 +15,7 @@ from jaxtyping import Float, Float32, Float64, Int, UInt8
 
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.clips.preprocessing import Fit, Fitter, Framing, Mode
+from vggtjax.clips.shots import looks_of, warn_of_shots
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.clips.still import same_picture
 from vggtjax.config import VGGTConfig
@@ -108,6 +109,7 @@ def load_clip(
     stride: int = 1,
     start: int = 0,
     max_frames: int | None = None,
+    skip: str | None = None,
     progress: Progress | None = None,
 ) -> Clip:
     """Load frames and bring them to the model's size the way VGGT was trained (Pillow's bicubic, 8 bits).
@@ -131,6 +133,7 @@ def load_clip(
         stride: take every stride-th frame; not together with `fps`.
         start: index of the first frame to take, counted in frames of the source, for video too.
         max_frames: take at most this many frames; a video is not decoded further.
+        skip: frames to leave out, such as "0-2,17", counted as for `start`.
         progress: called after each frame with the number of frames done and of all frames, None if unknown.
 
     Returns:
@@ -140,7 +143,7 @@ def load_clip(
         InputError: an argument out of range, something else than a model, or another patch size than the model's.
         ClipError: no frames, a source that is missing or cannot be read, or a frame that cannot be used.
     """
-    fitter, sampling = _fitter(model, mode, size, patch), Sampling(start, stride, fps, max_frames)
+    fitter, sampling = _fitter(model, mode, size, patch), Sampling(start, stride, fps, max_frames, skip)
     return read_clip(open_source(source), sampling, fitter, progress)
 
 
@@ -156,11 +159,18 @@ def _fitter(model: Configured | None, mode: Mode, size: int | None, patch: int |
 
 
 def read_clip(
-    source: Source, sampling: Sampling, fitter: Fitter, progress: Progress | None = None, *, warn: bool = True
+    source: Source,
+    sampling: Sampling,
+    fitter: Fitter,
+    progress: Progress | None = None,
+    *,
+    warn: bool = True,
+    is_part: bool = False,
 ) -> Clip:
     """Read the frames of a source that `sampling` takes, fitted to the model; `load_clip` says more.
 
-    With `warn` what the source leaves out, large cuts and padding are logged.
+    With `warn` what the source leaves out, large crops and padding are logged, and, unless the frames are a part of a
+    clip, those that are no part of its scene.
     """
     if warn:
         warn_of_left_out(source)
@@ -195,6 +205,9 @@ def read_clip(
         cut = 100 * most.cut_share
         logger.warning("%s %.0f %% of their pixels above and below; mode 'pad' (--preprocess pad) keeps all", size, cut)
     images, fits = _joined(pixels, fits, warn=warn)
+    boxes = np.array([fit.box for fit in fits], np.int64)
+    if warn and not is_part:
+        warn_of_shots(looks_of(images, boxes), names, sampling)
     return Clip(
         images=images,
         frame_names=names,
@@ -205,7 +218,7 @@ def read_clip(
         source_size=np.array([fit.source_size[::-1] for fit in fits], np.int64),
         source_scale=np.array([fit.scale for fit in fits], np.float64),
         source_offset=np.array([fit.offset for fit in fits], np.float64),
-        valid_box=np.array([fit.box for fit in fits], np.int64),
+        valid_box=boxes,
         source=source,
         sampling=sampling,
     )

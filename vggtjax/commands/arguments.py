@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -60,6 +60,16 @@ def _view(view: Switch = False) -> bool:
     return view
 
 
+def _shots(shots: Literal["keep", "split"] = "keep") -> str:
+    """Return the choice.
+
+    Args:
+        shots: keep a clip with cuts as one clip, or split it: each shot gets a result of its own, in OUT/shot_1 and on,
+            without flashes and frames of one colour
+    """
+    return shots
+
+
 def _shard(shard: Annotated[str | None, tyro.conf.arg(metavar="K/N", help_behavior_hint="")] = None) -> str | None:
     """Return the choice.
 
@@ -76,4 +86,5 @@ EvaluationFolder = Annotated[
     Path, tyro.conf.arg(constructor=_evaluation_folder, name="output", prefix_name=False, help="")
 ]
 View = Annotated[bool, tyro.conf.arg(constructor=_view, name="output", prefix_name=False, help="")]
+Shots = Annotated[str, tyro.conf.arg(constructor=_shots, name="input", prefix_name=False, help="")]
 Shards = Annotated[str | None, tyro.conf.arg(constructor=_shard, name="output", prefix_name=False, help="")]

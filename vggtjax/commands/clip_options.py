@@ -30,6 +30,13 @@ class GivenInputs:
         if self.masks is not None and self.no_masks:
             raise InputError("--masks and --no-masks are opposites; give one of them")
 
+    def check_one_shot(self) -> None:
+        """Raise InputError for points to follow, which are points of one shot."""
+        if self.tracks is not None:
+            raise InputError(
+                "--shots split and --tracks exclude each other: take one shot, by --start and --max-frames"
+            )
+
     def check(self, recipe: ClipRecipe, windows: Windows) -> None:
         """Raise InputError for missing files, for options that need mined masks, and for those that exclude others."""
         if windows.window and recipe.devices > 1:

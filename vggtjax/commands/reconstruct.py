@@ -8,7 +8,7 @@ from typing import Annotated
 import tyro
 
 from vggtjax.batch.recipe import ClipRecipe
-from vggtjax.commands.arguments import CONSISTENT, ResultFolder, Sources, View
+from vggtjax.commands.arguments import CONSISTENT, ResultFolder, Shots, Sources, View
 from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
@@ -26,6 +26,7 @@ def reconstruct(
     recipe: Annotated[ClipRecipe, tyro.conf.arg(name="", help="")] = ClipRecipe(options=CONSISTENT),
     given: Annotated[GivenInputs, tyro.conf.arg(name="input", help="")] = GivenInputs(),
     windows: Annotated[Windows, tyro.conf.arg(name="limits", help="")] = Windows(),
+    shots: Shots = "keep",
     out: ResultFolder,
     view: View = False,
 ) -> None:
@@ -37,6 +38,7 @@ def reconstruct(
         recipe: how the clip is read, reconstructed and written
         given: masks and points of your own
         windows: how a long clip is cut
+        shots: whether each shot gets a result of its own
         out: folder for the result
         view: whether the viewer opens at the end
     """
@@ -45,6 +47,7 @@ def reconstruct(
     frames = source[0] if len(source) == 1 else list(source)
     report = Report()
     with report.running():
+        from vggtjax.clips.shots import shot_samplings
         from vggtjax.clips.sources import open_source
         from vggtjax.known.given import check_readable
         from vggtjax.pipeline.devices import frames_mesh
@@ -58,14 +61,29 @@ def reconstruct(
         check_refinement(recipe.options.refine_cameras, recipe.known.poses is not None)
         check_readable(recipe.known)
         frames_mesh(recipe.devices)
-        check_folder(out, recipe.saving.names(tracks=given.tracks is not None))
+        samplings = {out: recipe.sampling}
+        if shots == "split":
+            given.check_one_shot()
+            with report.stage("find shots"):
+                found = shot_samplings(opened, recipe.sampling)
+            samplings = {out / f"shot_{number}": sampling for number, sampling in enumerate(found, start=1)}
+        for folder in samplings:
+            check_folder(folder, recipe.saving.names(tracks=given.tracks is not None))
         network, fitted, options = files.load_fastest(report, recipe.options, [recipe.options.method])
         recipe = dataclasses.replace(recipe, options=options)
         from vggtjax.commands.one_clip import OneClip
 
-        result = OneClip(report, frames, network, fitted, recipe, given, out, opened).run(windows)
-    report.summary(result, out, network)
+        results = {}
+        for folder, sampling in samplings.items():
+            if shots == "split":
+                report.note(
+                    f"{folder.name} of {len(samplings)}: from frame {sampling.start}, {sampling.max_frames} frames"
+                )
+            own = dataclasses.replace(recipe, sampling=sampling)
+            results[folder] = OneClip(report, frames, network, fitted, own, given, folder, opened).run(windows)
+    for folder, result in results.items():
+        report.summary(result, folder, network)
     if given.tracks is not None and "tracks" in network.untrained_heads:
         report.line("The track head of this model is untrained: its tracks show that everything runs, no more.")
     if view:
-        serve(report, [result], [str(out)])
+        serve(report, list(results.values()), list(map(str, results)))

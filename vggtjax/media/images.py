@@ -86,7 +86,8 @@ def is_image_name(path: Path) -> bool:
 def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
     """Read an image file as upright RGB.
 
-    The orientation of its EXIF data is applied, colours are converted to sRGB by its ICC profile, transparency is composited over white, 16-bit values are scaled to
+    The orientation of its EXIF data is applied, colours are converted to sRGB by its ICC profile, transparency is
+    composited over white, 16-bit values are scaled to
     8 bits and floating-point values must lie in [0, 1]. With `said`, the kinds of warnings that were given, pictures
     that use few of their bits or have others behind them are warned of.
 

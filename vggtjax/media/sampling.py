@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Protocol, TypeVar
+from typing import Annotated, Protocol, TypeVar
 
 import numpy as np
+import tyro
 from jaxtyping import Float32
 from PIL import Image
 
@@ -45,11 +48,14 @@ class Sampling:
     """take so many frames per second of a video, by presentation time; not together with stride"""
     max_frames: InWords[int | None] = None
     """take at most so many frames; all by default"""
+    skip: Annotated[str | None, tyro.conf.arg(metavar="N,N-N", help_behavior_hint="")] = None
+    """frames to leave out, such as 0-2,17, counted as for start; none by default"""
 
     def __post_init__(self) -> None:
         for name, lowest in (("start", 0), ("stride", 1), ("max_frames", 1)):
             if name == "start" or getattr(self, name) is not None:
                 object.__setattr__(self, name, whole_number(name, getattr(self, name), lowest))
+        _ = self._skipped
         if self.fps is None:
             return
         if isinstance(self.fps, bool) or not isinstance(self.fps, Real) or not 0 < self.fps < math.inf:
@@ -63,7 +69,22 @@ class Sampling:
         """Frames of the source from one taken frame to the next, without `fps`."""
         return 1 if self.stride is None else self.stride
 
-    def indices(self, count: int) -> range:
+    @functools.cached_property
+    def _skipped(self) -> tuple[range, ...]:
+        """The frames to leave out. Raises InputError for text that is no list of frames."""
+        if self.skip is None:
+            return ()
+        parts = [re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", part) for part in str(self.skip).split(",")]
+        ranges = [range(int(part[1]), int(part[2] or part[1]) + 1) for part in parts if part]
+        if len(ranges) < len(parts) or not all(ranges):
+            raise InputError(f"skip is {self.skip!r}; expected numbers of frames, such as 0-2,17")
+        return tuple(ranges)
+
+    def takes(self, index: int) -> bool:
+        """Return whether a frame of the source is not among those to leave out."""
+        return not any(index in skipped for skipped in self._skipped)
+
+    def indices(self, count: int) -> Sequence[int]:
         """Return the indices taken of `count` still frames. Raises InputError for `fps`, ClipError for a late start."""
         if self.fps is not None:
             raise InputError(
@@ -72,7 +93,13 @@ class Sampling:
             )
         if self.start >= count:
             raise ClipError(f"start is {self.start}, but the source has only {count} frames; expected below {count}")
-        return range(self.start, count, self.step)[: self.max_frames]
+        every = range(self.start, count, self.step)
+        taken = [index for index in every if self.takes(index)] if self._skipped else every
+        if not taken:
+            raise ClipError(
+                f"skip is {self.skip!r} and leaves no frame of {len(every)}; expected to leave one at least"
+            )
+        return taken[: self.max_frames]
 
     def select(self, frames: Iterable[tuple[float, Item]]) -> Iterator[tuple[int, float, Item]]:
         """Yield (index, time, item) of the frames taken; frames after the last one are not read.
@@ -94,13 +121,15 @@ class Sampling:
                 passed = (time - begin + TIME_ROUNDING) * self.fps
                 wanted = passed >= tick
                 tick = max(tick, math.floor(passed) + 1)
-            if wanted:
+            if wanted and self.takes(index):
                 yield index, time, item
                 taken += 1
                 if taken == self.max_frames:
                     return
         if not count:
             raise ClipError("the source has no frames; expected at least one")
+        if not taken and self.start < count:
+            raise ClipError(f"skip is {self.skip!r} and leaves no frame of {count}; expected to leave one at least")
         if not taken:
             raise ClipError(f"start is {self.start}, but the source has only {count} frames; expected below {count}")
 

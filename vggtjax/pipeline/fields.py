@@ -12,6 +12,7 @@ from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
+from vggtjax.clips.shots import looks_of
 from vggtjax.method.assembly import Assembly, FusionRule
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.method.passes import Passes
@@ -24,9 +25,15 @@ _MATCHED = "mined: matches between frames and Gram similarities"
 _NOT_MATCHED = "mined: Gram similarities, as matches between frames cannot be used"
 
 
-def assembled_fields(assembly: Assembly, source: Predictions) -> dict[str, Any]:
-    """Return a method's depth, confidence and cameras of the first clip; the pass `source` gave the intrinsics."""
+def assembled_fields(assembly: Assembly, source: Predictions, clip: Clip) -> dict[str, Any]:
+    """Return a method's depth, confidence and cameras of the first clip; the pass `source` gave the intrinsics.
+
+    Frames of one colour have the lowest confidence of all pixels: nothing in them tells their depth.
+    """
     depth, confidence, camera_from_world, intrinsics = (np.array(x)[0] for x in jax.tree.leaves(assembly))
+    blank = [number for number, look in enumerate(looks_of(clip.images, clip.valid_box)) if look.is_blank]
+    if blank:
+        confidence[blank] = np.nanmin(confidence)
     fields_of_view = np.asarray(source.pose_encoding)[0][:, [8, 7]]  # of width and height
     focal = intrinsics[:, [0, 1], [0, 1]]
     # tan(fov / 2) has period 2 pi: a field of view above pi gets a negative focal length, which Reconstruction clamps.

@@ -245,7 +245,7 @@ def _result(
     tracked = {} if tracks is None or passes.tracks is None else track_fields(tracks, passes.tracks, len(clip.images))
     try:
         return Reconstruction(
-            **assembled_fields(assembly, getattr(passes, options.row.intrinsics)),
+            **assembled_fields(assembly, getattr(passes, options.row.intrinsics), clip),
             **clip_fields(clip),
             **tracked,
             saliency=np.asarray(passes.saliency[0]),

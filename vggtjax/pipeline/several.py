@@ -85,7 +85,7 @@ def _as_method(
             warnings.simplefilter("ignore", FieldOfViewWarning)
         result = dataclasses.replace(
             result,
-            **assembled_fields(assembly, getattr(passes, method.intrinsics)),
+            **assembled_fields(assembly, getattr(passes, method.intrinsics), clip),
             method=options.method,
             settings=settings if fusion is None else settings | {"fusion": fusion_digest(fusion)},
             passes=None,

@@ -14,6 +14,7 @@ import numpy as np
 
 from vggtjax.clips.clip import Clip, read_clip, warn_of_left_out
 from vggtjax.clips.preprocessing import Fitter
+from vggtjax.clips.shots import looks_of, warn_of_shots
 from vggtjax.errors import ClipError
 from vggtjax.media.sampling import Frame, Sampling, Source
 from vggtjax.results.result import Result
@@ -50,17 +51,21 @@ def window_clips(source: Source, sampling: Sampling, fitter: Fitter, windows: Se
     warn_of_left_out(source)
     reading = source.frames(sampling)
     held: Clip | None = None
-    read = 0
+    read, looks, names = 0, [], []
     for window in windows:
         count = window.stop - read
         try:
-            fresh = read_clip(_Next(source.name, reading, count), Sampling(), fitter, warn=held is None)
+            fresh = read_clip(_Next(source.name, reading, count), Sampling(), fitter, warn=held is None, is_part=True)
         except ValueError as error:
             if isinstance(error, ClipError):
                 raise
             raise _changed(read) from error
         if len(fresh) < count:
             raise _changed(read + len(fresh))
+        looks += looks_of(fresh.images, fresh.valid_box)
+        names += fresh.frame_names
+        if window.stop == windows[-1].stop:
+            warn_of_shots(looks, names, sampling)
         clip = fresh if held is None else _joined(held, fresh)
         read = window.stop
         held = _part(clip, range(len(clip) - len(window), len(clip)))
