@@ -190,9 +190,7 @@ def test_depth_maps_are_no_film(tmp_path, folder, low, high, is_depth):
     paths = [tmp_path / folder / f"{number}.png" for number in range(3)]
     for source in (tmp_path / folder, tmp_path / folder / "*.png", paths):
         if is_depth:
-            with pytest.raises(
-                ClipError, match=r"16-bit single-channel pictures, likely depth maps \(0.png\); give the"
-            ):
+            with pytest.raises(ClipError, match=r"single-channel pictures, likely depth maps \(0.png\); give"):
                 open_source(source)
         else:
             assert open_source(source).total(Sampling()) == 3

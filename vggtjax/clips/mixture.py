@@ -68,8 +68,8 @@ def check_frames(images: Sequence[Path], place: str) -> None:
 def check_colours(images: Sequence[Path]) -> None:
     """Raise ClipError where several pictures are likely depth maps; the first and the last are looked at.
 
-    These have one channel of 16 bits, or floats, and are named as depth, or lack the dark values of a grey film: between
-    unknown pixels (0, or the highest value) and the nearest surface there is a gap. A single picture is taken as it is.
+    These have one channel of 16 bits, or floats, and are named as depth, or lack the dark values of a grey film: there
+    is a gap between unknown pixels (0, or the highest value) and the nearest surface. One picture is taken as it is.
     """
     ends = [images[0], images[-1]] if len(images) > 1 else []
     if ends and all(map(_is_depth, ends)):
