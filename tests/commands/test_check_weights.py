@@ -124,6 +124,8 @@ def test_beside_code_that_gives_the_same(tmp_path, capsys, seeded):
     assert re.search(r"SHA-256 of tiny.safetensors \| [0-9a-f]{64} ", out)
     code, _, err = run(capsys, seeded, seeded[0] / "tiny.safetensors", "--out", tmp_path / "out")
     assert (code, "check-weights.md exists" in err) == (2, True)
+    assert run(capsys, seeded, seeded[0] / "tiny.safetensors", "--out", tmp_path / "out", "--overwrite")[0] == 0
+    assert "public code" not in (tmp_path / "out" / "check-weights.md").read_text()
 
 
 def test_a_wrong_output_is_named_and_the_exit_code_is_1(tmp_path, capsys, seeded):
@@ -181,6 +183,9 @@ def test_bad_input(tmp_path, capsys, seeded, monkeypatch, tiny_demo):
     (peer / "vggt" / "models" / "vggt.py").write_text("import a_module_that_is_not_there")
     code, _, err = run(capsys, seeded, weights, "--peer", peer)
     assert (code, "No module named 'a_module_that_is_not_there'; install what it needs" in err) == (2, True)
+    (peer / "vggt" / "models" / "vggt.py").write_text("import os\nos.kill(os.getpid(), 9)")
+    code, _, err = run(capsys, seeded, weights, "--peer", peer)
+    assert (code, "was ended by signal 9, as a system does that is short of memory" in err) == (2, True)
     monkeypatch.setattr(command, "find_spec", lambda name: None)
     code, _, err = run(capsys, seeded, weights, "--peer", peer)
     assert (code, "torch is not installed; pip install torch" in err) == (2, True)

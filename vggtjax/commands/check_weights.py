@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vggtjax.commands.arguments import Revision
+from vggtjax.commands.arguments import Overwrite, Revision
 from vggtjax.commands.models import at_revision, load
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
@@ -33,6 +33,7 @@ def check_weights(
     revision: Revision = None,
     config: InWords[Path | None] = None,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FOLDER", help_behavior_hint="")] = None,
+    overwrite: Overwrite = False,
 ) -> int:
     """Check a model's weights on the embedded clip, alone or beside the public PyTorch code; print a table to paste.
 
@@ -48,12 +49,14 @@ def check_weights(
         revision: commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use.
         config: JSON file with the configuration; VGGT-1B by default.
         out: folder for the table, as check-weights.md; by default it is printed alone.
+        overwrite: replace the file if it exists.
     """
     if not 0 < tolerance < 1:
         raise InputError(f"tolerance is {tolerance}; expected a number between 0 and 1")
+    peer = None if peer is None else peer.expanduser().resolve()
     packages = [] if peer is None else _packages(peer)
     if out is not None:
-        check_free(out, [_REPORT], replaced=False, what="check")
+        check_free(out, [_REPORT], replaced=overwrite, what="check")
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")  # both processes share a GPU
     report = Report()
     with report.running(), TemporaryDirectory() as folder:
@@ -102,7 +105,6 @@ def check_weights(
 
 def _packages(peer: Path) -> list[str]:
     """Return the packages of a checkout that are compared; raise InputError without VGGT's, or without torch."""
-    peer = peer.expanduser()
     if not (peer / "vggt" / "models" / "vggt.py").is_file():
         raise InputError(
             f"{peer} has no file vggt/models/vggt.py; expected a checkout of the public code of VGGT, the folder in "
