@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import struct
 import subprocess
 import sys
 from collections import Counter
@@ -71,11 +72,31 @@ def test_colmap_reads_the_model_and_projects_its_points(tmp_path, result, pictur
         np.testing.assert_array_less(np.abs(point.color.astype(int) - 60) % 40, 1)  # of the wall
         pixels = [image.project_point(point.xyz) for image in images]
         assert any(pixel is not None and (pixel >= 0).all() for pixel in pixels)
+    positions, errors = read_as_trainers_do(tmp_path / "out/sparse/0", form == "colmap")
+    np.testing.assert_allclose(sorted(positions), sorted(point.xyz.tolist() for point in model.points3D.values()))
+    assert set(errors) == {-1}
     if form == "colmap":
         for number, name in enumerate(names):
             view = read_views(tmp_path / "out/sparse/0")[name]
             np.testing.assert_allclose(view.camera_from_world, result.camera_from_world[number], atol=1e-6)
             np.testing.assert_allclose(view.intrinsics[:2] / scale, result.intrinsics[number][:2], rtol=1e-6)
+
+
+def read_as_trainers_do(folder, binary):
+    """Read positions and errors of points record by record, as the loaders of splats do, and step over their tracks."""
+    if not binary:
+        lines = (folder / "points3D.txt").read_text().splitlines()
+        words = [line.split() for line in lines if not line.startswith("#")]
+        return [list(map(float, word[1:4])) for word in words], [float(word[7]) for word in words]
+    data, place = (folder / "points3D.bin").read_bytes(), 8
+    positions, errors = [], []
+    for _ in range(*struct.unpack_from("<Q", data)):
+        _, *position, _, _, _, error, length = struct.unpack_from("<QdddBBBdQ", data, place)
+        place += struct.calcsize("<QdddBBBdQ") + 8 * length
+        positions.append(position)
+        errors.append(error)
+    assert place == len(data)
+    return positions, errors
 
 
 @pytest.mark.parametrize("original", [False, True])

@@ -55,8 +55,8 @@ def run_public(task: Task) -> tuple[Arrays, Facts]:
     done = subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
     if done.returncode < 0:
         raise InputError(
-            f"the public code in {task.checkout} was ended by signal {-done.returncode}, as a system does that is short "
-            "of memory; take fewer frames (--frames)"
+            f"the public code in {task.checkout} was ended by signal {-done.returncode}, as a system does that is "
+            "short of memory; take fewer frames (--frames)"
         )
     if done.returncode:
         words = [line for line in done.stderr.splitlines() if line.strip()] or [f"exit code {done.returncode}"]
