@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.worker import PeakMemory
-from testing.process_memory import process_bytes
 from vggtjax.errors import InputError
+from vggtjax.storage.process_memory import process_bytes
 
 
 def run_command(words: list[str], cache: Path, devices: int = 1) -> dict[str, Any]:

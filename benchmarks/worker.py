@@ -14,15 +14,18 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import numpy as np
 
-from testing.process_memory import process_bytes
 from testing.seeded import seeded_images
+from vggtjax.config import vggt_1b
+from vggtjax.parity.public_code import add_checkout, build, give_weights, read_weights
 from vggtjax.storage.cores import core_count
+from vggtjax.storage.process_memory import process_bytes
 
 Outputs = dict[str, np.ndarray]
 Run = Callable[[str, np.ndarray, np.ndarray | None], Outputs]  # work, images [S, 3, H, W] in [0, 1], mask [S, H, W]
@@ -81,9 +84,9 @@ def peer(weights: Path, checkout: Path, *, mapped: bool, dtype: str) -> Run:
     the CPU in place of CUDA. The weights of all heads are loaded as by `from_pretrained`; with `mapped` they are mapped
     as ours, and for a plain pass only those of its heads. In bfloat16 all of it runs under PyTorch's autocast.
     """
-    sys.path.insert(0, str(checkout))
+    add_checkout(checkout)
     import torch
-    from safetensors.torch import load_file, load_model
+    from safetensors.torch import load_model
 
     torch.set_num_threads(core_count())
     models: dict[str, Any] = {}
@@ -91,20 +94,14 @@ def peer(weights: Path, checkout: Path, *, mapped: bool, dtype: str) -> Run:
     def model_for(work: str) -> Any:
         if work not in models:
             models.clear()
-            if work == "pass":
-                from vggt.models.vggt import VGGT  # pyright: ignore[reportMissingImports]: the user's checkout
-
-                model = VGGT(enable_point=not mapped, enable_track=not mapped)
-            else:
-                from vggt4d.models.vggt4d import VGGTFor4D  # pyright: ignore[reportMissingImports]
-
-                model = VGGTFor4D()
+            plain = work == "pass"
+            config = replace(vggt_1b(), heads=("camera", "depth")) if plain and mapped else vggt_1b()
+            model = build("vggt" if plain else "vggt4d", config)
             if mapped:
-                names, tensors = set(model.state_dict()), load_file(weights)
-                model.load_state_dict({n: t for n, t in tensors.items() if n in names}, assign=True, strict=True)
+                give_weights(model, read_weights(weights, weights.name))
             else:
                 load_model(model, weights)
-            models[work] = model.eval()
+            models[work] = model
         return models[work]
 
     def one_pass(images: np.ndarray) -> Outputs:

@@ -1,5 +1,6 @@
 """PyTorch checkpoints of VGGT -> checkpoints of vggtjax."""
 
-from converters.torch_to_flax import Conversion, convert, convert_state_dict
+import lazy_loader
 
-__all__ = ["Conversion", "convert", "convert_state_dict"]
+# Names and their modules stand in __init__.pyi: reading PyTorch's files needs no jax.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

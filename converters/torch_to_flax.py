@@ -145,15 +145,16 @@ def convert_weights(
     """Convert located weights as `convert` does; `with_its_heads`, the model has those heads alone that they have."""
     kind = numpy_dtype(dtype)
     destination = Path(destination).expanduser()
-    if os.path.isfile(destination) and os.path.samefile(destination, weights.path):  # noqa: PTH113, PTH121
-        raise InputError(f"the destination {destination} is the source; choose another name")
+    files = weight_files(weights.path)
+    for file in files:  # all of the shards
+        if os.path.isfile(destination) and os.path.isfile(file) and os.path.samefile(destination, file):  # noqa: PTH113, PTH121
+            raise InputError(f"the destination {destination} is the source; choose another name")
     tensors, problems = read_state_dict(weights.path)
     refuse_strangers(weights.name, tensors)
     tensors = _own(tensors, weights.name)
     if with_its_heads:
         config = own_heads(tensors, config, weights.name)
     targets = plan_conversion(tensors, config, problems)
-    files = weight_files(weights.path)
     used = {source for target in targets.values() for source in target.sources}
     total = len(used) + sum(-(-file.stat().st_size // _DIGEST_BLOCK) for file in files)
     done = count(1)

@@ -17,7 +17,7 @@ T = TypeVar("T")
 _ADAPTER = re.compile(r"(?:^|\.)(?:lora_|hada_|lokr_|ia3_|oft_|base_layer\.)")
 _COUNTED = ("n_averaged",)  # of torch's AveragedModel, beside its module
 _MOST_LETTERS = 100  # of a prefix
-_SOURCES = {"camera": "camera_head", "depth": "depth_head", "points": "point_head", "tracks": "track_head"}
+SOURCES = {"camera": "camera_head", "depth": "depth_head", "points": "point_head", "tracks": "track_head"}
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ def own_names(tensors: Mapping[str, T], modules: Collection[str], source: str) -
 def own_heads(tensors: Collection[str], config: VGGTConfig, source: str) -> VGGTConfig:
     """Return the configuration with those heads alone that the weights have, and say so; as it is without any."""
     modules = {name.partition(".")[0] for name in tensors}
-    heads = tuple(head for head in config.heads if _SOURCES[head] in modules)
+    heads = tuple(head for head in config.heads if SOURCES[head] in modules)
     if not heads or heads == config.heads:
         return config
     lacking = ", ".join(head for head in config.heads if head not in heads)

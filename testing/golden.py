@@ -17,19 +17,14 @@ from converters import convert_state_dict
 from testing.seeded import seeded_images, seeded_state_dict
 from vggtjax.config import VGGTConfig
 from vggtjax.network.layers import Params
+from vggtjax.parity.outputs import OUTPUTS as PUBLIC
+from vggtjax.parity.outputs import TOLERANCE as TOLERANCE
 
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
 FORWARD = ("single", "frames4", "batch2")  # the cases of a pass
-TOLERANCE = 1e-4  # float32, of each array's standard deviation; measured: 1e-6 (poses) to 3e-5 (points)
 BFLOAT16 = {"pose_enc": 0.06, "depth": 0.25, "depth_conf": 0.15}  # likewise; measured: half of it
 
-OUTPUTS = {  # fields of `Predictions`, and their names in the files
-    "pose_encoding": "pose_enc",
-    "depth": "depth",
-    "depth_confidence": "depth_conf",
-    "world_points": "world_points",
-    "world_points_confidence": "world_points_conf",
-}
+OUTPUTS = {name: output.public for name, output in PUBLIC.items() if output.most is None}  # field -> name in the files
 
 
 def golden_config() -> VGGTConfig:

@@ -190,6 +190,9 @@ def test_the_signatures_of_the_reference_are_those_of_the_code(site):
         page for page in pages if site["with_overview"](site["with_signatures"](page, package)) != page.read_text()
     ]
     assert stale == []
+    captures = (ROOT / "docs" / "reference" / "captures.md").read_text()
+    assert "**Arguments**\n\n- `path`: the capture's folder, or a .r3d file of Record3D.\n- `kind`: " in captures
+    assert "**Errors**\n\n- `InputError`: an unknown kind, a folder of no kind" in captures
     assert 'method: MethodName = "4dvggt-d"' in (ROOT / "docs" / "reference" / "configuration.md").read_text()
 
 

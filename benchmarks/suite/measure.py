@@ -15,8 +15,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from testing.process_memory import process_bytes, reset_high_water
 from vggtjax.network.precision import full_precision
+from vggtjax.storage.process_memory import process_bytes, reset_high_water
 
 _SUSTAINED = 0.05  # seconds
 

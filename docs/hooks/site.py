@@ -1,13 +1,14 @@
 """Pages that read well as plain Markdown, in a checkout or a code host, and better on the site.
 
 A block `<!-- site: TEXT -->...<!-- /site -->` shows its own text wherever Markdown is read, and TEXT on the site. In
-the reference TEXT is a directive of mkdocstrings, which shows whole docstrings, and the block is a signature and its
-first sentence, made by `make reference`.
+the reference TEXT is a directive of mkdocstrings, and the block is a signature and its docstring, with arguments,
+returns and errors as lists, made by `make reference`.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,13 @@ BLOCK = re.compile(r"<!-- site: (.*?) -->.*?<!-- /site -->", flags=re.DOTALL)
 _DIRECTIVE = re.compile(r"<!-- site: ::: (\S+) -->.*?<!-- /site -->", flags=re.DOTALL)
 EVERY_COMMAND = "HELP OF EVERY COMMAND"  # command_line.py puts it there
 _WIDEST = 100  # columns of a signature in one line
+_SECTIONS = {  # of a docstring, by griffe's names
+    "parameters": "Arguments",
+    "attributes": "Attributes",
+    "returns": "Returns",
+    "yields": "Yields",
+    "raises": "Errors",
+}
 _SETTINGS = {  # of pages, which as front matter plain Markdown would show
     "index.md": {"hide": ["navigation", "toc"]},
     "reference/changes.md": {"search": {"exclude": True}},
@@ -60,20 +68,35 @@ def read_package() -> griffe.Module:
 
 
 def block(name: str, page: Path, package: griffe.Module) -> str:
-    """Return what a plain reader sees of one name: its signature, a sentence, and where the rest stands."""
+    """Return what a plain reader sees of one name: its signature and docstring, and its file."""
     found: Any = package[name.removeprefix("vggtjax.")]
     found = found.final_target if found.is_alias else found
-    sentence = "" if found.docstring is None else re.split(r"\n\s*\n", found.docstring.value.strip())[0]
     source = found.filepath.relative_to(DOCS.parent).as_posix()
     here = "../" * len(page.relative_to(DOCS.parent).parent.parts)
-    kind = "Arguments, returns and errors" if found.is_function else "All of it"
     parts = [
         f'<!-- site: ::: {name} -->\n<a id="{name}"></a>\n\n### {found.name}',
         f"```py\n{_double_quoted(_signature(found))}\n```",
-        sentence,
-        f"{kind}: [{source}]({here}{source})\n<!-- /site -->",
+        *_sections(found),
+        f"All of it: [{source}]({here}{source})\n<!-- /site -->",
     ]
     return "\n\n".join(filter(None, parts))
+
+
+def _sections(found: Any) -> Iterator[str]:
+    """Yield the texts of a docstring, and its lists: arguments or attributes, what is returned or yielded, errors."""
+    for section in [] if found.docstring is None else found.docstring.parse("google", warnings=False):
+        if section.kind.value == "text":
+            yield section.value
+        elif title := _SECTIONS.get(section.kind.value):
+            yield f"**{title}**\n\n" + "\n".join(_item(section.kind.value, item) for item in section.value)
+
+
+def _item(kind: str, item: Any) -> str:
+    text = " ".join(item.description.split())
+    name = item.annotation if kind == "raises" else getattr(item, "name", "")
+    if kind in ("returns", "yields"):
+        name = ""
+    return f"- `{name}`: {text}" if name else f"- {text}"
 
 
 def _double_quoted(text: str) -> str:

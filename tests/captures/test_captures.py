@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import struct
 import zipfile
 from typing import Any
 
@@ -11,6 +12,7 @@ from PIL import Image
 
 from tests.captures import folders
 from tests.captures.folders import FRAMES, HEIGHT, WIDTH, make_truth
+from tests.dataset_files import cameras_bin, images_bin
 from vggtjax.cameras import project
 from vggtjax.captures.cameras import DISTORTED
 from vggtjax.captures.table import KINDS, find_capture, read_capture
@@ -162,6 +164,70 @@ def test_places_of_a_colmap_model(tmp_path, model, caplog):
     assert read(tmp_path).notes == (note,)
     load_clip(tmp_path, size=28, patch=14)
     assert caplog.text.count(note) == 1
+
+
+def part_of(folder, number, frames, points=0, form=".txt"):
+    """Add a model of some of the frames to a folder that has a whole one in sparse/whole."""
+    model = folder / "sparse" / number if number else folder / "sparse"
+    model.mkdir(parents=True, exist_ok=True)
+    lines = (folder / "whole/images.txt").read_text().splitlines()
+    if form == ".txt":
+        shutil.copy(folder / "whole/cameras.txt", model / "cameras.txt")
+        kept = [line for frame in frames for line in lines[2 + 2 * frame : 4 + 2 * frame]]
+        (model / "images.txt").write_text("\n".join(kept) + "\n")
+        (model / "points3D.txt").write_text("# points\n" + "1 0 0 1 9 9 9 -1\n" * points)
+        return
+    cameras, images = [], []
+    for frame in frames:
+        words = lines[2 + 2 * frame].split()
+        K = TRUTH.intrinsics[frame]
+        cameras.append((frame + 1, 1, WIDTH, HEIGHT, [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]))
+        values = [float(word) for word in words[1:8]]
+        images.append((frame + 1, values[:4], values[4:], frame + 1, words[9]))
+    (model / "cameras.bin").write_bytes(cameras_bin(cameras))
+    (model / "images.bin").write_bytes(images_bin(images))
+    (model / "points3D.bin").write_bytes(struct.pack("<Q", points))
+
+
+@pytest.mark.parametrize(
+    ("parts", "taken"),
+    [
+        ({"0": ([0, 1], 90, ".txt"), "1": (range(FRAMES), 5, ".txt")}, "sparse/1"),
+        ({"0": ([0, 1], 90, ".bin"), "2": (range(FRAMES), 5, ".bin"), "10": ([2], 0, ".txt")}, "sparse/2"),
+        ({"0": (range(FRAMES), 5, ".txt"), "1": (range(FRAMES), 7, ".bin")}, "sparse/1"),
+        ({"2": (range(FRAMES), 5, ".bin"), "10": (range(FRAMES), 5, ".txt")}, "sparse/2"),
+        ({"0": ([3], 5, ".bin"), "": (range(FRAMES), 5, ".txt")}, "sparse"),
+    ],
+)
+def test_of_several_colmap_models_that_with_most_pictures_is_read(tmp_path, caplog, parts, taken):
+    folders.colmap_text(tmp_path, TRUTH, "whole")
+    for number, part in parts.items():
+        part_of(tmp_path, number, *part)
+    capture = read(tmp_path)
+    check(capture, TRUTH)
+    (note,) = capture.notes
+    assert f"of {len(parts)} COLMAP models {taken} is read" in note
+    for number, (frames, points, _) in parts.items():
+        name = f"sparse/{number}".rstrip("/")
+        assert f"{name} has {len(frames)} pictures and {points} points" in note
+    load_clip(tmp_path, size=28, patch=14)
+    assert caplog.text.count(note) == 1
+
+
+def test_pictures_that_are_not_there_do_not_count_and_a_broken_model_is_no_choice(tmp_path):
+    folders.colmap_text(tmp_path, TRUTH, "whole")
+    part_of(tmp_path, "0", range(FRAMES))
+    lost = (tmp_path / "sparse/0/images.txt").read_text()
+    for frame in range(8, 11):
+        lost = lost.replace(f"view_{frame}.png", f"lost_{frame}.png")
+    (tmp_path / "sparse/0/images.txt").write_text(lost)  # one picture of it is there
+    part_of(tmp_path, "1", [0, 2])
+    part_of(tmp_path, "3", [0, 2], form=".bin")
+    (tmp_path / "sparse/3/images.bin").write_bytes(b"short")
+    capture = read(tmp_path)
+    assert capture.frame_names == ("view_8", "view_10")
+    assert "sparse/0 has 1 pictures" in capture.notes[0]
+    assert "sparse/3 cannot be read" in capture.notes[0]
 
 
 def test_frames_keep_their_cameras_by_name(tmp_path):

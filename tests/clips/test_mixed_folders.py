@@ -172,6 +172,31 @@ def test_sixteen_bits_that_hold_fewer(tmp_path, caplog, most, is_said, shape):
     assert not is_said or "16 bits a value and uses at most 12" in caplog.messages[0]
 
 
+@pytest.mark.parametrize(
+    ("folder", "low", "high", "is_depth"),
+    [
+        ("frames", 700, 6000, True),  # millimetres
+        ("frames", 60000, 65535, True),
+        ("depth", 0, 65535, True),
+        ("left", 0, 40000, False),  # a grey film
+    ],
+)
+def test_depth_maps_are_no_film(tmp_path, folder, low, high, is_depth):
+    (tmp_path / folder).mkdir()
+    for number in range(3):
+        values = np.linspace(low, high, 32 * 64).reshape(32, 64).astype(np.uint16)
+        values[number, :9] = 0  # unknown
+        write_deep(tmp_path / folder / f"{number}.png", values)
+    paths = [tmp_path / folder / f"{number}.png" for number in range(3)]
+    for source in (tmp_path / folder, tmp_path / folder / "*.png", paths):
+        if is_depth:
+            with pytest.raises(ClipError, match=r"single-channel pictures, likely depth maps \(0.png\); give"):
+                open_source(source)
+        else:
+            assert open_source(source).total(Sampling()) == 3
+    assert open_source(paths[0]).total(Sampling()) == 1  # named on purpose
+
+
 @pytest.mark.parametrize("name", ["a.webp", "a.png", "a.avif", "hidden.png"])
 def test_animations_have_frames_and_times(tmp_path, name):
     colours, times = [(40 * index, 60, 200) for index in range(5)], [100, 40, 300, 20, 100]

@@ -2,16 +2,21 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 from safetensors.numpy import save_file
 
+from testing.make_checkpoint import make_checkpoint
 from testing.seeded import seeded_state_dict
+from tests.room import make_room
 from vggtjax import Reconstruction, __main__, load_model
+from vggtjax.calibration.export import FORMAT
 from vggtjax.clips.truth import Truth
 from vggtjax.commands import main as cli
 from vggtjax.pretrained import embedded
@@ -65,6 +70,54 @@ def test_a_converted_model(tmp_path, capsys, golden):
     assert "float32" in out
     token = load_model(model).params["backbone"]["class_token"]
     assert np.array_equal(np.ravel(token), np.ravel(tensors["aggregator.patch_embed.cls_token"]))
+    model.write_bytes(b"another")
+    again = ["convert", tmp_path / "torch.safetensors", model, "--config", golden / "config.json"]
+    code, _, err = run(capsys, *again)
+    assert (code, "exists and is not replaced" in err, model.read_bytes()) == (2, True, b"another")
+    assert run(capsys, *again, "--overwrite")[0] == 0
+    assert load_model(model).config.depth == 24
+    source = tmp_path / "torch.safetensors"
+    linked, before = tmp_path / "link.safetensors", source.read_bytes()
+    linked.hardlink_to(source)
+    code, _, err = run(capsys, "convert", source, linked, "--overwrite")
+    assert (code, "is the source, which is never replaced" in err) == (2, True)
+    assert source.read_bytes() == before
+
+
+def test_a_shard_is_a_source_too(tmp_path, capsys, golden):
+    shapes = json.loads((golden / "shapes.json").read_text())
+    make_checkpoint(tmp_path / "shards", shapes, shards=2, seed=7)
+    shard = tmp_path / "shards" / "model-00002-of-00002.safetensors"
+    before = shard.read_bytes()
+    config = ["--config", golden / "config.json", "--overwrite"]
+    code, _, err = run(capsys, "convert", tmp_path / "shards", shard, *config)
+    assert (code, "is the source" in err, shard.read_bytes() == before) == (2, True, True)
+
+
+def test_a_source_or_a_strangers_file_in_the_output_folder_is_not_replaced(tmp_path, capsys, tiny_demo, sequences):
+    result = tmp_path / "result"
+    make_room(3).save(result)
+    film = result / "preview" / "turntable.webp"
+    shutil.copy(next((sequences / "clip0" / "rgb").iterdir()), film.with_suffix(".png"))
+    before = sorted(result.rglob("*"))
+    code, _, err = run(capsys, "reconstruct", film.with_suffix(".png"), "--model", "demo", "--out", result)
+    assert (code, "is part of the result in" in err) == (2, True)
+    assert sorted(result.rglob("*")) == before
+    run_folder = tmp_path / "run"
+    run_folder.mkdir()
+    model = run_folder / "model.safetensors"
+    shutil.copy(tiny_demo, model)
+    recipe = Path(__file__).parents[2] / "docs" / "recipes" / "smoke.json"
+    (run_folder / "calibration.json").write_text(json.dumps({"format": FORMAT}))
+    for arguments, words in (
+        (("train", "--recipe", recipe, "--out", run_folder), "model.safetensors exists and is not part of an earlier"),
+        (("train", "--recipe", recipe, "--out", run_folder, "--init", model), "is the source"),
+        (("calibrate-cues", "--model", model, "--out", run_folder), "is the source"),
+        (("calibrate-cues", "--model", run_folder, "--out", run_folder), "is the source"),
+    ):
+        code, _, err = run(capsys, *arguments)
+        assert (code, words in err) == (2, True), err
+        assert model.read_bytes() == tiny_demo.read_bytes()
 
 
 def test_reconstruct_with_masks_and_tracks_of_ones_own(tmp_path, capsys, frames):

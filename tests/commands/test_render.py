@@ -38,6 +38,24 @@ def test_a_gif_elsewhere_along_the_camera(result, tmp_path, capsys):
         assert film.size == (96, 54)
 
 
+def test_an_existing_film_is_replaced_on_request_and_the_result_never(result, tmp_path, capsys):
+    film = tmp_path / "mine.webp"
+    film.write_bytes(b"mine")
+    assert run(capsys, result, "--size", "32x18", "--out", film)[0] == 2
+    assert film.read_bytes() == b"mine"
+    assert run(capsys, result, "--size", "32x18", "--out", film, "--overwrite")[0] == 0
+    assert film.stat().st_size > 100
+    part = next((result / "preview").glob("*.webp"), None) or result / "preview" / "own.webp"
+    part.write_bytes(b"part")
+    linked = tmp_path / "link.webp"
+    linked.symlink_to(part)
+    for out in (part, linked):
+        code, captured = run(capsys, result, "--out", out, "--overwrite")
+        assert (code, "is part of the result in" in captured.err, part.read_bytes()) == (2, True, b"part")
+    for _ in range(2):  # the film at its usual place is one of this command
+        assert run(capsys, result, "--size", "32x18")[0] == 0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

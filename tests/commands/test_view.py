@@ -36,6 +36,23 @@ def test_a_page_and_a_recording_are_written(tmp_path, capsys, folder):
     assert (tmp_path / "scene.viser").stat().st_size > 1000
 
 
+def test_an_existing_page_is_replaced_on_request_and_the_result_never(tmp_path, capsys, folder):
+    page = tmp_path / "mine.html"
+    page.write_text("mine")
+    code, _, err = run(capsys, folder, "--export", page)
+    assert (code, "exists and is not replaced" in err, page.read_text()) == (2, True, "mine")
+    assert run(capsys, folder, "--export", page, "--overwrite")[0] == 0
+    assert page.read_text().startswith("<!doctype html>")
+    report = folder / "report.html"
+    report.write_text("the result's")
+    code, _, err = run(capsys, folder, "--export", report, "--overwrite")
+    assert (code, "is part of the result" in err, report.read_text()) == (2, True, "the result's")
+    own = folder / "preview" / "viewer.html"
+    for _ in range(2):  # added to a result, as the demo does
+        assert run(capsys, folder, "--export", own, "--overwrite")[0] == 0
+    assert run(capsys, folder, "--export", own)[0] == 2
+
+
 def test_what_cannot_be_viewed_is_one_sentence(tmp_path, capsys, folder):
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]

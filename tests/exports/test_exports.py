@@ -1,10 +1,15 @@
 """Results in the formats of other programs, read back by those programs' libraries or by plain readers."""
 
+import csv
+import json
 import os
 import re
+import struct
 import subprocess
 import sys
 from collections import Counter
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +17,7 @@ from PIL import Image
 
 from tests.glb_files import split_glb
 from tests.room import make_room
+from vggtjax.cameras import project
 from vggtjax.captures.colmap_model import read_views
 from vggtjax.clips.sources import open_source
 from vggtjax.commands.main import command_help
@@ -49,7 +55,6 @@ def test_colmap_reads_the_model_and_projects_its_points(tmp_path, result, pictur
     names = [f"a{i}{('.JPG' if i % 2 else '.png') if original else '.png'}" for i in range(FRAMES)]
     assert sorted(image.name for image in model.images.values()) == names
     images = sorted(model.images.values(), key=lambda image: image.name)
-    seen = 0
     for number, image in enumerate(images):
         pose = image.cam_from_world().matrix()
         np.testing.assert_allclose(pose, result.camera_from_world[number], atol=1e-6)
@@ -59,21 +64,76 @@ def test_colmap_reads_the_model_and_projects_its_points(tmp_path, result, pictur
         with Image.open(tmp_path / "out/images" / image.name) as picture:
             assert picture.size == (scale * W, scale * H)
         with Image.open(tmp_path / f"out/masks/{image.name}.png") as mask:
-            static = np.asarray(mask) > 0
-        for observed in image.points2D:
-            point = model.points3D[observed.point3D_id]
-            np.testing.assert_allclose(image.project_point(point.xyz), observed.xy, atol=0.01)
-            column, row = (observed.xy - 1e-9).astype(int)
-            assert static[row, column]
-            np.testing.assert_array_less(np.abs(point.color.astype(int) - 60) % 40, 1)  # of the wall
-            seen += 1
+            assert np.asarray(mask).shape == (scale * H, scale * W)
+        assert image.num_points2D() == 0
     assert len(model.points3D) > 400
-    assert seen > 2 * len(model.points3D)
+    for point in model.points3D.values():
+        assert (point.error, point.track.length()) == (-1, 0)  # no frame measured it
+        np.testing.assert_array_less(np.abs(point.color.astype(int) - 60) % 40, 1)  # of the wall
+        pixels = [image.project_point(point.xyz) for image in images]
+        assert any(pixel is not None and (pixel >= 0).all() for pixel in pixels)
+    positions, errors = read_as_trainers_do(tmp_path / "out/sparse/0", form == "colmap")
+    np.testing.assert_allclose(sorted(positions), sorted(point.xyz.tolist() for point in model.points3D.values()))
+    assert set(errors) == {-1}
     if form == "colmap":
         for number, name in enumerate(names):
             view = read_views(tmp_path / "out/sparse/0")[name]
             np.testing.assert_allclose(view.camera_from_world, result.camera_from_world[number], atol=1e-6)
             np.testing.assert_allclose(view.intrinsics[:2] / scale, result.intrinsics[number][:2], rtol=1e-6)
+
+
+def read_as_trainers_do(folder, binary):
+    """Read positions and errors of points record by record, as the loaders of splats do, and step over their tracks."""
+    if not binary:
+        lines = (folder / "points3D.txt").read_text().splitlines()
+        words = [line.split() for line in lines if not line.startswith("#")]
+        return [list(map(float, word[1:4])) for word in words], [float(word[7]) for word in words]
+    data, place = (folder / "points3D.bin").read_bytes(), 8
+    positions, errors = [], []
+    for _ in range(*struct.unpack_from("<Q", data)):
+        _, *position, _, _, _, error, length = struct.unpack_from("<QdddBBBdQ", data, place)
+        place += struct.calcsize("<QdddBBBdQ") + 8 * length
+        positions.append(position)
+        errors.append(error)
+    assert place == len(data)
+    return positions, errors
+
+
+@pytest.mark.parametrize("original", [False, True])
+def test_tracks_of_the_result_are_the_observations_of_colmap(tmp_path, result, pictures, original):
+    """Tracks that are right but for one position, which is 3 pixels off: the error of its point says so."""
+    pycolmap = pytest.importorskip("pycolmap")
+    middle = (np.arange(W) - W / 2) ** 2 < (W / 6) ** 2
+    static = np.argwhere(~result.dynamic_mask[1] & result.valid_pixels[1] & middle)
+    rows, columns = static[:: len(static) // 4][:3].T
+    query = np.column_stack([columns, rows]) + 0.5
+    inside = np.column_stack([query, np.ones(3)]) @ np.linalg.inv(result.intrinsics[1]).T
+    inside *= result.depth[1, rows, columns, None]
+    world = (inside - result.camera_from_world[1, :, 3]) @ result.camera_from_world[1, :, :3]
+    positions = np.stack([np.column_stack(project(world, pose, K)[:2]) for pose, K in cameras_of(result)])
+    positions[3, 0] += (0, 3)
+    moving = np.argwhere(result.dynamic_mask[1])[0][::-1] + 0.5
+    positions = np.concatenate([positions, np.broadcast_to(moving, (FRAMES, 1, 2))], axis=1)
+    visibility = np.full((FRAMES, 4), 0.9)
+    visibility[2, 1] = 0.1  # hidden there
+    tracks = {"track_positions": positions, "track_visibility": visibility, "track_confidence": visibility}
+    tracked = replace(result, **tracks, track_frames=np.ones(4, int))
+    source = open_source(str(pictures)) if original else None
+    export_result(tracked, tmp_path / "out", "colmap", source=source, exporting=Exporting(50))
+    model = pycolmap.Reconstruction(str(tmp_path / "out/sparse/0"))
+    measured = [point for point in model.points3D.values() if point.track.length()]
+    inside = ((positions[:, :3] >= 0) & (positions[:, :3] < (W, H))).all(axis=2) & (visibility[:, :3] >= 0.5)
+    lengths = [point.track.length() for point in measured]
+    assert sorted(lengths) == sorted(inside.sum(axis=0).tolist())
+    np.testing.assert_allclose(sorted(p.xyz[0] for p in measured), sorted(world[:, 0]), atol=1e-4)
+    assert inside[3, 0]
+    (wrong,) = [point for point in measured if point.error > 0.01]
+    np.testing.assert_allclose(wrong.error, (2 if original else 1) * 3 / inside[:, 0].sum(), rtol=1e-3)
+    assert any(point.error == -1 for point in model.points3D.values())
+
+
+def cameras_of(result):
+    return zip(result.camera_from_world.astype(float), result.intrinsics.astype(float), strict=True)
 
 
 def test_each_frame_of_the_animation_shows_its_own_points(tmp_path, result):
@@ -130,12 +190,60 @@ def test_rerun_opens_the_recording_and_finds_every_frame(tmp_path, result):
     assert points == {"/world/static": 1, "/world/moving": FRAMES}
 
 
-@pytest.mark.parametrize("names", [["../x", "../y", "z", "w"], ["a", "A", "b", "c"], ["x" * 300, "a", "b", "c"]])
-def test_unsafe_names_give_way_to_numbers(tmp_path, names):
+@pytest.mark.parametrize(
+    ("names", "written"),
+    [
+        (["a", "A", "b", "c"], ["a", "A_000001", "b", "c"]),
+        (["a", "x" * 300, "b", "c"], ["a", "x" * 196, "b", "c"]),
+        (["ü", "u\u0308", "IMG (1)", "a+b,c&d#e%f'g"], ["ü", "u\u0308_000001", "IMG (1)", "a+b,c&d#e%f'g"]),
+        (["con", "LPT1.x", "a:b", "end."], ["_con", "_LPT1.x", "a_b", "end_"]),
+        (["../x", "/etc/y", "C:\\z", ".hidden"], ["_/x", "etc/y", "C__z", "_hidden"]),
+        (["", "..", "a\x00b", "a"], ["_", "__000001", "a_b", "a"]),
+        (["a.png", "a.png/b", "c/d", "c"], ["a.png", "a.png/b", "c/d", "c"]),
+        (["a", "a.png/b", "c", "c"], ["a", "a.png_b", "c", "c_000003"]),
+    ],
+)
+def test_only_names_that_a_system_cannot_hold_are_changed(tmp_path, caplog, names, written):
     export_result(make_room(FRAMES, 28, 42, frame_names=names), tmp_path / "out", "nerfstudio")
-    written = sorted(path.name for path in (tmp_path / "out/images").iterdir())
-    assert written == [f"{number:06d}.png" for number in range(FRAMES)]
+    frames = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == [f"images/{name}.png" for name in written]
+    for frame in frames:
+        for kind in ("file_path", "depth_file_path", "mask_path"):
+            assert (tmp_path / "out" / frame[kind]).is_file()
+    assert len({frame["depth_file_path"] for frame in frames}) == FRAMES
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    changed = [(f"{old}.png", f"{new}.png") for old, new in zip(names, written, strict=True) if old != new]
+    table = tmp_path / "out/renamed.csv"
+    assert table.exists() == bool(changed) == ("have another name in the export" in caplog.text)
+    if changed:
+        with table.open(newline="", encoding="utf-8") as file:
+            assert list(map(tuple, csv.reader(file))) == [("name", "exported as"), *changed]
+
+
+@pytest.mark.parametrize("form", ["colmap", "colmap-text", "nerfstudio"])
+def test_names_of_files_with_folders_survive_as_the_format_holds_them(tmp_path, form):
+    if form != "nerfstudio":
+        pytest.importorskip("pycolmap")
+    names = ["cam0/0001.png", "cam0/Küche & Bad, 100%.jpg", "cam1/0001.png", "cam1/IMG (1).jpg"]
+    room = make_room(FRAMES, 28, 42, frame_names=[Path(name).stem for name in names])
+    for name, image in zip(names, room.images, strict=True):
+        (tmp_path / "in" / name).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(image).resize((84, 56)).save(tmp_path / "in" / name)
+    source = open_source([tmp_path / "in" / name for name in names])
+    export_result(room, tmp_path / "out", form, source=source)
+    expected = [name.replace(" ", "_") if form == "colmap-text" else name for name in names]
+    if form == "nerfstudio":
+        frames = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+        made = [frame["file_path"].removeprefix("images/") for frame in frames]
+    else:
+        model = pytest.importorskip("pycolmap").Reconstruction(str(tmp_path / "out/sparse/0"))
+        made = [model.images[number].name for number in range(1, FRAMES + 1)]
+        assert list(read_views(tmp_path / "out/sparse/0", ".bin" if form == "colmap" else ".txt")) == made
+    assert made == expected
+    for name, image in zip(made, room.images, strict=True):
+        with Image.open(tmp_path / "out/images" / name) as picture:
+            assert np.abs(np.asarray(picture.resize((42, 28))).astype(int) - image).mean() < 8
+    assert (tmp_path / "out/renamed.csv").exists() == (form == "colmap-text")
 
 
 def test_bad_input_is_refused_and_nothing_is_written(tmp_path, result, pictures):

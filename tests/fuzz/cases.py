@@ -14,10 +14,10 @@ from pathlib import Path
 from random import Random
 from typing import Any, NamedTuple
 
-from testing.process_memory import process_bytes, reset_high_water
 from tests.fuzz.changes.text import NAMES
 from tests.fuzz.mutations import mutated
 from vggtjax.errors import VggtjaxError
+from vggtjax.storage.process_memory import process_bytes, reset_high_water
 
 MOST_SECONDS = 10.0
 MOST_LETTERS = 500  # of a message

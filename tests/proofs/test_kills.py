@@ -47,7 +47,9 @@ class Case(NamedTuple):
 
 MODEL = "--model {inputs}/model.safetensors"
 CASES = {
-    "convert": Case("convert {inputs}/source.safetensors {out}/model.safetensors --config {inputs}/config.json"),
+    "convert": Case(
+        "convert {inputs}/source.safetensors {out}/model.safetensors --config {inputs}/config.json --overwrite"
+    ),
     "reconstruct": Case(f"reconstruct {{inputs}}/clips/a {MODEL} --out {{out}}/result"),
     "batch": Case(f"batch {{inputs}}/clips {MODEL} --only cameras,depth --out {{out}}", growing=("index.html",)),
     "export": Case("export {inputs}/result --out {out}/model --to colmap-text", at_once=("model",)),

@@ -5,6 +5,7 @@ Does not import jax.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,13 +13,13 @@ import numpy as np
 
 from vggtjax.captures.cameras import DISTORTED, world_from_camera_of
 from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out, lenses_of
-from vggtjax.captures.colmap_model import Suffix, read_views
+from vggtjax.captures.colmap_model import ColmapView, Suffix, count_points, read_views
 from vggtjax.captures.files import inside
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, one_line
 from vggtjax.media.images import is_image_name
 from vggtjax.media.order import in_order
 
-_MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0")  # places in a folder
+_PLACES = ("sparse", "colmap/sparse", "distorted/sparse")  # of models in a folder: one, or numbered ones
 _PICTURES = ("images", "../images", "../../images", ".")  # places beside a model's own folder
 _FILES = ("cameras", "images")
 
@@ -29,27 +30,76 @@ class _Model(NamedTuple):
 
 
 def find_model(folder: Path) -> _Model | None:
-    """Return the model of a folder, or the folder itself where it is one; half a model counts below `sparse`."""
-    for place, enough in (*((name, any) for name in _MODELS), (".", all)):
+    """Return the first model of a folder, or the folder itself where it is one; half a model counts below `sparse`."""
+    return next(iter(_models(folder)), None)
+
+
+def _models(folder: Path) -> list[_Model]:
+    """Return the models of one place: those with a number in its order, then the one that has none.
+
+    COLMAP numbers the parts of a reconstruction that it could not join. Where no model is whole, half ones count.
+    """
+    for place in _PLACES:
         if place.startswith("colmap") and not (folder / "images").is_dir():
             continue  # a folder of captures, of which one is named colmap
-        suffixes: tuple[Suffix, ...] = (".bin", ".txt")
-        for complete in (all, enough):
-            for suffix in suffixes:
-                if complete((folder / place / f"{name}{suffix}").is_file() for name in _FILES):
-                    return _Model(folder / place if place != "." else folder, suffix)
+        root = folder / place
+        if not root.is_dir():
+            continue
+        parts = in_order([path for path in root.iterdir() if path.name.isdecimal() and path.is_dir()], Path)
+        for enough in (all, any):
+            if found := [model for path in (*parts, root) if (model := _model_in(path, enough))]:
+                return found
+    own = _model_in(folder, all)
+    return [] if own is None else [own]
+
+
+def _model_in(folder: Path, enough: Callable[[Iterable[bool]], bool]) -> _Model | None:
+    suffixes: tuple[Suffix, ...] = (".bin", ".txt")
+    for complete in (all, enough):
+        for suffix in suffixes:
+            if complete((folder / f"{name}{suffix}").is_file() for name in _FILES):
+                return _Model(folder, suffix)
     return None
+
+
+def _chosen(folder: Path) -> tuple[_Model, Mapping[str, ColmapView], tuple[str, ...]]:
+    """Return the model with the most pictures that are there, its views, and a note on the others.
+
+    Where several have as many, the one with the most points is taken, then the first. A model that cannot be read does
+    not count beside others.
+    """
+    models = _models(folder)
+    if not models:
+        raise InputError(f"{folder} has no COLMAP model; expected sparse/0 with cameras and images, .bin or .txt")
+    if len(models) == 1:
+        return models[0], read_views(*models[0]), ()
+    ranks, counts, problems = [], [], []
+    for number, model in enumerate(models):
+        name = model.folder.relative_to(folder).as_posix()
+        try:
+            views = read_views(*model)
+            pictures = sum((_pictures(folder, view) / view).is_file() for view in views)
+            points = count_points(model.folder / f"points3D{model.suffix}")
+        except InputError as error:
+            problems.append(error)
+            counts.append(f"{name} cannot be read")
+            continue
+        ranks.append((pictures, points, -number, model, views, name))
+        counts.append(f"{name} has {pictures} pictures and {points} points")
+    if not ranks:
+        raise problems[0]
+    *_, model, views, name = max(ranks, key=lambda rank: rank[:3])
+    said = f"of {len(models)} COLMAP models {name} is read, which has the most pictures or points: {', '.join(counts)}"
+    return model, views, (one_line(said),)
 
 
 def read_colmap(folder: Path) -> Capture:
     """Read a folder with a model and its pictures, or the model's own folder with the pictures beside it.
 
-    Pictures that the model did not register are left out.
+    Of several models the one with the most pictures is read. Pictures that it did not register are left out.
     """
-    if (model := find_model(folder)) is None:
-        raise InputError(f"{folder} has no COLMAP model; expected sparse/0 with cameras and images, .bin or .txt")
+    model, views, note = _chosen(folder)
     source = model.folder / f"images{model.suffix}"
-    views = read_views(model.folder, model.suffix)
     if not views:
         raise InputError(f"{source} has no image; expected a model with registered images")
     names = in_order(views, Path)
@@ -68,8 +118,8 @@ def read_colmap(folder: Path) -> Capture:
         fitted_intrinsics([view.intrinsics for view in taken], [view.size for view in taken], sizes, model.folder),
         world_from_camera_of(np.stack([view.camera_from_world for view in taken]), model.folder),
         lenses=(lenses := lenses_of(view.lens for view in taken)),
-        left_out=missing,
-        notes=missing + (DISTORTED,) * (lenses is not None),
+        left_out=note + missing,
+        notes=note + missing + (DISTORTED,) * (lenses is not None),
     )
 
 

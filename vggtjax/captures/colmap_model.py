@@ -19,7 +19,7 @@ from jaxtyping import Float64
 from vggtjax.captures.cameras import PIXEL_CENTRE, intrinsics_matrix
 from vggtjax.captures.files import read_bytes, read_text
 from vggtjax.captures.lens import MODELS, Lens, lens_of
-from vggtjax.errors import InputError, one_line
+from vggtjax.errors import InputError, one_line, reading
 
 Suffix = Literal[".bin", ".txt"]
 
@@ -63,6 +63,17 @@ def read_views(folder: Path, suffix: Suffix = ".bin") -> dict[str, ColmapView]:
         rotation = scipy.spatial.transform.Rotation.from_quat(quaternion, scalar_first=True).as_matrix()
         views[name] = ColmapView(*cameras[number], np.column_stack([rotation, translation]))
     return views
+
+
+def count_points(path: Path) -> int:
+    """Return the number of points of a model, 0 without its file of points. Raises InputError for a broken file."""
+    if not path.is_file():
+        return 0
+    with reading(path), path.open("rb") as file:
+        if path.suffix == ".bin":
+            start = file.read(struct.calcsize("<Q"))
+            return struct.unpack("<Q", start)[0] if len(start) == struct.calcsize("<Q") else 0
+        return sum(1 for line in file if line.strip() and not line.startswith(b"#"))
 
 
 def _camera(path: Path, kind: str, width: int, height: int, values: Sequence[float]) -> _Camera:

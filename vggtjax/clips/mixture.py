@@ -12,7 +12,11 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from PIL import Image
+
 from vggtjax.errors import ClipError
+from vggtjax.media.images import UNREADABLE, check_pixels, known_formats
 from vggtjax.media.video import is_video_name
 
 # Words in names of pictures that belong to a frame and are none; of frames beside them; of either.
@@ -31,6 +35,9 @@ _UNREAD = (
     *(".3fr", ".iiq", ".x3f", ".raw", ".jxl", ".jxr", ".exr", ".hdr", ".pfm", ".dpx", ".cin", ".psd", ".psb", ".xcf"),
     *(".svg", ".eps", ".pcx", ".ico", ".qoi", ".dds", ".sgi", ".fits", ".insp"),
 )
+_DEPTH = re.compile("depths?|depthmaps?|disp|disparity|lidar")
+_NEAREST = 0.05  # surface of a depth map, as share of the farthest one
+_HIGHEST = 65535
 _LEAST_ALIKE = 3  # pictures named alike, before others are odd ones
 _MOST_ODD = 0.1  # share of all pictures
 _SHOWN = 20  # names in a sentence
@@ -56,6 +63,35 @@ def check_frames(images: Sequence[Path], place: str) -> None:
         names = " and ".join(path.name for path in same)
         frames = [path for path in images if path.suffix == twice[0].suffix]
         raise ClipError(f"{place} {len(same)} pictures named {same[0].stem} ({names}); {_advice(frames, images)}")
+
+
+def check_colours(images: Sequence[Path]) -> None:
+    """Raise ClipError where several pictures are likely depth maps; the first and the last are looked at.
+
+    These have one channel of 16 bits, or floats, and are named as depth, or lack the dark values of a grey film: there
+    is a gap between unknown pixels (0, or the highest value) and the nearest surface. One picture is taken as it is.
+    """
+    ends = [images[0], images[-1]] if len(images) > 1 else []
+    if ends and all(map(_is_depth, ends)):
+        raise ClipError(
+            f"{images[0].parent}: these are 16-bit single-channel pictures, likely depth maps ({images[0].name}); give "
+            "the folder of colour pictures, or write grey frames with 8 bits a value"
+        )
+
+
+def _is_depth(path: Path) -> bool:
+    try:
+        with Image.open(path, formats=known_formats()) as picture:
+            if not (picture.mode in ("I", "F") or picture.mode.startswith("I;16")):
+                return False
+            if any(map(_DEPTH.fullmatch, (*_words(path), *_words(path.parent)))):
+                return True
+            check_pixels(picture, path)
+            values = np.asarray(picture)
+    except (ClipError, *UNREADABLE):
+        return False  # its reader says what is wrong
+    known = values[(values > 0) & (values < _HIGHEST)] if picture.mode != "F" else values[:0]
+    return known.size > 0 and bool(known.min() >= _NEAREST * known.max())
 
 
 def odd_ones(entries: Sequence[Path], images: Sequence[Path]) -> tuple[str, ...]:

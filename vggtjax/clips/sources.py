@@ -18,7 +18,7 @@ from vggtjax.captures.frames import CaptureFrames
 from vggtjax.captures.lens import check_no_fisheye
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, find_capture
 from vggtjax.clips.manifest import MOST_BYTES, is_manifest, read_manifest, source_name
-from vggtjax.clips.mixture import check_frames, odd_ones
+from vggtjax.clips.mixture import check_colours, check_frames, odd_ones
 from vggtjax.errors import ClipError, InputError, reading
 from vggtjax.media.animation import Animation, is_animation
 from vggtjax.media.arrays import ArrayFrames
@@ -200,6 +200,7 @@ def _from_list(paths: list[Path]) -> Source:
             raise ClipError(f"image {path} does not exist or is not a file; check the list of frames")
         if is_video_name(path):
             raise ClipError(f"{path} is a video; give one video at a time, or several to vggtjax batch")
+    check_colours(paths)
     return ImageFiles(tuple(path.absolute() for path in paths))
 
 
@@ -213,6 +214,7 @@ def _images(paths: list[Path], place: str, advice: str) -> Source:
     if not images:
         raise ClipError(f"{place} no images{_inventory(paths)}; {advice}")
     check_frames(images, place)
+    check_colours(images)
     return ImageFiles(tuple(images), notes=odd_ones(entries, images))
 
 

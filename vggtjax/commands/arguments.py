@@ -20,6 +20,9 @@ Revision = Annotated[str | None, tyro.conf.arg(metavar="COMMIT", help_behavior_h
 Size = Annotated[Framing, tyro.conf.arg(name="input", help="")]
 Method = Annotated[Options, tyro.conf.arg(name="method", help="")]
 
+_REPLACE = "replace the file if it exists; never the source, or a part of a result"
+Overwrite = Annotated[tyro.conf.FlagCreatePairsOff[bool], tyro.conf.arg(help=_REPLACE, help_behavior_hint="")]
+
 CONSISTENT = Options(consistent_depth=True)
 """What the commands `reconstruct` and `batch` do unless told otherwise; functions keep to the papers."""
 

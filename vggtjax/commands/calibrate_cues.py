@@ -13,6 +13,7 @@ from vggtjax.config import Gram
 from vggtjax.errors import InputError, share, whole_number
 from vggtjax.options import pairs_to_try
 from vggtjax.storage.flags import InWords
+from vggtjax.storage.writing import check_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -70,12 +71,13 @@ def calibrate_cues(
         import numpy as np
 
         from vggtjax.calibration.choice import choose
-        from vggtjax.calibration.export import calibrated, check_folder, save_calibration
+        from vggtjax.calibration.export import MODEL, calibrated, check_folder, save_calibration
         from vggtjax.calibration.second_pass import choose_second_pass
         from vggtjax.calibration.sweep import sweep
         from vggtjax.pretrained.load import load_model
 
         check_folder(out)
+        check_file(out / MODEL, overwrite=True, sources=[Path(model), Path(model) / MODEL])
         with report.stage("load model") as progress:
             loaded = load_model(model, progress=progress)
         side = loaded.config.image_size if size is None else size

@@ -7,11 +7,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from vggtjax.commands.arguments import Revision
+from vggtjax.commands.arguments import Overwrite, Revision
 from vggtjax.commands.models import at_revision, load, read_config
 from vggtjax.commands.report import Report
 from vggtjax.results.saving import ForeignFormat, Saving
 from vggtjax.storage.flags import InWords
+from vggtjax.storage.writing import check_file
 
 
 def convert(
@@ -23,6 +24,7 @@ def convert(
     config: InWords[Path | None] = None,
     heads: Annotated[str | None, tyro.conf.arg(metavar="HEAD,HEAD", help_behavior_hint="")] = None,
     dtype: Literal["float32", "bfloat16"] = "float32",
+    overwrite: Overwrite = False,
 ) -> None:
     """Convert a PyTorch VGGT checkpoint to one .safetensors with Flax names, and say what was read and written.
 
@@ -33,7 +35,9 @@ def convert(
         config: JSON file with the configuration; VGGT-1B by default.
         heads: heads to convert, such as camera,depth; all of camera,depth,points,tracks by default.
         dtype: of the written weights.
+        overwrite: replace the file if it exists.
     """
+    check_file(destination, overwrite=overwrite, sources=[Path(source)])
     report = Report()
     with report.running(), report.stage("convert") as progress:
         from converters import convert as run

@@ -185,6 +185,9 @@ def _print(report: Report, found: dict[str, Any]) -> None:
         "Cache": {
             "folder": found["cache"]["folder"],
             **{kind: f"{size / _MEGA:.1f} MB" for kind, size in found["cache"]["parts"].items()},
+            "in all": f"{found['cache']['bytes'] / _MEGA:.1f} MB",
+            "empty it": "vggtjax doctor --clear-cache; what is needed is made anew",
+            "move it": "VGGTJAX_CACHE=FOLDER",
         },
     }
     if "cleared_bytes" in found["cache"]:

@@ -23,6 +23,7 @@ from vggtjax import __version__
 from vggtjax.commands.app import app
 from vggtjax.commands.batch import batch
 from vggtjax.commands.calibrate_cues import calibrate_cues
+from vggtjax.commands.check_weights import check_weights
 from vggtjax.commands.convert import convert, import_result, info
 from vggtjax.commands.demo import demo
 from vggtjax.commands.doctor import doctor
@@ -56,6 +57,7 @@ COMMANDS = {
     "import": Command(import_result, _RESULTS, "a result of another program as ours"),
     "info": Command(info, _MODELS, "what a model is made of, or a clip is"),
     "convert": Command(convert, _MODELS, "a PyTorch checkpoint of VGGT as one .safetensors"),
+    "check-weights": Command(check_weights, _MODELS, "a model's numbers, beside those of the public code"),
     "train": Command(train, _MODELS, "train a model on generated scenes, or finetune one"),
     "calibrate-cues": Command(calibrate_cues, _MODELS, "choose a model's motion cues"),
     "fit-fusion": Command(fit_fusion, _MODELS, "fit how the two passes are fused"),
@@ -80,7 +82,10 @@ class _OneLine(logging.Formatter):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; return the exit code: 0, 1 if nobody reads the output, 2 for errors, 130 if interrupted."""
+    """Run the command line; return the exit code.
+
+    0, 1 if nobody reads the output or a check does not hold, 2 for errors, 130 if interrupted.
+    """
     arguments = sys.argv[1:] if arguments is None else arguments
     keep_freed_memory(training=list(arguments[:1]) == ["train"])
     give_devices_threads()
@@ -93,6 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     warnings.showwarning = lambda message, *_, **__: logging.getLogger("vggtjax").warning("%s", message)
     if "jax" not in sys.modules:  # else a program calls this function, which decides for itself
         enable_compilation_cache()  # after showwarning is set, which it replaces for some warnings
+    code = 0
     try:
         if list(arguments) in (["--version"], ["-V"]):
             sys.stdout.write(f"vggtjax {__version__}\n")
@@ -106,9 +112,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             command = _parsed(arguments)
             check_limits()
-            command()
+            code = command() or 0
         sys.stdout.flush()  # a broken pipe is noticed here
-        return 0
+        return code
     except VggtjaxError as error:
         message, code = _with_flag(str(error), arguments), 2
     except MemoryError:  # of the host
@@ -145,7 +151,7 @@ def _renamed(argument: str) -> str:
     return f"{_OLD_FLAGS.get(flag, flag)}{equals}{value}"
 
 
-def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
+def _parsed(arguments: Sequence[str]) -> Callable[[], int | None]:
     """Return the command with its arguments, ready to be called.
 
     tyro prints errors of the option dataclasses in a box. Find the error in the chain of exceptions and raise it.
@@ -169,7 +175,7 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], None]:
         raise
 
 
-def _read_by_tyro(name: str, arguments: Sequence[str]) -> Callable[[], None]:
+def _read_by_tyro(name: str, arguments: Sequence[str]) -> Callable[[], int | None]:
     """Return the command with its arguments, as tyro reads them.
 
     tyro reads the command's signature through `ready`. An option that all commands take is one more parameter in
@@ -178,7 +184,7 @@ def _read_by_tyro(name: str, arguments: Sequence[str]) -> Callable[[], None]:
     command = COMMANDS[name].run
 
     @functools.wraps(command)
-    def ready(*positional: object, **options: object) -> Callable[[], None]:
+    def ready(*positional: object, **options: object) -> Callable[[], int | None]:
         return functools.partial(command, *positional, **options)
 
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)

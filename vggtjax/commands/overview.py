@@ -10,7 +10,7 @@ from typing import NamedTuple
 class Command(NamedTuple):
     """A row of the table of commands, whose groups stand together."""
 
-    run: Callable[..., None]  # tyro makes its flags and its help
+    run: Callable[..., int | None]  # an exit code other than 0; tyro makes its flags and its help
     group: str  # its title on the page
     says: str  # its line on the page
 

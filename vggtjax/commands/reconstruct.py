@@ -50,9 +50,10 @@ def reconstruct(
         from vggtjax.clips.shots import shot_samplings
         from vggtjax.clips.sources import open_source
         from vggtjax.known.given import check_readable
+        from vggtjax.media.images import ImageFiles
         from vggtjax.pipeline.devices import frames_mesh
         from vggtjax.refinement.refine import check_refinement
-        from vggtjax.results.folder import check_folder
+        from vggtjax.results.folder import check_folder, check_no_part
 
         given.check(recipe, windows)
         opened = open_source(frames, undistort=recipe.undistort)
@@ -69,6 +70,8 @@ def reconstruct(
             samplings = {out / f"shot_{number}": sampling for number, sampling in enumerate(found, start=1)}
         for folder in samplings:
             check_folder(folder, recipe.saving.names(tracks=given.tracks is not None))
+        taken = opened.paths if isinstance(opened, ImageFiles) else [getattr(opened, "path", out)]
+        check_no_part(taken, out, what="a source of the next one, which would replace it")
         network, fitted, options = files.load_fastest(report, recipe.options, [recipe.options.method])
         recipe = dataclasses.replace(recipe, options=options)
         from vggtjax.commands.one_clip import OneClip

@@ -8,11 +8,12 @@ from typing import Annotated, Literal
 
 import tyro
 
-from vggtjax.commands.arguments import ResultPath
+from vggtjax.commands.arguments import Overwrite, ResultPath
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results.saving import ReadFormat
 from vggtjax.storage.flags import InWords
+from vggtjax.storage.writing import check_file
 
 _FILM = "turntable.mp4"
 
@@ -26,6 +27,7 @@ def render(
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "960x540",
     fps: float = 24.0,
     out: Annotated[Path | None, tyro.conf.arg(metavar="FILM", help_behavior_hint="")] = None,
+    overwrite: Overwrite = False,
     format: ReadFormat = "vggtjax",
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
 ) -> None:
@@ -38,7 +40,8 @@ def render(
         size: width x height in pixels.
         fps: frames per second.
         out: the film, an .mp4, .gif or .webp; RESULT/preview/turntable.mp4 by default, RESULT/turntable.mp4 where
-            the result has no previews.
+            the result has no previews, where the next film replaces it.
+        overwrite: replace the file if it exists.
         format: the program whose files the folder has.
         quaternion: order of the quaternions in pred_traj.txt, where the format has one: wxyz as MonST3R and VGGT4D
             write it, or xyzw.
@@ -49,9 +52,13 @@ def render(
         from vggtjax.reconstruction import Reconstruction
         from vggtjax.rendering.film import check_film
         from vggtjax.results.films import film_frames, write_film
+        from vggtjax.results.folder import check_no_part
 
         film = out or _film_of(result.parent if result.is_file() else result)
         check_film(film, fps)
+        check_file(film, overwrite=overwrite or out is None, sources=[result])
+        if out is not None:
+            check_no_part([film], result, what="no film replaces it", foreign=format != "vggtjax")
         with report.stage("read"):
             loaded = Reconstruction.load(result, format=format, quaternion=quaternion)
         if not film.parent.is_dir():

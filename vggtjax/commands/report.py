@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from rich.text import Text
 
 from vggtjax.errors import one_line, printable
 from vggtjax.progress import Progress
+from vggtjax.storage.process_memory import peak_bytes
 
 if TYPE_CHECKING:
     from vggtjax.checkpoint import Model
@@ -144,12 +144,10 @@ class _Count(MofNCompleteColumn):
 
 
 def _peak_memory() -> str:
-    if sys.platform == "win32":
+    peak = peak_bytes()
+    if peak is None:
         return "not measured on this system"
-    import resource
-
-    unit = 1 if sys.platform == "darwin" else 1024  # ru_maxrss is bytes there, kilobytes elsewhere
-    text = f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9:.2f} GB of host memory"
+    text = f"{peak / 1e9:.2f} GB of host memory"
     import jax
 
     statistics = jax.local_devices()[0].memory_stats() or {}

@@ -10,14 +10,17 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from vggtjax.commands.report import Report
-from vggtjax.errors import check_extra
+from vggtjax.errors import InputError, check_extra
 from vggtjax.storage.flags import InWords
 from vggtjax.storage.kept_memory import run_in_calling_thread
+from vggtjax.storage.writing import check_file, check_free
 from vggtjax.training.options import RunOptions
 
 if TYPE_CHECKING:
     from vggtjax.training.loop import Status
 
+_MODEL, _RECIPE = "model.safetensors", "recipe.json"  # of a run, beside its metrics
+_WRITTEN = (_MODEL, _RECIPE, "metrics.csv", "metrics.png")
 _LINE_SECONDS = 20.0  # between lines of progress
 
 
@@ -41,6 +44,9 @@ def train(
         options: how the run logs, saves, ends, and uses the cores of a CPU.
     """
     check_extra("training", "train", "optax", "orbax", "matplotlib")
+    check_file(out / _MODEL, overwrite=True, sources=[] if init is None else [Path(init), Path(init) / _MODEL])
+    if steps is not None:  # else it is written as it is
+        check_file(out / _RECIPE, overwrite=True, sources=[recipe])
     report = Report()
     with report.running():
         with report.stage("prepare"):
@@ -49,6 +55,7 @@ def train(
             from vggtjax.training.recipe import read_recipe
 
             chosen = read_recipe(recipe)
+            check_free(out, _WRITTEN, replaced=_is_recipe(out / _RECIPE), what="training run")
             if steps is not None:
                 chosen = chosen.with_steps(steps)
         model = None
@@ -78,6 +85,16 @@ def train(
             "metrics": f"{out / 'metrics.csv'}, {out / 'metrics.png'}",
         }
     )
+
+
+def _is_recipe(path: Path) -> bool:
+    from vggtjax.training.recipe import read_recipe
+
+    try:
+        read_recipe(path)
+    except InputError:
+        return False
+    return True
 
 
 def _line(status: Status) -> str:

@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from vggtjax.commands.arguments import Overwrite
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.results.saving import ReadFormat
 from vggtjax.storage.flags import InWords, Switch
+from vggtjax.storage.writing import check_file
 
 if TYPE_CHECKING:
     from vggtjax.results.result import Result
@@ -42,6 +44,7 @@ def view(
     /,
     *,
     export: InWords[Path | None] = None,
+    overwrite: Overwrite = False,
     format: ReadFormat = "vggtjax",
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None,
     serving: Annotated[Serving, tyro.conf.arg(name="server")] = Serving(),
@@ -52,6 +55,7 @@ def view(
         results: folders of results, up to nine; several are shown side by side or swapped by a key.
         export: write this .html file, which holds everything and opens without a server, and end; or a .viser file of
             one result, for viser's own player (extra "view"); by default the viewer is served.
+        overwrite: replace the file if it exists.
         format: the program whose files the folders have.
         quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw;
             only their formats need it.
@@ -65,11 +69,16 @@ def view(
         raise InputError(f"{len(results)} results for {export}; a .viser file holds one, an .html file up to nine")
     report = Report()
     with report.running():
+        from vggtjax.results.folder import check_no_part
         from vggtjax.results.foreign import check_format
         from vggtjax.viewer.page import check_count
 
         check_count(len(results))
         check_format(format, quaternion)
+        if export is not None:
+            check_file(export, overwrite=overwrite, sources=results)
+            for path in results:
+                check_no_part([export], path, what="no page replaces it", foreign=format != "vggtjax")
         with report.stage("read") as progress:
             from vggtjax.reconstruction import Reconstruction
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vggtjax.exports.views import View
+from vggtjax.exports.views import View, placed
 
 
 def write_exr(folder: Path, items: Iterator[View]) -> None:
@@ -24,7 +24,7 @@ def write_exr(folder: Path, items: Iterator[View]) -> None:
         channels["confidence"] = frame.confidence.astype(np.float32)
         channels["moving"] = frame.dynamic_mask.astype(np.float32)
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        OpenEXR.File(header, channels).write(str(folder / f"{Path(view.name).stem}.exr"))
+        OpenEXR.File(header, channels).write(str(placed(folder, f"{Path(view.name).with_suffix('')}.exr")))
 
 
 def _linear(values: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from vggtjax.exports.views import View
+from vggtjax.exports.views import View, placed
 from vggtjax.results.point_cloud import PointCloud, write_ply
 
 _FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # of the camera's axes
@@ -28,11 +28,11 @@ def write_nerfstudio(folder: Path, items: Iterator[View], points: PointCloud) ->
         (folder / name).mkdir()
     frames: list[dict[str, Any]] = []
     for view in items:
-        stem = Path(view.name).stem if len(view.name.split(".")) == 2 else view.name
+        stem = Path(view.name).with_suffix("").as_posix()
         view.write_picture(folder / "images")
         depth = np.where(view.frame.valid, view.frame.depth * np.float32(_DEPTH_SCALE), 0).astype(np.float32)
-        np.save(folder / f"depth/{stem}.npy", depth, allow_pickle=False)
-        Image.fromarray(view.static.astype(np.uint8) * 255).save(folder / f"masks/{stem}.png")
+        np.save(placed(folder, f"depth/{stem}.npy"), depth, allow_pickle=False)
+        Image.fromarray(view.static.astype(np.uint8) * 255).save(placed(folder, f"masks/{stem}.png"))
         frames.append(_frame(view, stem))
     write_ply(folder / "points.ply", points)
     scene = {"camera_model": "OPENCV", "ply_file_path": "points.ply", "frames": frames}

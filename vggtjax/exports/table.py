@@ -33,19 +33,20 @@ class Format(NamedTuple):
     modules: tuple[str, ...] = ()
     suffixes: tuple[str, ...] = ()  # of its one file; none for a folder
     has_pictures: bool = True  # or maps, at the size of the source where that is given
+    has_names: bool = False  # files of frames have the names of the source's
 
 
 FORMATS: dict[ExportFormat, Format] = {
-    "colmap": Format("colmap", ("pycolmap",)),
-    "colmap-text": Format("colmap", ("pycolmap",)),
-    "gsplat": Format("colmap", ("pycolmap",)),
-    "nerfstudio": Format(None),
+    "colmap": Format("colmap", ("pycolmap",), has_names=True),
+    "colmap-text": Format("colmap", ("pycolmap",), has_names=True),
+    "gsplat": Format("colmap", ("pycolmap",), has_names=True),
+    "nerfstudio": Format(None, has_names=True),
     "rerun": Format("rerun", ("rerun",), (".rrd",)),
     "glb-animated": Format(None, (), (".glb",), has_pictures=False),
     "dynamic-splats": Format(None),
     "blender": Format(None),
     "mesh": Format(None, (), (".glb", ".ply"), has_pictures=False),
-    "exr": Format("exr", ("OpenEXR",)),
+    "exr": Format("exr", ("OpenEXR",), has_names=True),
     "tum": Format(None, (), (".txt",), has_pictures=False),
     "kitti": Format(None, (), (".txt",), has_pictures=False),
 }

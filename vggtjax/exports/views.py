@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,19 +13,15 @@ from scipy.spatial.transform import Rotation
 
 from vggtjax.cameras import world_from_camera
 from vggtjax.errors import ClipError, InputError
-from vggtjax.media.images import ImageFiles
 from vggtjax.media.sampling import Sampling, Source
 from vggtjax.results.frame import ResultFrame, frame_of
 from vggtjax.results.result import Result
-
-_SAFE = re.compile(r"\w[\w. -]{0,99}", re.ASCII)
-_WRITTEN = (".jpg", ".jpeg", ".png")  # as which pictures are written
 
 
 class View(NamedTuple):
     """A frame of the clip as an exporter writes it."""
 
-    name: str  # of the picture's file; unique in the clip
+    name: str  # of the picture's file, with / between folders; unique in the clip
     time: float  # seconds; the frame's number where times are unknown
     frame: ResultFrame
 
@@ -52,7 +47,14 @@ class View(NamedTuple):
 
     def write_picture(self, folder: Path) -> None:
         """Write the picture under its name: .jpg with little loss, .png with none."""
-        Image.fromarray(self.frame.image).save(folder / self.name, quality=95, compress_level=3)
+        Image.fromarray(self.frame.image).save(placed(folder, self.name), quality=95, compress_level=3)
+
+
+def placed(folder: Path, name: str) -> Path:
+    """Return the path of a file in a folder; make the folders in between."""
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def rigid(camera_from_world: np.ndarray) -> Float64[np.ndarray, "3 4"]:
@@ -61,13 +63,12 @@ def rigid(camera_from_world: np.ndarray) -> Float64[np.ndarray, "3 4"]:
     return np.column_stack([Rotation.from_matrix(pose[:, :3]).as_matrix(), pose[:, 3]])
 
 
-def views(result: Result, source: Source | None) -> Iterator[View]:
-    """Yield the frames at the model's size, or with a `source` at the size of its pictures, one in memory at a time.
+def views(result: Result, source: Source | None, names: Sequence[str]) -> Iterator[View]:
+    """Yield the frames by these names, one in memory at a time: at the model's size, or at that of a source's pictures.
 
     Raises ClipError where the source lacks a frame of the result, or has a picture of another size.
     """
     times = range(len(result.depth)) if result.timestamps is None else result.timestamps
-    names = view_names(result, source)
     if source is None:
         for number, (name, time) in enumerate(zip(names, times, strict=True)):
             yield View(name, float(time), frame_of(result, number))
@@ -88,23 +89,6 @@ def of_one_size(items: Iterator[View], what: str) -> Iterator[View]:
                 f"{what} has one size: leave out the pictures, to write them at the model's size"
             )
         yield view
-
-
-def view_names(result: Result, source: Source | None) -> list[str]:
-    """Return the names of the pictures' files.
-
-    They are the names of the source's files where these are .jpg or .png, else the frames' names and a suffix: .jpg for
-    frames of a video, .png at the model's size. Names that are unsafe or not unique give way to the frames' numbers.
-    """
-    suffix = ".png" if source is None else ".jpg"
-    names = [f"{name}{suffix}" for name in result.frame_names]
-    if isinstance(source, ImageFiles):
-        pictures = zip(source.frame_names, source.paths, strict=True)
-        files = {name: path.name for name, path in pictures if path.suffix.lower() in _WRITTEN}
-        names = [files.get(stem, name) for stem, name in zip(result.frame_names, names, strict=True)]
-    if len({name.casefold() for name in names}) == len(names) and all(_SAFE.fullmatch(name) for name in names):
-        return names
-    return [f"{number:06d}{suffix}" for number in range(len(names))]
 
 
 def _pictures(result: Result, source: Source) -> Iterator[UInt8[np.ndarray, "h w 3"]]:

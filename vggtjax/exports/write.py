@@ -10,6 +10,7 @@ from typing import get_args
 import numpy as np
 
 from vggtjax.errors import InputError, OutputError, check_choice, check_extra
+from vggtjax.exports.names import picture_names, safe_names, say_renamed
 from vggtjax.exports.table import FORMATS, ExportFormat, Exporting
 from vggtjax.exports.views import View, views
 from vggtjax.media.sampling import Source
@@ -70,7 +71,11 @@ def export_result(
     with writing(out) as path:
         if not FORMATS[form].suffixes:
             path.mkdir()
-        items = _counted(views(result, source), len(result.depth), progress)
+        wanted = picture_names(result, source)
+        names = safe_names(wanted, blanks=form != "colmap-text")
+        if FORMATS[form].has_names:
+            say_renamed(path, wanted, names)
+        items = _counted(views(result, source, names), len(result.depth), progress)
         _write(result, path, form, items, exporting, progress)
 
 
@@ -85,10 +90,9 @@ def _write(
     match form:
         case "colmap" | "colmap-text" | "gsplat":
             from vggtjax.exports.colmap import write_colmap
-            from vggtjax.exports.observations import observe
 
             static, _ = _shown(result, exporting)
-            write_colmap(path, items, observe(result, static), "text" if form == "colmap-text" else "binary")
+            write_colmap(path, items, result, static.cloud(result), "text" if form == "colmap-text" else "binary")
         case "nerfstudio":
             from vggtjax.exports.nerfstudio import write_nerfstudio
 

@@ -10,15 +10,17 @@ folder are old. If the process is killed, `.replacing` stays, and the next save 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
+from vggtjax.errors import OutputError
 from vggtjax.results.archive import ARCHIVE_NAME, saved_names
 from vggtjax.results.saving import NAMES, OPTIONAL_FILES
 from vggtjax.storage.writing import check_free, locked_folder, staging
 
 _ALL = (*NAMES, *OPTIONAL_FILES, ARCHIVE_NAME)
+ADDED = ("preview/turntable.mp4", "preview/viewer.html")  # by commands, to a result that is there
 _REPLACING = ".replacing"
 _WAIT = 60  # seconds for the moves of another process
 
@@ -40,6 +42,26 @@ def check_folder(folder: Path, names: Sequence[str] = NAMES) -> None:
         ours = saved_names(folder / ARCHIVE_NAME)
         others = [name for name in (ARCHIVE_NAME, *names) if name not in ours]
         check_free(folder, others, replaced=False, what="result")
+
+
+def check_no_part(files: Iterable[Path], result: Path, *, what: str, foreign: bool = False) -> None:
+    """Raise OutputError where a file is part of a saved result, which is replaced as a whole or not at all.
+
+    Args:
+        files: those to check; a missing one is no part, nor is one that a command added to a result that was there.
+        result: the folder of a result, or a file in it.
+        what: what would happen to the file, such as "no film replaces it".
+        foreign: the result is another program's; every file in its folder is a part.
+    """
+    folder = (result if result.is_dir() else result.parent).resolve()
+    names = saved_names(find_archive(folder)) if result.exists() else ()
+    for file in files if names or foreign else ():
+        place = file.resolve()
+        if not place.is_relative_to(folder) or not place.exists() or place == folder:
+            continue
+        name = place.relative_to(folder)
+        if name.as_posix() not in ADDED and (foreign or name.parts[0] in names):
+            raise OutputError(f"{file} is part of the result in {folder}, and {what}; choose another name")
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import re
 import shutil
 import time
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
@@ -96,6 +96,24 @@ def check_free(folder: Path, names: Sequence[str], *, replaced: bool, what: str)
         parent = next(parent for parent in (folder, *folder.absolute().parents) if os.path.lexists(parent))
         with _staged(parent):
             pass
+
+
+def check_file(path: Path, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
+    """Check that a file may be written, before the work: one of the sources never, another one that exists on request.
+
+    Raises OutputError where it may not.
+    """
+    if any(_is_same(path, source) for source in sources):
+        raise OutputError(f"{path} is the source, which is never replaced; choose another name")
+    if os.path.lexists(path) and not overwrite:
+        raise OutputError(f"{path} exists and is not replaced; choose another name, or give --overwrite")
+
+
+def _is_same(path: Path, source: Path) -> bool:
+    try:
+        return path.samefile(source)
+    except (OSError, ValueError):  # a missing file, or words that are no path
+        return False
 
 
 def says_format(path: Path, name: str) -> bool:

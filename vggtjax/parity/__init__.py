@@ -1,0 +1,1 @@
+"""A model's weights checked: alone, and beside the public PyTorch code."""
