@@ -77,8 +77,9 @@ def read_poses(
     path = folder / "groundtruth.txt"
     if not path.is_file():
         return None, np.full(len(times), -1)
-    stamps, poses = read_trajectory(path)
-    return np.asarray(poses, np.float64), partners(times, stamps)
+    stamps, poses = read_trajectory(path, lost=True)
+    found = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
+    return np.asarray(poses[found], np.float64), partners(times, stamps[found])
 
 
 def read_intrinsics(folder: Path) -> tuple[Float64[np.ndarray, "3 3"] | None, tuple[str, ...]]:
@@ -128,19 +129,19 @@ def read_tum(folder: Path) -> Capture:
 
 
 def depth_files(
-    folder: Path, times: Float64[np.ndarray, " N"], frames: Sequence[int] | Int[np.ndarray, " S"]
+    folder: Path, times: Float64[np.ndarray, " N"], frames: Sequence[int] | Int[np.ndarray, " S"], *, whole: bool = True
 ) -> tuple[Path | None, ...] | None:
     """Return the depth maps of some pictures of the list with these times; None where there is no depth.txt.
 
     Partners are sought among all pictures, so that a choice of frames does not change the owner of a depth map.
-    Raises InputError for a file that is listed and missing.
+    Raises InputError for a file that is listed and missing; unless `whole`, its frame has no depth.
     """
     if not (folder / "depth.txt").is_file():
         return None
     listed = read_list(folder, "depth.txt")
     owners = partners(times, listed.times)[frames]
     found = tuple(listed.paths[owner] if owner >= 0 else None for owner in owners)
-    for path in found:
-        if path is not None and not path.is_file():
-            raise InputError(f"{path} is missing, but depth.txt names it; get the capture whole")
-    return found
+    missing = [path for path in found if path is not None and not path.is_file()]
+    if missing and whole:
+        raise InputError(f"{missing[0]} is missing, but depth.txt names it; get the capture whole")
+    return tuple(None if path in missing else path for path in found)

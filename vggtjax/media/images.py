@@ -18,7 +18,9 @@ from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 from vggtjax.errors import ClipError, InputError, check_regular
 from vggtjax.media.arrays import eight_bit
 from vggtjax.media.colour import HDR, srgb_of_coded
+from vggtjax.media.order import in_order
 from vggtjax.media.sampling import Frame, Sampling
+from vggtjax.media.times import FrameTimes, frame_times
 
 logger = logging.getLogger(__name__)
 
@@ -62,19 +64,31 @@ class ImageFiles:
         """The names of all frames."""
         return tuple(path.stem for path in self.paths)
 
+    @functools.cached_property
+    def times(self) -> FrameTimes | None:
+        """The times that the names of the files state, or a list of them; see `frame_times`."""
+        pictures: list[str] = []
+        if len({path.parent for path in self.paths}) == 1 and self.paths[0].parent.is_dir():
+            folder = self.paths[0].parent.iterdir()
+            pictures = [path.name for path in in_order(filter(is_image_name, folder)) if not path.name.startswith(".")]
+        return frame_times(self.paths, pictures)
+
     def total(self, sampling: Sampling) -> int:
         """Return how many frames `sampling` takes."""
         return len(self.taken(sampling))
 
     def taken(self, sampling: Sampling) -> Sequence[int]:
-        """Return the indices of the files that `sampling` takes."""
-        return sampling.indices(len(self.paths))
+        """Return the indices of the files that `sampling` takes, with `fps` by their times."""
+        if sampling.fps is None or self.times is None:
+            return sampling.indices(len(self.paths))
+        return [index for index, _, _ in sampling.select((float(time), None) for time in self.times.from_first)]
 
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes. Raises ClipError for a file that cannot be read."""
+        times = None if self.times is None else self.times.from_first
         for index in self.taken(sampling):
             path = self.paths[index]
-            yield Frame(path.stem, read_image(path, self._said))
+            yield Frame(path.stem, read_image(path, self._said), None if times is None else float(times[index]))
 
 
 def is_image_name(path: Path) -> bool:

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Float64
 from PIL import Image
 
 from vggtjax.cameras import Cameras, world_from_camera
@@ -40,6 +40,7 @@ from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, 
 from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory
 
 _WHITE = 1.01  # of shares, with rounding
+_MOST_NUMBER = 10**9  # of a frame
 _GREY = 128  # of pictures that a format does not keep
 
 logger = logging.getLogger(__name__)
@@ -63,6 +64,14 @@ def write_cameras(
     write_trajectory(folder / "pred_traj.txt", world_from_camera, numbers, quaternion="wxyz")
 
 
+class _Posed(NamedTuple):
+    """Numbers of frames, their cameras, and their times where they are known in seconds."""
+
+    numbers: Sequence[int]
+    cameras: Cameras
+    times: Float64[np.ndarray, " S"] | None = None
+
+
 class _Folder(NamedTuple):
     """A file for each array and frame: the paths of the first frame's files, and the reader of the cameras."""
 
@@ -70,7 +79,7 @@ class _Folder(NamedTuple):
     picture: str
     confidence: str
     mask: str | None
-    cameras: Callable[[Path, Sequence[int], Quaternion | None], Cameras]
+    cameras: Callable[[Path, Sequence[int], Quaternion | None], _Posed]
     logarithmic: bool = False  # confidence
 
 
@@ -100,15 +109,16 @@ def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict
         "dynamic_mask": np.zeros((S, H, W), bool),
         "images": np.full((S, H, W, 3), _GREY, np.uint8),
     }
+    numbers = fields.pop("numbers", range(S))
     missing = [name for name in plain if fields.get(name) is None]
     if missing:
         logger.warning("%s has no %s; plain values stand for them", path, ", ".join(missing))
-    return {
+    made = {
         **plain,
         **{name: value for name, value in fields.items() if value is not None},
         "saliency": None,
-        "frame_names": tuple(f"{number:06d}" for number in range(S)),
-        "timestamps": None,
+        "frame_names": tuple(f"{number:06d}" for number in numbers),
+        "timestamps": fields.get("timestamps"),
         "method": format,
         "model_name": format,
         "settings": {"format": format, "quaternion": quaternion, "missing": missing},
@@ -116,6 +126,21 @@ def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict
         "source_scale": np.ones((S, 2)),
         "source_offset": np.zeros((S, 2)),
         "valid_box": np.tile([0, 0, W, H], (S, 1)),
+    }
+    return _without_lost(made, path)
+
+
+def _without_lost(fields: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the frames whose camera is finite: programs write others for frames that they lost."""
+    found = np.isfinite(fields["camera_from_world"]).all(axis=(1, 2))
+    if found.all() or not found.any():  # `Result` refuses the latter
+        return fields
+    lost = [name for name, is_found in zip(fields["frame_names"], found, strict=True) if not is_found]
+    logger.warning("%s has no finite camera for %d of %d frames, %s first; they are left out",
+                   path, len(lost), len(found), lost[0])  # fmt: skip
+    names = tuple(name for name, is_found in zip(fields["frame_names"], found, strict=True) if is_found)
+    return {name: value[found] if isinstance(value, np.ndarray) else value for name, value in fields.items()} | {
+        "frame_names": names
     }
 
 
@@ -147,11 +172,11 @@ def _read_folder(folder: Path, format: str, quaternion: Quaternion | None) -> di
             f"it has no depth; expected files like {' or '.join(each.depth for each in _FOLDERS[format])}"
         )
     depth_files = _numbered(folder, files.depth)
-    numbers = sorted(depth_files)
-    cameras = files.cameras(folder, numbers, quaternion)
-    depth = _stacked(depth_files, numbers, _read_map, None)
+    numbers, cameras, times = files.cameras(folder, sorted(depth_files), quaternion)
+    of_files = sorted(depth_files)
+    depth = _stacked(depth_files, of_files, _read_map, None)
     shape = depth.shape[1:]
-    confidence = _stacked(_numbered(folder, files.confidence), numbers, _read_map, shape)
+    confidence = _stacked(_numbered(folder, files.confidence), of_files, _read_map, shape)
     if confidence is not None and files.logarithmic:
         if padded := sorted(path.name for path in folder.glob("conf_0[0-9]*.npy")):
             raise ResultError(
@@ -159,15 +184,17 @@ def _read_folder(folder: Path, format: str, quaternion: Quaternion | None) -> di
             )
         with np.errstate(over="ignore"):
             confidence = np.exp(confidence).clip(0, np.finfo(np.float32).max)
-    mask = None if files.mask is None else _stacked(_numbered(folder, files.mask), numbers, read_mask, shape)
+    mask = None if files.mask is None else _stacked(_numbered(folder, files.mask), of_files, read_mask, shape)
     return {
         "depth": depth,
         "depth_confidence": confidence,
         "dynamic_mask": mask,
         "images": _stacked(
-            _numbered(folder, files.picture), numbers, lambda path: np.asarray(read_image(path)), (*shape, 3)
+            _numbered(folder, files.picture), of_files, lambda path: np.asarray(read_image(path)), (*shape, 3)
         ),
         **cameras._asdict(),
+        "numbers": numbers,
+        "timestamps": times,
     }
 
 
@@ -217,18 +244,28 @@ def _read_map(path: Path) -> Float32[np.ndarray, "H W"]:
     return array.astype(np.float32)
 
 
-def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
-    poses = read_trajectory(folder / "pred_traj.txt", quaternion)[1]  # pyright: ignore[reportArgumentType] - checked
+def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> _Posed:
+    """Return the cameras of the frames with these numbers; times that are other whole numbers are numbers of frames."""
+    times, poses = read_trajectory(folder / "pred_traj.txt", quaternion, lost=True)
     intrinsics = read_numbers(folder / "pred_intrinsics.txt", 9).reshape(-1, 3, 3)
     for name, array in (("pred_traj.txt", poses), ("pred_intrinsics.txt", intrinsics)):
         if len(array) != len(numbers):
             raise ResultError(
                 f"{name} has {len(array)} lines for {len(numbers)} frames of depth; expected one for each"
             )
-    return Cameras(world_from_camera(poses[:, :3])[:, :3], intrinsics)
+    inverse = np.full((len(poses), 4, 4), np.nan)
+    found = np.isfinite(poses).all(axis=(1, 2))
+    inverse[found] = world_from_camera(poses[found][:, :3])
+    cameras, counted = Cameras(inverse[:, :3], intrinsics), list(range(len(numbers)))
+    if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
+        return _Posed(numbers, cameras)
+    if (times == np.round(times)).all() and 0 <= times[0] and times[-1] < _MOST_NUMBER:
+        whole = times.astype(int).tolist()
+        return _Posed(whole if list(numbers) == counted else numbers, cameras)
+    return _Posed(numbers, cameras, times)
 
 
-def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
+def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> _Posed:
     files = _numbered(folder, "camera/000000.npz")
     poses, intrinsics = [], []
     for number in numbers:
@@ -237,7 +274,7 @@ def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | 
         arrays = _read_some(files[number], {"pose": ((4, 4),), "intrinsics": ((3, 3),)}, {})
         poses.append(arrays["pose"].astype(np.float64))
         intrinsics.append(arrays["intrinsics"].astype(np.float64))
-    return Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
+    return _Posed(numbers, Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics)))
 
 
 def _read_archive(path: Path, names: _Archive) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def commented(columns: str, note: str) -> str:
 
 
 def read_trajectory(
-    path: str | Path, quaternion: Quaternion | None = None
+    path: str | Path, quaternion: Quaternion | None = None, *, lost: bool = False
 ) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, "S 4 4"]]:
     """Read a trajectory: timestamps, and world-from-camera poses.
 
@@ -65,16 +65,19 @@ def read_trajectory(
     order of the last four: "xyzw" is TUM's, "wxyz" that of MonST3R, CUT3R, Easi3R and VGGT4D; without it the names of
     the columns tell, and where there are none it is TUM's. Raises InputError for an unknown order, and ResultError for
     an unreadable file, names of columns in the other order, lines without eight finite numbers, or quaternions not of
-    length 1.
+    length 1. With `lost`, a pose that is not finite, or whose quaternion is 0, is one of NaN.
     """
     if quaternion is not None:
         check_choice("quaternion", quaternion, get_args(Quaternion))
-    rows, named = read_numbers(path, 8), named_order(path)
+    rows, named = read_numbers(path, 8, finite=not lost), named_order(path)
     if named is not None and quaternion is not None and named != quaternion:
         raise ResultError(f"{path} names its columns {_COLUMNS[named]}; read it with quaternion={named!r}")
     is_first = (quaternion or named) == "wxyz"
     turns = rows[:, [5, 6, 7, 4]] if is_first else rows[:, 4:]
-    return rows[:, 0], pose_matrices(rows[:, 1:4], turns, path)
+    found = np.isfinite(rows).all(axis=1) & rows[:, 4:].any(axis=1) if lost else np.ones(len(rows), bool)
+    poses = np.full((len(rows), 4, 4), np.nan)
+    poses[found] = pose_matrices(rows[found, 1:4], turns[found], path)
+    return rows[:, 0], poses
 
 
 def named_order(path: str | Path) -> Quaternion | None:
@@ -163,8 +166,10 @@ def _timestamps(name: str, times) -> Float64[np.ndarray, " N"]:
     return times
 
 
-def read_numbers(path: str | Path, columns: int | tuple[int, ...]) -> Float[np.ndarray, "S columns"]:
-    """Read a text file of finite numbers, `columns` in every line, or one of several numbers of columns.
+def read_numbers(
+    path: str | Path, columns: int | tuple[int, ...], *, finite: bool = True
+) -> Float[np.ndarray, "S columns"]:
+    """Read a text file of `finite` numbers, `columns` in every line, or one of several numbers of columns.
 
     Text after # is a comment, commas count as spaces, and a first line of words names the columns. Raises ResultError
     for anything else.
@@ -186,7 +191,7 @@ def read_numbers(path: str | Path, columns: int | tuple[int, ...]) -> Float[np.n
     if array.shape[1] not in choices or not len(array):
         problem = f"has {array.shape[1]} numbers a line" if len(array) else "is empty"
         raise ResultError(f"{path} {problem}; expected {expected} numbers a line")
-    if not np.isfinite(array).all():
+    if finite and not np.isfinite(array).all():
         raise ResultError(f"{path} holds {array[~np.isfinite(array)][0]}; expected finite numbers")
     return array
 
