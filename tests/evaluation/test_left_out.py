@@ -44,8 +44,16 @@ def scored(folder, result, *arguments, capsys):
     root = folder.parent.parent
     result.save(root / "mine/walk", only=("depth",))
     code = cli.main(
-        ["evaluate", "plain", str(folder.parent), "--results", f"mine={root / 'mine'}", "--out", str(root / "out")]
-        + list(arguments)
+        [
+            "evaluate",
+            "plain",
+            str(folder.parent),
+            "--results",
+            f"mine={root / 'mine'}",
+            "--out",
+            str(root / "out"),
+            *list(arguments),
+        ]
     )
     shown = capsys.readouterr()
     return code, shown.out + shown.err, json.loads((root / "out/results.json").read_text())["sequences"][0]

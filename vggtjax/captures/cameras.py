@@ -72,7 +72,7 @@ def with_lost_poses(poses: Float[np.ndarray, "S 4 4"], source: Path | str) -> Fl
     Raises what `checked_world_from_camera` raises for the others.
     """
     poses = np.array(poses, np.float64)
-    lost = ~np.isfinite(poses).all(axis=(1, 2)) | ~poses[:, :3].any(axis=(1, 2))
+    lost = np.asarray(~np.isfinite(poses).all(axis=(1, 2)) | ~poses[:, :3].any(axis=(1, 2)))
     checked_world_from_camera(np.where(lost[:, None, None], np.eye(4), poses), source)
     poses[lost] = np.nan
     return poses

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.errors import ClipError, InputError
-from vggtjax.media.times import name_times
+from vggtjax.media.times import in_seconds, name_times
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.result import ARRAYS, TRACKS
 from vggtjax.storage.trajectories import associate
@@ -104,7 +104,7 @@ def _pairs(
         return [(own[name], place) for place, name in enumerate(names) if name in own]
     count = len(result.depth)
     if result.timestamps is not None and (wanted := name_times(names) if times is None else times) is not None:
-        pairs = associate(wanted, result.timestamps)
+        pairs = associate(wanted, in_seconds(result.timestamps))
         if len(pairs):
             return [(int(mine), int(theirs)) for theirs, mine in pairs]
     numbers = {int(name) if name.isdecimal() else place: place for name, place in own.items()}
@@ -114,7 +114,7 @@ def _pairs(
         return []
     ends = [re.search(r"(\d{1,9})$", name) for name in names]
     by_name = {int(end[1]): place for place, end in enumerate(ends) if end}
-    if None not in ends and set(numbers) <= set(by_name) or max(numbers) >= len(names):
+    if (None not in ends and set(numbers) <= set(by_name)) or max(numbers) >= len(names):
         return [(numbers[number], place) for number, place in by_name.items() if number in numbers]
     return [(numbers[number], number) for number in sorted(numbers)]
 

@@ -143,9 +143,7 @@ def _computed(
             yield record, scores.curves
 
 
-def _matched(
-    sequence: LabelledSequence, result: Reconstruction
-) -> tuple[LabelledSequence, tuple[LeftOut, ...]]:
+def _matched(sequence: LabelledSequence, result: Reconstruction) -> tuple[LabelledSequence, tuple[LeftOut, ...]]:
     """Return the frames of a sequence that a result has, by their names, and the frames that it lacks."""
     if len(result.depth) == len(sequence):
         return sequence, ()

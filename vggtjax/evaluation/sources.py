@@ -168,9 +168,7 @@ class FolderSource:
             form = self._format(name)
             quaternion = self.quaternion if needs_quaternion(form) else None
             result = Reconstruction.load(self._path(name, sequence), format=form, quaternion=quaternion)
-            results[name] = placed(
-                result, form, sizes, sequence.frame_names, sequence.timestamps, strict=self.strict
-            )
+            results[name] = placed(result, form, sizes, sequence.frame_names, sequence.timestamps, strict=self.strict)
         return results
 
 

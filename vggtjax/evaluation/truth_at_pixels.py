@@ -24,8 +24,8 @@ class AbsentError(InputError):
 class TruthAtPixels:
     """A sequence's ground truth at the pixels of results with one placement; each part is read at its first use.
 
-    Depth beyond `max_depth` metres counts as unknown. A part that the sequence lacks raises AbsentError. Maps of another
-    shape than their pictures are left out, which `left_out` says, unless `strict`.
+    Depth beyond `max_depth` metres counts as unknown. A part that the sequence lacks raises AbsentError. Maps of
+    another shape than their pictures are left out, which `left_out` says, unless `strict`.
     """
 
     def __init__(
@@ -50,7 +50,9 @@ class TruthAtPixels:
             raise AbsentError("the sequence has no depth")
         sizes = [(int(height), int(width)) for height, width in self._placed.source_size]
         maps = self._read("depth", read)
-        missing = [np.zeros(size, np.float32) if depth is None else depth for depth, size in zip(maps, sizes, strict=True)]
+        missing = [
+            np.zeros(size, np.float32) if depth is None else depth for depth, size in zip(maps, sizes, strict=True)
+        ]
         depth = _stacked("depth", [depth.astype(np.float32) for depth in missing])
         if self.max_depth is not None:
             depth[depth >= self.max_depth] = 0

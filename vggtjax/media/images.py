@@ -66,12 +66,8 @@ class ImageFiles:
 
     @functools.cached_property
     def times(self) -> FrameTimes | None:
-        """The times that the names of the files state, or a list of them; see `frame_times`."""
-        pictures: list[str] = []
-        if len({path.parent for path in self.paths}) == 1 and self.paths[0].parent.is_dir():
-            folder = self.paths[0].parent.iterdir()
-            pictures = [path.name for path in in_order(filter(is_image_name, folder)) if not path.name.startswith(".")]
-        return frame_times(self.paths, pictures)
+        """The times that the files state; see `stated_times`."""
+        return stated_times(self.paths)
 
     def total(self, sampling: Sampling) -> int:
         """Return how many frames `sampling` takes."""
@@ -89,6 +85,15 @@ class ImageFiles:
         for index in self.taken(sampling):
             path = self.paths[index]
             yield Frame(path.stem, read_image(path, self._said), None if times is None else float(times[index]))
+
+
+def stated_times(paths: Sequence[Path]) -> FrameTimes | None:
+    """Return the times of picture files by a list beside or above them, or by their names; see `frame_times`."""
+    pictures: list[str] = []
+    if len({path.parent for path in paths}) == 1 and (folder := paths[0].parent).is_dir():
+        found = (path for path in folder.iterdir() if is_image_name(path) and not path.name.startswith("."))
+        pictures = [path.name for path in in_order(found)]
+    return frame_times(paths, pictures)
 
 
 def is_image_name(path: Path) -> bool:

@@ -11,7 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from vggtjax.errors import InputError, reading
 
@@ -25,6 +25,7 @@ _NUMBER = re.compile(r"[+-]?\d{1,25}(?:\.\d{0,25})?(?:[eE][+-]?\d{1,2})?")
 _FIRST, _LAST = Decimal(631_152_000), Decimal(4_102_444_800)  # the years 1990 to 2100
 _LONGEST = Decimal(3600)  # seconds from frame to frame, in the middle, of names that are times
 _FILMED = Decimal(2)  # the same of whole numbers in a list, which may be in any unit
+_MOST_DIGITS = 9
 _MOST_BYTES = 2**26
 _LONGEST_LINE = 2**12
 
@@ -47,9 +48,14 @@ class FrameTimes:
         return np.array([float(time - self.first) for time in self.seconds])
 
     @property
+    def floats(self) -> Float64[np.ndarray, " S"]:
+        """Seconds as the source counts them; nanoseconds of today are rounded to a quarter of a microsecond."""
+        return np.array([float(time) for time in self.seconds])
+
+    @property
     def digits(self) -> int:
         """The most digits after the point."""
-        return max(0, *(-int(time.as_tuple().exponent) for time in self.seconds))
+        return min(_MOST_DIGITS, max(-int(time.as_tuple().exponent) for time in self.seconds))
 
 
 def frame_times(paths: Sequence[Path], pictures: Sequence[str]) -> FrameTimes | None:
@@ -79,7 +85,17 @@ def frame_times(paths: Sequence[Path], pictures: Sequence[str]) -> FrameTimes | 
 def name_times(names: Sequence[str]) -> Float64[np.ndarray, " S"] | None:
     """Return the seconds that the names of frames state, None where they state none."""
     found = _named(names)
-    return None if found is None else np.array([float(time) for time in found.seconds])
+    return None if found is None else found.floats
+
+
+def in_seconds(times: Float[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
+    """Return times since 1970 that are in milliseconds, microseconds or nanoseconds as seconds; others as they are."""
+    times = np.asarray(times, np.float64)
+    with np.errstate(invalid="ignore"):
+        for digits in _UNITS.values():
+            if len(times) and (times >= float(_FIRST) * 10**digits).all() and (times < float(_LAST) * 10**digits).all():
+                return times / 10**digits
+    return times
 
 
 def _named(names: Sequence[str]) -> FrameTimes | None:

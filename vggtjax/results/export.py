@@ -250,7 +250,9 @@ def _frame_writer(
 
 
 def _write_cameras(result: Result, written: Sequence[_Written], folder: Path) -> None:
-    write_trajectory(folder / "trajectory.txt", result.world_from_camera, result.file_times, note=result.model_note)
+    write_trajectory(
+        folder / "trajectory.txt", result.world_from_camera, result.file_time_texts, note=result.model_note
+    )
     intrinsics, sizes = [frame.intrinsics for frame in written], [frame.size for frame in written]
     write_intrinsics(folder / "intrinsics.txt", intrinsics, sizes, note=result.model_note)
 

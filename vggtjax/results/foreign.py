@@ -259,7 +259,7 @@ def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion |
     cameras, counted = Cameras(inverse[:, :3], intrinsics), list(range(len(numbers)))
     if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
         return _Posed(numbers, cameras)
-    if (times == np.round(times)).all() and 0 <= times[0] and times[-1] < _MOST_NUMBER:
+    if (times == np.round(times)).all() and times[0] >= 0 and times[-1] < _MOST_NUMBER:
         whole = times.astype(int).tolist()
         return _Posed(whole if list(numbers) == counted else numbers, cameras)
     return _Posed(numbers, cameras, times)

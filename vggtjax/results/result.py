@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import cached_property
 from typing import Any, get_args, get_type_hints
 
@@ -19,6 +20,8 @@ from vggtjax.method.instances import find_instances
 from vggtjax.storage.arrays import is_mapped, zeros_beside
 
 _TIME = re.compile(r"\d{1,18}\.\d{1,18}")  # in seconds, as a frame's name
+_EXACT = re.compile(r"-?\d{1,20}(?:\.\d{1,20})?")  # seconds
+_FEWEST_DIGITS = 6  # after the point
 _MOST_SIDE, _MOST_PIXELS = 1 << 20, 1 << 28  # of a source's picture
 
 
@@ -205,16 +208,26 @@ class Result:
         return np.arange(len(self.depth), dtype=np.float64) if self.timestamps is None else self.timestamps
 
     @property
+    def file_time_texts(self) -> tuple[str, ...]:
+        """`file_times` as texts with all digits of the source: nanoseconds since 1970 do not fit 64 bits."""
+        exact, digits = self.settings.get("first_time_exact"), self.settings.get("time_digits")
+        if self.timestamps is None or not isinstance(exact, str) or not _EXACT.fullmatch(exact):
+            return tuple(f"{time:.6f}" for time in self.file_times)
+        digits = digits if isinstance(digits, int) and digits in range(_FEWEST_DIGITS, 10) else _FEWEST_DIGITS
+        return tuple(f"{Decimal(exact) + Decimal(float(time)):.{digits}f}" for time in self.timestamps)
+
+    @property
     def model_note(self) -> str:
         """A caution about the model for readers of the files, on one line; empty for most models."""
         return " ".join(str(self.settings.get("model_note", "")).split()).encode(errors="replace").decode()
 
     @property
     def known_facts(self) -> dict[str, str]:
-        """How cameras and depth were refined and brought to known ones and to lengths: a sentence by step."""
+        """How cameras and depth were refined and brought to known ones and to lengths, and where times are from."""
         found = self._known.get("found")
         done = {"cameras": self.settings.get("refined_cameras"), "depth": self.settings.get("consistency")}
         facts = {name: outcome.get("sentence") for name, outcome in done.items() if isinstance(outcome, dict)}
+        facts |= {"times": f"from {self.settings['times']}"} if "times" in self.settings else {}
         facts |= found if isinstance(found, dict) else {}
         return {name: text for name, text in facts.items() if isinstance(text, str)}
 

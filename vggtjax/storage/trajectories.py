@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, TextIO, get_args
 
@@ -31,12 +31,12 @@ _COLUMNS: dict[Quaternion, str] = {"xyzw": "qx qy qz qw", "wxyz": "qw qx qy qz"}
 def write_trajectory(
     path: Path,
     world_from_camera: Float[np.ndarray, "S 4 4"],
-    times: Float[np.ndarray, " S"],
+    times: Float[np.ndarray, " S"] | Sequence[str],
     *,
     quaternion: Quaternion = "xyzw",
     note: str = "",
 ) -> None:
-    """Write poses as timestamp tx ty tz and a quaternion with w at least 0.
+    """Write poses as timestamp tx ty tz and a quaternion with w at least 0; times are seconds, or texts of them.
 
     Files in TUM's order "xyzw" start with a comment of the columns and the `note`; files in the order "wxyz" of MonST3R
     and VGGT4D have no comments, as theirs.
@@ -45,10 +45,12 @@ def write_trajectory(
     turns = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3]).as_quat(
         canonical=True, scalar_first=quaternion == "wxyz"
     )
-    rows = np.column_stack([times, poses[:, :3, 3], turns])
+    texts = [time if isinstance(time, str) else f"{time:.6f}" for time in times]
+    rows = np.column_stack([poses[:, :3, 3], turns])
     header = commented(f"timestamp tx ty tz {_COLUMNS['xyzw']} (world-from-camera)", note)
     header = header if quaternion == "xyzw" else ""
-    np.savetxt(path, rows, fmt=["%.6f"] + ["%.9g"] * 7, header=header, comments="", encoding="utf-8")
+    lines = [" ".join([text, *(f"{value:.9g}" for value in row)]) for text, row in zip(texts, rows, strict=True)]
+    path.write_text("\n".join([*header.splitlines(), *lines]) + "\n", encoding="utf-8", newline="\n")
 
 
 def commented(columns: str, note: str) -> str:

@@ -77,7 +77,9 @@ def test_kitti_takes_the_first_110_and_names_what_is_missing(tmp_path):
     (tmp_path / "2011_09_26" / "calib_cam_to_cam.txt").unlink()
     (sequence,) = opened("kitti", tmp_path)
     assert [int(path.stem) for path in sequence.pictures] == [i for i in range(5, 115) if i not in (7, 9)]
-    assert f"{DRIVE}: 2 of 110 frames have no picture and are skipped: 0000000007, 0000000009; expected " in " ".join(sequence.notes)
+    assert f"{DRIVE}: 2 of 110 frames have no picture and are skipped: 0000000007, 0000000009; expected " in " ".join(
+        sequence.notes
+    )
     assert f"{DRIVE}: it has no intrinsics; expected {tmp_path}/2011_09_26/calib_cam_to_cam.txt" in sequence.notes
     assert np.allclose(sequence.depth(2)[0], [0, 1, 0.5, 265 / 256])  # frame 8
 

@@ -139,7 +139,9 @@ def _colmap_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _C
     known = world_from_camera_of(np.stack([view.camera_from_world for view in taken.values()]), source)
     notes = (DISTORTED,) * any(view.lens for view in taken.values())
     gaps = left_out("poses", missing, len(frames), f"are not in {_MODEL}")
-    return _with_gaps(dict(zip(taken, known, strict=True)), intrinsics, len(frames))._replace(notes=notes, left_out=gaps)
+    return _with_gaps(dict(zip(taken, known, strict=True)), intrinsics, len(frames))._replace(
+        notes=notes, left_out=gaps
+    )
 
 
 def _with_gaps(

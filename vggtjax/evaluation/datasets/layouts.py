@@ -128,7 +128,7 @@ def _read_sintel(training: Path, name: str, frames: FrameChoice) -> LabelledSequ
     )
 
 
-def finite(array: Float64[np.ndarray, "..."]) -> bool:
+def finite(array: Float64[np.ndarray, ...]) -> bool:
     """Return whether all values of an array are finite."""
     return bool(np.isfinite(array).all())
 

@@ -5,8 +5,8 @@ Clips of `vggtjax scenes` are read too: images/, intrinsics.txt and trajectory.t
 Depth is PNG of 16 bits in millimetres, .npy in metres (of whole numbers: in millimetres) or .exr in metres, 0 where it
 is unknown; masks are pictures of any kind, bright where the world moves. K.txt has three rows of three numbers for all
 frames, or three rows for each; world_from_camera.txt a row of 16 numbers for each frame, or of 12 as KITTI's, in
-metres; numbers of a frame without a pose are not finite. Intrinsics are not shifted by half a pixel: the pixel origin of the HoloLens is unknown, and half a pixel is
-below the accuracy of its poses and depth.
+metres; numbers of a frame without a pose are not finite. Intrinsics are not shifted by half a pixel: the pixel origin
+of the HoloLens is unknown, and half a pixel is below the accuracy of its poses and depth.
 """
 
 from __future__ import annotations
@@ -27,10 +27,17 @@ from vggtjax.captures.files import files
 from vggtjax.clips.masks import read_mask
 from vggtjax.errors import InputError, one_line
 from vggtjax.evaluation.datasets.folders import sequence_folders
-from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, depth_reader, left_out, mask_reader
-from vggtjax.media.images import is_image_name
+from vggtjax.evaluation.datasets.sequence import (
+    FrameChoice,
+    LabelledSequence,
+    Opener,
+    depth_reader,
+    left_out,
+    mask_reader,
+)
+from vggtjax.media.images import ImageFiles, is_image_name
 from vggtjax.media.order import in_order
-from vggtjax.media.times import name_times
+from vggtjax.media.times import in_seconds
 from vggtjax.storage.trajectories import associate, read_numbers, read_trajectory
 
 _NEW_TAKE = 10.0  # times the median step of the camera: a jump between two takes
@@ -107,6 +114,7 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
         mask,
         poses,
         None if intrinsics is None else intrinsics[chosen],
+        None if (times := _times(pictures)) is None else times[chosen],
         notes=notes,
         left_out=gaps,
     )
@@ -168,7 +176,7 @@ def _known_poses(folder: Path, pictures: list[Path]) -> _Known:
     named = [[path.stem for path in files(folder / place, "").values()] for place in ("depth", "mask")]
     stems = [path.stem for path in pictures]
     rows: Sequence[int] = ()
-    if (timed := _by_time(folder, stems)) is not None:
+    if (timed := _by_time(folder, pictures)) is not None:
         rows = timed
     elif len(every := in_order({*stems, *named[0], *named[1]}, Path)) == len(poses):
         rows = [every.index(stem) for stem in stems]
@@ -184,13 +192,13 @@ def _known_poses(folder: Path, pictures: list[Path]) -> _Known:
     )
 
 
-def _by_time(folder: Path, stems: list[str]) -> list[int] | None:
-    """Return for each name that is a time in seconds the line of trajectory.txt at that time, or -1."""
+def _by_time(folder: Path, pictures: list[Path]) -> list[int] | None:
+    """Return for each picture whose time is known the line of trajectory.txt at that time, or -1."""
     path = folder / "trajectory.txt"
-    if (folder / "world_from_camera.txt").is_file() or (times := name_times(stems)) is None:
+    if (folder / "world_from_camera.txt").is_file() or (times := _times(pictures)) is None:
         return None
-    indices = np.full(len(stems), -1)
-    pairs = associate(times, read_trajectory(path, lost=True)[0])
+    indices = np.full(len(pictures), -1)
+    pairs = associate(times, in_seconds(read_trajectory(path, lost=True)[0]))
     indices[pairs[:, 0]] = pairs[:, 1]
     return indices.tolist() if len(pairs) else None
 
@@ -203,6 +211,11 @@ def _counted(stems: list[str], count: int) -> list[int]:
     if numbers[0] == 0 and numbers[-1] < count:
         return numbers
     return [number - 1 for number in numbers] if numbers[-1] == count else []
+
+
+def _times(pictures: list[Path]) -> Float64[np.ndarray, " S"] | None:
+    times = ImageFiles(tuple(pictures)).times
+    return None if times is None else times.floats
 
 
 def _poses(folder: Path) -> Float64[np.ndarray, "S 4 4"] | None:

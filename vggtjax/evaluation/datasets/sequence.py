@@ -134,7 +134,7 @@ class LabelledSequence:
     def posed(self) -> Bool[np.ndarray, " S"]:
         """Frames with a camera pose."""
         poses = self.world_from_camera
-        return np.zeros(len(self), bool) if poses is None else np.isfinite(poses).all(axis=(1, 2))
+        return np.zeros(len(self), bool) if poses is None else np.asarray(np.isfinite(poses).all(axis=(1, 2)))
 
     def of_frames(self, chosen: Sequence[int]) -> LabelledSequence:
         """Return the sequence of some frames, in this order."""
