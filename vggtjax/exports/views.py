@@ -29,6 +29,7 @@ class View(NamedTuple):
     name: str  # of the picture's file; unique in the clip
     time: float  # seconds; the frame's number where times are unknown
     frame: ResultFrame
+    has_mask: bool = True  # which tells what moves
 
     @property
     def size(self) -> tuple[int, int]:
@@ -70,11 +71,11 @@ def views(result: Result, source: Source | None) -> Iterator[View]:
     names = view_names(result, source)
     if source is None:
         for number, (name, time) in enumerate(zip(names, times, strict=True)):
-            yield View(name, float(time), frame_of(result, number))
+            yield View(name, float(time), frame_of(result, number), result.has_mask)
         return
     for number, picture in enumerate(_pictures(result, source)):
         frame = frame_of(result, number, "original", picture=picture)
-        yield View(names[number], float(times[number]), frame)
+        yield View(names[number], float(times[number]), frame, result.has_mask)
 
 
 def of_one_size(items: Iterator[View], what: str) -> Iterator[View]:

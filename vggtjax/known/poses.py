@@ -76,8 +76,8 @@ def read_poses(
     """Return the world-from-camera poses of a clip's frames; `pose_table` says which files are read.
 
     Of poses with times every frame takes the one at its own time: the one that its name or a list states, as in TUM's
-    data sets and EuRoC's, or its time in the video. Where there are no times, or others, the file has one pose for every
-    frame, in their order.
+    data sets and EuRoC's, or its time in the video. Where there are no times, or others, the file has one pose for
+    every frame, in their order.
 
     Raises InputError or ResultError for an unreadable file, another number of poses, or a frame without a pose.
     """

@@ -43,6 +43,7 @@ from vggtjax.progress import OnStage, Progress
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.refine import check_refinement
 from vggtjax.results.not_finite import warn_of_not_finite
+from vggtjax.results.result import without_mask
 from vggtjax.storage.cache import hint_compilation_cache
 
 _LESS_MEMORY = (
@@ -92,6 +93,23 @@ def reconstruct(
         MissingExtraError: cameras are to be refined, and pycolmap is not installed.
     """
     options, running = changed(options, running, changes)
+    given = {"size": size, "masks": masks, "tracks": tracks, "fusion": fusion, "known": known}
+    return without_mask(with_own_mask(model, clip, options, running, **given))
+
+
+def with_own_mask(
+    model: Model,
+    clip: Clip | ClipSource,
+    options: Options,
+    running: Running,
+    *,
+    size: int | None = None,
+    masks: GivenMasks | None = None,
+    tracks: Queries | None = None,
+    fusion: FusionRule | None = None,
+    known: KnownGeometry | None = None,
+) -> Reconstruction:
+    """Return what `reconstruct` does, with the mask that the steps used, also by a method that makes none."""
     if masks is not None:
         options.check_given_masks()
     options = options.resolved(model.config.motion)
@@ -101,7 +119,7 @@ def reconstruct(
     result = _result(model, inputs, options, running, fusion, outputs)
     warn_of_not_finite(result)
     result, unit = _with_geometry(result, inputs, options, running.stage)
-    if options.refine_mask:
+    if options.refine_mask and result.has_mask:
         with running.stage("refine mask") as progress:
             result = refined(result, progress, unit)
     return result

@@ -46,13 +46,14 @@ _GREY = 128  # of pictures that a format does not keep
 logger = logging.getLogger(__name__)
 
 
-def write_frame(folder: Path, number: int, frame: ResultFrame) -> None:
-    """Write a frame as VGGT4D does."""
+def write_frame(folder: Path, number: int, frame: ResultFrame, *, mask: bool = True) -> None:
+    """Write a frame as VGGT4D does, with its mask if there is one."""
     Image.fromarray(frame.image).save(folder / f"frame_{number:04d}.png")
     np.save(folder / f"frame_{number:04d}.npy", frame.depth, allow_pickle=False)
     np.save(folder / f"conf_{number:04d}.npy", frame.confidence, allow_pickle=False)
-    mask = Image.fromarray(frame.dynamic_mask.astype(np.uint8) * 255)
-    mask.save(folder / f"dynamic_mask_{number:04d}.png")
+    if mask:
+        moving = Image.fromarray(frame.dynamic_mask.astype(np.uint8) * 255)
+        moving.save(folder / f"dynamic_mask_{number:04d}.png")
 
 
 def write_cameras(

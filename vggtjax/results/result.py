@@ -6,10 +6,10 @@ import json
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import cached_property
-from typing import Any, get_args, get_type_hints
+from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
 from vggtjax.cameras import FIELD_OF_VIEW_RANGE, camera_centres, clamp_intrinsics, unproject, world_from_camera
 from vggtjax.errors import ResultError
 from vggtjax.method.instances import find_instances
+from vggtjax.options import METHODS
 from vggtjax.storage.arrays import is_mapped, zeros_beside
 
 _TIME = re.compile(r"\d{1,18}\.\d{1,18}")  # in seconds, as a frame's name
@@ -143,7 +144,7 @@ class Result:
         frames, height, width = self.depth.shape
         return (
             f"{type(self).__name__}({frames} frames of {width} x {height} pixels, method {self.method!r}, "
-            f"model {self.model_name!r}, {self.dynamic_share:.1%} dynamic)"
+            f"model {self.model_name!r}, {f'{self.dynamic_share:.1%} dynamic' if self.has_mask else 'no mask'})"
         )
 
     @property
@@ -166,6 +167,11 @@ class Result:
     def _valid(self, frames: int | slice) -> Bool[np.ndarray, "*F H W"]:
         inside = inside_box(self.valid_box[frames], self.depth.shape[1:])
         return show_points(self.depth[frames], self.depth_confidence[frames], inside)
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether `dynamic_mask` tells what moves; the method vggt makes no mask, nor do some other programs."""
+        return "dynamic_mask" not in missing_fields(self)
 
     @property
     def dynamic_share(self) -> float:
@@ -261,6 +267,7 @@ def _arrays() -> dict[str, tuple[np.dtype, tuple[str | int, ...]]]:
     }
 
 
+R = TypeVar("R", bound=Result)
 ARRAYS = _arrays()  # S, H, W are those of depth, h, w of saliency, Q of track_frames; all others must match
 TRACKS = frozenset(name for name in ARRAYS if name.startswith("track_"))  # all are given, or none
 OPTIONAL = TRACKS | {"timestamps", "saliency", "motion"}
@@ -268,9 +275,25 @@ STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": ()
 
 
 def missing_fields(result: Result) -> tuple[str, ...]:
-    """Return the fields that another program did not write, and for which plain values stand."""
+    """Return the fields that a method or another program does not make, and for which plain values stand."""
     missing = result.settings.get("missing")
-    return tuple(name for name in missing if isinstance(name, str)) if isinstance(missing, list) else ()
+    named = tuple(name for name in missing if isinstance(name, str)) if isinstance(missing, list) else ()
+    return (*named, "dynamic_mask") if _has_no_mask(result) and "dynamic_mask" not in named else named
+
+
+def _has_no_mask(result: Result) -> bool:
+    """Return whether a method of ours made the result and makes no mask, and none was given."""
+    masks = str(result.settings.get("masks", "given"))  # of other results it is not known
+    return result.method in METHODS and not METHODS[result.method].makes_mask and not masks.startswith("given")
+
+
+def without_mask(result: R) -> R:
+    """Return the result of a method that makes no mask without the one that its steps used; others as they are."""
+    if not _has_no_mask(result):
+        return result
+    settings = result.settings | {"masks": f"none: {result.method} makes no mask"}
+    nothing = np.zeros(result.dynamic_mask.shape, bool)
+    return replace(result, dynamic_mask=nothing, saliency=None, motion=None, settings=settings)
 
 
 def inside_box(box: Int[np.ndarray, "*F 4"], size: tuple[int, ...]) -> Bool[np.ndarray, "*F H W"]:
