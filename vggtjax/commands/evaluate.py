@@ -107,8 +107,9 @@ class ScoreOptions:
     """names, with commas; the sequences of the published protocol, or all, by default"""
     gt: Annotated[str | None, tyro.conf.arg(metavar="{easi3r,lidar}", help_behavior_hint="")] = None
     """ground truth to use, where a data set has several: for dycheck easi3r (the default) or lidar"""
-    depth_align: Literal["metric", "median", "scale", "scale-shift"] = "scale"
-    """how video depth is brought to metres"""
+    depth_align: Literal["metric", "median", "scale", "least-absolute", "scale-shift"] = "scale"
+    """how video depth is brought to metres: by ten rounds towards the scale of the least absolute error, as MonST3R
+    and CUT3R do it (scale); by that scale itself (least-absolute); by a scale and a shift; by medians; or not"""
     empty: Literal["davis", "vggt4d"] = "davis"
     """J of a frame in which nothing moves and nothing is found: 1 (davis) or 0 (vggt4d)"""
     strict: bool = False
