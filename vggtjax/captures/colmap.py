@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vggtjax.captures.cameras import DISTORTED, world_from_camera_of
-from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out, lenses_of
+from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out, lenses_of, there
 from vggtjax.captures.colmap_model import Suffix, read_views
 from vggtjax.captures.files import inside
 from vggtjax.errors import InputError
@@ -41,7 +41,7 @@ def find_model(folder: Path) -> _Model | None:
     return None
 
 
-def read_colmap(folder: Path) -> Capture:
+def read_colmap(folder: Path, *, whole: bool = True) -> Capture:
     """Read a folder with a model and its pictures, or the model's own folder with the pictures beside it.
 
     Pictures that the model did not register are left out.
@@ -55,6 +55,9 @@ def read_colmap(folder: Path) -> Capture:
     names = in_order(views, Path)
     place = _pictures(folder, names[0])
     pictures = tuple(inside(place, name, source) for name in names)
+    kept = there(pictures, source, whole=whole)
+    absent = tuple(picture.stem for number, picture in enumerate(pictures) if number not in kept)
+    names, pictures = [names[number] for number in kept], tuple(pictures[number] for number in kept)
     sizes = checked_sizes(pictures, source)
     taken = [views[name] for name in names]
     found = {path for path in place.rglob("*") if is_image_name(path) and not path.name.startswith(".")}
@@ -68,6 +71,7 @@ def read_colmap(folder: Path) -> Capture:
         fitted_intrinsics([view.intrinsics for view in taken], [view.size for view in taken], sizes, model.folder),
         world_from_camera_of(np.stack([view.camera_from_world for view in taken]), model.folder),
         lenses=(lenses := lenses_of(view.lens for view in taken)),
+        absent=absent,
         left_out=missing,
         notes=missing + (DISTORTED,) * (lenses is not None),
     )

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 
 from vggtjax.captures.cameras import DISTORTED, intrinsics_matrix
-from vggtjax.captures.capture import Capture, checked_sizes, left_out
+from vggtjax.captures.capture import Capture, checked_sizes, left_out, there
 from vggtjax.captures.depth_files import read_png
 from vggtjax.captures.files import inside, read_text
 from vggtjax.errors import InputError
@@ -97,7 +97,7 @@ def read_intrinsics(folder: Path) -> tuple[Float64[np.ndarray, "3 3"] | None, tu
     return matrix, () if match[1] == "3" else (DISTORTED,)
 
 
-def read_tum(folder: Path) -> Capture:
+def read_tum(folder: Path, *, whole: bool = True) -> Capture:
     """Read a folder of the benchmark; frames without a pose are left out."""
     listed = read_list(folder, "rgb.txt")
     count = len(listed.paths)
@@ -108,6 +108,9 @@ def read_tum(folder: Path) -> Capture:
     lost = [listed.paths[frame].stem for frame in np.setdiff1d(np.arange(count), frames)]
     missing = left_out(lost, count, f"pose within {TOLERANCE} s")
     notes = missing + (NO_POSES,) * (poses is None)
+    kept = there([listed.paths[frame] for frame in frames], folder / "rgb.txt", whole=whole)
+    absent = tuple(listed.paths[frame].stem for place, frame in enumerate(frames) if place not in kept)
+    frames = frames[kept]
     pictures = tuple(listed.paths[frame] for frame in frames)
     sizes = checked_sizes(pictures, folder / "rgb.txt")
     intrinsics, more = read_intrinsics(folder)
@@ -120,9 +123,10 @@ def read_tum(folder: Path) -> Capture:
         None if poses is None else poses[posed[frames]],
         has_unknown_lens=DISTORTED in more,
         metric=True,
-        depth_files=depth_files(folder, listed.times, frames),
+        depth_files=depth_files(folder, listed.times, frames, whole=whole),
         read_depth_file=partial(read_png, per_metre=PER_METRE),
         timestamps=listed.times[frames],
+        absent=absent,
         left_out=missing,
         notes=notes + more,
     )

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from vggtjax.captures.capture import OtherShapeError
 from vggtjax.errors import VggtjaxError, one_line, reading
-from vggtjax.evaluation.datasets.sequence import LabelledSequence, LeftOut, OtherShapeError, left_out
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, LeftOut, left_out
 from vggtjax.evaluation.metrics.depth import Align
 from vggtjax.evaluation.metrics.masks import Empty
 from vggtjax.evaluation.protocol import score

@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64
 
 from vggtjax.cameras import unproject, world_from_camera
+from vggtjax.captures.capture import OtherShapeError
 from vggtjax.clips.truth import Placed, at_clip_pixels, intrinsics_at_clip_pixels
 from vggtjax.errors import InputError
-from vggtjax.evaluation.datasets.sequence import LabelledSequence, LeftOut, OtherShapeError, left_out
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, LeftOut, left_out
 from vggtjax.geometry.similarity import FEWEST_POSES, moves
 
 PIXEL_OFFSET = 0.0  # of points: the protocol lifts whole pixel numbers, predicted and true ones alike

@@ -41,7 +41,7 @@ def captures(root: Path) -> dict[str, Opener]:
 
 
 def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
-    whole = read_capture(path)
+    whole = read_capture(path, whole=False)
     capture = whole.for_frames(frames.of(whole.frame_names, name))
     check_no_fisheye(capture.lenses, path)
     maps = capture.depth_files or (None,) * len(capture)
@@ -57,7 +57,8 @@ def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
         intrinsics=capture.intrinsics,
         timestamps=capture.timestamps,
         notes=notes,
-        left_out=() if len(missing) == len(capture) else left_out("depth", missing, len(capture), "have no depth"),
+        left_out=left_out("pictures", whole.absent, len(whole) + len(whole.absent), "have no picture")
+        + (() if len(missing) == len(capture) else left_out("depth", missing, len(capture), "have no depth")),
         frame_names=capture.frame_names,
         archive=capture.archive,
     )

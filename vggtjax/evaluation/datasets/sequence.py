@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
 from vggtjax.captures.cameras import TURNED
+from vggtjax.captures.capture import OtherShapeError
 from vggtjax.captures.pictures import PNG, opening, picture_size
 from vggtjax.errors import InputError, one_line
 from vggtjax.media.sampling import Sampling
@@ -23,10 +24,6 @@ DepthReader = Callable[[int], Float32[np.ndarray, "h w"]]
 MaskReader = Callable[[int], Bool[np.ndarray, "h w"] | None]
 _MOST_NAMES = 5  # of frames in a sentence
 _SAME_SHAPE = 0.02  # by which the shapes of a picture and its map may differ, as ScanNet's do
-
-
-class OtherShapeError(InputError):
-    """A map of another shape than its picture: it does not show what the picture shows."""
 
 
 class LeftOut(NamedTuple):
