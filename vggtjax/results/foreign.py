@@ -66,11 +66,12 @@ def write_cameras(
 
 
 class _Posed(NamedTuple):
-    """Numbers of frames, their cameras, and their times where they are known in seconds."""
+    """Numbers of frames, their cameras, their times where they are known in seconds, and the numbers of their files."""
 
     numbers: Sequence[int]
     cameras: Cameras
-    times: Float64[np.ndarray, " S"] | None = None
+    times: Float64[np.ndarray, " S"] | None
+    files: Sequence[int]
 
 
 class _Folder(NamedTuple):
@@ -173,8 +174,9 @@ def _read_folder(folder: Path, format: str, quaternion: Quaternion | None) -> di
             f"it has no depth; expected files like {' or '.join(each.depth for each in _FOLDERS[format])}"
         )
     depth_files = _numbered(folder, files.depth)
-    numbers, cameras, times = files.cameras(folder, sorted(depth_files), quaternion)
-    of_files = sorted(depth_files)
+    numbers, cameras, times, of_files = files.cameras(folder, sorted(depth_files), quaternion)
+    if len(of_files) < len(depth_files):
+        logger.warning("%s has cameras for %d of %d frames of depth", folder, len(of_files), len(depth_files))
     depth = _stacked(depth_files, of_files, _read_map, None)
     shape = depth.shape[1:]
     confidence = _stacked(_numbered(folder, files.confidence), of_files, _read_map, shape)
@@ -245,25 +247,34 @@ def _read_map(path: Path) -> Float32[np.ndarray, "H W"]:
     return array.astype(np.float32)
 
 
-def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> _Posed:
-    """Return the cameras of the frames with these numbers; times that are other whole numbers are numbers of frames."""
+def _text_cameras(folder: Path, files: Sequence[int], quaternion: Quaternion | None) -> _Posed:
+    """Return the cameras of the frames whose files have these numbers.
+
+    Times that are whole numbers are numbers of frames, unless both lists count on from 0. Where there are more poses
+    than maps, or fewer, those numbers tell which frames have both.
+    """
     times, poses = read_trajectory(folder / "pred_traj.txt", quaternion, lost=True)
     intrinsics = read_numbers(folder / "pred_intrinsics.txt", 9).reshape(-1, 3, 3)
+    counted = list(range(len(times)))
+    is_timed = bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
+    is_whole = is_timed and bool((times == np.round(times)).all()) and times[0] >= 0 and times[-1] < _MOST_NUMBER
+    whole = times.astype(int).tolist() if is_whole else counted
+    lines = {number: line for line, number in enumerate(whole)}
+    kept = list(files)
+    if len(poses) != len(files):
+        told = is_whole and (len(poses) > len(files) or whole != counted)
+        kept = [number for number in files if number in lines] if told else []
     for name, array in (("pred_traj.txt", poses), ("pred_intrinsics.txt", intrinsics)):
-        if len(array) != len(numbers):
-            raise ResultError(
-                f"{name} has {len(array)} lines for {len(numbers)} frames of depth; expected one for each"
-            )
-    inverse = np.full((len(poses), 4, 4), np.nan)
-    found = np.isfinite(poses).all(axis=(1, 2))
-    inverse[found] = world_from_camera(poses[found][:, :3])
-    cameras, counted = Cameras(inverse[:, :3], intrinsics), list(range(len(numbers)))
-    if not np.isfinite(times).all() or not (np.diff(times) > 0).all():
-        return _Posed(numbers, cameras)
-    if (times == np.round(times)).all() and times[0] >= 0 and times[-1] < _MOST_NUMBER:
-        whole = times.astype(int).tolist()
-        return _Posed(whole if list(numbers) == counted else numbers, cameras)
-    return _Posed(numbers, cameras, times)
+        if not kept or len(array) not in (len(poses), len(files)):
+            raise ResultError(f"{name} has {len(array)} lines for {len(files)} frames of depth; expected one for each")
+    rows = list(range(len(files))) if len(poses) == len(files) else [lines[number] for number in kept]
+    places = rows if len(intrinsics) == len(poses) else [list(files).index(number) for number in kept]
+    inverse = np.full((len(rows), 4, 4), np.nan)
+    found = np.isfinite(poses[rows]).all(axis=(1, 2))
+    inverse[found] = world_from_camera(poses[rows][found][:, :3])
+    numbers = whole if len(poses) == len(files) and list(files) == counted else kept
+    timed = None if is_whole or not is_timed else times[rows]
+    return _Posed(numbers, Cameras(inverse[:, :3], intrinsics[places]), timed, kept)
 
 
 def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> _Posed:
@@ -275,7 +286,8 @@ def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | 
         arrays = _read_some(files[number], {"pose": ((4, 4),), "intrinsics": ((3, 3),)}, {})
         poses.append(arrays["pose"].astype(np.float64))
         intrinsics.append(arrays["intrinsics"].astype(np.float64))
-    return _Posed(numbers, Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics)))
+    cameras = Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
+    return _Posed(numbers, cameras, None, numbers)
 
 
 def _read_archive(path: Path, names: _Archive) -> dict[str, Any]:
