@@ -12,9 +12,12 @@ from tests.room import make_room
 from tests.scored_room import room_and_truth
 from vggtjax.clips.truth import Truth
 from vggtjax.commands import main as cli
+from vggtjax.commands.evaluate import _frames_in_words
+from vggtjax.evaluation.datasets import chosen_frames
 from vggtjax.evaluation.metrics.trajectory import trajectory_errors
 from vggtjax.evaluation.protocol import score
 from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
+from vggtjax.media.sampling import Sampling
 
 S = 4
 ROOM = make_room(S)
@@ -167,6 +170,21 @@ def test_a_sequence_of_which_nothing_is_left_is_refused(walk, capsys):
     assert record["status"] == "failed"
     assert record["reason"].startswith("nothing is left to score: ")
     assert "nothing could be scored" in shown
+
+
+def test_the_frames_that_are_taken_are_said(walk, capsys):
+    folder, result = walk
+    _, shown, record = scored(folder, result, "--stride", "2", capsys=capsys)
+    sentence = "frames: one frame of 2 (stride 2), by --stride"
+    assert sentence in shown
+    settings = json.loads((folder.parent.parent / "out/results.json").read_text())["settings"]
+    assert (settings["stride"], settings["frames"]) == (2, sentence)
+    assert sentence in (folder.parent.parent / "out/index.html").read_text()
+    assert record["frames"] == 2
+    of_tum = _frames_in_words(chosen_frames("tum", Sampling()), "tum", Sampling())
+    assert of_tum.startswith("frames: one frame of 3 (stride 3), at most 90, as the protocol of tum has it; --stride")
+    of_bonn = _frames_in_words(chosen_frames("bonn", Sampling(max_frames=5)), "bonn", Sampling(max_frames=5))
+    assert of_bonn == "frames: every frame, from frame 30 to 139, at most 5, by --max-frames"
 
 
 def test_errors_of_cameras_are_those_of_the_frames_that_are_left():

@@ -283,8 +283,8 @@ def missing_fields(result: Result) -> tuple[str, ...]:
 
 def _has_no_mask(result: Result) -> bool:
     """Return whether a method of ours made the result and makes no mask, and none was given."""
-    masks = str(result.settings.get("masks", "given"))  # of other results it is not known
-    return result.method in METHODS and not METHODS[result.method].makes_mask and not masks.startswith("given")
+    is_made_up = str(result.settings.get("masks")).startswith(("mined", "none"))
+    return is_made_up and result.method in METHODS and not METHODS[result.method].makes_mask
 
 
 def without_mask(result: R) -> R:

@@ -120,6 +120,9 @@ def test_seven_scenes(tmp_path):
     assert sequence.posed.tolist() == [True, False, False]
     assert np.allclose(sequence.world_from_camera[0, :3, 3], [0, 0.5, -1])
     assert opened("7scenes", folder, stride=2)[0].world_from_camera.shape == (2, 4, 4)
+    (folder / "frame-000001.color.png").unlink()
+    (sequence,) = opened("7scenes", folder)
+    assert {each.what: each.frames for each in sequence.left_out}["pictures"] == ("frame-000001",)
 
 
 WRITERS = {
@@ -146,3 +149,18 @@ def test_broken_files_are_refused(tmp_path, data_set, file, content, message):
     write(tmp_path / file, content)
     with pytest.raises(InputError, match=message):
         opened(data_set, tmp_path)[0].depth(1)
+
+
+def test_sintel_scores_the_frames_that_are_whole(tmp_path):
+    sintel_folder(tmp_path)
+    (whole,) = opened("sintel", tmp_path)
+    names = whole.frame_names
+    (tmp_path / f"training/camdata_left/alley_2/{names[1]}.cam").unlink()
+    (tmp_path / f"training/final/alley_2/{names[0]}.png").unlink()
+    (sequence,) = opened("sintel", tmp_path)
+    assert sequence.posed.tolist() == [name != names[1] for name in names[1:]]
+    np.testing.assert_array_equal(sequence.world_from_camera[sequence.posed], whole.world_from_camera[2:])
+    assert np.isfinite(sequence.intrinsics).all()
+    assert {each.what: each.frames for each in sequence.left_out} == {"poses": (names[1],), "pictures": (names[0],)}
+    with pytest.raises(InputError, match="without --strict"):
+        opened("sintel", tmp_path, strict=True)

@@ -49,6 +49,7 @@ from vggtjax.evaluation.datasets.sequence import (
     left_out,
     mask_reader,
     read_labels,
+    unpictured,
 )
 from vggtjax.storage.trajectories import read_numbers
 
@@ -64,11 +65,12 @@ def davis(root: Path) -> dict[str, Opener]:
 
 
 def _read_davis(root: Path, name: str, frames: FrameChoice) -> LabelledSequence:
-    pictures = frames.of(_pictures(root / "JPEGImages" / _RESOLUTION / name, ".jpg"), name)
-    folder = root / "Annotations" / _RESOLUTION / name
-    labels = files(folder, ".png")
+    source, folder = root / "JPEGImages" / _RESOLUTION / name, root / "Annotations" / _RESOLUTION / name
+    every, labels = _pictures(source, ".jpg"), files(folder, ".png")
+    pictures = frames.of(every, name)
     paths = [labels.get(path.stem) for path in pictures]
     mask, missing, notes = mask_reader(pictures, paths, read_labels, folder / "*.png")
+    missing += unpictured((path.stem for path in every), labels, source)
     return LabelledSequence(name, tuple(pictures), mask=mask, notes=notes, left_out=missing)
 
 
@@ -103,11 +105,13 @@ def read_cam(path: Path) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray
 
 
 def _read_sintel(training: Path, name: str, frames: FrameChoice) -> LabelledSequence:
-    pictures = frames.of(_pictures(training / "final" / name, ".png"), name)
+    every = _pictures(training / "final" / name, ".png")
+    pictures = frames.of(every, name)
     source = training / "camdata_left" / name
     depths, cams = files(training / "depth" / name, ".dpt"), files(source, ".cam")
     expected = training / "depth" / name / "*.dpt"
     depth, gaps, notes = depth_reader(pictures, [depths.get(path.stem) for path in pictures], read_dpt, expected)
+    gaps += unpictured((path.stem for path in every), {*depths, *cams}, training / "final" / name)
     poses = intrinsics = None
     cameras = [read_cam(cams[path.stem]) if path.stem in cams else None for path in pictures]
     seen = [camera is not None and all(map(finite, camera)) for camera in cameras]
@@ -152,6 +156,7 @@ def _read_seven_scenes(folder: Path, name: str, frames: FrameChoice) -> Labelled
     taken = [pictures[frame] for frame in chosen]
     read = partial(read_png, per_metre=_MILLIMETRES, invalid=_INVALID)
     depth, gaps, notes = depth_reader(taken, [depths.get(frame) for frame in chosen], read, folder / f"*{_DEPTH}")
+    gaps += unpictured(pictures, {*depths, *pose_files}, folder / f"*{_PICTURE}")
     nowhere = np.full((4, 4), np.nan)
     poses = np.stack([_pose(pose_files[frame]) if frame in pose_files else nowhere for frame in chosen])
     lost = [frame for frame, pose in zip(chosen, poses, strict=True) if not finite(pose)]

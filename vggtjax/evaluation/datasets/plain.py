@@ -34,6 +34,7 @@ from vggtjax.evaluation.datasets.sequence import (
     depth_reader,
     left_out,
     mask_reader,
+    unpictured,
 )
 from vggtjax.media.images import ImageFiles, is_image_name
 from vggtjax.media.order import in_order
@@ -95,9 +96,7 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
         paths = [masks.get(path.stem) for path in taken]
         mask, more_gaps, more = mask_reader(taken, paths, read_mask, folder / "mask" / "*.png")
         notes, gaps = notes + more, gaps + more_gaps
-    stems = {path.stem for path in pictures}
-    lacking = in_order({*depths, *masks} - stems, Path)
-    gaps += left_out("pictures", lacking, len(pictures) + len(lacking), "have no picture", folder / "rgb")
+    gaps += unpictured((path.stem for path in pictures), {*depths, *masks}, folder / "rgb")
     poses = None if known.poses is None else known.poses[chosen]
     if poses is not None:
         lost = [path.stem for path, pose in zip(taken, poses, strict=True) if not np.isfinite(pose).all()]

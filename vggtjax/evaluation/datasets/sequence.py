@@ -5,7 +5,7 @@ Does not import jax.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -17,6 +17,7 @@ from vggtjax.captures.cameras import TURNED
 from vggtjax.captures.capture import OtherShapeError
 from vggtjax.captures.pictures import PNG, opening, picture_size
 from vggtjax.errors import InputError, one_line
+from vggtjax.media.order import in_order
 from vggtjax.media.sampling import Sampling
 
 T = TypeVar("T")
@@ -87,6 +88,13 @@ class FrameChoice(NamedTuple):
 
 
 EVERY_FRAME = FrameChoice()
+
+
+def unpictured(pictures: Iterable[str], truth: Iterable[str], expected: Path | str) -> tuple[LeftOut, ...]:
+    """Return the frames that have a truth of some kind, by these names, and no picture, which is `expected` there."""
+    named = set(pictures)
+    lacking = in_order({*truth} - named, Path)
+    return left_out("pictures", lacking, len(named) + len(lacking), "have no picture", expected)
 
 
 @dataclass(frozen=True, eq=False)
