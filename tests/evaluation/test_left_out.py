@@ -103,6 +103,7 @@ def test_a_missing_frame_of_every_kind(walk, capsys):
     names = ("depth/00000.png", "mask/00003.png", "rgb/00002.png")
     for name in names:
         (folder / name).unlink()
+    (folder / "K.txt").write_text((folder / "K.txt").read_text() * S)  # for each frame, as the poses
     code, shown, record = scored(folder, result, capsys=capsys)
     assert code == 0, shown
     assert {what: (each["count"], each["frames"]) for what, each in record["left_out"].items()} == {

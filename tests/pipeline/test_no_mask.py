@@ -14,6 +14,7 @@ from vggtjax.options import METHODS, Options
 from vggtjax.pipeline.run import reconstruct, with_own_mask
 from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.several import reconstruct_methods
+from vggtjax.progress import StageSeconds
 from vggtjax.reconstruction import Reconstruction
 
 
@@ -33,7 +34,10 @@ def test_only_the_first_pass_makes_none():
 
 
 def test_a_result_of_one_pass_has_no_mask_and_the_same_depth_and_cameras(model, clip, tmp_path):
-    alone = reconstruct(model, clip, method="vggt", size=42)
+    stages = StageSeconds()
+    alone = reconstruct(model, clip, method="vggt", size=42, on_stage=stages.stage)
+    assert "first pass" in stages.seconds
+    assert "dynamic mask" not in stages.seconds
     used = with_own_mask(model, clip, Options("vggt"), Running(), size=42)
     both = reconstruct_methods(model, clip, ["vggt", "4dvggt-d"], size=42)
     assert used.dynamic_mask.any()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from vggtjax.errors import InputError, reading
+
+logger = logging.getLogger(__name__)
 
 LISTS = ("timestamps.txt", "times.txt", "data.csv")
 _UNITS = {"seconds": 0, "milliseconds": 3, "microseconds": 6, "nanoseconds": 9}  # digits after the point of a second
@@ -79,6 +82,8 @@ def frame_times(paths: Sequence[Path], pictures: Sequence[str]) -> FrameTimes | 
         for path in filter(Path.is_file, lists):
             if (found := _listed(path, [path.name for path in paths], pictures)) is not None:
                 return found
+            if path.suffix == ".txt":
+                logger.warning("%s does not give each frame a later time than the one before; it is not used", path)
     return _named([path.stem for path in paths])
 
 

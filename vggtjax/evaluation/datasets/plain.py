@@ -84,7 +84,7 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
     pictures = _pictures(folder)
     known = _known_poses(folder, pictures)
     chosen = frames.of(range(len(pictures))[part], name)
-    intrinsics = _intrinsics(folder, len(pictures))
+    intrinsics = _intrinsics(folder, len(pictures), known.rows, known.lines)
     taken = [pictures[frame] for frame in chosen]
     depths, unread = _of_one_kind(folder / "depth", _DEPTH_FILES)
     masks, unread_masks = _of_one_kind(folder / "mask", _MASK_FILES)
@@ -102,7 +102,7 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
         lost = [path.stem for path, pose in zip(taken, poses, strict=True) if not np.isfinite(pose).all()]
         gaps += left_out("poses", lost, len(chosen), "have no pose")
     elif known.notes:
-        gaps += left_out("poses", [path.stem for path in taken], len(chosen), "have no pose that is known for theirs")
+        gaps += left_out("poses", [path.stem for path in taken], len(chosen), "have no pose that is known to be theirs")
     else:
         notes += (f"it has no world_from_camera.txt; expected {folder / 'world_from_camera.txt'}",)
     notes += (f"it has no K.txt; expected {folder / 'K.txt'}",) * (intrinsics is None)
@@ -159,6 +159,8 @@ def _pictures(folder: Path) -> list[Path]:
 
 class _Known(NamedTuple):
     poses: Float64[np.ndarray, "S 4 4"] | None
+    rows: Sequence[int] = ()  # of the file, by picture, where it has another number of poses
+    lines: int = 0  # its poses
     notes: tuple[str, ...] = ()
 
 
@@ -185,9 +187,10 @@ def _known_poses(folder: Path, pictures: list[Path]) -> _Known:
     if rows:
         for place, row in enumerate(rows):
             taken[place] = poses[row] if row >= 0 else np.nan
-        return _Known(taken)
+        return _Known(taken, rows, len(poses))
     return _Known(
-        None, (f"it has {len(poses)} poses for {len(pictures)} pictures, and nothing says whose they are; no poses",)
+        None,
+        notes=(f"it has {len(poses)} poses for {len(pictures)} pictures, and nothing says whose they are; no poses",),
     )
 
 
@@ -227,7 +230,10 @@ def _poses(folder: Path) -> Float64[np.ndarray, "S 4 4"] | None:
     return with_lost_poses(rows.reshape(-1, 4, 4), path)
 
 
-def _intrinsics(folder: Path, count: int) -> Float64[np.ndarray, "S 3 3"] | None:
+def _intrinsics(
+    folder: Path, count: int, places: Sequence[int] = (), poses: int = 0
+) -> Float64[np.ndarray, "S 3 3"] | None:
+    """Return the intrinsics of `count` pictures; a file of as many as there are `poses` has them at these places."""
     path, focals = folder / "K.txt", folder / "intrinsics.txt"
     if path.is_file():
         rows = read_numbers(path, 3)
@@ -236,6 +242,8 @@ def _intrinsics(folder: Path, count: int) -> Float64[np.ndarray, "S 3 3"] | None
         rows, path = rows.reshape(-1, 3), focals
     else:
         return None
+    if places and len(rows) == 3 * poses:
+        rows = rows.reshape(-1, 3, 3)[np.maximum(places, 0)].reshape(-1, 3)
     if len(rows) not in (3, 3 * count):
         raise InputError(f"{path} has {len(rows)} rows; expected 3, or 3 for each of {count} pictures")
     return np.broadcast_to(checked_intrinsics(rows.reshape(-1, 3, 3), path), (count, 3, 3))
