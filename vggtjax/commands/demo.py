@@ -44,7 +44,7 @@ def demo(
         from vggtjax.pipeline.agreement import agree_with_pixels
         from vggtjax.pipeline.run import with_own_mask
         from vggtjax.pipeline.running import Running
-        from vggtjax.results.result import without_mask
+        from vggtjax.results.no_mask import without_mask
 
         predicted = with_own_mask(model, clip, Options(method), Running(on_stage=report.stage), size=size)
         predicted = replace(predicted, settings=predicted.settings | {"clip": "Embedded clip"})

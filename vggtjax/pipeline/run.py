@@ -42,8 +42,8 @@ from vggtjax.pipeline.steps import Compile, Execute, StageMemory
 from vggtjax.progress import OnStage, Progress
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.refine import check_refinement
+from vggtjax.results.no_mask import without_mask
 from vggtjax.results.not_finite import warn_of_not_finite
-from vggtjax.results.result import without_mask
 from vggtjax.storage.cache import hint_compilation_cache
 
 _LESS_MEMORY = (

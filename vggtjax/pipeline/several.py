@@ -21,7 +21,8 @@ from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, no_stage
 from vggtjax.reconstruction import Reconstruction
-from vggtjax.results.result import FieldOfViewWarning, without_mask
+from vggtjax.results.no_mask import without_mask
+from vggtjax.results.result import FieldOfViewWarning
 
 
 def reconstruct_methods(

@@ -28,19 +28,19 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32
 from PIL import Image
 
 from vggtjax.cameras import Cameras, world_from_camera
 from vggtjax.clips.masks import read_mask
 from vggtjax.errors import InputError, ResultError, check_choice, reading
 from vggtjax.media.images import read_image
+from vggtjax.results.foreign_cameras import Posed, text_cameras
 from vggtjax.results.frame import ResultFrame
 from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, read_headers
-from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory
+from vggtjax.storage.trajectories import Quaternion, write_trajectory
 
 _WHITE = 1.01  # of shares, with rounding
-_MOST_NUMBER = 10**9  # of a frame
 _GREY = 128  # of pictures that a format does not keep
 
 logger = logging.getLogger(__name__)
@@ -65,15 +65,6 @@ def write_cameras(
     write_trajectory(folder / "pred_traj.txt", world_from_camera, numbers, quaternion="wxyz")
 
 
-class _Posed(NamedTuple):
-    """Numbers of frames, their cameras, their times where they are known in seconds, and the numbers of their files."""
-
-    numbers: Sequence[int]
-    cameras: Cameras
-    times: Float64[np.ndarray, " S"] | None
-    files: Sequence[int]
-
-
 class _Folder(NamedTuple):
     """A file for each array and frame: the paths of the first frame's files, and the reader of the cameras."""
 
@@ -81,7 +72,7 @@ class _Folder(NamedTuple):
     picture: str
     confidence: str
     mask: str | None
-    cameras: Callable[[Path, Sequence[int], Quaternion | None], _Posed]
+    cameras: Callable[[Path, Sequence[int], Quaternion | None], Posed]
     logarithmic: bool = False  # confidence
 
 
@@ -247,37 +238,7 @@ def _read_map(path: Path) -> Float32[np.ndarray, "H W"]:
     return array.astype(np.float32)
 
 
-def _text_cameras(folder: Path, files: Sequence[int], quaternion: Quaternion | None) -> _Posed:
-    """Return the cameras of the frames whose files have these numbers.
-
-    Times that are whole numbers are numbers of frames, unless both lists count on from 0. Where there are more poses
-    than maps, or fewer, those numbers tell which frames have both.
-    """
-    times, poses = read_trajectory(folder / "pred_traj.txt", quaternion, lost=True)
-    intrinsics = read_numbers(folder / "pred_intrinsics.txt", 9).reshape(-1, 3, 3)
-    counted = list(range(len(times)))
-    is_timed = bool(np.isfinite(times).all() and (np.diff(times) > 0).all())
-    is_whole = is_timed and bool((times == np.round(times)).all()) and times[0] >= 0 and times[-1] < _MOST_NUMBER
-    whole = times.astype(int).tolist() if is_whole else counted
-    lines = {number: line for line, number in enumerate(whole)}
-    kept = list(files)
-    if len(poses) != len(files):
-        told = is_whole and (len(poses) > len(files) or whole != counted)
-        kept = [number for number in files if number in lines] if told else []
-    for name, array in (("pred_traj.txt", poses), ("pred_intrinsics.txt", intrinsics)):
-        if not kept or len(array) not in (len(poses), len(files)):
-            raise ResultError(f"{name} has {len(array)} lines for {len(files)} frames of depth; expected one for each")
-    rows = list(range(len(files))) if len(poses) == len(files) else [lines[number] for number in kept]
-    places = rows if len(intrinsics) == len(poses) else [list(files).index(number) for number in kept]
-    inverse = np.full((len(rows), 4, 4), np.nan)
-    found = np.isfinite(poses[rows]).all(axis=(1, 2))
-    inverse[found] = world_from_camera(poses[rows][found][:, :3])
-    numbers = whole if len(poses) == len(files) and list(files) == counted else kept
-    timed = None if is_whole or not is_timed else times[rows]
-    return _Posed(numbers, Cameras(inverse[:, :3], intrinsics[places]), timed, kept)
-
-
-def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> _Posed:
+def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Posed:
     files = _numbered(folder, "camera/000000.npz")
     poses, intrinsics = [], []
     for number in numbers:
@@ -287,7 +248,7 @@ def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | 
         poses.append(arrays["pose"].astype(np.float64))
         intrinsics.append(arrays["intrinsics"].astype(np.float64))
     cameras = Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
-    return _Posed(numbers, cameras, None, numbers)
+    return Posed(numbers, cameras, None, numbers)
 
 
 def _read_archive(path: Path, names: _Archive) -> dict[str, Any]:
@@ -352,14 +313,14 @@ def _read_some(
     return read_arrays(file, {*needed, *others})
 
 
-_VGGT4D = _Folder("frame_0000.npy", "frame_0000.png", "conf_0000.npy", "dynamic_mask_0000.png", _text_cameras)
+_VGGT4D = _Folder("frame_0000.npy", "frame_0000.png", "conf_0000.npy", "dynamic_mask_0000.png", text_cameras)
 _MONST3R = _VGGT4D._replace(logarithmic=True)
 _REARRANGED = _Folder(
     "depth_maps/frame_0000.npy",
     "images/frame_0000.png",
     "confidence_maps/conf_0000.npy",
     "dynamic_masks/dynamic_mask_0000.png",
-    _text_cameras,
+    text_cameras,
     logarithmic=True,
 )
 _CUT3R = _Folder("depth/000000.npy", "color/000000.png", "conf/000000.npy", None, _npz_cameras)
@@ -385,4 +346,4 @@ _SPATIALTRACKER = _Archive(
 )
 _ARCHIVES = {"da3": _DA3, "spatialtrackerv2": _SPATIALTRACKER}
 FORMATS = (*_FOLDERS, *_ARCHIVES)
-_WITH_TRAJECTORY = tuple(name for name, (files, *_) in _FOLDERS.items() if files.cameras is _text_cameras)
+_WITH_TRAJECTORY = tuple(name for name, (files, *_) in _FOLDERS.items() if files.cameras is text_cameras)

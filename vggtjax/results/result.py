@@ -6,10 +6,10 @@ import json
 import re
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from decimal import Decimal
 from functools import cached_property
-from typing import Any, TypeVar, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
@@ -21,8 +21,7 @@ from vggtjax.options import METHODS
 from vggtjax.storage.arrays import is_mapped, zeros_beside
 
 _TIME = re.compile(r"\d{1,18}\.\d{1,18}")  # in seconds, as a frame's name
-_EXACT = re.compile(r"-?\d{1,20}(?:\.\d{1,20})?")  # seconds
-_FEWEST_DIGITS = 6  # after the point
+_EXACT, _FEWEST_DIGITS = re.compile(r"-?\d{1,20}(?:\.\d{1,20})?"), 6  # seconds; digits after the point
 _MOST_SIDE, _MOST_PIXELS = 1 << 20, 1 << 28  # of a source's picture
 
 
@@ -267,7 +266,6 @@ def _arrays() -> dict[str, tuple[np.dtype, tuple[str | int, ...]]]:
     }
 
 
-R = TypeVar("R", bound=Result)
 ARRAYS = _arrays()  # S, H, W are those of depth, h, w of saliency, Q of track_frames; all others must match
 TRACKS = frozenset(name for name in ARRAYS if name.startswith("track_"))  # all are given, or none
 OPTIONAL = TRACKS | {"timestamps", "saliency", "motion"}
@@ -278,22 +276,13 @@ def missing_fields(result: Result) -> tuple[str, ...]:
     """Return the fields that a method or another program does not make, and for which plain values stand."""
     missing = result.settings.get("missing")
     named = tuple(name for name in missing if isinstance(name, str)) if isinstance(missing, list) else ()
-    return (*named, "dynamic_mask") if _has_no_mask(result) and "dynamic_mask" not in named else named
+    return (*named, "dynamic_mask") if makes_no_mask(result) and "dynamic_mask" not in named else named
 
 
-def _has_no_mask(result: Result) -> bool:
+def makes_no_mask(result: Result) -> bool:
     """Return whether a method of ours made the result and makes no mask, and none was given."""
     is_made_up = str(result.settings.get("masks")).startswith(("mined", "none"))
     return is_made_up and result.method in METHODS and not METHODS[result.method].makes_mask
-
-
-def without_mask(result: R) -> R:
-    """Return the result of a method that makes no mask without the one that its steps used; others as they are."""
-    if not _has_no_mask(result):
-        return result
-    settings = result.settings | {"masks": f"none: {result.method} makes no mask"}
-    nothing = np.zeros(result.dynamic_mask.shape, bool)
-    return replace(result, dynamic_mask=nothing, saliency=None, motion=None, settings=settings)
 
 
 def inside_box(box: Int[np.ndarray, "*F 4"], size: tuple[int, ...]) -> Bool[np.ndarray, "*F H W"]:

@@ -43,8 +43,8 @@ from vggtjax.progress import OnStage, Progress, StageSeconds, no_stage
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
+from vggtjax.results.no_mask import without_mask
 from vggtjax.results.report import RunFacts, versions
-from vggtjax.results.result import without_mask
 from vggtjax.results.saving import Saving
 from vggtjax.storage.writing import locked_folder
 from vggtjax.windows.frames import SeenFrames, count_frames, window_clips
