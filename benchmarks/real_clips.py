@@ -33,7 +33,7 @@ def load_windows(root: Path, config: VGGTConfig, frames: int) -> Windows:
         InputError: a take shorter than a window, without depth or cameras, or clips of several sizes.
     """
     names, truths = [], []
-    for name, opened in find_sequences("plain", root, sampling=Sampling(stride=1)).items():
+    for name, opened in find_sequences("plain", root, sampling=Sampling(stride=1), strict=True).items():
         sequence = opened()
         if len(sequence) < frames:
             raise InputError(f"{name} in {root} has {len(sequence)} frames; choose --frames of at most that")

@@ -49,6 +49,11 @@ class Method:
     mask: Witness = "gram"
 
     @property
+    def makes_mask(self) -> bool:
+        """Whether what moves is told apart; the mask is for the second pass."""
+        return self.needs_second_pass
+
+    @property
     def needs_second_pass(self) -> bool:
         return {self.depth, self.extrinsics, self.intrinsics} != {"first"}
 

@@ -104,8 +104,9 @@ def test_results_are_those_of_single_runs(model, clips, tmp_path):
         many = Reconstruction.load(tmp_path / name)
         np.testing.assert_array_equal(many.depth, alone.depth)
         assert "known" not in many.settings
-        with Image.open(tmp_path / name / "mask/000000.png") as mask, Image.open(f"{source}/0.png") as picture:
-            assert mask.size == picture.size
+        with Image.open(tmp_path / name / "depth/000000.png") as depth, Image.open(f"{source}/0.png") as picture:
+            assert depth.size == picture.size
+        assert not (tmp_path / name / "mask").exists()  # the method makes none
 
 
 def test_clips_from_urls_and_results_at_urls(model, clips, tmp_path, monkeypatch):

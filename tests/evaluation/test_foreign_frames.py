@@ -32,8 +32,12 @@ def test_our_own_know_by_themselves():
     assert (frames.source_scale.tolist(), frames.source_offset.tolist()) == ([[1, 1]] * 2, [[0, 0]] * 2)
     with pytest.raises(InputError, match=r"frame 1 of the result was 84 x 56, the sequence's picture is \(80, 56\)"):
         placed(room, "vggtjax", [(84, 56), (80, 56)], ["a", "b"])
+    with pytest.raises(InputError, match=r"the result is of frames a, b, \.\.\. and the sequence has c, d"):
+        placed(room, "vggtjax", [(84, 56)] * 2, ["c", "d"])
+    second = placed(room, "vggtjax", [(84, 56)] * 2, ["b", "c"])  # of which it has one
+    np.testing.assert_array_equal(second.depth, room.depth[1:])
     with pytest.raises(InputError, match=r"the result is of frames a, b, \.\.\. and the sequence has b, c"):
-        placed(room, "vggtjax", [(84, 56)] * 2, ["b", "c"])
+        placed(room, "vggtjax", [(84, 56)] * 2, ["b", "c"], strict=True)
 
 
 @pytest.mark.parametrize(("width", "height"), [(854, 480), (480, 854)])
@@ -72,3 +76,28 @@ def test_frames_of_the_pictures_own_size_are_those_and_others_are_refused(layout
         placed(of_size(518, 294), layout, [(480, 854)] * 2, ["a", "b"])
     with pytest.raises(InputError, match="the result has 2 frames, the sequence 3; expected equal numbers"):
         placed(of_size(512, 384), layout, [(640, 480)] * 3, ["a", "b", "c"])
+
+
+def test_frames_of_others_are_the_sequences_by_number_or_time_or_not_at_all():
+    def numbered(*numbers, times=None):
+        result = of_size(64, 48, len(numbers))
+        depth = np.array(numbers, np.float32)[:, None, None] * np.ones((48, 64), np.float32) + 1
+        names = tuple(f"{number:06d}" for number in numbers)
+        return dataclasses.replace(result, depth=depth, frame_names=names, timestamps=times)
+
+    def found(result, names, times=None):
+        made = placed(result, "vggt4d", [(64, 48)] * len(names), names, times)
+        return dict(zip(made.frame_names, (made.depth[:, 0, 0] - 1).tolist(), strict=True))
+
+    letters = list("abcdef")
+    assert found(numbered(0, 2, 5), letters) == {"a": 0, "c": 2, "f": 5}  # counted from 0
+    assert found(numbered(0, 1, 2), ["10", "11", "12"]) == {"10": 0, "11": 1, "12": 2}  # as many
+    assert found(numbered(3, 9), ["x_3", "x_6", "x_9"]) == {"x_3": 3, "x_9": 9}  # by the names' numbers
+    assert found(numbered(*range(9)), ["0", "3", "6"]) == {"0": 0, "3": 3, "6": 6}  # of which the protocol takes some
+    with pytest.raises(InputError, match="the result has 3 frames, the sequence 6; expected equal numbers, or"):
+        found(numbered(0, 1, 2), letters)  # counted on: of which frames, nothing tells
+    times = np.array([5.0, 5.1, 5.2, 5.3])
+    keyframes = numbered(0, 1, times=np.array([5.101, 5.299]))
+    assert found(keyframes, letters[:4], times) == {"b": 0, "d": 1}
+    named = [f"17000000{second:02d}.000000" for second in range(4)]
+    assert found(numbered(0, 1, times=np.array([1700000001.0, 1700000003.0])), named) == {named[1]: 0, named[3]: 1}

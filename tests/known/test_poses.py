@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from tests.room import make_room
 from tests.textured_room import textured_room
+from vggtjax import load_clip
 from vggtjax.errors import InputError
 from vggtjax.known.apply import apply_known
 from vggtjax.known.given import check_readable, read_known
@@ -52,6 +54,22 @@ def test_poses_with_times_go_to_their_frames(tmp_path):
     named = make_room(frames=3, frame_names=("1305.020833", "1305.041667", "1305.0625"))
     write_trajectory(tmp_path / "poses.txt", poses, times + 1305)
     np.testing.assert_allclose(read_poses(tmp_path / "poses.txt", named), poses[1:4], atol=1e-6)
+
+
+def test_poses_go_to_pictures_that_are_named_by_nanoseconds(tmp_path):
+    names = [str(1403636579763555584 + 50_000_000 * frame) for frame in range(3)]
+    for name in names:
+        Image.new("RGB", (28, 28)).save(tmp_path / f"{name}.png")
+    clip = load_clip(tmp_path, size=28)
+    room = make_room(3, timestamps=None, frame_names=tuple(names))  # as a result of an earlier version
+    poses = make_room(frames=5).world_from_camera
+    seconds = 1403636579.763555584 + 0.025 * np.arange(5)
+    for times in (seconds, 1e9 * seconds):  # a file may have nanoseconds, too
+        write_trajectory(tmp_path / "poses.txt", poses, times)
+        for frames in (clip, room):
+            np.testing.assert_allclose(read_poses(tmp_path / "poses.txt", frames), poses[::2], atol=1e-6)
+    write_trajectory(tmp_path / "poses.txt", poses, 0.025 * np.arange(5))  # from the first frame
+    np.testing.assert_allclose(read_poses(tmp_path / "poses.txt", clip), poses[::2], atol=1e-6)
 
 
 def test_as_many_poses_as_frames_at_other_times_go_by_their_order(tmp_path, caplog):

@@ -17,7 +17,7 @@ from vggtjax.results import export
 from vggtjax.results.frame import frame_of
 from vggtjax.results.point_cloud import least_confidence
 from vggtjax.results.saving import Saving
-from vggtjax.storage.trajectories import read_trajectory
+from vggtjax.storage.trajectories import associate, read_trajectory
 
 pytestmark = pytest.mark.usefixtures("empty_reports")
 
@@ -253,3 +253,24 @@ def test_a_capture_tells_its_clock(tmp_path, named):
     assert clip.timestamps[0] == 0
     settings = settings_of(cast(Any, SimpleNamespace(note="")), clip, Options(), "cues", None)
     assert settings["first_time"] == 100
+
+
+def test_files_have_nanoseconds_that_no_float_holds(tmp_path):
+    names = [f"frame_{time}" for time in ("1403636579763555584", "1403636579813555457", "1403636579863555586")]
+    for name in names:
+        Image.new("RGB", (28, 28)).save(tmp_path / f"{name}.png")
+    clip = load_clip(tmp_path, size=28)
+    settings = settings_of(cast(Any, SimpleNamespace(note="")), clip, Options(), "cues", None)
+    room = make_room(3, timestamps=clip.timestamps, frame_names=tuple(clip.frame_names), settings=settings)
+    assert room.known_facts["times"] == "from the names of the frames, in nanoseconds"
+    room.save(tmp_path / "out", only=("cameras",))
+    written = Reconstruction.load(tmp_path / "out")
+    for folder in (tmp_path / "out", tmp_path / "again"):
+        written.save(folder, only=("cameras",))
+        lines = (folder / "trajectory.txt").read_text().splitlines()[1:]
+        assert [line.split()[0] for line in lines] == [
+            "1403636579.763555584",
+            "1403636579.813555457",
+            "1403636579.863555586",
+        ]
+    assert len(associate(room.file_times, np.array([1403636579.7635, 1403636579.8635]))) == 2

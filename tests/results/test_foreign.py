@@ -140,3 +140,34 @@ def test_what_is_broken_is_named(tmp_path, layout, change, message):
         Reconstruction.load(tmp_path / "x", format=layout, quaternion=QUATERNIONS[layout])
     assert str(raised.value).startswith(f"{tmp_path / 'x'} cannot be loaded as a result of {layout}: ")
     assert "\n" not in str(raised.value)
+
+
+def test_numbers_of_files_and_of_poses_tell_which_frames_have_both(tmp_path, caplog):
+    tmp_path = tmp_path / "result"
+    WRITERS["vggt4d"](tmp_path)
+    (tmp_path / "frame_0001.npy").unlink()  # depth of keyframes, poses of all frames
+    result = Reconstruction.load(tmp_path, format="vggt4d", quaternion="wxyz")
+    assert result.frame_names == ("000000", "000002")
+    np.testing.assert_allclose(result.camera_from_world, ROOM.camera_from_world[[0, 2]], atol=1e-6)
+    np.testing.assert_array_equal(result.depth, ROOM.depth[[0, 2]])
+    np.testing.assert_array_equal(result.dynamic_mask, ROOM.dynamic_mask[[0, 2]])
+
+    np.save(tmp_path / "frame_0001.npy", ROOM.depth[1])  # depth of all frames, poses of keyframes
+    for name in ("pred_traj.txt", "pred_intrinsics.txt"):
+        lines = (tmp_path / name).read_text().splitlines()
+        (tmp_path / name).write_text("\n".join([lines[0], lines[2]]))
+    result = Reconstruction.load(tmp_path, format="vggt4d", quaternion="wxyz")
+    assert result.frame_names == ("000000", "000002")
+    np.testing.assert_allclose(result.camera_from_world, ROOM.camera_from_world[[0, 2]], atol=1e-6)
+    assert "has cameras for 2 of 3 frames of depth" in caplog.text
+
+
+def test_a_camera_that_is_not_finite_leaves_its_frame_out(tmp_path, caplog):
+    tmp_path = tmp_path / "result"
+    WRITERS["monst3r"](tmp_path)
+    lines = (tmp_path / "pred_traj.txt").read_text().splitlines()
+    (tmp_path / "pred_traj.txt").write_text("\n".join([lines[0], "1 " + "nan " * 7, lines[2]]))
+    result = Reconstruction.load(tmp_path, format="monst3r", quaternion="wxyz")
+    assert result.frame_names == ("000000", "000002")
+    np.testing.assert_array_equal(result.depth, ROOM.depth[[0, 2]])
+    assert "no finite camera for 1 of 3 frames, 000001 first" in caplog.text

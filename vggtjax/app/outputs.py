@@ -55,7 +55,8 @@ def write_outputs(result: Reconstruction, folder: Path, name: str, on_stage: OnS
     with on_stage("zip"):
         archive = Path(shutil.make_archive(str(saved), "zip", root_dir=folder, base_dir=name))
     frames, height, width = result.depth.shape
-    facts = f"{frames} frames of {width} x {height} pixels, {result.dynamic_share:.1%} of them moving"
+    moving = f", {result.dynamic_share:.1%} of them moving" if result.has_mask else ""
+    facts = f"{frames} frames of {width} x {height} pixels{moving}"
     sheet, report, megabytes = saved / "preview" / "sheet.png", saved / "report.html", archive.stat().st_size / 1e6
     return Outputs(viewer, film, layers, sheet, report, archive, megabytes, facts, result.model_note)
 

@@ -16,6 +16,7 @@ import numpy as np
 from vggtjax.batch.destination import PAGE_NAME, Destination, LocalFolder
 from vggtjax.batch.recipe import ClipOutcome
 from vggtjax.errors import OutputError, ResultError, one_line
+from vggtjax.options import METHODS
 from vggtjax.results.archive import ARCHIVE_NAME, is_result
 from vggtjax.results.report import REPORT_NAME
 from vggtjax.storage.arrays import read_arrays
@@ -137,4 +138,6 @@ def _told(path: Path) -> str:
         raise ResultError(f"its valid_box has the shape {box.shape}; expected that of a saved result")
     pictured = max(float(((box[:, 2] - box[:, 0]) * (box[:, 3] - box[:, 1])).sum()), 1.0)
     size = f"{frames} frame{'' if frames == 1 else 's'} of {width} x {height} pixels"
-    return f"{size}, {mask.sum() / pictured:.1%} moving, {one_line(str(arrays['method'].item()), 60)}"
+    method = one_line(str(arrays["method"].item()), 60)
+    makes_none = method in METHODS and not METHODS[method].makes_mask and not mask.any()
+    return f"{size}, {'' if makes_none else f'{mask.sum() / pictured:.1%} moving, '}{method}"

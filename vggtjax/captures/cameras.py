@@ -66,6 +66,18 @@ def checked_world_from_camera(poses: Float[np.ndarray, "S 4 4"], source: Path | 
     return poses
 
 
+def with_lost_poses(poses: Float[np.ndarray, "S 4 4"], source: Path | str) -> Float64[np.ndarray, "S 4 4"]:
+    """Return poses, NaN for lost frames: those that are not finite, as ScanNet writes them, or 0 throughout.
+
+    Raises what `checked_world_from_camera` raises for the others.
+    """
+    poses = np.array(poses, np.float64)
+    lost = np.asarray(~np.isfinite(poses).all(axis=(1, 2)) | ~poses[:, :3].any(axis=(1, 2)))
+    checked_world_from_camera(np.where(lost[:, None, None], np.eye(4), poses), source)
+    poses[lost] = np.nan
+    return poses
+
+
 def world_from_camera_of(
     camera_from_world: Float[np.ndarray, "S 3 4"], source: Path | str
 ) -> Float64[np.ndarray, "S 4 4"]:

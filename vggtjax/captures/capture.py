@@ -26,6 +26,10 @@ from vggtjax.errors import InputError
 CaptureKind = Literal["record3d", "polycam", "nerfstudio", "colmap", "tum"]
 
 
+class OtherShapeError(InputError):
+    """A map of another shape than its picture: it does not show what the picture shows."""
+
+
 @dataclass(frozen=True, eq=False)
 class Capture:
     """Pictures in order, and what is known of each of them: OpenCV's axes, pixels of the upright pictures.
@@ -47,6 +51,7 @@ class Capture:
     depth_files: tuple[Path | None, ...] | None = field(default=None, repr=False)
     read_depth_file: Callable[[Path], Float32[np.ndarray, "h w"]] | None = field(default=None, repr=False)
     timestamps: Float64[np.ndarray, " S"] | None = field(default=None, repr=False)  # seconds
+    absent: tuple[str, ...] = ()  # frames whose picture is not there, of a capture that need not be whole
     left_out: tuple[str, ...] = ()  # a sentence on pictures that are not among these
     notes: tuple[str, ...] = ()  # a sentence for each part that is missing or not as it seems
     archive: Unpacked | None = field(default=None, repr=False)  # keeps the temporary files that `pictures` are, if any
@@ -148,7 +153,8 @@ class Capture:
         """Return the depth of a frame along z, 0 where it is unknown, or None for a frame without depth.
 
         It spans the picture, often with fewer pixels; it is in metres if the capture is `metric`, else in the unit of
-        the poses. Raises InputError for an unreadable file, MissingExtraError where a format's library is missing.
+        the poses. Raises InputError for an unreadable file, OtherShapeError for another shape than the picture's,
+        MissingExtraError where a format's library is missing.
         """
         if self.depth_files is None or self.read_depth_file is None or (path := self.depth_files[frame]) is None:
             return None
@@ -158,12 +164,23 @@ class Capture:
             (width, height), (rows, columns) = self.sizes[frame] if undone is None else undone.stored, values.shape
             if abs(columns * height - rows * width) > max(width, height):  # more than one pixel of rounding
                 turned = TURNED if abs(rows * height - columns * width) <= max(width, height) else ""
-                raise InputError(
+                raise OtherShapeError(
                     f"{path} has {columns} x {rows} pixels and its picture {width} x {height}; expected the same shape"
                     f"{turned}"
                 )
         values = np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
         return values if undone is None else undone.nearest(values)
+
+
+def there(pictures: Sequence[Path], source: Path, *, whole: bool) -> list[int]:
+    """Return the places of the pictures that are there; all of them for a `whole` capture, whose sizes are checked.
+
+    Raises InputError where none is there.
+    """
+    found = [place for place, path in enumerate(pictures) if whole or path.is_file()]
+    if pictures and not found:
+        raise InputError(f"{pictures[0]} is missing, and so is every picture that {source} names")
+    return found
 
 
 def checked_sizes(pictures: Sequence[Path], source: Path) -> tuple[tuple[int, int], ...]:

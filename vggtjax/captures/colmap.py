@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vggtjax.captures.cameras import DISTORTED, world_from_camera_of
-from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out, lenses_of
+from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, left_out, lenses_of, there
 from vggtjax.captures.colmap_model import ColmapView, Suffix, count_points, read_views
 from vggtjax.captures.files import inside
 from vggtjax.errors import InputError, one_line
@@ -93,7 +93,7 @@ def _chosen(folder: Path) -> tuple[_Model, Mapping[str, ColmapView], tuple[str, 
     return model, views, (one_line(said),)
 
 
-def read_colmap(folder: Path) -> Capture:
+def read_colmap(folder: Path, *, whole: bool = True) -> Capture:
     """Read a folder with a model and its pictures, or the model's own folder with the pictures beside it.
 
     Of several models the one with the most pictures is read. Pictures that it did not register are left out.
@@ -105,6 +105,9 @@ def read_colmap(folder: Path) -> Capture:
     names = in_order(views, Path)
     place = _pictures(folder, names[0])
     pictures = tuple(inside(place, name, source) for name in names)
+    kept = there(pictures, source, whole=whole)
+    absent = tuple(picture.stem for number, picture in enumerate(pictures) if number not in kept)
+    names, pictures = [names[number] for number in kept], tuple(pictures[number] for number in kept)
     sizes = checked_sizes(pictures, source)
     taken = [views[name] for name in names]
     found = {path for path in place.rglob("*") if is_image_name(path) and not path.name.startswith(".")}
@@ -118,6 +121,7 @@ def read_colmap(folder: Path) -> Capture:
         fitted_intrinsics([view.intrinsics for view in taken], [view.size for view in taken], sizes, model.folder),
         world_from_camera_of(np.stack([view.camera_from_world for view in taken]), model.folder),
         lenses=(lenses := lenses_of(view.lens for view in taken)),
+        absent=absent,
         left_out=note + missing,
         notes=note + missing + (DISTORTED,) * (lenses is not None),
     )
@@ -128,8 +132,8 @@ def _pictures(folder: Path, first: str) -> Path:
     root = folder.resolve()
     places = [(root / place).resolve() for place in _PICTURES]
     inside(places[0], first, folder)
-    there = [place for place in places if (place / first).is_file()]
+    having = [place for place in places if (place / first).is_file()]
     images = [place for place in places if place.name == "images" and place.is_dir()]
-    if not there + images:
+    if not having + images:
         raise InputError(f"{folder} has a COLMAP model and no folder images; put the model's pictures there")
-    return (there + images)[0]
+    return (having + images)[0]

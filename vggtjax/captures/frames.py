@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from decimal import Decimal
+from functools import cached_property
 
 from vggtjax.captures.capture import Capture
 from vggtjax.captures.files import folder_name
 from vggtjax.captures.lens import Undistortion
-from vggtjax.media.images import ImageFiles, read_image
+from vggtjax.media.images import ImageFiles, read_image, stated_times
 from vggtjax.media.sampling import Frame, Sampling
+from vggtjax.media.times import FrameTimes
 
 
 @dataclass(frozen=True)
@@ -29,10 +32,13 @@ class CaptureFrames(ImageFiles):
         """Those of the capture."""
         return self.capture.frame_names
 
-    @property
-    def first_time(self) -> float | None:
-        """The time of the capture's first frame by its own clock, in seconds; times of frames count from it."""
-        return None if self.capture.timestamps is None else float(self.capture.timestamps[0])
+    @cached_property
+    def times(self) -> FrameTimes | None:
+        """The times by the capture's own clock, or else those that the files state."""
+        if self.capture.timestamps is None:
+            return None if self.capture.archive is not None else stated_times(self.paths)
+        seconds = tuple(Decimal(repr(float(time))) for time in self.capture.timestamps)
+        return FrameTimes(seconds, f"the capture ({self.capture.kind})")
 
     @property
     def lenses_undone(self) -> str:
@@ -45,19 +51,12 @@ class CaptureFrames(ImageFiles):
 
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes. Raises ClipError for a file that cannot be read."""
-        times = self.capture.timestamps
+        times = None if self.times is None else self.times.from_first
         for index in self.taken(sampling):
-            time = None if times is None else float(times[index] - times[0])
+            time = None if times is None else float(times[index])
             with self.capture.naming_files():
                 image = read_image(self.paths[index], self._said)
             made = None if self.capture.undone is None else self.capture.undone[index]
             if made is not None:
                 image = made.picture(image)
             yield Frame(self.frame_names[index], image, time)
-
-    def taken(self, sampling: Sampling) -> list[int]:
-        """Return the indices of the pictures that `sampling` takes, with `fps` by their times."""
-        times = self.capture.timestamps
-        if sampling.fps is None or times is None:
-            return list(sampling.indices(len(self.paths)))
-        return [index for index, _, _ in sampling.select((float(time - times[0]), None) for time in times)]

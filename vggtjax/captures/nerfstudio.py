@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from vggtjax.captures.cameras import DISTORTED, PIXEL_CENTRE, from_opengl, intrinsics_matrix
-from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, lenses_of
+from vggtjax.captures.capture import Capture, checked_sizes, fitted_intrinsics, lenses_of, there
 from vggtjax.captures.depth_files import read_npy, read_png
 from vggtjax.captures.files import inside
 from vggtjax.captures.lens import opencv_lens
@@ -35,7 +35,7 @@ _FISHEYE = "OPENCV_FISHEYE"
 _SUFFIXES = (".png", ".jpg", ".jpeg")  # of names without one, as Blender's scenes have
 
 
-def read_nerfstudio(folder: Path) -> Capture:
+def read_nerfstudio(folder: Path, *, whole: bool = True) -> Capture:
     """Read a folder with transforms.json: frames in the natural order of their names.
 
     `applied_transform` and `applied_scale`, which nerfstudio's own converters add, are undone.
@@ -49,6 +49,9 @@ def read_nerfstudio(folder: Path) -> Capture:
     pictures = tuple(picture for picture, _ in found)
     if len(set(pictures)) < len(pictures):
         raise InputError(f"{path} names a picture twice; expected each once")
+    kept = there(pictures, path, whole=whole)
+    absent = tuple(picture.stem for place, picture in enumerate(pictures) if place not in kept)
+    found, pictures = [found[place] for place in kept], tuple(pictures[place] for place in kept)
     sizes = checked_sizes(pictures, path)
     # Numbers of a frame come before those of all.
     merged = [{**{key: scene[key] for key in scene if key != "frames"}, **frame} for _, frame in found]
@@ -58,7 +61,7 @@ def read_nerfstudio(folder: Path) -> Capture:
         opencv_lens(camera, matrix, size, path, model=model)
         for camera, model, (matrix, size) in zip(merged, models, cameras, strict=True)
     )
-    depths = [_depth_file(folder, frame, path) for _, frame in found]
+    depths = [_depth_file(folder, frame, path, whole=whole) for _, frame in found]
     return Capture(
         "nerfstudio",
         folder,
@@ -69,6 +72,7 @@ def read_nerfstudio(folder: Path) -> Capture:
         lenses=lenses,
         depth_files=tuple(depths) if any(depths) else None,
         read_depth_file=_read_depth,
+        absent=absent,
         notes=(DISTORTED,) * (lenses is not None),
     )
 
@@ -142,15 +146,15 @@ def _matrix(values: Mapping[str, Any], key: str, source: Path) -> Float64[np.nda
     return rows if len(rows) == 4 else np.vstack([rows, [0, 0, 0, 1]])
 
 
-def _depth_file(folder: Path, frame: Mapping[str, Any], source: Path) -> Path | None:
+def _depth_file(folder: Path, frame: Mapping[str, Any], source: Path, *, whole: bool) -> Path | None:
     if (name := frame.get("depth_file_path")) is None:
         return None
     if not isinstance(name, str):
         raise InputError(f"{source} has a 'depth_file_path' that is no text; expected the path of a depth map")
     path = inside(folder, name, source)
-    if not path.is_file():
+    if whole and not path.is_file():
         raise InputError(f"{path} is missing, but {source} names it; get the capture whole")
-    return path
+    return path if path.is_file() else None
 
 
 def _read_depth(path: Path) -> Float32[np.ndarray, "h w"]:

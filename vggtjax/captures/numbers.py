@@ -13,11 +13,11 @@ from vggtjax.errors import InputError
 
 
 def numbers(
-    values: Mapping[str, Any], key: str, shapes: tuple[tuple[int, ...], ...], source: Path
+    values: Mapping[str, Any], key: str, shapes: tuple[tuple[int, ...], ...], source: Path, *, finite: bool = True
 ) -> Float64[np.ndarray, ...]:
     """Return a field as an array of one of the shapes; -1 is any length.
 
-    Raises InputError, which names `source`, for a field that is missing, not of numbers, not finite, or of another
+    Raises InputError, which names `source`, for a field that is missing, not of numbers, not `finite`, or of another
     shape.
     """
     try:
@@ -30,7 +30,7 @@ def numbers(
         array.ndim == len(shape) and all(want in (-1, side) for want, side in zip(shape, array.shape, strict=True))
         for shape in shapes
     )
-    if not fits or not np.isfinite(array).all():
+    if not fits or (finite and not np.isfinite(array).all()):
         raise InputError(
             f"{source} has a '{key}' of shape {array.shape}; expected finite numbers of shape {_words(shapes)}"
         )

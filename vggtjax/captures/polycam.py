@@ -38,7 +38,7 @@ def is_polycam(folder: Path) -> bool:
     return any((folder / _KEYFRAMES / name).is_dir() for name in ("cameras", "corrected_cameras"))
 
 
-def read_polycam(folder: Path) -> Capture:
+def read_polycam(folder: Path, *, whole: bool = True) -> Capture:
     """Read raw data of Polycam: the optimised cameras with their pictures where there are some, else ARKit's."""
     root = folder / _KEYFRAMES
     corrected = bool(files(root / "corrected_cameras", ".json")) and (root / "corrected_images").is_dir()
@@ -47,8 +47,10 @@ def read_polycam(folder: Path) -> Capture:
     if not cameras:
         raise InputError(f"{root} has no cameras/*.json; export Polycam's raw data, with developer mode on")
     pictures = _pictures(root / f"{prefix}images")
-    if alone := [name for name in cameras if name not in pictures]:
+    alone = [name for name in cameras if name not in pictures]
+    if alone and (whole or len(alone) == len(cameras)):
         raise InputError(f"{root} has the camera {alone[0]} and no picture for it; get the capture whole")
+    cameras = {name: path for name, path in cameras.items() if name in pictures}
     lost = [name for name in pictures if name not in cameras]
     paths = tuple(pictures[name] for name in cameras)
     sizes = checked_sizes(paths, root)
@@ -68,6 +70,7 @@ def read_polycam(folder: Path) -> Capture:
         depth_files=tuple(depths.get(name) for name in cameras) if depths else None,
         read_depth_file=_read_depth,
         timestamps=_times(list(cameras)),
+        absent=tuple(alone),
         left_out=missing,
         notes=missing + (() if corrected else (_NOT_OPTIMISED, DISTORTED)),
     )

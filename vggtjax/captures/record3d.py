@@ -51,30 +51,31 @@ def is_record3d(folder: Path) -> bool:
     return own or ((folder / _EXPORT.metadata).is_file() and any(map(Path.is_file, first)))
 
 
-def read_record3d(path: Path) -> Capture:
+def read_record3d(path: Path, *, whole: bool = True) -> Capture:
     """Read a .r3d file, the folder that it unpacks to, or an export "EXR + JPG".
 
     Depth needs the extra 'record3d', that of an export the extra 'exr', and only when it is read.
     """
     if path.is_dir():
-        return _read(path, path, None)
+        return _read(path, path, None, whole=whole)
     archive = unpacked(path, (_OWN.metadata, _OWN.pictures))
     with archive.named(path):
-        return _read(path, archive.folder, archive)
+        return _read(path, archive.folder, archive, whole=whole)
 
 
-def _read(path: Path, folder: Path, archive: Unpacked | None) -> Capture:
+def _read(path: Path, folder: Path, archive: Unpacked | None, *, whole: bool) -> Capture:
     layout = _OWN if (folder / _OWN.metadata).is_file() else _EXPORT
     source = folder / layout.metadata
     values = read_json(source, dict[str, Any], "metadata", most_bytes=_MOST_BYTES)
     named = files(folder / layout.pictures, ".png") | files(folder / layout.pictures, ".jpg")
     numbered = {int(name): file for name, file in named.items() if name.isdecimal()}
-    pictures = tuple(numbered[number] for number in sorted(numbered))
-    count = len(pictures)
+    taken = sorted(numbered)
+    pictures = tuple(numbered[number] for number in taken)
     poses = numbers(values, "poses", ((-1, 7),), source)
-    if sorted(numbered) != list(range(count)) or len(poses) != count or not count:
+    count = len(pictures) if whole else len(poses)
+    if not taken or len(poses) != count or (taken != list(range(count)) if whole else taken[-1] >= count):
         expected = f"{layout.pictures}/0.jpg and so on, one each"
-        raise InputError(f"{path} has {count} pictures and {len(poses)} poses; expected {expected}")
+        raise InputError(f"{path} has {len(pictures)} pictures and {len(poses)} poses; expected {expected}")
     sizes = checked_sizes(pictures, source)
     size = (int(number(values, "w", source)), int(number(values, "h", source)))
     if min(size) < 1:
@@ -86,12 +87,13 @@ def _read(path: Path, folder: Path, archive: Unpacked | None) -> Capture:
         path,
         pictures,
         sizes,
-        fitted_intrinsics(list(_intrinsics(values, count, source)), [size] * count, sizes, source),
-        from_opengl(pose_matrices(poses[:, 4:], poses[:, :4], source), source),
+        fitted_intrinsics(list(_intrinsics(values, count, source)[taken]), [size] * len(taken), sizes, source),
+        from_opengl(pose_matrices(poses[taken, 4:], poses[taken, :4], source), source),
         metric=True,
         depth_files=tuple(there) if any(there) else None,
         read_depth_file=partial(_read_depth, shape=_depth_shape(values, size, source)),
-        timestamps=_times(values, count, source),
+        timestamps=None if (times := _times(values, count, source)) is None else times[taken],
+        absent=tuple(str(number) for number in range(count) if number not in numbered),
         archive=archive,
     )
 

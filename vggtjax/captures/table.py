@@ -19,7 +19,7 @@ RECORD3D_SUFFIX = ".r3d"
 
 
 # Whether a path is of the kind, and its reader. The first that recognises a folder reads it.
-KINDS: Mapping[CaptureKind, tuple[Callable[[Path], bool], Callable[[Path], Capture]]] = {
+KINDS: Mapping[CaptureKind, tuple[Callable[[Path], bool], Callable[..., Capture]]] = {
     "record3d": (lambda path: _is_r3d(path) or is_record3d(path), read_record3d),
     "polycam": (is_polycam, read_polycam),
     "nerfstudio": (lambda path: any((path / name).is_file() for name in NAMES), read_nerfstudio),
@@ -46,12 +46,14 @@ def find_capture(path: str | PathLike[str]) -> Capture | None:
     return None if kind is None else read_capture(path, kind)
 
 
-def read_capture(path: str | PathLike[str], kind: CaptureKind | None = None) -> Capture:
+def read_capture(path: str | PathLike[str], kind: CaptureKind | None = None, *, whole: bool = True) -> Capture:
     """Read the pictures, intrinsics, poses and depth of a capture.
 
     Args:
         path: the capture's folder, or a .r3d file of Record3D.
         kind: "record3d", "polycam", "nerfstudio", "colmap" or "tum"; recognised by the files if None.
+        whole: refuse a capture that names pictures or depth maps which are not there; else they are left out, and
+            `absent` names the frames without a picture.
 
     Raises:
         InputError: an unknown kind, a folder of no kind, and files that are missing, invalid or too large.
@@ -62,7 +64,7 @@ def read_capture(path: str | PathLike[str], kind: CaptureKind | None = None) -> 
         )
     check_choice("kind", kind, get_args(CaptureKind))
     with reading(path):
-        return KINDS[kind][1](Path(path))
+        return KINDS[kind][1](Path(path), whole=whole)
 
 
 def _is_r3d(path: Path) -> bool:

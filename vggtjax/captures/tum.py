@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int
 
 from vggtjax.captures.cameras import DISTORTED, intrinsics_matrix
-from vggtjax.captures.capture import Capture, checked_sizes, left_out
+from vggtjax.captures.capture import Capture, checked_sizes, left_out, there
 from vggtjax.captures.depth_files import read_png
 from vggtjax.captures.files import inside, read_text
 from vggtjax.errors import InputError
@@ -77,8 +77,9 @@ def read_poses(
     path = folder / "groundtruth.txt"
     if not path.is_file():
         return None, np.full(len(times), -1)
-    stamps, poses = read_trajectory(path)
-    return np.asarray(poses, np.float64), partners(times, stamps)
+    stamps, poses = read_trajectory(path, lost=True)
+    found = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(stamps)
+    return np.asarray(poses[found], np.float64), partners(times, stamps[found])
 
 
 def read_intrinsics(folder: Path) -> tuple[Float64[np.ndarray, "3 3"] | None, tuple[str, ...]]:
@@ -96,7 +97,7 @@ def read_intrinsics(folder: Path) -> tuple[Float64[np.ndarray, "3 3"] | None, tu
     return matrix, () if match[1] == "3" else (DISTORTED,)
 
 
-def read_tum(folder: Path) -> Capture:
+def read_tum(folder: Path, *, whole: bool = True) -> Capture:
     """Read a folder of the benchmark; frames without a pose are left out."""
     listed = read_list(folder, "rgb.txt")
     count = len(listed.paths)
@@ -107,6 +108,9 @@ def read_tum(folder: Path) -> Capture:
     lost = [listed.paths[frame].stem for frame in np.setdiff1d(np.arange(count), frames)]
     missing = left_out(lost, count, f"pose within {TOLERANCE} s")
     notes = missing + (NO_POSES,) * (poses is None)
+    kept = there([listed.paths[frame] for frame in frames], folder / "rgb.txt", whole=whole)
+    absent = tuple(listed.paths[frame].stem for place, frame in enumerate(frames) if place not in kept)
+    frames = frames[kept]
     pictures = tuple(listed.paths[frame] for frame in frames)
     sizes = checked_sizes(pictures, folder / "rgb.txt")
     intrinsics, more = read_intrinsics(folder)
@@ -119,28 +123,29 @@ def read_tum(folder: Path) -> Capture:
         None if poses is None else poses[posed[frames]],
         has_unknown_lens=DISTORTED in more,
         metric=True,
-        depth_files=depth_files(folder, listed.times, frames),
+        depth_files=depth_files(folder, listed.times, frames, whole=whole),
         read_depth_file=partial(read_png, per_metre=PER_METRE),
         timestamps=listed.times[frames],
+        absent=absent,
         left_out=missing,
         notes=notes + more,
     )
 
 
 def depth_files(
-    folder: Path, times: Float64[np.ndarray, " N"], frames: Sequence[int] | Int[np.ndarray, " S"]
+    folder: Path, times: Float64[np.ndarray, " N"], frames: Sequence[int] | Int[np.ndarray, " S"], *, whole: bool = True
 ) -> tuple[Path | None, ...] | None:
     """Return the depth maps of some pictures of the list with these times; None where there is no depth.txt.
 
     Partners are sought among all pictures, so that a choice of frames does not change the owner of a depth map.
-    Raises InputError for a file that is listed and missing.
+    Raises InputError for a file that is listed and missing; unless `whole`, its frame has no depth.
     """
     if not (folder / "depth.txt").is_file():
         return None
     listed = read_list(folder, "depth.txt")
     owners = partners(times, listed.times)[frames]
     found = tuple(listed.paths[owner] if owner >= 0 else None for owner in owners)
-    for path in found:
-        if path is not None and not path.is_file():
-            raise InputError(f"{path} is missing, but depth.txt names it; get the capture whole")
-    return found
+    missing = [path for path in found if path is not None and not path.is_file()]
+    if missing and whole:
+        raise InputError(f"{missing[0]} is missing, but depth.txt names it; get the capture whole")
+    return tuple(None if path in missing else path for path in found)

@@ -21,9 +21,9 @@ _BINS = 8  # of each channel
 _FLAT = 0.04  # largest range of brightness, from the 2nd to the 98th percentile, of a frame without content
 _FLASH = 0.2  # brightness above both neighbours, which are as bright as each other within half of it
 _LONGEST_FLASH = 2  # frames
-# A cut: colours differ (Hellinger's distance, squared) by so much more than between most frames of the clip, and no shift
-# makes the thumbnails alike. Filmed neighbours have up to .02, of a fast camera at few frames a second .20 with a median
-# of .11; frames of two clips have .13 to .8, and are never as alike.
+# A cut: colours differ (Hellinger's distance, squared) by so much more than between most frames of the clip, and no
+# shift makes the thumbnails alike. Filmed neighbours have up to .02, of a fast camera at few frames a second .20 with a
+# median of .11; frames of two clips have .13 to .8, and are never as alike.
 _OTHER_COLOURS, _TIMES_MEDIAN, _ALIKE = 0.1, 3.0, 0.7
 
 

@@ -10,7 +10,7 @@ from vggtjax.clips.clip import read_clip
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.clips.sources import open_source
 from vggtjax.known.stated import focal_in_words
-from vggtjax.media.images import is_image_name
+from vggtjax.media.images import ImageFiles, is_image_name
 from vggtjax.media.sampling import Sampling
 from vggtjax.media.video import VideoFile, is_video_name
 
@@ -35,6 +35,8 @@ def clip_facts(path: str) -> dict[str, str]:
     facts |= {} if frames is None else {"frames": str(frames)}
     facts |= {} if seconds is None else {"length": f"{seconds:.2f} s, as the file states it"}
     facts["focal length"] = focal_in_words(clip)
+    if isinstance(source, ImageFiles) and source.times is not None:
+        facts["times"] = f"from {source.times.origin}"
     if isinstance(source, CaptureFrames):
         capture = source.capture
         known = {

@@ -42,11 +42,14 @@ def demo(
             size = truth.images.shape[2]
             clip = load_clip(truth.images, model=model, size=size)
         from vggtjax.pipeline.agreement import agree_with_pixels
-        from vggtjax.pipeline.run import reconstruct
+        from vggtjax.pipeline.run import with_own_mask
+        from vggtjax.pipeline.running import Running
+        from vggtjax.results.no_mask import without_mask
 
-        predicted = reconstruct(model, clip, options=Options(method), size=size, on_stage=report.stage)
+        predicted = with_own_mask(model, clip, Options(method), Running(on_stage=report.stage), size=size)
         predicted = replace(predicted, settings=predicted.settings | {"clip": "Embedded clip"})
         result = agree_with_pixels(predicted, clip.pictures, CONSISTENT, on_stage=report.stage)
+        predicted, result = without_mask(predicted), without_mask(result)
         with report.stage("measure") as progress:
             from vggtjax.evaluation.ladder import error_table, ladder, score_result
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -21,6 +21,7 @@ from vggtjax.results.saving import READ_FORMATS, ReadFormat
 from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
+    from vggtjax.evaluation.datasets.sequence import FrameChoice
     from vggtjax.evaluation.records import Record
     from vggtjax.evaluation.sources import FolderSource, ModelSource
 
@@ -75,7 +76,7 @@ class Folders:
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None
     """order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw"""
 
-    def source(self) -> FolderSource:
+    def source(self, *, strict: bool = False) -> FolderSource:
         """Return the results in the folders."""
         from vggtjax.evaluation.sources import FolderSource
 
@@ -95,7 +96,7 @@ class Folders:
             if name in folders:
                 raise InputError(f"--results has two folders named {name}; give them different names: NAME=FOLDER")
             folders[name], formats[name] = path, form if known else self.format or "vggtjax"
-        return FolderSource(folders, formats, self.quaternion)
+        return FolderSource(folders, formats, self.quaternion, strict)
 
 
 @dataclass(frozen=True)
@@ -106,10 +107,14 @@ class ScoreOptions:
     """names, with commas; the sequences of the published protocol, or all, by default"""
     gt: Annotated[str | None, tyro.conf.arg(metavar="{easi3r,lidar}", help_behavior_hint="")] = None
     """ground truth to use, where a data set has several: for dycheck easi3r (the default) or lidar"""
-    depth_align: Literal["metric", "median", "scale", "scale-shift"] = "scale"
-    """how video depth is brought to metres"""
+    depth_align: Literal["metric", "median", "scale", "least-absolute", "scale-shift"] = "scale"
+    """how video depth is brought to metres: by ten rounds towards the scale of the least absolute error, as MonST3R
+    and CUT3R do it (scale); by that scale itself (least-absolute); by a scale and a shift; by medians; or not"""
     empty: Literal["davis", "vggt4d"] = "davis"
     """J of a frame in which nothing moves and nothing is found: 1 (davis) or 0 (vggt4d)"""
+    strict: bool = False
+    """refuse a sequence of which a frame lacks a picture, depth, mask, pose or result, or has a map of another size;
+    the other frames are scored by default"""
 
 
 def evaluate(
@@ -145,24 +150,29 @@ def evaluate(
         report.note(f"score {_subjects(candidates, folders)} on {one_line(dataset)} in {one_line(str(root))}")
         with report.stage("open data set"):
             from vggtjax import __version__
-            from vggtjax.evaluation.datasets import DATASETS, find_sequences
+            from vggtjax.evaluation.datasets import DATASETS, chosen_frames, find_sequences
             from vggtjax.evaluation.page import check_report, write_report
             from vggtjax.evaluation.records import Records
             from vggtjax.evaluation.run import Scoring
             from vggtjax.evaluation.run import evaluate as run
 
             chosen = None if scores.sequences is None else _words(scores.sequences)
-            found = find_sequences(dataset, root, sequences=chosen, sampling=sampling, gt=scores.gt)
+            found = find_sequences(
+                dataset, root, sequences=chosen, sampling=sampling, gt=scores.gt, strict=scores.strict
+            )
             store = Records(out)
             check_report(out, store)
         named = ", ".join(one_line(name, 60) for name in list(found)[:_SHOWN])
         more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         report.note(f"{len(found)} sequence{'' if len(found) == 1 else 's'}: {named}{more}")
+        frames = chosen_frames(dataset, sampling)
+        taken = _frames_in_words(frames, dataset, sampling)
+        report.note(taken)
         if folders.results:
             for name, value in vars(candidates).items():
                 if value is not None:
                     raise InputError(f"--{name} and --results exclude each other; give one of them")
-            source = folders.source()
+            source = folders.source(strict=scores.strict)
         else:
             for name in ("format", "quaternion"):
                 if getattr(folders, name) is not None:
@@ -174,20 +184,35 @@ def evaluate(
             "dataset": dataset,
             "root": str(root.resolve()),
             "gt": scores.gt or labels.gt_default,
-            "start": sampling.start,
-            "stride": sampling.stride,
-            "max_frames": sampling.max_frames,
+            "start": frames.window.start or 0,
+            "stop": frames.window.stop,
+            "stride": frames.stride,
+            "max_frames": frames.most,
+            "frames": taken,
             "depth_align": scores.depth_align,
             "max_depth": labels.max_depth,
             "empty": scores.empty,
+            "strict": scores.strict,
             **source.settings,
         }
         store.begin()
-        scoring = Scoring(scores.depth_align, labels.max_depth, scores.empty)
+        scoring = Scoring(scores.depth_align, labels.max_depth, scores.empty, scores.strict)
         records = run(found, source, store, settings, scoring, on_stage=report.stage)
         with report.stage("draw"):
             write_report(out, records, store, settings, warnings=source.warnings)
-    _print(report, out, records, source.warnings)
+    _print(report, out, records, source.warnings, settings)
+
+
+def _frames_in_words(frames: FrameChoice, dataset: str, sampling: Sampling) -> str:
+    """Return which frames of a sequence are taken, and who chose them."""
+    every = "every frame" if frames.stride == 1 else f"one frame of {frames.stride} (stride {frames.stride})"
+    start, stop = frames.window.start or 0, frames.window.stop
+    window = f", from frame {start}" * bool(start or stop) + ("" if stop is None else f" to {stop - 1}")
+    most = "" if frames.most is None else f", at most {frames.most}"
+    own = [name for name in ("start", "stride", "max_frames") if getattr(sampling, name)]
+    by = ", ".join(f"--{name.replace('_', '-')}" for name in own)
+    choice = f"by {by}" if own else f"as the protocol of {dataset} has it; --stride, --start and --max-frames change it"
+    return f"frames: {every}{window}{most}, {choice}"
 
 
 def _subjects(candidates: Candidates, folders: Folders) -> str:
@@ -198,8 +223,11 @@ def _subjects(candidates: Candidates, folders: Folders) -> str:
     return one_line(f"{methods} with {'no model' if candidates.model is None else f'the model {candidates.model}'}")
 
 
-def _print(report: Report, out: Path, records: Sequence[Record], warnings: Sequence[str]) -> None:
+def _print(
+    report: Report, out: Path, records: Sequence[Record], warnings: Sequence[str], settings: Mapping[str, Any]
+) -> None:
     """Print the means, each failure, notes and warnings; raises InputError where nothing could be scored."""
+    from vggtjax.evaluation.page import NO_PLOTS, can_plot
     from vggtjax.evaluation.records import summary
 
     report.means(summary(records))
@@ -213,6 +241,9 @@ def _print(report: Report, out: Path, records: Sequence[Record], warnings: Seque
         report.line(f"note: {note}")
     for warning in warnings:
         report.line(warning)
+    report.line(str(settings["frames"]))
+    if not can_plot():
+        report.line(NO_PLOTS)
     report.line(f"Look at {out / 'index.html'}")
     if all(record.status == "failed" for record in records):
         raise InputError(f"nothing could be scored; {out / 'index.html'} says why")

@@ -84,7 +84,7 @@ class Report:
             {
                 "frames": f"{frames} of {width} x {height} pixels",
                 "method": f"{result.method}, model {result.model_name}",
-                "dynamic": f"{100 * result.dynamic_share:.1f} % of the pixels",
+                "dynamic": f"{100 * result.dynamic_share:.1f} % of the pixels" if result.has_mask else "-",
                 **{one_line(name, 40): one_line(text) for name, text in result.known_facts.items()},
                 "total": f"{sum(self.seconds.values()):.2f} s",
                 "peak memory": _peak_memory(),

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from jaxtyping import Float64
 
 from vggtjax.clips.preprocessing import Fitter
 from vggtjax.errors import ClipError, InputError
+from vggtjax.media.times import in_seconds, name_times
 from vggtjax.reconstruction import Reconstruction
+from vggtjax.results.result import ARRAYS, TRACKS
+from vggtjax.storage.trajectories import associate
 
 Place = tuple[tuple[float, float], tuple[float, float]]  # scale and offset: source (x, y) = scale * (x, y) + offset
 _SAME: Place = ((1.0, 1.0), (0.0, 0.0))
@@ -18,9 +23,15 @@ _TRACKED_WIDTH, _TRACKED_SIDE = 518, 336  # of SpatialTrackerV2's frames, and th
 
 
 def placed(
-    result: Reconstruction, format: str, sizes: Sequence[tuple[int, int]], names: Sequence[str]
+    result: Reconstruction,
+    format: str,
+    sizes: Sequence[tuple[int, int]],
+    names: Sequence[str],
+    times: Float64[np.ndarray, " N"] | None = None,
+    *,
+    strict: bool = False,
 ) -> Reconstruction:
-    """Return a result with the place of its frames in pictures of these sizes.
+    """Return the frames of a result that pictures of these sizes show, with their place in them and their names.
 
     Folders of other projects do not record this place; it follows from the project: VGGT4D resizes to a width and cuts
     tall frames; Depth Anything 3 resizes both sides; MonST3R, those that build on it and CUT3R resize the long side
@@ -31,37 +42,92 @@ def placed(
         result: the loaded result.
         format: of its folder, such as "vggt4d".
         sizes: width and height of each picture.
-        names: of the pictures, without endings, to compare with the frames of results of vggtjax.
+        names: of the pictures, without endings, to compare with the frames of the result.
+        times: of the pictures in seconds, where they are known.
+        strict: refuse a result of other frames than all of these.
 
     Raises:
-        InputError: different numbers of pictures and frames, or frames of other pictures.
+        InputError: frames of other pictures, or fewer than pictures where nothing tells whose they are.
     """
-    S, H, W = result.depth.shape
-    if len(sizes) != S:
-        raise InputError(f"the result has {S} frames, the sequence {len(sizes)}; expected equal numbers")
-    if format == "vggtjax":
-        if result.frame_names != tuple(names):
+    pairs = _pairs(result, format, names, times)
+    if not pairs or (strict and not len(pairs) == len(names) == len(result.depth)):
+        if format == "vggtjax":
             raise InputError(
                 f"the result is of frames {', '.join(result.frame_names[:3])}, ... and the sequence has "
                 f"{', '.join(names[:3])}, ...; expected a result of the sequence's pictures"
             )
-        wrong = [i for i, (w, h) in enumerate(sizes) if tuple(result.source_size[i]) != (h, w)]
-        if wrong and set(sizes) == {(W, H)}:  # the frames themselves, as an export at the model's size holds them
-            return _replaced(result, sizes, [_SAME] * S)
-        if wrong:
-            height, width = result.source_size[wrong[0]]
-            raise InputError(
-                f"frame {wrong[0]} of the result was {width} x {height}, the sequence's picture is {sizes[wrong[0]]}; "
-                "expected a result of the sequence's pictures"
-            )
-        return result
-    places = [_SAME if size == (W, H) else _PLACES[format](*size, W, H) for size in sizes]
-    for place, (width, height) in zip(places, sizes, strict=True):
+        raise InputError(
+            f"the result has {len(result.depth)} frames, the sequence {len(names)}; expected equal numbers, or numbers "
+            "of files or times in pred_traj.txt that tell whose they are"
+        )
+    chosen = [sizes[theirs] for _, theirs in pairs]
+    if pairs != [(place, place) for place in range(len(result.depth))]:
+        result = _of_frames(result, [own for own, _ in pairs])
+    shown = tuple(names[theirs] for _, theirs in pairs)
+    if format == "vggtjax":
+        return _our_own(result, chosen)
+    W, H = result.depth.shape[2], result.depth.shape[1]
+    places = [_SAME if size == (W, H) else _PLACES[format](*size, W, H) for size in chosen]
+    for place, (width, height) in zip(places, chosen, strict=True):
         if place is None:
             raise InputError(
                 f"frames of {W} x {H} do not come from pictures of {width} x {height} as {format} makes them"
             )
-    return _replaced(result, sizes, [place for place in places if place])
+    made = _replaced(result, chosen, [place for place in places if place])
+    return made if made.frame_names == shown else dataclasses.replace(made, frame_names=shown)
+
+
+def _our_own(result: Reconstruction, sizes: Sequence[tuple[int, int]]) -> Reconstruction:
+    S, H, W = result.depth.shape
+    wrong = [i for i, (w, h) in enumerate(sizes) if tuple(result.source_size[i]) != (h, w)]
+    if wrong and set(sizes) == {(W, H)}:  # the frames themselves, as an export at the model's size holds them
+        return _replaced(result, sizes, [_SAME] * S)
+    if wrong:
+        height, width = result.source_size[wrong[0]]
+        raise InputError(
+            f"frame {wrong[0]} of the result was {width} x {height}, the sequence's picture is {sizes[wrong[0]]}; "
+            "expected a result of the sequence's pictures"
+        )
+    return result
+
+
+def _pairs(
+    result: Reconstruction, format: str, names: Sequence[str], times: Float64[np.ndarray, " N"] | None
+) -> list[tuple[int, int]]:
+    """Return places of frames in the result and the sequence: by name, by time, or by number; in the latter's order.
+
+    Frames of other programs have numbers. They are those of the sequence's frames, counted from 0, or those at the end
+    of their names. As many frames as the sequence has are the sequence's.
+    """
+    own = {name: place for place, name in enumerate(result.frame_names)}
+    if format == "vggtjax":
+        return [(own[name], place) for place, name in enumerate(names) if name in own]
+    count = len(result.depth)
+    if result.timestamps is not None and (wanted := name_times(names) if times is None else times) is not None:
+        pairs = associate(wanted, in_seconds(result.timestamps))
+        if len(pairs):
+            return [(int(mine), int(theirs)) for theirs, mine in pairs]
+    numbers = {int(name) if name.isdecimal() else place: place for name, place in own.items()}
+    if count == len(names) and max(numbers) < count:
+        return [(place, place) for place in range(count)]
+    if max(numbers) == count - 1 and count < len(names):  # counted on, whatever frames they are of
+        return []
+    ends = [re.search(r"(\d{1,9})$", name) for name in names]
+    by_name = {int(end[1]): place for place, end in enumerate(ends) if end}
+    if (None not in ends and set(numbers) <= set(by_name)) or max(numbers) >= len(names):
+        return [(numbers[number], place) for number, place in by_name.items() if number in numbers]
+    return [(numbers[number], number) for number in sorted(numbers)]
+
+
+def _of_frames(result: Reconstruction, frames: Sequence[int]) -> Reconstruction:
+    """Return some frames of a result, without tracks."""
+    taken = {
+        name: getattr(result, name)[list(frames)]
+        for name, (_, dimensions) in ARRAYS.items()
+        if dimensions[0] == "S" and name not in TRACKS and getattr(result, name) is not None
+    }
+    names = tuple(result.frame_names[frame] for frame in frames)
+    return dataclasses.replace(result, **taken, **dict.fromkeys(TRACKS), frame_names=names, passes=None)
 
 
 def _replaced(result: Reconstruction, sizes: Sequence[tuple[int, int]], places: Sequence[Place]) -> Reconstruction:

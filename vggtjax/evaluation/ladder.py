@@ -178,7 +178,7 @@ def score_result(result: Reconstruction, truth: ClipTruth, mask_source: Literal[
     if motion is not None:
         pixels = np.asarray(upsample(jax.numpy.asarray(motion[None]), result.depth.shape[1:]))[0]
     fields = (result.depth, result.intrinsics, result.camera_from_world, result.dynamic_mask, pixels)
-    return _row(_scene(0, truth), result.method, _Setting(mask_source), *fields)
+    return _row(_scene(0, truth), result.method, _Setting(mask_source if result.has_mask else None), *fields)
 
 
 def _check_options(options: Options) -> None:

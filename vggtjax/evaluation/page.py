@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from vggtjax.errors import InputError, check_extra
+from vggtjax.errors import InputError
 from vggtjax.evaluation import tables
 from vggtjax.evaluation.plots import draw_sequence
 from vggtjax.evaluation.records import FOLDER, Record, Records, costs, safe_name, summary
@@ -17,7 +18,18 @@ from vggtjax.storage.writing import check_free, writing
 
 PLOT_FOLDER = "plots"
 _MOST_BYTES = 2**28
+NO_PLOTS = "plots are left out, as matplotlib is not installed: pip install 'vggtjax[evaluate]' and run again"
 NAMES = ("results.json", "results.csv", "table.md", "table.tex", "index.html", PLOT_FOLDER)
+
+
+def can_plot() -> bool:
+    """Return whether matplotlib is installed."""
+    try:
+        for name in ("matplotlib", "matplotlib.figure"):
+            import_module(name)
+    except ImportError:
+        return False
+    return True
 
 
 def is_report(path: Path) -> bool:
@@ -33,10 +45,8 @@ def check_report(out: Path, store: Records) -> None:
     """Make sure that `write_report` can write into `out`, before hours are spent.
 
     Raises:
-        MissingExtraError: matplotlib is not installed.
         OutputError: the folder cannot be written, or holds files that are not of an evaluation.
     """
-    check_extra("drawing an evaluation", "evaluate", "matplotlib")
     replaced = is_report(out / "results.json") or store.exists()
     check_free(out, (*NAMES, FOLDER), replaced=replaced, what="evaluation")
 
@@ -44,7 +54,7 @@ def check_report(out: Path, store: Records) -> None:
 def write_report(
     out: Path, records: Sequence[Record], store: Records, settings: Mapping[str, Any], *, warnings: Sequence[str] = ()
 ) -> None:
-    """Write all files of an evaluation into `out`.
+    """Write all files of an evaluation into `out`; without matplotlib there are no plots, which the page says.
 
     Args:
         out: folder.
@@ -58,7 +68,8 @@ def write_report(
         "settings": dict(settings),
         "sequences": [
             {"name": r.name, "method": r.method, "status": r.status, "reason": r.reason, "frames": r.frames}
-            | {"metrics": r.metrics, "notes": list(r.notes), "seconds": r.seconds, "settings": r.settings}
+            | {"metrics": r.metrics, "notes": list(r.notes), "left_out": r.left_out, "seconds": r.seconds}
+            | {"settings": r.settings}
             for r in records
         ],
         "mean": means,
@@ -81,7 +92,7 @@ def write_report(
         costs=seconds,
         stages=list(dict.fromkeys(stage for row in seconds.values() for stage in row)),
         settings=settings,
-        warnings=warnings,
+        warnings=[*warnings, *(() if can_plot() else (NO_PLOTS,))],
         tables=tables,
     )
     _write(out / "index.html", page)
@@ -91,7 +102,8 @@ def _section(out: Path, records: Sequence[Record], store: Records) -> dict[str, 
     name = records[0].name
     good = [record for record in records if record.status == "ok"]
     folder = f"{PLOT_FOLDER}/{safe_name(name)}"
-    plots = draw_sequence(out / folder, {record.method: store.curves(record) for record in good})
+    curves = {record.method: store.curves(record) for record in good} if can_plot() else {}
+    plots = draw_sequence(out / folder, curves)
     rows = {record.method: record.metrics for record in good}
     return {
         "name": name,

@@ -31,7 +31,8 @@ def truth_sheet(
     size = (_SIDE, round(_SIDE * H / W))
     depths = {} if predicted is None else {"Depth predicted": predicted.depth}
     depths |= {"Depth found": result.depth, "Depth true": np.asarray(truth.depth)}
-    rows = ("Picture", *depths, "Moving found", "Moving true")
+    found = ("Moving found",) if result.has_mask else ()
+    rows = ("Picture", *depths, *found, "Moving true")
     left, top = _MARGIN + _LABEL, _MARGIN + 40
     plot_left = left + len(shown) * (size[0] + _GAP) + 2 * _MARGIN
     height = top + len(rows) * (size[1] + _GAP) + _MARGIN
@@ -50,7 +51,7 @@ def truth_sheet(
         pictures = (
             image,
             *(color_depth(depth[frame], everywhere[frame], inverse_range) for depth in scaled),
-            overlay(image, result.dynamic_mask[frame]),
+            *([overlay(image, result.dynamic_mask[frame])] if result.has_mask else ()),
             overlay(image, truth.dynamic_mask[frame]),
         )
         for row, picture in enumerate(pictures):

@@ -97,17 +97,19 @@ def _check_any(known: np.ndarray) -> None:
 
 def _trajectory(result: Result, truth: TruthAtPixels) -> _Outputs:
     poses = truth.poses
-    errors = trajectory_errors(result.world_from_camera, poses)
-    similarity = _alignment(result, poses, allow_line=True)
-    return errors._asdict(), {"centres": similarity.apply(result.camera_centres), "true_centres": poses[:, :3, 3]}
+    errors = trajectory_errors(result.world_from_camera[truth.posed], poses)
+    similarity = _alignment(result, truth, allow_line=True)
+    found = similarity.apply(result.camera_centres[truth.posed])
+    return errors._asdict(), {"centres": found, "true_centres": poses[:, :3, 3]}
 
 
-def _alignment(result: Result, poses: Float64[np.ndarray, "S 4 4"], *, allow_line: bool = False) -> Similarity:
-    return umeyama_sim3(centres(result.camera_from_world), poses[:, :3, 3], allow_line=allow_line)
+def _alignment(result: Result, truth: TruthAtPixels, *, allow_line: bool = False) -> Similarity:
+    found = centres(result.camera_from_world[truth.posed])
+    return umeyama_sim3(found, truth.poses[:, :3, 3], allow_line=allow_line)
 
 
 def _point_clouds(result: Result, truth: TruthAtPixels) -> _Outputs:
-    true, known = truth.points, truth.depth > 0
+    true, known = truth.points, truth.shown
     is_predicted = result.depth[known] != _UNKNOWN
     known &= result.depth != _UNKNOWN
     _check_any(is_predicted)
@@ -115,7 +117,7 @@ def _point_clouds(result: Result, truth: TruthAtPixels) -> _Outputs:
     predicted = known_points(result.depth, intrinsics, result.camera_from_world.astype(np.float64), known)
     if not np.isfinite(predicted).all():
         raise InputError(f"{int((~np.isfinite(predicted).all(axis=1)).sum())} predicted points are not finite")
-    similarity = _alignment(result, truth.poses)
+    similarity = _alignment(result, truth)
     predicted = similarity.apply(predicted).astype(np.float32)
     paired = paired_distance(predicted, true[is_predicted])
     ways = {"accuracy": (predicted, true), "completeness": (true, predicted)}
@@ -132,21 +134,24 @@ def _point_clouds(result: Result, truth: TruthAtPixels) -> _Outputs:
 
 
 def _masks(result: Result, truth: TruthAtPixels, *, empty: Empty) -> _Outputs:
-    true = truth.mask
     _check_predicted(result, "dynamic_mask", "masks")
-    inside = result.inside_pictures
-    predicted = result.dynamic_mask & inside
+    used = truth.masked
+    true = truth.mask[used]
+    inside = result.inside_pictures[used]
+    predicted = result.dynamic_mask[used] & inside
     rows, columns = (np.flatnonzero(inside.any(axis=axes)) for axes in ((0, 2), (0, 1)))
     window = np.s_[:, rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]  # without padding
     frames = frame_scores(predicted[window], true[window], empty=empty)
     metrics = dict(mask_statistics(frames)._asdict())
+    metrics |= {} if used.all() else {"mask_frames": float(used.sum())}
     of_patches = result.saliency if result.motion is None else result.motion  # what the mask was cut from
     if of_patches is not None and true.any() and not true[inside].all():
         factors = (1, *(big // small for big, small in zip(true.shape[1:], of_patches.shape[1:], strict=True)))
-        saliency = np.kron(of_patches, np.ones(factors, np.float32))
+        saliency = np.kron(of_patches[used], np.ones(factors, np.float32))
         metrics["saliency_auc"] = auc(saliency[inside], true[inside])
-    shown = _pictured(len(true))
-    pictures = {"masks": predicted[shown], "true_masks": true[shown]}
+    some = _pictured(len(true))
+    shown = np.flatnonzero(used)[some]
+    pictures = {"masks": predicted[some], "true_masks": true[some]}
     return metrics, {"j": frames.j, "f": frames.f, "images": result.images[shown], "shown": shown, **pictures}
 
 

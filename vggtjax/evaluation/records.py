@@ -35,7 +35,8 @@ class Record:
     metrics: dict[str, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # what the ground truth lacks, and why a metric is missing
     reason: str = ""  # of a failure
-    frames: Natural = 0
+    frames: Natural = 0  # that are scored
+    left_out: dict[str, dict[str, Any]] = field(default_factory=dict)  # by what they lack: counts, the first names
     seconds: dict[str, float] = field(default_factory=dict)  # of the stages of its group of methods
 
 
@@ -128,16 +129,19 @@ def summary(records: Sequence[Record]) -> dict[str, dict[str, float]]:
         own = [record for record in records if record.method == method]
         good = [record for record in own if record.status == "ok"]
         means[method] = {"sequences": len(good), "failed": len(own) - len(good)}
-        metrics = dict.fromkeys(metric for record in good for metric in record.metrics if metric != "depth_pixels")
+        metrics = dict.fromkeys(metric for record in good for metric in record.metrics if metric not in _WEIGHTS)
         for metric in metrics:
             weights = [r.metrics.get("depth_pixels", 1.0) if metric in _VIDEO_DEPTH else 1.0 for r in good]
             means[method][metric] = _mean(good, metric, weights)
         for metric, pooled in _POOLED.items():
             if metric in metrics:
-                means[method][pooled] = _mean(good, metric, [record.frames for record in good])
+                means[method][pooled] = _mean(
+                    good, metric, [record.metrics.get("mask_frames", record.frames) for record in good]
+                )
     return means
 
 
+_WEIGHTS = ("depth_pixels", "mask_frames")
 _VIDEO_DEPTH = ("abs_rel", "rmse", "delta1", "delta2", "delta3")
 _POOLED = {"j_mean": "j_pooled", "f_mean": "f_pooled"}  # metric -> its mean over the frames of all sequences
 

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from vggtjax.captures.capture import OtherShapeError
 from vggtjax.errors import VggtjaxError, one_line, reading
-from vggtjax.evaluation.datasets.sequence import LabelledSequence
+from vggtjax.evaluation.datasets.sequence import LabelledSequence, LeftOut, left_out
 from vggtjax.evaluation.metrics.depth import Align
 from vggtjax.evaluation.metrics.masks import Empty
 from vggtjax.evaluation.protocol import score
@@ -36,6 +37,7 @@ class Scoring:
     depth_align: Align = "scale"
     max_depth: float | None = None
     empty: Empty = "davis"
+    strict: bool = False  # refuse a sequence of which a frame lacks something, rather than score the others
 
 
 def evaluate(
@@ -70,6 +72,7 @@ def evaluate(
             try:
                 sequence = opener()
                 facts = {"notes": _lines(sequence.notes), "frames": len(sequence)}
+                facts["left_out"] = _left_out(sequence.left_out)
                 data = fingerprint(sequence)
                 for name in drafts:
                     own = {**settings, "data": data, "result": source.fingerprint(name, sequence)}
@@ -116,21 +119,43 @@ def _computed(
                 if problem is not None:
                     raise problem
                 result = results[name]
-                if truth is None or not truth.fits(result):  # results with one placement share it
-                    truth = TruthAtPixels(sequence, result, max_depth=scoring.max_depth)
+                own, lacking = _matched(sequence, result)
+                if truth is None or truth.sequence is not own or not truth.fits(result):  # results with one share it
+                    truth = TruthAtPixels(own, result, max_depth=scoring.max_depth, strict=scoring.strict)
                 scores = score(result, truth, depth_align=scoring.depth_align, empty=scoring.empty)
+                lacking += tuple(truth.left_out.values())
+                said = tuple(f"{name} of {sequence.name}: {each.sentence}" for each in lacking)
+                problems = scores.problems
+                if not scores.metrics and not problems:
+                    problems = (f"nothing is left to score: {'; '.join((*said, *scores.notes))}",)
             except Exception as error:
                 yield replace(drafts[name], reason=_reason(error)), {}
                 continue
             record = replace(
                 drafts[name],
-                status="failed" if scores.problems else "ok",
+                status="failed" if problems else "ok",
                 metrics=scores.metrics,
-                notes=drafts[name].notes + _lines(scores.notes),
-                reason=one_line("; ".join(scores.problems), _MOST_LETTERS),
+                notes=drafts[name].notes + _lines((*said, *scores.notes)),
+                reason=one_line("; ".join(problems), _MOST_LETTERS),
+                frames=len(own),
+                left_out=drafts[name].left_out | _left_out(lacking),
                 seconds=seconds,
             )
             yield record, scores.curves
+
+
+def _matched(sequence: LabelledSequence, result: Reconstruction) -> tuple[LabelledSequence, tuple[LeftOut, ...]]:
+    """Return the frames of a sequence that a result has, by their names, and the frames that it lacks."""
+    if len(result.depth) == len(sequence):
+        return sequence, ()
+    places = {name: place for place, name in enumerate(sequence.frame_names)}
+    lacking = [name for name in sequence.frame_names if name not in set(result.frame_names)]
+    matched = sequence.of_frames([places[name] for name in result.frame_names])
+    return matched, left_out("results", lacking, len(sequence), "have no result")
+
+
+def _left_out(lacking: Sequence[LeftOut]) -> dict[str, dict[str, Any]]:
+    return {each.what: each.to_json() for each in lacking}
 
 
 def _reason(error: Exception) -> str:
@@ -161,5 +186,10 @@ def fingerprint(sequence: LabelledSequence) -> str:
     for read in (sequence.depth, sequence.mask):
         if read is not None:
             for frame in frames:
-                digest.update(np.ascontiguousarray(read(frame)).tobytes())
+                try:
+                    values = read(frame)
+                except OtherShapeError as error:  # that frame is left out, or refused, when it is scored
+                    digest.update(str(error).encode())
+                else:
+                    digest.update(b"-" if values is None else np.ascontiguousarray(values).tobytes())
     return digest.hexdigest()

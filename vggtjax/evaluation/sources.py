@@ -113,6 +113,7 @@ class FolderSource:
     folders: Mapping[str, Path]
     formats: Mapping[str, str] = field(default_factory=dict)  # by name, of the program that wrote it; else "vggtjax"
     quaternion: Quaternion | None = None  # of the formats that need one
+    strict: bool = False  # refuse results of other frames than all of a sequence's
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -167,7 +168,7 @@ class FolderSource:
             form = self._format(name)
             quaternion = self.quaternion if needs_quaternion(form) else None
             result = Reconstruction.load(self._path(name, sequence), format=form, quaternion=quaternion)
-            results[name] = placed(result, form, sizes, sequence.frame_names)
+            results[name] = placed(result, form, sizes, sequence.frame_names, sequence.timestamps, strict=self.strict)
         return results
 
 

@@ -36,8 +36,9 @@ def write_rerun(path: Path, items: Iterator[View], static: PointCloud, moving: S
         recording.log("world/camera/picture", rerun.Image(view.frame.image).compress(jpeg_quality=90))
         depth = np.where(view.frame.valid, view.frame.depth, 0)
         recording.log("world/camera/picture/depth", rerun.DepthImage(depth, meter=1.0))
-        mask = view.frame.dynamic_mask.astype(np.uint8)
-        recording.log("world/camera/picture/moving", rerun.SegmentationImage(mask))
+        if view.has_mask:
+            mask = view.frame.dynamic_mask.astype(np.uint8)
+            recording.log("world/camera/picture/moving", rerun.SegmentationImage(mask))
         points = moving[number]
         recording.log("world/moving", rerun.Points3D(points.points, colors=points.colors))
     recording.log("world/path", rerun.LineStrips3D([np.array(centres)]), static=True)

@@ -24,6 +24,7 @@ class View(NamedTuple):
     name: str  # of the picture's file, with / between folders; unique in the clip
     time: float  # seconds; the frame's number where times are unknown
     frame: ResultFrame
+    has_mask: bool = True  # which tells what moves
 
     @property
     def size(self) -> tuple[int, int]:
@@ -71,11 +72,11 @@ def views(result: Result, source: Source | None, names: Sequence[str]) -> Iterat
     times = range(len(result.depth)) if result.timestamps is None else result.timestamps
     if source is None:
         for number, (name, time) in enumerate(zip(names, times, strict=True)):
-            yield View(name, float(time), frame_of(result, number))
+            yield View(name, float(time), frame_of(result, number), result.has_mask)
         return
     for number, picture in enumerate(_pictures(result, source)):
         frame = frame_of(result, number, "original", picture=picture)
-        yield View(names[number], float(times[number]), frame)
+        yield View(names[number], float(times[number]), frame, result.has_mask)
 
 
 def of_one_size(items: Iterator[View], what: str) -> Iterator[View]:

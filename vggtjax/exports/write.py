@@ -129,7 +129,7 @@ def _write(
 
             write_exr(path, items)
         case "tum":
-            write_trajectory(path, result.world_from_camera, result.file_times, note=result.model_note)
+            write_trajectory(path, result.world_from_camera, result.file_time_texts, note=result.model_note)
         case "kitti":
             poses = result.world_from_camera[:, :3].reshape(-1, 12).astype(np.float64)
             np.savetxt(path, poses, fmt="%.9g", encoding="utf-8")

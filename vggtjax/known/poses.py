@@ -14,6 +14,8 @@ from vggtjax.cameras import camera_centres, world_from_camera
 from vggtjax.captures.cameras import checked_world_from_camera
 from vggtjax.clips.clip import Clip
 from vggtjax.errors import InputError
+from vggtjax.media.images import ImageFiles
+from vggtjax.media.times import in_seconds, name_times
 from vggtjax.results.result import Result
 from vggtjax.storage.trajectories import Quaternion, associate, named_order, read_numbers, read_trajectory
 
@@ -73,15 +75,21 @@ def read_poses(
 ) -> Float64[np.ndarray, "S 4 4"]:
     """Return the world-from-camera poses of a clip's frames; `pose_table` says which files are read.
 
-    Of poses with times every frame takes the one at its own time: the timestamp in its name, as in TUM's data sets, or
-    its time in the video. Where there are no times, or others, the file has one pose for every frame, in their order.
+    Of poses with times every frame takes the one at its own time: the one that its name or a list states, as in TUM's
+    data sets and EuRoC's, or its time in the video. Where there are no times, or others, the file has one pose for
+    every frame, in their order.
 
     Raises InputError or ResultError for an unreadable file, another number of poses, or a frame without a pose.
     """
-    times, poses = pose_table(path, quaternion)
+    stamps, poses = pose_table(path, quaternion)
+    times = None if stamps is None else in_seconds(stamps)
     frames = len(clip.images)
-    wanted = _times(clip)
-    pairs = np.zeros((0, 2), int) if times is None or wanted is None else associate(wanted, times)
+    pairs, wanted = np.zeros((0, 2), int), None
+    if times is not None:
+        for each in _times(clip):
+            found = associate(each, times)
+            if wanted is None or len(found) > len(pairs):
+                pairs, wanted = found, each
     if len(poses) == frames and len(pairs) < frames:  # by their order
         if len(pairs):
             logger.warning(
@@ -196,10 +204,13 @@ def _in_order(known: Float64[np.ndarray, "S 3 4"], order: list[int]) -> Float64[
     return world_from_camera(poses[:, :3])[:, :3]
 
 
-def _times(clip: Clip | Result) -> Float64[np.ndarray, " S"] | None:
-    """Return the times in the frames' names, or else the clip's; None where neither is known."""
-    try:
-        times = np.array([float(name) for name in clip.frame_names if "." in name])
-    except ValueError:
-        times = np.array([])
-    return times if len(times) == len(clip.frame_names) else clip.timestamps
+def _times(clip: Clip | Result) -> list[Float64[np.ndarray, " S"]]:
+    """Return the times of the frames by the source's clock, and from its first frame; those that are known."""
+    if clip.timestamps is None:
+        named = name_times(list(clip.frame_names))
+        return [] if named is None else [named]
+    source = getattr(clip, "source", None)
+    times = source.times if isinstance(source, ImageFiles) else None
+    if isinstance(clip, Result):
+        return [clip.file_times, clip.timestamps]
+    return [clip.timestamps] if times is None else [clip.timestamps + float(times.first), clip.timestamps]

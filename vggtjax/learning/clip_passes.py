@@ -190,7 +190,8 @@ def dataset_passes(
 
         def truth(result: Reconstruction) -> tuple[Any, Any]:
             at_pixels = TruthAtPixels(sequence, result, max_depth=max_depth)
-            return at_pixels.depth, None if sequence.mask is None else at_pixels.mask
+            has_masks = sequence.mask is not None and bool(at_pixels.masked.all())
+            return at_pixels.depth, at_pixels.mask if has_masks else None
 
         key = {"dataset": [dataset, max_depth], "data": sequence_digest(sequence)}
         return _LabelledClip(name, key, lambda: [str(path) for path in sequence.pictures], truth)
@@ -240,7 +241,7 @@ def sequence_digest(sequence: LabelledSequence) -> str:
     for read in (sequence.depth, sequence.mask):
         digest.update(b"-" if read is None else b"+")
         for array in () if read is None else map(read, range(len(sequence))):
-            digest.update(np.ascontiguousarray(array).tobytes())
+            digest.update(b"-" if array is None else np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 

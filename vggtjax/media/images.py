@@ -18,8 +18,10 @@ from PIL import Image, ImageFile, ImageOps, UnidentifiedImageError
 from vggtjax.errors import ClipError, InputError, check_regular
 from vggtjax.media.arrays import eight_bit
 from vggtjax.media.colour import HDR, WIDE, srgb_of_coded
+from vggtjax.media.order import in_order
 from vggtjax.media.profiles import in_srgb, profile_of
 from vggtjax.media.sampling import Frame, Sampling
+from vggtjax.media.times import FrameTimes, frame_times
 
 logger = logging.getLogger(__name__)
 
@@ -63,19 +65,36 @@ class ImageFiles:
         """The names of all frames."""
         return tuple(path.stem for path in self.paths)
 
+    @functools.cached_property
+    def times(self) -> FrameTimes | None:
+        """The times that the files state; see `stated_times`."""
+        return stated_times(self.paths)
+
     def total(self, sampling: Sampling) -> int:
         """Return how many frames `sampling` takes."""
         return len(self.taken(sampling))
 
     def taken(self, sampling: Sampling) -> Sequence[int]:
-        """Return the indices of the files that `sampling` takes."""
-        return sampling.indices(len(self.paths))
+        """Return the indices of the files that `sampling` takes, with `fps` by their times."""
+        if sampling.fps is None or self.times is None:
+            return sampling.indices(len(self.paths))
+        return [index for index, _, _ in sampling.select((float(time), None) for time in self.times.from_first)]
 
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes. Raises ClipError for a file that cannot be read."""
+        times = None if self.times is None else self.times.from_first
         for index in self.taken(sampling):
             path = self.paths[index]
-            yield Frame(path.stem, read_image(path, self._said))
+            yield Frame(path.stem, read_image(path, self._said), None if times is None else float(times[index]))
+
+
+def stated_times(paths: Sequence[Path]) -> FrameTimes | None:
+    """Return the times of picture files by a list beside or above them, or by their names; see `frame_times`."""
+    pictures: list[str] = []
+    if len({path.parent for path in paths}) == 1 and (folder := paths[0].parent).is_dir():
+        found = (path for path in folder.iterdir() if is_image_name(path) and not path.name.startswith("."))
+        pictures = [path.name for path in in_order(found)]
+    return frame_times(paths, pictures)
 
 
 def is_image_name(path: Path) -> bool:

@@ -39,7 +39,7 @@ def as_images(images: Any) -> Float[Array, "B S H W 3"]:
 
     Raises InputError unless they have five axes, and for NaN and infinity, unless the call is traced by jit.
     """
-    images = as_array("images", images)
+    images: Any = as_array("images", images)
     if images.ndim != 5:
         remedy = ": of one clip give images[None]" if images.ndim == 4 else ""
         raise InputError(f"images have shape {tuple(images.shape)}; expected [B, S, H, W, 3]{remedy}")

@@ -13,6 +13,7 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.shots import looks_of
+from vggtjax.media.images import ImageFiles
 from vggtjax.method.assembly import Assembly, FusionRule
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.method.passes import Passes
@@ -86,8 +87,9 @@ def settings_of(
     settings |= {"masks": mask_source}
     settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
     settings |= {"clip": clip.source.name} if clip.source.name else {}
-    if isinstance(clip.source, CaptureFrames) and clip.source.first_time is not None:
-        settings["first_time"] = clip.source.first_time
+    if isinstance(clip.source, ImageFiles) and (times := clip.source.times) is not None:
+        settings |= {"times": times.origin, "first_time": float(times.first)}
+        settings |= {"first_time_exact": str(times.first), "time_digits": times.digits}
     if isinstance(clip.source, CaptureFrames) and clip.source.lenses_undone:
         settings["undistorted"] = clip.source.lenses_undone
     return settings | ({"model_note": model.note} if model.note else {}) | {"versions": versions()}

@@ -42,6 +42,7 @@ from vggtjax.pipeline.steps import Compile, Execute, StageMemory
 from vggtjax.progress import OnStage, Progress
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.refine import check_refinement
+from vggtjax.results.no_mask import without_mask
 from vggtjax.results.not_finite import warn_of_not_finite
 from vggtjax.storage.cache import hint_compilation_cache
 
@@ -92,16 +93,38 @@ def reconstruct(
         MissingExtraError: cameras are to be refined, and pycolmap is not installed.
     """
     options, running = changed(options, running, changes)
+    given = {"size": size, "masks": masks, "tracks": tracks, "fusion": fusion, "known": known}
+    mines = options.row.makes_mask or agrees_with_pixels(options) or running.keep_passes
+    return without_mask(with_own_mask(model, clip, options, running, mines=mines, **given))
+
+
+def with_own_mask(
+    model: Model,
+    clip: Clip | ClipSource,
+    options: Options,
+    running: Running,
+    *,
+    size: int | None = None,
+    masks: GivenMasks | None = None,
+    tracks: Queries | None = None,
+    fusion: FusionRule | None = None,
+    known: KnownGeometry | None = None,
+    mines: bool = True,
+) -> Reconstruction:
+    """Return what `reconstruct` does, with the mask that the steps used, also by a method that makes none.
+
+    Unless it `mines`, nothing moves where no masks are given.
+    """
     if masks is not None:
         options.check_given_masks()
     options = options.resolved(model.config.motion)
     _check(options, running, tracks, fusion, known)
     inputs = read_inputs(model, clip, size=size, masks=masks, tracks=tracks, known=known, on_stage=running.stage)
-    outputs = _run(model, inputs, options, running, fusion)
+    outputs = _run(model, inputs, options, running, fusion, mines=mines)
     result = _result(model, inputs, options, running, fusion, outputs)
     warn_of_not_finite(result)
     result, unit = _with_geometry(result, inputs, options, running.stage)
-    if options.refine_mask:
+    if options.refine_mask and result.has_mask:
         with running.stage("refine mask") as progress:
             result = refined(result, progress, unit)
     return result
@@ -187,7 +210,7 @@ def _check(
 
 
 def _run(
-    model: Model, inputs: Inputs, options: Options, running: Running, fusion: FusionRule | None
+    model: Model, inputs: Inputs, options: Options, running: Running, fusion: FusionRule | None, *, mines: bool
 ) -> tuple[Assembly, Passes]:
     """Compile the method for the clip and run it; return its outputs on the host, without padded frames."""
     clip, tracks, masks = inputs.clip, inputs.tracks, inputs.masks
@@ -214,7 +237,7 @@ def _run(
         clips,
         model.config,
         options,
-        masks=None if masks is None else padded(masks) if masks.any() else False,
+        masks=(None if mines else False) if masks is None else padded(masks) if masks.any() else False,
         fusion=rule,
         both_outputs=running.keep_passes,
         compute=compute_by(options, Frames(mesh, None if mesh is None else length)),

@@ -16,10 +16,12 @@ from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
 from vggtjax.pipeline.fields import assembled_fields
-from vggtjax.pipeline.run import reconstruct, refined
+from vggtjax.pipeline.run import refined, with_own_mask
+from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, no_stage
 from vggtjax.reconstruction import Reconstruction
+from vggtjax.results.no_mask import without_mask
 from vggtjax.results.result import FieldOfViewWarning
 
 
@@ -56,7 +58,7 @@ def reconstruct_methods(
         shared = next((each for each in group if each.row.needs_second_pass), group[0]).changed(
             refine_mask=False, consistent_depth=False
         )
-        result = reconstruct(model, clip, options=shared, size=size, keep_passes=True, on_stage=on_stage)
+        result = with_own_mask(model, clip, shared, Running(keep_passes=True, on_stage=on_stage), size=size)
         for each in group:
             results[each.method] = _as_method(result, each, fusion, clip, on_stage or no_stage)
     return {name: results[name] for name in methods}
@@ -91,7 +93,7 @@ def _as_method(
             passes=None,
         )
     result = agree_with_pixels(result, clip.pictures, options, on_stage=on_stage)
-    if method.refine:
+    if method.refine and result.has_mask:
         with on_stage("refine mask") as progress:
             result = refined(result, progress)
-    return result
+    return without_mask(result)

@@ -64,7 +64,7 @@ from vggtjax.results.gltf_animation import add_camera
 from vggtjax.results.point_cloud import PlyWriter, PointCloud, frame_cloud, least_confidence, write_ply
 from vggtjax.results.report import REPORT_NAME, RunFacts, report_page
 from vggtjax.results.result import Result
-from vggtjax.results.saving import Resolution, Saving
+from vggtjax.results.saving import GROUPS, Resolution, Saving
 from vggtjax.storage.arrays import write_arrays
 from vggtjax.storage.markup import webp, write_page
 from vggtjax.storage.trajectories import commented, write_trajectory
@@ -200,11 +200,13 @@ def _frame_writer(
     result: Result, least: LeastConfidence, saving: Saving, folder: Path
 ) -> Callable[[int, Callable[[], ResultFrame]], tuple[_Written, PointCloud | None]]:
     """Return a function that writes the files of a frame and returns its static points, where clouds are written."""
-    names = [name for name in saving.names(tracks=False) if not Path(name).suffix]
+    has_mask = result.has_mask
+    unmade = () if has_mask else GROUPS["masks"]
+    names = [name for name in saving.names(tracks=False) if not Path(name).suffix and name not in unmade]
     for name in names:
         (folder / name).mkdir(parents=True)
     if saving.writes("previews"):
-        for name in ("depth", "overlay"):
+        for name in ("depth", *(("overlay",) if has_mask else ())):
             (folder / "preview" / name).mkdir()
     valid, pictured = result.valid_pixels, result.pictured
     invalid = pictured - int(valid.sum())
@@ -228,29 +230,32 @@ def _frame_writer(
             np.save(folder / f"depth/{name}.npy", frame.depth, allow_pickle=False)
             encoded = encode_depth(frame.depth, frame.valid, scale)
             _write_png(folder / f"depth/{name}.png", encoded, depth_scale=repr(scale))
-        if saving.writes("masks"):
+        if saving.writes("masks") and has_mask:
             _write_png(folder / f"mask/{name}.png", frame.dynamic_mask.astype(np.uint8) * 255)
             instances = Image.fromarray(frame.instances)
             instances.putpalette(previews.INSTANCE_COLORS.ravel().tolist())
             instances.save(folder / f"instances/{name}.png", compress_level=_PNG_LEVEL)
         if saving.writes("previews"):
             depth = previews.depth_picture(frame.depth, frame.valid, inverse_range)
-            moving = previews.moving_ids(frame.dynamic_mask, frame.instances)
             _write_png(folder / f"preview/depth/{name}.png", depth)
-            _write_png(folder / f"preview/overlay/{name}.png", previews.overlay_picture(frame.image, moving))
+            if has_mask:
+                moving = previews.moving_ids(frame.dynamic_mask, frame.instances)
+                _write_png(folder / f"preview/overlay/{name}.png", previews.overlay_picture(frame.image, moving))
         if saving.writes("clouds"):
             pixels = frame.confident(least)
             write_ply(folder / f"frames/{name}.ply", frame_cloud(frame, pixels))
             cloud = frame_cloud(frame, pixels & ~frame.dynamic_mask)
         if saving.format == "vggt4d":
-            foreign.write_frame(folder / "vggt4d", number, frame)
+            foreign.write_frame(folder / "vggt4d", number, frame, mask=has_mask)
         return _Written((frame.depth.shape[0], frame.depth.shape[1]), frame.intrinsics), cloud
 
     return write_frame
 
 
 def _write_cameras(result: Result, written: Sequence[_Written], folder: Path) -> None:
-    write_trajectory(folder / "trajectory.txt", result.world_from_camera, result.file_times, note=result.model_note)
+    write_trajectory(
+        folder / "trajectory.txt", result.world_from_camera, result.file_time_texts, note=result.model_note
+    )
     intrinsics, sizes = [frame.intrinsics for frame in written], [frame.size for frame in written]
     write_intrinsics(folder / "intrinsics.txt", intrinsics, sizes, note=result.model_note)
 

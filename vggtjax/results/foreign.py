@@ -35,9 +35,10 @@ from vggtjax.cameras import Cameras, world_from_camera
 from vggtjax.clips.masks import read_mask
 from vggtjax.errors import InputError, ResultError, check_choice, reading
 from vggtjax.media.images import read_image
+from vggtjax.results.foreign_cameras import Posed, text_cameras
 from vggtjax.results.frame import ResultFrame
 from vggtjax.storage.arrays import SIZE_LIMIT, Header, read_array, read_arrays, read_headers
-from vggtjax.storage.trajectories import Quaternion, read_numbers, read_trajectory, write_trajectory
+from vggtjax.storage.trajectories import Quaternion, write_trajectory
 
 _WHITE = 1.01  # of shares, with rounding
 _GREY = 128  # of pictures that a format does not keep
@@ -45,13 +46,14 @@ _GREY = 128  # of pictures that a format does not keep
 logger = logging.getLogger(__name__)
 
 
-def write_frame(folder: Path, number: int, frame: ResultFrame) -> None:
-    """Write a frame as VGGT4D does."""
+def write_frame(folder: Path, number: int, frame: ResultFrame, *, mask: bool = True) -> None:
+    """Write a frame as VGGT4D does, with its mask if there is one."""
     Image.fromarray(frame.image).save(folder / f"frame_{number:04d}.png")
     np.save(folder / f"frame_{number:04d}.npy", frame.depth, allow_pickle=False)
     np.save(folder / f"conf_{number:04d}.npy", frame.confidence, allow_pickle=False)
-    mask = Image.fromarray(frame.dynamic_mask.astype(np.uint8) * 255)
-    mask.save(folder / f"dynamic_mask_{number:04d}.png")
+    if mask:
+        moving = Image.fromarray(frame.dynamic_mask.astype(np.uint8) * 255)
+        moving.save(folder / f"dynamic_mask_{number:04d}.png")
 
 
 def write_cameras(
@@ -70,7 +72,7 @@ class _Folder(NamedTuple):
     picture: str
     confidence: str
     mask: str | None
-    cameras: Callable[[Path, Sequence[int], Quaternion | None], Cameras]
+    cameras: Callable[[Path, Sequence[int], Quaternion | None], Posed]
     logarithmic: bool = False  # confidence
 
 
@@ -100,15 +102,16 @@ def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict
         "dynamic_mask": np.zeros((S, H, W), bool),
         "images": np.full((S, H, W, 3), _GREY, np.uint8),
     }
+    numbers = fields.pop("numbers", range(S))
     missing = [name for name in plain if fields.get(name) is None]
     if missing:
         logger.warning("%s has no %s; plain values stand for them", path, ", ".join(missing))
-    return {
+    made = {
         **plain,
         **{name: value for name, value in fields.items() if value is not None},
         "saliency": None,
-        "frame_names": tuple(f"{number:06d}" for number in range(S)),
-        "timestamps": None,
+        "frame_names": tuple(f"{number:06d}" for number in numbers),
+        "timestamps": fields.get("timestamps"),
         "method": format,
         "model_name": format,
         "settings": {"format": format, "quaternion": quaternion, "missing": missing},
@@ -116,6 +119,21 @@ def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict
         "source_scale": np.ones((S, 2)),
         "source_offset": np.zeros((S, 2)),
         "valid_box": np.tile([0, 0, W, H], (S, 1)),
+    }
+    return _without_lost(made, path)
+
+
+def _without_lost(fields: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Return the frames whose camera is finite: programs write others for frames that they lost."""
+    found = np.isfinite(fields["camera_from_world"]).all(axis=(1, 2))
+    if found.all() or not found.any():  # `Result` refuses the latter
+        return fields
+    lost = [name for name, is_found in zip(fields["frame_names"], found, strict=True) if not is_found]
+    logger.warning("%s has no finite camera for %d of %d frames, %s first; they are left out",
+                   path, len(lost), len(found), lost[0])  # fmt: skip
+    names = tuple(name for name, is_found in zip(fields["frame_names"], found, strict=True) if is_found)
+    return {name: value[found] if isinstance(value, np.ndarray) else value for name, value in fields.items()} | {
+        "frame_names": names
     }
 
 
@@ -147,11 +165,12 @@ def _read_folder(folder: Path, format: str, quaternion: Quaternion | None) -> di
             f"it has no depth; expected files like {' or '.join(each.depth for each in _FOLDERS[format])}"
         )
     depth_files = _numbered(folder, files.depth)
-    numbers = sorted(depth_files)
-    cameras = files.cameras(folder, numbers, quaternion)
-    depth = _stacked(depth_files, numbers, _read_map, None)
+    numbers, cameras, times, of_files = files.cameras(folder, sorted(depth_files), quaternion)
+    if len(of_files) < len(depth_files):
+        logger.warning("%s has cameras for %d of %d frames of depth", folder, len(of_files), len(depth_files))
+    depth = _stacked(depth_files, of_files, _read_map, None)
     shape = depth.shape[1:]
-    confidence = _stacked(_numbered(folder, files.confidence), numbers, _read_map, shape)
+    confidence = _stacked(_numbered(folder, files.confidence), of_files, _read_map, shape)
     if confidence is not None and files.logarithmic:
         if padded := sorted(path.name for path in folder.glob("conf_0[0-9]*.npy")):
             raise ResultError(
@@ -159,15 +178,17 @@ def _read_folder(folder: Path, format: str, quaternion: Quaternion | None) -> di
             )
         with np.errstate(over="ignore"):
             confidence = np.exp(confidence).clip(0, np.finfo(np.float32).max)
-    mask = None if files.mask is None else _stacked(_numbered(folder, files.mask), numbers, read_mask, shape)
+    mask = None if files.mask is None else _stacked(_numbered(folder, files.mask), of_files, read_mask, shape)
     return {
         "depth": depth,
         "depth_confidence": confidence,
         "dynamic_mask": mask,
         "images": _stacked(
-            _numbered(folder, files.picture), numbers, lambda path: np.asarray(read_image(path)), (*shape, 3)
+            _numbered(folder, files.picture), of_files, lambda path: np.asarray(read_image(path)), (*shape, 3)
         ),
         **cameras._asdict(),
+        "numbers": numbers,
+        "timestamps": times,
     }
 
 
@@ -217,18 +238,7 @@ def _read_map(path: Path) -> Float32[np.ndarray, "H W"]:
     return array.astype(np.float32)
 
 
-def _text_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
-    poses = read_trajectory(folder / "pred_traj.txt", quaternion)[1]  # pyright: ignore[reportArgumentType] - checked
-    intrinsics = read_numbers(folder / "pred_intrinsics.txt", 9).reshape(-1, 3, 3)
-    for name, array in (("pred_traj.txt", poses), ("pred_intrinsics.txt", intrinsics)):
-        if len(array) != len(numbers):
-            raise ResultError(
-                f"{name} has {len(array)} lines for {len(numbers)} frames of depth; expected one for each"
-            )
-    return Cameras(world_from_camera(poses[:, :3])[:, :3], intrinsics)
-
-
-def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Cameras:
+def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | None) -> Posed:
     files = _numbered(folder, "camera/000000.npz")
     poses, intrinsics = [], []
     for number in numbers:
@@ -237,7 +247,8 @@ def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | 
         arrays = _read_some(files[number], {"pose": ((4, 4),), "intrinsics": ((3, 3),)}, {})
         poses.append(arrays["pose"].astype(np.float64))
         intrinsics.append(arrays["intrinsics"].astype(np.float64))
-    return Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
+    cameras = Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
+    return Posed(numbers, cameras, None, numbers)
 
 
 def _read_archive(path: Path, names: _Archive) -> dict[str, Any]:
@@ -302,14 +313,14 @@ def _read_some(
     return read_arrays(file, {*needed, *others})
 
 
-_VGGT4D = _Folder("frame_0000.npy", "frame_0000.png", "conf_0000.npy", "dynamic_mask_0000.png", _text_cameras)
+_VGGT4D = _Folder("frame_0000.npy", "frame_0000.png", "conf_0000.npy", "dynamic_mask_0000.png", text_cameras)
 _MONST3R = _VGGT4D._replace(logarithmic=True)
 _REARRANGED = _Folder(
     "depth_maps/frame_0000.npy",
     "images/frame_0000.png",
     "confidence_maps/conf_0000.npy",
     "dynamic_masks/dynamic_mask_0000.png",
-    _text_cameras,
+    text_cameras,
     logarithmic=True,
 )
 _CUT3R = _Folder("depth/000000.npy", "color/000000.png", "conf/000000.npy", None, _npz_cameras)
@@ -335,4 +346,4 @@ _SPATIALTRACKER = _Archive(
 )
 _ARCHIVES = {"da3": _DA3, "spatialtrackerv2": _SPATIALTRACKER}
 FORMATS = (*_FOLDERS, *_ARCHIVES)
-_WITH_TRAJECTORY = tuple(name for name, (files, *_) in _FOLDERS.items() if files.cameras is _text_cameras)
+_WITH_TRAJECTORY = tuple(name for name, (files, *_) in _FOLDERS.items() if files.cameras is text_cameras)

@@ -129,14 +129,15 @@ def overlay_picture(image: UInt8[np.ndarray, "H W 3"], moving: UInt8[np.ndarray,
 
 
 def card(result: Result) -> UInt8[np.ndarray, "h w 3"]:
-    """Draw the middle frame: picture, depth and moving objects beside each other."""
+    """Draw the middle frame: picture, depth and, where a mask tells them, moving objects beside each other."""
     frame = len(result.depth) // 2
     valid = result.valid_pixels
     depth = depth_picture(result.depth[frame], valid[frame], inverse_depth_range(result.depth, valid))
     moving = moving_ids(result.dynamic_mask[frame], result.instances[frame])
     picture = Image.fromarray(result.images[frame]).resize(enlarged(moving.shape), Image.Resampling.LANCZOS)
     gap = np.full((len(depth), max(4, depth.shape[1] // 60), 3), BACKGROUND, np.uint8)
-    return np.hstack([np.asarray(picture), gap, depth, gap, overlay_picture(result.images[frame], moving)])
+    last = [gap, overlay_picture(result.images[frame], moving)] if result.has_mask else []
+    return np.hstack([np.asarray(picture), gap, depth, *last])
 
 
 def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
@@ -201,6 +202,8 @@ def _thumbnails(
         motion = Image.fromarray(np.nan_to_num(above).clip(0, 1).astype(np.float32))
         motion = np.asarray(motion.resize(size, Image.Resampling.BILINEAR))
         column["By matches"] = Image.fromarray(SALIENCY_COLORS[(motion * 255).round().astype(np.uint8)])
+    if not result.has_mask:
+        return column
     moving = Image.fromarray(moving_ids(result.dynamic_mask[frame], result.instances[frame]))
     moving = np.asarray(moving.resize(size, Image.Resampling.NEAREST))
     return column | {"Dynamic": Image.fromarray(overlay(np.asarray(picture), moving))}

@@ -16,6 +16,7 @@ from jaxtyping import UInt8
 
 from vggtjax.cameras import camera_centres
 from vggtjax.errors import one_line
+from vggtjax.options import METHODS
 from vggtjax.results import charts, previews, tracks
 from vggtjax.results.archive import ARCHIVE_NAME
 from vggtjax.results.result import Result, missing_fields
@@ -104,7 +105,7 @@ def report_page(folder: Path, result: Result, facts: RunFacts | None = None) -> 
         title=f"{title}: {result.method}",
         heading=title,
         result=result,
-        lacking=", ".join(one_line(name, 40) for name in missing_fields(result)[:20]),
+        lacking=", ".join(one_line(name, 40) for name in missing_fields(result)[:20] if result.method not in METHODS),
         moving=None if moving is None else {"film": data_uri(moving.film), "still": data_uri(moving.still)},
         summary=_summary(result),
         lengths=_LENGTHS[result.length_unit],
@@ -138,7 +139,8 @@ def _summary(result: Result) -> list[tuple[str, str]]:
     ]
     if result.timestamps is not None and frames > 1:
         rows.append(("Time", f"{result.timestamps[0]:.2f} s to {result.timestamps[-1]:.2f} s"))
-    rows.append(("Moving", f"{result.dynamic_share:.1%} of the pixels, {objects} object{'' if objects == 1 else 's'}"))
+    moving = f"{result.dynamic_share:.1%} of the pixels, {objects} object{'' if objects == 1 else 's'}"
+    rows.append(("Moving", moving if result.has_mask else "-"))
     if valid.any():
         depth, known = spread_frames(result.depth, valid)
         low, middle, high = np.percentile(depth[known][:: max(1, int(known.sum()) // 1_000_000)], (5, 50, 95))
@@ -197,7 +199,7 @@ def _strip(result: Result) -> dict[str, Any]:
         ],
         "rows": [
             row("Picture", "picture", lambda frame: result.images[frame]),
-            row("Moving", "moving objects", moving, f"{result.dynamic_share:.1%}"),
+            *([row("Moving", "moving objects", moving, f"{result.dynamic_share:.1%}")] if result.has_mask else ()),
             row("Depth", "depth", depth, ramp=_ramp(previews.DEPTH_COLORS), low="far", high="near"),
             row(
                 _confidence_name(result),

@@ -7,6 +7,7 @@ import re
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from functools import cached_property
 from typing import Any, get_args, get_type_hints
 
@@ -16,9 +17,11 @@ from jaxtyping import Bool, Float32, Float64, Int, Int64, UInt8
 from vggtjax.cameras import FIELD_OF_VIEW_RANGE, camera_centres, clamp_intrinsics, unproject, world_from_camera
 from vggtjax.errors import ResultError
 from vggtjax.method.instances import find_instances
+from vggtjax.options import METHODS
 from vggtjax.storage.arrays import is_mapped, zeros_beside
 
 _TIME = re.compile(r"\d{1,18}\.\d{1,18}")  # in seconds, as a frame's name
+_EXACT, _FEWEST_DIGITS = re.compile(r"-?\d{1,20}(?:\.\d{1,20})?"), 6  # seconds; digits after the point
 _MOST_SIDE, _MOST_PIXELS = 1 << 20, 1 << 28  # of a source's picture
 
 
@@ -140,7 +143,7 @@ class Result:
         frames, height, width = self.depth.shape
         return (
             f"{type(self).__name__}({frames} frames of {width} x {height} pixels, method {self.method!r}, "
-            f"model {self.model_name!r}, {self.dynamic_share:.1%} dynamic)"
+            f"model {self.model_name!r}, {f'{self.dynamic_share:.1%} dynamic' if self.has_mask else 'no mask'})"
         )
 
     @property
@@ -163,6 +166,11 @@ class Result:
     def _valid(self, frames: int | slice) -> Bool[np.ndarray, "*F H W"]:
         inside = inside_box(self.valid_box[frames], self.depth.shape[1:])
         return show_points(self.depth[frames], self.depth_confidence[frames], inside)
+
+    @property
+    def has_mask(self) -> bool:
+        """Whether `dynamic_mask` tells what moves; the method vggt makes no mask, nor do some other programs."""
+        return "dynamic_mask" not in missing_fields(self)
 
     @property
     def dynamic_share(self) -> float:
@@ -205,16 +213,26 @@ class Result:
         return np.arange(len(self.depth), dtype=np.float64) if self.timestamps is None else self.timestamps
 
     @property
+    def file_time_texts(self) -> tuple[str, ...]:
+        """`file_times` as texts with all digits of the source: nanoseconds since 1970 do not fit 64 bits."""
+        exact, digits = self.settings.get("first_time_exact"), self.settings.get("time_digits")
+        if self.timestamps is None or not isinstance(exact, str) or not _EXACT.fullmatch(exact):
+            return tuple(f"{time:.6f}" for time in self.file_times)
+        digits = digits if isinstance(digits, int) and digits in range(_FEWEST_DIGITS, 10) else _FEWEST_DIGITS
+        return tuple(f"{Decimal(exact) + Decimal(float(time)):.{digits}f}" for time in self.timestamps)
+
+    @property
     def model_note(self) -> str:
         """A caution about the model for readers of the files, on one line; empty for most models."""
         return " ".join(str(self.settings.get("model_note", "")).split()).encode(errors="replace").decode()
 
     @property
     def known_facts(self) -> dict[str, str]:
-        """How cameras and depth were refined and brought to known ones and to lengths: a sentence by step."""
+        """How cameras and depth were refined and brought to known ones and to lengths, and where times are from."""
         found = self._known.get("found")
         done = {"cameras": self.settings.get("refined_cameras"), "depth": self.settings.get("consistency")}
         facts = {name: outcome.get("sentence") for name, outcome in done.items() if isinstance(outcome, dict)}
+        facts |= {"times": f"from {self.settings['times']}"} if "times" in self.settings else {}
         facts |= found if isinstance(found, dict) else {}
         return {name: text for name, text in facts.items() if isinstance(text, str)}
 
@@ -255,9 +273,16 @@ STRINGS: dict[str, tuple[str | int, ...]] = {"frame_names": ("S",), "method": ()
 
 
 def missing_fields(result: Result) -> tuple[str, ...]:
-    """Return the fields that another program did not write, and for which plain values stand."""
+    """Return the fields that a method or another program does not make, and for which plain values stand."""
     missing = result.settings.get("missing")
-    return tuple(name for name in missing if isinstance(name, str)) if isinstance(missing, list) else ()
+    named = tuple(name for name in missing if isinstance(name, str)) if isinstance(missing, list) else ()
+    return (*named, "dynamic_mask") if makes_no_mask(result) and "dynamic_mask" not in named else named
+
+
+def makes_no_mask(result: Result) -> bool:
+    """Return whether a method of ours made the result and makes no mask, and none was given."""
+    is_made_up = str(result.settings.get("masks")).startswith(("mined", "none"))
+    return is_made_up and result.method in METHODS and not METHODS[result.method].makes_mask
 
 
 def inside_box(box: Int[np.ndarray, "*F 4"], size: tuple[int, ...]) -> Bool[np.ndarray, "*F H W"]:

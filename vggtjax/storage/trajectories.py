@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal, TextIO, get_args
 
@@ -31,12 +31,12 @@ _COLUMNS: dict[Quaternion, str] = {"xyzw": "qx qy qz qw", "wxyz": "qw qx qy qz"}
 def write_trajectory(
     path: Path,
     world_from_camera: Float[np.ndarray, "S 4 4"],
-    times: Float[np.ndarray, " S"],
+    times: Float[np.ndarray, " S"] | Sequence[str],
     *,
     quaternion: Quaternion = "xyzw",
     note: str = "",
 ) -> None:
-    """Write poses as timestamp tx ty tz and a quaternion with w at least 0.
+    """Write poses as timestamp tx ty tz and a quaternion with w at least 0; times are seconds, or texts of them.
 
     Files in TUM's order "xyzw" start with a comment of the columns and the `note`; files in the order "wxyz" of MonST3R
     and VGGT4D have no comments, as theirs.
@@ -45,10 +45,12 @@ def write_trajectory(
     turns = scipy.spatial.transform.Rotation.from_matrix(poses[:, :3, :3]).as_quat(
         canonical=True, scalar_first=quaternion == "wxyz"
     )
-    rows = np.column_stack([times, poses[:, :3, 3], turns])
+    texts = [time if isinstance(time, str) else f"{time:.6f}" for time in times]
+    rows = np.column_stack([poses[:, :3, 3], turns])
     header = commented(f"timestamp tx ty tz {_COLUMNS['xyzw']} (world-from-camera)", note)
     header = header if quaternion == "xyzw" else ""
-    np.savetxt(path, rows, fmt=["%.6f"] + ["%.9g"] * 7, header=header, comments="", encoding="utf-8")
+    lines = [" ".join([text, *(f"{value:.9g}" for value in row)]) for text, row in zip(texts, rows, strict=True)]
+    path.write_text("\n".join([*header.splitlines(), *lines]) + "\n", encoding="utf-8", newline="\n")
 
 
 def commented(columns: str, note: str) -> str:
@@ -57,7 +59,7 @@ def commented(columns: str, note: str) -> str:
 
 
 def read_trajectory(
-    path: str | Path, quaternion: Quaternion | None = None
+    path: str | Path, quaternion: Quaternion | None = None, *, lost: bool = False
 ) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, "S 4 4"]]:
     """Read a trajectory: timestamps, and world-from-camera poses.
 
@@ -65,16 +67,19 @@ def read_trajectory(
     order of the last four: "xyzw" is TUM's, "wxyz" that of MonST3R, CUT3R, Easi3R and VGGT4D; without it the names of
     the columns tell, and where there are none it is TUM's. Raises InputError for an unknown order, and ResultError for
     an unreadable file, names of columns in the other order, lines without eight finite numbers, or quaternions not of
-    length 1.
+    length 1. With `lost`, a pose that is not finite, or whose quaternion is 0, is one of NaN.
     """
     if quaternion is not None:
         check_choice("quaternion", quaternion, get_args(Quaternion))
-    rows, named = read_numbers(path, 8), named_order(path)
+    rows, named = read_numbers(path, 8, finite=not lost), named_order(path)
     if named is not None and quaternion is not None and named != quaternion:
         raise ResultError(f"{path} names its columns {_COLUMNS[named]}; read it with quaternion={named!r}")
     is_first = (quaternion or named) == "wxyz"
     turns = rows[:, [5, 6, 7, 4]] if is_first else rows[:, 4:]
-    return rows[:, 0], pose_matrices(rows[:, 1:4], turns, path)
+    found = np.isfinite(rows).all(axis=1) & rows[:, 4:].any(axis=1) if lost else np.ones(len(rows), bool)
+    poses = np.full((len(rows), 4, 4), np.nan)
+    poses[found] = pose_matrices(rows[found, 1:4], turns[found], path)
+    return rows[:, 0], poses
 
 
 def named_order(path: str | Path) -> Quaternion | None:
@@ -163,8 +168,10 @@ def _timestamps(name: str, times) -> Float64[np.ndarray, " N"]:
     return times
 
 
-def read_numbers(path: str | Path, columns: int | tuple[int, ...]) -> Float[np.ndarray, "S columns"]:
-    """Read a text file of finite numbers, `columns` in every line, or one of several numbers of columns.
+def read_numbers(
+    path: str | Path, columns: int | tuple[int, ...], *, finite: bool = True
+) -> Float[np.ndarray, "S columns"]:
+    """Read a text file of `finite` numbers, `columns` in every line, or one of several numbers of columns.
 
     Text after # is a comment, commas count as spaces, and a first line of words names the columns. Raises ResultError
     for anything else.
@@ -186,7 +193,7 @@ def read_numbers(path: str | Path, columns: int | tuple[int, ...]) -> Float[np.n
     if array.shape[1] not in choices or not len(array):
         problem = f"has {array.shape[1]} numbers a line" if len(array) else "is empty"
         raise ResultError(f"{path} {problem}; expected {expected} numbers a line")
-    if not np.isfinite(array).all():
+    if finite and not np.isfinite(array).all():
         raise ResultError(f"{path} holds {array[~np.isfinite(array)][0]}; expected finite numbers")
     return array
 

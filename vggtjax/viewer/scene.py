@@ -133,7 +133,8 @@ def _median_depth(result: Result, number: int = 0) -> float:
 def _facts(result: Result) -> str:
     S, H, W = result.depth.shape
     frames = f"{S} frame{'s' if S > 1 else ''} of {W} x {H}"
-    return one_line(f"{result.method} · {result.model_name} · {frames} · {result.dynamic_share:.0%} moving")
+    moving = f" · {result.dynamic_share:.0%} moving" if result.has_mask else ""
+    return one_line(f"{result.method} · {result.model_name} · {frames}{moving}")
 
 
 def frame_rate(result: Result) -> float:

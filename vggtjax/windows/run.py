@@ -36,12 +36,14 @@ from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.track_head import check_track_size
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
-from vggtjax.pipeline.run import reconstruct
+from vggtjax.pipeline.run import with_own_mask
+from vggtjax.pipeline.running import Running
 from vggtjax.pipeline.steps import Execute
 from vggtjax.progress import OnStage, Progress, StageSeconds, no_stage
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.disk import announce, forecast_bytes
 from vggtjax.results.folder import check_folder
+from vggtjax.results.no_mask import without_mask
 from vggtjax.results.report import RunFacts, versions
 from vggtjax.results.saving import Saving
 from vggtjax.storage.writing import locked_folder
@@ -152,7 +154,7 @@ def tools_of(
 
     def run(clip: Clip) -> Reconstruction:
         moving = load_masks(str(masks), clip) if isinstance(masks, str | Path) else masks
-        return reconstruct(model, clip, options=options, size=size, masks=moving, fusion=fusion)
+        return with_own_mask(model, clip, options, Running(), size=size, masks=moving, fusion=fusion)
 
     execute, compute = Execute(), compute_by(options)
 
@@ -252,6 +254,7 @@ def run_windows(
                 yield progress
 
         result = agree_with_pixels(result, pictures, Options(consistent_depth=consistent), on_stage=stage)
+        result = without_mask(result)
         with plan.on_stage("write") as progress:
             shown = pictures() if plan.saving.resolution == "original" else None
             facts = RunFacts(seconds.seconds)

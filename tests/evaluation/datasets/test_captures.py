@@ -6,6 +6,8 @@ import pytest
 from tests.captures import folders
 from tests.captures.folders import FRAMES, HEIGHT, WIDTH, make_truth
 from tests.dataset_files import opened
+from vggtjax.captures.table import read_capture
+from vggtjax.errors import InputError
 
 TRUTH = make_truth()
 
@@ -41,3 +43,35 @@ def test_files_of_record3d_stand_beside_folders(tmp_path):
     assert walk.depth(0).any()
     assert walk.pictures[0].is_file()  # of an archive that only the sequence keeps
     assert yard.notes[-1] == "walk: it has no depth"
+
+
+@pytest.mark.parametrize(
+    ("write", "picture", "depth"),
+    [
+        (folders.polycam, "keyframes/corrected_images/*.jpg", "keyframes/depth/*.png"),
+        (folders.nerfstudio, "images/*.png", "*/*.png"),
+        (folders.colmap_text, "images/*.png", None),
+        (folders.tum, "rgb/*.png", "depth/*.png"),
+    ],
+)
+def test_pictures_and_maps_that_are_missing_leave_their_frames_out(tmp_path, write, picture, depth):
+    folder = write(tmp_path / "clip", TRUTH)
+    (whole,) = opened("capture", folder)
+    lost = sorted(folder.glob(picture))[1]
+    place = whole.pictures.index(lost)
+    lost.unlink()
+    (sequence,) = opened("capture", folder)
+    assert len(sequence) == FRAMES - 1
+    np.testing.assert_array_equal(sequence.world_from_camera, np.delete(whole.world_from_camera, place, axis=0))
+    (left,) = sequence.left_out
+    assert (left.what, left.frames, left.total) == ("pictures", (lost.stem,), FRAMES)
+    assert any(f"1 of {FRAMES} frames have no picture: {lost.stem}" in note for note in sequence.notes)
+    with pytest.raises(InputError, match=f"have no picture: {lost.stem}; add them"):
+        opened("capture", folder, strict=True)
+    with pytest.raises(InputError, match="the capture whole"):
+        read_capture(folder)
+    if depth is not None:
+        maps = sorted(path for path in folder.glob(depth) if path not in whole.pictures)
+        maps[-1].unlink()
+        (sequence,) = opened("capture", folder)
+        assert {each.what: len(each.frames) for each in sequence.left_out} == {"pictures": 1, "depth": 1}

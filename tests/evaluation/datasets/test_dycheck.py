@@ -94,15 +94,23 @@ def test_what_is_missing_is_noted_and_never_taken_from_the_other_truth(tmp_path)
     assert sequence.world_from_camera is sequence.intrinsics is None
     assert not sequence.depth(1).any()
     assert sequence.notes[2:] == (
-        f"apple: 1 of 3 frames have no depth, 0_00010 first; expected {extra}/aligned_depth_anything_colmap/1x/*.npy",
         f"apple: it has no cameras; expected {extra}/colmap/sparse/images.bin",
+        f"apple: 1 of 3 frames have no depth: 0_00010; expected {extra}/aligned_depth_anything_colmap/1x/*.npy",
     )
     write(extra / "colmap" / "sparse" / "images.bin", images_bin([(1, (1, 0, 0, 0), (0, 0, 0), 1, "0_00000.png")]))
-    assert "apple: 2 of 3 frames are not in" in opened("dycheck", folder)[0].notes[-1]
+    (sequence,) = opened("dycheck", folder)
+    assert "apple: 2 of 3 frames are not in" in sequence.notes[-1]
+    assert sequence.posed.tolist() == [True, False, False]
     (sequence,) = opened("dycheck", folder, gt="lidar")
-    assert sequence.world_from_camera is None
-    note = f"apple: 1 of 3 frames have no camera, so it has no cameras; expected {folder}/camera/0_00020.json"
+    assert sequence.posed.tolist() == [True, True, False]
+    assert sequence.world_from_camera[1, :3, 3].tolist() == [1, 2, 10]
+    note = f"apple: 1 of 3 frames have no camera: 0_00020; expected {folder}/camera/*.json"
     assert sequence.notes[2:] == (note,)
+    (folder / "rgb/1x/0_00000.png").unlink()
+    (sequence,) = opened("dycheck", folder, gt="lidar")
+    assert (sequence.frame_names, sequence.posed.tolist()) == (("0_00010", "0_00020"), [True, False])
+    with pytest.raises(InputError, match=r"1 of 3 frames have no picture: 0_00000.*without --strict"):
+        opened("dycheck", folder, gt="lidar", strict=True)
 
 
 SPLIT, CAMERA = "splits/train.json", "camera/0_00000.json"
@@ -113,7 +121,7 @@ SPLIT, CAMERA = "splits/train.json", "camera/0_00000.json"
     [
         (SPLIT, '{"frame_names": ["a"], "time_ids": ' + "[" * 70 + "]" * 70 + "}", "nested more than 64 levels"),
         (SPLIT, '{"frame_names": ["../camera"]}', "expected a path inside"),
-        (SPLIT, '{"frame_names": ["0_99999"]}', "names its frame; get the sequence whole"),
+        (SPLIT, '{"frame_names": ["0_99999"]}', "names"),
         (CAMERA, camera_json(orientation=[[1, 0, 0], [0, 2, 0], [0, 0, 1]]), "invalid poses"),
         (CAMERA, camera_json(focal_length=0.0), "focal lengths above 0"),
     ],

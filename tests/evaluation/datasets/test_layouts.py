@@ -77,7 +77,9 @@ def test_kitti_takes_the_first_110_and_names_what_is_missing(tmp_path):
     (tmp_path / "2011_09_26" / "calib_cam_to_cam.txt").unlink()
     (sequence,) = opened("kitti", tmp_path)
     assert [int(path.stem) for path in sequence.pictures] == [i for i in range(5, 115) if i not in (7, 9)]
-    assert f"{DRIVE}: 2 of 110 frames have no picture and are skipped, 0000000007 first" in sequence.notes
+    assert f"{DRIVE}: 2 of 110 frames have no picture and are skipped: 0000000007, 0000000009; expected " in " ".join(
+        sequence.notes
+    )
     assert f"{DRIVE}: it has no intrinsics; expected {tmp_path}/2011_09_26/calib_cam_to_cam.txt" in sequence.notes
     assert np.allclose(sequence.depth(2)[0], [0, 1, 0.5, 265 / 256])  # frame 8
 
@@ -111,10 +113,16 @@ def test_seven_scenes(tmp_path):
     folder = tmp_path / "chess" / "seq-02"
     (folder / "frame-000001.pose.txt").unlink()
     (sequence,) = opened("7scenes", folder)
-    assert (sequence.name, sequence.world_from_camera) == ("seq-02", None)
-    note = f"1 of 3 frames have no pose, so it has no poses; expected {folder}/frame-000001.pose.txt"
-    assert f"seq-02: {note}" in sequence.notes
+    assert (sequence.name, sequence.posed.tolist()) == ("seq-02", [True, False, True])
+    assert f"seq-02: 1 of 3 frames have no pose: frame-000001; expected {folder}/*.pose.txt" in sequence.notes
+    write(folder / "frame-000002.pose.txt", "\n".join(["-inf -inf -inf -inf"] * 4))  # as ScanNet marks lost frames
+    (sequence,) = opened("7scenes", folder)
+    assert sequence.posed.tolist() == [True, False, False]
+    assert np.allclose(sequence.world_from_camera[0, :3, 3], [0, 0.5, -1])
     assert opened("7scenes", folder, stride=2)[0].world_from_camera.shape == (2, 4, 4)
+    (folder / "frame-000001.color.png").unlink()
+    (sequence,) = opened("7scenes", folder)
+    assert {each.what: each.frames for each in sequence.left_out}["pictures"] == ("frame-000001",)
 
 
 WRITERS = {
@@ -141,3 +149,18 @@ def test_broken_files_are_refused(tmp_path, data_set, file, content, message):
     write(tmp_path / file, content)
     with pytest.raises(InputError, match=message):
         opened(data_set, tmp_path)[0].depth(1)
+
+
+def test_sintel_scores_the_frames_that_are_whole(tmp_path):
+    sintel_folder(tmp_path)
+    (whole,) = opened("sintel", tmp_path)
+    names = whole.frame_names
+    (tmp_path / f"training/camdata_left/alley_2/{names[1]}.cam").unlink()
+    (tmp_path / f"training/final/alley_2/{names[0]}.png").unlink()
+    (sequence,) = opened("sintel", tmp_path)
+    assert sequence.posed.tolist() == [name != names[1] for name in names[1:]]
+    np.testing.assert_array_equal(sequence.world_from_camera[sequence.posed], whole.world_from_camera[2:])
+    assert np.isfinite(sequence.intrinsics).all()
+    assert {each.what: each.frames for each in sequence.left_out} == {"poses": (names[1],), "pictures": (names[0],)}
+    with pytest.raises(InputError, match="without --strict"):
+        opened("sintel", tmp_path, strict=True)

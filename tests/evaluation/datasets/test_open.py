@@ -116,12 +116,13 @@ def test_what_is_missing_is_noted(tmp_path):
         (folder / name).unlink()
     (sequence,) = opened("plain", folder)
     assert sequence.notes == (
-        f"clip: 1 of 3 frames have no depth, 01 first; expected {folder}/depth/*.png",
-        f"clip: 2 of 3 frames have a mask, so it has no masks; expected {folder}/mask/*.png",
         f"clip: it has no world_from_camera.txt; expected {folder}/world_from_camera.txt",
         f"clip: it has no K.txt; expected {folder}/K.txt",
+        f"clip: 1 of 3 frames have no depth: 01; expected {folder}/depth/*.png",
+        f"clip: 1 of 3 frames have no mask: 02; expected {folder}/mask/*.png",
     )
-    assert sequence.mask is sequence.world_from_camera is sequence.intrinsics is None
+    assert sequence.world_from_camera is sequence.intrinsics is sequence.mask(2) is None
+    assert sequence.mask(1).any()
     assert not sequence.depth(1).any()
 
 

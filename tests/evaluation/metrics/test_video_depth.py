@@ -50,6 +50,27 @@ def test_alignments_by_hand():
     assert depth_alignment(np.ones(2), np.array([1.0, 3.0])).scale == pytest.approx(2)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_least_absolute_scale_is_the_optimum_and_ten_rounds_need_not_be(seed):
+    predicted, truth = depths(seed, (2, 14, 14))
+    g, d = truth[truth > 0], predicted[truth > 0]
+    found = depth_alignment(predicted, truth, "least-absolute")
+    every = np.abs((g / d)[:, None] * d - g).sum(axis=1)  # the least sum is where a pixel is exact
+    assert found == pytest.approx(((g / d)[every.argmin()], 0), rel=1e-12)
+    assert np.abs(found.scale * d - g).sum() <= np.abs(depth_alignment(predicted, truth).scale * d - g).sum()
+
+
+def test_ten_rounds_stop_before_the_optimum():
+    d, g = np.ones(11), np.repeat([1.0, 20.0], [6, 5])  # |s - 1| of six pixels and |s - 20| of five: least at 1
+    assert depth_alignment(d, g, "least-absolute") == (1, 0)
+    assert depth_alignment(d, g).scale > 2  # from the mean, 9.6
+    # The ratios 3, 3.1, 3.2 and 0.1 have the weights 1, 1, 1 and 10: one deep pixel is over half.
+    d, g = np.array([1.0, 1.0, 1.0, 10.0]), np.array([3.0, 3.1, 3.2, 1.0])
+    assert depth_alignment(d, g, "least-absolute") == (0.1, 0)
+    with pytest.raises(InputError, match="the predicted depth is 0 in all valid pixels"):
+        depth_alignment(np.zeros(2), np.ones(2), "least-absolute")
+
+
 def test_a_depth_behind_the_camera_is_close_to_nothing():
     errors = video_depth_errors(np.array([[[-3.0, 0.0, 2.0]]]), np.full((1, 1, 3), 2.0), "metric")
     assert errors[2:] == pytest.approx((1 / 3, 1 / 3, 1 / 3, 3))

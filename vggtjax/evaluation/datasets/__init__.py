@@ -2,4 +2,5 @@
 
 from vggtjax.evaluation.datasets.table import DATASETS as DATASETS
 from vggtjax.evaluation.datasets.table import Dataset as Dataset
+from vggtjax.evaluation.datasets.table import chosen_frames as chosen_frames
 from vggtjax.evaluation.datasets.table import find_sequences as find_sequences

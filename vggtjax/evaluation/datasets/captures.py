@@ -14,7 +14,7 @@ from vggtjax.captures.lens import check_no_fisheye
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, read_capture
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
-from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener
+from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, at_size, left_out
 
 _OWN_UNIT = "its unit is not the metre, but one of its program's own"  # a note
 
@@ -41,7 +41,7 @@ def captures(root: Path) -> dict[str, Opener]:
 
 
 def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
-    whole = read_capture(path)
+    whole = read_capture(path, whole=False)
     capture = whole.for_frames(frames.of(whole.frame_names, name))
     check_no_fisheye(capture.lenses, path)
     maps = capture.depth_files or (None,) * len(capture)
@@ -49,8 +49,6 @@ def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     notes = capture.notes + (() if capture.metric else (_OWN_UNIT,))
     if len(missing) == len(capture):
         notes += ("it has no depth",)
-    elif missing:
-        notes += (f"{len(missing)} of {len(capture)} frames have no depth, {missing[0]} first",)
     return LabelledSequence(
         name,
         capture.pictures,
@@ -59,6 +57,8 @@ def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
         intrinsics=capture.intrinsics,
         timestamps=capture.timestamps,
         notes=notes,
+        left_out=left_out("pictures", whole.absent, len(whole) + len(whole.absent), "have no picture")
+        + (() if len(missing) == len(capture) else left_out("depth", missing, len(capture), "have no depth")),
         frame_names=capture.frame_names,
         archive=capture.archive,
     )
@@ -69,8 +69,4 @@ def _depth(capture: Capture, frame: int) -> Float32[np.ndarray, "h w"]:
     width, height = capture.sizes[frame]
     if (depth := capture.depth(frame)) is None:
         return np.zeros((height, width), np.float32)
-    rows, columns = (
-        ((np.arange(side) + 0.5) * count / side).astype(int)
-        for side, count in zip((height, width), depth.shape, strict=True)
-    )
-    return depth[rows[:, None], columns]
+    return at_size(depth, (height, width))

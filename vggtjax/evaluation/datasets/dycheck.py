@@ -21,8 +21,8 @@ from jaxtyping import Float32, Float64
 from vggtjax.captures.cameras import (
     DISTORTED,
     checked_intrinsics,
-    checked_world_from_camera,
     resized_intrinsics,
+    with_lost_poses,
     world_from_camera_of,
 )
 from vggtjax.captures.colmap_model import read_views
@@ -33,7 +33,14 @@ from vggtjax.captures.numbers import numbers
 from vggtjax.captures.pictures import picture_size
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
-from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, depth_reader
+from vggtjax.evaluation.datasets.sequence import (
+    FrameChoice,
+    LabelledSequence,
+    LeftOut,
+    Opener,
+    depth_reader,
+    left_out,
+)
 from vggtjax.storage.json_values import read_json
 
 EASI3R, LIDAR = TRUTHS = ("easi3r", "lidar")
@@ -50,6 +57,7 @@ class _Cameras(NamedTuple):
     world_from_camera: Float64[np.ndarray, "S 4 4"] | None
     intrinsics: Float64[np.ndarray, "S 3 3"] | None
     notes: tuple[str, ...]
+    left_out: tuple[LeftOut, ...] = ()
 
 
 def dycheck(root: Path, gt: str = EASI3R) -> dict[str, Opener]:
@@ -61,15 +69,19 @@ def dycheck(root: Path, gt: str = EASI3R) -> dict[str, Opener]:
 def _read(folder: Path, name: str, gt: str, frames: FrameChoice) -> LabelledSequence:
     names = _frame_names(folder / _SPLIT)
     chosen = frames.of(names, name)
-    pictures = [inside(folder / _PICTURES, f"{frame}.png", folder / _SPLIT) for frame in chosen]
-    if absent := [path for path in pictures if not path.is_file()]:
-        raise InputError(f"{absent[0]} is missing, but {folder / _SPLIT} names its frame; get the sequence whole")
+    paths = {frame: inside(folder / _PICTURES, f"{frame}.png", folder / _SPLIT) for frame in chosen}
+    absent = [frame for frame, path in paths.items() if not path.is_file()]
+    if len(absent) == len(chosen):
+        raise InputError(f"{paths[absent[0]]} is missing, and so is every picture that {folder / _SPLIT} names")
+    gaps = left_out("pictures", absent, len(chosen), "have no picture", folder / _PICTURES)
+    chosen = [frame for frame in chosen if frame not in absent]
+    pictures = [paths[frame] for frame in chosen]
     easi3r = gt == EASI3R
     cameras = (_colmap_cameras if easi3r else _json_cameras)(folder, chosen, pictures)
     maps_folder = folder / (_ALIGNED if easi3r else _LIDAR)
     maps = files(maps_folder, ".npy")
     read = _from_disparity([maps[frame] for frame in names if frame in maps]) if easi3r else read_npy
-    depth, notes = depth_reader(pictures, [maps.get(frame) for frame in chosen], read, maps_folder / "*.npy")
+    depth, more, notes = depth_reader(pictures, [maps.get(frame) for frame in chosen], read, maps_folder / "*.npy")
     return LabelledSequence(
         name,
         tuple(pictures),
@@ -77,6 +89,7 @@ def _read(folder: Path, name: str, gt: str, frames: FrameChoice) -> LabelledSequ
         world_from_camera=cameras.world_from_camera,
         intrinsics=cameras.intrinsics,
         notes=(f"its ground truth is {gt}", *notes, *cameras.notes),
+        left_out=gaps + more + cameras.left_out,
     )
 
 
@@ -114,31 +127,50 @@ def _colmap_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _C
     if not (source / "images.bin").is_file():
         return _Cameras(None, None, (f"it has no cameras; expected {source / 'images.bin'}",))
     views = read_views(source)
-    if missing := [frame for frame in frames if f"{frame}.png" not in views]:
-        note = f"{len(missing)} of {len(frames)} frames are not in {_MODEL}, {missing[0]} first; no cameras"
-        return _Cameras(None, None, (note,))
-    taken = [views[f"{frame}.png"] for frame in frames]
-    check_no_fisheye((view.lens for view in taken), source)
-    intrinsics = [
-        resized_intrinsics(view.intrinsics, view.size, picture_size(path), source)
-        for view, path in zip(taken, pictures, strict=True)
-    ]
-    poses = world_from_camera_of(np.stack([view.camera_from_world for view in taken]), source)
-    return _Cameras(poses, np.stack(intrinsics), (DISTORTED,) * any(view.lens for view in taken))
+    missing = [frame for frame in frames if f"{frame}.png" not in views]
+    if len(missing) == len(frames):
+        return _Cameras(None, None, (f"it has no cameras: none of its frames is in {_MODEL}",))
+    taken = {place: views[f"{frame}.png"] for place, frame in enumerate(frames) if f"{frame}.png" in views}
+    check_no_fisheye((view.lens for view in taken.values()), source)
+    intrinsics = {
+        place: resized_intrinsics(view.intrinsics, view.size, picture_size(pictures[place]), source)
+        for place, view in taken.items()
+    }
+    known = world_from_camera_of(np.stack([view.camera_from_world for view in taken.values()]), source)
+    notes = (DISTORTED,) * any(view.lens for view in taken.values())
+    gaps = left_out("poses", missing, len(frames), f"are not in {_MODEL}")
+    return _with_gaps(dict(zip(taken, known, strict=True)), intrinsics, len(frames))._replace(
+        notes=notes, left_out=gaps
+    )
+
+
+def _with_gaps(
+    poses: dict[int, Float64[np.ndarray, "4 4"]], intrinsics: dict[int, Float64[np.ndarray, "3 3"]], count: int
+) -> _Cameras:
+    """Return the cameras of `count` frames, of which some have none: NaN, and the intrinsics of another frame."""
+    other = next(iter(intrinsics.values()))
+    nowhere = np.full((4, 4), np.nan)
+    return _Cameras(
+        np.stack([poses.get(place, nowhere) for place in range(count)]),
+        np.stack([intrinsics.get(place, other) for place in range(count)]),
+        (),
+    )
 
 
 def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cameras:
     paths = [folder / "camera" / f"{frame}.json" for frame in frames]
-    if missing := [path.stem for path in paths if not path.is_file()]:
-        note = f"{len(missing)} of {len(frames)} frames have no camera, so it has no cameras"
-        return _Cameras(None, None, (f"{note}; expected {folder / 'camera' / missing[0]}.json",))
-    poses, intrinsics, distorted = [], [], False
-    for path, picture in zip(paths, pictures, strict=True):
+    poses, intrinsics, distorted = {}, {}, False
+    for place, (path, picture) in enumerate(zip(paths, pictures, strict=True)):
+        if not path.is_file():
+            continue
         camera = read_json(path, dict[str, Any], "camera")
         pose = np.eye(4)
-        pose[:3, :3] = numbers(camera, "orientation", ((3, 3),), path).T  # the file has camera-from-world
-        pose[:3, 3] = numbers(camera, "position", ((3,),), path)
-        poses.append(checked_world_from_camera(pose[None], path)[0])
+        pose[:3, :3] = numbers(camera, "orientation", ((3, 3),), path, finite=False).T  # the file: camera-from-world
+        pose[:3, 3] = numbers(camera, "position", ((3,),), path, finite=False)
+        pose = with_lost_poses(pose[None], path)[0]
+        if not np.isfinite(pose).all():
+            continue
+        poses[place] = pose
         focal, skew, ratio = (
             float(numbers(camera, key, ((),), path)) for key in ("focal_length", "skew", "pixel_aspect_ratio")
         )
@@ -147,7 +179,11 @@ def _json_cameras(folder: Path, frames: list[str], pictures: list[Path]) -> _Cam
         if min(width, height) < 1:
             raise InputError(f"{path} has an image_size of {width:g} x {height:g}; expected pixels")
         matrix = checked_intrinsics(np.array([[focal, skew, cx], [0, focal * ratio, cy], [0, 0, 1]]), path)
-        intrinsics.append(resized_intrinsics(matrix, (width, height), picture_size(picture), path))
+        intrinsics[place] = resized_intrinsics(matrix, (width, height), picture_size(picture), path)
         for key, count in (("radial_distortion", 3), ("tangential_distortion", 2)):
             distorted |= bool(numbers(camera, key, ((count,),), path).any())
-    return _Cameras(np.stack(poses), np.stack(intrinsics), (DISTORTED,) * distorted)
+    if not poses:
+        return _Cameras(None, None, (f"it has no cameras; expected {folder / 'camera' / '*.json'}",))
+    missing = [frame for place, frame in enumerate(frames) if place not in poses]
+    gaps = left_out("poses", missing, len(frames), "have no camera", folder / "camera" / "*.json")
+    return _with_gaps(poses, intrinsics, len(frames))._replace(notes=(DISTORTED,) * distorted, left_out=gaps)

@@ -33,8 +33,8 @@ from jaxtyping import Float64
 from vggtjax.captures.cameras import (
     PIXEL_CENTRE,
     checked_intrinsics,
-    checked_world_from_camera,
     intrinsics_matrix,
+    with_lost_poses,
     world_from_camera_of,
 )
 from vggtjax.captures.depth_files import SINTEL_TAG, read_dpt, read_png
@@ -46,8 +46,10 @@ from vggtjax.evaluation.datasets.sequence import (
     LabelledSequence,
     Opener,
     depth_reader,
+    left_out,
     mask_reader,
     read_labels,
+    unpictured,
 )
 from vggtjax.storage.trajectories import read_numbers
 
@@ -63,11 +65,13 @@ def davis(root: Path) -> dict[str, Opener]:
 
 
 def _read_davis(root: Path, name: str, frames: FrameChoice) -> LabelledSequence:
-    pictures = frames.of(_pictures(root / "JPEGImages" / _RESOLUTION / name, ".jpg"), name)
-    folder = root / "Annotations" / _RESOLUTION / name
-    labels = files(folder, ".png")
-    mask, notes = mask_reader(pictures, [labels.get(path.stem) for path in pictures], read_labels, folder / "*.png")
-    return LabelledSequence(name, tuple(pictures), mask=mask, notes=notes)
+    source, folder = root / "JPEGImages" / _RESOLUTION / name, root / "Annotations" / _RESOLUTION / name
+    every, labels = _pictures(source, ".jpg"), files(folder, ".png")
+    pictures = frames.of(every, name)
+    paths = [labels.get(path.stem) for path in pictures]
+    mask, missing, notes = mask_reader(pictures, paths, read_labels, folder / "*.png")
+    missing += unpictured((path.stem for path in every), labels, source)
+    return LabelledSequence(name, tuple(pictures), mask=mask, notes=notes, left_out=missing)
 
 
 def _pictures(folder: Path, ending: str) -> list[Path]:
@@ -101,21 +105,36 @@ def read_cam(path: Path) -> tuple[Float64[np.ndarray, "3 3"], Float64[np.ndarray
 
 
 def _read_sintel(training: Path, name: str, frames: FrameChoice) -> LabelledSequence:
-    pictures = frames.of(_pictures(training / "final" / name, ".png"), name)
+    every = _pictures(training / "final" / name, ".png")
+    pictures = frames.of(every, name)
     source = training / "camdata_left" / name
     depths, cams = files(training / "depth" / name, ".dpt"), files(source, ".cam")
     expected = training / "depth" / name / "*.dpt"
-    depth, notes = depth_reader(pictures, [depths.get(path.stem) for path in pictures], read_dpt, expected)
+    depth, gaps, notes = depth_reader(pictures, [depths.get(path.stem) for path in pictures], read_dpt, expected)
+    gaps += unpictured((path.stem for path in every), {*depths, *cams}, training / "final" / name)
     poses = intrinsics = None
-    if missing := [path.stem for path in pictures if path.stem not in cams]:
-        count = f"{len(missing)} of {len(pictures)}"
-        notes += (f"{count} frames have no camera, so it has no cameras; expected {source / missing[0]}.cam",)
+    cameras = [read_cam(cams[path.stem]) if path.stem in cams else None for path in pictures]
+    seen = [camera is not None and all(map(finite, camera)) for camera in cameras]
+    lost = [path.stem for path, found in zip(pictures, seen, strict=True) if not found]
+    if len(lost) == len(pictures):
+        notes += (f"it has no cameras; expected {source / '*.cam'}",)
     else:
-        matrices, camera_from_world = zip(*(read_cam(cams[path.stem]) for path in pictures), strict=True)
-        intrinsics = checked_intrinsics(np.stack(matrices), source)
+        found = [camera for camera, sees in zip(cameras, seen, strict=True) if camera is not None and sees]
+        matrices, camera_from_world = (np.stack(values) for values in zip(*found, strict=True))
+        intrinsics = np.tile(checked_intrinsics(matrices, source)[:1], (len(pictures), 1, 1))
+        intrinsics[seen] = matrices
         intrinsics[:, :2, 2] += PIXEL_CENTRE
-        poses = world_from_camera_of(np.stack(camera_from_world), source)
-    return LabelledSequence(name, tuple(pictures), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes)
+        poses = np.full((len(pictures), 4, 4), np.nan)
+        poses[seen] = world_from_camera_of(camera_from_world, source)
+        gaps += left_out("poses", lost, len(pictures), "have no camera", source / "*.cam")
+    return LabelledSequence(
+        name, tuple(pictures), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes, left_out=gaps
+    )
+
+
+def finite(array: Float64[np.ndarray, ...]) -> bool:
+    """Return whether all values of an array are finite."""
+    return bool(np.isfinite(array).all())
 
 
 # 7-Scenes
@@ -136,23 +155,28 @@ def _read_seven_scenes(folder: Path, name: str, frames: FrameChoice) -> Labelled
     chosen = frames.of(list(pictures), name)
     taken = [pictures[frame] for frame in chosen]
     read = partial(read_png, per_metre=_MILLIMETRES, invalid=_INVALID)
-    depth, notes = depth_reader(taken, [depths.get(frame) for frame in chosen], read, folder / f"*{_DEPTH}")
-    poses = None
-    if missing := [frame for frame in chosen if frame not in pose_files]:
-        count = f"{len(missing)} of {len(chosen)}"
-        notes += (f"{count} frames have no pose, so it has no poses; expected {folder / missing[0]}{_POSE}",)
+    depth, gaps, notes = depth_reader(taken, [depths.get(frame) for frame in chosen], read, folder / f"*{_DEPTH}")
+    gaps += unpictured(pictures, {*depths, *pose_files}, folder / f"*{_PICTURE}")
+    nowhere = np.full((4, 4), np.nan)
+    poses = np.stack([_pose(pose_files[frame]) if frame in pose_files else nowhere for frame in chosen])
+    lost = [frame for frame, pose in zip(chosen, poses, strict=True) if not finite(pose)]
+    if len(lost) == len(chosen):
+        poses = None
+        notes += (f"it has no poses; expected {folder / f'*{_POSE}'}",)
     else:
-        poses = np.stack([_pose(pose_files[frame]) for frame in chosen])
+        gaps += left_out("poses", lost, len(chosen), "have no pose", folder / f"*{_POSE}")
     intrinsics = np.broadcast_to(intrinsics_matrix(*_CAMERA, first_pixel=0, source="7-Scenes"), (len(taken), 3, 3))
     notes += ("depth is not registered to the pictures; the intrinsics are the depth camera's",)
-    return LabelledSequence(name, tuple(taken), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes)
+    return LabelledSequence(
+        name, tuple(taken), depth, world_from_camera=poses, intrinsics=intrinsics, notes=notes, left_out=gaps
+    )
 
 
 def _pose(path: Path) -> Float64[np.ndarray, "4 4"]:
-    rows = read_numbers(path, 4)
+    rows = read_numbers(path, 4, finite=False)
     if len(rows) != 4:
         raise InputError(f"{path} has {len(rows)} rows; expected a pose of 4 rows")
-    return checked_world_from_camera(rows[None], path)[0]
+    return with_lost_poses(rows[None], path)[0]
 
 
 # KITTI
@@ -192,18 +216,19 @@ def _read_kitti(name: str, truth: Path, folder: Path, calibration: Path, frames:
         raise InputError(f"the drive has no {kind}; expected {place / '*.png'}")
     chosen = frames.of(list(depths), name)  # frames with depth: the first and the last few of a drive have none
     notes: tuple[str, ...] = ()
-    if missing := [frame for frame in chosen if frame not in pictures]:
-        notes += (f"{len(missing)} of {len(chosen)} frames have no picture and are skipped, {missing[0]} first",)
-        chosen = [frame for frame in chosen if frame in pictures]
+    missing = [frame for frame in chosen if frame not in pictures]
+    gaps = left_out("pictures", missing, len(chosen), "have no picture and are skipped", folder / "*.png")
+    chosen = [frame for frame in chosen if frame in pictures]
     taken = [pictures[frame] for frame in chosen]
     maps, read = [depths[frame] for frame in chosen], partial(read_png, per_metre=_PER_METRE)
-    depth, more = depth_reader(taken, maps, read, truth / "*.png")
+    depth, more_gaps, more = depth_reader(taken, maps, read, truth / "*.png")
     intrinsics = None
     if calibration.is_file():
         intrinsics = np.broadcast_to(_projection(calibration), (len(taken), 3, 3))
     else:
         notes += (f"it has no intrinsics; expected {calibration}",)
-    return LabelledSequence(name, tuple(taken), depth, intrinsics=intrinsics, notes=(*notes, *more, "it has no poses"))
+    notes = (*notes, *more, "it has no poses")
+    return LabelledSequence(name, tuple(taken), depth, intrinsics=intrinsics, notes=notes, left_out=gaps + more_gaps)
 
 
 def _projection(path: Path) -> Float64[np.ndarray, "3 3"]:

@@ -5,22 +5,56 @@ Does not import jax.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Shaped
 
 from vggtjax.captures.cameras import TURNED
+from vggtjax.captures.capture import OtherShapeError
 from vggtjax.captures.pictures import PNG, opening, picture_size
-from vggtjax.errors import InputError
+from vggtjax.errors import InputError, one_line
+from vggtjax.media.order import in_order
 from vggtjax.media.sampling import Sampling
 
 T = TypeVar("T")
 DepthReader = Callable[[int], Float32[np.ndarray, "h w"]]
-MaskReader = Callable[[int], Bool[np.ndarray, "h w"]]
+MaskReader = Callable[[int], Bool[np.ndarray, "h w"] | None]
+_MOST_NAMES = 5  # of frames in a sentence
+_SAME_SHAPE = 0.02  # by which the shapes of a picture and its map may differ, as ScanNet's do
+
+
+class LeftOut(NamedTuple):
+    """Frames of a sequence that are not scored, or not by one kind of truth."""
+
+    what: str  # of "poses", "depth", "masks", "pictures", "results"
+    frames: tuple[str, ...]
+    total: int  # of frames
+    why: str  # what they lack: "have no depth"
+    expected: str = ""  # where it is expected
+    usual: bool = False  # a published protocol leaves them out, too
+
+    @property
+    def sentence(self) -> str:
+        """Counts and names in words."""
+        names = ", ".join(one_line(name, 60) for name in self.frames[:_MOST_NAMES])
+        more = f" and {len(self.frames) - _MOST_NAMES} more" if len(self.frames) > _MOST_NAMES else ""
+        expected = f"; expected {self.expected}" if self.expected else ""
+        return f"{len(self.frames)} of {self.total} frames {self.why}: {names}{more}{expected}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return counts and the first names as JSON values."""
+        return {"count": len(self.frames), "of": self.total, "why": self.why, "frames": [*self.frames[:_MOST_NAMES]]}
+
+
+def left_out(
+    what: str, frames: Sequence[str], total: int, why: str, expected: Path | str = "", *, usual: bool = False
+) -> tuple[LeftOut, ...]:
+    """Return what is left out as a tuple of one; empty where no frame is."""
+    return (LeftOut(what, tuple(frames), total, why, str(expected), usual),) if frames else ()
 
 
 class FrameChoice(NamedTuple):
@@ -56,6 +90,13 @@ class FrameChoice(NamedTuple):
 EVERY_FRAME = FrameChoice()
 
 
+def unpictured(pictures: Iterable[str], truth: Iterable[str], expected: Path | str) -> tuple[LeftOut, ...]:
+    """Return the frames that have a truth of some kind, by these names, and no picture, which is `expected` there."""
+    named = set(pictures)
+    lacking = in_order({*truth} - named, Path)
+    return left_out("pictures", lacking, len(named) + len(lacking), "have no picture", expected)
+
+
 @dataclass(frozen=True, eq=False)
 class LabelledSequence:
     """Frames in order, and the ground truth that the data set has: metres, seconds, OpenCV's axes.
@@ -67,11 +108,12 @@ class LabelledSequence:
     name: str
     pictures: tuple[Path, ...]
     depth: DepthReader | None = None  # along z, 0 where it is unknown; at the pictures' size
-    mask: MaskReader | None = None  # True where the world moves; at the pictures' size
-    world_from_camera: Float64[np.ndarray, "S 4 4"] | None = None
+    mask: MaskReader | None = None  # True where the world moves; at the pictures' size; None for a frame without
+    world_from_camera: Float64[np.ndarray, "S 4 4"] | None = None  # NaN for a frame without
     intrinsics: Float64[np.ndarray, "S 3 3"] | None = None
     timestamps: Float64[np.ndarray, " S"] | None = None
     notes: tuple[str, ...] = ()  # a sentence for each missing or skipped part
+    left_out: tuple[LeftOut, ...] = ()  # frames that lack something
     frame_names: tuple[str, ...] = ()  # the pictures' names without endings by default
     archive: object | None = None  # keeps the temporary files that `pictures` are, if any
 
@@ -93,9 +135,105 @@ class LabelledSequence:
     def __len__(self) -> int:
         return len(self.pictures)
 
+    @property
+    def posed(self) -> Bool[np.ndarray, " S"]:
+        """Frames with a camera pose."""
+        poses = self.world_from_camera
+        return np.zeros(len(self), bool) if poses is None else np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+
+    def of_frames(self, chosen: Sequence[int]) -> LabelledSequence:
+        """Return the sequence of some frames, in this order."""
+
+        def taken(values: Any) -> Any:
+            if callable(values):
+                return lambda frame: values(chosen[frame])
+            if isinstance(values, tuple):
+                return tuple(values[frame] for frame in chosen)
+            return None if values is None else values[list(chosen)]
+
+        names = ("pictures", "depth", "mask", "world_from_camera", "intrinsics", "timestamps", "frame_names")
+        return replace(self, **{name: taken(getattr(self, name)) for name in names})
+
 
 Opener = Callable[[FrameChoice], LabelledSequence]
 Reader = Callable[..., Mapping[str, Opener]]  # of a root, and of a ground truth where a data set has several
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Reads a file for each frame, at the size of its picture: each pixel takes the value of the file's around it."""
+
+    pictures: Sequence[Path]
+    paths: Sequence[Path | None]
+    read: Callable[[Path], Shaped[np.ndarray, "h w"]]
+    strict: bool = False  # refuse another size
+
+    def __call__(self, frame: int) -> Shaped[np.ndarray, "h w"] | None:
+        """Return a frame's map, None where it has no file. Raises OtherShapeError, and InputError for another file."""
+        path = self.paths[frame]
+        if path is None:
+            return None
+        values, (width, height) = self.read(path), picture_size(self.pictures[frame])
+        if values.shape == (height, width):
+            return values
+        if self.strict or not alike(values.shape, (height, width)):
+            turned = TURNED if values.shape == (width, height) else ""
+            raise OtherShapeError(
+                f"{path} has shape {values.shape}; expected {(height, width)}, the size of "
+                f"{self.pictures[frame].name}{turned}"
+            )
+        return at_size(values, (height, width))
+
+    def notes(self, what: str) -> tuple[str, ...]:
+        """Return a note where the first map has another size than its picture."""
+        first = next(frame for frame, path in enumerate(self.paths) if path is not None)
+        try:
+            shape = self.read(self.paths[first]).shape  # type: ignore[arg-type]
+            width, height = picture_size(self.pictures[first])
+        except InputError:  # raised again where it is read
+            return ()
+        if shape == (height, width):
+            return ()
+        sizes = f"{shape[1]} x {shape[0]} pixels and pictures {width} x {height}"
+        return (f"its {what} has {sizes}; each pixel of a picture takes the value of the one around its centre",)
+
+
+def alike(shape: tuple[int, ...], picture: tuple[int, int]) -> bool:
+    """Return whether maps of a (height, width) have the shape of a picture, but for a pixel or a fiftieth."""
+    rows, columns = shape
+    height, width = picture
+    across, down = columns * height, rows * width
+    return abs(across - down) <= max(max(picture), _SAME_SHAPE * down)
+
+
+def at_size(values: Shaped[np.ndarray, "h w"], size: tuple[int, int]) -> Shaped[np.ndarray, "H W"]:
+    """Return a map at another (height, width): each pixel takes the value of the pixel around its centre."""
+    rows, columns = (
+        ((np.arange(side) + 0.5) * count / side).astype(int) for side, count in zip(size, values.shape, strict=True)
+    )
+    return values[rows[:, None], columns]
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """Reads the depth of frames, 0 where it is unknown: not finite, not above 0, or in a frame without a map."""
+
+    maps: Maps
+
+    def __call__(self, frame: int) -> Float32[np.ndarray, "h w"]:
+        """Return the depth of a frame at the size of its picture; raises what `Maps` raises."""
+        if (values := self.maps(frame)) is None:
+            width, height = picture_size(self.maps.pictures[frame])
+            return np.zeros((height, width), np.float32)
+        return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
+
+
+class Labels(NamedTuple):
+    """A reader of maps, None where no frame has one, what is left out, and notes."""
+
+    read: Any
+    left_out: tuple[LeftOut, ...]
+    notes: tuple[str, ...]
 
 
 def depth_reader(
@@ -103,29 +241,15 @@ def depth_reader(
     paths: Sequence[Path | None],
     read: Callable[[Path], Float32[np.ndarray, "h w"]],
     expected: Path,
-) -> tuple[DepthReader | None, tuple[str, ...]]:
-    """Return a reader of the frames' depth, 0 where it is unknown, and notes on frames without depth.
-
-    The notes say where the depth is `expected`.
-
-    The reader is None if no frame has depth. It raises InputError for unreadable files and for maps of another size
-    than their picture. Depth that is not finite or not above 0 counts as unknown.
-    """
+) -> Labels:
+    """Return a `DepthMaps` of the frames, the frames without depth, which is `expected` there, and notes."""
     missing = [picture.stem for picture, path in zip(pictures, paths, strict=True) if path is None]
     if len(missing) == len(pictures):
-        return None, (f"it has no depth; expected {expected}",)
-
-    def depth(frame: int) -> Float32[np.ndarray, "h w"]:
-        path = paths[frame]
-        if path is None:
-            width, height = picture_size(pictures[frame])
-            return np.zeros((height, width), np.float32)
-        values = _of_picture_size(read(path), path, pictures[frame])
-        return np.where(np.isfinite(values) & (values > 0), values, 0).astype(np.float32)
-
-    if not missing:
-        return depth, ()
-    return depth, (f"{len(missing)} of {len(pictures)} frames have no depth, {missing[0]} first; expected {expected}",)
+        return Labels(None, (), (f"it has no depth; expected {expected}",))
+    maps = Maps(pictures, paths, read)
+    return Labels(
+        DepthMaps(maps), left_out("depth", missing, len(paths), "have no depth", expected), maps.notes("depth")
+    )
 
 
 def mask_reader(
@@ -133,13 +257,24 @@ def mask_reader(
     paths: Sequence[Path | None],
     read: Callable[[Path], Bool[np.ndarray, "h w"]],
     expected: Path,
-) -> tuple[MaskReader | None, tuple[str, ...]]:
-    """Return a reader of the frames' masks, or None and a note unless every frame has a mask, `expected` there."""
-    masks = [path for path in paths if path is not None]
-    if len(masks) < len(pictures):
-        count = f"{len(masks) or 'none'} of {len(pictures)}"
-        return None, (f"{count} frames have a mask, so it has no masks; expected {expected}",)
-    return lambda frame: _of_picture_size(read(masks[frame]), masks[frame], pictures[frame]), ()
+) -> Labels:
+    """Return a reader of the frames' masks, the frames without one, which is `expected` there, and notes."""
+    missing = [picture.stem for picture, path in zip(pictures, paths, strict=True) if path is None]
+    if len(missing) == len(pictures):
+        return Labels(None, (), (f"it has no masks; expected {expected}",))
+    maps = Maps(pictures, paths, read)
+    return Labels(maps, left_out("masks", missing, len(paths), "have no mask", expected), maps.notes("mask"))
+
+
+def refuse_left_out(sequence: LabelledSequence) -> LabelledSequence:
+    """Return a sequence that refuses maps of another size; raises InputError where a frame lacks something."""
+    for each in sequence.left_out:
+        if not each.usual:
+            raise InputError(f"{each.sentence}; add them, or score the other frames, without --strict")
+    depth, mask = sequence.depth, sequence.mask
+    if isinstance(depth, DepthMaps):
+        depth = DepthMaps(replace(depth.maps, strict=True))
+    return replace(sequence, depth=depth, mask=replace(mask, strict=True) if isinstance(mask, Maps) else mask)
 
 
 def read_labels(path: Path) -> Bool[np.ndarray, "h w"]:
@@ -154,13 +289,3 @@ def read_labels(path: Path) -> Bool[np.ndarray, "h w"]:
         labels = labels[..., :-1]  # without opacity
     above = np.asarray(labels > 0)
     return above if above.ndim == 2 else np.asarray(above.any(axis=2))
-
-
-def _of_picture_size(values: Shaped[np.ndarray, "h w"], path: Path, picture: Path) -> Shaped[np.ndarray, "h w"]:
-    width, height = picture_size(picture)
-    if values.shape != (height, width):
-        turned = TURNED if values.shape == (width, height) else ""
-        raise InputError(
-            f"{path} has shape {values.shape}; expected {(height, width)}, the size of {picture.name}{turned}"
-        )
-    return values

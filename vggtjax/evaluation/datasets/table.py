@@ -16,7 +16,7 @@ from vggtjax.evaluation.datasets.dycheck import TRUTHS, dycheck
 from vggtjax.evaluation.datasets.folders import listed
 from vggtjax.evaluation.datasets.layouts import davis, kitti, seven_scenes, sintel
 from vggtjax.evaluation.datasets.plain import plain
-from vggtjax.evaluation.datasets.sequence import EVERY_FRAME, FrameChoice, LabelledSequence, Reader
+from vggtjax.evaluation.datasets.sequence import EVERY_FRAME, FrameChoice, LabelledSequence, Reader, refuse_left_out
 from vggtjax.evaluation.datasets.tum import bonn, tum
 from vggtjax.media.sampling import Sampling
 
@@ -66,6 +66,7 @@ def find_sequences(
     sequences: Iterable[str] | None = None,
     sampling: Sampling = Sampling(),
     gt: str | None = None,
+    strict: bool = False,
 ) -> dict[str, Callable[[], LabelledSequence]]:
     """Find sequences of a data set; a call opens each of them, and raises errors of that sequence alone.
 
@@ -78,6 +79,7 @@ def find_sequences(
         sampling: frames of each sequence; its stride replaces the data set's own, a window or cap of the data set
             stays. Pictures have no `fps`.
         gt: name of a ground truth, for a data set with several; the first if None.
+        strict: refuse a sequence of which a frame lacks a picture, depth, mask or pose, or has a map of another size.
 
     Raises:
         InputError: an unknown name, sequence or ground truth, or a root without sequences. The calls raise it for
@@ -98,14 +100,21 @@ def find_sequences(
     chosen, notices = _chosen(name, root, list(openers), sequences)
     for notice in notices:
         logger.warning("%s", notice)
-    frames = dataset.frames.sampled(sampling)
+    frames = chosen_frames(name, sampling)
 
     def opened(name: str) -> LabelledSequence:
         with reading(f"sequence {name}"):
             sequence = openers[name](frames)
-        return dataclasses.replace(sequence, notes=(*notices, *(f"{sequence.name}: {note}" for note in sequence.notes)))
+            sequence = refuse_left_out(sequence) if strict else sequence
+        said = (*sequence.notes, *(each.sentence for each in sequence.left_out))
+        return dataclasses.replace(sequence, notes=(*notices, *(f"{sequence.name}: {note}" for note in said)))
 
     return {sequence: partial(opened, sequence) for sequence in chosen}
+
+
+def chosen_frames(name: str, sampling: Sampling) -> FrameChoice:
+    """Return the frames that are taken of each sequence of a data set."""
+    return DATASETS[name].frames.sampled(sampling)
 
 
 def _chosen(

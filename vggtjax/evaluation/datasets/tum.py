@@ -25,7 +25,14 @@ from vggtjax.captures.tum import (
 )
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
-from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, depth_reader
+from vggtjax.evaluation.datasets.sequence import (
+    FrameChoice,
+    LabelledSequence,
+    LeftOut,
+    Opener,
+    depth_reader,
+    left_out,
+)
 
 _BONN = (542.822841, 542.576870, 315.593520, 237.756098)
 # Bonn tracks markers on the camera. Its page takes a point of the camera to the world by ROS T ROS MARKERS, with T from
@@ -53,7 +60,7 @@ def tum(root: Path) -> dict[str, Opener]:
 def bonn(root: Path) -> dict[str, Opener]:
     """Find sequences of Bonn RGB-D Dynamic, named without "rgbd_bonn_".
 
-    The window counts all pictures, as in MonST3R's evaluation of depth. Poses are missing unless every frame has one.
+    The window counts all pictures, as in MonST3R's evaluation of depth.
     """
     return {name: partial(_read_bonn, folder, name) for name, folder in _folders(root, "rgbd_bonn_").items()}
 
@@ -67,22 +74,20 @@ def _read_tum(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     pictures = read_list(folder, "rgb.txt")
     poses, posed = read_poses(folder, pictures.times)
     notes: tuple[str, ...] = ()
+    skipped: tuple[LeftOut, ...] = ()
     candidates = np.arange(len(pictures.paths))
     if poses is None or (posed < 0).all():
         notes += (_no_poses(folder) if poses is None else f"no frame has a pose within {TOLERANCE} s",)
         poses = None
     elif (lost := np.flatnonzero(posed < 0)).size:
         candidates = np.flatnonzero(posed >= 0)
-        notes += (
-            f"{len(lost)} of {len(posed)} frames have no pose within {TOLERANCE} s and are skipped, "
-            f"{pictures.paths[lost[0]].stem} first",
-        )
+        names = [pictures.paths[frame].stem for frame in lost]
+        skipped = left_out("poses", names, len(posed), f"have no pose within {TOLERANCE} s and are skipped", usual=True)
     chosen = frames.of(candidates.tolist(), name)
     notes += frames.shortage(len(candidates))
     intrinsics, more = read_intrinsics(folder)
-    return _sequence(
-        folder, name, pictures, chosen, None if poses is None else poses[posed[chosen]], intrinsics, notes + more
-    )
+    poses = None if poses is None else poses[posed[chosen]]
+    return _sequence(folder, name, pictures, chosen, poses, intrinsics, notes + more, skipped)
 
 
 def _read_bonn(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence:
@@ -92,18 +97,18 @@ def _read_bonn(folder: Path, name: str, frames: FrameChoice) -> LabelledSequence
     poses, posed = read_poses(folder, pictures.times)
     if poses is None:
         notes += (_no_poses(folder),)
-    elif lost := [frame for frame in chosen if posed[frame] < 0]:
-        first = pictures.paths[lost[0]].stem
-        notes += (f"{len(lost)} of {len(chosen)} frames have no pose within {TOLERANCE} s, {first} first; no poses",)
-        poses = None
+    lost: list[str] = []
     if poses is not None:
+        lost = [pictures.paths[frame].stem for frame in chosen if posed[frame] < 0]
         left, _, right = np.linalg.svd(_MARKERS[:3, :3])
         markers = _MARKERS.copy()
         markers[:3, :3] = left @ right
         poses = _ROS @ poses[posed[chosen]] @ _ROS @ markers
+        poses[posed[chosen] < 0] = np.nan
         notes += ("poses are of the markers, moved to the camera by the data set's calibration",)
     intrinsics = intrinsics_matrix(*_BONN, first_pixel=0, source="Bonn")
-    return _sequence(folder, name, pictures, chosen, poses, intrinsics, notes)
+    missing = left_out("poses", lost, len(chosen), f"have no pose within {TOLERANCE} s")
+    return _sequence(folder, name, pictures, chosen, poses, intrinsics, notes, missing)
 
 
 def _no_poses(folder: Path) -> str:
@@ -118,13 +123,18 @@ def _sequence(
     poses: Float64[np.ndarray, "S 4 4"] | None,
     intrinsics: Float64[np.ndarray, "3 3"] | None,
     notes: tuple[str, ...],
+    missing: tuple[LeftOut, ...],
 ) -> LabelledSequence:
+    there = [place for place, frame in enumerate(chosen) if pictures.paths[frame].is_file()]
+    if not there:
+        raise InputError(f"{pictures.paths[chosen[0]]} is missing, and so is every picture that rgb.txt names")
+    absent = [pictures.paths[frame].stem for frame in chosen if not pictures.paths[frame].is_file()]
+    missing += left_out("pictures", absent, len(chosen), "have no picture, but rgb.txt names it")
+    poses = None if poses is None else poses[there]
+    chosen = [chosen[place] for place in there]
     taken = [pictures.paths[frame] for frame in chosen]
-    maps = depth_files(folder, pictures.times, chosen) or (None,) * len(taken)
-    for path in taken:
-        if not path.is_file():
-            raise InputError(f"{path} is missing, but rgb.txt names it; get the sequence whole")
-    depth, more = depth_reader(taken, maps, partial(read_png, per_metre=PER_METRE), folder / "depth.txt")
+    maps = depth_files(folder, pictures.times, chosen, whole=False) or (None,) * len(taken)
+    depth, gaps, more = depth_reader(taken, maps, partial(read_png, per_metre=PER_METRE), folder / "depth.txt")
     return LabelledSequence(
         name,
         tuple(taken),
@@ -133,4 +143,5 @@ def _sequence(
         intrinsics=None if intrinsics is None else np.broadcast_to(intrinsics, (len(taken), 3, 3)),
         timestamps=pictures.times[chosen],
         notes=notes + more,
+        left_out=missing + gaps,
     )

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float64
 
 from vggtjax.errors import InputError, check_choice
 
-Align = Literal["metric", "median", "scale", "scale-shift"]
+Align = Literal["metric", "median", "scale", "least-absolute", "scale-shift"]
 
 DELTA = 1.25
 _SCALE_ROUNDS = 10
@@ -104,16 +104,16 @@ def video_depth_errors(
         predicted: depth at the truth's size, finite wherever the truth is valid. Aligned depth that is not above 0
             counts in AbsRel and RMSE, and is within no delta.
         truth: depth; valid where it is finite, above 0 and below `max_depth`.
-        align: "metric" changes nothing; "median" scales by median g / median d; "scale" by the least absolute error,
-            as MonST3R and CUT3R do it: from mean g / mean d, ten rounds of least squares with weights
-            1 / (|s d - g| + 1e-8); "scale-shift" by s d + t of the least absolute error, as `_least_absolute_line`
-            says.
+        align: "metric" changes nothing; "median" scales by median g / median d; "scale" as MonST3R and CUT3R do it:
+            from mean g / mean d, ten rounds of least squares with weights 1 / (|s d - g| + 1e-8), which are on the way
+            to the least absolute error and often stop before it; "least-absolute" by the scale of the least absolute
+            error itself; "scale-shift" by s d + t of the least absolute error, as `_least_absolute_line` says.
         max_depth: in the truth's unit; no limit if None.
 
     Raises:
         InputError: different shapes or shapes other than [S, H, W], no valid pixel, a prediction there that is not
             finite, an unknown alignment, a `max_depth` that is not above 0, or a prediction that cannot be aligned: its
-            mean or median is not above 0, or with "scale-shift" it is constant.
+            mean, median or scale is not above 0, or with "scale-shift" it is constant.
     """
     if np.ndim(truth) != 3:
         raise InputError(f"the true depth has shape {np.shape(truth)}; expected a sequence [S, H, W]")
@@ -138,11 +138,25 @@ def depth_alignment(
 
 
 def _scale(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]) -> DepthLine:
-    """Return the scale of the least absolute error, by a fixed number of rounds of reweighted least squares."""
+    """Return the scale of MonST3R's evaluation: ten rounds of reweighted least squares, converged or not."""
     scale = _ratio(np.mean, predicted, truth)
     for _ in range(_SCALE_ROUNDS):
         weighted = predicted / (np.abs(scale * predicted - truth) + _LEAST)
         scale = float(weighted @ truth / (weighted @ predicted))
+    return DepthLine(scale)
+
+
+def _least_absolute_scale(predicted: Float64[np.ndarray, " N"], truth: Float64[np.ndarray, " N"]) -> DepthLine:
+    """Return the s of the least sum of |s d - g|: the median of g / d with weights |d|, the lower one of two."""
+    used = predicted != 0
+    if not used.any():
+        raise InputError("the predicted depth is 0 in all valid pixels; its scale is undefined")
+    ratios, weights = truth[used] / predicted[used], np.abs(predicted[used])
+    order = np.argsort(ratios, kind="stable")
+    below = weights[order].cumsum()
+    scale = float(ratios[order[np.searchsorted(below, below[-1] / 2)]])
+    if scale <= 0:
+        raise InputError(f"the scale of the least absolute error is {scale:.6g}; expected depth above 0 in most pixels")
     return DepthLine(scale)
 
 
@@ -181,6 +195,7 @@ _ALIGNMENTS: dict[str, Callable[[Float64[np.ndarray, " N"], Float64[np.ndarray, 
     "metric": lambda predicted, truth: DepthLine(1.0),
     "median": lambda predicted, truth: DepthLine(_ratio(np.median, predicted, truth)),
     "scale": _scale,
+    "least-absolute": _least_absolute_scale,
     "scale-shift": _least_absolute_line,
 }
 
