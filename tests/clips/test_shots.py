@@ -92,7 +92,7 @@ def test_frames_to_leave_out():
     for text in ("1-", "b", "3-1", "-2", "1,,2"):
         with pytest.raises(InputError, match=r"skip is .* expected numbers of frames, such as 0-2,17"):
             Sampling(skip=text)
-    with pytest.raises(ClipError, match="skip is .0-99. and leaves no frame of 6"):
+    with pytest.raises(ClipError, match=r"skip is .0-99. and leaves no frame of 6"):
         load_clip(A, skip="0-99")
 
 

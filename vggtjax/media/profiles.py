@@ -44,7 +44,7 @@ def _read(stored: bytes) -> Profile:
     try:
         profile = ImageCms.ImageCmsProfile(io.BytesIO(stored))
         name = one_line(ImageCms.getProfileDescription(profile) or "no name", 60)
-        space = profile.profile.xcolor_space.strip()
+        space = str(profile.profile.xcolor_space).strip()  # pyright: ignore[reportAttributeAccessIssue]: Pillow's stub
         if space not in _MODES:
             return Profile(unread.format(f"colour space {one_line(space, 8)}"))
         if "srgb" in name.lower():

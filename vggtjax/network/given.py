@@ -39,19 +39,19 @@ def as_images(images: Any) -> Float[Array, "B S H W 3"]:
 
     Raises InputError unless they have five axes, and for NaN and infinity, unless the call is traced by jit.
     """
-    images: Any = as_array("images", images)
-    if images.ndim != 5:
-        remedy = ": of one clip give images[None]" if images.ndim == 4 else ""
-        raise InputError(f"images have shape {tuple(images.shape)}; expected [B, S, H, W, 3]{remedy}")
-    is_known = not isinstance(images, Tracer | jax.ShapeDtypeStruct) and getattr(images, "is_fully_addressable", True)
-    if is_known and images.size and jnp.issubdtype(images.dtype, jnp.floating):
-        library = np if isinstance(images, np.ndarray) else jnp
+    given: Any = as_array("images", images)
+    if given.ndim != 5:
+        remedy = ": of one clip give images[None]" if given.ndim == 4 else ""
+        raise InputError(f"images have shape {tuple(given.shape)}; expected [B, S, H, W, 3]{remedy}")
+    is_known = not isinstance(given, Tracer | jax.ShapeDtypeStruct) and getattr(given, "is_fully_addressable", True)
+    if is_known and given.size and jnp.issubdtype(given.dtype, jnp.floating):
+        library = np if isinstance(given, np.ndarray) else jnp
         with jax.ensure_compile_time_eval():  # also where a caller's jit has closed over them
-            is_finite = np.asarray(library.isfinite(images))
+            is_finite = np.asarray(library.isfinite(given))
         if not is_finite.all():
             place = ", ".join(map(str, np.argwhere(~is_finite)[0]))
             raise InputError(
                 f"images have {np.sum(~is_finite)} values that are NaN or infinite, the first at [{place}]; one of "
                 "them would spoil the depth of all frames: repair them, or leave out their frames"
             )
-    return images
+    return given
