@@ -43,8 +43,7 @@ def as_images(images: Any) -> Float[Array, "B S H W 3"]:
     if given.ndim != 5:
         remedy = ": of one clip give images[None]" if given.ndim == 4 else ""
         raise InputError(f"images have shape {tuple(given.shape)}; expected [B, S, H, W, 3]{remedy}")
-    is_known = not isinstance(given, Tracer | jax.ShapeDtypeStruct) and getattr(given, "is_fully_addressable", True)
-    if is_known and given.size and jnp.issubdtype(given.dtype, jnp.floating):
+    if _is_known(given) and given.size and jnp.issubdtype(given.dtype, jnp.floating):
         library = np if isinstance(given, np.ndarray) else jnp
         with jax.ensure_compile_time_eval():  # also where a caller's jit has closed over them
             is_finite = np.asarray(library.isfinite(given))
@@ -55,3 +54,8 @@ def as_images(images: Any) -> Float[Array, "B S H W 3"]:
                 "them would spoil the depth of all frames: repair them, or leave out their frames"
             )
     return given
+
+
+def _is_known(array: Any) -> bool:
+    """Return whether this process has the values of an array."""
+    return not isinstance(array, Tracer | jax.ShapeDtypeStruct) and getattr(array, "is_fully_addressable", True)
