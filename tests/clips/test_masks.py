@@ -9,7 +9,7 @@ from PIL import Image, ImageOps
 from testing.seeded import seeded_images
 from tests.tiny import tiny_model
 from vggtjax import load_clip, reconstruct
-from vggtjax.clips.masks import load_masks, masks_at_clip_pixels, read_mask
+from vggtjax.clips.masks import MaskWarning, load_masks, masks_at_clip_pixels, read_mask
 from vggtjax.errors import ClipError, InputError
 
 WIDE, TALL = (90, 160), (160, 90)  # height, width
@@ -192,3 +192,20 @@ def test_frames_that_exif_turns(tmp_path, caplog, orientation, of):
         left, top, right, bottom = clip.valid_box[0]
         np.testing.assert_array_equal(found[top:bottom, left:right], np.asarray(shown) > 127)
     assert bool(caplog.messages) == (ambiguous and of != "exif")
+
+
+@pytest.mark.parametrize("given", ["folder", "array"])
+@pytest.mark.parametrize(("mode", "size"), [("crop", WIDE), ("pad", TALL)])
+def test_masks_the_wrong_way_round_are_said(tmp_path, given, mode, size):
+    """Of what moves little, the inverted mask moves nearly everywhere; padding does not count."""
+    frames = [np.full((*size, 3), 90, np.uint8)] * 3
+    right = np.zeros(size, np.uint8)
+    right[40:50, 40:60] = 255
+    names = ["a.png", "b.png", "c.png"]
+    clip = load_clip(str(written(tmp_path / "frames", frames, names)), size=70, patch=14, mode=mode)
+    wrong = written(tmp_path / "wrong", [255 - right] * 3, names)
+    masks = np.stack([255 - right > 0] * 3)
+    advice = "mogrify -negate" if given == "folder" else "give ~masks"
+    with pytest.warns(MaskWarning, match=rf"9[5-9]\..% of the pixels move by these masks.*{advice}"):
+        masks_at_clip_pixels(wrong if given == "folder" else masks, clip, clip)
+    masks_at_clip_pixels(~masks, clip, clip)  # warnings are errors here

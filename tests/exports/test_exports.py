@@ -284,3 +284,18 @@ def test_formats_without_pictures_refuse_their_source(tmp_path):
     with pytest.raises(InputError, match="mesh has no pictures, and is made at the model's size; leave --pictures out"):
         check_export(tmp_path / "a.ply", "mesh", pictures=True)
     check_export(tmp_path / "ROOM.PLY", "mesh")
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_result_without_points_is_not_exported(tmp_path, result, form):
+    """Where all moves there is no static point, and without depth none at all; poses and channels need no points."""
+    moves = replace(result, dynamic_mask=np.ones_like(result.dynamic_mask))
+    empty = replace(result, depth=np.zeros_like(result.depth))
+    name = "".join(("a", *FORMATS[form].suffixes[:1]))
+    if form in ("colmap", "colmap-text", "gsplat", "nerfstudio"):
+        with pytest.raises(InputError, match=f"{form} has the static points .* 100% .* the wrong way round"):
+            export_result(moves, tmp_path / name, form)
+    if form not in ("exr", "tum", "kitti"):
+        with pytest.raises(InputError):
+            export_result(empty, tmp_path / name, form)
+    assert not list(tmp_path.iterdir())

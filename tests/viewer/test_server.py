@@ -41,6 +41,19 @@ def test_on_this_machine_the_page_needs_no_token_and_nothing_else_is_served():
             assert "the page" not in body
 
 
+@pytest.mark.parametrize("name", ["hub.example.org", "box:8888", "192.168.1.7:8080", "<script>"])
+def test_a_page_asked_for_by_another_name_says_its_address(name):
+    """Behind a proxy, as of Jupyter, there is no token that could be brought: none was printed."""
+    with served() as server:
+        body = get(server, "/", Host=name)[1]
+        for words in (f"answers to this machine alone, as {server.door.url},", f"asked as {name}.", "--host 0.0.0.0"):
+            assert words in body
+    with served(host="0.0.0.0") as server:
+        assert "with ?token= at its end; under another name keep that end" in get(server, "/", Host=name)[1]
+        entered = get(server, f"/?token={server.door.token}", Host=name)
+        assert (entered[0], entered[2]["Location"]) == (303, ".")  # under a proxy's folder, too
+
+
 def test_elsewhere_every_request_needs_the_token():
     with served(host="0.0.0.0") as server:
         assert server.door.token
@@ -52,7 +65,7 @@ def test_elsewhere_every_request_needs_the_token():
             assert status == 403
             assert "the page" not in body
         status, _, headers = get(server, f"/?token={server.door.token}")
-        assert (status, headers["Location"]) == (303, "/")
+        assert (status, headers["Location"]) == (303, ".")
         assert "HttpOnly" in headers["Set-Cookie"]
         assert get(server, "/", Cookie=headers["Set-Cookie"].split(";")[0])[:2] == (200, "<p>the page</p>")
         assert get(server, "/any", Cookie=headers["Set-Cookie"].split(";")[0])[0] == 404

@@ -11,7 +11,7 @@ from starlette.responses import PlainTextResponse, RedirectResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from vggtjax.app.uploads import room_for
-from vggtjax.viewer.door import REFUSAL, Door
+from vggtjax.viewer.door import Door
 
 _UPLOADS = 8  # of the largest size are on the disk together
 _FORM = 2**20  # bytes around the files of an upload, and of any other request
@@ -47,7 +47,7 @@ class Guard:
         query = scope["query_string"].decode("latin-1")
         admitted = self._door.admits(headers.get("host", ""), query, headers.get("cookie", ""))
         if admitted == "closed":
-            return _text(403, REFUSAL)
+            return _text(403, self._door.refusal(headers.get("host", "")))
         if admitted == "enter":  # to the address without the token
             return RedirectResponse(".", status_code=303, headers={"set-cookie": self._door.cookie})
         path = scope["path"]

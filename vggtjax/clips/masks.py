@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
@@ -34,6 +35,7 @@ from vggtjax.storage.file_digest import file_digest
 
 logger = logging.getLogger(__name__)
 
+_ALL_MOVES = 0.95  # share of the pixels
 _WHITE = 127  # above it, a pixel of a picture in grey or colour moves
 _LABELS = ("P", "1")  # modes whose values are numbers of objects, not brightness
 _DEEP_LABELS = ("I", "I;16", "I;16B", "I;16L", "I;16N")  # and of 16 or 32 bits, unless white is their brightest
@@ -41,6 +43,10 @@ _DEEP_WHITE = 65535
 _SAME_SHAPE, _ACROSS = (2, 3, 4), (5, 6, 7, 8)  # orientations of EXIF that leave and that swap width and height
 _NEARLY = 16  # values by which black and white may be off; others are those of a picture
 _FEW_GREYS = 0.1  # share of the opaque pixels of a mask that are neither black nor white: its edges
+
+
+class MaskWarning(UserWarning):
+    """Given masks by which almost all moves: they may be the wrong way round."""
 
 
 def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
@@ -58,7 +64,7 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
         clip: what `load_clip` returned.
 
     Raises ClipError for a folder without pictures, or pictures that match no frames, have another shape than the
-    frames, or are too dark to be a mask.
+    frames, or are too dark to be a mask. Gives a MaskWarning where more than 95 % of the pixels move.
     """
     source = open_source(str(folder))
     if not isinstance(source, ImageFiles):
@@ -85,7 +91,10 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
             "%s is stored upside down or mirrored (its EXIF orientation); its mask is taken as of the upright frame",
             same_shape[0],
         )
-    return np.stack([_mask(path, clip, frame, turns) for frame, path in enumerate(paths)])
+    masks = np.stack([_mask(path, clip, frame, turns) for frame, path in enumerate(paths)])
+    advice = "white is what moves; if it is what rests, invert the pictures: magick mogrify -negate, on a copy"
+    _warn_of_inverted(masks, clip, f"{folder}: {advice}")
+    return masks
 
 
 def masks_at_clip_pixels(
@@ -99,7 +108,25 @@ def masks_at_clip_pixels(
     """
     if isinstance(masks, str | Path):
         return load_masks(masks, clip)
-    masks = np.asarray(masks)
+    fitted = _fitted(np.asarray(masks), clip, loaded)
+    _warn_of_inverted(fitted, clip, "masks: True is what moves; if it is what rests, give ~masks")
+    return fitted
+
+
+def _warn_of_inverted(masks: Bool[np.ndarray, "S H W"], clip: Clip, advice: str) -> None:
+    """Give a MaskWarning where almost all pixels that are not padding move, which leaves no static world."""
+    inside = np.zeros(masks.shape, bool)
+    for frame, (left, top, right, bottom) in enumerate(clip.valid_box):
+        inside[frame, top:bottom, left:right] = True
+    share = masks[inside].mean()
+    if share > _ALL_MOVES:
+        text = (
+            f"{share:.1%} of the pixels move by these masks, which leaves no static world to see cameras by; {advice}"
+        )
+        warnings.warn(text, MaskWarning, stacklevel=3)
+
+
+def _fitted(masks: np.ndarray, clip: Clip, loaded: Clip) -> Bool[np.ndarray, "S H W"]:
     expected = clip.images.shape[:3]
     sizes = {(int(height), int(width)) for height, width in clip.source_size}
     if masks.dtype == bool and masks.shape == expected:

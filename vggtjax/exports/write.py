@@ -91,12 +91,12 @@ def _write(
         case "colmap" | "colmap-text" | "gsplat":
             from vggtjax.exports.colmap import write_colmap
 
-            static, _ = _shown(result, exporting)
+            static = _static(result, form, exporting)
             write_colmap(path, items, result, static.cloud(result), "text" if form == "colmap-text" else "binary")
         case "nerfstudio":
             from vggtjax.exports.nerfstudio import write_nerfstudio
 
-            static, _ = _shown(result, exporting)
+            static = _static(result, form, exporting)
             write_nerfstudio(path, items, static.cloud(result))
         case "rerun":
             from vggtjax.exports.rerun import write_rerun
@@ -139,13 +139,27 @@ def _shown(
     result: Result, exporting: Exporting, most_moving: int | None = None
 ) -> tuple[ShownPoints, list[ShownPoints]]:
     percentile = exporting.confidence_percentile
-    return shown_points(
+    static, moving = shown_points(
         result,
         static_percentile=percentile,
         dynamic_percentile=percentile,
         most_static=exporting.points,
         most_moving=exporting.points if most_moving is None else most_moving,
     )
+    if not len(static.positions) + sum(len(points.positions) for points in moving):
+        raise InputError("the result has no point: no pixel has a depth; run again, and look at its report.html first")
+    return static, moving
+
+
+def _static(result: Result, form: ExportFormat, exporting: Exporting) -> ShownPoints:
+    """Return the static points. Raises InputError without any: no program could use such a model."""
+    static, _ = _shown(result, exporting)
+    if not len(static.positions):
+        raise InputError(
+            f"{form} has the static points of a result, and this one has none: {result.dynamic_mask.mean():.0%} of its "
+            "pixels move; are the masks the wrong way round (white is what moves)?"
+        )
+    return static
 
 
 def _counted(items: Iterator[View], count: int, progress: Progress | None) -> Iterator[View]:

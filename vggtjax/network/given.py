@@ -53,7 +53,7 @@ def as_images(images: Any) -> Float[Array, "B S H W 3"]:
                 f"images have {np.sum(~is_finite)} values that are NaN or infinite, the first at [{place}]; one of "
                 "them would spoil the depth of all frames: repair them, or leave out their frames"
             )
-    return given
+    return given  # pyright: ignore[reportReturnType]: checked where it is used
 
 
 def _is_known(array: Any) -> bool:

@@ -11,9 +11,7 @@ from http.cookies import CookieError, SimpleCookie
 from typing import Literal
 from urllib.parse import parse_qs, urlsplit
 
-from vggtjax.errors import InputError
-
-REFUSAL = "Open the whole address that vggtjax printed; without a token it answers on this machine only."
+from vggtjax.errors import InputError, one_line
 
 
 def listening(host: str, port: int) -> socket.socket:
@@ -49,6 +47,19 @@ class Door:
         host = socket.gethostname() if self.host in ("0.0.0.0", "::") else self.host
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + ("" if self.token is None else f"?token={self.token}")
+
+    def refusal(self, host: str) -> str:
+        """Return what a request under the name `host` that may not pass is told."""
+        if self.token is not None:
+            return (
+                "Open the whole address that vggtjax printed, with ?token= at its end; under another name keep that end"
+            )
+        return (
+            f"This server answers to this machine alone, as {self.url}, and was asked as {one_line(host, 80) or 'nobody'}. "
+            f"Open {self.url} on this machine, after ssh -L {self.port}:localhost:{self.port} if it is elsewhere. For "
+            "another name, as behind a proxy, start it again with --host 0.0.0.0: the address that it prints then ends "
+            "with ?token=..., which every name needs."
+        )
 
     @property
     def cookie(self) -> str:

@@ -6,7 +6,7 @@ from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import urlsplit
 
-from vggtjax.viewer.door import REFUSAL, Door, listening, token_for
+from vggtjax.viewer.door import Door, listening, token_for
 
 _SILENCE = 30  # seconds after which a connection that says nothing is closed
 
@@ -48,13 +48,14 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         address, door = urlsplit(self.path), self.server.door
-        admitted = door.admits(self.headers.get("Host", ""), address.query, self.headers.get("Cookie", ""))
+        host = self.headers.get("Host", "")
+        admitted = door.admits(host, address.query, self.headers.get("Cookie", ""))
         if admitted == "closed":
-            self._answer(HTTPStatus.FORBIDDEN, f"{REFUSAL}\n".encode())
+            self._answer(HTTPStatus.FORBIDDEN, f"{door.refusal(host)}\n".encode())
         elif address.path != "/":
             self._answer(HTTPStatus.NOT_FOUND, b"There is only one page here: /\n")
         elif admitted == "enter":
-            self._answer(HTTPStatus.SEE_OTHER, b"", **{"Location": "/", "Set-Cookie": door.cookie})
+            self._answer(HTTPStatus.SEE_OTHER, b"", **{"Location": ".", "Set-Cookie": door.cookie})
         else:
             self._answer(HTTPStatus.OK, self.server.page, "text/html")
 
