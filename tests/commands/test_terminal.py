@@ -2,9 +2,14 @@
 
 import errno
 import logging
+import os
+import subprocess
+import sys
 import warnings
+from functools import partial
 
 import pytest
+from PIL import Image
 
 from vggtjax.commands import main as cli
 from vggtjax.commands.report import Report
@@ -48,3 +53,18 @@ def test_names_of_files_forge_no_lines(tmp_path, capsys, monkeypatch):
         cli.main(["info", f"--{path.name}"])
     out, err = capsys.readouterr()
     assert all(letter == "\n" or letter.isprintable() for letter in out + err)
+
+
+@pytest.mark.parametrize("code", ["cp1252", "ascii", "shift_jis"])
+def test_output_in_a_code_page_without_the_letters_of_a_folder(tmp_path, code):
+    """As on Windows, where output goes to a file: the work is done, and letters that the file cannot hold are "?"."""
+    folder = tmp_path / "Видео-写真-é"
+    folder.mkdir()
+    Image.new("RGB", (64, 48), "teal").save(folder / "a.png")
+    environment = os.environ | {"PYTHONIOENCODING": code, "PYTHONUTF8": "0"}
+    run = partial(subprocess.run, capture_output=True, env=environment, timeout=120)
+    told = run([sys.executable, "-m", "vggtjax", "info", str(folder)])
+    assert told.returncode == 0, told.stderr
+    assert folder.name.encode(code, "replace") in told.stdout
+    missing = run([sys.executable, "-m", "vggtjax", "info", f"{folder}-нет"])
+    assert (missing.returncode, b"Traceback" in missing.stderr) == (2, False)

@@ -4,6 +4,8 @@ import http.client
 import threading
 from contextlib import contextmanager
 
+import pytest
+
 from vggtjax.viewer.server import PageServer
 
 UPGRADE = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "eA=="}

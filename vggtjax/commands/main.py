@@ -87,6 +87,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0, 1 if nobody reads the output or a check does not hold, 2 for errors, 130 if interrupted.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # redirected, it may have a code page without a folder's letters
+            stream.reconfigure(errors="replace")
     keep_freed_memory(training=list(arguments[:1]) == ["train"])
     give_devices_threads()
     atexit.register(gc.freeze)  # at the end there is nothing to collect, and a last collection takes half a second

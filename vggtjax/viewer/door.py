@@ -55,7 +55,7 @@ class Door:
                 "Open the whole address that vggtjax printed, with ?token= at its end; under another name keep that end"
             )
         return (
-            f"This server answers to this machine alone, as {self.url}, and was asked as {one_line(host, 80) or 'nobody'}. "
+            f"This server answers to this machine alone, as {self.url}, and was asked as {one_line(host, 80) or '?'}. "
             f"Open {self.url} on this machine, after ssh -L {self.port}:localhost:{self.port} if it is elsewhere. For "
             "another name, as behind a proxy, start it again with --host 0.0.0.0: the address that it prints then ends "
             "with ?token=..., which every name needs."
