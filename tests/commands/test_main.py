@@ -214,7 +214,7 @@ def test_interruption_while_modules_are_imported(monkeypatch, capsys):
 
     monkeypatch.delitem(sys.modules, "vggtjax.commands.main")
     monkeypatch.setattr(sys, "meta_path", [type("Finder", (), {"find_spec": staticmethod(interrupted)})])
-    assert __main__.run() == 130
+    assert __main__.answered() == 130
     assert capsys.readouterr().err == "vggtjax: interrupted\n"
 
 

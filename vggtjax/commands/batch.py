@@ -16,6 +16,7 @@ from vggtjax.commands.models import ModelFiles, check_named, load_on_worker
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
 from vggtjax.progress import Progress
+from vggtjax.storage.interruption import kept
 
 
 def batch(
@@ -69,7 +70,11 @@ def batch(
             run = partial(reconstruct_many, network, named, out, recipe=recipe, fusion=fitted, shard=shard)
             warning = network.warning
         outcomes: list[ClipOutcome] = []
-        with report.stage("clips") as show:
+
+        def stopped() -> str:
+            return f"{len(outcomes)} of {len(part)} clips are done; the same command goes on with the others"
+
+        with kept(stopped), report.stage("clips") as show:
             clock = _Clock(show)
             for outcome in run(progress=clock.progress):
                 outcomes.append(outcome)

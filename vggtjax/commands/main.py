@@ -41,6 +41,7 @@ from vggtjax.commands.train import train
 from vggtjax.commands.view import view
 from vggtjax.errors import InputError, VggtjaxError, message_line, one_line, printable
 from vggtjax.storage.cache import enable_compilation_cache
+from vggtjax.storage.interruption import message as message_of_interruption
 from vggtjax.storage.kept_memory import keep_freed_memory
 
 _START, _RESULTS, _MODELS = "Start", "Look at results, and pass them on", "Models"
@@ -133,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = f"{error.filename or 'a file'}: {error.strerror or error}"
         message, code = _OUT_OF_MEMORY if error.errno == errno.ENOMEM else text, 2
     except KeyboardInterrupt:
-        message, code = "interrupted", 130
+        message, code = message_of_interruption(), 130
     sys.stderr.write(f"vggtjax: {message_line(message)}\n")
     return code
 

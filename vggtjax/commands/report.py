@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from vggtjax.reconstruction import Reconstruction
     from vggtjax.results.report import ErrorTable
 
+_BY_STEP = ("windows",)  # stages whose steps are long enough for a line each in a log
 _LISTED_SECONDS = 0.5  # of compiling a program
 
 
@@ -63,8 +64,14 @@ class Report:
         label = f"{name} (once for clips of this shape)" if compiles else name
         task = self._progress.add_task(label, total=None)
         started = time.perf_counter()
+
+        def show(done: int, total: int | None) -> None:
+            self._progress.update(task, completed=done, total=total)
+            if name in _BY_STEP and not self._console.is_terminal:
+                self.note(f"{name} {done} of {total}, {time.perf_counter() - started:.1f} s")
+
         try:
-            yield lambda done, total: self._progress.update(task, completed=done, total=total)
+            yield show
         except BaseException:
             self._progress.stop_task(task)  # its clock
             raise

@@ -6,6 +6,7 @@ Consistent depth is the exception: it fits the joined clip, of up to 512 frames,
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -46,6 +47,7 @@ from vggtjax.results.folder import check_folder
 from vggtjax.results.no_mask import without_mask
 from vggtjax.results.report import RunFacts, versions
 from vggtjax.results.saving import Saving
+from vggtjax.storage.interruption import kept
 from vggtjax.storage.writing import locked_folder
 from vggtjax.windows.frames import SeenFrames, count_frames, window_clips
 from vggtjax.windows.join import JoinRule
@@ -53,6 +55,8 @@ from vggtjax.windows.plan import Windows, plan_windows
 from vggtjax.windows.store import FOLDER, WindowStore, write_cut
 from vggtjax.windows.tracks import Follow, Images, Start, Tracked
 from vggtjax.windows.whole import Whole, store_window
+
+logger = logging.getLogger(__name__)
 
 _JOINED = 12.0 + 12.0  # bytes of a pixel, beside the files of a result: blended arrays, windows
 
@@ -139,6 +143,11 @@ def reconstruct_long(
         "versions": versions(),
     }
     return run_windows(source, Path(out), windows, plan, tools, settings, consistent=consistent)
+
+
+def _stopped(store: WindowStore, windows: int) -> str:
+    """Return what an interruption says."""
+    return f"{store.count()} of {windows} windows are kept; the same command goes on from there"
 
 
 def tools_of(
@@ -230,7 +239,10 @@ def run_windows(
         write_cut(out, windows.window, windows.shared)
         whole = Whole(store, cut, tools.run, plan.rule, plan.on_stage)
         clip, seen = first, SeenFrames()
-        with seconds.stage("windows"), plan.on_stage("windows") as progress:
+        if before := store.count():
+            logger.info("%d of %d windows are kept from a run that was stopped", before, len(cut))
+        stopped = partial(_stopped, store, len(cut))
+        with kept(stopped), seconds.stage("windows"), plan.on_stage("windows") as progress:
             for number, clip in enumerate(chain([first], clips)):
                 seen.add(clip, cut[number])
                 store_window(number, clip, cut[number], store, tools.run, tools.describe)
@@ -242,7 +254,7 @@ def run_windows(
             queries = parse_queries(plan.tracks, seen.clip()) if isinstance(plan.tracks, str) else plan.tracks
             with seconds.stage("follow points"), plan.on_stage("follow points") as progress:
                 tracks = whole.tracks(queries, tools.follow, progress)
-        with seconds.stage("join and blend"):
+        with kept(stopped), seconds.stage("join and blend"):
             result = whole.result(clip, loops=not windows.no_loops, tracks=tracks)
 
         def pictures() -> Iterator[UInt8[np.ndarray, "h w 3"]]:

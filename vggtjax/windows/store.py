@@ -74,6 +74,10 @@ class WindowStore:
                 return result
         return None
 
+    def count(self) -> int:
+        """Return how many windows of the clip are stored, without those that close loops."""
+        return sum(path.stem.isdecimal() for path in self._folder.glob("*.npz"))
+
     def load(self, name: str) -> Reconstruction:
         """Return the stored result of a window. Raises ResultError where there is none."""
         return Reconstruction.load(self._folder / f"{name}.npz")

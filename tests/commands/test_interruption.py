@@ -1,0 +1,46 @@
+"""Ctrl-C while the main thread is in compiled code, and while it is in Python: what is kept is said, and it ends."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+_WORK = """
+import hashlib, signal, sys, time
+import vggtjax.commands.main
+from vggtjax.__main__ import run
+from vggtjax.storage.interruption import kept
+
+def work():
+    {before}
+    with kept(lambda: "1 of 3 windows are kept"):
+        print("working", flush=True)
+        {work}
+    return 5
+
+vggtjax.commands.main.main = work
+sys.exit(run())
+"""
+_COMPILED = 'hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)'  # for minutes, as XLA does; no signal is heard in it
+_PYTHON = "time.sleep(600)"
+_OWN = "signal.signal(signal.SIGINT, lambda *_: sys.exit(7))"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
+@pytest.mark.parametrize(
+    ("before", "work", "code", "said"),
+    [
+        ("pass", _COMPILED, 130, "vggtjax: interrupted; 1 of 3 windows are kept\n"),
+        ("pass", _PYTHON, 130, "vggtjax: interrupted; 1 of 3 windows are kept\n"),
+        (_OWN, _PYTHON, 7, ""),  # a handler of the program's own, as training has one, is left alone
+    ],
+)
+def test_an_interruption_ends_the_process_and_says_what_is_kept(before, work, code, said):
+    program = _WORK.format(before=before, work=work)
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=-1, stderr=-1, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "working\n"
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=60)[1] == said
+    assert process.returncode == code
