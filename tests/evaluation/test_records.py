@@ -148,6 +148,11 @@ def test_means_and_costs_by_hand():
     assert "depth_pixels" not in means
     ratio = {BOTH_OVER_ONE: pytest.approx(4 / 3)}
     assert costs(records[:2])["m"] == {"image features": 0.5, "first pass": 2.5, "second pass": 1.0} | ratio
+    plain, both = (dataclasses.replace(records[0], method=name) for name in ("vggt", "4dvggt-d"))
+    assert costs([plain, both]) == {
+        "vggt": {"image features": 1.0, "first pass": 3.0},
+        "4dvggt-d": seconds | {BOTH_OVER_ONE: 1.5},
+    }
 
 
 def test_tables_by_hand():

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vggtjax.errors import InputError, OutputError, ResultError, one_line
+from vggtjax.options import METHODS
 from vggtjax.storage.arrays import read_arrays, write_arrays
 from vggtjax.storage.json_values import Natural, read_json
 from vggtjax.storage.writing import remove_leftovers, writing
@@ -143,6 +144,7 @@ def summary(records: Sequence[Record]) -> dict[str, dict[str, float]]:
 
 _WEIGHTS = ("depth_pixels", "mask_frames")
 _VIDEO_DEPTH = ("abs_rel", "rmse", "delta1", "delta2", "delta3")
+_SECOND = ("dynamic mask", "second pass")  # stages
 _POOLED = {"j_mean": "j_pooled", "f_mean": "f_pooled"}  # metric -> its mean over the frames of all sequences
 
 
@@ -152,14 +154,16 @@ def _mean(records: Sequence[Record], metric: str, weights: Sequence[float]) -> f
 
 
 def costs(records: Sequence[Record]) -> dict[str, dict[str, float]]:
-    """Return the mean seconds of each stage by method; shared stages count for each of their methods.
+    """Return the mean seconds of each stage by method; stages that methods share count for each that needs them.
 
     `both passes over one` is the time of image features and both passes over the time of features and first pass.
     """
     means: dict[str, dict[str, float]] = {}
     for method in dict.fromkeys(record.method for record in records):
         own = [record.seconds for record in records if record.method == method and record.seconds]
-        stages = dict.fromkeys(stage for seconds in own for stage in seconds)
+        row = METHODS.get(method)
+        needless = _SECOND if row is not None and not row.needs_second_pass else ()
+        stages = dict.fromkeys(stage for seconds in own for stage in seconds if stage not in needless)
         mean = {stage: float(np.mean([seconds.get(stage, 0.0) for seconds in own])) for stage in stages}
         one = mean.get("image features", 0.0) + mean.get("first pass", 0.0)
         if one and "second pass" in mean:

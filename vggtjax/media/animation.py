@@ -12,7 +12,7 @@ from PIL import Image, ImageOps
 from vggtjax.errors import ClipError
 from vggtjax.media.arrays import frame_name
 from vggtjax.media.images import UNREADABLE, check_pixels, known_formats, to_rgb
-from vggtjax.media.sampling import Frame, Sampling
+from vggtjax.media.sampling import Frame, Sampling, before_it
 
 _FORMATS = ("WEBP", "PNG", "AVIF")  # of animations; GIF is a video
 _LEAST_MS, _USUAL_MS = 10, 100  # shorter times are shown for the usual one, as browsers do
@@ -56,9 +56,7 @@ class Animation:
         except ClipError:
             raise
         except UNREADABLE as error:
-            raise ClipError(
-                f"{self.path} breaks off at frame {index} ({error}); set max_frames, or write it anew"
-            ) from error
+            raise ClipError(f"{self.path} breaks off at frame {index} ({error}); {before_it(index)}") from error
 
 
 def is_animation(path: Path) -> bool:

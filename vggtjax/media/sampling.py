@@ -134,6 +134,11 @@ class Sampling:
             raise ClipError(f"start is {self.start}, but the source has only {count} frames; expected below {count}")
 
 
+def before_it(frame: int) -> str:
+    """Return what to do with a source that breaks off at a frame, counted in frames of the source."""
+    return f"write it anew, or take frames before {frame} alone (start, stride, max_frames)"
+
+
 class Source(Protocol):
     """A source of frames that can be read again and again."""
 

@@ -17,7 +17,7 @@ from vggtjax.errors import ClipError, check_regular
 from vggtjax.media.arrays import frame_name
 from vggtjax.media.colour import Colours, colours_of, rgb_pixels, tags
 from vggtjax.media.images import check_not_empty
-from vggtjax.media.sampling import Frame, Sampling
+from vggtjax.media.sampling import Frame, Sampling, before_it
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -295,5 +295,5 @@ def _expected_end(container: InputContainer, stream: VideoStream) -> float:
 def _unreadable(path: Path, count: int, error: Exception) -> ClipError:
     reason = getattr(error, "strerror", None) or error
     if count:
-        return ClipError(f"video {path} breaks off at frame {count} ({reason}); set max_frames, or write it anew")
+        return ClipError(f"video {path} breaks off at frame {count} ({reason}); {before_it(count)}")
     return ClipError(f"cannot read video {path}: {reason}; expected a whole file of a known video format")
