@@ -163,8 +163,8 @@ def adjust(
         blocks -= jnp.einsum("pma,pnb->mnab", cross / depth_curvature[:, None, None], cross)
         gradient -= jnp.einsum("pma,p->ma", cross, depth_slope / depth_curvature)
         if how.focal_prior is None:
-            none = jnp.zeros(())
-            of_focal = (jnp.zeros(P), jnp.zeros_like(gradient), none, none)
+            none = jnp.zeros((), gradient.dtype)
+            of_focal = (jnp.zeros(P, gradient.dtype), jnp.zeros_like(gradient), none, none)
         else:  # a longer focal length turns the ray inwards, and moves the position outwards
             inwards = jnp.einsum("mpij,mjk,pk->mpi", slope, turn, rays * np.array([[-1.0, -1, 0]], np.float32))
             by_focal = inwards + position - centre[jnp.asarray(others)[s]]
@@ -192,8 +192,8 @@ def adjust(
     rotation, translation = cameras.camera_from_world[..., :3], cameras.camera_from_world[..., 3] / unit
     still = jnp.concatenate([0 * translation, 0 * translation], axis=-1)  # on several devices, as the others are
     state = _State(rotation, translation, -jnp.log(depth / unit), 0 * unit, still)
-    state, _ = jax.lax.scan(step, state, how.sigma * jnp.array(how.annealed))
-    last = jnp.asarray(how.sigma * (how.annealed or (1.0,))[-1])
+    state, _ = jax.lax.scan(step, state, how.sigma * jnp.array(how.annealed, jnp.float32))
+    last = jnp.asarray(how.sigma * (how.annealed or (1.0,))[-1], jnp.float32)
 
     def outcome(s: Array) -> tuple[Array, ...]:
         world = seen(state, last, s)
