@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vggtjax.options import Options
-from vggtjax.pipeline.surroundings import own_settings
 from vggtjax.progress import OnStage, no_stage
 from vggtjax.refinement.consistent import consistent_depth
 from vggtjax.refinement.dense import KNOWN, PREDICTED
@@ -27,7 +26,6 @@ def agrees_with_pixels(options: Options) -> bool:
     return options.refine_cameras or options.consistent_depth
 
 
-@own_settings()
 def agree_with_pixels(
     result: R,
     pictures: Pictures,

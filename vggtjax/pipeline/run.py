@@ -24,6 +24,7 @@ from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.passes import Passes
 from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
+from vggtjax.network.surroundings import own_settings
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels, agrees_with_pixels
 from vggtjax.pipeline.arguments import check_kinds
@@ -40,7 +41,6 @@ from vggtjax.pipeline.inputs import GivenMasks, Inputs, read_inputs
 from vggtjax.pipeline.lengths import padded_frames, shared_length
 from vggtjax.pipeline.running import Running, changed
 from vggtjax.pipeline.steps import Compile, Execute, StageMemory
-from vggtjax.pipeline.surroundings import own_settings
 from vggtjax.progress import OnStage, Progress
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.refinement.refine import check_refinement

@@ -14,10 +14,11 @@ _NUMPY: dict[str, Any] = {"divide": "warn", "over": "warn", "under": "ignore", "
 
 @contextmanager
 def own_settings() -> Iterator[None]:
-    """Compute with 32 bits, with transfers to the device, and without errors of numpy, whatever the program has set.
+    """Compute with jax's and numpy's defaults, whatever the program has set; it also decorates a function.
 
-    That is `jax_enable_x64`, `jax_transfer_guard` and `numpy.seterr`. They hold again after the body. It also decorates
-    a function.
+    The settings are `jax_enable_x64`, `jax_numpy_dtype_promotion`, `jax_transfer_guard` and `numpy.seterr`. They are
+    the program's again after the body.
     """
-    with jax.enable_x64(False), jax.transfer_guard("allow"), np.errstate(**_NUMPY):
+    ours = jax.enable_x64(False), jax.numpy_dtype_promotion("standard"), jax.transfer_guard("allow")
+    with ours[0], ours[1], ours[2], np.errstate(**_NUMPY):
         yield
