@@ -25,6 +25,7 @@ from vggtjax.network.layers import Params
 from vggtjax.network.model import parameter_shapes
 from vggtjax.network.narrow import is_multiplied
 from vggtjax.network.quantised import Halves, Quantised, halves, is_quantised, is_stored, quantise
+from vggtjax.storage.backend import backend
 from vggtjax.storage.json_values import parse_json
 from vggtjax.storage.programs import kept_text
 from vggtjax.storage.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
@@ -163,7 +164,7 @@ def read_model(
     Raises CheckpointError, which counts the problems and lists the first ones, unless the file is a whole checkpoint of
     this library that fits its own configuration.
     """
-    path = Path(path)
+    path, platform = Path(path), backend()
     facts = _file_facts(path)
     tensors, metadata = read_tensors(path)
     config, stored_fields = _read_metadata(path, metadata)
@@ -185,7 +186,7 @@ def read_model(
         is_as_stored &= tensor.dtype == stored.dtype
         if is_narrowed:
             tensor = tensor.astype(numpy_dtype("bfloat16"), copy=False)
-            if key.endswith(".kernel") and jax.default_backend() == "cpu":
+            if key.endswith(".kernel") and platform == "cpu":
                 flat[key] = jax.block_until_ready(halves(tensor))
                 continue
         flat[key] = jax.device_put(tensor).block_until_ready()  # on a CPU, a view of the file if aligned

@@ -21,6 +21,7 @@ from vggtjax.config import (
     Witness,
 )
 from vggtjax.errors import InputError, check_choice, whole_number
+from vggtjax.storage.backend import backend
 from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields, without_defaults
 
@@ -268,6 +269,4 @@ class Options:
 
 def has_accelerator() -> bool:
     """Return whether jax has a GPU or TPU."""
-    import jax  # it takes a second, and a command line that is refused needs none
-
-    return jax.default_backend() != "cpu"
+    return backend() != "cpu"

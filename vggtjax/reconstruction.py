@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -111,6 +112,8 @@ class Reconstruction(Result):
             ResultError: anything but a whole result, of a known version.
             InputError: an unknown format, or a quaternion order that is missing or unknown.
         """
+        if not isinstance(path, str | os.PathLike):
+            raise ResultError(f"the path is a {type(path).__name__}; expected the folder of a result, as str or Path")
         path = Path(path)
         if format != "vggtjax":
             from vggtjax.results.foreign import read_foreign

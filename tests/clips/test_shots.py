@@ -110,3 +110,12 @@ def test_split_writes_a_result_of_each_shot_and_blank_frames_have_the_lowest_con
     assert "shot_2 of 2: from frame 4, 3 frames" in capsys.readouterr().err
     assert cli.main([*call, "--shots", "split", "--tracks", "grid:3", "--out", str(tmp_path / "no")]) == 2
     assert "--shots split and --tracks exclude each other" in capsys.readouterr().err
+
+
+def test_frames_that_are_dark_as_a_whole_are_warned_of(caplog):
+    dark = [np.stack(A).astype(np.uint16) * 16, (np.stack(A) / 255 / 255).astype(np.float32), [a // 16 for a in A]]
+    bright = [np.stack(A), [*dark[2][1:], A[0]], np.zeros_like(np.stack(A))]  # zeros are of one colour
+    for frames, is_dark in (*((frames, True) for frames in dark), *((frames, False) for frames in bright)):
+        caplog.clear()
+        load_clip(frames, mode="pad", size=112)  # with white around
+        assert ("the brightest pixel of all frames has" in caplog.text) == is_dark

@@ -51,3 +51,12 @@ def test_frames_are_named_by_their_index_in_the_source():
     assert [frame.name for frame in frames] == ["000001", "000003"]
     assert [np.asarray(frame.image)[0, 0, 0] for frame in frames] == [1, 3]
     assert all(frame.time is None and frame.image.mode == "RGB" and frame.image.size == (3, 2) for frame in frames)
+
+
+def test_bytes_in_16_bits_are_refused_and_dark_frames_of_16_bits_are_not():
+    values = np.arange(4 * 5 * 6 * 3).reshape(4, 5, 6, 3) % 256
+    for arrays in (values.astype(np.uint16), list(values.astype(">u2"))):
+        with pytest.raises(ClipError, match=r"uint16 and have no value above 255, .*; give array\.astype\(np\.uint8\)"):
+            ArrayFrames.from_arrays(arrays)
+    values[3, 0, 0, 0] = 256
+    assert len(ArrayFrames.from_arrays(values.astype(np.uint16)).arrays) == 4

@@ -105,9 +105,7 @@ def broken(tmp_path):
 def test_a_video_that_breaks_off_within_a_frame(broken, monkeypatch):
     path, ends = broken
     path.write_bytes(path.read_bytes()[: ends[8] - 2])
-    with pytest.raises(
-        ClipError, match=r"broken.mp4 breaks off at frame 8 .*, or take frames before 8 alone"
-    ):
+    with pytest.raises(ClipError, match=r"broken.mp4 breaks off at frame 8 .*, or take frames before 8 alone"):
         read(path)
     assert len(read(path, max_frames=8)) == 8  # nothing after the last frame taken is looked at
     monkeypatch.setattr("vggtjax.media.video._MOST_PIXELS", WIDTH * HEIGHT - 1)
@@ -179,3 +177,19 @@ def test_frames_are_let_go(even):
         assert not [thing for thing in gc.get_objects() if type(thing) is av.VideoFrame][1:]
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize(("codec", "pixels"), [("qtrle", "argb"), ("prores_ks", "yuva444p10le"), ("png", "rgb24")])
+def test_what_is_transparent_is_white_as_in_pictures(tmp_path, codec, pixels):
+    path = tmp_path / "a.mov"
+    colours = np.dstack([picture(5), np.full((HEIGHT, WIDTH), 255, np.uint8)])
+    colours[:, WIDTH // 2 :, 3] = 0
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=10)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(colours, format="rgba").reformat(format=pixels)))
+        container.mux(stream.encode())
+    frame = np.asarray(read(path)[0].image).astype(int)
+    is_clear = codec != "png"
+    np.testing.assert_allclose(frame[:, WIDTH // 2 + 4 :], 255 if is_clear else picture(5)[:, WIDTH // 2 + 4 :], atol=6)
+    np.testing.assert_allclose(frame[:, : WIDTH // 2 - 4], picture(5)[:, : WIDTH // 2 - 4], atol=6)

@@ -57,3 +57,15 @@ def test_without_iterations_only_the_differences_are_measured(clip):
     made = fast(clip.depth, Cameras(clip.poses, clip.K), clip.matched, clip.weight, GRID, how)
     np.testing.assert_allclose(made.depth, clip.depth, rtol=1e-5)
     assert np.linalg.norm(made.position - clip.matched, axis=-1)[clip.weight > 0].max() < 1e-3
+
+
+@pytest.mark.parametrize("focal_prior", [None, 0.1])
+def test_64_bits_of_jax_leave_it_in_32(clip, focal_prior):
+    arguments = (np.float32(clip.depth), Cameras(np.float32(clip.poses), np.float32(clip.K)))
+    arguments += (np.float32(clip.matched), np.float32(clip.weight), GRID, Adjustment(focal_prior=focal_prior))
+    plain = fast(*arguments)
+    with jax.enable_x64(True):
+        wide = fast(*arguments)
+    for own, other in zip(plain, wide, strict=True):
+        assert other.dtype == np.float32
+        np.testing.assert_allclose(own, other, rtol=1e-3, atol=1e-4)

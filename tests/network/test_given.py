@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from vggtjax import infer
+from vggtjax import encode, infer
 from vggtjax.errors import InputError
 from vggtjax.method.algorithm import run_method, run_passes
 from vggtjax.network.given import as_array
@@ -23,6 +23,7 @@ def _calls(params, config):
     """Return each public function of a batch, as a function of the images."""
     return {
         "forward": lambda images: forward(params, images, config, outputs=("camera",)).pose_encoding,
+        "encode": lambda images: encode(params, images, config),
         "run_passes": lambda images: run_passes(params, images, config, _VGGT).first.pose_encoding,
         "run_method": lambda images: run_method(params, images, config, _VGGT)[1].first.pose_encoding,
         "infer": lambda images: infer(params, images, config, options=_VGGT)[1].first.pose_encoding,
@@ -48,6 +49,13 @@ def test_a_pixel_that_is_not_finite_is_named(calls, images, value, library):
     for call in calls.values():
         with pytest.raises(InputError, match=r"1 values that are NaN or infinite, the first at \[0, 1, 3, 4, 2\]"):
             call(library(images))
+
+
+def test_bytes_are_refused(calls, images):
+    for call in calls.values():
+        for dtype in (np.uint8, np.int32):
+            with pytest.raises(InputError, match=rf"images have type {np.dtype(dtype)}; .*: divide bytes by 255"):
+                call((255 * images).astype(dtype))
 
 
 def test_images_that_a_jit_traces_are_not_looked_into(params, config, images):

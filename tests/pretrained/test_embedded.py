@@ -8,6 +8,7 @@ import jax
 import numpy as np
 import pytest
 
+from vggtjax import load_model
 from vggtjax.clips.truth import Truth
 from vggtjax.errors import CheckpointError, ClipError
 from vggtjax.pretrained import embedded as demo
@@ -62,3 +63,9 @@ def test_a_broken_installation_says_so(monkeypatch, tmp_path):
         demo.demo_model()
     with pytest.raises(ClipError, match=re.escape("is missing; install vggtjax again")):
         demo.demo_clip(tmp_path / "nothing.npz")
+
+
+def test_what_is_no_name_of_a_model_is_named():
+    for name in (None, 3, {"params": {}}, b"demo"):
+        with pytest.raises(CheckpointError, match=f"named by a {type(name).__name__}; expected a path or a name"):
+            load_model(name)  # type: ignore

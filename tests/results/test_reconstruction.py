@@ -1,10 +1,14 @@
+import copy
 import dataclasses
+import io
+import pickle
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from tests.room import make_room
-from vggtjax.errors import ResultError
+from vggtjax.errors import InputError, ResultError
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.results.result import FieldOfViewWarning
 from vggtjax.storage import arrays as archive
@@ -112,3 +116,32 @@ def test_archives_that_are_not_results(stored, changes, message):
     with pytest.raises(ResultError, match=message) as error:
         Reconstruction.load(path)
     assert str(path) in str(error.value)
+
+
+def test_all_arrays_can_be_written_and_are_not_the_callers():
+    room = make_room()
+    saliency = np.array(room.saliency)
+    saliency.flags.writeable = False
+    result = dataclasses.replace(room, saliency=saliency, dynamic_mask=jnp.asarray(room.dynamic_mask))
+    for name in ("depth", "saliency", "dynamic_mask", "camera_from_world", "intrinsics", "images"):
+        getattr(result, name)[0] = 0
+    assert saliency[0].any() == np.asarray(room.saliency)[0].any()
+    assert not result.saliency[0].any()
+
+
+def test_a_copy_is_equal_and_apart():
+    room = make_room()
+    for other in (copy.deepcopy(room), pickle.loads(pickle.dumps(room))):  # noqa: S301 - its own bytes
+        for field in dataclasses.fields(room):
+            np.testing.assert_equal(getattr(other, field.name), getattr(room, field.name))
+        other.depth[0] = 0
+        assert room.depth[0].any()
+
+
+def test_what_is_no_path_and_no_result_is_named():
+    for path in (None, b"out", io.BytesIO(), 3):
+        with pytest.raises(ResultError, match=f"the path is a {type(path).__name__}; expected the folder of a result"):
+            Reconstruction.load(path)  # type: ignore
+    for other in ("demo-output", [make_room()]):
+        with pytest.raises(InputError, match=f"a {type(other).__name__} is given to the viewer; expected results"):
+            make_room().view(other)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Float64, Int, UInt8
 
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.clips.preprocessing import Fit, Fitter, Framing, Mode
-from vggtjax.clips.shots import looks_of, warn_of_shots
+from vggtjax.clips.shots import looks_of, warn_of_dark, warn_of_shots
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.clips.still import same_picture
 from vggtjax.config import VGGTConfig
@@ -208,6 +208,7 @@ def read_clip(
     boxes = np.array([fit.box for fit in fits], np.int64)
     if warn and not is_part:
         warn_of_shots(looks_of(images, boxes), names, sampling)
+        warn_of_dark(images, boxes)
     return Clip(
         images=images,
         frame_names=names,

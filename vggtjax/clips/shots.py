@@ -19,6 +19,7 @@ _SIDE = 32  # pixels of a thumbnail
 _SHIFTS = (-8, -4, 0, 4, 8)  # of thumbnails, as a camera turns
 _BINS = 8  # of each channel
 _FLAT = 0.04  # largest range of brightness, from the 2nd to the 98th percentile, of a frame without content
+_DARK = 4095 / 65535  # white, where 12 bits are stored in 16
 _FLASH = 0.2  # brightness above both neighbours, which are as bright as each other within half of it
 _LONGEST_FLASH = 2  # frames
 # A cut: colours differ (Hellinger's distance, squared) by so much more than between most frames of the clip, and no
@@ -95,6 +96,18 @@ def find_shots(looks: Sequence[Look]) -> Shots:
         else:
             joined.append(part)
     return Shots(blank, tuple(sorted(flashes)), tuple(range(part[0], part[-1] + 1) for part in joined))
+
+
+def warn_of_dark(images: Float32[np.ndarray, "S H W 3"], boxes: Int[np.ndarray, "S 4"]) -> None:
+    """Log that all frames are nearly black, as where their values were stored in more bits or divided twice."""
+    pictures = (image[top:bottom, left:right] for image, (left, top, right, bottom) in zip(images, boxes, strict=True))
+    brightest = max(float(picture.max()) for picture in pictures)
+    if 0 < brightest <= _DARK:
+        logger.warning(
+            "the brightest pixel of all frames has %.1f of 255, and the model sees little in the dark; where 8, 10 or "
+            "12 bits were stored in 16, or bytes divided by 255 twice, scale the values, so that white is the largest",
+            255 * brightest,
+        )
 
 
 def warn_of_shots(looks: Sequence[Look], names: Sequence[str], sampling: Sampling) -> Shots:

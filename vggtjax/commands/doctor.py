@@ -76,8 +76,10 @@ def facts(gpu: str | None = None) -> dict[str, Any]:
     """
     import jax
 
+    from vggtjax.storage.backend import backend
     from vggtjax.storage.free_memory import own_limits, rooms, total_bytes
 
+    backend()
     devices = []
     for device in jax.local_devices():
         stats = device.memory_stats() or {}

@@ -44,6 +44,11 @@ class ArrayFrames:
                 first = frame.ndim == 3 and frame.shape[0] == 3
                 remedy = ": put colours last, array.transpose(1, 2, 0)" if first else ", none empty"
                 raise ClipError(f"frame {frame_name(index)} has shape {frame.shape}; expected [H, W, 3]{remedy}")
+        if all(frame.dtype.kind == "u" and frame.itemsize == 2 and frame.max() <= 255 for frame in frames):
+            raise ClipError(
+                "the frames are uint16 and have no value above 255, so they would be black, as 65535 is white; give "
+                "array.astype(np.uint8)"
+            )
         return cls(frames)
 
     def total(self, sampling: Sampling) -> int:

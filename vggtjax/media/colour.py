@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from PIL import Image
 
 if TYPE_CHECKING:
     from av import VideoCodecContext, VideoFrame
@@ -88,6 +89,10 @@ def tags(decoder: VideoCodecContext) -> tuple[int, int, int]:
 def rgb_pixels(frame: VideoFrame, colours: Colours) -> np.ndarray:
     """Return the pixels of a frame as sRGB, uint8 [H, W, 3]. Raises what the decoder raises."""
     matrix = None if colours.matrix in (None, frame.colorspace) else _swscale(colours.matrix)
+    if colours.is_plain and any(component.is_alpha for component in frame.format.components):
+        clear = Image.fromarray(frame.to_ndarray(format="rgba", src_colorspace=matrix))
+        on_white = Image.alpha_composite(Image.new("RGBA", clear.size, "white"), clear)  # as transparent pictures
+        return np.array(on_white.convert("RGB"))
     if colours.is_plain:
         return frame.to_ndarray(format="rgb24", src_colorspace=matrix)
     return _to_srgb(frame.to_ndarray(format="rgb48le", src_colorspace=matrix), colours)

@@ -123,7 +123,7 @@ def adjust(
     focal, centre = K[:, [0, 1], [0, 1]][:, None], K[:, :2, 2][:, None]
     others = frame_pairs(S).others
     seen_by = np.concatenate([np.arange(S)[:, None], others], axis=1)  # [S, M + 1], the cameras that a patch connects
-    prior = jnp.repeat(jnp.array([how.rotation_prior, how.translation_prior]) ** -2.0, 3)
+    prior = jnp.repeat(jnp.array([how.rotation_prior, how.translation_prior], K.dtype) ** -2.0, 3)
 
     def seen(state: _State, sigma: Array, s: Array) -> _Seen:
         inverse, to, factor = jnp.exp(state.log_inverse[s]), jnp.asarray(others)[s], jnp.exp(state.log_focal)
@@ -163,8 +163,8 @@ def adjust(
         blocks -= jnp.einsum("pma,pnb->mnab", cross / depth_curvature[:, None, None], cross)
         gradient -= jnp.einsum("pma,p->ma", cross, depth_slope / depth_curvature)
         if how.focal_prior is None:
-            none = jnp.zeros(())
-            of_focal = (jnp.zeros(P), jnp.zeros_like(gradient), none, none)
+            none = jnp.zeros((), gradient.dtype)
+            of_focal = (jnp.zeros(P, gradient.dtype), jnp.zeros_like(gradient), none, none)
         else:  # a longer focal length turns the ray inwards, and moves the position outwards
             inwards = jnp.einsum("mpij,mjk,pk->mpi", slope, turn, rays * np.array([[-1.0, -1, 0]], np.float32))
             by_focal = inwards + position - centre[jnp.asarray(others)[s]]
@@ -192,8 +192,8 @@ def adjust(
     rotation, translation = cameras.camera_from_world[..., :3], cameras.camera_from_world[..., 3] / unit
     still = jnp.concatenate([0 * translation, 0 * translation], axis=-1)  # on several devices, as the others are
     state = _State(rotation, translation, -jnp.log(depth / unit), 0 * unit, still)
-    state, _ = jax.lax.scan(step, state, how.sigma * jnp.array(how.annealed))
-    last = jnp.asarray(how.sigma * (how.annealed or (1.0,))[-1])
+    state, _ = jax.lax.scan(step, state, how.sigma * jnp.array(how.annealed, K.dtype))
+    last = jnp.asarray(how.sigma * (how.annealed or (1.0,))[-1], K.dtype)
 
     def outcome(s: Array) -> tuple[Array, ...]:
         world = seen(state, last, s)
@@ -237,7 +237,7 @@ def _change(
     H = H.swapaxes(1, 2).reshape(6 * S, 6 * S) + jnp.diag(jnp.tile(prior, S))
     g = (jnp.zeros((S, 6), of.blocks.dtype).at[seen_by].add(of.gradient) + prior[None] * state.moved).ravel()
     g = jnp.where(is_free, g, 0)
-    H = jnp.where(is_free[:, None] & is_free[None], H, np.eye(6 * S))
+    H = jnp.where(is_free[:, None] & is_free[None], H, jnp.eye(6 * S, dtype=H.dtype))
     if how.focal_prior is not None:
         column = jnp.zeros((S, 6), H.dtype).at[seen_by].add(of.focal_cameras).ravel() * is_free
         corner = jnp.sum(of.focal_curvature) + how.focal_prior**-2
@@ -262,7 +262,7 @@ def _local_blocks(
 def _slope_of_projection(points: Float[Array, "M P 3"], focal: Float[Array, "M 1 2"]) -> Float[Array, "M P 2 3"]:
     """Return the derivative of the projected position by the point."""
     z = jnp.maximum(points[..., 2], _NEAREST)[..., None]
-    straight = jnp.einsum("mpi,ij->mpij", focal / z, jnp.eye(2, 3))
+    straight = jnp.einsum("mpi,ij->mpij", focal / z, jnp.eye(2, 3, dtype=z.dtype))
     return straight - jnp.pad((focal * points[..., :2] / z**2)[..., None], (*((0, 0),) * 3, (2, 0)))
 
 

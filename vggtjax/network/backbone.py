@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.block import Block, apply_block, with_remat_policy
+from vggtjax.network.given import as_images, check_floats
 from vggtjax.network.layers import Conv, LayerNorm, Params, apply, stack
 from vggtjax.network.precision import check_compute_dtype, full_precision, upcast
 
@@ -41,10 +42,12 @@ def encode(
         Tokens in row-major patch order, in float32 (float64 for compute_dtype "float64"). Both passes share them.
 
     Raises:
-        InputError: an invalid shape of the images, or an unknown compute_dtype.
+        InputError: an invalid shape or type of the images, or an unknown compute_dtype.
     """
     check_compute_dtype(compute_dtype)
+    images = as_images(images)
     patch_grid(images, config)
+    check_floats(images)
     return apply(Backbone(config, compute_dtype, remat), params["backbone"], images)
 
 

@@ -34,6 +34,12 @@ def as_array(name: str, value: Any) -> Any:
     return array
 
 
+def check_floats(images: Any) -> None:
+    """Raise InputError for images of whole numbers: bytes would be taken as RGB in [0, 1]."""
+    if not jnp.issubdtype(images.dtype, jnp.floating):
+        raise InputError(f"images have type {images.dtype}; expected floats in [0, 1]: divide bytes by 255")
+
+
 def as_images(images: Any) -> Float[Array, "B S H W 3"]:
     """Return images as `as_array` does.
 

@@ -21,7 +21,7 @@ from vggtjax.network.camera_head import ITERATIONS, CameraHead, predict_pose
 from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.dpt_head import DENSE_HEADS, DenseHead, predict_dense, project_tap
 from vggtjax.network.frames import Frames
-from vggtjax.network.given import as_array, as_images
+from vggtjax.network.given import as_array, as_images, check_floats
 from vggtjax.network.layers import Params
 from vggtjax.network.precision import Compute, full_precision
 from vggtjax.network.suppression import Suppression
@@ -259,8 +259,7 @@ def init_params(seed: int, config: VGGTConfig) -> Params:
 
 
 def _check(params: Params, grid: tuple[int, int], clips: ClipBatch, config: VGGTConfig, outputs: Sequence[str]) -> None:
-    if not jnp.issubdtype(clips.images.dtype, jnp.floating):
-        raise InputError(f"images have type {clips.images.dtype}; expected floats in [0, 1]: divide bytes by 255")
+    check_floats(clips.images)
     tokens_shape = (*clips.images.shape[:2], grid[0] * grid[1], config.embed_dim)
     if clips.patch_tokens is not None and tuple(clips.patch_tokens.shape) != tokens_shape:
         raise InputError(f"patch_tokens have shape {tuple(clips.patch_tokens.shape)}; expected {tokens_shape}")

@@ -13,6 +13,7 @@ from jaxtyping import Array
 from vggtjax.errors import InputError, whole_number
 from vggtjax.network.frames import AXIS, BY_FRAME, REPLICATED, Frames
 from vggtjax.pipeline.lengths import shared_length
+from vggtjax.storage.backend import backend
 
 
 def frames_mesh(devices: int) -> Mesh | None:
@@ -20,6 +21,7 @@ def frames_mesh(devices: int) -> Mesh | None:
 
     Raises InputError for fewer devices than that.
     """
+    backend()  # or an error that says what to do
     count, present = whole_number("devices", devices, 1), jax.devices()
     if count > len(present):
         advice = f"take at most {len(present)}"

@@ -24,8 +24,10 @@ from vggtjax.method.assembly import Assembly, FusionRule, as_tree, check_fuses
 from vggtjax.method.mask_refinement import refine_masks
 from vggtjax.method.passes import Passes
 from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
+from vggtjax.network.surroundings import own_settings
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels, agrees_with_pixels
+from vggtjax.pipeline.arguments import check_kinds
 from vggtjax.pipeline.devices import frames_mesh, on_host, replicate, shard_frames
 from vggtjax.pipeline.fields import (
     assembled_fields,
@@ -92,12 +94,14 @@ def reconstruct(
         DeviceMemoryError: the clip does not fit in the memory of the device.
         MissingExtraError: cameras are to be refined, and pycolmap is not installed.
     """
+    check_kinds(model=model, options=options, running=running, tracks=tracks, known=known)
     options, running = changed(options, running, changes)
     given = {"size": size, "masks": masks, "tracks": tracks, "fusion": fusion, "known": known}
     mines = options.row.makes_mask or agrees_with_pixels(options) or running.keep_passes
     return without_mask(with_own_mask(model, clip, options, running, mines=mines, **given))
 
 
+@own_settings()
 def with_own_mask(
     model: Model,
     clip: Clip | ClipSource,
@@ -130,6 +134,7 @@ def with_own_mask(
     return result
 
 
+@own_settings()
 def compile_ahead(
     model: Model,
     frames: int,
@@ -154,6 +159,7 @@ def compile_ahead(
             than there are.
         DeviceMemoryError: the clip does not fit in the memory of the device.
     """
+    check_kinds(model=model, options=options, running=running)
     patch = model.config.patch_size
     if frames < 1 or min(height, width) < patch or height % patch or width % patch:
         raise InputError(

@@ -15,6 +15,7 @@ from vggtjax.method.assembly import FusionRule, as_tree, assemble, check_fuses
 from vggtjax.method.fusion_file import fusion_digest
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
+from vggtjax.pipeline.arguments import check_kinds
 from vggtjax.pipeline.fields import assembled_fields
 from vggtjax.pipeline.run import refined, with_own_mask
 from vggtjax.pipeline.running import Running
@@ -49,6 +50,7 @@ def reconstruct_methods(
     Returns:
         The results by method, in the order of `methods`.
     """
+    check_kinds(model=model, options=options)
     options = options.changed(**changes)
     check_fuses(fusion, *methods)
     if options.refine_cameras:

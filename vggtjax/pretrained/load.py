@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import logging
+import os
 import re
 from contextlib import suppress
 from pathlib import Path
@@ -73,6 +74,10 @@ def load_weights(
         check_choice("dtype", dtype, get_args(LoadedDType))
     if compute_dtype is not None:
         check_choice("compute_dtype", compute_dtype, get_args(ComputeDType))
+    if not isinstance(name_or_path, str | os.PathLike):
+        raise CheckpointError(
+            f"the model is named by a {type(name_or_path).__name__}; expected a path or a name, such as 'demo'"
+        )
     if str(name_or_path) == "demo":
         return demo_model(dtype or "float32", compute_dtype)
     weights = locate(name_or_path)

@@ -21,6 +21,7 @@ import scipy
 from jaxtyping import Float32, UInt8
 
 from vggtjax.known.intrinsics import shared_focal
+from vggtjax.network.surroundings import own_settings
 from vggtjax.progress import Progress, no_progress
 from vggtjax.refinement.cells import Cells, cells_of, grey_pictures
 from vggtjax.refinement.dense import PREDICTED, ROUNDS, CameraPriors, DenseWorld, adjust_to_pixels
@@ -70,6 +71,7 @@ class ConsistencyReport:
         )
 
 
+@own_settings()
 def consistent_depth(
     result: R,
     pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None,

@@ -15,6 +15,7 @@ from PIL import Image
 from vggtjax.method.matched_mask import is_moving, motion_pixels
 from vggtjax.method.matched_motion import VOTE, voted
 from vggtjax.method.matches import frame_pairs
+from vggtjax.network.surroundings import own_settings
 from vggtjax.refinement.cells import Cells, at_scale, cells_of, grey_pictures
 from vggtjax.refinement.consistent import FEWEST_FRAMES, MOST_FRAMES
 from vggtjax.refinement.pixel_matches import PixelMatches, Window, expected_matches, match_pixels
@@ -34,6 +35,7 @@ _LEAST = 0.2  # sum of the weights of a cell's matches, from which they tell its
 _OFFSET, _FLOOR = 0.25, 0.1  # score = log(difference + offset) + log(Gram + floor)
 
 
+@own_settings()
 def mask_by_pixels(result: R, pictures: Iterable[UInt8[np.ndarray, "h w 3"]] | None = None) -> R:
     """Return the result with the motion and the dynamic mask that its pixels tell, around its cameras and depth.
 

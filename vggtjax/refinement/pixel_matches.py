@@ -150,7 +150,7 @@ def _sample(picture: Float[Array, "H W"], places: Float[Array, "*N 2"]) -> Float
     H, W = picture.shape
     x, y = jnp.clip(places[..., 0] - 0.5, 0, W - 1.001), jnp.clip(places[..., 1] - 0.5, 0, H - 1.001)
     column, row = jnp.floor(x).astype(int), jnp.floor(y).astype(int)
-    right, down = x - column, y - row
+    right, down = x - column.astype(x.dtype), y - row.astype(y.dtype)
     flat, corner = picture.reshape(-1), row * W + column
     above = flat[corner] * (1 - right) + flat[corner + 1] * right
     below = flat[corner + W] * (1 - right) + flat[corner + W + 1] * right

@@ -328,7 +328,8 @@ def _cast(name: str, value: Any, dtype: np.dtype) -> np.ndarray:
     array = value if is_mapped(value) else np.asarray(value)
     if not np.can_cast(array.dtype, dtype, "same_kind"):
         raise ResultError(f"{name} has type {array.dtype}; expected {dtype}")
-    return array.astype(dtype, copy=False)
+    array = array.astype(dtype, copy=False)
+    return array if array.flags.writeable or is_mapped(array) else array.copy()  # arrays of jax cannot be written
 
 
 def _json_values(settings: Any) -> dict[str, Any]:

@@ -50,6 +50,9 @@ def viewer_page(
     Raises InputError for another number of results or names.
     """
     check_count(len(results))
+    for result in results:
+        if not isinstance(result, Result):
+            raise InputError(f"a {type(result).__name__} is given to the viewer; expected results, one by one")
     names = [f"{result.method}, {result.model_name}" for result in results] if names is None else list(names)
     if len(names) != len(results):
         raise InputError(f"{len(names)} names for {len(results)} results; expected one for each")
