@@ -1,6 +1,7 @@
 """What tests/method/test_mask.py runs in a process with several devices: masks, here and on eight devices.
 
-It prints JSON: for each method, the share of dynamic pixels, and whether the masks are equal.
+It prints JSON: for each method, the share of dynamic pixels, and whether the masks are equal; of attention in bfloat16,
+the largest difference, as a share of the largest value.
 """
 
 import json
@@ -14,6 +15,7 @@ from tests.static_world import GRID, PATCH, StaticWorld
 from vggtjax.method.mask import mine_mask
 from vggtjax.method.matched_mask import mine_matched_mask
 from vggtjax.network.frames import BY_FRAME, Frames
+from vggtjax.network.gathered_attention import gathered_attention
 from vggtjax.network.pose import encode_pose
 from vggtjax.pipeline.devices import frames_mesh
 from vggtjax.pipeline.lengths import shared_length
@@ -64,4 +66,13 @@ is_equal = all(
     np.allclose(a, b[:, :COUNT], atol=1e-4) for a, b in zip(*map(jax.tree.leaves, (alone, shared)), strict=True)
 )
 found["4dvggt-m"] = float(np.mean(alone.dynamic_mask)), is_equal and bool(alone.is_matched.all())
+
+q, k, v = (
+    jax.random.normal(key, (1, 8 * 60, 4, 16)).astype(jnp.bfloat16) for key in jax.random.split(jax.random.key(0), 3)
+)
+frames = Frames(mesh)
+alone = jax.jit(partial(gathered_attention, visible=None, frames=Frames()))(q, k, v)
+attend = frames.on_devices(partial(gathered_attention, visible=None, frames=frames), *(BY_FRAME,) * 3)
+difference = jnp.abs(jax.jit(attend)(q, k, v).astype(jnp.float32) - alone.astype(jnp.float32)) / jnp.abs(alone).max()
+found["attention in bfloat16"] = float(difference.max()), alone.dtype == jnp.bfloat16
 print(json.dumps(found))  # noqa: T201

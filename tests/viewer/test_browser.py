@@ -1,5 +1,6 @@
 """The page in a real browser: it opens from a file, plays, and shows the frame that is due."""
 
+import dataclasses
 import io
 
 import numpy as np
@@ -125,16 +126,47 @@ def test_two_results_side_by_side_and_swapped_by_a_key(page, room, tmp_path):
     assert page.complaints == []
 
 
-def test_the_first_view_swings_and_what_moves_glows_until_the_first_touch(browser, room, tmp_path):
+BRIGHT, DARK = (64, 255, 242), (5, 13, 26)  # the rims of the halo
+
+
+def rims(page):
+    """Return the number of pixels of each rim."""
+    shot = page.screenshot(clip={"x": 0, "y": 0, "width": 630, "height": 420})
+    pixels = np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"), int)
+    return [np.count_nonzero(np.abs(pixels - color).max(axis=-1) < 4) for color in (BRIGHT, DARK)]
+
+
+def test_the_first_view_swings_and_what_moves_has_a_halo_until_the_first_touch(browser, room, tmp_path):
     page = browser.new_page(viewport=SCREEN, reduced_motion="no-preference")
     open_page(page, tmp_path, [room])
     page.evaluate("window.vggtjax.viewer.adapt = () => {}")  # however slowly this machine draws
     first = page.evaluate("window.vggtjax.viewer.orbit.yaw")
-    turned = f"Math.abs(window.vggtjax.viewer.orbit.yaw - {first}) > 0.02"
-    page.evaluate(until(f"{turned} && window.vggtjax.viewer.glow > 0"))
+    page.evaluate(until(f"Math.abs(window.vggtjax.viewer.orbit.yaw - {first}) > 0.02"))
+    page.evaluate("window.vggtjax.welcome.rest()")  # the swing ends by itself, the halo does not
+    assert min(rims(page)) > 100
     page.keyboard.press("h")
-    yaw, glow = page.evaluate("[window.vggtjax.viewer.orbit.yaw, window.vggtjax.viewer.glow]")
-    page.evaluate("new Promise(done => setTimeout(done, 200))")
+    yaw = page.evaluate("window.vggtjax.viewer.orbit.yaw")
+    page.evaluate(until("window.vggtjax.viewer.halo === 0"))
     assert page.evaluate("window.vggtjax.viewer.orbit.yaw") == yaw
-    assert glow == 0
     page.close()
+
+
+@pytest.mark.parametrize("touch", ["wheel", "pointer", "key"])
+def test_where_nothing_is_to_move_by_itself_the_halo_is_still_there(page, room, tmp_path, touch):
+    open_page(page, tmp_path, [room])
+    page.evaluate(DRAWN)
+    page.mouse.move(300, 200)  # is no touch
+    assert min(rims(page)) > 100
+    {"wheel": lambda: page.mouse.wheel(0, 30), "pointer": page.mouse.down, "key": lambda: page.keyboard.press("x")}[
+        touch
+    ]()
+    page.evaluate(until("window.vggtjax.viewer.halo === 0"))
+    page.evaluate(DRAWN)
+    assert max(rims(page)) < 20
+
+
+def test_a_result_in_which_nothing_moves_has_no_halo(page, room, tmp_path):
+    still = dataclasses.replace(room, dynamic_mask=np.zeros_like(room.dynamic_mask))
+    open_page(page, tmp_path, [still])
+    page.evaluate(DRAWN)
+    assert max(rims(page)) < 20

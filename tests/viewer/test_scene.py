@@ -8,7 +8,8 @@ from scipy.spatial import KDTree
 
 from tests.room import make_room
 from vggtjax.results.shown import middle_and_radius
-from vggtjax.viewer.scene import Budget, Place, home_view, place_beside, scene_of
+from vggtjax.viewer.home import Place, home_view
+from vggtjax.viewer.scene import Budget, place_beside, scene_of
 
 SAME = Place(1.0, np.eye(3), np.zeros(3))
 
@@ -57,6 +58,34 @@ def test_the_first_view_has_the_framing_of_the_middle_picture_and_the_cameras_be
     assert wide == pytest.approx(depth * W / 2 / result.intrinsics[2, 0, 0], rel=1e-5)
     below = (result.camera_centres[2] - eye) @ -np.array(view["up"])
     assert 0.5 < below / ((result.camera_centres[2] - eye) @ ahead) / view["tangents"][1] < 1.5
+
+
+def turned(result, degrees):
+    """The result with another world: in its middle frame all is seen aside."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]], np.float32)
+    cameras = result.camera_from_world.copy()
+    cameras[len(cameras) // 2] = turn @ cameras[len(cameras) // 2]
+    return dataclasses.replace(result, camera_from_world=cameras)
+
+
+@pytest.mark.parametrize("degrees", [0, 20, -20])
+def test_the_first_view_shows_most_of_the_room_and_the_middle_of_what_moves_before_it(degrees):
+    result = turned(make_room(9), degrees)  # the middle camera, from which the view starts, looks aside
+    view = {name: np.array(value) for name, value in home_view(result, SAME).items()}
+    ahead = (view["target"] - view["eye"]) / np.linalg.norm(view["target"] - view["eye"])
+    right = np.cross(ahead, view["up"])
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(ahead, right), ahead])
+    points = (result.world_points() - view["eye"]) @ axes.T
+    at = np.abs(points[..., :2] / points[..., 2:] / view["tangents"]).max(axis=-1)
+    is_inside = (at < 1) & (points[..., 2] > 0)
+    assert is_inside[~result.dynamic_mask].mean() > 0.7
+    middle = np.median(points[result.dynamic_mask], axis=0)
+    assert np.abs(middle[:2] / middle[2] / view["tangents"]).max() < 1
+    static = points[~result.dynamic_mask & is_inside]
+    beside = np.abs(static[:, :2] / static[:, 2:] - middle[:2] / middle[2]).max(axis=1) < 0.03
+    assert (static[beside, 2] > 0.9 * middle[2]).all()
 
 
 def test_a_second_result_is_placed_on_the_first_camera_at_its_scale():

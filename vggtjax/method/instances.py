@@ -1,14 +1,17 @@
-"""The dynamic mask as objects: regions of each frame, matched to objects at their expected places."""
+"""The dynamic mask as objects: regions of each frame, matched to parts at their expected places, joined by motion."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float64, Int, UInt8
+from jaxtyping import Bool, Float, Float64, Int, UInt8
 
 from vggtjax.errors import InputError
+from vggtjax.method.moving_parts import MovingParts
 from vggtjax.storage.arrays import zeros_beside
 
 MOST = 255  # objects: ids fit the palette of a picture
@@ -17,11 +20,12 @@ GAP = 1  # frames for which an object may be lost
 _REACH = 2.0  # largest distance of a region from the expected place of its object, in sizes of the object
 _NEIGHBOURS = np.ones((3, 3), bool)
 _PART = 0.5  # share of a region at the expected place of an object that makes the region a part of that object
+_INSIDE = 0.5  # share of the expected place of an object in a region that makes the object a part of that region
 
 
 @dataclass
 class _Object:
-    """The state of an object after some frames."""
+    """The state of an object, or of a part of one, after some frames."""
 
     id: int
     frame: int  # the last one with the object
@@ -34,20 +38,38 @@ class _Object:
         """Return the expected movement since the last frame with the object."""
         return self.velocity * (frame - self.frame)
 
+    def places(self, frame: int, size: tuple[int, ...]) -> Int[np.ndarray, "N 2"]:
+        """Return the expected pixels that are inside the picture."""
+        places = np.rint(self.pixels + self.expected(frame)).astype(int)
+        return places[((places >= 0) & (places < size)).all(axis=1)]
+
+    def move(self, frame: int, region: Int[np.ndarray, "N 2"]) -> None:
+        """Go on as a region of this frame."""
+        centre = region.mean(axis=0)
+        self.velocity = (centre - self.centre) / (frame - self.frame)
+        self.frame, self.centre, self.pixels = frame, centre, region
+
 
 def find_instances(
-    dynamic_mask: Bool[np.ndarray, "S H W"], *, gap: int = GAP, least_share: float = LEAST_SHARE
+    dynamic_mask: Bool[np.ndarray, "S H W"],
+    points: Iterable[Float[np.ndarray, "H W 3"]] | None = None,
+    *,
+    gap: int = GAP,
+    least_share: float = LEAST_SHARE,
 ) -> UInt8[np.ndarray, "S H W"]:
     """Return the ids of moving objects, the same in all frames.
 
     The connected regions of a frame are matched one to one with the earlier objects, with the least sum of squared
     distances from the expected places (last place plus last velocity), in sizes of the object. A region without a match
-    that mostly covers the expected place of a matched object is a part of it; any other region is a new object. Objects
-    that touch are one region, which continues one of them. Objects are told apart if none moves by much more than its
-    own size between two frames.
+    that mostly covers the expected place of a matched object is a part of it; any other region is a new object. A
+    region at the expected places of several objects is shared by them: every pixel goes to the nearest. Objects that
+    touch and keep their places beside each other are one in the end: a rider and the scooter. Objects are told
+    apart if none moves by much more than its own size between two frames.
 
     Args:
         dynamic_mask: True on dynamic pixels.
+        points: of every frame, where its pixels are in the world, NaN where unknown; motion is compared there. None:
+            it is compared in the picture.
         gap: frames for which an object may vanish and keep its id.
         least_share: least share of a frame's pixels for a region to be an object.
 
@@ -62,9 +84,13 @@ def find_instances(
         raise InputError(f"gap is {gap} and least_share {least_share}; expected at least 0, and 0 to 1")
     ids = zeros_beside(dynamic_mask, np.int32)
     objects: list[_Object] = []
-    for frame, mask in enumerate(dynamic_mask):
-        regions = _regions(mask, max(1, least_share * mask.size))
+    parts, pixels = MovingParts(), np.moveaxis(np.indices(dynamic_mask.shape[1:]), 0, -1)
+    for frame, (mask, places) in enumerate(zip(dynamic_mask, repeat(pixels) if points is None else points)):  # noqa: B905
         known = [owner for owner in objects if frame - owner.frame <= 1 + gap]
+        whole = _regions(mask, max(1, least_share * mask.size))
+        shares = [_shares(region, known, frame, mask.shape) for region in whole]
+        regions = [share for of_region in shares for share in of_region]
+        alone = [len(of_region) == 1 for of_region in shares for _ in of_region]
         owners = _matched(known, regions, frame)
         expected = _painted([owner for owner in owners if owner is not None], frame, mask.shape)
         for number, region in enumerate(regions):
@@ -72,18 +98,42 @@ def find_instances(
             if owner is None:
                 objects.append(owner := _Object(len(objects) + 1, frame, region.mean(axis=0), np.zeros(2), region, 0))
             elif owners[number] is not None:
-                centre = region.mean(axis=0)
-                owner.velocity = (centre - owner.centre) / (frame - owner.frame)
-                owner.frame, owner.centre, owner.pixels = frame, centre, region
+                owner.move(frame, region)
             owner.volume += len(region)
             ids[frame, region[:, 0], region[:, 1]] = owner.id
-    names = np.zeros(len(objects) + 1, np.uint8)
-    for name, owner in enumerate(sorted(objects, key=lambda owner: -owner.volume)[:MOST], 1):
-        names[owner.id] = name
-    named = zeros_beside(dynamic_mask, np.uint8)
+            if alone[number] and owner.pixels is region:
+                parts.see(owner.id, frame, places[region[:, 0], region[:, 1]])
+        parts.touch(ids[frame], [{int(ids[frame, *share[0]]) for share in of_region} for of_region in shares])
+    return _named(ids, objects, parts.objects(len(objects)))
+
+
+def _named(ids: Int[np.ndarray, "S H W"], objects: list[_Object], joined: list[int]) -> UInt8[np.ndarray, "S H W"]:
+    """Return the ids of joined objects by their volume, the largest first."""
+    volumes = np.zeros(len(joined), np.int64)
+    np.add.at(volumes, joined[1:], [owner.volume for owner in objects])
+    order = [first for first in np.argsort(-volumes, kind="stable").tolist() if volumes[first]][:MOST]
+    names = np.zeros(len(joined), np.uint8)
+    names[order] = np.arange(1, len(order) + 1)
+    named = zeros_beside(ids, np.uint8)
     for frame, of_frame in enumerate(ids):
-        named[frame] = names[of_frame]
+        named[frame] = names[np.array(joined)[of_frame]]
     return named
+
+
+def _shares(
+    region: Int[np.ndarray, "N 2"], known: list[_Object], frame: int, size: tuple[int, ...]
+) -> list[Int[np.ndarray, "N 2"]]:
+    """Return a region, divided among the objects that are expected in it if it has room for them beside each other."""
+    inside = np.zeros(size, bool)
+    inside[region[:, 0], region[:, 1]] = True
+    there = [owner for owner in known if inside[tuple(owner.places(frame, size).T)].sum() > _INSIDE * len(owner.pixels)]
+    areas = sorted(len(owner.pixels) for owner in there)
+    if len(there) < 2 or len(region) - areas[-1] < _INSIDE * sum(areas[:-1]):  # one is hidden by the other
+        return [region]
+    expected = _painted(there, frame, size)
+    nearest = scipy.ndimage.distance_transform_edt(expected == 0, return_distances=False, return_indices=True)
+    owners = expected[tuple(nearest)][region[:, 0], region[:, 1]]
+    return [region[owners == owner] for owner in np.unique(owners)]
 
 
 def _regions(mask: Bool[np.ndarray, "H W"], least: float) -> list[Int[np.ndarray, "N 2"]]:
@@ -118,8 +168,7 @@ def _painted(owners: list[_Object], frame: int, size: tuple[int, ...]) -> Int[np
     """Return the ids of objects at their expected pixels, 0 elsewhere; small objects lie over large ones."""
     ids = np.zeros(size, np.int32)
     for owner in sorted(owners, key=lambda owner: -len(owner.pixels)):
-        places = np.rint(owner.pixels + owner.expected(frame)).astype(int)
-        places = places[((places >= 0) & (places < size)).all(axis=1)]
+        places = owner.places(frame, size)
         ids[places[:, 0], places[:, 1]] = owner.id
     return ids
 

@@ -186,7 +186,12 @@ class Result:
     @cached_property
     def instances(self) -> UInt8[np.ndarray, "S H W"]:
         """Moving objects: 0 where nothing moves, else the same id in all frames; see `find_instances`."""
-        return find_instances(self.dynamic_mask)
+        return find_instances(self.dynamic_mask, map(self._points_of_motion, range(len(self.depth))))
+
+    def _points_of_motion(self, frame: int) -> Float32[np.ndarray, "H W 3"]:
+        """Return the points of the world that a frame shows, NaN where the depth is unknown."""
+        depth = np.where(self._valid(frame), self.depth[frame], np.nan).astype(np.float32)
+        return unproject(depth, self.intrinsics[frame], self.camera_from_world[frame], pixel_offset=0.5)
 
     @property
     def camera_centres(self) -> Float32[np.ndarray, "S 3"]:

@@ -21,7 +21,8 @@ from vggtjax.errors import InputError, one_line
 from vggtjax.progress import Progress
 from vggtjax.results.result import Result
 from vggtjax.storage.writing import writing
-from vggtjax.viewer.scene import SAME_PLACE, Budget, place_beside, scene_of
+from vggtjax.viewer.home import SAME_PLACE
+from vggtjax.viewer.scene import Budget, place_beside, scene_of
 
 _FARTHEST = 1e30
 MOST_RESULTS = 9  # the keys 1 to 9 choose one

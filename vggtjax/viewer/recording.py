@@ -14,7 +14,8 @@ from vggtjax.progress import Progress
 from vggtjax.results.result import Result
 from vggtjax.results.shown import middle_and_radius, shown_points
 from vggtjax.storage.writing import writing
-from vggtjax.viewer.scene import FRUSTUM, SAME_PLACE, Budget, frame_rate, home_view, shown_widths
+from vggtjax.viewer.home import SAME_PLACE, home_view
+from vggtjax.viewer.scene import FRUSTUM, Budget, frame_rate, shown_widths
 
 
 def write_recording(

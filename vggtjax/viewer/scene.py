@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from cmap import Colormap
-from jaxtyping import Float, Float32, Float64, UInt8, UInt16
+from jaxtyping import Float, Float32, UInt8, UInt16
 from PIL import Image
 
 from vggtjax.cameras import frustum_corners
@@ -21,11 +21,11 @@ from vggtjax.results.shown import ShownPoints, middle_and_radius, relative_steps
 from vggtjax.results.tracks import SEEN
 from vggtjax.results.widths import point_widths
 from vggtjax.viewer.colors import TIME_RAMP, confidence_ranks, lacks, offered_colors
+from vggtjax.viewer.home import Place, home_view, median_depth, tangents
 
 LARGEST_STEP = 0.3  # of depth between neighbours, as a share; pixels beside larger ones are never shown
 _LEAST_MOVING = 200  # points of a frame
 FRUSTUM = 0.045  # of the scene's radius
-_BEHIND, _ABOVE = 0.35, 0.16  # of the median depth: where the first view stands from a camera
 _TILE, _SHEET = 256, 4096  # pixels: the longer side of a small picture; a side of the sheet that every browser takes
 
 
@@ -36,24 +36,9 @@ class Budget(NamedTuple):
     moving: int = 800_000  # of all frames together
 
 
-class Place(NamedTuple):
-    """Where a result's world lies in the page's: x -> scale * rotation x + offset."""
-
-    scale: float
-    rotation: Float64[np.ndarray, "3 3"]
-    offset: Float64[np.ndarray, " 3"]
-
-    def points(self, points: Float[np.ndarray, "*N 3"]) -> Float32[np.ndarray, "*N 3"]:
-        with np.errstate(over="ignore"):  # worlds of untrained weights
-            return (self.scale * (points @ self.rotation.T) + self.offset).astype(np.float32)
-
-
-SAME_PLACE = Place(1.0, np.eye(3), np.zeros(3))
-
-
 def place_beside(result: Result, first: Result) -> Place:
     """Return the place at which the first camera is that of `first`, and the median depth of its frame the same."""
-    scale = _median_depth(first) / _median_depth(result)
+    scale = median_depth(first) / median_depth(result)
     ours, theirs = (one.camera_from_world[0].astype(np.float64) for one in (result, first))
     rotation = theirs[:, :3].T @ ours[:, :3]
     offset = theirs[:, :3].T @ (scale * ours[:, 3] - theirs[:, 3])
@@ -125,11 +110,6 @@ def contracted(
     return ((inside + 1) * 32767.5).round().astype(np.uint16)
 
 
-def _median_depth(result: Result, number: int = 0) -> float:
-    frame = frame_of(result, number)
-    return float(np.median(frame.depth[frame.valid].astype(np.float64))) if frame.valid.any() else 1.0
-
-
 def _facts(result: Result) -> str:
     S, H, W = result.depth.shape
     frames = f"{S} frame{'s' if S > 1 else ''} of {W} x {H}"
@@ -188,32 +168,7 @@ def _cameras(result: Result, place: Place) -> dict[str, Any]:
         ],
         axis=-1,
     )
-    return {"poses": poses.astype(np.float32).ravel(), "tangents": _tangents(result).astype(np.float32).ravel()}
-
-
-def _tangents(result: Result) -> Float[np.ndarray, "S 2"]:
-    """Return the tangents of half the fields of view, of the width and of the height."""
-    _, H, W = result.depth.shape
-    return np.array([W, H]) / 2 / result.intrinsics[:, [0, 1], [0, 1]]
-
-
-def home_view(result: Result, place: Place) -> dict[str, Any]:
-    """Return the first view: behind and above the middle camera, along its axis.
-
-    At the median depth it is as wide as the picture of that camera, so the film's framing fills the canvas, and the
-    cameras lie low in the view, in front of what is near rather than of the subject.
-    """
-    number = len(result.depth) // 2
-    axes = result.camera_from_world[number, :, :3].astype(np.float64) @ place.rotation.T
-    centres = place.points(result.camera_centres).astype(np.float64)
-    depth = place.scale * _median_depth(result, number)
-    farthest_back = -((centres - centres[number]) @ axes[2]).min()
-    behind = _BEHIND * depth + np.clip(farthest_back, 0, depth / 2)
-    eye = centres[number] - behind * axes[2] - _ABOVE * depth * axes[1]
-    target = centres[number] + depth * axes[2]
-    tangents = _tangents(result)[number] * depth / max(float(np.linalg.norm(target - eye)), 1e-12)
-    view = {"eye": eye, "target": target, "up": -axes[1], "tangents": tangents}
-    return {name: np.nan_to_num(value).tolist() for name, value in view.items()}
+    return {"poses": poses.astype(np.float32).ravel(), "tangents": tangents(result).astype(np.float32).ravel()}
 
 
 def _tracks(result: Result, place: Place) -> dict[str, Any] | None:

@@ -6,10 +6,9 @@ async function main() {
     const viewer = new Viewer(element("scene"), await readData());
     const controls = new Controls(viewer);
     window.vggtjax = { viewer, controls };
-    if (!matchMedia("(prefers-reduced-motion: reduce)").matches) {
-      window.vggtjax.welcome = new Welcome(viewer);
-      if (viewer.result.frames > 1) controls.play(true);
-    }
+    const isCalm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    window.vggtjax.welcome = new Welcome(viewer, isCalm);
+    if (!isCalm && viewer.result.frames > 1) controls.play(true);
   } catch (error) {
     message.textContent = error.message;
     message.hidden = false;

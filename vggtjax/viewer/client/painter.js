@@ -30,8 +30,9 @@ class Painter {
   }
 
   // limits: least rank of the confidence, largest step of the depth, both in [0, 1].
-  // size: of a point, over its width. blend: a colour, and how much of it the points take on.
-  drawPoints(model, first, count, view, { limits, size, smallest = 1, blend = [0, 0, 0, 0] }) {
+  // size: of a point, over its width. blend: a colour, and how much of it the points take on. rim: pixels by which points
+  // are wider than they are; those of a rim leave no depths, so all that is drawn later lies over them.
+  drawPoints(model, first, count, view, { limits, size, smallest = 1, rim = 0, blend = [0, 0, 0, 0] }) {
     if (count <= 0) return;
     const { gl, points: { uniforms } } = this;
     this.use(this.points, view);
@@ -43,9 +44,12 @@ class Painter {
     gl.uniform1f(uniforms.size, size * narrowest * pixels);
     gl.uniform1f(uniforms.doublings, doublings);
     gl.uniform1f(uniforms.smallest, smallest);
+    gl.uniform1f(uniforms.rim, rim);
     gl.uniform2f(uniforms.limits, ...limits);
     gl.uniform4f(uniforms.blend, ...blend);
+    gl.depthMask(rim === 0);
     gl.drawArrays(gl.POINTS, first, count);
+    gl.depthMask(true);
   }
 
   drawLines(model, { first, count }, view, width, blend = [0, 0, 0, 0]) {

@@ -17,6 +17,7 @@ const POINTS = {
     uniform float size;  // of the narrowest point at distance 1, in pixels
     uniform float doublings;  // from the narrowest point to the widest
     uniform float smallest;
+    uniform float rim;  // pixels that are added
     uniform vec2 limits;  // least rank, largest step
     uniform vec4 blend;  // towards this colour, by this much
     uniform float pixels;  // of a length at distance 1
@@ -25,11 +26,11 @@ const POINTS = {
     flat out highp vec2 reach;  // distance from the eye, and half the width
     void main() {
       gl_Position = matrix * vec4(position, 1.0);
-      gl_PointSize = clamp(size * exp2(doublings * quality.z) / gl_Position.w, smallest, 64.0);
+      gl_PointSize = clamp(size * exp2(doublings * quality.z) / gl_Position.w, smallest, 64.0) + rim;
       if (quality.x < limits.x || quality.y > limits.y) gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
       shade = mix(color, blend.rgb, blend.a);
       roundness = gl_PointSize > 4.0 ? 0.25 : 1.0;  // small points are squares: discs would leave holes
-      reach = vec2(gl_Position.w, 0.5 * gl_PointSize * gl_Position.w / pixels);
+      reach = vec2(gl_Position.w, 0.5 * (gl_PointSize - rim) * gl_Position.w / pixels);
     }`,
   fragment: `${HIDING}
     in vec3 shade;

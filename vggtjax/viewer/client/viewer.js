@@ -1,7 +1,10 @@
 // What is shown, and when it is drawn again.
 
 const BACKGROUND = [38 / 255, 38 / 255, 46 / 255];
-const GLOW = [1, 90 / 255, 130 / 255]; // of moving points in the first seconds
+// Around what moves until the first touch: a dark rim around a bright one, which some surface may be like, never both.
+const RIMS = [{ rim: 4.5, color: [0.02, 0.05, 0.1] }, { rim: 3, color: [0.25, 1, 0.95] }]; // halves of CSS pixels
+const TINT = 0.25; // share of the bright rim's colour that the moving points take on
+const FADING = 900; // milliseconds in which the halo fades
 const FAINT = 0.5; // how much of the background's colour the cameras of other moments take on
 const SLOW = 42, FAST = 24; // milliseconds of a picture, above and below which fewer and more points are drawn
 const STILL = 160; // milliseconds without a change of the view, after which all points are drawn
@@ -23,7 +26,8 @@ class Viewer {
       color: 0, size: 1, leastStatic: 20, leastMoving: 20, steps: 0.08, trail: 0, static: true, moving: true,
       cameras: true, pictures: true, path: true, tracks: true, fly: false, active: 0, side: false, loop: true, speed: 1,
     };
-    this.glow = 0; // how much of its colour moving points take on
+    this.halo = 0; // around what moves, from 0 to 1
+    this.fades = false; // the halo, to 0
     this.time = 0; // in frames
     this.playing = false;
     this.budget = 60000; // points of the background while the view moves
@@ -101,6 +105,7 @@ class Viewer {
     this.last = now;
     this.advance(Math.min(passed, 1000));
     this.ontick?.(now, passed);
+    if (this.fades) this.fade(passed);
     const isTurning = this.settledAt !== null && now - this.settledAt < STILL;
     if (isTurning || this.playing) this.adapt(passed, isTurning);
     this.fitCanvas(isTurning || this.playing ? this.sharpness : 1);
@@ -114,6 +119,12 @@ class Viewer {
       this.wanted = true;
     } else if (this.settledAt !== null && now - this.settledAt > STILL) this.refine(views);
     if (this.wanted) this.compose(views);
+  }
+
+  fade(milliseconds) {
+    this.halo = Math.max(this.halo - milliseconds / FADING, 0);
+    this.fades = this.halo > 0;
+    this.wanted = true;
   }
 
   keyOf(views) {
@@ -215,7 +226,10 @@ class Viewer {
     for (let past = Math.min(trail, frame); moving && past >= 0; past--) {
       const [first, end] = result.offsets.subarray(frame - past, frame - past + 2);
       const options = { limits: [leastMoving / 100, steps / result.largestStep], size };
-      const blend = past ? [...BACKGROUND, 0.25 + (0.6 * past) / (trail + 1)] : [...GLOW, this.glow];
+      const blend = past ? [...BACKGROUND, 0.25 + (0.6 * past) / (trail + 1)] : [...RIMS[1].color, TINT * this.halo];
+      const ratio = Math.min(window.devicePixelRatio || 1, 2) * this.halo;
+      for (const { rim, color } of past || !this.halo ? [] : RIMS)
+        this.painter.drawPoints(model, first, end - first, view, { ...options, rim: 2 * rim * ratio, blend: [...color, 1] });
       this.painter.drawPoints(model, first, end - first, view, { ...options, blend });
     }
     for (let past = 0; tracks && result.tracks && past < Math.max(trail, 8) && past < frame; past++)
