@@ -7,11 +7,13 @@ import pytest
 from PIL import Image
 
 from vggtjax import Reconstruction, load_clip
-from vggtjax.clips.shots import find_shots, look_at, numbers_of, shot_samplings
+from vggtjax.clips.preprocessing import Fitter
+from vggtjax.clips.shots import find_shots, look_at, shot_samplings
 from vggtjax.clips.sources import open_source
 from vggtjax.commands import main as cli
 from vggtjax.errors import ClipError, InputError
 from vggtjax.media.sampling import Sampling
+from vggtjax.windows.frames import window_clips
 
 SIDE = 96
 
@@ -33,7 +35,22 @@ def shown(pictures):
 
 BLACK, GREY = np.zeros((SIDE, SIDE, 3), np.uint8), np.full((SIDE, SIDE, 3), 120, np.uint8)
 A, B = place(1, 6), place(2, 6)
-FLASH = [*A[:3], (255 - (255 - A[3].astype(int)) // 4).astype(np.uint8), *A[4:]]
+NIGHT = [(picture // 16).astype(np.uint8) for picture in A]  # within 16 of 255
+HALVES = np.concatenate([np.full((SIDE, 48, 3), (200, 0, 0)), np.full((SIDE, 48, 3), (0, 200, 0))], axis=1)
+
+
+def lit(pictures, *numbers):
+    """Return the pictures, those of these numbers as in a flash."""
+    bright = [(255 - (255 - picture.astype(int)) // 3).astype(np.uint8) for picture in pictures]
+    return [bright[i] if i in numbers else picture for i, picture in enumerate(pictures)]
+
+
+def grey(pictures):
+    return [np.repeat(picture.mean(axis=-1, keepdims=True), 3, axis=-1).astype(np.uint8) for picture in pictures]
+
+
+FLASH = lit(A, 3)
+LONG = place(1, 9)
 
 
 @pytest.mark.parametrize(
@@ -46,6 +63,12 @@ FLASH = [*A[:3], (255 - (255 - A[3].astype(int)) // 4).astype(np.uint8), *A[4:]]
         ([*A, GREY], (6,), (), [(0, 6)]),
         ([*A[:3], BLACK, *A[3:]], (3,), (), [(0, 7)]),
         (FLASH, (), (3,), [(0, 6)]),
+        (lit(LONG, 4, 5), (), (4, 5), [(0, 9)]),
+        (lit(LONG, 0), (), (0,), [(1, 9)]),
+        (lit(LONG, 8), (), (8,), [(0, 8)]),
+        (NIGHT, (), (), [(0, 6)]),
+        ([HALVES.astype(np.uint8)] * 3, (), (), [(0, 3)]),
+        ([*grey(place(1, 6, step=1)), *grey(place(2, 6, step=1))], (), (), [(0, 6), (6, 12)]),
         ([*A[:3], B[0], *A[3:]], (), (3,), [(0, 7)]),  # a picture of another place
         ([*A, *B], (), (), [(0, 6), (6, 12)]),
         ([*A, BLACK, *B], (6,), (), [(0, 6), (7, 13)]),
@@ -73,7 +96,31 @@ def test_they_are_named_with_what_to_do(caplog):
 def test_numbers_are_those_of_the_source(caplog):
     load_clip([BLACK, *A, *B], start=1, stride=2, size=98)
     assert "frames 1-5, 7-11" in caplog.text
-    assert numbers_of(["000003", "000006"], Sampling(fps=5)) == [3, 6]
+
+
+def test_numbers_of_pictures_with_times_are_places_in_the_folder(tmp_path, caplog):
+    for number, picture in enumerate([*A, *B]):
+        Image.fromarray(picture).save(tmp_path / f"{1403636579763555584 + number * 50_000_000}.png")
+    (first, second) = shot_samplings(open_source(tmp_path), Sampling(fps=10, skip="0"))
+    assert (first.start, second.start, second.max_frames, first.skip) == (2, 6, 3, "0")
+    assert "frames 2-4, 6-10" in caplog.text
+
+
+def test_clips_in_which_nothing_can_be_seen(caplog):
+    load_clip([BLACK, GREY], size=98)
+    assert "frames 0-1 are of one colour" in caplog.text
+    with pytest.raises(ClipError, match="all 2 frames are of one colour"):
+        shot_samplings(open_source([BLACK, GREY]), Sampling())
+
+
+def test_each_finding_of_a_long_clip_is_said_when_it_is_read(caplog):
+    source = open_source([BLACK, *A, *B])
+    windows = window_clips(source, Sampling(), Fitter("crop", 98, 14), [range(5), range(3, 9), range(7, 13)])
+    next(windows)
+    assert "frame 0 is of one colour" in caplog.text
+    assert len(caplog.messages) == 1
+    list(windows)
+    assert [("of one colour" in text, "2 shots" in text) for text in caplog.messages] == [(True, False), (False, True)]
 
 
 @pytest.mark.parametrize("stride", [None, 2])

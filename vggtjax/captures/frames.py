@@ -59,4 +59,4 @@ class CaptureFrames(ImageFiles):
             made = None if self.capture.undone is None else self.capture.undone[index]
             if made is not None:
                 image = made.picture(image)
-            yield Frame(self.frame_names[index], image, time)
+            yield Frame(self.frame_names[index], image, time, index=index)

@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Float64, Int, UInt8
 
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.clips.preprocessing import Fit, Fitter, Framing, Mode
-from vggtjax.clips.shots import looks_of, warn_of_dark, warn_of_shots
+from vggtjax.clips.shots import ShotWatch, warn_of_dark
 from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.clips.still import same_picture
 from vggtjax.config import VGGTConfig
@@ -175,6 +175,7 @@ def read_clip(
     if warn:
         warn_of_left_out(source)
     total = source.total(sampling)
+    watch = ShotWatch(sampling)
     names: list[str] = []
     times: list[float] = []
     pixels: list[Rendered] = []
@@ -182,7 +183,7 @@ def read_clip(
     rendering: deque[Future[Rendered]] = deque()
     workers = min(os.cpu_count() or 1, _MOST_WORKERS)
     with ThreadPoolExecutor(workers) as pool:  # Pillow resizes without holding the interpreter
-        for frame in source.frames(sampling):
+        for frame in watch.over(source.frames(sampling)):
             fit = fitter.fit(*frame.image.size, frame.name)
             width, height = fit.frame_size
             if 12 * width * height * (len(fits) + 1) > _MOST_BYTES:  # 3 channels of 4 bytes
@@ -207,7 +208,7 @@ def read_clip(
     images, fits = _joined(pixels, fits, warn=warn)
     boxes = np.array([fit.box for fit in fits], np.int64)
     if warn and not is_part:
-        warn_of_shots(looks_of(images, boxes), names, sampling)
+        watch.warn()
         warn_of_dark(images, boxes)
     return Clip(
         images=images,

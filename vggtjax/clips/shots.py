@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import itertools
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
 from PIL import Image
 
-from vggtjax.media.sampling import Sampling, Source
+from vggtjax.errors import ClipError
+from vggtjax.media.sampling import Frame, Sampling, Source
 
 logger = logging.getLogger(__name__)
 
 _SIDE = 32  # pixels of a thumbnail
 _SHIFTS = (-8, -4, 0, 4, 8)  # of thumbnails, as a camera turns
 _BINS = 8  # of each channel
-_FLAT = 0.04  # largest range of brightness, from the 2nd to the 98th percentile, of a frame without content
+_GREYS = 32  # bins of brightness
+_FLAT = 5  # of 255: the largest range of a channel in a frame without content, coarser than noise
 _DARK = 4095 / 65535  # white, where 12 bits are stored in 16
-_FLASH = 0.2  # brightness above both neighbours, which are as bright as each other within half of it
-_LONGEST_FLASH = 2  # frames
-# A cut: colours differ (Hellinger's distance, squared) by so much more than between most frames of the clip, and no
-# shift makes the thumbnails alike. Filmed neighbours have up to .02, of a fast camera at few frames a second .20 with a
-# median of .11; frames of two clips have .13 to .8, and are never as alike.
-_OTHER_COLOURS, _TIMES_MEDIAN, _ALIKE = 0.1, 3.0, 0.7
+_FLASH = 0.2  # brightness above the frames before and after, which are as bright as each other within half of it
+_LONGEST_FLASH = 3  # frames
+# A cut: colours or brightness are spread otherwise (Hellinger's distance, squared), or thumbnails are less alike under
+# every shift, by so much more than between most frames of the clip; and they are not very alike. Colours of filmed
+# neighbours have up to .02, of a fast camera at few frames a second .20 with a median of .11; of two clips .13 to .8.
+_OTHERWISE, _TIMES_MEDIAN, _UNLIKE = np.array([0.1, 0.1, 0.4]), 3.0, 0.3
 
 
 class Look(NamedTuple):
@@ -34,7 +36,7 @@ class Look(NamedTuple):
     is_blank: bool
     brightness: float
     thumbnail: Float32[np.ndarray, "32 32"]
-    colours: Float[np.ndarray, " 512"]  # shares of the pixels
+    spreads: tuple[Float[np.ndarray, " bins"], ...]  # of colours, of brightness: shares of the pixels
 
 
 class Shots(NamedTuple):
@@ -47,14 +49,15 @@ class Shots(NamedTuple):
 
 def look_at(picture: Image.Image) -> Look:
     """Return the look of an RGB picture."""
-    small = picture.resize((2 * _SIDE, 2 * _SIDE), Image.Resampling.BOX)
-    pixels = np.asarray(small)
-    grey = pixels.astype(np.float32).mean(axis=-1) / 255
-    low, high = np.percentile(grey, (2, 98))
-    codes = (pixels // (256 // _BINS)).astype(int) @ (_BINS**2, _BINS, 1)
-    shares = np.bincount(codes.ravel(), minlength=_BINS**3) / codes.size
-    thumbnail = grey.reshape(_SIDE, 2, _SIDE, 2).mean(axis=(1, 3))
-    return Look(bool(high - low < _FLAT), float(grey.mean()), thumbnail, shares)
+    pixels = np.asarray(picture.resize((2 * _SIDE, 2 * _SIDE), Image.Resampling.BOX))
+    grey = pixels.astype(np.float32).mean(axis=-1)
+    codes = (pixels // (256 // _BINS)).astype(int) @ (_BINS**2, _BINS, 1), (grey * (_GREYS / 256)).astype(int)
+    spreads = tuple(
+        np.bincount(code.ravel(), minlength=bins) / code.size
+        for code, bins in zip(codes, (_BINS**3, _GREYS), strict=True)
+    )
+    thumbnail = grey.reshape(_SIDE, 2, _SIDE, 2).mean(axis=(1, 3)) / 255
+    return Look(bool(np.ptp(pixels, axis=(0, 1)).max() <= _FLAT), float(grey.mean() / 255), thumbnail, spreads)
 
 
 def looks_of(images: Float32[np.ndarray, "S H W 3"], boxes: Int[np.ndarray, "S 4"]) -> list[Look]:
@@ -67,20 +70,15 @@ def find_shots(looks: Sequence[Look]) -> Shots:
     """Return what is no part of the scene, and the shots; a clip of a few pictures from afar has no cuts."""
     blank = tuple(i for i, look in enumerate(looks) if look.is_blank)
     kept = [i for i, look in enumerate(looks) if not look.is_blank]
-    flashes = {
-        b
-        for a, b, c in zip(kept, kept[1:], kept[2:], strict=False)
-        if looks[b].brightness > _FLASH + max(looks[a].brightness, looks[c].brightness)
-        and abs(looks[a].brightness - looks[c].brightness) < _FLASH / 2
-    }
+    flashes = _bright_runs(looks, kept)
     kept = [i for i in kept if i not in flashes]
     if not kept:
         return Shots(blank, tuple(sorted(flashes)), ())
-    distances = [_distance(looks[a], looks[b]) for a, b in itertools.pairwise(kept)]
-    bound = _OTHER_COLOURS + _TIMES_MEDIAN * float(np.median(distances)) if distances else 1.0
+    distances = [_distances(looks[a], looks[b]) for a, b in itertools.pairwise(kept)]
+    bound = _OTHERWISE + _TIMES_MEDIAN * np.median(distances, axis=0) if distances else np.ones(3)
     parts = [[kept[0]]]
     for (a, b), distance in zip(itertools.pairwise(kept), distances, strict=True):
-        if distance > bound and _likeness(looks[a], looks[b]) < _ALIKE:
+        if (distance > bound).any() and distance[-1] > _UNLIKE:
             parts.append([])
         parts[-1].append(b)
     joined = parts[:1]
@@ -89,7 +87,7 @@ def find_shots(looks: Sequence[Look]) -> Shots:
         if (
             before is not None
             and len(joined[-1]) <= _LONGEST_FLASH
-            and _distance(looks[before], looks[part[0]]) <= bound
+            and (_distances(looks[before], looks[part[0]]) <= bound).all()
         ):
             flashes.update(joined.pop())
             joined[-1].extend(part)
@@ -110,56 +108,111 @@ def warn_of_dark(images: Float32[np.ndarray, "S H W 3"], boxes: Int[np.ndarray, 
         )
 
 
-def warn_of_shots(looks: Sequence[Look], names: Sequence[str], sampling: Sampling) -> Shots:
-    """Log what is no part of the scene, by numbers of the source's frames, and what to do; return it."""
-    found = find_shots(looks)
-    number = numbers_of(names, sampling)
-    for positions, what in (
-        (found.blank, "{} of one colour: without depth, and bad for the cameras of the others"),
-        (found.flashes, "{} unlike those before and after, as a flash is: bad for the cameras of the others"),
-    ):
-        if positions and len(positions) < len(looks):
-            skipped = _as_ranges([number[i] for i in positions])
-            are = f"frame {skipped} is" if len(positions) == 1 else f"frames {skipped} are"
-            logger.warning("%s; leave out with --skip %s", what.format(are), skipped)
-    if len(found.shots) > 1:
-        spans = [f"{number[shot[0]]}-{number[shot[-1]]}" for shot in found.shots]
-        shown = ", ".join([*spans[:5], *(["..."] if len(spans) > 5 else [])])
-        first = found.shots[1]
-        logger.warning(
-            "the clip has %d shots: frames %s; their places would be mixed into one: --shots split makes a result of "
-            "each, or take one, such as with --start %d --max-frames %d",
-            len(spans), shown, number[first[0]], len(first),
-        )  # fmt: skip
-    return found
+class ShotWatch:
+    """Says what is no part of a clip's scene while its frames are read, each finding once."""
 
+    def __init__(self, sampling: Sampling) -> None:
+        self.looks: list[Look] = []
+        self.numbers: list[int] = []  # of the frames in the source
+        self._sampling = sampling
+        self._said = Shots((), (), ())
+        self._due = 0  # frames, before the next look over all
 
-def numbers_of(names: Sequence[str], sampling: Sampling) -> list[int]:
-    """Return the number in the source of each frame that was taken; with `fps` the frames' names are their numbers."""
-    if sampling.fps is not None:
-        return [int(name) if name.isdecimal() else i for i, name in enumerate(names)]
-    taken = filter(sampling.takes, itertools.count(sampling.start, sampling.step))
-    return list(itertools.islice(taken, len(names)))
+    def over(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """Yield the frames, and look at each."""
+        for position, frame in enumerate(frames):
+            self.looks.append(look_at(frame.image))
+            self.numbers.append(position if frame.index is None else frame.index)
+            yield frame
+
+    def warn_early(self) -> None:
+        """Do as `warn` where twice as many frames have been seen as at the last time."""
+        if len(self.looks) >= self._due:
+            self._due = 2 * len(self.looks)
+            self.warn()
+
+    def warn(self) -> Shots:
+        """Log what was found since the last call, by numbers of the source's frames, and what to do; return all."""
+        found = find_shots(self.looks)
+        for positions, said, what in (
+            (found.blank, self._said.blank, "of one colour: without depth, and bad for the cameras of the others"),
+            (found.flashes, self._said.flashes, "unlike those before and after, as a flash is: bad for the cameras"),
+        ):
+            if set(positions) - set(said):
+                numbers = as_ranges([self.numbers[i] for i in positions])
+                are = f"frame {numbers} is" if len(positions) == 1 else f"frames {numbers} are"
+                skip = self.skip([self.numbers[i] for i in positions])
+                advice = f"leave out with --skip {skip}" if len(positions) < len(self.looks) else "nothing can be seen"
+                logger.warning("%s %s; %s", are, what, advice)
+        if len(found.shots) > max(1, len(self._said.shots)):
+            spans = [f"{self.numbers[shot[0]]}-{self.numbers[shot[-1]]}" for shot in found.shots]
+            shown = ", ".join([*spans[:5], *(["..."] if len(spans) > 5 else [])])
+            first = found.shots[1]
+            logger.warning(
+                "the clip has %d shots: frames %s; their places would be mixed into one: --shots split makes a result "
+                "of each, or take one, such as with --start %d --max-frames %d",
+                len(spans), shown, self.numbers[first[0]], len(first),
+            )  # fmt: skip
+        self._said = found
+        return found
+
+    def skip(self, numbers: Sequence[int]) -> str | None:
+        """Return the frames to leave out, with those that are left out already, as `Sampling.skip`."""
+        parts = [self._sampling.skip, as_ranges(numbers)]
+        return ",".join(part for part in parts if part) or None
 
 
 def shot_samplings(source: Source, sampling: Sampling) -> list[Sampling]:
-    """Return what takes each shot of a source, without frames of one colour and flashes; reads the source once."""
-    looks, names = [], []
-    for frame in source.frames(sampling):
-        looks.append(look_at(frame.image))
-        names.append(frame.name)
-    found, number = warn_of_shots(looks, names, sampling), numbers_of(names, sampling)
-    left_out = sorted(number[i] for i in {*found.blank, *found.flashes})
-    own = [sampling.skip] if sampling.skip else []
-    skip = ",".join([*own, *([_as_ranges(left_out)] if left_out else [])]) or None
+    """Return what takes each shot of a source, without frames of one colour and flashes; reads the source once.
+
+    Raises ClipError where no frame is left.
+    """
+    watch = ShotWatch(sampling)
+    for _ in watch.over(source.frames(sampling)):
+        pass
+    found = watch.warn()
+    left_out = {*found.blank, *found.flashes}
+    skip = watch.skip([watch.numbers[i] for i in sorted(left_out)])
+    if not found.shots:
+        raise ClipError(
+            f"all {len(watch.looks)} frames are of one colour; expected a clip in which something can be seen"
+        )
     return [
-        Sampling(number[shot[0]], sampling.stride, sampling.fps, sum(number[i] not in left_out for i in shot), skip)
+        Sampling(watch.numbers[shot[0]], sampling.stride, sampling.fps, len(set(shot) - left_out), skip)
         for shot in found.shots
     ]
 
 
-def _distance(a: Look, b: Look) -> float:
-    return float(1 - np.sqrt(a.colours * b.colours).sum())
+def as_ranges(numbers: Sequence[int]) -> str:
+    """Return numbers in order as text: 0-2,17."""
+    parts: list[list[int]] = []
+    for number in numbers:
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1].append(number)
+        else:
+            parts.append([number])
+    return ",".join(f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts)
+
+
+def _bright_runs(looks: Sequence[Look], kept: Sequence[int]) -> set[int]:
+    """Return frames that are brighter than those before and after, or than one side at an end of the clip."""
+    bright = [looks[i].brightness for i in kept]
+    found: set[int] = set()
+    for length in range(1, _LONGEST_FLASH + 1):
+        for first in range(len(kept) - length + 1):
+            run, end = range(first, first + length), first + length
+            beside = bright[max(first - 1, 0) : first] + bright[end : end + 1]
+            if len(beside) < 2 and len(kept) < 2 * length + 2:  # too few to tell which are the odd ones
+                continue
+            if min(bright[i] for i in run) > _FLASH + max(beside) and max(beside) - min(beside) < _FLASH / 2:
+                found.update(kept[i] for i in run)
+    return found
+
+
+def _distances(a: Look, b: Look) -> Float[np.ndarray, " 3"]:
+    """Return how differently colours and brightness are spread, and how unlike the thumbnails are."""
+    spreads = [1 - np.sqrt(x * y).sum() for x, y in zip(a.spreads, b.spreads, strict=True)]
+    return np.array([*spreads, 1 - _likeness(a, b)])
 
 
 def _likeness(a: Look, b: Look) -> float:
@@ -172,14 +225,3 @@ def _correlation(a: np.ndarray, b: np.ndarray, y: int, x: int) -> float:
     other = b[max(0, -y) : _SIDE + min(0, -y), max(0, -x) : _SIDE + min(0, -x)]
     own, other = own - own.mean(), other - other.mean()
     return float((own * other).sum() / np.sqrt((own**2).sum() * (other**2).sum() + 1e-6))
-
-
-def _as_ranges(numbers: Sequence[int]) -> str:
-    """Return numbers in order as text: 0-2,17."""
-    parts: list[list[int]] = []
-    for number in numbers:
-        if parts and number == parts[-1][-1] + 1:
-            parts[-1].append(number)
-        else:
-            parts.append([number])
-    return ",".join(f"{part[0]}-{part[-1]}" if len(part) > 1 else f"{part[0]}" for part in parts)

@@ -39,7 +39,7 @@ class Animation:
     def frames(self, sampling: Sampling) -> Iterator[Frame]:
         """Yield the frames that `sampling` takes, upright and over white. Raises ClipError where the file breaks."""
         for index, time, picture in sampling.select(self._timed()):
-            yield Frame(frame_name(index), picture, time)
+            yield Frame(frame_name(index), picture, time, index=index)
 
     def _timed(self) -> Iterator[tuple[float, Image.Image]]:
         index = 0

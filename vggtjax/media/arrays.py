@@ -61,7 +61,8 @@ class ArrayFrames:
             name, values = frame_name(index), self.arrays[index]
             image = Image.fromarray(eight_bit(values, name))
             is_float = np.issubdtype(values.dtype, np.floating)
-            yield Frame(name, image, exact=values.astype(np.float32).clip(0, 1) if is_float else None)
+            exact = values.astype(np.float32).clip(0, 1) if is_float else None
+            yield Frame(name, image, exact=exact, index=index)
 
 
 def frame_name(index: int) -> str:

@@ -85,7 +85,8 @@ class ImageFiles:
         times = None if self.times is None else self.times.from_first
         for index in self.taken(sampling):
             path = self.paths[index]
-            yield Frame(path.stem, read_image(path, self._said), None if times is None else float(times[index]))
+            time = None if times is None else float(times[index])
+            yield Frame(path.stem, read_image(path, self._said), time, index=index)
 
 
 def stated_times(paths: Sequence[Path]) -> FrameTimes | None:
@@ -106,9 +107,8 @@ def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
     """Read an image file as upright RGB.
 
     The orientation of its EXIF data is applied, colours are converted to sRGB by its ICC profile, transparency is
-    composited over white, 16-bit values are scaled to
-    8 bits and floating-point values must lie in [0, 1]. With `said`, the kinds of warnings that were given, pictures
-    that use few of their bits or have others behind them are warned of.
+    composited over white, 16-bit values are scaled to 8 bits and floating-point values must lie in [0, 1]. With `said`,
+    the kinds of warnings that were given, pictures that use few of their bits or have others behind them are warned of.
 
     Raises ClipError for a file that is missing, empty, no image, truncated, corrupt, above Pillow's limit of pixels, or
     too short for the pixels that it says it has.

@@ -28,12 +28,14 @@ class Frame:
     """One frame of a source: its name, its upright RGB image and, for a video or some captures, its time in seconds.
 
     Of frames that are given as floating point, `exact` has the values in [0, 1] before they are rounded to 8 bits.
+    `index` is its number in the source, as `Sampling.start` counts.
     """
 
     name: str
     image: Image.Image
     time: float | None = None
     exact: Float32[np.ndarray, "H W 3"] | None = None
+    index: int | None = None
 
 
 @dataclass(frozen=True)

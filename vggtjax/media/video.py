@@ -100,7 +100,7 @@ class VideoFile:
                 pixels = rgb_pixels(frame, colours)
             except (av.error.FFmpegError, ValueError) as error:
                 raise _unreadable(self.path, index, error) from error
-            yield Frame(frame_name(index), Image.fromarray(upright(pixels, matrix)), time)
+            yield Frame(frame_name(index), Image.fromarray(upright(pixels, matrix)), time, index=index)
 
 
 def is_video_name(path: Path) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from vggtjax.clips.clip import Clip, read_clip, warn_of_left_out
 from vggtjax.clips.preprocessing import Fitter
-from vggtjax.clips.shots import looks_of, warn_of_shots
+from vggtjax.clips.shots import ShotWatch
 from vggtjax.errors import ClipError
 from vggtjax.media.sampling import Frame, Sampling, Source
 from vggtjax.results.result import Result
@@ -49,9 +49,10 @@ def window_clips(source: Source, sampling: Sampling, fitter: Fitter, windows: Se
     Raises ClipError where the source has fewer frames than planned, or its frames have several sizes.
     """
     warn_of_left_out(source)
-    reading = source.frames(sampling)
+    watch = ShotWatch(sampling)
+    reading = watch.over(source.frames(sampling))
     held: Clip | None = None
-    read, looks, names = 0, [], []
+    read = 0
     for window in windows:
         count = window.stop - read
         try:
@@ -62,10 +63,7 @@ def window_clips(source: Source, sampling: Sampling, fitter: Fitter, windows: Se
             raise _changed(read) from error
         if len(fresh) < count:
             raise _changed(read + len(fresh))
-        looks += looks_of(fresh.images, fresh.valid_box)
-        names += fresh.frame_names
-        if window.stop == windows[-1].stop:
-            warn_of_shots(looks, names, sampling)
+        (watch.warn if window.stop == windows[-1].stop else watch.warn_early)()
         clip = fresh if held is None else _joined(held, fresh)
         read = window.stop
         held = _part(clip, range(len(clip) - len(window), len(clip)))
