@@ -94,11 +94,37 @@ def test_transparency_lies_over_white(tmp_path):
     assert np.abs(pixels[4:] - GREEN).max() <= 4
 
 
-def test_grey_has_the_curve_of_its_profile(tmp_path):
-    Image.new("L", (8, 8), round(255 * 0.5**0.5556)).save(
-        tmp_path / "a.png", icc_profile=profile("Gray 1.8", None, 1.8, b"GRAY")
-    )
+@pytest.mark.parametrize("mode", ["L", "LA", "I;16"])
+def test_grey_has_the_curve_of_its_profile(tmp_path, mode):
+    value = round(255 * 0.5**0.5556)
+    picture = Image.new("L", (8, 8), value)
+    if mode == "I;16":
+        picture = Image.fromarray(np.full((8, 8), 257 * value, np.uint16))
+    picture.convert(mode).save(tmp_path / "a.png", icc_profile=profile("Gray 1.8", None, 1.8, b"GRAY"))
     assert np.abs(np.asarray(read_image(tmp_path / "a.png")).astype(int) - 188).max() <= 1  # half the light of white
+
+
+def test_grey_pictures_have_profiles_of_colours_too(tmp_path, caplog):
+    linear = profile("linear sRGB", TO_D50 @ to_xyz("Display P3"), 1.0)  # whatever its name says
+    Image.new("L", (64, 64), 55).save(tmp_path / "a.jpg", icc_profile=linear, quality=100)
+    assert np.abs(np.asarray(read_image(tmp_path / "a.jpg", set())).astype(int) - 128).max() <= 2
+    assert "'linear sRGB'; its colours are converted" in caplog.text
+
+
+def test_a_profile_of_another_kind_of_picture_is_said_to_be_unused(tmp_path, caplog):
+    Image.new("CMYK", (8, 8), (0, 128, 0, 0)).save(tmp_path / "a.tif", icc_profile=stored("Display P3"))
+    read_image(tmp_path / "a.tif", set())
+    assert "is CMYK and its colour profile is of RGB; it is not used" in caplog.text
+
+
+@pytest.mark.parametrize("ending", [".webp", ".png"])
+def test_animations_have_profiles(tmp_path, caplog, ending):
+    frames = [Image.new("RGB", (42, 42), in_space((60, green, 70), "Display P3")) for green in (170, 150)]
+    path = tmp_path / f"a{ending}"
+    frames[0].save(path, save_all=True, append_images=frames[1:], icc_profile=stored("Display P3"), lossless=True)
+    clip = load_clip(path, size=42)
+    assert np.abs(255 * np.asarray(clip.images)[:, 20, 20] - [(60, 170, 70), (60, 150, 70)]).max() <= 4
+    assert caplog.text.count("are converted to sRGB") == 1
 
 
 @pytest.mark.parametrize("broken", [b"no profile", stored("Display P3")[:200], bytes(1 << 23)])

@@ -77,7 +77,7 @@ def find_shots(looks: Sequence[Look]) -> Shots:
     distances = [_distances(looks[a], looks[b]) for a, b in itertools.pairwise(kept)]
     bound = _OTHERWISE + _TIMES_MEDIAN * np.median(distances, axis=0) if distances else np.ones(3)
     parts = [[kept[0]]]
-    for (a, b), distance in zip(itertools.pairwise(kept), distances, strict=True):
+    for b, distance in zip(kept[1:], distances, strict=True):
         if (distance > bound).any() and distance[-1] > _UNLIKE:
             parts.append([])
         parts[-1].append(b)

@@ -56,7 +56,8 @@ def open_source(source: ClipSource, *, undistort: bool = True) -> Source:
         if all(isinstance(item, (str, os.PathLike)) for item in items):
             return _from_list([Path(item) for item in items])
         if all(isinstance(item, Image.Image) for item in items):
-            items = [np.asarray(to_rgb(ImageOps.exif_transpose(item), f"{i}")) for i, item in enumerate(items)]
+            said: set[str] = set()
+            items = [np.asarray(to_rgb(ImageOps.exif_transpose(item), f"{i}", said)) for i, item in enumerate(items)]
         if all(hasattr(item, "__array__") for item in items):
             return ArrayFrames.from_arrays(items)
         kinds = ", ".join(sorted({type(item).__name__ for item in items}))

@@ -46,10 +46,10 @@ class Animation:
         try:
             with Image.open(self.path, formats=known_formats()) as image:
                 check_pixels(image, self.path)
-                hidden, milliseconds = _hidden(image), 0.0
+                hidden, milliseconds, said = _hidden(image), 0.0, set[str]()
                 for index in range(_count(image)):
                     image.seek(index + hidden)
-                    picture = to_rgb(ImageOps.exif_transpose(image), self.path.name)
+                    picture = to_rgb(ImageOps.exif_transpose(image), self.path.name, said)
                     shown = float(image.info.get("duration", 0))  # known when the frame is loaded
                     yield milliseconds / 1000, picture
                     milliseconds += shown if shown > _LEAST_MS else _USUAL_MS

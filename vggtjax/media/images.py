@@ -119,11 +119,12 @@ def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
         with Image.open(path, formats=known_formats()) as image:
             check_pixels(image, path)
             is_deep, count = _has_sixteen_bits(image), 1 if image.format in _SEVERAL else getattr(image, "n_frames", 1)
-            picture = to_rgb(ImageOps.exif_transpose(image), path.name)
-            note = profile_of(image).note
-            picture, coded_note = _by_code(picture, path, image.info.get("nclx_profile"), has_profile=note is not None)
-        if said is not None and (coded_note or note):
-            _say(path, str(coded_note or note), "colours", said)
+            upright, coded = ImageOps.exif_transpose(image), image.info.get("nclx_profile")
+            picture, note = _by_code(upright, path, coded) if coded else (None, None)
+            if picture is None:
+                picture = to_rgb(upright, path.name, said)
+        if said is not None and note is not None:
+            _say(path.name, note, "colours", said)
         if said is not None and count > 1:
             _say(path, f"holds {count} pictures; the first is read, write the others as files", "several", said)
         if said is not None and _is_panorama(image):
@@ -143,19 +144,20 @@ def read_image(path: Path, said: set[str] | None = None) -> Image.Image:
         raise ClipError(f"cannot read image {path}: {reason}; leave it out or write it anew") from error
 
 
-def _by_code(picture: Image.Image, path: Path, coded: Any, *, has_profile: bool) -> tuple[Image.Image, str | None]:
-    """Return a picture as sRGB, by the code of colours that its HEIF file states, and what was done, if anything was.
+def _by_code(picture: Image.Image, path: Path, coded: Any) -> tuple[Image.Image | None, str | None]:
+    """Return a HEIF file as sRGB by the code of colours that it states, and what was done.
 
-    The file is read again for its 10 or 12 bits, of which Pillow's pictures have 8.
+    None for plain colours, and for wide ones with an ICC profile. The file is read again for its 10 or 12 bits, of
+    which Pillow's pictures have 8.
     """
-    names = ("transfer_characteristics", "color_primaries")
-    transfer, primaries = (int(coded[name]) for name in names) if coded else (0, 0)
-    if transfer not in HDR and (has_profile or primaries not in WIDE):
-        return picture, None
+    transfer, primaries = (int(coded[name]) for name in ("transfer_characteristics", "color_primaries"))
+    if transfer not in HDR and (primaries not in WIDE or profile_of(picture).note):
+        return None, None
     file = pi_heif.open_heif(path, convert_hdr_to_8bit=False)
     deep = np.array(file)  # a copy: a view does not keep the file's memory
-    pixels = deep[..., :3] if deep.dtype == np.uint16 else np.asarray(picture).astype(np.uint16) * np.uint16(257)
-    pixels, note = srgb_of_coded(pixels, transfer, primaries)
+    if deep.dtype != np.uint16:
+        deep = np.asarray(to_rgb(picture, path.name)).astype(np.uint16) * np.uint16(257)
+    pixels, note = srgb_of_coded(deep[..., :3], transfer, primaries)
     return Image.fromarray(pixels), note
 
 
@@ -165,7 +167,7 @@ def _is_panorama(image: Image.Image) -> bool:
     return b"equirectangular" in (xmp if isinstance(xmp, bytes) else str(xmp).encode())[:_MOST_XMP]
 
 
-def _say(path: Path, note: str, kind: str, said: set[str]) -> None:
+def _say(path: Path | str, note: str, kind: str, said: set[str]) -> None:
     """Log what is odd about a picture, once for all of a kind."""
     if kind not in said:
         said.add(kind)
@@ -207,22 +209,30 @@ def has_transparency(image: Image.Image) -> bool:
     return not is_bare and image.has_transparency_data
 
 
-def to_rgb(image: Image.Image, name: str) -> Image.Image:
-    """Return an image of any mode and ICC profile as RGB in sRGB, as `read_image` does; errors say `name`."""
+def to_rgb(image: Image.Image, name: str, said: set[str] | None = None) -> Image.Image:
+    """Return an image of any mode and ICC profile as RGB in sRGB, as `read_image` does; errors and warnings say `name`.
+
+    With `said`, the kinds of warnings that were given, what becomes of its colours is warned of.
+    """
+    stored = image
     if image.mode == "I" or image.mode == "F" or image.mode.startswith("I;16"):
         values = np.asarray(image)
         if image.mode == "I":  # 32 bits that hold 16
             if values.min() < 0 or values.max() > 65535:
                 raise ClipError(f"frame {name} has values from {values.min()} to {values.max()}; expected 16 bits")
             values = values.astype(np.uint16)
-        return Image.fromarray(eight_bit(values, name)).convert("RGB")
-    if has_transparency(image):  # white is white in sRGB, too
-        stored, image = image, image.convert("RGBA")
+        image = Image.fromarray(eight_bit(values, name))
+    elif has_transparency(image):  # white is white in sRGB, too
+        image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image)
-        image.info = stored.info
+        image = image.convert("L" if stored.mode == "LA" else "RGB")
     elif image.mode not in ("L", "CMYK"):
         image = image.convert("RGB")
-    return in_srgb(image if image.mode != "RGBA" else image.convert("RGB")).convert("RGB")
+    image.info = stored.info
+    image, note = in_srgb(image)
+    if said is not None and note is not None:
+        _say(name, note, "colours", said)
+    return image
 
 
 def _has_sixteen_bits(image: ImageFile.ImageFile) -> bool:
