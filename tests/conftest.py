@@ -24,7 +24,6 @@ _CACHE_BYTES = 2**31  # a larger cache of compiled programs is emptied; a whole 
 
 gc.set_threshold(50_000, 50, 100)  # tracing makes many small objects, which are not garbage
 jax.config.update("jax_numpy_rank_promotion", "raise")
-jax.config.update("jax_numpy_dtype_promotion", "strict")  # as careful users set it
 settings.register_profile("untimed", deadline=None)  # a busy machine is no fault of the code
 settings.load_profile("untimed")
 

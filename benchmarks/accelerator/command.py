@@ -46,7 +46,7 @@ def accelerator(
 ) -> None:
     """Compile the programs of a reconstruction for accelerators that are not there, and count their kernels.
 
-    Needs the compilers: pip install 'vggtjax[accelerator]', or make accelerator.
+    Needs the compilers: pip install -e '.[accelerator]', or make accelerator.
 
     Args:
         targets: names of accelerators, or all.

@@ -144,7 +144,7 @@ def target(name: str) -> Target:
 def _require(platform: Platform) -> None:
     """Raise InputError unless the compiler for a platform is installed; tell jax where that for TPUs is."""
     if not any(map(find_spec, _COMPILERS[platform])):
-        raise InputError(f"the compiler for {platform} is not installed; pip install 'vggtjax[accelerator]'")
+        raise InputError(f"the compiler for {platform} is not installed; pip install -e '.[accelerator]'")
     if platform == "tpu":
         os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")  # of the cloud, about the machine: there is no TPU here
         os.environ.setdefault("TPU_LIBRARY_PATH", str(distribution("libtpu").locate_file("libtpu/libtpu.so")))

@@ -95,4 +95,4 @@ def test_a_missing_extra_and_a_short_token_are_named(capsys, monkeypatch):
     assert "expected letters and digits, at least 16" in capsys.readouterr().err
     monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: None)
     assert main(["app"]) == 2
-    assert "pip install 'vggtjax[app]'" in capsys.readouterr().err
+    assert "pip install -e '.[app]'" in capsys.readouterr().err

@@ -28,7 +28,7 @@ from vggtjax.options import Options
 from vggtjax.results.archive import ARCHIVE_NAME
 from vggtjax.storage.versions import running_versions
 
-pytest.importorskip("ray", reason="Ray is not installed: pip install 'vggtjax[cluster]'")
+pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[cluster]'")
 RECIPE = BatchRecipe(options=Options(method="vggt"))
 
 

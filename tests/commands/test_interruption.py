@@ -10,20 +10,29 @@ _WORK = """
 import hashlib, signal, sys, time
 import vggtjax.commands.main
 from vggtjax.__main__ import run
-from vggtjax.storage.interruption import kept
+from vggtjax.storage.interruption import handled, kept
 
 def work():
     {before}
     with kept(lambda: "1 of 3 windows are kept"):
-        print("working", flush=True)
         {work}
     return 5
 
 vggtjax.commands.main.main = work
 sys.exit(run())
 """
-_COMPILED = 'hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)'  # for minutes, as XLA does; no signal is heard in it
-_PYTHON = "time.sleep(600)"
+_WORKS = 'print("working", flush=True); '
+_COMPILED = (
+    _WORKS + 'hashlib.pbkdf2_hmac("sha256", b"", b"", 10**9)'
+)  # for minutes, as XLA does; no signal is heard in it
+_PYTHON = _WORKS + "time.sleep(600)"
+_SERVER = """
+        try:
+            print("working", flush=True); time.sleep(600)
+        except KeyboardInterrupt:
+            handled()
+            time.sleep(3)
+"""
 _OWN = "signal.signal(signal.SIGINT, lambda *_: sys.exit(7))"
 
 
@@ -33,6 +42,7 @@ _OWN = "signal.signal(signal.SIGINT, lambda *_: sys.exit(7))"
     [
         ("pass", _COMPILED, 130, "vggtjax: interrupted; 1 of 3 windows are kept\n"),
         ("pass", _PYTHON, 130, "vggtjax: interrupted; 1 of 3 windows are kept\n"),
+        ("pass", _SERVER, 5, ""),  # its normal end, which may take a while
         (_OWN, _PYTHON, 7, ""),  # a handler of the program's own, as training has one, is left alone
     ],
 )
@@ -42,5 +52,5 @@ def test_an_interruption_ends_the_process_and_says_what_is_kept(before, work, co
     assert process.stdout is not None
     assert process.stdout.readline() == "working\n"
     process.send_signal(signal.SIGINT)
-    assert process.communicate(timeout=60)[1] == said
+    assert process.communicate(timeout=20)[1] == said
     assert process.returncode == code

@@ -13,6 +13,7 @@ from typing import Any
 
 from vggtjax.app.jobs import Desk
 from vggtjax.errors import OutputError
+from vggtjax.storage.interruption import handled
 from vggtjax.viewer.door import Door
 
 _CLOSING = 2  # seconds for open connections at the end
@@ -46,6 +47,7 @@ def serve(application: Any, opened: socket.socket) -> None:
     )
     with suppress(KeyboardInterrupt):  # its normal end
         uvicorn.Server(config).run(sockets=[opened])
+    handled()
 
 
 def build_application(desk: Desk, door: Door) -> Any:

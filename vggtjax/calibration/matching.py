@@ -44,8 +44,8 @@ class CameBack:
         pairs = frame_pairs(S)
         compared = pairs.exist & (np.abs(pairs.offsets) == min(_STEP, S - 1))
         comes_back = ((found.cycle < CYCLE) & (found.confidence > 0)).sum(axis=-1)
-        share = (comes_back * compared[None]).sum(axis=(1, 2)) / (compared.sum() * P)
-        return sums + counts[:, None] * share[None]
+        share = jnp.where(compared[None], comes_back, 0).sum(axis=(1, 2)) / (compared.sum() * P)
+        return sums + counts[:, None].astype(sums.dtype) * share[None]
 
 
 def matching_pairs(shares: Float[np.ndarray, "L N"]) -> tuple[int, ...] | None:

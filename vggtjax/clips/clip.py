@@ -209,7 +209,8 @@ def read_clip(
     boxes = np.array([fit.box for fit in fits], np.int64)
     if warn and not is_part:
         watch.warn()
-        warn_of_dark(images, boxes)
+        if not isinstance(source, ImageFiles):  # which says it of each
+            warn_of_dark(images, boxes)
     return Clip(
         images=images,
         frame_names=names,

@@ -20,7 +20,7 @@ _SIDE = 32  # pixels of a thumbnail
 _SHIFTS = (-8, -4, 0, 4, 8)  # of thumbnails, as a camera turns
 _BINS = 8  # of each channel
 _GREYS = 32  # bins of brightness
-_FLAT = 5  # of 255: the largest range of a channel in a frame without content, coarser than noise
+_FLAT = 8  # of 255: the largest range of a channel in a frame without content, coarser than noise
 _DARK = 4095 / 65535  # white, where 12 bits are stored in 16
 _FLASH = 0.2  # brightness above the frames before and after, which are as bright as each other within half of it
 _LONGEST_FLASH = 3  # frames
@@ -138,12 +138,11 @@ class ShotWatch:
             (found.blank, self._said.blank, "of one colour: without depth, and bad for the cameras of the others"),
             (found.flashes, self._said.flashes, "unlike those before and after, as a flash is: bad for the cameras"),
         ):
-            if set(positions) - set(said):
+            if set(positions) - set(said) and len(positions) < len(self.looks):
                 numbers = as_ranges([self.numbers[i] for i in positions])
                 are = f"frame {numbers} is" if len(positions) == 1 else f"frames {numbers} are"
                 skip = self.skip([self.numbers[i] for i in positions])
-                advice = f"leave out with --skip {skip}" if len(positions) < len(self.looks) else "nothing can be seen"
-                logger.warning("%s %s; %s", are, what, advice)
+                logger.warning("%s %s; leave out with --skip %s", are, what, skip)
         if len(found.shots) > max(1, len(self._said.shots)):
             spans = [f"{self.numbers[shot[0]]}-{self.numbers[shot[-1]]}" for shot in found.shots]
             shown = ", ".join([*spans[:5], *(["..."] if len(spans) > 5 else [])])

@@ -12,6 +12,7 @@ from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip, read_clip
 from vggtjax.clips.masks import load_masks
 from vggtjax.clips.queries import parse_queries
+from vggtjax.clips.shots import looks_of
 from vggtjax.clips.sources import open_source
 from vggtjax.commands.clip_options import GivenInputs
 from vggtjax.commands.report import Report
@@ -146,6 +147,8 @@ class OneClip:
             announce(self._out, forecast_bytes(clip.images.shape[:3], clip.source_size, saving))
             masks = False if given.no_masks else None if given.masks is None else load_masks(given.masks, clip)
             queries = None if given.tracks is None else parse_queries(given.tracks, clip)
+        if all(look.is_blank for look in looks_of(clip.images, clip.valid_box)):
+            self._report.note("all frames are of one colour: nothing can be seen in them, and the result says nothing")
         stated = focal_stated(clip)
         lens = "" if stated is None else f"; the camera states {stated.words}, {stated.pixels:.4g} pixels"
         self._report.note(_taken(clip, self._source.total(Sampling())) + lens)

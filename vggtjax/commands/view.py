@@ -17,6 +17,7 @@ from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.results.saving import ReadFormat
 from vggtjax.storage.flags import InWords, Switch
+from vggtjax.storage.interruption import handled
 from vggtjax.storage.writing import check_file
 
 if TYPE_CHECKING:
@@ -115,6 +116,7 @@ def serve(report: Report, results: Sequence[Result], names: Sequence[str], servi
         try:
             server.serve_forever()
         except KeyboardInterrupt:
+            handled()
             report.line("The viewer has ended.")
 
 

@@ -18,7 +18,7 @@ from vggtjax.storage.writing import check_free, writing
 
 PLOT_FOLDER = "plots"
 _MOST_BYTES = 2**28
-NO_PLOTS = "plots are left out, as matplotlib is not installed: pip install 'vggtjax[evaluate]' and run again"
+NO_PLOTS = "plots are left out, as matplotlib is not installed: pip install -e '.[evaluate]' and run again"
 NAMES = ("results.json", "results.csv", "table.md", "table.tex", "index.html", PLOT_FOLDER)
 
 

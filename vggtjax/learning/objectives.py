@@ -59,7 +59,7 @@ def negative_log_likelihood(
         loss = (_LOG_2PI - log_precision + square) / 2
     else:
         loss = _laplace(error, -log_precision)
-    return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1)
+    return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1).astype(fused.depth.dtype)
 
 
 def joint_negative_log_likelihood(
@@ -88,7 +88,7 @@ def joint_negative_log_likelihood(
     residual = second - rho * first  # of pass 2 conditional on pass 1, with variance 1 - rho^2
     other = (_LOG_2PI - claims[1] + jnp.log(left) + residual * residual / left) / 2
     loss = alone + (1 - seen.dynamic) * other
-    return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1)
+    return jnp.sum(jnp.where(known, loss, 0)) / jnp.maximum(known.sum(), 1).astype(fused.depth.dtype)
 
 
 def _laplace(error: Float[Array, "*S"], log_variance: Float[Array, "*S"]) -> Float[Array, "*S"]:

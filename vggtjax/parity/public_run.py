@@ -92,6 +92,8 @@ def _run(task: Task) -> Facts:
     with torch.inference_mode():
         model = network("vggt")
         model(images, query_points=queries)  # the first pass prepares kernels
+        if device == "cuda":
+            torch.cuda.synchronize()
         began = time.perf_counter()
         made = _arrays(model(images, query_points=queries), images.shape[-2:])
         seconds = time.perf_counter() - began

@@ -14,6 +14,7 @@ from types import FrameType
 
 _PATIENCE = 1.5  # seconds for the main thread to end as usual
 _SHOW_CURSOR = "\x1b[?25h"  # which a progress bar hides
+_handled = threading.Event()
 _notes: list[Callable[[], str]] = []  # of the work that is under way, the innermost last
 
 
@@ -36,12 +37,17 @@ def message() -> str:
     return "; ".join(["interrupted", *(note() for note in _notes[-1:])])
 
 
+def handled() -> None:
+    """Say that the program has taken Ctrl-C as its normal end, as a server does, and ends in its own time."""
+    _handled.set()
+
+
 def answer_at_once() -> None:
     """Have Ctrl-C end this process within two seconds, unless the program handles the signal in its own way.
 
     Python tells the main thread, which hears of it when compiled code returns; XLA compiles for a minute. So a thread
-    waits for the signal, gives the main thread time to end as usual, and then ends the process as a kill would: files
-    are written whole or not at all. A process that ignores Ctrl-C, as in the background of a shell, goes on to.
+    waits for the signal, gives the main thread time to end or to call `handled`, and then ends the process as a kill
+    would: files are written whole or not at all. A process that ignores Ctrl-C, as in a shell's background, still does.
     """
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return
@@ -50,10 +56,11 @@ def answer_at_once() -> None:
         signal.default_int_handler(number, frame)
 
     def watch() -> None:
-        while reader.recv(1):
-            if signal.getsignal(signal.SIGINT) is notice:
+        while number := reader.recv(1):
+            if number[0] == signal.SIGINT and signal.getsignal(signal.SIGINT) is notice:
                 time.sleep(_PATIENCE)
-                leave(message())
+                if not _handled.is_set():
+                    leave(message())
 
     reader, writer = socket.socketpair()
     writer.setblocking(False)
