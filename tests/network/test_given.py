@@ -70,6 +70,7 @@ def test_images_that_a_jit_traces_are_not_looked_into(params, config, images):
         (torch.ones(2, requires_grad=True), r"requires grad.*tensor\.detach\(\)"),
         ([[1.0], [1.0, 2.0]], "numpy cannot read this list"),
         ("picture.png", "numpy cannot read this str"),
+        (np.array(["a.png", "b.png"]), "numpy cannot read this numpy.ndarray"),
     ],
 )
 def test_what_numpy_cannot_read_is_refused(value, sentence):

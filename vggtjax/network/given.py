@@ -18,7 +18,8 @@ def as_array(name: str, value: Any) -> Any:
 
     Raises InputError for what numpy cannot read, such as a tensor on a GPU, in bfloat16, or with a gradient.
     """
-    if isinstance(value, jax.Array | np.ndarray | jax.ShapeDtypeStruct):
+    is_numbers = isinstance(value, np.ndarray) and value.dtype.kind in "biufV"  # V: bfloat16
+    if is_numbers or isinstance(value, jax.Array | jax.ShapeDtypeStruct):
         return value
     problem = "no numbers"
     try:
