@@ -32,6 +32,8 @@ def test_frames_are_a_window_then_a_stride_then_a_cap():
     assert DATASETS["dycheck"].frames.of(range(35), "dycheck") == [0, 10, 20, 30]
     assert DATASETS["kitti"].frames.of(range(1000), "kitti") == list(range(110))
     assert FrameChoice(slice(2, 9), 3, 2).of(range(20), "a") == [2, 5]
+    of_bonn = FrameChoice(slice(30, 140)).sampled(Sampling(start=2, stride=2, skip="2,5-6", max_frames=3))
+    assert of_bonn.of(range(200), "a") == [34, 38, 40]  # 32 and 36 are frames 2 and 6 of the window
     assert FrameChoice(slice(30, 140)).of(range(100), "a") == list(range(30, 100))
     assert FrameChoice(slice(30, 140)).shortage(100) == ("it has 100 frames; the protocol takes 30 to 139",)
     with pytest.raises(InputError, match="sequence a has 30 frames, none of them from frame 30 on"):

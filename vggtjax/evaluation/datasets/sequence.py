@@ -57,28 +57,44 @@ def left_out(
     return (LeftOut(what, tuple(frames), total, why, str(expected), usual),) if frames else ()
 
 
+def _always(frame: int) -> bool:
+    del frame
+    return True
+
+
 class FrameChoice(NamedTuple):
-    """A window of frames, of which every `stride`-th is taken, and at most `most`."""
+    """A window of frames, of which every `stride`-th is taken unless it is left out, and at most `most`."""
 
     window: slice = slice(None)
     stride: int = 1
     most: int | None = None
+    takes: Callable[[int], bool] = _always  # by its number in the sequence
 
     def sampled(self, sampling: Sampling) -> FrameChoice:
-        """Return the frames of `sampling` within the window; its stride, if any, replaces this stride."""
-        window = slice((self.window.start or 0) + sampling.start, self.window.stop)
+        """Return the frames of `sampling` within the window; its stride, if any, replaces this stride.
+
+        Its `start` and `skip` count from the start of the window.
+        """
+        first = self.window.start or 0
+        window = slice(first + sampling.start, self.window.stop)
         stride = self.stride if sampling.stride is None else sampling.stride
         mosts = [most for most in (self.most, sampling.max_frames) if most is not None]
-        return FrameChoice(window if sampling.start else self.window, stride, min(mosts, default=None))
+        takes = self.takes if sampling.skip is None else lambda frame: sampling.takes(frame - first)
+        return FrameChoice(window if sampling.start else self.window, stride, min(mosts, default=None), takes)
 
     def of(self, items: Sequence[T], name: str) -> list[T]:
         """Return the chosen items, one for each frame of the sequence `name`; raises InputError if there is none."""
         if not items:
             raise InputError(f"sequence {name} has no frames; expected at least one")
-        chosen = list(items[self.window][:: self.stride][: self.most])
-        if not chosen:
+        inside = [*enumerate(items)][self.window][:: self.stride]
+        if not inside:
             raise InputError(f"sequence {name} has {len(items)} frames, none of them from frame {self.window.start} on")
-        return chosen
+        chosen = [item for frame, item in inside if self.takes(frame)]
+        if not chosen:
+            raise InputError(
+                f"skip leaves none of {len(inside)} frames of sequence {name}; expected to leave one at least"
+            )
+        return chosen[: self.most]
 
     def shortage(self, count: int) -> tuple[str, ...]:
         """Return a note if a sequence of `count` frames ends before the window."""
