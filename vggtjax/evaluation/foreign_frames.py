@@ -99,8 +99,8 @@ def _pairs(
     """Return places of frames in the result and the sequence: by name, by time, or by number; in the latter's order.
 
     Frames of other programs have numbers, and so have those that they lost. As many as the sequence has, counted from 0
-    or 1 or unlike the numbers at the end of its names, are the sequence's in order. Else they are those at the end of its
-    names, or those of its frames, counted from 0.
+    or 1 or unlike the numbers at the end of its names, are the sequence's in order. Else they are those at the end of
+    its names, or those of its frames, counted from 0.
     """
     own = {name: place for place, name in enumerate(result.frame_names)}
     wanted = name_times(names) if times is None else times

@@ -12,6 +12,7 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets import DATASETS, find_sequences, published
 from vggtjax.evaluation.datasets.plain import takes
 from vggtjax.evaluation.datasets.sequence import FrameChoice
+from vggtjax.media.sampling import Sampling
 
 EYE = " ".join(map(str, np.eye(4).ravel()))
 

@@ -91,9 +91,7 @@ class FrameChoice(NamedTuple):
             raise InputError(f"sequence {name} has {len(items)} frames, none of them from frame {self.window.start} on")
         chosen = [item for frame, item in inside if self.takes(frame)]
         if not chosen:
-            raise InputError(
-                f"skip leaves none of {len(inside)} frames of sequence {name}; expected to leave one at least"
-            )
+            raise InputError(f"skip leaves none of {len(inside)} frames of sequence {name}; expected to leave one")
         return chosen[: self.most]
 
     def shortage(self, count: int) -> tuple[str, ...]:
