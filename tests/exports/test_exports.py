@@ -295,7 +295,45 @@ def test_a_result_without_points_is_not_exported(tmp_path, result, form):
     if form in ("colmap", "colmap-text", "gsplat", "nerfstudio"):
         with pytest.raises(InputError, match=f"{form} has the static points .* 100% .* the wrong way round"):
             export_result(moves, tmp_path / name, form)
+        unmasked = replace(moves, method="vggt", settings={"masks": "none"})
+        with pytest.raises(
+            InputError, match=f"{form} has the static points .* none: no pixel that stands still is sure"
+        ):
+            export_result(unmasked, tmp_path / name, form)
     if form not in ("exr", "tum", "kitti"):
         with pytest.raises(InputError):
             export_result(empty, tmp_path / name, form)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("padded", [False, True])
+@pytest.mark.parametrize(
+    ("form", "kept", "absent"),
+    [
+        ("colmap", "masks", ""),
+        ("nerfstudio", "masks", ""),
+        ("dynamic-splats", "", "mask moving"),
+        ("blender", "", "moving"),
+    ],
+)
+def test_a_result_without_a_mask_has_mask_files_for_padding_alone(tmp_path, result, form, kept, absent, padded):
+    if form == "colmap":
+        pytest.importorskip("pycolmap")
+    export_result(result, tmp_path / "masked", form)
+    box = np.tile([0, 0, W, H], (FRAMES, 1))
+    box[1, 2] -= 6 * padded  # of one frame alone
+    nothing = np.zeros_like(result.dynamic_mask)
+    vggt = replace(result, method="vggt", dynamic_mask=nothing, settings={"masks": "none"}, valid_box=box)
+    export_result(vggt, tmp_path / "out", form)
+    for name in (*kept.split(), *absent.split()):
+        assert any((tmp_path / "masked" / name).rglob("*.p*"))
+        assert (tmp_path / "out" / name).exists() == (padded and name in kept.split())
+    if form == "nerfstudio":
+        frames = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+        assert [(tmp_path / "out" / frame["mask_path"]).is_file() for frame in frames if "mask_path" in frame] == (
+            [True] * FRAMES * padded
+        )
+    if form == "colmap" and padded:
+        (path,) = (tmp_path / "out/masks").iterdir()
+        assert path.name == "a1.png.png"
+        assert not np.asarray(Image.open(path))[:, W - 6 :].any()
