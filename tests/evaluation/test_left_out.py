@@ -153,11 +153,17 @@ def test_depth_of_another_size_is_taken_at_the_pixels_of_the_pictures_and_never_
     code, _, record = scored(folder, result, "--strict", capsys=capsys)
     assert code == 2
     assert f"expected ({H}, {W}), the size of" in record["reason"]
+    assert "in 4 of 4 frames" in shown
+    for frame in (0, 1, 3):
+        right = np.rint(1000 * ROOM.depth[frame]).astype(np.uint16)
+        (folder / f"depth/{frame:05d}.png").write_bytes(depth_png(right))
+    _, shown, _ = scored(folder, result, capsys=capsys)
+    assert f"its depth has {2 * W} x {2 * H} pixels and pictures {W} x {H} in 1 of 4 frames" in shown
     (folder / "depth/00001.png").write_bytes(depth_png(np.ones((W, H))))  # on its side
     code, shown, record = scored(folder, result, capsys=capsys)
     assert code == 0, shown
     assert record["left_out"]["depth"]["frames"] == ["00001"]
-    assert record["metrics"]["depth_pixels"] == (S - 1) * (H - 2) * W
+    assert record["metrics"]["depth_pixels"] == (S - 1) * H * W - 2 * W
 
 
 def test_a_sequence_of_which_nothing_is_left_is_refused(walk, capsys):

@@ -60,6 +60,21 @@ def test_plain_folder(tmp_path):
     assert [sequence.name for sequence in opened("plain", tmp_path, sequences=["clip10"])] == ["clip10"]
 
 
+def test_pictures_that_are_missing_count_where_they_would_be_taken(tmp_path):
+    folder = plain_folder(tmp_path / "clip", frames=8)
+    (folder / "rgb/01.png").unlink()
+    (folder / "rgb/06.png").unlink()
+    for choice, lost, total in (
+        ({}, ("01", "06"), 8),
+        ({"max_frames": 3}, ("01",), 4),  # of 00, 02 and 03
+        ({"max_frames": 1, "strict": True}, (), 0),
+        ({"stride": 3}, ("06",), 3),  # of 00 and 04
+    ):
+        (sequence,) = opened("plain", folder, **choice)
+        left = [(each.frames, each.total) for each in sequence.left_out if each.what == "pictures"]
+        assert left == [(lost, total)] * bool(lost)
+
+
 @pytest.mark.parametrize(
     ("depth", "mask"), [("npy", "jpg"), ("uint16.npy", "webp"), ("exr", "tif"), ("npz", "npy"), ("npy and png", "png")]
 )
