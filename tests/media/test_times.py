@@ -131,6 +131,7 @@ def test_rows_are_found_by_number_and_by_names_with_blanks(tmp_path, names, text
         ("timestamps.csv", "file;time\na.png;1\nb.png;then\nc.png;3\n", "its row 2 has 'then'; expected a time"),
         ("times.txt", "\0\0\0 not a list", "its row 1 has"),
         ("times.txt", "# nothing\n", "it has no line with a time"),
+        ("data.csv", "name,x,y\na,1.5,2\nb,2.5,1\nc,3.5,2\n", "none of its columns is headed as times"),
         ("data.csv", "name,label\na,cat\nb,dog\nc,cat\n", ""),  # of something else
     ],
 )

@@ -18,10 +18,19 @@ from vggtjax.errors import InputError, one_line, reading
 
 logger = logging.getLogger(__name__)
 
-LISTS = ("timestamps.txt", "timestamp.txt", "times.txt", "timestamps.csv", "data.csv")  # in any case
+LISTS = (
+    "timestamps.txt",
+    "timestamp.txt",
+    "times.txt",
+    "timestamps.csv",
+    "timestamp.csv",
+    "times.csv",
+    "data.csv",
+)  # in any case
 _UNITS = {"seconds": 0, "milliseconds": 3, "microseconds": 6, "nanoseconds": 9}  # digits after the point of a second
 _SHORT = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 _STATED = re.compile(r"[\[(](s|ms|us|ns)[\])]")  # a unit, as in "#timestamp [ns]"
+_HEADINGS = ("stamp", "time", _STATED, r"^(?:t|seconds|date)$")  # of columns of times, the surest first
 _BEFORE_UNIT = re.compile(r"\s+(?=[\[(])")  # blanks
 _TWO_PARTS = re.compile(r"(?<![\d.])(\d{10})[_-](\d{9})(?![\d.])")  # seconds and nanoseconds, as ROS has them
 _CUT_PARTS = re.compile(r"(?<![\d.])\d{10}[_-](?:\d{3}|\d{6,})(?!\d)")  # seconds and a part that is not certain
@@ -206,6 +215,10 @@ def _of_table(
     lines = [line for line in found[at] if line is not None]
     if len(lines) != len(names):
         return f"it names no {one_line(names[found[at].index(None)], 60)!r}"
+    if path.suffix.lower() == ".csv" and width == len(heading) > 2:
+        headed = any(re.search(pattern, word.lower()) for pattern in _HEADINGS for word in heading)
+        if not headed:
+            return "none of its columns is headed as times, as by timestamp"
     place = _time_column({place: column for place, column in times.items() if place != at}, heading)
     is_headed = len(heading) == len(rows[0]) and any(map(_STATED.search, heading))
     stated = _STATED.findall(heading[place] if is_headed else start)
@@ -231,9 +244,9 @@ def _lines_of(names: Sequence[str], keys: Sequence[str]) -> list[int | None]:
 
 def _time_column(times: Mapping[int, Sequence[Decimal]], heading: Sequence[str]) -> int:
     """Return the column that is headed as times; else the first that does not count on by one."""
-    for word in ("stamp", "time"):
+    for pattern in _HEADINGS:
         for place in times:
-            if place < len(heading) and word in heading[place].lower():
+            if place < len(heading) and re.search(pattern, heading[place].lower()):
                 return place
     steps = {place: {after - before for before, after in pairwise(column)} for place, column in times.items()}
     return next((place for place in times if steps[place] != {1}), next(iter(times)))
