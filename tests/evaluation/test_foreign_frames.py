@@ -5,8 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tests.results.foreign_writers import ROOM, WRITERS
 from tests.room import make_room
-from vggtjax import load_clip
+from vggtjax import Reconstruction, load_clip
 from vggtjax.errors import InputError
 from vggtjax.evaluation.foreign_frames import placed
 
@@ -78,17 +79,19 @@ def test_frames_of_the_pictures_own_size_are_those_and_others_are_refused(layout
         placed(of_size(512, 384), layout, [(640, 480)] * 3, ["a", "b", "c"])
 
 
+def numbered(*numbers, times=None, lost=()):
+    result = of_size(64, 48, len(numbers))
+    depth = np.array(numbers, np.float32)[:, None, None] * np.ones((48, 64), np.float32) + 1
+    names = tuple(f"{number:06d}" for number in numbers)
+    return dataclasses.replace(result, depth=depth, frame_names=names, timestamps=times, settings={"lost": [*lost]})
+
+
+def found(result, names, times=None, format="vggt4d"):
+    made = placed(result, format, [(64, 48)] * len(names), names, times)
+    return dict(zip(made.frame_names, (made.depth[:, 0, 0] - 1).tolist(), strict=True))
+
+
 def test_frames_of_others_are_the_sequences_by_number_or_time_or_not_at_all():
-    def numbered(*numbers, times=None):
-        result = of_size(64, 48, len(numbers))
-        depth = np.array(numbers, np.float32)[:, None, None] * np.ones((48, 64), np.float32) + 1
-        names = tuple(f"{number:06d}" for number in numbers)
-        return dataclasses.replace(result, depth=depth, frame_names=names, timestamps=times)
-
-    def found(result, names, times=None):
-        made = placed(result, "vggt4d", [(64, 48)] * len(names), names, times)
-        return dict(zip(made.frame_names, (made.depth[:, 0, 0] - 1).tolist(), strict=True))
-
     letters = list("abcdef")
     assert found(numbered(0, 2, 5), letters) == {"a": 0, "c": 2, "f": 5}  # counted from 0
     assert found(numbered(0, 1, 2), ["10", "11", "12"]) == {"10": 0, "11": 1, "12": 2}  # as many
@@ -101,3 +104,49 @@ def test_frames_of_others_are_the_sequences_by_number_or_time_or_not_at_all():
     assert found(keyframes, letters[:4], times) == {"b": 0, "d": 1}
     named = [f"17000000{second:02d}.000000" for second in range(4)]
     assert found(numbered(0, 1, times=np.array([1700000001.0, 1700000003.0])), named) == {named[1]: 0, named[3]: 1}
+
+
+@pytest.mark.parametrize("lost", [0, 2])
+def test_a_folder_with_a_lost_frame_is_placed_as_it_was_written(tmp_path, lost):
+    tmp_path = tmp_path / "result"
+    WRITERS["monst3r"](tmp_path)
+    lines = (tmp_path / "pred_traj.txt").read_text().splitlines()
+    lines[lost] = f"{lost} " + "nan " * 7
+    (tmp_path / "pred_traj.txt").write_text("\n".join(lines))
+    result = Reconstruction.load(tmp_path, format="monst3r", quaternion="wxyz")
+    names = ["frame_0001", "frame_0002", "frame_0003"]
+    made = placed(result, "monst3r", [(42, 28)] * 3, names)
+    left = [frame for frame in range(3) if frame != lost]
+    assert made.frame_names == tuple(names[frame] for frame in left)
+    np.testing.assert_array_equal(made.depth, ROOM.depth[left])
+
+
+@pytest.mark.parametrize("lost", [0, 2, 4])
+def test_a_lost_frame_does_not_shift_the_others(lost):
+    numbers = [number for number in range(5) if number != lost]
+    names = [f"frame_{number:04d}" for number in range(1, 6)]  # as Sintel's, counted from 1
+    assert found(numbered(*numbers, lost=[lost]), names) == {names[number]: number for number in numbers}
+    later = [f"frame_{number:04d}" for number in range(2, 8)]  # by the names' numbers: one more than the result
+    told = {f"frame_{number + 2:04d}": number + 2 for number in numbers}
+    assert found(numbered(*(number + 2 for number in numbers), lost=[lost + 2]), later) == told
+
+
+def test_as_many_frames_as_the_sequence_are_its_frames_in_order():
+    names = [f"{number:05d}" for number in range(5)]
+    assert found(numbered(1, 2, 3, 4, 5), names) == dict(zip(names, range(1, 6), strict=True))  # counted from 1
+    assert found(numbered(10, 20, 30, 40, 50), names) == dict(zip(names, range(10, 60, 10), strict=True))
+    assert found(numbered(1, 4), ["x_1", "x_6"]) == {"x_1": 1}  # not as many of the same
+    many = [f"{number:05d}" for number in range(1500)]
+    shown = numbered(*range(1500), times=np.arange(1500) / 30)  # 50 ms from the sequence's clock at the end
+    assert found(shown, many, np.arange(1500) / 29.97) == dict(zip(many, range(1500), strict=True))
+
+
+def test_our_own_are_found_by_time_where_no_name_fits():
+    stated = np.array([1403636579.76, 1403636580.76, 1403636581.76])
+    keyframes = numbered(0, 1, times=np.array([0.0, 1.0]))
+    stating = dataclasses.replace(keyframes, settings={"first_time": 1403636580.755})
+    stating = dataclasses.replace(stating, frame_names=("x", "y"), source_size=np.tile([48, 64], (2, 1)))
+    assert found(stating, ["a", "b", "c"], stated, "vggtjax") == {"b": 0, "c": 1}
+    counted = dataclasses.replace(stating, settings={})  # seconds from the first frame of some video
+    with pytest.raises(InputError, match=r"the result is of frames x, y"):
+        found(counted, ["a", "b", "c"], stated - stated[0], "vggtjax")

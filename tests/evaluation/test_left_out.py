@@ -13,7 +13,7 @@ from tests.scored_room import room_and_truth
 from vggtjax.clips.truth import Truth
 from vggtjax.commands import main as cli
 from vggtjax.commands.evaluate import _frames_in_words
-from vggtjax.evaluation.datasets import chosen_frames
+from vggtjax.evaluation.datasets import DATASETS, chosen_frames
 from vggtjax.evaluation.metrics.trajectory import trajectory_errors
 from vggtjax.evaluation.protocol import score
 from vggtjax.evaluation.truth_at_pixels import TruthAtPixels
@@ -84,7 +84,7 @@ def test_a_pose_that_is_not_finite_leaves_its_frame_out(walk, capsys, lost):
     page = (folder.parent.parent / "out/index.html").read_text()
     for place in (shown, page):  # nothing is drawn, but all is scored
         assert "plots are left out, as matplotlib is not installed" in place
-        assert "frames: every frame, as the protocol of plain has it" in place
+        assert "frames: every frame; --stride, --start, --max-frames and --skip change it" in place
     assert not (folder.parent.parent / "out/plots").exists()
     assert (folder.parent.parent / "out/table.md").stat().st_size > 100
     code, shown, record = scored(folder, result, "--strict", capsys=capsys)
@@ -153,11 +153,17 @@ def test_depth_of_another_size_is_taken_at_the_pixels_of_the_pictures_and_never_
     code, _, record = scored(folder, result, "--strict", capsys=capsys)
     assert code == 2
     assert f"expected ({H}, {W}), the size of" in record["reason"]
+    assert "in 4 of 4 frames" in shown
+    for frame in (0, 1, 3):
+        right = np.rint(1000 * ROOM.depth[frame]).astype(np.uint16)
+        (folder / f"depth/{frame:05d}.png").write_bytes(depth_png(right))
+    _, shown, _ = scored(folder, result, capsys=capsys)
+    assert f"its depth has {2 * W} x {2 * H} pixels and pictures {W} x {H} in 1 of 4 frames" in shown
     (folder / "depth/00001.png").write_bytes(depth_png(np.ones((W, H))))  # on its side
     code, shown, record = scored(folder, result, capsys=capsys)
     assert code == 0, shown
     assert record["left_out"]["depth"]["frames"] == ["00001"]
-    assert record["metrics"]["depth_pixels"] == (S - 1) * (H - 2) * W
+    assert record["metrics"]["depth_pixels"] == (S - 1) * H * W - 2 * W
 
 
 def test_a_sequence_of_which_nothing_is_left_is_refused(walk, capsys):
@@ -186,6 +192,21 @@ def test_the_frames_that_are_taken_are_said(walk, capsys):
     assert of_tum.startswith("frames: one frame of 3 (stride 3), at most 90, as the protocol of tum has it; --stride")
     of_bonn = _frames_in_words(chosen_frames("bonn", Sampling(max_frames=5)), "bonn", Sampling(max_frames=5))
     assert of_bonn == "frames: every frame, from frame 30 to 139, at most 5, by --max-frames"
+    for name, has_one in {"davis": True, "kitti": True, "plain": False, "capture": False}.items():
+        assert DATASETS[name].has_protocol == has_one
+
+
+def test_frames_are_left_out_by_number(walk, capsys):
+    folder, result = walk
+    _, shown, record = scored(folder, result, "--skip", "1", capsys=capsys)
+    assert "frames: every frame, without 1, by --skip" in shown
+    assert (record["frames"], record["settings"]["skip"], record["notes"][-1:]) == (3, "1", [])
+    assert record["metrics"]["j_mean"] == 1  # each of its own frame
+    code, _, record = scored(folder, result, "--skip", "0-9", capsys=capsys)
+    assert (code, record["reason"]) == (
+        2,
+        "skip leaves none of 4 frames of sequence walk; expected to leave one",
+    )
 
 
 def test_errors_of_cameras_are_those_of_the_frames_that_are_left():

@@ -22,6 +22,7 @@ from vggtjax.captures.colmap_model import read_views
 from vggtjax.clips.sources import open_source
 from vggtjax.commands.main import command_help
 from vggtjax.errors import ClipError, InputError, OutputError
+from vggtjax.exports.names import picture_names, safe_names
 from vggtjax.exports.table import FORMATS, Exporting
 from vggtjax.exports.write import check_export, export_result
 from vggtjax.results.gltf_animation import frame_times
@@ -295,7 +296,73 @@ def test_a_result_without_points_is_not_exported(tmp_path, result, form):
     if form in ("colmap", "colmap-text", "gsplat", "nerfstudio"):
         with pytest.raises(InputError, match=f"{form} has the static points .* 100% .* the wrong way round"):
             export_result(moves, tmp_path / name, form)
+        unmasked = replace(moves, method="vggt", settings={"masks": "none"})
+        with pytest.raises(
+            InputError, match=f"{form} has the static points .* none: no pixel that stands still is sure"
+        ):
+            export_result(unmasked, tmp_path / name, form)
     if form not in ("exr", "tum", "kitti"):
         with pytest.raises(InputError):
             export_result(empty, tmp_path / name, form)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("padded", [False, True])
+@pytest.mark.parametrize(
+    ("form", "kept", "absent"),
+    [
+        ("colmap", "masks", ""),
+        ("nerfstudio", "masks", ""),
+        ("dynamic-splats", "", "mask moving"),
+        ("blender", "", "moving"),
+    ],
+)
+def test_a_result_without_a_mask_has_mask_files_for_padding_alone(tmp_path, result, form, kept, absent, padded):
+    if form == "colmap":
+        pytest.importorskip("pycolmap")
+    export_result(result, tmp_path / "masked", form)
+    box = np.tile([0, 0, W, H], (FRAMES, 1))
+    box[1, 2] -= 6 * padded  # of one frame alone
+    nothing = np.zeros_like(result.dynamic_mask)
+    vggt = replace(result, method="vggt", dynamic_mask=nothing, settings={"masks": "none"}, valid_box=box)
+    export_result(vggt, tmp_path / "out", form)
+    for name in (*kept.split(), *absent.split()):
+        assert any((tmp_path / "masked" / name).rglob("*.p*"))
+        assert (tmp_path / "out" / name).exists() == (padded and name in kept.split())
+    if form == "nerfstudio":
+        frames = json.loads((tmp_path / "out/transforms.json").read_text())["frames"]
+        assert [(tmp_path / "out" / frame["mask_path"]).is_file() for frame in frames if "mask_path" in frame] == (
+            [True] * FRAMES * padded
+        )
+    if form == "colmap" and padded:
+        (path,) = (tmp_path / "out/masks").iterdir()
+        assert path.name == "a1.png.png"
+        assert not np.asarray(Image.open(path))[:, W - 6 :].any()
+
+
+def test_names_that_clash_get_their_number_and_lose_their_folder_last():
+    assert safe_names(["a?.png", "a*.png", "a_.png", "a__000001.png"]) == [
+        *("a__000000.png", "a__000001_0.png"),
+        *("a_.png", "a__000001.png"),  # as they are
+    ]
+    assert safe_names(["a.png", "a.png/b.png", "c/b?.png", "c/b_.png"]) == [
+        *("a.png", "a.png_b.png"),  # a folder cannot have the name of a picture
+        *("c/b__000002.png", "c/b_.png"),
+    ]
+
+
+def test_pictures_of_relative_and_absolute_paths_and_of_several_drives_have_names(tmp_path, result, monkeypatch):
+    for number in range(FRAMES):
+        (tmp_path / f"cam{number % 2}").mkdir(exist_ok=True)
+        Image.new("RGB", (W, H)).save(tmp_path / f"cam{number % 2}/a{number}.png")
+    monkeypatch.chdir(tmp_path)
+    paths = [f"cam{number % 2}/a{number}.png" for number in range(FRAMES)]
+    source = open_source([paths[0], *(str(tmp_path / path) for path in paths[1:3]), f"cam0/../{paths[3]}"])
+    named = replace(result, frame_names=tuple(source.frame_names))
+    assert picture_names(named, source) == paths
+
+    def on_two_drives(paths):
+        raise ValueError("Paths don't have the same drive")
+
+    monkeypatch.setattr(os.path, "commonpath", on_two_drives)
+    assert picture_names(named, source) == [f"a{number}.png" for number in range(FRAMES)]

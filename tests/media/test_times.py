@@ -35,6 +35,8 @@ def frames(folder, names):
         (["1305031102.175304", "1305031102.3"], ["1305031102.175304", "1305031102.3"], "seconds"),
         (["rgb-1305031102.175304", "rgb-1305031102.211"], ["1305031102.175304", "1305031102.211"], "seconds"),
         (["0.033", "0.067"], ["0.033", "0.067"], "seconds"),
+        (["1403636579_763555584", "1403636579_813555456"], SECONDS[:2], "seconds"),  # as ROS has them
+        (["left-1700000000-000000009", "left-1700000001-000000000"], ["1700000000.000000009", "1700000001"], "seconds"),
     ],
 )
 def test_names_tell_seconds_by_their_digits(names, seconds, unit):
@@ -57,6 +59,7 @@ def test_names_tell_seconds_by_their_digits(names, seconds, unit):
         [EUROC[0], "1700000000123"],  # of two units
         ["1700000000123", "1800000000123"],  # years apart
         ["shot2.0001", "shot2.0002"],
+        ["1403636579_76355558", "1403636580_8135554"],  # nanoseconds without their zeros, or what?
         ["1403636579763555584_1403636579813555456", "1403636579863555584_1403636579913555456"],
     ],
 )
@@ -77,6 +80,18 @@ def test_names_that_are_no_times(names):
                                                               zip(EUROC, "abc", strict=True)), SECONDS),
         ("data.csv", "timestamp [us],filename\n0,data/a.png\n7,data/b.png\n9,data/c.png\n",
          ["0", "0.000007", "0.000009"]),
+        ("data.csv", "#timestamp [ns],filename,exposure [s]\n" + "".join(f"{time},{name}.png,0.01\n" for time, name in
+                                                                        zip(EUROC, "abc", strict=True)), SECONDS),
+        ("data.csv", "exposure [s],filename,timestamp [ms]\n1,a,5\n2,b,7\n3,c,8\n", ["0.005", "0.007", "0.008"]),
+        ("data.csv", "frame,timestamp,filename\n0,0.5,a.png\n1,0.75,b.png\n2,1.5,c.png\n", ["0.5", "0.75", "1.5"]),
+        ("TimeStamps.TXT", "0 0.5 a.png\n1 0.75 b.png\n2 1.5 c.png\n", ["0.5", "0.75", "1.5"]),
+        ("../timestamps.csv", "file;time\n\"a.png\";0.5\nb.png;0.75\nc.png;1.5\n", ["0.5", "0.75", "1.5"]),
+        ("timestamp.txt", "time\n0.5\n0.75\n1.5\n", ["0.5", "0.75", "1.5"]),
+        ("times.txt", "0.0\n8.33\n16.67\n", ["0", "0.00833", "0.01667"]),  # milliseconds of 120 frames a second
+        ("times.txt", "0.0 a\n4.17 b\n8.33 c\n", ["0", "0.00417", "0.00833"]),
+        ("times.txt", "0.0\n3.25\n11.5\n", ["0", "3.25", "11.5"]),  # seconds of keyframes
+        ("times.txt", "2011-09-26T13:02:25.96Z a\n2011-09-26T15:02:26+02:00 b\n2011-09-26T13:02:27 c\n",
+         ["1317042145.96", "1317042146", "1317042147"]),
         ("../timestamps.txt", "".join(f"2011-09-26 13:02:25.{digit}64360375\n" for digit in (1, 5, 9)),
          [f"1317042145.{digit}64360375" for digit in (1, 5, 9)]),
     ],
@@ -91,19 +106,41 @@ def test_lists_beside_and_above_the_frames(tmp_path, file, text, seconds):
 
 
 @pytest.mark.parametrize(
-    ("file", "text"),
+    ("names", "text", "seconds"),
     [
-        ("timestamps.txt", "0\n1\n"),  # of two frames
-        ("timestamps.txt", "2\n1\n3\n"),  # backwards
-        ("timestamps.txt", "a.png 1\nb.png 2\n"),  # without one
-        ("data.csv", "name,label\na,cat\nb,dog\nc,cat\n"),
-        ("times.txt", "\0\0\0 not a list"),
+        (["000000", "000001"], "0 10.0\n1 10.1\n", ["10.0", "10.1"]),  # by the number
+        (["000005", "000010"], "5 0\n10 33\n", ["0", "0.033"]),
+        (["my walk 1", "my walk 2"], "0.5 my walk 1.png\n0.75 my walk 2.png\n", ["0.5", "0.75"]),
+        (["a b", "c"], "a b.png 0.5\nc.png 0.75\n", ["0.5", "0.75"]),
+        (EUROC[:2], "".join(f"{time},{time}.png,0.{time}\n" for time in EUROC), SECONDS[:2]),  # the last is no time
     ],
 )
-def test_lists_of_something_else_tell_nothing(tmp_path, file, text):
+def test_rows_are_found_by_number_and_by_names_with_blanks(tmp_path, names, text, seconds):
+    paths = frames(tmp_path, names)
+    (tmp_path / "data.csv").write_text(text)
+    assert stated_times(paths).seconds == tuple(map(Decimal, seconds))
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "reason"),
+    [
+        ("timestamps.txt", "0\n1\n", "it has 2 times for 3 pictures"),
+        ("timestamps.txt", "time\n0\n1\n2\n3\n", "it has 4 times for 3 pictures"),
+        ("timestamps.txt", "2\n1\n3\n", "it gives 'b.png' no later time than the frame before"),
+        ("timestamps.txt", "a.png 1\nb.png 2\n", "it names no 'c.png'"),
+        ("timestamps.csv", "file;time\na.png;1\nb.png;then\nc.png;3\n", "its row 2 has 'then'; expected a time"),
+        ("times.txt", "\0\0\0 not a list", "its row 1 has"),
+        ("times.txt", "# nothing\n", "it has no line with a time"),
+        ("data.csv", "name,x,y\na,1.5,2\nb,2.5,1\nc,3.5,2\n", "none of its columns is headed as times"),
+        ("data.csv", "name,label\na,cat\nb,dog\nc,cat\n", ""),  # of something else
+    ],
+)
+def test_lists_that_tell_nothing_say_why(tmp_path, caplog, file, text, reason):
     paths = frames(tmp_path / "data", "abc")
     (tmp_path / "data" / file).write_text(text)
     assert stated_times(paths) is None
+    assert len(caplog.messages) == bool(reason)
+    assert not reason or f"{file} is not used: {reason}" in caplog.text
 
 
 def test_a_clip_has_the_times_of_its_frames(tmp_path):

@@ -160,6 +160,7 @@ def test_numbers_of_files_and_of_poses_tell_which_frames_have_both(tmp_path, cap
     assert result.frame_names == ("000000", "000002")
     np.testing.assert_allclose(result.camera_from_world, ROOM.camera_from_world[[0, 2]], atol=1e-6)
     assert "has cameras for 2 of 3 frames of depth" in caplog.text
+    assert result.settings["lost"] == [1]
 
 
 def test_a_camera_that_is_not_finite_leaves_its_frame_out(tmp_path, caplog):
@@ -171,3 +172,4 @@ def test_a_camera_that_is_not_finite_leaves_its_frame_out(tmp_path, caplog):
     assert result.frame_names == ("000000", "000002")
     np.testing.assert_array_equal(result.depth, ROOM.depth[[0, 2]])
     assert "no finite camera for 1 of 3 frames, 000001 first" in caplog.text
+    assert result.settings["lost"] == [1]

@@ -74,11 +74,12 @@ def _chosen(folder: Path) -> tuple[_Model, Mapping[str, ColmapView], tuple[str, 
     if len(models) == 1:
         return models[0], read_views(*models[0]), ()
     ranks, counts, problems = [], [], []
+    places = _places(folder)
     for number, model in enumerate(models):
         name = model.folder.relative_to(folder).as_posix()
         try:
             views = read_views(*model)
-            pictures = sum((_pictures(folder, view) / view).is_file() for view in views)
+            pictures = sum(any(inside(place, view, folder).is_file() for place in places) for view in views)
             points = count_points(model.folder / f"points3D{model.suffix}")
         except InputError as error:
             problems.append(error)
@@ -127,10 +128,14 @@ def read_colmap(folder: Path, *, whole: bool = True) -> Capture:
     )
 
 
+def _places(folder: Path) -> list[Path]:
+    root = folder.resolve()
+    return [(root / place).resolve() for place in _PICTURES]
+
+
 def _pictures(folder: Path, first: str) -> Path:
     """Return the folder of the pictures: the one that has the first name, else the first that is there."""
-    root = folder.resolve()
-    places = [(root / place).resolve() for place in _PICTURES]
+    places = _places(folder)
     inside(places[0], first, folder)
     having = [place for place in places if (place / first).is_file()]
     images = [place for place in places if place.name == "images" and place.is_dir()]

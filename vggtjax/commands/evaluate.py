@@ -166,7 +166,7 @@ def evaluate(
         more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
         report.note(f"{len(found)} sequence{'' if len(found) == 1 else 's'}: {named}{more}")
         frames = chosen_frames(dataset, sampling)
-        taken = _frames_in_words(frames, dataset, sampling)
+        taken = _frames_in_words(frames, dataset if DATASETS[dataset].has_protocol else None, sampling)
         report.note(taken)
         if folders.results:
             for name, value in vars(candidates).items():
@@ -188,6 +188,7 @@ def evaluate(
             "stop": frames.window.stop,
             "stride": frames.stride,
             "max_frames": frames.most,
+            "skip": sampling.skip,
             "frames": taken,
             "depth_align": scores.depth_align,
             "max_depth": labels.max_depth,
@@ -203,16 +204,18 @@ def evaluate(
     _print(report, out, records, source.warnings, settings)
 
 
-def _frames_in_words(frames: FrameChoice, dataset: str, sampling: Sampling) -> str:
-    """Return which frames of a sequence are taken, and who chose them."""
+def _frames_in_words(frames: FrameChoice, protocol: str | None, sampling: Sampling) -> str:
+    """Return which frames of a sequence are taken, and who chose them: the protocol of a data set, if it has one."""
     every = "every frame" if frames.stride == 1 else f"one frame of {frames.stride} (stride {frames.stride})"
     start, stop = frames.window.start or 0, frames.window.stop
     window = f", from frame {start}" * bool(start or stop) + ("" if stop is None else f" to {stop - 1}")
     most = "" if frames.most is None else f", at most {frames.most}"
-    own = [name for name in ("start", "stride", "max_frames") if getattr(sampling, name)]
+    skip = "" if sampling.skip is None else f", without {sampling.skip}" + f" of these from {start}" * bool(stop)
+    own = [name for name in ("start", "stride", "max_frames", "skip") if getattr(sampling, name)]
     by = ", ".join(f"--{name.replace('_', '-')}" for name in own)
-    choice = f"by {by}" if own else f"as the protocol of {dataset} has it; --stride, --start and --max-frames change it"
-    return f"frames: {every}{window}{most}, {choice}"
+    default = "" if protocol is None else f", as the protocol of {protocol} has it"
+    choice = f", by {by}" if own else f"{default}; --stride, --start, --max-frames and --skip change it"
+    return f"frames: {every}{window}{skip}{most}{choice}"
 
 
 def _subjects(candidates: Candidates, folders: Folders) -> str:

@@ -64,17 +64,19 @@ def placed(
     if pairs != [(place, place) for place in range(len(result.depth))]:
         result = _of_frames(result, [own for own, _ in pairs])
     shown = tuple(names[theirs] for _, theirs in pairs)
-    if format == "vggtjax":
-        return _our_own(result, chosen)
+    made = _our_own(result, chosen) if format == "vggtjax" else _others(result, format, chosen)
+    return made if made.frame_names == shown else dataclasses.replace(made, frame_names=shown)
+
+
+def _others(result: Reconstruction, format: str, sizes: Sequence[tuple[int, int]]) -> Reconstruction:
     W, H = result.depth.shape[2], result.depth.shape[1]
-    places = [_SAME if size == (W, H) else _PLACES[format](*size, W, H) for size in chosen]
-    for place, (width, height) in zip(places, chosen, strict=True):
+    places = [_SAME if size == (W, H) else _PLACES[format](*size, W, H) for size in sizes]
+    for place, (width, height) in zip(places, sizes, strict=True):
         if place is None:
             raise InputError(
                 f"frames of {W} x {H} do not come from pictures of {width} x {height} as {format} makes them"
             )
-    made = _replaced(result, chosen, [place for place in places if place])
-    return made if made.frame_names == shown else dataclasses.replace(made, frame_names=shown)
+    return _replaced(result, sizes, [place for place in places if place])
 
 
 def _our_own(result: Reconstruction, sizes: Sequence[tuple[int, int]]) -> Reconstruction:
@@ -96,27 +98,36 @@ def _pairs(
 ) -> list[tuple[int, int]]:
     """Return places of frames in the result and the sequence: by name, by time, or by number; in the latter's order.
 
-    Frames of other programs have numbers. They are those of the sequence's frames, counted from 0, or those at the end
-    of their names. As many frames as the sequence has are the sequence's.
+    Frames of other programs have numbers, and so have those that they lost. As many as the sequence has, counted from 0
+    or 1 or unlike the numbers at the end of its names, are the sequence's in order. Else they are those at the end of
+    its names, or those of its frames, counted from 0.
     """
     own = {name: place for place, name in enumerate(result.frame_names)}
+    wanted = name_times(names) if times is None else times
     if format == "vggtjax":
-        return [(own[name], place) for place, name in enumerate(names) if name in own]
-    count = len(result.depth)
-    if result.timestamps is not None and (wanted := name_times(names) if times is None else times) is not None:
-        pairs = associate(wanted, in_seconds(result.timestamps))
-        if len(pairs):
-            return [(int(mine), int(theirs)) for theirs, mine in pairs]
+        named = [(own[name], place) for place, name in enumerate(names) if name in own]
+        states = "first_time" in result.settings or name_times(result.frame_names) is not None
+        return named or (_by_time(wanted, result.file_times) if states else [])
     numbers = {int(name) if name.isdecimal() else place: place for name, place in own.items()}
-    if count == len(names) and max(numbers) < count:
-        return [(place, place) for place in range(count)]
-    if max(numbers) == count - 1 and count < len(names):  # counted on, whatever frames they are of
-        return []
+    every = sorted({*numbers, *result.settings.get("lost", ())})
     ends = [re.search(r"(\d{1,9})$", name) for name in names]
     by_name = {int(end[1]): place for place, end in enumerate(ends) if end}
-    if (None not in ends and set(numbers) <= set(by_name)) or max(numbers) >= len(names):
-        return [(numbers[number], place) for number, place in by_name.items() if number in numbers]
-    return [(numbers[number], number) for number in sorted(numbers)]
+    counted = every[0] in (0, 1) and every[-1] - every[0] == len(every) - 1
+    if len(every) == len(names) and (counted or by_name.keys().isdisjoint(every)):
+        places = {number: place for place, number in enumerate(every)}
+    elif len(every) != len(names) and result.timestamps is not None and (pairs := _by_time(wanted, result.timestamps)):
+        return pairs
+    elif every[-1] == len(every) - 1 and len(every) < len(names):  # counted on, whatever frames they are of
+        return []
+    elif (None not in ends and by_name.keys() >= set(every)) or every[-1] >= len(names):
+        places = by_name
+    else:
+        places = {number: number for number in every}
+    return [(numbers[number], place) for number, place in places.items() if number in numbers]
+
+
+def _by_time(times: Float64[np.ndarray, " N"] | None, own: Float64[np.ndarray, " S"]) -> list[tuple[int, int]]:
+    return [] if times is None else [(int(mine), int(theirs)) for theirs, mine in associate(times, in_seconds(own))]
 
 
 def _of_frames(result: Reconstruction, frames: Sequence[int]) -> Reconstruction:

@@ -125,6 +125,7 @@ def _computed(
                 scores = score(result, truth, depth_align=scoring.depth_align, empty=scoring.empty)
                 lacking += tuple(truth.left_out.values())
                 said = tuple(f"{name} of {sequence.name}: {each.sentence}" for each in lacking)
+                sizes = tuple(f"{sequence.name}: {note}" for note in sequence.resized)
                 problems = scores.problems
                 if not scores.metrics and not problems:
                     problems = (f"nothing is left to score: {'; '.join((*said, *scores.notes))}",)
@@ -135,7 +136,7 @@ def _computed(
                 drafts[name],
                 status="failed" if problems else "ok",
                 metrics=scores.metrics,
-                notes=drafts[name].notes + _lines((*said, *scores.notes)),
+                notes=drafts[name].notes + _lines((*sizes, *said, *scores.notes)),
                 reason=one_line("; ".join(problems), _MOST_LETTERS),
                 frames=len(own),
                 left_out=drafts[name].left_out | _left_out(lacking),
@@ -149,7 +150,8 @@ def _matched(sequence: LabelledSequence, result: Reconstruction) -> tuple[Labell
     if len(result.depth) == len(sequence):
         return sequence, ()
     places = {name: place for place, name in enumerate(sequence.frame_names)}
-    lacking = [name for name in sequence.frame_names if name not in set(result.frame_names)]
+    there = set(result.frame_names)
+    lacking = [name for name in sequence.frame_names if name not in there]
     matched = sequence.of_frames([places[name] for name in result.frame_names])
     return matched, left_out("results", lacking, len(sequence), "have no result")
 

@@ -29,12 +29,12 @@ _MOST_SPACINGS = 2000  # of points, of which the median is taken
 def write_blender(
     folder: Path, items: Iterator[View], result: Result, static: PointCloud, moving: Sequence[PointCloud]
 ) -> None:
-    """Write scene.py, scene.json, pictures/, static.ply and moving/ into an empty folder.
+    """Write scene.py, scene.json, pictures/, static.ply and, if a mask tells what moves, moving/ into an empty folder.
 
     Frames count from 1. scene.json has poses as everywhere here, world from camera in OpenCV's axes. Raises InputError
     for pictures of several sizes, as a scene of Blender has one.
     """
-    for name in ("pictures", "moving"):
+    for name in ("pictures", "moving") if result.has_mask else ("pictures",):
         (folder / name).mkdir()
     frames: list[dict[str, Any]] = []
     size, suffix = (0, 0), ""
@@ -45,7 +45,7 @@ def write_blender(
         view.write_picture(folder / "pictures")
         frames.append(_frame(view))
     write_ply(folder / "static.ply", static)
-    for number, cloud in enumerate(moving, start=1):
+    for number, cloud in enumerate(moving if result.has_mask else (), start=1):
         write_ply(folder / f"moving/{number:06d}.ply", cloud)
     distance = middle_and_radius(result)[1]
     scene = {

@@ -38,7 +38,7 @@ def main():
     add_points(scene.collection, "static", folder / "static.ply", style)
     moving = bpy.data.collections.new("moving")
     scene.collection.children.link(moving)
-    for number in range(1, len(facts["frames"]) + 1):
+    for number in range(1, len(facts["frames"]) + 1) if (folder / "moving").is_dir() else ():
         points = add_points(moving, f"moving_{number:06d}", folder / f"moving/{number:06d}.ply", style)
         show_only_at(points, number)
     scene.frame_set(1)

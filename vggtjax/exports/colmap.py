@@ -21,20 +21,22 @@ def write_colmap(
     """Write images/, masks/ and sparse/0/ into an empty folder.
 
     Every frame has a PINHOLE camera of its own, as its focal lengths are its own. masks/NAME.png are 0 where pixels
-    move or are padding, as COLMAP's feature extractor takes them. The points of the cloud come from depth, so that no
+    move or are padding, as COLMAP's feature extractor takes them; a frame without mask and padding has
+    none. The points of the cloud come from depth, so that no
     frame observed them: their tracks are empty, and their errors -1, COLMAP's sign for unknown ones. Points that the
     result's tracks follow have these tracks, and the errors that are measured by them.
     """
     import pycolmap
 
-    for name in ("images", "masks", "sparse/0"):
+    for name in ("images", "sparse/0"):
         (folder / name).mkdir(parents=True)
     model = pycolmap.Reconstruction()
     tracked = tracked_points(result)
     tracks: list[list[Any]] = [[] for _ in tracked.points]
     for number, view in enumerate(items, start=1):
         view.write_picture(folder / "images")
-        Image.fromarray(view.static.astype(np.uint8) * 255).save(placed(folder / "masks", f"{view.name}.png"))
+        if view.needs_mask:
+            Image.fromarray(view.static.astype(np.uint8) * 255).save(placed(folder / "masks", f"{view.name}.png"))
         height, width = view.size
         K = view.frame.intrinsics
         model.add_camera_with_trivial_rig(

@@ -37,12 +37,14 @@ def write_dynamic_splats(
     """Write the data set into an empty folder.
 
     rgb/1x/ and rgb/2x/ (half the size) are the pictures, transparent where the model saw nothing; depth/1x/ is 0 where
-    unknown; mask/1x/ is 255 where the world moves; moving/ has the moving points of each frame; points.npy and the
-    .ply the static ones. Every eighth frame is for testing, never the first nor the last.
+    unknown; mask/1x/ is 255 where the world moves; moving/ has the moving points of each frame (neither is there for a
+    result without a mask); points.npy and the .ply the static ones. Every eighth frame is for testing, never the first
+    nor the last.
 
     Raises InputError for pictures of several sizes.
     """
-    for name in ("camera", "rgb/1x", "rgb/2x", "depth/1x", "mask/1x", "moving", "splits"):
+    of_mask = ("mask/1x", "moving") if result.has_mask else ()
+    for name in ("camera", "rgb/1x", "rgb/2x", "depth/1x", "splits", *of_mask):
         (folder / name).mkdir(parents=True)
     times = frame_times(result)[:-1]
     shares = times / max(times[-1], np.finfo(np.float64).tiny)  # from 0 to 1
@@ -52,7 +54,8 @@ def write_dynamic_splats(
     for number, view in enumerate(of_one_size(items, "a data set of dynamic splats")):
         name = ids[number]
         _write_frame(folder, name, view)
-        write_ply(folder / f"moving/{name}.ply", moving[number])
+        if view.has_mask:
+            write_ply(folder / f"moving/{name}.ply", moving[number])
         _dump(folder / f"camera/{name}.json", _camera(view))
         frames.append({
             "file_path": f"rgb/1x/{name}.png",
@@ -100,7 +103,8 @@ def _write_frame(folder: Path, name: str, view: View) -> None:
         image.save(folder / f"rgb/{scale}x/{name}.png", compress_level=3)
     depth = np.where(frame.valid, frame.depth, 0).astype(np.float32)
     np.save(folder / f"depth/1x/{name}.npy", depth[..., None], allow_pickle=False)
-    Image.fromarray(frame.dynamic_mask.astype(np.uint8) * 255).save(folder / f"mask/1x/{name}.png")
+    if view.has_mask:
+        Image.fromarray(frame.dynamic_mask.astype(np.uint8) * 255).save(folder / f"mask/1x/{name}.png")
 
 
 def _camera(view: View) -> dict[str, Any]:

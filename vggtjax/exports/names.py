@@ -8,6 +8,7 @@ import os
 import re
 import unicodedata
 from collections.abc import Sequence
+from itertools import chain, count, product
 from pathlib import Path, PurePosixPath
 
 from vggtjax.media.images import ImageFiles
@@ -26,19 +27,24 @@ logger = logging.getLogger(__name__)
 def picture_names(result: Result, source: Source | None) -> list[str]:
     """Return the names of the frames' pictures with a suffix, as they are: no name is safe yet.
 
-    They are those of the source's files, with the folders that not all of them share, where the files are .jpg or .png;
-    else the frames' names and a suffix: .jpg for frames of a source, .png at the model's size.
+    They are those of the source's files, with the folders that not all of them share (none on several drives), where
+    the files are .jpg or .png; else the frames' names and a suffix: .jpg for frames of a source, .png at the model's
+    size.
     """
     suffix = ".png" if source is None else ".jpg"
     names = [f"{name}{suffix}" for name in result.frame_names]
     if not isinstance(source, ImageFiles):
         return names
-    root = os.path.commonpath([path.parent for path in source.paths])
-    files = iter(zip(source.frame_names, source.paths, strict=True))
+    paths = [Path(os.path.abspath(path)) for path in source.paths]  # noqa: PTH100 -- links keep their names
+    try:
+        root = os.path.commonpath([path.parent for path in paths])
+    except ValueError:  # files on several drives
+        root = None
+    files = iter(zip(source.frame_names, paths, strict=True))
     for number, frame in enumerate(result.frame_names):  # in the order of the source
         path = next((path for name, path in files if name == frame), None)
         if path is not None:
-            place = path.relative_to(root)
+            place = Path(path.name) if root is None else path.relative_to(root)
             own = path.suffix if path.suffix.lower() in WRITTEN else suffix
             names[number] = place.with_name(f"{path.stem}{own}").as_posix()
     return names
@@ -63,8 +69,9 @@ def safe_names(names: Sequence[str], *, blanks: bool = True) -> list[str]:
             continue
         path = PurePosixPath(_safe(name, blanks))
         flat = PurePosixPath("_".join(path.parts))  # where a folder has the name of a picture
-        ends = ("", f"_{number:06d}", *(f"_{number:06d}_{more}" for more in range(len(names))))
-        tries = (str(place.with_name(f"{place.stem}{end}{place.suffix}")) for place in (path, flat) for end in ends)
+        own = f"_{number:06d}"
+        ends = chain(product((path, flat), ("", own)), ((flat, f"{own}_{more}") for more in count()))
+        tries = (str(place.with_name(f"{place.stem}{end}{place.suffix}")) for place, end in ends)
         new = next(text for text in tries if not _clashes(text, taken))
         _take(new, taken)
         made.append(new)

@@ -8,6 +8,7 @@ depth files hold a thousand times the depth, as the parser's default `depth_unit
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,14 @@ _DEPTH_SCALE = 1000.0
 
 
 def write_nerfstudio(folder: Path, items: Iterator[View], points: PointCloud) -> None:
-    """Write transforms.json, images/, depth/, masks/ and points.ply into an empty folder; moving pixels are masked."""
+    """Write transforms.json, images/, depth/, masks/ and points.ply into an empty folder; moving pixels are masked.
+
+    All frames have a mask, as nerfstudio asks, or none, where no frame needs one.
+    """
     for name in ("images", "depth", "masks"):
         (folder / name).mkdir()
     frames: list[dict[str, Any]] = []
+    has_masks = False
     for view in items:
         stem = Path(view.name).with_suffix("").as_posix()
         view.write_picture(folder / "images")
@@ -34,6 +39,10 @@ def write_nerfstudio(folder: Path, items: Iterator[View], points: PointCloud) ->
         np.save(placed(folder, f"depth/{stem}.npy"), depth, allow_pickle=False)
         Image.fromarray(view.static.astype(np.uint8) * 255).save(placed(folder, f"masks/{stem}.png"))
         frames.append(_frame(view, stem))
+        has_masks |= view.needs_mask
+    if not has_masks:
+        shutil.rmtree(folder / "masks")
+        frames = [{key: value for key, value in frame.items() if key != "mask_path"} for frame in frames]
     write_ply(folder / "points.ply", points)
     scene = {"camera_model": "OPENCV", "ply_file_path": "points.ply", "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(scene, indent=1), encoding="utf-8")

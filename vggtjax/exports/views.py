@@ -46,6 +46,11 @@ class View(NamedTuple):
         """Pixels that the model saw and that do not move."""
         return self.frame.seen & ~self.frame.dynamic_mask
 
+    @property
+    def needs_mask(self) -> bool:
+        """Whether `static` tells anything: what moves, or what the model did not see."""
+        return self.has_mask or not self.frame.seen.all()
+
     def write_picture(self, folder: Path) -> None:
         """Write the picture under its name: .jpg with little loss, .png with none."""
         Image.fromarray(self.frame.image).save(placed(folder, self.name), quality=95, compress_level=3)

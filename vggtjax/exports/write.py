@@ -20,6 +20,8 @@ from vggtjax.results.shown import POINT_LIMIT, ShownPoints, shown_points
 from vggtjax.storage.trajectories import write_trajectory
 from vggtjax.storage.writing import writing
 
+_MOSTLY = 0.5  # share of moving pixels from which a mask may be the wrong way round
+
 
 def check_export(out: Path, form: ExportFormat, *, pictures: bool = False) -> None:
     """Check what can be checked before the result is read.
@@ -147,7 +149,8 @@ def _shown(
         most_moving=exporting.points if most_moving is None else most_moving,
     )
     if not len(static.positions) + sum(len(points.positions) for points in moving):
-        raise InputError("the result has no point: no pixel has a depth; run again, and look at its report.html first")
+        seen = "is sure of its depth and off the edges of surfaces" if (result.depth > 0).any() else "has a depth"
+        raise InputError(f"the result has no point: no pixel {seen}; run again, and look at its report.html first")
     return static, moving
 
 
@@ -155,10 +158,12 @@ def _static(result: Result, form: ExportFormat, exporting: Exporting) -> ShownPo
     """Return the static points. Raises InputError without any: no program could use such a model."""
     static, _ = _shown(result, exporting)
     if not len(static.positions):
-        raise InputError(
-            f"{form} has the static points of a result, and this one has none: {result.dynamic_mask.mean():.0%} of its "
-            "pixels move; are the masks the wrong way round (white is what moves)?"
+        why = (
+            f"{result.dynamic_share:.0%} of its pixels move; are the masks the wrong way round (white is what moves)?"
+            if result.has_mask and result.dynamic_share > _MOSTLY
+            else "no pixel that stands still is sure of its depth; look at its report.html"
         )
+        raise InputError(f"{form} has the static points of a result, and this one has none: {why}")
     return static
 
 

@@ -4,30 +4,46 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import datetime
 from decimal import Decimal, InvalidOperation
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float64
 
-from vggtjax.errors import InputError, reading
+from vggtjax.errors import InputError, one_line, reading
 
 logger = logging.getLogger(__name__)
 
-LISTS = ("timestamps.txt", "times.txt", "data.csv")
+LISTS = (
+    "timestamps.txt",
+    "timestamp.txt",
+    "times.txt",
+    "timestamps.csv",
+    "timestamp.csv",
+    "times.csv",
+    "data.csv",
+)  # in any case
 _UNITS = {"seconds": 0, "milliseconds": 3, "microseconds": 6, "nanoseconds": 9}  # digits after the point of a second
-_SHORT = {"[s]": "seconds", "[ms]": "milliseconds", "[us]": "microseconds", "[ns]": "nanoseconds"}
+_SHORT = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
+_STATED = re.compile(r"[\[(](s|ms|us|ns)[\])]")  # a unit, as in "#timestamp [ns]"
+_HEADINGS = ("stamp", "time", _STATED, r"^(?:t|seconds|date)$")  # of columns of times, the surest first
+_BEFORE_UNIT = re.compile(r"\s+(?=[\[(])")  # blanks
+_TWO_PARTS = re.compile(r"(?<![\d.])(\d{10})[_-](\d{9})(?![\d.])")  # seconds and nanoseconds, as ROS has them
+_CUT_PARTS = re.compile(r"(?<![\d.])\d{10}[_-](?:\d{3}|\d{6,})(?!\d)")  # seconds and a part that is not certain
 _SINCE_1970 = re.compile(r"(?<![\d.])(?:\d{19}|\d{16}|\d{13}|\d{10}(?:\.\d{1,9})?|\d{9}\.\d{1,9})(?![\d.])")
 _DATE = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")  # 20240102..., which is no count
 _SECONDS = re.compile(r"\d{1,18}\.\d{1,18}")  # a whole name
 _NUMBER = re.compile(r"[+-]?\d{1,25}(?:\.\d{0,25})?(?:[eE][+-]?\d{1,2})?")
 _FIRST, _LAST = Decimal(631_152_000), Decimal(4_102_444_800)  # the years 1990 to 2100
 _LONGEST = Decimal(3600)  # seconds from frame to frame, in the middle, of names that are times
-_FILMED = Decimal(2)  # the same of whole numbers in a list, which may be in any unit
+_FILMED = Decimal(2)  # the same of whole numbers in a list, or of a film's steady gaps, which may be in any unit
+_APART = 5 * _FILMED  # the same of numbers with decimals whose gaps differ, as of keyframes
+_STEADY = Decimal("1.2")  # of a film: times between a fourth and three fourths of the gaps
+_MOMENT = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d:\d\d)(?:\.(\d{1,9}))?(Z|[+-]\d\d:?\d\d)?")
 _MOST_DIGITS = 9
 _MOST_BYTES = 2**26
 _LONGEST_LINE = 2**12
@@ -64,10 +80,11 @@ class FrameTimes:
 def frame_times(paths: Sequence[Path], pictures: Sequence[str]) -> FrameTimes | None:
     """Return the times of picture files, of a list beside or above them or of their names; None where none tells.
 
-    A list is timestamps.txt, times.txt or EuRoC's data.csv. Its lines are "time name" or "name time", or times alone,
-    one for each picture of the folder; a time is a number or a date and time of day. The unit is the one that the first
-    lines name, the one in which times since 1970 are of our years, or the largest in which frames follow each other as
-    in a film. Times that do not increase from frame to frame are none.
+    A list has a name of `LISTS`. It has times alone, one for each picture of the folder, or columns, one of which names
+    the pictures (or numbers them as their names do); a time is a number or a date and time of day. The unit is the one
+    that the heading of the column or the first lines name, the one in which times since 1970 are of our years, or the
+    largest in which frames follow each other as in a film. Times that do not increase from frame to frame are none; a
+    warning says why a list is not used.
 
     Args:
         paths: the files, in the order of the frames.
@@ -78,12 +95,12 @@ def frame_times(paths: Sequence[Path], pictures: Sequence[str]) -> FrameTimes | 
     folders = {path.parent for path in paths}
     if len(folders) == 1:
         (folder,) = folders
-        lists = [place / name for place in (folder, folder.parent) for name in LISTS]
-        for path in filter(Path.is_file, lists):
-            if (found := _listed(path, [path.name for path in paths], pictures)) is not None:
+        for path in [*_lists(folder), *_lists(folder.parent)]:
+            found = _listed(path, [path.name for path in paths], pictures)
+            if isinstance(found, FrameTimes):
                 return found
-            if path.suffix == ".txt":
-                logger.warning("%s does not give each frame a later time than the one before; it is not used", path)
+            if found:
+                logger.warning("%s is not used: %s", path, found)
     return _named([path.stem for path in paths])
 
 
@@ -104,6 +121,9 @@ def in_seconds(times: Float[np.ndarray, " N"]) -> Float64[np.ndarray, " N"]:
 
 
 def _named(names: Sequence[str]) -> FrameTimes | None:
+    if any(map(_CUT_PARTS.search, each := [_TWO_PARTS.sub(r"\1.\2", name) for name in names])):
+        return None
+    names = each
     if all(map(_SECONDS.fullmatch, names)):
         return _increasing([Decimal(name) for name in names], "the names of the frames, in seconds")
     found = [_SINCE_1970.findall(name) for name in names]
@@ -135,47 +155,111 @@ def _gap(times: Sequence[Decimal]) -> Decimal:
     return gaps[len(gaps) // 2] if gaps else Decimal(0)
 
 
-def _listed(path: Path, names: Sequence[str], pictures: Sequence[str]) -> FrameTimes | None:
-    """Return the times of a list for files of these names; None where it is no such list."""
+def _lists(folder: Path) -> list[Path]:
+    """Return the files of a folder that may be lists, the first of `LISTS` first."""
+    try:
+        found = {path.name.lower(): path for path in folder.iterdir() if path.name.lower() in LISTS}
+    except OSError:  # a folder above that may not be listed
+        found = {name: folder / name for name in LISTS}
+    return [found[name] for name in LISTS if name in found and found[name].is_file()]
+
+
+def _listed(path: Path, names: Sequence[str], pictures: Sequence[str]) -> FrameTimes | str:
+    """Return the times of a list for files of these names; else why it tells none, "" for a list of something else."""
     with reading(path):
         if path.stat().st_size > _MOST_BYTES:
             raise InputError(f"{path} has more than {_MOST_BYTES} bytes; expected a line for each frame")
         text = path.read_text(encoding="utf-8-sig", errors="replace")
-    lines = [line.partition("#")[0].replace(",", " ").split() for line in text.splitlines()]
-    rows = [words for words in lines if words and len(" ".join(words)) < _LONGEST_LINE]
-    if rows and len(rows[0]) > 1 and all(_read(word) is None for word in _joined(rows[0])):
-        rows = rows[1:]  # names of the columns
-    rows = [_joined(words) for words in rows]
-    columns = ((0, None),) if rows and len(rows[0]) == 1 else ((0, 1), (1, 0))
-    for time, name in columns:
-        if any(len(words) <= max(time, name or 0) for words in rows):
-            continue
-        keys = pictures if name is None else [words[name].replace("\\", "/").rpartition("/")[2] for words in rows]
-        times = [_read(words[time]) for words in rows]
-        if len(keys) != len(times):
-            continue
-        known = dict(zip(keys, times, strict=True))
-        known |= {key.rpartition(".")[0]: value for key, value in known.items() if "." in key and _read(key) is None}
-        found = [known.get(each, known.get(each.rpartition(".")[0])) for each in names]
-        every = [value for value in times if value is not None]
-        if None not in found and len(every) == len(times):
-            unit = _SHORT[next(short for short in _SHORT if short in text[:1000])] if _states(text) else _unit(every)
-            seconds = [value.scaleb(-_UNITS[unit]) for value in found if value is not None]
-            return _increasing(seconds, f"{path.name}, in {unit}")
-    return None
+    found: list[FrameTimes | str] = [_of_table(path, text[:1000], *table, names, pictures) for table in _tables(text)]
+    return next((times for times in found if isinstance(times, FrameTimes)), found[0])
 
 
-def _states(text: str) -> bool:
-    return any(short in text[:1000] for short in _SHORT)
+def _tables(text: str) -> Iterator[tuple[list[str], list[list[str]]]]:
+    """Yield the names of a list's columns, if any, and its rows, in each way in which its lines may be split."""
+    lines = [line for line in text.splitlines() if line.strip() and len(line) < _LONGEST_LINE]
+    comments = [line.lstrip("# \t") for line in takewhile(lambda line: line.lstrip().startswith("#"), lines)]
+    lines = [content for line in lines if (content := line.partition("#")[0].strip())]
+    mark = next((mark for mark in ";," if lines and mark in lines[0]), None)
+
+    def split(line: str) -> list[str]:
+        return _joined(line.split()) if mark is None else [word.strip().strip('"') for word in line.split(mark)]
+
+    heading, rows = split(_BEFORE_UNIT.sub("", comments[-1])) if comments else [], [split(line) for line in lines]
+    if len(rows) > 1 and all(_read(word) is None for word in rows[0]):
+        heading, rows = split(_BEFORE_UNIT.sub("", lines[0])), rows[1:]
+    yield heading, rows
+    if mark is None and any(len(row) > 2 for row in rows):  # names with blanks
+        yield heading, [[row[0], " ".join(row[1:])] for row in rows]
+        yield heading, [[" ".join(row[:-1]), row[-1]] for row in rows]
+
+
+def _of_table(
+    path: Path, start: str, heading: list[str], rows: list[list[str]], names: Sequence[str], pictures: Sequence[str]
+) -> FrameTimes | str:
+    """Return what `_listed` does for the rows of a list; its first letters, `start`, may state the unit."""
+    width = min(map(len, rows), default=0)
+    read = [[_read(row[place]) for row in rows] for place in range(width)]
+    columns = [[time for time in column if time is not None] for column in read]
+    times = {place: column for place, column in enumerate(columns) if len(column) == len(rows)}
+    if not times:
+        best = max(range(width), key=lambda place: len(columns[place]), default=0)
+        if not rows or (path.suffix.lower() == ".csv" and not columns[best]):
+            return "" if rows else "it has no line with a time"
+        line = read[best].index(None)
+        return f"its row {line + 1} has {one_line(rows[line][best], 60)!r}; expected a time"
+    if width == 1 and len(rows) != len(pictures):
+        return f"it has {len(rows)} times for {len(pictures)} pictures"
+    keys = {at: [row[at] for row in rows] for at in range(width) if {*times} - {at}} or {-1: pictures}
+    found = {at: _lines_of(names, column) for at, column in keys.items()}
+    at = min(found, key=lambda at: (found[at].count(None), at in times))
+    lines = [line for line in found[at] if line is not None]
+    if len(lines) != len(names):
+        return f"it names no {one_line(names[found[at].index(None)], 60)!r}"
+    if path.suffix.lower() == ".csv" and width == len(heading) > 2:
+        headed = any(re.search(pattern, word.lower()) for pattern in _HEADINGS for word in heading)
+        if not headed:
+            return "none of its columns is headed as times, as by timestamp"
+    place = _time_column({place: column for place, column in times.items() if place != at}, heading)
+    is_headed = len(heading) == len(rows[0]) and any(map(_STATED.search, heading))
+    stated = _STATED.findall(heading[place] if is_headed else start)
+    unit = _SHORT[stated[0]] if stated else _unit(times[place])
+    seconds = tuple(times[place][line].scaleb(-_UNITS[unit]) for line in lines)
+    for name, (before, after) in zip(names[1:], pairwise(seconds), strict=True):
+        if after <= before:
+            return f"it gives {one_line(name, 60)!r} no later time than the frame before"
+    return FrameTimes(seconds, f"{path.name}, in {unit}")
+
+
+def _lines_of(names: Sequence[str], keys: Sequence[str]) -> list[int | None]:
+    """Return the place of each file's key: its name, the name without its ending, or the number that the latter is."""
+    keys = [key.replace("\\", "/").rpartition("/")[2] for key in keys]
+    known: dict[str | int, int] = {int(key): line for line, key in enumerate(keys) if key.isdecimal()}
+    known |= {key.rpartition(".")[0]: line for line, key in enumerate(keys) if "." in key and _read(key) is None}
+    known |= {key: line for line, key in enumerate(keys)}
+    stems = [name.rpartition(".")[0] for name in names]
+    numbers = [int(stem) if stem.isdecimal() else stem for stem in stems]
+    ways = zip(names, stems, numbers, strict=True)
+    return [next((known[key] for key in way if key in known), None) for way in ways]
+
+
+def _time_column(times: Mapping[int, Sequence[Decimal]], heading: Sequence[str]) -> int:
+    """Return the column that is headed as times; else the first that does not count on by one."""
+    for pattern in _HEADINGS:
+        for place in times:
+            if place < len(heading) and re.search(pattern, heading[place].lower()):
+                return place
+    steps = {place: {after - before for before, after in pairwise(column)} for place, column in times.items()}
+    return next((place for place in times if steps[place] != {1}), next(iter(times)))
 
 
 def _unit(times: Sequence[Decimal]) -> str:
     """Return the unit of the times of a list that names none."""
     if (unit := _unit_since_1970(times)) is not None:
         return unit
+    gaps = sorted(after - before for before, after in pairwise(sorted(times)))
+    is_steady = len(gaps) > 1 and gaps[3 * len(gaps) // 4] <= _STEADY * gaps[len(gaps) // 4]
     is_whole = all(time == time.to_integral_value() for time in times)
-    most = _FILMED if is_whole else 5 * _FILMED
-    gap = abs(_gap(sorted(times)))
+    most, gap = _FILMED if is_whole or is_steady else _APART, _gap(sorted(times))
     return next((unit for unit, digits in _UNITS.items() if gap.scaleb(-digits) <= most), "seconds")
 
 
@@ -194,11 +278,11 @@ def _read(word: str) -> Decimal | None:
             return Decimal(word)
         except InvalidOperation:
             return None
-    day, dot, fraction = word.partition(".")
+    if (match := _MOMENT.fullmatch(word)) is None:
+        return None
+    day, hour, fraction, zone = match.groups()
     try:
-        moment = datetime.strptime(day, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+        moment = datetime.fromisoformat(f"{day}T{hour}{zone or 'Z'}")
     except ValueError:
         return None
-    if dot and not re.fullmatch(r"\d{1,9}", fraction):
-        return None
-    return Decimal(int(moment.timestamp())) + (Decimal(f"0.{fraction}") if dot else 0)
+    return Decimal(int(moment.timestamp())) + Decimal(f"0.{fraction or 0}")

@@ -102,7 +102,7 @@ def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict
         "dynamic_mask": np.zeros((S, H, W), bool),
         "images": np.full((S, H, W, 3), _GREY, np.uint8),
     }
-    numbers = fields.pop("numbers", range(S))
+    numbers, lost = fields.pop("numbers", range(S)), fields.pop("lost", [])
     missing = [name for name in plain if fields.get(name) is None]
     if missing:
         logger.warning("%s has no %s; plain values stand for them", path, ", ".join(missing))
@@ -114,7 +114,7 @@ def read_foreign(path: Path, format: str, quaternion: Quaternion | None) -> dict
         "timestamps": fields.get("timestamps"),
         "method": format,
         "model_name": format,
-        "settings": {"format": format, "quaternion": quaternion, "missing": missing},
+        "settings": {"format": format, "quaternion": quaternion, "missing": missing, "lost": lost},
         "source_size": np.tile([H, W], (S, 1)),
         "source_scale": np.ones((S, 2)),
         "source_offset": np.zeros((S, 2)),
@@ -132,8 +132,10 @@ def _without_lost(fields: dict[str, Any], path: Path) -> dict[str, Any]:
     logger.warning("%s has no finite camera for %d of %d frames, %s first; they are left out",
                    path, len(lost), len(found), lost[0])  # fmt: skip
     names = tuple(name for name, is_found in zip(fields["frame_names"], found, strict=True) if is_found)
+    settings = fields["settings"]
     return {name: value[found] if isinstance(value, np.ndarray) else value for name, value in fields.items()} | {
-        "frame_names": names
+        "frame_names": names,
+        "settings": settings | {"lost": sorted([*settings["lost"], *map(int, lost)])},
     }
 
 
@@ -165,7 +167,7 @@ def _read_folder(folder: Path, format: str, quaternion: Quaternion | None) -> di
             f"it has no depth; expected files like {' or '.join(each.depth for each in _FOLDERS[format])}"
         )
     depth_files = _numbered(folder, files.depth)
-    numbers, cameras, times, of_files = files.cameras(folder, sorted(depth_files), quaternion)
+    numbers, cameras, times, of_files, every = files.cameras(folder, sorted(depth_files), quaternion)
     if len(of_files) < len(depth_files):
         logger.warning("%s has cameras for %d of %d frames of depth", folder, len(of_files), len(depth_files))
     depth = _stacked(depth_files, of_files, _read_map, None)
@@ -188,6 +190,7 @@ def _read_folder(folder: Path, format: str, quaternion: Quaternion | None) -> di
         ),
         **cameras._asdict(),
         "numbers": numbers,
+        "lost": sorted({*every} - {*numbers}),
         "timestamps": times,
     }
 
@@ -248,7 +251,7 @@ def _npz_cameras(folder: Path, numbers: Sequence[int], quaternion: Quaternion | 
         poses.append(arrays["pose"].astype(np.float64))
         intrinsics.append(arrays["intrinsics"].astype(np.float64))
     cameras = Cameras(world_from_camera(np.stack(poses)[:, :3])[:, :3], np.stack(intrinsics))
-    return Posed(numbers, cameras, None, numbers)
+    return Posed(numbers, cameras, None, numbers, numbers)
 
 
 def _read_archive(path: Path, names: _Archive) -> dict[str, Any]:

@@ -17,12 +17,16 @@ _MOST_NUMBER = 10**9  # of a frame
 
 
 class Posed(NamedTuple):
-    """Numbers of frames, their cameras, their times where they are known in seconds, and the numbers of their files."""
+    """Numbers of frames, their cameras, their times where they are known in seconds, and the numbers of their files.
+
+    `every` are the numbers of all frames of which the folder has anything.
+    """
 
     numbers: Sequence[int]
     cameras: Cameras
     times: Float64[np.ndarray, " S"] | None
     files: Sequence[int]
+    every: Sequence[int]
 
 
 def text_cameras(folder: Path, files: Sequence[int], quaternion: Quaternion | None) -> Posed:
@@ -51,5 +55,6 @@ def text_cameras(folder: Path, files: Sequence[int], quaternion: Quaternion | No
     found = np.isfinite(poses[rows]).all(axis=(1, 2))
     inverse[found] = world_from_camera(poses[rows][found][:, :3])
     numbers = whole if len(poses) == len(files) and list(files) == counted else kept
+    every = numbers if len(poses) == len(files) else sorted({*files, *whole})
     timed = None if is_whole or not is_timed else times[rows]
-    return Posed(numbers, Cameras(inverse[:, :3], intrinsics[places]), timed, kept)
+    return Posed(numbers, Cameras(inverse[:, :3], intrinsics[places]), timed, kept, every)

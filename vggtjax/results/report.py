@@ -215,7 +215,7 @@ def _strip(result: Result) -> dict[str, Any]:
 
 def _settings(result: Result) -> list[tuple[str, str]]:
     made_with = result.settings.get("versions")
-    hidden = {"clip", "model_note", "missing", "versions"}
+    hidden = {"clip", "model_note", "missing", "lost", "versions"}
     rows = [(name, value) for name, value in result.settings.items() if name not in hidden]
     rows += list(made_with.items()) if isinstance(made_with, dict) else []
     return [(name, value if isinstance(value, str) else json.dumps(value)) for name, value in rows]

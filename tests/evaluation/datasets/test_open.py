@@ -12,6 +12,7 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets import DATASETS, find_sequences, published
 from vggtjax.evaluation.datasets.plain import takes
 from vggtjax.evaluation.datasets.sequence import FrameChoice
+from vggtjax.media.sampling import Sampling
 
 EYE = " ".join(map(str, np.eye(4).ravel()))
 
@@ -32,6 +33,8 @@ def test_frames_are_a_window_then_a_stride_then_a_cap():
     assert DATASETS["dycheck"].frames.of(range(35), "dycheck") == [0, 10, 20, 30]
     assert DATASETS["kitti"].frames.of(range(1000), "kitti") == list(range(110))
     assert FrameChoice(slice(2, 9), 3, 2).of(range(20), "a") == [2, 5]
+    of_bonn = FrameChoice(slice(30, 140)).sampled(Sampling(start=2, stride=2, skip="2,5-6", max_frames=3))
+    assert of_bonn.of(range(200), "a") == [34, 38, 40]  # 32 and 36 are frames 2 and 6 of the window
     assert FrameChoice(slice(30, 140)).of(range(100), "a") == list(range(30, 100))
     assert FrameChoice(slice(30, 140)).shortage(100) == ("it has 100 frames; the protocol takes 30 to 139",)
     with pytest.raises(InputError, match="sequence a has 30 frames, none of them from frame 30 on"):
@@ -55,6 +58,21 @@ def test_plain_folder(tmp_path):
     assert [path.name for path in second.pictures] == ["00.png", "02.png"]
     assert second.depth(1).max() == 2
     assert [sequence.name for sequence in opened("plain", tmp_path, sequences=["clip10"])] == ["clip10"]
+
+
+def test_pictures_that_are_missing_count_where_they_would_be_taken(tmp_path):
+    folder = plain_folder(tmp_path / "clip", frames=8)
+    (folder / "rgb/01.png").unlink()
+    (folder / "rgb/06.png").unlink()
+    for choice, lost, total in (
+        ({}, ("01", "06"), 8),
+        ({"max_frames": 3}, ("01",), 4),  # of 00, 02 and 03
+        ({"max_frames": 1, "strict": True}, (), 0),
+        ({"stride": 3}, ("06",), 3),  # of 00 and 04
+    ):
+        (sequence,) = opened("plain", folder, **choice)
+        left = [(each.frames, each.total) for each in sequence.left_out if each.what == "pictures"]
+        assert left == [(lost, total)] * bool(lost)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from vggtjax.captures.lens import check_no_fisheye
 from vggtjax.captures.table import RECORD3D_SUFFIX, capture_kind, read_capture
 from vggtjax.errors import InputError
 from vggtjax.evaluation.datasets.folders import sequence_folders
-from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, at_size, left_out
+from vggtjax.evaluation.datasets.sequence import FrameChoice, LabelledSequence, Opener, at_size, left_out, unpictured
 
 _OWN_UNIT = "its unit is not the metre, but one of its program's own"  # a note
 
@@ -57,7 +57,7 @@ def _read(path: Path, name: str, frames: FrameChoice) -> LabelledSequence:
         intrinsics=capture.intrinsics,
         timestamps=capture.timestamps,
         notes=notes,
-        left_out=left_out("pictures", whole.absent, len(whole) + len(whole.absent), "have no picture")
+        left_out=unpictured(frames, whole.frame_names, whole.absent, "")
         + (() if len(missing) == len(capture) else left_out("depth", missing, len(capture), "have no depth")),
         frame_names=capture.frame_names,
         archive=capture.archive,

@@ -70,7 +70,7 @@ def _read_davis(root: Path, name: str, frames: FrameChoice) -> LabelledSequence:
     pictures = frames.of(every, name)
     paths = [labels.get(path.stem) for path in pictures]
     mask, missing, notes = mask_reader(pictures, paths, read_labels, folder / "*.png")
-    missing += unpictured((path.stem for path in every), labels, source)
+    missing += unpictured(frames, (path.stem for path in every), labels, source)
     return LabelledSequence(name, tuple(pictures), mask=mask, notes=notes, left_out=missing)
 
 
@@ -111,7 +111,7 @@ def _read_sintel(training: Path, name: str, frames: FrameChoice) -> LabelledSequ
     depths, cams = files(training / "depth" / name, ".dpt"), files(source, ".cam")
     expected = training / "depth" / name / "*.dpt"
     depth, gaps, notes = depth_reader(pictures, [depths.get(path.stem) for path in pictures], read_dpt, expected)
-    gaps += unpictured((path.stem for path in every), {*depths, *cams}, training / "final" / name)
+    gaps += unpictured(frames, (path.stem for path in every), {*depths, *cams}, training / "final" / name)
     poses = intrinsics = None
     cameras = [read_cam(cams[path.stem]) if path.stem in cams else None for path in pictures]
     seen = [camera is not None and all(map(finite, camera)) for camera in cameras]
@@ -156,7 +156,7 @@ def _read_seven_scenes(folder: Path, name: str, frames: FrameChoice) -> Labelled
     taken = [pictures[frame] for frame in chosen]
     read = partial(read_png, per_metre=_MILLIMETRES, invalid=_INVALID)
     depth, gaps, notes = depth_reader(taken, [depths.get(frame) for frame in chosen], read, folder / f"*{_DEPTH}")
-    gaps += unpictured(pictures, {*depths, *pose_files}, folder / f"*{_PICTURE}")
+    gaps += unpictured(frames, pictures, {*depths, *pose_files}, folder / f"*{_PICTURE}")
     nowhere = np.full((4, 4), np.nan)
     poses = np.stack([_pose(pose_files[frame]) if frame in pose_files else nowhere for frame in chosen])
     lost = [frame for frame, pose in zip(chosen, poses, strict=True) if not finite(pose)]

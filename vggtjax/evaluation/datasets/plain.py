@@ -96,7 +96,11 @@ def _read(folder: Path, name: str, part: slice, frames: FrameChoice) -> Labelled
         paths = [masks.get(path.stem) for path in taken]
         mask, more_gaps, more = mask_reader(taken, paths, read_mask, folder / "mask" / "*.png")
         notes, gaps = notes + more, gaps + more_gaps
-    gaps += unpictured((path.stem for path in pictures), {*depths, *masks}, folder / "rgb")
+    stems, truth = [path.stem for path in pictures], {*depths, *masks}
+    if part != slice(None):
+        every = in_order({*stems} | truth, Path)
+        truth = {*every[every.index(stems[part][0]) : every.index(stems[part][-1]) + 1]}
+    gaps += unpictured(frames, stems[part], truth, folder / "rgb")
     poses = None if known.poses is None else known.poses[chosen]
     if poses is not None:
         lost = [path.stem for path, pose in zip(taken, poses, strict=True) if not np.isfinite(pose).all()]

@@ -6,7 +6,7 @@ Does not import jax.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -57,28 +57,46 @@ def left_out(
     return (LeftOut(what, tuple(frames), total, why, str(expected), usual),) if frames else ()
 
 
+def _always(frame: int) -> bool:
+    del frame
+    return True
+
+
 class FrameChoice(NamedTuple):
-    """A window of frames, of which every `stride`-th is taken, and at most `most`."""
+    """A window of frames, of which every `stride`-th is taken unless it is left out, and at most `most`."""
 
     window: slice = slice(None)
     stride: int = 1
     most: int | None = None
+    takes: Callable[[int], bool] = _always  # by its number in the sequence
 
     def sampled(self, sampling: Sampling) -> FrameChoice:
-        """Return the frames of `sampling` within the window; its stride, if any, replaces this stride."""
-        window = slice((self.window.start or 0) + sampling.start, self.window.stop)
+        """Return the frames of `sampling` within the window; its stride, if any, replaces this stride.
+
+        Its `start` and `skip` count from the start of the window.
+        """
+        first = self.window.start or 0
+        window = slice(first + sampling.start, self.window.stop)
         stride = self.stride if sampling.stride is None else sampling.stride
         mosts = [most for most in (self.most, sampling.max_frames) if most is not None]
-        return FrameChoice(window if sampling.start else self.window, stride, min(mosts, default=None))
+        takes = self.takes if sampling.skip is None else lambda frame: sampling.takes(frame - first)
+        return FrameChoice(window if sampling.start else self.window, stride, min(mosts, default=None), takes)
 
     def of(self, items: Sequence[T], name: str) -> list[T]:
         """Return the chosen items, one for each frame of the sequence `name`; raises InputError if there is none."""
         if not items:
             raise InputError(f"sequence {name} has no frames; expected at least one")
-        chosen = list(items[self.window][:: self.stride][: self.most])
-        if not chosen:
+        count = len(items[self.window][:: self.stride])
+        if not count:
             raise InputError(f"sequence {name} has {len(items)} frames, none of them from frame {self.window.start} on")
+        if not (chosen := self.inside(items)):
+            raise InputError(f"skip leaves none of {count} frames of sequence {name}; expected to leave one")
         return chosen
+
+    def inside(self, items: Sequence[T]) -> list[T]:
+        """Return the chosen items, maybe none."""
+        within = [*enumerate(items)][self.window][:: self.stride]
+        return [item for frame, item in within if self.takes(frame)][: self.most]
 
     def shortage(self, count: int) -> tuple[str, ...]:
         """Return a note if a sequence of `count` frames ends before the window."""
@@ -90,11 +108,19 @@ class FrameChoice(NamedTuple):
 EVERY_FRAME = FrameChoice()
 
 
-def unpictured(pictures: Iterable[str], truth: Iterable[str], expected: Path | str) -> tuple[LeftOut, ...]:
-    """Return the frames that have a truth of some kind, by these names, and no picture, which is `expected` there."""
-    named = set(pictures)
-    lacking = in_order({*truth} - named, Path)
-    return left_out("pictures", lacking, len(named) + len(lacking), "have no picture", expected)
+def unpictured(
+    frames: FrameChoice, pictures: Iterable[str], truth: Iterable[str], expected: Path | str
+) -> tuple[LeftOut, ...]:
+    """Return the frames of the choice that have a truth of some kind, by these names, and no picture.
+
+    Pictures are `expected` there. A choice is made of the pictures that are there; the frames without count as left out
+    where it would take them among all frames.
+    """
+    named = [*pictures]
+    lacking = {*truth} - {*named}
+    wanted = frames.inside(in_order({*named} | lacking, Path))
+    lost = [name for name in wanted if name in lacking]
+    return left_out("pictures", lost, len(frames.inside(named)) + len(lost), "have no picture", expected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +167,13 @@ class LabelledSequence:
         poses = self.world_from_camera
         return np.zeros(len(self), bool) if poses is None else np.asarray(np.isfinite(poses).all(axis=(1, 2)))
 
+    @property
+    def resized(self) -> tuple[str, ...]:
+        """Notes on the maps that were read so far, of other sizes than their pictures."""
+        depth = self.depth.maps if isinstance(self.depth, DepthMaps) else None
+        readers = {"depth": depth, "mask": self.mask}
+        return tuple(note for what, maps in readers.items() if isinstance(maps, Maps) for note in maps.note(what))
+
     def of_frames(self, chosen: Sequence[int]) -> LabelledSequence:
         """Return the sequence of some frames, in this order."""
 
@@ -167,6 +200,8 @@ class Maps:
     paths: Sequence[Path | None]
     read: Callable[[Path], Shaped[np.ndarray, "h w"]]
     strict: bool = False  # refuse another size
+    resized: dict[int, tuple[tuple[int, ...], tuple[int, int]]] = field(default_factory=dict)
+    """Sizes of the maps that were read at another size than their pictures, and of these, by frame."""
 
     def __call__(self, frame: int) -> Shaped[np.ndarray, "h w"] | None:
         """Return a frame's map, None where it has no file. Raises OtherShapeError, and InputError for another file."""
@@ -182,19 +217,16 @@ class Maps:
                 f"{path} has shape {values.shape}; expected {(height, width)}, the size of "
                 f"{self.pictures[frame].name}{turned}"
             )
+        self.resized[frame] = values.shape, (height, width)
         return at_size(values, (height, width))
 
-    def notes(self, what: str) -> tuple[str, ...]:
-        """Return a note where the first map has another size than its picture."""
-        first = next(frame for frame, path in enumerate(self.paths) if path is not None)
-        try:
-            shape = self.read(self.paths[first]).shape  # type: ignore[arg-type]
-            width, height = picture_size(self.pictures[first])
-        except InputError:  # raised again where it is read
+    def note(self, what: str) -> tuple[str, ...]:
+        """Return a note where some of the maps that were read have another size than their pictures."""
+        if not self.resized:
             return ()
-        if shape == (height, width):
-            return ()
-        sizes = f"{shape[1]} x {shape[0]} pixels and pictures {width} x {height}"
+        (rows, columns), (height, width) = next(iter(self.resized.values()))
+        count = f"in {len(self.resized)} of {len(self.paths)} frames"
+        sizes = f"{columns} x {rows} pixels and pictures {width} x {height} {count}"
         return (f"its {what} has {sizes}; each pixel of a picture takes the value of the one around its centre",)
 
 
@@ -247,9 +279,7 @@ def depth_reader(
     if len(missing) == len(pictures):
         return Labels(None, (), (f"it has no depth; expected {expected}",))
     maps = Maps(pictures, paths, read)
-    return Labels(
-        DepthMaps(maps), left_out("depth", missing, len(paths), "have no depth", expected), maps.notes("depth")
-    )
+    return Labels(DepthMaps(maps), left_out("depth", missing, len(paths), "have no depth", expected), ())
 
 
 def mask_reader(
@@ -263,7 +293,7 @@ def mask_reader(
     if len(missing) == len(pictures):
         return Labels(None, (), (f"it has no masks; expected {expected}",))
     maps = Maps(pictures, paths, read)
-    return Labels(maps, left_out("masks", missing, len(paths), "have no mask", expected), maps.notes("mask"))
+    return Labels(maps, left_out("masks", missing, len(paths), "have no mask", expected), ())
 
 
 def refuse_left_out(sequence: LabelledSequence) -> LabelledSequence:

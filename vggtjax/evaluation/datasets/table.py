@@ -36,6 +36,11 @@ class Dataset:
     gt: tuple[str, ...] = ()  # names of ground truths, the default first; empty for a single ground truth
 
     @property
+    def has_protocol(self) -> bool:
+        """Whether a published protocol chooses frames or sequences."""
+        return self.frames != EVERY_FRAME or self.sequences is not None
+
+    @property
     def gt_default(self) -> str | None:
         """The name of the default ground truth; None for a data set with a single one."""
         return self.gt[0] if self.gt else None
