@@ -211,7 +211,7 @@ def test_frames_are_left_out_by_number(walk, capsys):
 
 def test_errors_of_cameras_are_those_of_the_frames_that_are_left():
     room, sequence = room_and_truth(frames=6)
-    poses = sequence.world_from_camera.copy()
+    poses = np.array(sequence.world_from_camera)
     moved = poses.copy()
     moved[:, :3, 3] += np.random.default_rng(0).normal(size=(6, 3))
     left = [0, 2, 3, 5]

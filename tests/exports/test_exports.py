@@ -358,7 +358,7 @@ def test_pictures_of_relative_and_absolute_paths_and_of_several_drives_have_name
     monkeypatch.chdir(tmp_path)
     paths = [f"cam{number % 2}/a{number}.png" for number in range(FRAMES)]
     source = open_source([paths[0], *(str(tmp_path / path) for path in paths[1:3]), f"cam0/../{paths[3]}"])
-    named = replace(result, frame_names=tuple(source.frame_names))
+    named = replace(result, frame_names=tuple(Path(path).stem for path in paths))
     assert picture_names(named, source) == paths
 
     def on_two_drives(paths):

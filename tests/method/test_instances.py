@@ -1,5 +1,7 @@
 """Objects of a mask, by hand, on generated scenes, and against scikit-image's labels."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -114,7 +116,8 @@ def test_a_part_that_is_hidden_for_a_frame_is_the_object_again():
 def test_parts_that_are_one_region_at_times_are_one_object():
     mask, _ = boxes(RIDER, SCOOTER, frames=8)
     mask[2:5] = ndimage.binary_closing(mask[2:5], np.ones((1, 3, 3), bool))
-    assert label(mask[3], connectivity=2).max() == 1
+    regions: Any = label(mask[3], connectivity=2)
+    assert regions.max() == 1
     assert find_instances(mask).max() == 1
 
 
