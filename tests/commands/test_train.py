@@ -75,5 +75,5 @@ def test_bad_input(recipe, tmp_path, monkeypatch):
         command.train(recipe, tmp_path / "out", init="demo")  # another configuration
     assert not (tmp_path / "out").exists()
     monkeypatch.setattr("vggtjax.errors.find_spec", lambda name: None)
-    with pytest.raises(MissingExtraError, match=r"vggtjax\[train\]"):
+    with pytest.raises(MissingExtraError, match=r"\.\[train\]"):
         command.train(recipe, tmp_path / "out")
