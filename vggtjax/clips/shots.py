@@ -62,8 +62,13 @@ def look_at(picture: Image.Image) -> Look:
 
 def looks_of(images: Float32[np.ndarray, "S H W 3"], boxes: Int[np.ndarray, "S 4"]) -> list[Look]:
     """Return the look of each frame of a clip, by the pixels that are not padding."""
-    pictures = (image[top:bottom, left:right] for image, (left, top, right, bottom) in zip(images, boxes, strict=True))
-    return [look_at(Image.fromarray((255 * picture).astype(np.uint8))) for picture in pictures]
+    return [look_at(Image.fromarray((255 * picture).astype(np.uint8))) for picture in _inside(images, boxes)]
+
+
+def _inside(images: np.ndarray, boxes: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the pixels of each frame that are not padding."""
+    for image, (left, top, right, bottom) in zip(images, boxes, strict=True):
+        yield image[top:bottom, left:right]
 
 
 def find_shots(looks: Sequence[Look]) -> Shots:
@@ -98,8 +103,7 @@ def find_shots(looks: Sequence[Look]) -> Shots:
 
 def warn_of_dark(images: Float32[np.ndarray, "S H W 3"], boxes: Int[np.ndarray, "S 4"]) -> None:
     """Log that all frames are nearly black, as where their values were stored in more bits or divided twice."""
-    pictures = (image[top:bottom, left:right] for image, (left, top, right, bottom) in zip(images, boxes, strict=True))
-    brightest = max(float(picture.max()) for picture in pictures)
+    brightest = max(float(picture.max()) for picture in _inside(images, boxes))
     if 0 < brightest <= _DARK:
         logger.warning(
             "the brightest pixel of all frames has %.1f of 255, and the model sees little in the dark; where 8, 10 or "
