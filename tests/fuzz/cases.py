@@ -32,7 +32,6 @@ class Reader(NamedTuple):
     make: Callable[[Path], Path]  # returns what is read: a file or folder inside the given, empty folder
     read: Callable[[Path], object]
     slack: int = 48 * 2**20  # bytes that a case may take beyond twice what the valid sample takes
-    refusals: type[Exception] = VggtjaxError  # what the reader raises for a file that it refuses, in a sentence
 
 
 class Outcome(NamedTuple):
@@ -70,7 +69,7 @@ class Sample:
             shutil.copytree(seed, self._scratch, symlinks=True, dirs_exist_ok=True)
         elif seed is not None:
             change(self._scratch, Random(f"{self.reader.name} {seed}"))
-        outcome = read(self.reader.read, self._scratch / self._read, self.reader.refusals)
+        outcome = read(self.reader.read, self._scratch / self._read)
         if seed is not None and outcome.kind != "found" and outcome.bytes > _TIMES * self.bytes + self.reader.slack:
             words = f"took {outcome.bytes >> 20} MiB, the valid sample {self.bytes >> 20}; {outcome.words}"
             return outcome._replace(kind="found", words=words)
@@ -95,7 +94,7 @@ def scratch_folder() -> Iterator[Path]:
         yield Path(folder)
 
 
-def read(function: Callable[[Path], object], path: Path, refusals: type[Exception] = VggtjaxError) -> Outcome:
+def read(function: Callable[[Path], object], path: Path) -> Outcome:
     """Call a reader; every outcome but success and one good sentence is found."""
     before = reset_high_water() or 0  # on other systems than Linux both are unknown
     try:
@@ -103,7 +102,7 @@ def read(function: Callable[[Path], object], path: Path, refusals: type[Exceptio
             warnings.simplefilter("ignore")
             function(path)
         kind, words = "accepted", ""
-    except refusals as error:
+    except VggtjaxError as error:
         kind, words = _judged(error)
     except (Exception, HangError) as error:  # all else is what this looks for
         where = traceback.extract_tb(error.__traceback__)

@@ -21,7 +21,6 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
 from vggtjax.learning import paper_rule, reconstruct_soft, soft_masking
 from vggtjax.method.algorithm import run_method, run_passes
-from vggtjax.pipeline.artefact import write_artefact
 from vggtjax.pipeline.run import compile_ahead
 from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.windows.plan import Windows
@@ -60,7 +59,6 @@ def _callers(model, clip, folder):
         "several methods": lambda: reconstruct_methods(model, clip, ["vggt", "4dvggt-d"]),
         "ladder": lambda: ladder(model, truth),
         "soft masks": lambda: reconstruct_soft(model.params, IMAGES, config, soft_masking(config)),
-        "artefact": lambda: write_artefact(model, folder / "a", frames=FRAMES, height=SIDE, width=SIDE),
         "batch": lambda: next(reconstruct_many(model, {"clip": IMAGES[0]}, folder / "b")),
         "windows": lambda: reconstruct_long(model, np.concatenate(IMAGES), folder / "c", Windows(4, 2)),
     }

@@ -29,7 +29,6 @@ from vggtjax.commands.demo import demo
 from vggtjax.commands.doctor import doctor
 from vggtjax.commands.evaluate import evaluate
 from vggtjax.commands.export import export
-from vggtjax.commands.export_model import export_model
 from vggtjax.commands.fit_fusion import fit_fusion
 from vggtjax.commands.help_page import TYRO_WIDTH, Help, page, read_help
 from vggtjax.commands.overview import Command, overview
@@ -62,7 +61,6 @@ COMMANDS = {
     "train": Command(train, _MODELS, "train a model on generated scenes, or finetune one"),
     "calibrate-cues": Command(calibrate_cues, _MODELS, "choose a model's motion cues"),
     "fit-fusion": Command(fit_fusion, _MODELS, "fit how the two passes are fused"),
-    "export-model": Command(export_model, _MODELS, "a model as a program that jax runs without vggtjax"),
     "evaluate": Command(evaluate, _MEASURE, "score methods on a data set with ground truth"),
     "scenes": Command(scenes, _MEASURE, "generate clips with exact ground truth"),
     "doctor": Command(doctor, _COMPUTER, "versions, devices, memory, the longest clips, extras, the cache"),
@@ -70,6 +68,7 @@ COMMANDS = {
 
 _OUT_OF_MEMORY = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size"
 _OLD_FLAGS = {"--mode": "--preprocess"}  # still understood
+_OLD_COMMANDS = {"export-model": "jax.export writes a model as a program, in the 25 lines of docs/how-to/jax-export.md"}
 
 
 class _OneLine(logging.Formatter):
@@ -161,6 +160,8 @@ def _parsed(arguments: Sequence[str]) -> Callable[[], int | None]:
     tyro prints errors of the option dataclasses in a box. Find the error in the chain of exceptions and raise it.
     """
     name, *others = arguments
+    if name in _OLD_COMMANDS:
+        raise InputError(f"the command {name} is no longer there: {_OLD_COMMANDS[name]}")
     if name not in COMMANDS:
         similar = difflib.get_close_matches(name, COMMANDS, n=1)
         guess = f"did you mean {similar[0]}? " if similar else ""

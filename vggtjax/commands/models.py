@@ -69,16 +69,16 @@ class ModelFiles:
     """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""
 
     def load(
-        self, report: Report, options: Options, methods: Sequence[str], *, runs_here: bool = True
+        self, report: Report, options: Options, methods: Sequence[str]
     ) -> tuple[Model, FusionParams | None]:
         """Load the model, and the fitted rule of fusion (None, the paper's rule, without a file).
 
-        A model that runs here has weights in the type in which its blocks are computed here.
+        The weights have the type in which the blocks are computed here.
         The rule is read first: InputError where it is invalid or none of the `methods` (in place of `options.method`)
         fuses. A warning is logged if the rule was fitted to another model or with other options.
         """
         name = at_revision(check_named(self.model), self.revision)
-        dtype = options.computed().compute_dtype if runs_here else None
+        dtype = options.computed().compute_dtype
         if self.fusion is None:
             return load(report, name, self.config, dtype), None
         from vggtjax.method.assembly import check_fuses

@@ -1,11 +1,7 @@
-"""Rows of weights, and of what goes with them: configurations, recipes, checkpoints of a run, artefacts, the hub."""
+"""Rows of weights, and of what goes with them: configurations, recipes, checkpoints of a run, the hub."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import re
-from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import export
 
 from converters.files import read_state_dict
 from tests.dataset_files import write
@@ -24,7 +19,6 @@ from vggtjax.checkpoint import flat_shapes, read_model, write_checkpoint
 from vggtjax.config import VGGTConfig
 from vggtjax.method.fusion_family import start
 from vggtjax.method.fusion_file import load_fusion, save_fusion
-from vggtjax.pipeline import serve
 from vggtjax.storage.json_values import read_json
 from vggtjax.storage.tensor_file import Spec, write_tensors
 from vggtjax.training.checkpoints import restore, save
@@ -94,48 +88,6 @@ def _read_training_checkpoint(path: Path) -> None:
     restore(path, jax.eval_shape(_state), read_recipe(_RECIPE))
 
 
-def _artefact(folder: Path) -> Path:
-    """Write what `write_artefact` writes, with a small program, and a clip for it."""
-    place, shape = folder / "artefact", (2, 4, 6, 3)
-    weights = {"scale": np.ones((1, 1, 1, 3), np.float32), "shift": np.zeros((1, 1, 1, 3), np.float16)}
-    specs = {name: Spec(value.shape, value.dtype) for name, value in weights.items()}
-    place.mkdir()
-    write_tensors(place / serve.WEIGHTS, specs, lambda name: [weights[name]])
-    program = jax.jit(lambda w, images: {"depth": (images * w["scale"] + w["shift"]).sum(-1)})
-    exported = export.export(program, platforms=("cpu",))(weights, jax.ShapeDtypeStruct(shape, np.float32))
-    (place / serve.PROGRAM).write_bytes(exported.serialize())
-    manifest = {
-        "format": serve.FORMAT,
-        "version": serve.VERSION,
-        "jax": jax.__version__,
-        "calling_convention": exported.calling_convention_version,
-        "platforms": list(exported.platforms),
-        "model": {"name": "tiny"},
-        "inputs": {"images": {"shape": list(shape), "dtype": "float32", "about": "RGB in [0, 1]"}},
-        "outputs": {"depth": {"shape": list(shape[:3]), "dtype": "float32", "about": "up to scale"}},
-        "files": {name: {"sha256": _digest(place / name)} for name in (serve.PROGRAM, serve.WEIGHTS)},
-    }
-    write(place / serve.MANIFEST, json.dumps(manifest))
-    np.save(folder / "clip.npy", np.zeros(shape, np.uint8))
-    return folder
-
-
-def _read_artefact(folder: Path) -> None:
-    """Load an artefact and run it; who changes its weights writes their new digest into the manifest."""
-    place = folder / "artefact"
-    manifest = place / serve.MANIFEST
-    if (place / serve.WEIGHTS).is_file() and manifest.is_file() and not manifest.is_symlink():
-        entry = re.compile(f'("{serve.WEIGHTS}": {{"sha256": ")[0-9a-f]{{64}}'.encode())
-        with suppress(OSError):
-            digest = _digest(place / serve.WEIGHTS).encode()
-            manifest.write_bytes(entry.sub(rb"\g<1>" + digest, manifest.read_bytes()))
-    serve.load(place)(serve._read_frames(folder / "clip.npy"))
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 ROWS = (
     Reader("safetensors", lambda folder: _tensors(folder / "model.safetensors"), _weights),
     Reader("shards with an index", _shards, _weights),
@@ -150,5 +102,4 @@ ROWS = (
     Reader("recipe", file("recipe.json", _RECIPE.read_bytes()), read_recipe),
     Reader("fusion file", _fusion, load_fusion),
     Reader("training checkpoint", _training_checkpoint, _read_training_checkpoint),
-    Reader("artefact", _artefact, _read_artefact, refusals=serve.ArtefactError),
 )
