@@ -116,7 +116,7 @@ def test_imports_of_folders_form_no_circle(graph):
 
 
 def test_the_network_loads_no_library_of_the_command_line():
-    code = "import sys, vggtjax.network.model; print({'tyro', 'gradio', 'viser'} & set(sys.modules))"
+    code = "import sys, vggtjax.network.model; print({'tyro', 'gradio'} & set(sys.modules))"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "set()\n"
 
 

@@ -30,7 +30,6 @@ EXTRAS: dict[str, tuple[str, tuple[str, ...]]] = {
     "convert": ("PyTorch checkpoints, .pt and .pth", ("torch",)),
     "train": ("vggtjax train, and plots of fits", ("optax", "orbax", "matplotlib")),
     "evaluate": ("plots of vggtjax evaluate", ("matplotlib",)),
-    "view": (".viser recordings of vggtjax view", ("viser",)),
     "app": ("vggtjax app", ("gradio",)),
     "colmap": ("--refine-cameras, and models of COLMAP", ("pycolmap",)),
     "rerun": ("recordings of rerun by vggtjax export", ("rerun",)),

@@ -68,7 +68,11 @@ COMMANDS = {
 
 _OUT_OF_MEMORY = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size"
 _OLD_FLAGS = {"--mode": "--preprocess"}  # still understood
-_OLD_COMMANDS = {"export-model": "jax.export writes a model as a program, in the 25 lines of docs/how-to/jax-export.md"}
+_GONE = {  # a command, or one with a flag, or with a flag and its value: what to take instead
+    "export-model": "jax.export writes a model as a program, in the 25 lines of docs/how-to/jax-export.md",
+    "view --format viser": "vggtjax view RESULT --export PAGE.html writes a page that opens offline",
+    "export --to viser": "--to rerun writes a recording, and vggtjax view RESULT --export PAGE.html a page",
+}
 
 
 class _OneLine(logging.Formatter):
@@ -154,14 +158,21 @@ def _renamed(argument: str) -> str:
     return f"{_OLD_FLAGS.get(flag, flag)}{equals}{value}"
 
 
+def _refuse_gone(name: str, arguments: Sequence[str]) -> None:
+    given = f" {' '.join(arguments)} ".replace("=", " ")
+    for gone, instead in _GONE.items():
+        command, _, flag = gone.partition(" ")
+        if name == command and (not flag or f" {flag} " in given):
+            raise InputError(f"{gone} is no longer there: {instead}")
+
+
 def _parsed(arguments: Sequence[str]) -> Callable[[], int | None]:
     """Return the command with its arguments, ready to be called.
 
     tyro prints errors of the option dataclasses in a box. Find the error in the chain of exceptions and raise it.
     """
     name, *others = arguments
-    if name in _OLD_COMMANDS:
-        raise InputError(f"the command {name} is no longer there: {_OLD_COMMANDS[name]}")
+    _refuse_gone(name, others)
     if name not in COMMANDS:
         similar = difflib.get_close_matches(name, COMMANDS, n=1)
         guess = f"did you mean {similar[0]}? " if similar else ""

@@ -54,8 +54,8 @@ def view(
 
     Args:
         results: folders of results, up to nine; several are shown side by side or swapped by a key.
-        export: write this .html file, which holds everything and opens without a server, and end; or a .viser file of
-            one result, for viser's own player (extra "view"); by default the viewer is served.
+        export: write this .html file, which holds everything and opens without a server, and end; by default the
+            viewer is served.
         overwrite: replace the file if it exists.
         format: the program whose files the folders have.
         quaternion: order of the quaternions in pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw;
@@ -64,10 +64,9 @@ def view(
     """
     if not results:
         raise InputError("no result; name the folder of one, such as demo-output")
-    if export is not None and export.suffix not in (".html", ".viser"):
-        raise InputError(f"export is {export}; expected a name that ends with .html or .viser")
-    if export is not None and export.suffix == ".viser" and len(results) > 1:
-        raise InputError(f"{len(results)} results for {export}; a .viser file holds one, an .html file up to nine")
+    if export is not None and export.suffix != ".html":
+        other = "; vggtjax export RESULT OUT.rrd --to rerun writes a recording" if export.suffix == ".viser" else ""
+        raise InputError(f"export is {export}; expected a name that ends with .html{other}")
     report = Report()
     with report.running():
         from vggtjax.results.folder import check_no_part
@@ -91,7 +90,7 @@ def view(
         if export is not None:
             _export(report, loaded, names, export)
     if export is not None:
-        report.line(f"Open in a browser: {export}" if export.suffix == ".html" else f"Written: {export}")
+        report.line(f"Open in a browser: {export}")
     else:
         serve(report, loaded, names, serving)
 
@@ -122,14 +121,9 @@ def serve(report: Report, results: Sequence[Result], names: Sequence[str], servi
 
 def _export(report: Report, results: Sequence[Result], names: Sequence[str], path: Path) -> None:
     with report.stage("choose points") as progress:
-        if path.suffix == ".viser":
-            from vggtjax.viewer.recording import write_recording
+        from vggtjax.viewer.page import Viewer, viewer_page
 
-            write_recording(path, results[0], progress=progress)
-        else:
-            from vggtjax.viewer.page import Viewer, viewer_page
-
-            Viewer(viewer_page(results, names=names, progress=progress)).save(path)
+        Viewer(viewer_page(results, names=names, progress=progress)).save(path)
 
 
 def _names(paths: Sequence[Path]) -> list[str]:
