@@ -1,4 +1,4 @@
-"""Batches: regions of suppressed keys, their share of the clips and effect on the network; shares of workers."""
+"""Batches: regions of suppressed keys, their share of the clips and effect on the network."""
 
 import dataclasses
 from functools import partial
@@ -18,7 +18,7 @@ from vggtjax.network.camera_head import predict_pose
 from vggtjax.network.model import init_params
 from vggtjax.network.suppression import Suppression
 from vggtjax.training.data import make_batch
-from vggtjax.training.objective import LossWeights, init_probes, objective, with_counts
+from vggtjax.training.objective import LossWeights, init_probes, objective
 from vggtjax.training.recipe import Phase
 from vggtjax.training.regions import random_regions
 from vggtjax.training.truth import targets
@@ -100,18 +100,3 @@ def test_the_objective_suppresses_keys_as_a_second_pass_does(batch, trained, sup
     found = float(terms(trained, batch)["loss_translation"])
     assert found == pytest.approx(float(translation_loss(tokens)), rel=1e-5)
     assert abs(float(translation_loss(jnp.zeros_like(tokens))) - found) > 1e-5
-
-
-def test_the_loss_of_a_batch_is_the_mean_of_its_shares(batch, trained):
-    """The shares of two workers have different numbers of matches, which some terms are means over."""
-    count = jax.jit(with_counts, static_argnums=1, compiler_options=QUICK)
-
-    def shares(batch):
-        return [jax.tree.map(lambda leaf, i=i: leaf[i : i + 2], batch) for i in (0, 2)]
-
-    whole = jax.device_get(terms(trained, batch))
-    first, second = (jax.device_get(terms(trained, share)) for share in shares(count(batch, CONFIG)))
-    for name, value in whole.items():
-        assert np.mean([first[name], second[name]]) == pytest.approx(value, rel=1e-5), name
-    apart = [float(terms(trained, count(share, CONFIG))["loss_match"]) for share in shares(batch)]
-    assert abs(np.mean(apart) - whole["loss_match"]) > 1e-4 * whole["loss_match"]

@@ -1,19 +1,16 @@
-"""The loop of a training run: what it leaves, exact resume, signals, and worker processes that share the clips."""
+"""The loop of a training run: what it leaves, exact resume and signals."""
 
 import dataclasses
-import multiprocessing
 import os
 import shutil
 import signal
-from multiprocessing.process import BaseProcess
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_objective import broken
-from tests.training_runs import PROBES, SHORT, TASK, init_probes, measured
+from tests.training_runs import PROBES, SHORT, TASK, measured
 from vggtjax.checkpoint import read_model
 from vggtjax.errors import InputError, OutputError, VggtjaxError
 from vggtjax.network.model import init_params
@@ -23,8 +20,7 @@ from vggtjax.training.metrics import read_metrics
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, read_recipe
 from vggtjax.training.run import MOST_SKIPPED
-from vggtjax.training.state import exported, initial_state
-from vggtjax.training.workers import Workers, check_workers
+from vggtjax.training.state import exported
 
 NOW = 1e-9  # seconds: a run that ends after one step
 
@@ -142,71 +138,3 @@ def test_bad_arguments(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write"):
         train(SHORT, tmp_path / "file", task=TASK)
-    task = dataclasses.replace(TASK, objective=lambda *_, **__: (jnp.float32(0), {}))
-    with pytest.raises(InputError, match="cannot be sent to other processes; define it at the top of a module"):
-        train(SHORT, tmp_path, options=RunOptions(workers=2), task=task)
-
-
-def test_two_workers_give_the_numbers_of_one_process(straight, tmp_path, undrawn, monkeypatch):
-    """Where a run begins with one process and resumes with two.
-
-    A terminal's Ctrl-C, which every process gets, does not end the workers: neither at their start nor later.
-    """
-    start = BaseProcess.start
-
-    def interrupt_workers(status):
-        for process in multiprocessing.active_children():
-            assert process.pid is not None
-            os.kill(process.pid, signal.SIGINT)
-
-    def start_and_interrupt(process):
-        start(process)
-        interrupt_workers(None)
-
-    monkeypatch.setattr(BaseProcess, "start", start_and_interrupt)
-
-    whole, out, _ = straight
-    train(SHORT, tmp_path, options=RunOptions(log_every=2, seconds=NOW), task=TASK)
-    options = RunOptions(log_every=2, workers=2)
-    shared = train(SHORT, tmp_path, options=options, progress=interrupt_workers, task=TASK)
-    assert shared.finished
-    found, expected = (
-        [[row[name] for name in sorted(row)] for row in measured(folder / "metrics.csv")] for folder in (tmp_path, out)
-    )
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), shared.state, whole.state)
-    assert not multiprocessing.active_children()
-
-
-@pytest.mark.proof
-def test_a_worker_that_ends_is_said_and_the_run_resumes(tmp_path):
-    def kill(status):
-        if status.step == 2:
-            multiprocessing.active_children()[0].kill()
-
-    options = RunOptions(log_every=2, checkpoint_seconds=NOW, workers=2)
-    with pytest.raises(VggtjaxError, match="worker of the training run has ended, perhaps for lack of memory"):
-        train(SHORT, tmp_path, options=options, progress=kill, task=TASK)
-    assert not multiprocessing.active_children()
-    assert latest(tmp_path / "checkpoints") == 2
-    assert train(SHORT, tmp_path, options=RunOptions(), task=TASK).finished
-
-
-def test_an_error_in_a_worker_is_said():
-    trained = initial_state(SHORT, init_probes(0, SHORT.model)).trained
-    with (
-        Workers(SHORT, broken, trained, 1) as workers,
-        pytest.raises(VggtjaxError, match="a worker of the training run failed: ValueError: no such loss") as raised,
-    ):
-        workers.loss_and_gradient(trained, jnp.zeros((2, 2, 28, 28, 3)))
-    assert "in broken" in str(raised.value.__cause__)  # where in the objective
-
-
-def test_workers_that_cannot_share(monkeypatch):
-    monkeypatch.setattr(jax, "local_device_count", lambda: 8)
-    with pytest.raises(InputError, match="workers is 2, and the CPU is split into 8 devices"):
-        check_workers(SHORT, 2)
-    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    with pytest.raises(InputError, match="workers is 2, and jax computes on a gpu; expected 1, or a CPU"):
-        check_workers(SHORT, 2)
-    check_workers(SHORT, 1)

@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from tests.training_objective import objective
-from tests.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, train_step
+from tests.training_runs import RECIPE, SHORT, TASK, init_probes, make_batch, objective, train_step
 from vggtjax.checkpoint import read_model, save_model
 from vggtjax.errors import CheckpointError
 from vggtjax.network.model import init_params

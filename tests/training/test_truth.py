@@ -1,7 +1,5 @@
 """What the network should say, and where patches are seen again: by hand and against slow loops in float64."""
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -184,14 +182,8 @@ def slow_match_loss(matches, q, k):
     return -np.mean(to_first) - np.mean(to_each), np.mean(right)
 
 
-def clip_counts(found):
-    """The counts of all clips together, as the objective sums them."""
-    return jax.tree.map(jnp.sum, match_counts(found))
-
-
-@partial(jax.jit, compiler_options=QUICK)
 def quick_match_loss(found, q, k):
-    return match_loss(found, clip_counts(found), q, k)
+    return match_loss(found, match_counts(found), q, k)
 
 
 def log_softmax(x):
@@ -217,7 +209,7 @@ def test_the_loss_of_layers_is_the_mean_of_those_that_are_supervised():
     B, S, P = 1, 3, 4
     q, k = (jnp.asarray(generator.normal(0, 2, (4, B, S, 1 + P, 2, 8)), jnp.float32) for _ in range(2))
     found = random_matches(generator, B, S, P)
-    loss = MatchLoss(found, clip_counts(found), (1, 3), depth=4)
+    loss = MatchLoss(found, match_counts(found), (1, 3), depth=4)
     sums = loss.zeros(B, S, P)
     for layer, supervised in enumerate(loss.layer_counts()):
         sums = loss.add(sums, supervised, q[layer], k[layer])

@@ -70,6 +70,7 @@ _OUT_OF_MEMORY = "out of memory; take fewer frames (--max-frames, --stride) or a
 _OLD_FLAGS = {"--mode": "--preprocess"}  # still understood
 _GONE = {  # a command, or one with a flag, or with a flag and its value: what to take instead
     "export-model": "jax.export writes a model as a program, in the 25 lines of docs/how-to/jax-export.md",
+    "train --workers": "a run takes one process; leave it out",
     "view --format viser": "vggtjax view RESULT --export PAGE.html writes a page that opens offline",
     "export --to viser": "--to rerun writes a recording, and vggtjax view RESULT --export PAGE.html a page",
 }

@@ -68,9 +68,7 @@ class ModelFiles:
     fusion: InWords[Path | None] = None
     """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""
 
-    def load(
-        self, report: Report, options: Options, methods: Sequence[str]
-    ) -> tuple[Model, FusionParams | None]:
+    def load(self, report: Report, options: Options, methods: Sequence[str]) -> tuple[Model, FusionParams | None]:
         """Load the model, and the fitted rule of fusion (None, the paper's rule, without a file).
 
         The weights have the type in which the blocks are computed here.

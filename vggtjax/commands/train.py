@@ -41,7 +41,7 @@ def train(
             default. The recipe's image size, cues and number of masked pairs replace those of the model, and its
             new pairs are added.
         steps: total number of steps; phases, warm-up and decay keep their shares. The recipe's own by default.
-        options: how the run logs, saves, ends, and uses the cores of a CPU.
+        options: how the run logs, saves and ends.
     """
     check_extra("training", "train", "optax", "orbax", "matplotlib")
     check_file(out / _MODEL, overwrite=True, sources=[] if init is None else [Path(init), Path(init) / _MODEL])

@@ -19,7 +19,7 @@ def keep_freed_memory(*, training: bool = False) -> bool:
     One arena holds the memory of all threads, so that nothing is kept twice; its lock and its long lists of free blocks
     take a quarter of a training step. With `training`, threads have arenas of their own: see `run_in_calling_thread`.
 
-    A setting of the whole process: commands and workers of training call it, a program's own process is left alone.
+    A setting of the whole process: commands call it, a program's own process is left alone.
     """
     if not sys.platform.startswith("linux"):
         return False

@@ -12,12 +12,9 @@ from jaxtyping import Array, Bool, Float
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.network.suppression import Suppression
 from vggtjax.scenes.render import SyntheticClip
-from vggtjax.training.truth import MatchCounts
 
 
-@partial(
-    jax.tree_util.register_dataclass, data_fields=("clips", "regions", "pairs", "counts"), meta_fields=("suppress",)
-)
+@partial(jax.tree_util.register_dataclass, data_fields=("clips", "regions", "pairs"), meta_fields=("suppress",))
 @dataclass(frozen=True)
 class Batch:
     """The clips of a step, and the random regions in which their keys are suppressed: a pytree.
@@ -27,14 +24,12 @@ class Batch:
         regions: pixels of suppressed patches; None for no suppression in any clip.
         pairs: share of the pairs of blocks, from the first, that suppress keys, in (0, 1]; the same for all clips.
         suppress: how keys are suppressed; static under jit.
-        counts: numbers of matches, [B]: for each clip of a share the mean over the clips of the whole batch.
     """
 
     clips: SyntheticClip
     regions: Bool[Array, "B S H W"] | None = None
     pairs: Float[Array, " B"] | None = None
     suppress: Suppress = "zero"
-    counts: MatchCounts | None = None
 
     def suppression(self, config: VGGTConfig) -> Suppression:
         """Return the suppression of the network's keys: a patch is suppressed if its middle pixel is."""

@@ -26,13 +26,11 @@ from vggtjax.training.devices import placement
 from vggtjax.training.metrics import Row
 from vggtjax.training.objective import init_probes as init_scene_probes
 from vggtjax.training.objective import objective as scene_objective
-from vggtjax.training.objective import with_counts
 from vggtjax.training.options import RunOptions
 from vggtjax.training.recipe import Phase, Recipe
 from vggtjax.training.run import Run, labels_of
 from vggtjax.training.start import adapted
 from vggtjax.training.state import Metrics, Objective, TrainingState, apply_gradient, loss_and_gradient
-from vggtjax.training.workers import Workers, check_workers
 
 GENERATED_NOTE = "model trained on generated scenes alone"
 _AHEAD = 2  # steps that the host may prepare while the device computes
@@ -73,15 +71,12 @@ class Task:
         make_batch: (key, textures, phase, frames) -> batch, with the last two static.
         init_probes: (seed, config) -> parameters of the objective alone.
         objective: (trained, batch, config, weights, *, compute_dtype, remat) -> loss, metrics.
-        for_workers: (batch, config) -> the batch with what its shares need, as arrays [clips, ...]: loss and metrics of
-            the batch must be the means of those of equal shares.
     """
 
     textures: Any = None
     make_batch: Callable[..., Any] = make_scene_batch
     init_probes: Callable[..., Params] = init_scene_probes
     objective: Objective = scene_objective
-    for_workers: Callable[..., Any] = with_counts
 
 
 def train(
@@ -96,7 +91,7 @@ def train(
     """Train a model, or resume from the newest checkpoint in `out`.
 
     The batch of a step depends on the recipe and the step alone, so a resumed run gives the numbers of an uninterrupted
-    one with as many workers (on a GPU if its sums have a fixed order: XLA_FLAGS=--xla_gpu_deterministic_ops=true).
+    one (on a GPU if its sums have a fixed order: XLA_FLAGS=--xla_gpu_deterministic_ops=true).
     SIGINT and SIGTERM end the run after the current step, with a checkpoint; a second SIGINT ends it at once.
 
     Args:
@@ -111,22 +106,20 @@ def train(
         task: the data and the loss.
 
     Raises:
-        InputError: the workers of `options` cannot share the recipe's batches, the device is no CPU, or the recipe has
-            new pairs and `init` is None.
+        InputError: the recipe has new pairs and `init` is None.
         CheckpointError: the checkpoint in `out` is of another model, or `init` does not fit the recipe's.
         OutputError: `out` cannot be written, or another run is writing into it.
-        VggtjaxError: 50 steps in a row had a loss or gradient that is not finite, or a worker has ended.
+        VggtjaxError: 50 steps in a row had a loss or gradient that is not finite.
     """
     labels = labels_of(recipe, init, GENERATED_NOTE if task is None else "")
     params = adapted(init, recipe) if isinstance(init, Model) else init
     options, task = options or RunOptions(), task or Task()
-    check_workers(recipe, options.workers)
     with locked_folder(out, "checkpoints and a model"):
         run = Run(recipe, Path(out), task.init_probes(recipe.seed, recipe.model), params, labels, options)
         pace = _Pace(run, progress)
         pace.report()
-        with _signals() as received, _gradients(run, task) as loss_and_gradient:
-            trainer = _Trainer(run, task, loss_and_gradient)
+        with _signals() as received:
+            trainer = _Trainer(run, task)
             while run.step < recipe.total_steps:
                 trainer.step()
                 if run.step % options.log_every == 0 or run.step == recipe.total_steps:
@@ -162,10 +155,10 @@ def draw_shape(recipe: Recipe, step: int) -> tuple[int, Phase, int]:
 class _Trainer:
     """The compiled parts of a step; in the first steps of each interval, rendering is timed."""
 
-    def __init__(self, run: Run, task: Task, loss_and_gradient: Callable[..., tuple[Metrics, Params]]) -> None:
+    def __init__(self, run: Run, task: Task) -> None:
         where = placement(run.recipe)
         textures = load_textures("training") if task.textures is None else task.textures
-        self._run, self._loss_and_gradient = run, loss_and_gradient
+        self._run, self._objective = run, task.objective
         self._textures = jax.device_put(textures, where.whole)
         self._make_batch = jax.jit(task.make_batch, static_argnums=(2, 3), out_shardings=where.by_clip)
         self._key = jax.random.key(run.recipe.data_seed)
@@ -183,7 +176,7 @@ class _Trainer:
         began = time.perf_counter()
         batch = wait(self._make_batch(jax.random.fold_in(self._key, run.step), self._textures, phase, frames))
         rendered = time.perf_counter()
-        metrics, gradient = self._loss_and_gradient(run.state.trained, batch)
+        metrics, gradient = _loss_and_gradient(run.state.trained, batch, recipe, self._objective)
         run.state, metrics = wait(_apply_gradient(run.state, gradient, metrics, recipe))
         if is_timed:
             run.averages.add({"render_share": (rendered - began) / (time.perf_counter() - began)})
@@ -193,18 +186,6 @@ class _Trainer:
         self._ahead.append(metrics)
         if len(self._ahead) > _AHEAD:
             jax.block_until_ready(self._ahead.popleft())
-
-
-@contextmanager
-def _gradients(run: Run, task: Task) -> Iterator[Callable[..., tuple[Metrics, Params]]]:
-    """Yield the function for loss and gradient of a batch: of this process, or of its workers."""
-    recipe, count = run.recipe, run.options.workers
-    if count == 1:
-        yield lambda trained, batch: _loss_and_gradient(trained, batch, recipe, task.objective)
-        return
-    prepare = jax.jit(task.for_workers, static_argnums=1)
-    with Workers(recipe, task.objective, run.state.trained, count) as workers:
-        yield lambda trained, batch: workers.loss_and_gradient(trained, prepare(batch, recipe.model))
 
 
 class _Pace:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import jax
@@ -92,7 +91,7 @@ def objective(
     grid = patch_grid(images, config)
     truth = targets(clips)
     paired = matches(clips, config.patch_size)
-    counts = _counts(batch, paired)
+    counts = match_counts(paired)
     matching = MatchLoss(paired, counts, weights.match_layers, config.depth) if weights.match else None
 
     def capture(slot: int):
@@ -142,21 +141,6 @@ def objective(
             terms["probe"] = weights.probe * sum(probe_terms.values(), start=jnp.zeros(()))
     loss = sum(terms.values(), start=jnp.zeros(()))
     return loss, {"loss": loss} | {f"loss_{name}": value for name, value in terms.items()} | metrics
-
-
-def with_counts(batch: Batch, config: VGGTConfig) -> Batch:
-    """Return the batch with the means of its clips' counts of matches, for shares of it.
-
-    The loss of the batch is then the mean of the losses of equal shares.
-    """
-    counts = match_counts(matches(batch.clips, config.patch_size))
-    return dataclasses.replace(batch, counts=jax.tree.map(lambda x: jnp.full_like(x, x.mean()), counts))
-
-
-def _counts(batch: Batch, paired: Matches) -> MatchCounts:
-    """Return how many matches the means are over; a share counts its part of the whole batch's."""
-    each = match_counts(paired) if batch.counts is None else batch.counts
-    return jax.tree.map(jnp.sum, each)
 
 
 def dense_loss(

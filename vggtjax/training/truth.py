@@ -96,6 +96,6 @@ def matches(clip: SyntheticClip, patch_size: int) -> Matches:
 
 
 def match_counts(matches: Matches) -> MatchCounts:
-    """Return the counts of every clip, [B]."""
+    """Return the counts of all clips together."""
     each = matches.visible[:, :, 0], matches.from_others, matches.between
-    return MatchCounts(*(x.reshape(len(x), -1).sum(axis=1, dtype=jnp.float32) for x in each))
+    return MatchCounts(*(x.sum(dtype=jnp.float32) for x in each))
