@@ -131,53 +131,57 @@ _RefineMask = Annotated[bool | None, tyro.conf.arg(constructor=_refine_mask, nam
 
 @dataclass(frozen=True)
 class Options:
-    """How a clip is reconstructed. Raises InputError for an invalid value."""
+    """How a clip is reconstructed. Raises InputError for an invalid value.
+
+    Attributes:
+        method: which passes give depth and cameras: vggt, the first pass; vggt4d, depth of the first and cameras of the
+            second; pose-decoupling, the second pass; hard-replacement, the second pass, with depth of the first where
+            things move; 4dvggt-d, the same, with the depth of both passes fused where nothing moves; 4dvggt-m, as
+            4dvggt-d, with masks from matches
+        gram: similarity of the motion cues; by default dot for vggt4d, else cosine
+        suppress: how the second pass ignores keys of dynamic tokens; by default drop for vggt4d, else zero
+        mask_pairs: in how many pairs of blocks, from the first on, keys of dynamic tokens are ignored (L_mask of the
+            paper); by default the number that the model recommends, 5 for VGGT-1B
+        threshold: where the saliency is cut: otsu, one threshold; multi-otsu, the highest of up to three, usually with
+            a smaller mask; by default what the model recommends, else multi-otsu for vggt4d and otsu for the others
+        mask: what tells motion: gram, the similarity of tokens, as in the papers; matches, the same and the matches
+            between frames that do not fit a static world (not in the papers); by default matches for 4dvggt-m, else
+            gram
+        align_scale: scale the second pass to the first pass before it is used (not in the paper)
+        smooth_frames: an odd number of frames, each with its neighbours, over which the score of motion is averaged
+            before the mask is cut from it, so that masks flicker less; 1: every frame by itself, as in the papers
+        refine_mask: remove pixels from the mask that agree with other frames; the method's own choice by default
+        refine_cameras: adjust cameras and focal length to matches between the source's pictures, where nothing moves
+            (bundle adjustment; needs the extra colmap)
+        consistent_depth: fit depth, cameras and focal length to the pixels of the source, and join what several frames
+            see, where nothing moves (not in the papers; the default of the commands reconstruct and batch); with
+            --refine-cameras its points are fitted too
+        compute_dtype: number type of the transformer's matrix products; by default bfloat16 on a GPU or TPU, and on a
+            CPU float32, or bfloat16 if reconstruct runs a large model and a short trial finds it faster there
+        precision: how exactly a GPU or TPU computes: tf32, the default there, fast, with about three decimal digits in
+            the products that make depth and motion cues, as PyTorch has it in convolutions; highest, slower, with the
+            seven digits of float32 there and, without --dtype, in the transformer. A CPU always has seven
+        attention: how frames attend to each other: exact; sampled, an approximation that sees a third of the tokens of
+            other frames: faster for long clips, with other numbers (its errors are in the docs)
+    """
 
     method: MethodName = "4dvggt-d"
-    """which passes give depth and cameras: vggt, the first pass; vggt4d, depth of the first and cameras of the second;
-    pose-decoupling, the second pass; hard-replacement, the second pass, with depth of the first where things move;
-    4dvggt-d, the same, with the depth of both passes fused where nothing moves; 4dvggt-m, as 4dvggt-d, with masks from
-    matches"""
     gram: InWords[Gram | None] = None
-    """similarity of the motion cues; by default dot for vggt4d, else cosine"""
     suppress: InWords[Suppress | None] = None
-    """how the second pass ignores keys of dynamic tokens; by default drop for vggt4d, else zero"""
     mask_pairs: InWords[int | None] = None
-    """in how many pairs of blocks, from the first on, keys of dynamic tokens are ignored (L_mask of the paper); by
-    default the number that the model recommends, 5 for VGGT-1B"""
     threshold: InWords[Threshold | None] = None
-    """where the saliency is cut: otsu, one threshold; multi-otsu, the highest of up to three, usually with a smaller
-    mask; by default what the model recommends, else multi-otsu for vggt4d and otsu for the others"""
     mask: InWords[Witness | None] = None
-    """what tells motion: gram, the similarity of tokens, as in the papers; matches, the same and the matches between
-    frames that do not fit a static world (not in the papers); by default matches for 4dvggt-m, else gram"""
     align_scale: Switch = False
-    """scale the second pass to the first pass before it is used (not in the paper)"""
     smooth_frames: int = 1
-    """an odd number of frames, each with its neighbours, over which the score of motion is averaged before the mask is
-    cut from it, so that masks flicker less; 1: every frame by itself, as in the papers"""
     refine_mask: _RefineMask = None
-    """remove pixels from the mask that agree with other frames; the method's own choice by default"""
     refine_cameras: Switch = False
-    """adjust cameras and focal length to matches between the source's pictures, where nothing moves (bundle adjustment;
-    needs the extra colmap)"""
     consistent_depth: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = False
-    """fit depth, cameras and focal length to the pixels of the source, and join what several frames see, where nothing
-    moves (not in the papers; the default of the commands reconstruct and batch); with --refine-cameras its points are
-    fitted too"""
     compute_dtype: Annotated[
         ComputeDType | None,
         tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint=""),  # pyright: ignore
     ] = None
-    """number type of the transformer's matrix products; by default bfloat16 on a GPU or TPU, and on a CPU float32, or
-    bfloat16 if reconstruct runs a large model and a short trial finds it faster there"""
     precision: InWords[Precision | None] = None
-    """how exactly a GPU or TPU computes: tf32, the default there, fast, with about three decimal digits in the
-    products that make depth and motion cues, as PyTorch has it in convolutions; highest, slower, with the seven digits
-    of float32 there and, without --dtype, in the transformer. A CPU always has seven"""
     attention: InWords[Attention] = "exact"
-    """how frames attend to each other: exact; sampled, an approximation that sees a third of the tokens of other
-    frames: faster for long clips, with other numbers (its errors are in the docs)"""
 
     def __post_init__(self) -> None:
         find_method(self.method)

@@ -13,19 +13,22 @@ from vggtjax.storage.flags import InWords
 
 @dataclass(frozen=True)
 class Cluster:
-    """Where a batch runs. Raises InputError for an invalid value, or for options without an engine that reads them."""
+    """Where a batch runs. Raises InputError for an invalid value, or for options without an engine that reads them.
+
+    Attributes:
+        engine: local: in this process; ray: on a cluster of Ray
+        address: of the cluster, as host:port; auto: the one that runs on this machine; RAY_ADDRESS, or a new one of
+            this machine alone, by default
+        workers: how many workers, each with a model of its own; as many as the cluster has room for by default
+        worker_cpus: CPUs of a worker; by default all of a machine, or 1 beside a GPU
+        worker_gpus: GPUs of a worker; by default as many as --devices, if the cluster has any
+    """
 
     engine: Literal["local", "ray"] = "local"
-    """local: in this process; ray: on a cluster of Ray"""
     address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto", help_behavior_hint="")] = None
-    """of the cluster, as host:port; auto: the one that runs on this machine; RAY_ADDRESS, or a new one of this machine
-    alone, by default"""
     workers: InWords[int | None] = None
-    """how many workers, each with a model of its own; as many as the cluster has room for by default"""
     worker_cpus: InWords[int | None] = None
-    """CPUs of a worker; by default all of a machine, or 1 beside a GPU"""
     worker_gpus: InWords[float | None] = None
-    """GPUs of a worker; by default as many as --devices, if the cluster has any"""
 
     def __post_init__(self) -> None:
         check_choice("engine", self.engine, ("local", "ray"))

@@ -23,13 +23,16 @@ _MOST_PIXELS = 2**26  # of a resized frame, before it is cut: 8192 x 8192
 
 @dataclass(frozen=True)
 class Framing:
-    """How pictures are fitted to the model. Raises InputError for an invalid value."""
+    """How pictures are fitted to the model. Raises InputError for an invalid value.
+
+    Attributes:
+        mode: crop makes frames `size` wide and cuts tall frames above and below to `size`; pad keeps every pixel and
+            pads to a square
+        size: side in pixels to run at, a multiple of the model's patch size; the model's own size by default
+    """
 
     mode: Annotated[Mode, tyro.conf.arg(name="preprocess")] = "crop"
-    """crop makes frames `size` wide and cuts tall frames above and below to `size`; pad keeps every pixel and pads to a
-    square"""
     size: InWords[int | None] = None
-    """side in pixels to run at, a multiple of the model's patch size; the model's own size by default"""
 
     def __post_init__(self) -> None:
         check_choice("mode", self.mode, get_args(Mode))

@@ -16,15 +16,18 @@ from vggtjax.windows.plan import Windows
 
 @dataclass(frozen=True)
 class GivenInputs:
-    """Masks and points of the user. Raises InputError for options that exclude each other."""
+    """Masks and points of the user. Raises InputError for options that exclude each other.
+
+    Attributes:
+        masks: folder of pictures, one per frame, bright where something moves; mined from the clip by default
+        no_masks: nothing moves: one pass is enough
+        tracks: points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and, if
+            wanted, frame, in pixels of the source; none by default
+    """
 
     masks: InWords[Path | None] = None
-    """folder of pictures, one per frame, bright where something moves; mined from the clip by default"""
     no_masks: Switch = False
-    """nothing moves: one pass is enough"""
     tracks: Annotated[str | None, tyro.conf.arg(metavar="GRID|FILE", help_behavior_hint="")] = None
-    """points to follow: grid:20 for 20 x 20 over the first frame, or a CSV file with columns x, y and, if wanted,
-    frame, in pixels of the source; none by default"""
 
     def __post_init__(self) -> None:
         if self.masks is not None and self.no_masks:

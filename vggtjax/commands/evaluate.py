@@ -66,15 +66,18 @@ class Candidates(ModelFiles):
 
 @dataclass(frozen=True)
 class Folders:
-    """Results of other programs, or earlier ones of ours."""
+    """Results of other programs, or earlier ones of ours.
+
+    Attributes:
+        results: score results in these folders instead, each with a folder per sequence; no model is run. FORMAT is the
+            program that wrote a folder, as of --format
+        format: the program whose files the folders of --results have that name none; vggtjax by default
+        quaternion: order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw
+    """
 
     results: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=[FORMAT:]FOLDER ...", help_behavior_hint="")] = ()
-    """score results in these folders instead, each with a folder per sequence; no model is run. FORMAT is the program
-    that wrote a folder, as of --format"""
     format: InWords[ReadFormat | None] = None
-    """the program whose files the folders of --results have that name none; vggtjax by default"""
     quaternion: InWords[Literal["xyzw", "wxyz"] | None] = None
-    """order of quaternions in their pred_traj.txt: wxyz as MonST3R and VGGT4D write it, or xyzw"""
 
     def source(self, *, strict: bool = False) -> FolderSource:
         """Return the results in the folders."""
@@ -101,20 +104,24 @@ class Folders:
 
 @dataclass(frozen=True)
 class ScoreOptions:
-    """What is scored, and how."""
+    """What is scored, and how.
+
+    Attributes:
+        sequences: names, with commas; the sequences of the published protocol, or all, by default
+        gt: ground truth to use, where a data set has several: for dycheck easi3r (the default) or lidar
+        depth_align: how video depth is brought to metres: by ten rounds towards the scale of the least absolute error,
+            as MonST3R and CUT3R do it (scale); by that scale itself (least-absolute); by a scale and a shift; by
+            medians; or not
+        empty: J of a frame in which nothing moves and nothing is found: 1 (davis) or 0 (vggt4d)
+        strict: refuse a sequence of which a frame lacks a picture, depth, mask, pose or result, or has a map of another
+            size; the other frames are scored by default
+    """
 
     sequences: Annotated[str | None, tyro.conf.arg(metavar="NAME,NAME", help_behavior_hint="")] = None
-    """names, with commas; the sequences of the published protocol, or all, by default"""
     gt: Annotated[str | None, tyro.conf.arg(metavar="{easi3r,lidar}", help_behavior_hint="")] = None
-    """ground truth to use, where a data set has several: for dycheck easi3r (the default) or lidar"""
     depth_align: Literal["metric", "median", "scale", "least-absolute", "scale-shift"] = "scale"
-    """how video depth is brought to metres: by ten rounds towards the scale of the least absolute error, as MonST3R
-    and CUT3R do it (scale); by that scale itself (least-absolute); by a scale and a shift; by medians; or not"""
     empty: Literal["davis", "vggt4d"] = "davis"
-    """J of a frame in which nothing moves and nothing is found: 1 (davis) or 0 (vggt4d)"""
     strict: bool = False
-    """refuse a sequence of which a frame lacks a picture, depth, mask, pose or result, or has a map of another size;
-    the other frames are scored by default"""
 
 
 def evaluate(

@@ -94,23 +94,26 @@ class PassOptions(Options):
 
 @dataclass(frozen=True)
 class Fits:
-    """How fits run. Raises InputError for an invalid value."""
+    """How fits run. Raises InputError for an invalid value.
+
+    Attributes:
+        objective: likelihood of the true depth (joint: of both passes' errors, which measures their correlation), or
+            agreement of frames, whose fit needs no truth (only the scores do)
+        seeds: number of fits of every family; each seed splits the clips and draws pixels anew
+        steps: largest number of steps of the optimiser
+        learning_rate: largest rate of the schedule
+        patience: evaluations of the clips for early stopping, one every 10 steps, after which a fit without gain ends
+        held_out: share of the clips for the scores, and of the other clips for early stopping
+        pixels: number of pixels to draw of each clip; the gate and the objectives without truth take four whole frames
+    """
 
     objective: Literal["gaussian", "laplace", "joint", "photometric", "geometric"] = "gaussian"
-    """likelihood of the true depth (joint: of both passes' errors, which measures their correlation), or agreement of
-    frames, whose fit needs no truth (only the scores do)"""
     seeds: Count = 5
-    """number of fits of every family; each seed splits the clips and draws pixels anew"""
     steps: Count = 300
-    """largest number of steps of the optimiser"""
     learning_rate: float = 0.05
-    """largest rate of the schedule"""
     patience: Count = 10
-    """evaluations of the clips for early stopping, one every 10 steps, after which a fit without gain ends"""
     held_out: Annotated[float, Meta(gt=0, lt=1)] = 0.25
-    """share of the clips for the scores, and of the other clips for early stopping"""
     pixels: Count = 16384
-    """number of pixels to draw of each clip; the gate and the objectives without truth take four whole frames"""
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -12,7 +12,6 @@ import io
 import logging
 import os
 import re
-import shutil
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -30,7 +29,6 @@ from vggtjax.commands.doctor import doctor
 from vggtjax.commands.evaluate import evaluate
 from vggtjax.commands.export import export
 from vggtjax.commands.fit_fusion import fit_fusion
-from vggtjax.commands.help_page import TYRO_WIDTH, Help, page, read_help
 from vggtjax.commands.overview import Command, overview
 from vggtjax.commands.process import check_limits, give_devices_threads
 from vggtjax.commands.reconstruct import reconstruct
@@ -116,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stderr.write(overview(COMMANDS))
             return 2
         elif arguments[0] in COMMANDS and {"-h", "--help"} & set(arguments[1:]):
-            sys.stdout.write(page(command_help(arguments[0]), shutil.get_terminal_size().columns))
+            print_help(arguments[0])
         else:
             command = _parsed(arguments)
             check_limits()
@@ -208,17 +206,7 @@ def _read_by_tyro(name: str, arguments: Sequence[str]) -> Callable[[], int | Non
     return tyro.cli(ready, prog=f"vggtjax {name}", args=arguments, config=config)
 
 
-def command_help(name: str) -> Help:
-    """Return the help of a command."""
-    text = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")  # tyro draws its boxes by the encoding
-    before = os.environ.get("COLUMNS")
-    os.environ["COLUMNS"] = str(TYRO_WIDTH)
-    try:
-        with contextlib.redirect_stdout(text), contextlib.suppress(SystemExit):
-            _read_by_tyro(name, ["--help"])
-    finally:
-        os.environ.pop("COLUMNS")
-        if before is not None:
-            os.environ["COLUMNS"] = before
-    text.seek(0)
-    return read_help(text.read())
+def print_help(name: str) -> None:
+    """Print the help of a command, at the width of the terminal."""
+    with contextlib.suppress(SystemExit):
+        _read_by_tyro(name, ["--help"])

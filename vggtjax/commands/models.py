@@ -56,17 +56,20 @@ def at_revision(name: str, revision: str | None) -> str:
 
 @dataclass(frozen=True)
 class ModelFiles:
-    """The files of a model and of a fitted rule of fusion."""
+    """The files of a model and of a fitted rule of fusion.
+
+    Attributes:
+        model: a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or demo, the small
+            demonstration model, which is not for real footage
+        config: JSON file with the configuration of a PyTorch checkpoint; needed unless it is VGGT-1B
+        revision: commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use
+        fusion: file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default
+    """
 
     model: ModelName = None
-    """a converted .safetensors, a PyTorch checkpoint, a hub id such as facebook/VGGT-1B, or demo, the small
-    demonstration model, which is not for real footage"""
     config: InWords[Path | None] = None
-    """JSON file with the configuration of a PyTorch checkpoint; needed unless it is VGGT-1B"""
     revision: Revision = None
-    """commit of a hub id, 40 hexadecimal letters; by default the newest one of the first use"""
     fusion: InWords[Path | None] = None
-    """file of a fitted rule of fusion, as vggtjax fit-fusion writes it; the paper's rule by default"""
 
     def load(self, report: Report, options: Options, methods: Sequence[str]) -> tuple[Model, FusionParams | None]:
         """Load the model, and the fitted rule of fusion (None, the paper's rule, without a file).

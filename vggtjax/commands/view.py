@@ -29,15 +29,18 @@ _RESULTS = tyro.conf.arg(metavar="RESULT [RESULT ...]", help_behavior_hint="(req
 
 @dataclass(frozen=True)
 class Serving:
-    """Where the viewer is served."""
+    """Where the viewer is served.
+
+    Attributes:
+        host: address to serve on: this machine alone by default; on any other address the viewer asks for a token,
+            which is printed
+        port: 0 takes a free one
+        no_browser: open no browser; over ssh none is opened
+    """
 
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1"
-    """address to serve on: this machine alone by default; on any other address the viewer asks for a token, which is
-    printed"""
     port: int = 8080
-    """0 takes a free one"""
     no_browser: Switch = False
-    """open no browser; over ssh none is opened"""
 
 
 def view(

@@ -54,15 +54,18 @@ FORMATS: dict[ExportFormat, Format] = {
 
 @dataclass(frozen=True)
 class Exporting:
-    """Which points an export holds, and how fine a mesh is. Raises InputError for a value out of range."""
+    """Which points an export holds, and how fine a mesh is. Raises InputError for a value out of range.
+
+    Attributes:
+        points: most static points to write; moving points get as many in each frame
+        confidence_percentile: percent of the pixels, the least confident, to leave out of the points, or of a mesh
+        voxel_size: edge of the voxels of a mesh, in units of the result; by default as wide as a pixel on the surfaces,
+            or wider where the frames differ by more
+    """
 
     points: Annotated[int, Meta(ge=1)] = 100_000
-    """most static points to write; moving points get as many in each frame"""
     confidence_percentile: Annotated[float, Meta(ge=0, lt=100)] = 20.0
-    """percent of the pixels, the least confident, to leave out of the points, or of a mesh"""
     voxel_size: InWords[Annotated[float, Meta(ge=1e-30, le=1e9)] | None] = None
-    """edge of the voxels of a mesh, in units of the result; by default as wide as a pixel on the surfaces, or wider
-    where the frames differ by more"""
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -32,36 +32,41 @@ def _words(metavar: str):
 
 @dataclass(frozen=True)
 class KnownGeometry:
-    """Known cameras and lengths. Raises InputError for an invalid value, or for options that exclude each other."""
+    """Known cameras and lengths. Raises InputError for an invalid value, or for options that exclude each other.
+
+    Attributes:
+        intrinsics: known focal lengths and principal point in pixels of the source: four numbers, or a file with a 3 x
+            3 matrix or with four numbers or nine a line, for all frames or for each; source: those of the capture's
+            folder; exif: the focal length that the camera wrote into the pictures or the video
+        shared_focal: one focal length for the whole clip, the median of the predicted ones
+        poses: known camera poses, world-from-camera: TUM's eight numbers a line, KITTI's twelve, or sixteen; source:
+            those of the capture's folder
+        quaternion: order of the quaternions in the file of poses: wxyz as MonST3R, CUT3R and VGGT4D write them, or xyzw
+            as TUM does; by default what the names of its columns say, or xyzw
+        baseline: metric scale: the distance between the cameras of frames I and J, such as 0,7,0.85
+        camera_height: metric scale: the mean height of the cameras above the floor, in metres
+        known_depths: metric scale: a folder of depth maps, of a depth model or a lidar, named like the frames (.npz,
+            .npy or .exr in metres, .png of 16 bits); a CSV file with columns frame, x, y and depth, in pixels of the
+            source and metres; source: the depth maps of the capture's folder
+        depths_per_metre: steps of 16-bit pictures and of whole numbers in a folder of depth maps to the metre; 1000 by
+            default
+        robust: known depths that differ from most others count nothing: for maps with many wrong values, such as a
+            third
+        leave_out: folder of pictures, one per frame, bright where depth is left out, such as in the sky
+    """
 
     intrinsics: Annotated[str | None, _words("FX,FY,CX,CY|FILE|source|exif")] = None
-    """known focal lengths and principal point in pixels of the source: four numbers, or a file with a 3 x 3 matrix or
-    with four numbers or nine a line, for all frames or for each; source: those of the capture's folder; exif: the focal
-    length that the camera wrote into the pictures or the video"""
     shared_focal: Switch = False
-    """one focal length for the whole clip, the median of the predicted ones"""
     poses: Annotated[str | None, _words("FILE|source")] = None
-    """known camera poses, world-from-camera: TUM's eight numbers a line, KITTI's twelve, or sixteen; source: those of
-    the capture's folder"""
     quaternion: InWords[Quaternion | None] = None
-    """order of the quaternions in the file of poses: wxyz as MonST3R, CUT3R and VGGT4D write them, or xyzw as TUM does;
-    by default what the names of its columns say, or xyzw"""
     baseline: Annotated[str | None, _words("I,J,METRES")] = None
-    """metric scale: the distance between the cameras of frames I and J, such as 0,7,0.85"""
     camera_height: InWords[float | None] = None
-    """metric scale: the mean height of the cameras above the floor, in metres"""
     known_depths: Annotated[
         str | None, tyro.conf.arg(metavar="FILE|FOLDER|source", help_behavior_hint="", aliases=("--depths",))
     ] = None
-    """metric scale: a folder of depth maps, of a depth model or a lidar, named like the frames (.npz, .npy or .exr in
-    metres, .png of 16 bits); a CSV file with columns frame, x, y and depth, in pixels of the source and metres; source:
-    the depth maps of the capture's folder"""
     depths_per_metre: InWords[float | None] = None
-    """steps of 16-bit pictures and of whole numbers in a folder of depth maps to the metre; 1000 by default"""
     robust: Switch = False
-    """known depths that differ from most others count nothing: for maps with many wrong values, such as a third"""
     leave_out: InWords[Path | None] = None
-    """folder of pictures, one per frame, bright where depth is left out, such as in the sky"""
 
     def __post_init__(self) -> None:
         if isinstance(self.leave_out, str):

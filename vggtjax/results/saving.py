@@ -55,17 +55,20 @@ _Groups = tyro.constructors.PrimitiveConstructorSpec(
 
 @dataclass(frozen=True)
 class Saving:
-    """How a result is written. Raises InputError for a percentile outside [0, 100) or an unknown name."""
+    """How a result is written. Raises InputError for a percentile outside [0, 100) or an unknown name.
+
+    Attributes:
+        confidence_percentile: percent of the pixels, the least confident ones, to leave out of the point clouds
+        resolution: size of the written files: model, or original, the source's own, with crop, scale and padding undone
+        format: the program whose files the folder has: vggtjax; or vggt4d, with its files in vggt4d/ beside ours
+        only: write only these groups of files: depth, confidence, cameras, masks, previews, clouds, scene, report; all
+            by default. The archive, reconstruction.npz, is always written: vggtjax reads everything from it
+    """
 
     confidence_percentile: Annotated[float, Meta(ge=0, lt=100)] = 20.0
-    """percent of the pixels, the least confident ones, to leave out of the point clouds"""
     resolution: Resolution = "model"
-    """size of the written files: model, or original, the source's own, with crop, scale and padding undone"""
     format: Format = "vggtjax"
-    """the program whose files the folder has: vggtjax; or vggt4d, with its files in vggt4d/ beside ours"""
     only: InWords[Annotated[tuple[Group, ...] | None, _Groups]] = None
-    """write only these groups of files: depth, confidence, cameras, masks, previews, clouds, scene,
-    report; all by default. The archive, reconstruction.npz, is always written: vggtjax reads everything from it"""
 
     def __post_init__(self) -> None:
         if isinstance(self.only, str):

@@ -13,15 +13,20 @@ LEAST_OVERLAP = 2  # frames; one frame tells nothing of how cameras move
 
 @dataclass(frozen=True)
 class Windows:
-    """How a long clip is cut: without a window, or with window 0, not at all. Raises InputError for a bad value."""
+    """How a long clip is cut: without a window, or with window 0, not at all. Raises InputError for a bad value.
+
+    Attributes:
+        window: run the clip in windows of so many frames and join them: memory then does not depend on the clip's
+            length; 0 runs all frames together; by default they are run together where they fit in memory, else in
+            windows of up to 64
+        overlap: frames that neighbouring windows share, at least 2 and at most half a window; a quarter of a window by
+            default
+        no_loops: do not look for places that the camera comes back to
+    """
 
     window: InWords[int | None] = None
-    """run the clip in windows of so many frames and join them: memory then does not depend on the clip's length; 0 runs
-    all frames together; by default they are run together where they fit in memory, else in windows of up to 64"""
     overlap: InWords[int | None] = None
-    """frames that neighbouring windows share, at least 2 and at most half a window; a quarter of a window by default"""
     no_loops: Switch = False
-    """do not look for places that the camera comes back to"""
 
     def __post_init__(self) -> None:
         if self.window is None or self.window == 0:
