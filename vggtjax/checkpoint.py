@@ -27,7 +27,7 @@ from vggtjax.network.narrow import is_multiplied
 from vggtjax.network.quantised import Halves, Quantised, halves, is_quantised, is_stored, quantise
 from vggtjax.storage.backend import backend
 from vggtjax.storage.json_values import parse_json
-from vggtjax.storage.programs import kept_text
+from vggtjax.storage.kept_text import kept_text
 from vggtjax.storage.tensor_file import Spec, is_tensor_file, read_tensors, write_tensors
 
 DType = Literal["float32", "bfloat16"]
@@ -344,7 +344,7 @@ def _file_facts(path: Path) -> _FileFacts | None:
 
 @lru_cache(maxsize=64)
 def _file_digest(facts: _FileFacts) -> str:
-    """Return the sha256 of a file, computed once and kept with the programs: hashing 5 GB takes seconds."""
+    """Return the sha256 of a file, computed once and kept: hashing 5 GB takes seconds."""
 
     def digest() -> str:
         with facts.path.open("rb") as file:

@@ -23,6 +23,7 @@ def cache(tmp_path, monkeypatch):
     for name in (
         "compiled/a-cache",
         "lowered/b.bin",
+        "texts/e.bin",
         "passes/c.npz",
         "trials/d.json",
         f"m-{'0' * 16}.safetensors",

@@ -33,7 +33,7 @@ from vggtjax.progress import OnStage, Progress, no_progress
 from vggtjax.reconstruction import Reconstruction
 from vggtjax.storage.arrays import read_arrays, write_arrays
 from vggtjax.storage.cache import cache_folder
-from vggtjax.storage.programs import source_digest
+from vggtjax.storage.versions import source_digest
 from vggtjax.storage.writing import writing
 
 METHOD = "4dvggt-d"

@@ -27,7 +27,7 @@ from vggtjax.method.fusion_family import PARTS, FusionParams, Observations, fuse
 from vggtjax.progress import Progress, no_progress
 from vggtjax.storage.arrays import read_arrays, write_arrays
 from vggtjax.storage.json_values import Count, check_fields
-from vggtjax.storage.programs import source_digest
+from vggtjax.storage.versions import source_digest
 from vggtjax.storage.writing import writing
 
 Objective = Literal["gaussian", "laplace", "joint", "photometric", "geometric"]

@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future, as_completed
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from functools import cache
 from types import MappingProxyType
 from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 
-from vggtjax.cameras import Cameras
-from vggtjax.method.assembly import Assembly
-from vggtjax.method.matched_mask import Mined
-from vggtjax.method.matches import Matches
-from vggtjax.method.passes import Passes
-from vggtjax.method.soft_mask import SoftMasking
-from vggtjax.method.witnesses import Seen
-from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import OnDevices
-from vggtjax.network.model import Predictions
-from vggtjax.network.quantised import STORED
-from vggtjax.network.track_head import Tracks
 from vggtjax.progress import OnStage, Progress, no_stage
-from vggtjax.storage.programs import keep_type, program
+from vggtjax.storage.free_memory import return_freed_memory
 
 _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
@@ -32,9 +23,9 @@ _Result = TypeVar("_Result")
 _COLLECTIVE = re.compile(
     r" (all-gather|all-reduce|all-to-all|ragged-all-to-all|reduce-scatter|collective-\w+|send|recv)(?:-start)?\("
 )
-# What kept programs take and return.
-for _kind in (ClipBatch, Predictions, Passes, Seen, Matches, Mined, Cameras, Assembly, Tracks, SoftMasking, *STORED):
-    keep_type(_kind)
+# Of LLVM on a CPU. Its third level takes up to a fifth longer to compile the network, which runs no faster with it, as
+# its products are in libraries.
+_OPTIONS_ON_CPU = {"xla_backend_optimization_level": 1}
 
 
 class StageMemory(NamedTuple):
@@ -56,7 +47,7 @@ class Execute:
 
         def run(*arguments: _Parameters.args, **static: _Parameters.kwargs) -> _Result:
             with self._on_stage(name):
-                return jax.block_until_ready(program(function)(*arguments, **static))
+                return jax.block_until_ready(_jitted(function, tuple(static))(*arguments, **static))
 
         return run
 
@@ -78,12 +69,13 @@ class Compile:
 
     def __call__(self, name: str, function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
         """Return a function that takes and returns shapes."""
-        step = program(function)
 
         def compile_step(*arguments: _Parameters.args, **static: _Parameters.kwargs) -> _Result:
-            key = (step, step.signature(arguments, static))
+            leaves, structure = jax.tree.flatten(arguments)
+            shapes = tuple(map(jax.typeof, leaves))
+            key = function, tuple(static.items()), structure, shapes
             if key not in self._compiling:
-                self._compiling[key] = step.compile(*arguments, **static)
+                self._compiling[key] = _compiled(_jitted(function, tuple(static)).lower(*arguments, **static), leaves)
             compiling, outputs = self._compiling[key]
             self._steps.append((name, compiling, isinstance(function, OnDevices)))
             return outputs
@@ -102,6 +94,43 @@ class Compile:
                 progress(done, len(programs))
         memory = ((stage, _memory(compiling.result(), shared)) for stage, compiling, shared in self._steps)
         return {stage: needs for stage, needs in memory if needs is not None}
+
+
+@cache
+def _jitted(function: Callable[..., Any], static: tuple[str, ...]) -> Any:
+    """Return a step's function under jit, compiled as fast as is sensible, unless XLA_FLAGS say it."""
+    options = _OPTIONS_ON_CPU if jax.default_backend() == "cpu" else {}
+    given = os.environ.get("XLA_FLAGS", "")
+    options = {name: value for name, value in options.items() if name not in given}
+    return jax.jit(function, static_argnames=static, compiler_options=options or None)
+
+
+def _compiled(lowered: Any, arguments: Sequence[Any]) -> tuple[Future[Any], Any]:
+    """Compile in another thread; return the future, and shapes and types of the outputs."""
+
+    def compile_lowered() -> Any:
+        compiled = lowered.compile()
+        return_freed_memory()
+        return compiled
+
+    compiling, outputs = _compilers().submit(compile_lowered), lowered.out_info
+    shardings = (getattr(leaf, "sharding", None) for leaf in arguments)
+    if any(sharding is not None and sharding.num_devices > 1 for sharding in shardings):
+        outputs = jax.tree.map(_placed, outputs, compiling.result().output_shardings)  # the next step needs them
+    return compiling, outputs
+
+
+def _placed(output: Any, sharding: Any) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(output.shape, output.dtype, sharding=sharding)
+
+
+@cache
+def _compilers() -> ThreadPoolExecutor:
+    """Return the threads that compile: XLA holds no lock of Python, and has threads of its own.
+
+    On one core with two hyperthreads, two threads compiled a pass for 17 s where one took 15.
+    """
+    return ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // 2), "compile")
 
 
 def _memory(compiled: Any, shared: bool) -> StageMemory | None:

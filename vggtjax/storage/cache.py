@@ -21,7 +21,8 @@ CONVERTED = "converted weights"
 TRIALS = "trials"  # of what this computer does fast
 _KINDS = {
     "compiled programs": "compiled",
-    "traced programs": "lowered",
+    "digests and shapes": "texts",
+    "traced programs of earlier versions": "lowered",
     "passes for fits": "passes",
     "trials of the processor": TRIALS,
 }

@@ -1,8 +1,9 @@
-"""What code runs here: versions, and a digest of this package's sources. Does not import jax."""
+"""What code runs here: versions, and a digest of this package's sources. Does not import jax before it is needed."""
 
 from __future__ import annotations
 
 import hashlib
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -22,3 +23,14 @@ def running_versions() -> str:
     from vggtjax import __version__
 
     return f"vggtjax {__version__} (sources {package_digest()[:8]}) with jax {version('jax')}"
+
+
+@cache
+def source_digest() -> str:
+    """Return versions, platform, cores, and a digest of all sources: what results depend on besides arguments."""
+    import jax
+
+    from vggtjax.storage.cores import core_count
+
+    versions = [version(name) for name in ("jax", "jaxlib", "flax")]
+    return f"{' '.join(versions)} {jax.default_backend()} {core_count()} {package_digest()}"
