@@ -39,7 +39,7 @@ def test_facts_as_json(cache, capsys):
     assert cli.main(["doctor", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["versions"]["jax"].count(".") == 2
-    assert found["cache"] == {"folder": str(cache), "bytes": 20, "parts": dict.fromkeys(cache_parts(), 4)}
+    assert found["cache"] == {"folder": str(cache), "bytes": 24, "parts": dict.fromkeys(cache_parts(), 4)}
     assert found["devices"][0]["platform"] == "cpu"
     clip = {clip["model"]: clip for clip in found["clips"]}["demo"]
     assert (clip["width"], clip["height"]) == (96, 56)
