@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 
 from benchmarks.accelerator.hlo import Instruction, Program, Shape
 from benchmarks.accelerator.targets import Target
-from vggtjax.network.gpu_attention import NAME
 
 LAUNCH = 2e-6  # seconds between kernels
 COLLECTIVES = ("all-gather", "all-reduce", "all-to-all", "collective-permute", "reduce-scatter")
@@ -176,8 +175,6 @@ class _Counter:
         if "conv" in call:
             gradient = self._program.operand(name, instruction, 1 if "BackwardFilter" in call else 0)
             return self._convolution(name, instruction, gradient if "Backward" in call else instruction.result[0])
-        if NAME in instruction.text:
-            return Counter({"float32": self._attended(name, instruction)})
         return Counter()
 
     def _dot(self, name: str, instruction: Instruction) -> Flop:

@@ -8,15 +8,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.network.cpu_attention import attention_in_chunks
-from vggtjax.network.gpu_attention import fused_attention, is_fused
-from vggtjax.network.gpu_kernels import compiles_for_gpus, is_in_shard_map, is_on_one, runs
-from vggtjax.network.pieces import largest_divisor
 
-LOGITS_AT_ONCE = 2**28  # maximum of all clips and heads in memory, except on a CPU
+LOGITS_AT_ONCE = 2**28  # most in memory, except on a CPU: a gigabyte in float32
 _TPU_BLOCK = 128  # tokens in a block of the kernel for TPUs: lengths are multiples of it
 
 
@@ -29,17 +25,15 @@ def attention(
     """Return softmax(q k^T / sqrt(D)) v; only `visible` keys enter the softmax, at least one of every clip.
 
     A CPU computes one head and a few hundred queries at a time: several times faster than all at once, in little
-    memory. NVIDIA GPUs use cuDNN's flash attention for bfloat16 and a kernel of `gpu_attention` for float32, TPUs jax's
-    own kernel. Elsewhere attention is computed at once where the logits fit in memory, otherwise in chunks.
+    memory. NVIDIA GPUs use cuDNN's flash attention for bfloat16, TPUs jax's own kernel. Elsewhere, and for float32 on
+    GPUs, attention is computed at once where the logits fit in memory, otherwise in chunks.
     """
     branches: dict[str, Any] = {"cpu": attention_in_chunks, "default": _at_once_or_in_chunks}
     D = q.shape[-1]
     # The platform that the program is compiled for chooses, whether or not one is plugged in.
     if q.dtype == jnp.bfloat16 and D % 8 == 0 and D <= 128 and cudnn_works():
         branches["cuda"] = _with_cudnn
-    if q.dtype == jnp.float32 and is_fused(D) and is_on_one("gpu") and kernel_works():
-        branches["cuda"] = _in_one_kernel
-    if (D <= 128 or D % 128 == 0) and not is_in_shard_map() and is_on_one("tpu") and find_spec("libtpu"):
+    if (D <= 128 or D % 128 == 0) and _is_on_one_tpu() and find_spec("libtpu"):
         branches["tpu"] = _on_tpu
     return jax.lax.platform_dependent(q, k, v, visible, **branches)
 
@@ -48,35 +42,43 @@ def attention(
 def cudnn_works() -> bool:
     """Return whether cuDNN's attention and its gradient run on the first NVIDIA GPU; tried once.
 
-    Without a GPU, return whether cuDNN is installed: what is compiled for a GPU here runs on another machine.
+    Without a GPU, return whether jax lowers it for one: what is compiled here then runs on another machine.
     """
-    return _attends(_with_cudnn, jnp.bfloat16, 64)
+
+    def loss(x):
+        return _with_cudnn(x, x, x, jnp.ones(x.shape[:2], bool)).sum()
+
+    shape = (2, 13, 1, 64)
+    try:
+        try:
+            device = jax.local_devices(backend="cuda")[0]
+        except RuntimeError:
+            x = jax.ShapeDtypeStruct(shape, jnp.bfloat16)
+            jax.jit(jax.grad(loss)).trace(x).lower(lowering_platforms=("cuda",))
+            return True
+        with jax.ensure_compile_time_eval(), jax.default_device(device):
+            jax.block_until_ready(jax.grad(loss)(jnp.ones(shape, jnp.bfloat16)))
+    except Exception:  # a library that is missing, too old or too new, or too old a GPU: XLA computes it
+        return False
+    return True
 
 
-@functools.cache
-def kernel_works() -> bool:
-    """Return whether the kernel for float32 runs on the first NVIDIA GPU; tried once.
-
-    Without a GPU, return whether jax compiles for NVIDIA GPUs here: nothing else pays for tracing the kernel.
-    """
-    return compiles_for_gpus() and all(_attends(_in_one_kernel, jnp.float32, head_dim) for head_dim in (64, 128))
-
-
-def _attends(attend, dtype, head_dim: int) -> bool:
-    visible = np.ones((2, 13), bool)
-    gradient = jax.grad(lambda x: attend(x, x, x, jnp.asarray(visible)).sum())
-    return runs(gradient, jax.ShapeDtypeStruct((2, 13, 1, head_dim), dtype))
+def _is_on_one_tpu() -> bool:
+    """Return whether arrays are on one device: jax cannot divide the work of its kernel for TPUs among several."""
+    in_shard_map = bool(jax.sharding.get_abstract_mesh().manual_axes)
+    return not in_shard_map and (jax.default_backend() != "tpu" or jax.device_count() == 1)
 
 
 def _at_once_or_in_chunks(q, k, v, visible):
-    clips = LOGITS_AT_ONCE // (q.shape[2] * q.shape[1] * k.shape[1])  # at once
-    if clips >= q.shape[0]:
+    """Attend a few hundred queries of all heads at a time where the logits do not fit."""
+    B, T, N, D = q.shape
+    size = max(LOGITS_AT_ONCE // (B * N * k.shape[1]), 1)  # queries
+    if size >= T:
         return _at_once(q, k, v, visible)
-    if clips == 0:
-        return attention_in_chunks(q, k, v, visible)
-    clips = largest_divisor(q.shape[0], clips)
-    pieces = jax.tree.map(lambda x: x.reshape(-1, clips, *x.shape[1:]), (q, k, v, visible))
-    return jax.lax.map(lambda piece: _at_once(*piece), pieces).reshape(q.shape)
+    pieces = jnp.pad(q, ((0, 0), (0, -T % size), (0, 0), (0, 0))).reshape(B, -1, size, N, D)
+    attend = jax.checkpoint(lambda piece: _at_once(piece, k, v, visible))
+    out = jax.lax.map(attend, jnp.moveaxis(pieces, 1, 0))
+    return jnp.moveaxis(out, 0, 1).reshape(B, -1, N, D)[:, :T]
 
 
 def _at_once(q, k, v, visible):
@@ -111,24 +113,6 @@ def _batched_alike(*arrays):
 
 
 _with_cudnn.defvjp(_with_cudnn_forward, _with_cudnn_backward)
-
-
-@jax.custom_vjp
-def _in_one_kernel(q, k, v, visible):
-    return fused_attention(q, k, v, visible)
-
-
-def _in_one_kernel_forward(q, k, v, visible):
-    return _in_one_kernel(q, k, v, visible), (q, k, v, visible)
-
-
-def _in_one_kernel_backward(inputs, gradient):
-    """Compute the attention again, in chunks: training in float32 on a GPU is for checks."""
-    *inputs, visible = inputs
-    return *jax.vjp(lambda q, k, v: _at_once_or_in_chunks(q, k, v, visible), *inputs)[1](gradient), None
-
-
-_in_one_kernel.defvjp(_in_one_kernel_forward, _in_one_kernel_backward)
 
 
 def evened(q, k, v, visible, *, implementation):

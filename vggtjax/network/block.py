@@ -11,11 +11,8 @@ from flax import linen as nn
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.network.cpu_attention import ATTENDED
-from vggtjax.network.gpu_heads import heads_work, is_fused, normed_heads
-from vggtjax.network.gpu_kernels import is_on_one
 from vggtjax.network.layers import MLP, Dense, DType, LayerNorm, Params, apply
 from vggtjax.network.pieces import map_chunks, map_chunks_in_place
-from vggtjax.network.precision import upcast
 from vggtjax.network.quantised import as_multiplied
 from vggtjax.network.rope import Rope, apply_rope
 from vggtjax.network.suppression import Attend, SuppressedKeys, suppressed_attention
@@ -58,19 +55,7 @@ class Projections(nn.Module):
         if rope is None:
             return q, k, v
         rope = Rope(rope.cos[:count], rope.sin[:count])
-        q, k = apply_rope(q, rope), apply_rope(k, rope)
-        is_known = self.dtype in (jnp.bfloat16, jnp.float32)
-        if not (self.qk_norm and is_known and is_fused(*q.shape[1:]) and is_on_one("gpu") and heads_work()):
-            return q, k, v
-        norms = [norm.variables["params"] for norm in (self.q_norm, self.k_norm)]
-        norms = jnp.stack([jnp.stack([norm["scale"], norm["bias"]]) for norm in norms])
-
-        def in_one_kernel(y, norms, rope, *_):
-            return normed_heads(y.astype(self.dtype), upcast(norms), rope)
-
-        return jax.lax.platform_dependent(
-            y, norms, rope, q, k, v, cuda=in_one_kernel, default=lambda y, norms, rope, *heads: heads
-        )
+        return apply_rope(q, rope), apply_rope(k, rope), v
 
     def project(self, y: Float[Array, "R C"]) -> Float[Array, "R C"]:
         """Return what attention adds to the residual stream."""
