@@ -9,10 +9,11 @@ from PIL import Image, ImageDraw, ImageFont
 from vggtjax.calibration.choice import Choice
 from vggtjax.calibration.sweep import GRAMS, KINDS, kind_index
 from vggtjax.errors import one_line
-from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_ramp
+from vggtjax.results.colors import color_ramp
+from vggtjax.results.grid import BACKGROUND, FAINT, TEXT
 
 # Blue below one half, red above.
-_COLORS = color_ramp("colorbrewer:RdBu_r")
+_COLORS = color_ramp("RdBu_r")
 _DARK, _OUTLINE = (20, 20, 24), (30, 200, 90)
 _CELL, _GAP, _MARGIN = (46, 30), 26, 24  # width and height; between the similarities; around everything
 _LABEL_WIDTH, _HEADER_HEIGHT, _LINE, _LEGEND = 150, 96, 22, (256, 12)

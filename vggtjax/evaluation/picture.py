@@ -10,11 +10,12 @@ from vggtjax.clips.truth import Truth
 from vggtjax.evaluation.metrics.depth import median_scale
 from vggtjax.geometry.similarity import centres, moves, umeyama_sim3
 from vggtjax.reconstruction import Reconstruction
-from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_depth, inverse_depth_range, overlay
+from vggtjax.results.grid import BACKGROUND, FAINT, MARGIN, TEXT, Row, draw_grid, fitted
+from vggtjax.results.previews import color_depth, inverse_depth_range, overlay
 
 _FRAMES = 6
 _SIDE = 220  # of a picture, in pixels
-_MARGIN, _GAP, _LABEL, _PLOT = 24, 6, 130, 460
+_PLOT = 460
 _TRUE, _FOUND, _PREDICTED = (120, 200, 255), (255, 150, 60), (150, 150, 160)
 
 
@@ -28,49 +29,33 @@ def truth_sheet(
     """
     S, H, W = result.depth.shape
     shown = np.linspace(0, S - 1, min(S, _FRAMES)).round().astype(int)
-    size = (_SIDE, round(_SIDE * H / W))
+    true_depth, everywhere = np.asarray(truth.depth, np.float32), np.ones((H, W), bool)
+    inverse_range = inverse_depth_range(true_depth, np.ones((S, H, W), bool))
     depths = {} if predicted is None else {"Depth predicted": predicted.depth}
-    depths |= {"Depth found": result.depth, "Depth true": np.asarray(truth.depth)}
-    found = ("Moving found",) if result.has_mask else ()
-    rows = ("Picture", *depths, *found, "Moving true")
-    left, top = _MARGIN + _LABEL, _MARGIN + 40
-    plot_left = left + len(shown) * (size[0] + _GAP) + 2 * _MARGIN
-    height = top + len(rows) * (size[1] + _GAP) + _MARGIN
-    sheet = Image.new("RGB", (plot_left + _PLOT + _MARGIN, max(height, top + _PLOT + 80)), BACKGROUND)
-    draw, font, small = ImageDraw.Draw(sheet), ImageFont.load_default(22), ImageFont.load_default(15)
-    draw.text((_MARGIN, _MARGIN - 6), f"{result.method}  ·  {result.model_name}  ·  against the truth", TEXT, font)
-
-    everywhere = np.ones(result.depth.shape, bool)
-    true_depth = np.asarray(truth.depth, np.float32)
-    scaled = [(depth * median_scale(depth, true_depth)).astype(np.float32) for depth in depths.values()]
-    inverse_range = inverse_depth_range(true_depth, everywhere)
-    for row, label in enumerate(rows):
-        draw.text((_MARGIN, top + row * (size[1] + _GAP)), label, TEXT, small)
-    for column, frame in enumerate(shown):
-        image = result.images[frame]
-        pictures = (
-            image,
-            *(color_depth(depth[frame], everywhere[frame], inverse_range) for depth in scaled),
-            *([overlay(image, result.dynamic_mask[frame])] if result.has_mask else ()),
-            overlay(image, truth.dynamic_mask[frame]),
-        )
-        for row, picture in enumerate(pictures):
-            place = left + column * (size[0] + _GAP), top + row * (size[1] + _GAP)
-            sheet.paste(Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC), place)
+    depths |= {"Depth found": result.depth, "Depth true": true_depth}
+    masks = {"Moving found": result.dynamic_mask} if result.has_mask else {}
+    masks |= {"Moving true": np.asarray(truth.dynamic_mask)}
+    rows = [Row("Picture", result.images[shown])]
+    for label, depth in depths.items():
+        scaled = (depth * median_scale(depth, true_depth)).astype(np.float32)[shown]
+        rows.append(Row(label, [color_depth(frame, everywhere, inverse_range) for frame in scaled]))
+    rows += [Row(name, [overlay(result.images[i], mask[i]) for i in shown]) for name, mask in masks.items()]
+    title = f"{result.method}  ·  {result.model_name}  ·  against the truth"
+    sheet = draw_grid(title, [f"frame {frame}" for frame in shown], rows, fitted((H, W), (_SIDE, 2 * _SIDE)))
     found = {} if predicted is None else {"predicted": (predicted.camera_from_world, _PREDICTED)}
     found |= {"found": (result.camera_from_world, _FOUND)}
-    _draw_cameras(draw, (plot_left, top), small, found, np.asarray(truth.camera_from_world))
-    return np.asarray(sheet)
+    cameras = _cameras_from_above(found, np.asarray(truth.camera_from_world))
+    canvas = np.full((max(len(sheet), len(cameras)), sheet.shape[1] + cameras.shape[1], 3), BACKGROUND, np.uint8)
+    canvas[: len(sheet), : sheet.shape[1]], canvas[: len(cameras), sheet.shape[1] :] = sheet, cameras
+    return canvas
 
 
-def _draw_cameras(
-    draw: ImageDraw.ImageDraw,
-    corner: tuple[int, int],
-    font: ImageFont.FreeTypeFont | ImageFont.ImageFont,
-    found: dict[str, tuple[Float[np.ndarray, "S 3 4"], tuple[int, int, int]]],
-    true: Float[np.ndarray, "S 3 4"],
-) -> None:
+def _cameras_from_above(
+    found: dict[str, tuple[Float[np.ndarray, "S 3 4"], tuple[int, int, int]]], true: Float[np.ndarray, "S 3 4"]
+) -> UInt8[np.ndarray, "height width 3"]:
     """Plot centres from above, x to the right and z up, in the axes of the true first camera; `found` by name."""
+    picture = Image.new("RGB", (_PLOT + MARGIN, _PLOT + 2 * MARGIN + 60), BACKGROUND)
+    draw, font, corner = ImageDraw.Draw(picture), ImageFont.load_default(15), (0, MARGIN + 12)
     true_rotation, origin = true[0, :, :3], centres(true)[0]
     ways = {"true": (centres(true), _TRUE)}
     for name, (poses, colour) in found.items():
@@ -91,3 +76,4 @@ def _draw_cameras(
         x, y = pixels[0]
         draw.ellipse((x - 8, y - 8, x + 8, y + 8), outline=colour, width=2)
     draw.text((corner[0], corner[1] + _PLOT + 30), f"square of {span:.2f} m; ring: first frame", FAINT, font)
+    return np.asarray(picture)

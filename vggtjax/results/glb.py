@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from cmap import Colormap
 from jaxtyping import Float, Int
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual import ColorVisuals
 
 from vggtjax.cameras import FRUSTUM_EDGES, frustum_corners
+from vggtjax.results.colors import color_ramp
 from vggtjax.results.gltf_animation import TO_GLTF
 from vggtjax.results.point_cloud import PointCloud
 from vggtjax.results.result import Result
@@ -91,7 +91,7 @@ def _camera_mesh(result: Result, size: float) -> trimesh.Trimesh:
     frames, height, width = result.depth.shape
     corners = frustum_corners(result.intrinsics, result.camera_from_world, height, width, size)  # [S, 5, 3]
     corners = corners.astype(np.float64)
-    colors = (Colormap("plasma")(np.linspace(0, 0.9, frames))[:, :3] * 255).round().astype(np.uint8)
+    colors = color_ramp("plasma")[np.linspace(0, 230, frames).round().astype(int)]
 
     edges = corners[:, FRUSTUM_EDGES].reshape(-1, 2, 3)
     path = np.stack([corners[:-1, 0], corners[1:, 0]], axis=1)

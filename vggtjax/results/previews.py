@@ -6,18 +6,13 @@ from colorsys import hsv_to_rgb
 
 import numpy as np
 import skimage
-from cmap import Colormap
-from jaxtyping import Bool, Float32, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from PIL import Image
 
+from vggtjax.results.colors import color_ramp
+from vggtjax.results.grid import BACKGROUND, Row, draw_grid, fitted
 from vggtjax.results.result import Result
 from vggtjax.storage.arrays import spread_frames
-
-
-def color_ramp(name: str) -> UInt8[np.ndarray, "256 3"]:
-    """Return the colours of a colour map from its first to its last."""
-    return (Colormap(name).lut(256)[:, :3] * 255).round().astype(np.uint8)
-
 
 DEPTH_COLORS = color_ramp("turbo")  # far cold, near warm
 SALIENCY_COLORS = color_ramp("inferno")
@@ -36,10 +31,7 @@ _LEAST_SIDE = 480  # pixels of the longer side of a frame's preview
 _MOST_SAMPLES = 2_000_000  # pixels of a percentile
 _SHEET_FRAMES = 8
 _SHEET_WIDTH = 1800  # pixels of all columns
-_TITLE_WIDTH = 700  # least pixels of the title
 _THUMBNAIL = (480, 300)  # widest and highest
-_MARGIN, _GAP, _LABEL_WIDTH, _LEGEND_WIDTH, _HEADER_HEIGHT = 24, 6, 150, 120, 104
-BACKGROUND, TEXT, FAINT = (20, 20, 24), (236, 236, 240), (150, 150, 160)  # of every sheet
 
 
 def inverse_depth_range(depth: Float32[np.ndarray, "S H W"], valid: Bool[np.ndarray, "S H W"]) -> tuple[float, float]:
@@ -141,69 +133,43 @@ def card(result: Result) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:
-    """Draw up to eight frames, evenly spread: columns of picture, depth, what tells motion, moving objects."""
+    """Draw up to eight frames, evenly spread: rows of pictures, depth, what tells motion, moving objects."""
     frames, height, width = result.depth.shape
     shown = np.linspace(0, frames - 1, min(frames, _SHEET_FRAMES)).round().astype(int)
-    scale = min(_THUMBNAIL[0] / width, _THUMBNAIL[1] / height, _SHEET_WIDTH / len(shown) / width)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    step_x, step_y = size[0] + _GAP, size[1] + _GAP
-    left, top = _MARGIN + _LABEL_WIDTH, _MARGIN + _HEADER_HEIGHT
-
-    labels = tuple(_thumbnails(result, 0, np.zeros((height, width, 3), np.uint8), size))
-
-    sheet_width = max(left + len(shown) * step_x - _GAP, _TITLE_WIDTH) + _MARGIN
-    sheet = Image.new("RGB", (sheet_width, top + len(labels) * step_y - _GAP + _MARGIN), BACKGROUND)
-    draw = ImageDraw.Draw(sheet)
-    large, small = ImageFont.load_default(22), ImageFont.load_default(15)
-    draw.text((_MARGIN, _MARGIN), f"{result.method}  ·  {result.model_name}", TEXT, large)
+    size = fitted((height, width), (min(_THUMBNAIL[0], _SHEET_WIDTH // len(shown)), _THUMBNAIL[1]))
     count = f"{frames} frame{'s' if frames > 1 else ''} of {width} x {height} pixels"
-    draw.text((_MARGIN, _MARGIN + 30), count, FAINT, small)
-    draw.text((_MARGIN, _MARGIN + 48), result.model_note, FAINT, small)
+    times = ["" if result.timestamps is None else f"  ·  {result.timestamps[frame]:.2f} s" for frame in shown]
+    columns = [f"frame {frame}{time}" for frame, time in zip(shown, times, strict=True)]
+    title = f"{result.method}  ·  {result.model_name}"
+    return draw_grid(title, columns, _rows(result, shown, size), size, f"{count}\n{result.model_note}".strip())
 
-    objects = int(result.instances.max())
-    notes = (f"{result.dynamic_share:.1%} of pixels", f"{objects} object{'' if objects == 1 else 's'}")
-    legends = {"Depth": (DEPTH_COLORS, "far", "near"), "Saliency": (SALIENCY_COLORS, "0", "1")}
-    legends["By matches"] = (SALIENCY_COLORS, "median", f"{MOST_MOTION} x")
-    for row, label in enumerate(labels):
-        y = top + row * step_y
-        draw.text((_MARGIN, y), label, TEXT, small)
-        if label in legends:
-            colors, lowest, highest = legends[label]
-            sheet.paste(Image.fromarray(colors[None]).resize((_LEGEND_WIDTH, 10)), (_MARGIN, y + 24))
-            draw.text((_MARGIN, y + 38), lowest, FAINT, small)
-            draw.text((_MARGIN + _LEGEND_WIDTH, y + 38), highest, FAINT, small, "ra")
-        if label == "Dynamic":
-            draw.text((_MARGIN, y + 22), "\n".join(notes), FAINT, small)
 
+def _rows(result: Result, shown: Int[np.ndarray, " F"], size: tuple[int, int]) -> list[Row]:
     valid = result.valid_pixels
     inverse_range = inverse_depth_range(result.depth, valid)
-    for column, frame in enumerate(shown):
-        x = left + column * step_x
-        time = "" if result.timestamps is None else f"  ·  {result.timestamps[frame]:.2f} s"
-        draw.text((x, top - 24), f"frame {frame}{time}", FAINT, small)
-        depth = color_depth(result.depth[frame], valid[frame], inverse_range)
-        for row, thumbnail in enumerate(_thumbnails(result, int(frame), depth, size).values()):
-            sheet.paste(thumbnail, (x, top + row * step_y))
-    return np.asarray(sheet)
-
-
-def _thumbnails(
-    result: Result, frame: int, depth: UInt8[np.ndarray, "H W 3"], size: tuple[int, int]
-) -> dict[str, Image.Image]:
-    """Return one column of the sheet, from top to bottom."""
-    picture = Image.fromarray(result.images[frame]).resize(size, Image.Resampling.LANCZOS)
-    column = {"Picture": picture, "Depth": Image.fromarray(depth).resize(size, Image.Resampling.LANCZOS)}
+    depths = [color_depth(result.depth[frame], valid[frame], inverse_range) for frame in shown]
+    rows = [Row("Picture", result.images[shown]), Row("Depth", depths, ramp=(DEPTH_COLORS, "far", "near"))]
     if result.saliency is not None and np.nan_to_num(result.saliency).any():
-        saliency = np.nan_to_num(result.saliency[frame]).clip(0, 1)
-        saliency = np.asarray(Image.fromarray(saliency).resize(size, Image.Resampling.BILINEAR))
-        column["Saliency"] = Image.fromarray(SALIENCY_COLORS[(saliency * 255).round().astype(np.uint8)])
+        rows.append(Row("Saliency", [_heat(x, size) for x in result.saliency[shown]], ramp=(SALIENCY_COLORS, "0", "1")))
     if result.motion is not None:
-        above = (result.motion[frame] - 1) / (MOST_MOTION - 1)
-        motion = Image.fromarray(np.nan_to_num(above).clip(0, 1).astype(np.float32))
-        motion = np.asarray(motion.resize(size, Image.Resampling.BILINEAR))
-        column["By matches"] = Image.fromarray(SALIENCY_COLORS[(motion * 255).round().astype(np.uint8)])
-    if not result.has_mask:
-        return column
+        above = (result.motion[shown] - 1) / (MOST_MOTION - 1)
+        ramp = (SALIENCY_COLORS, "median", f"{MOST_MOTION} x")
+        rows.append(Row("By matches", [_heat(x, size) for x in above], ramp=ramp))
+    if result.has_mask:
+        objects = int(result.instances.max())
+        notes = f"{result.dynamic_share:.1%} of pixels\n{objects} object{'' if objects == 1 else 's'}"
+        rows.append(Row("Dynamic", [_overlaid(result, int(frame), size) for frame in shown], notes))
+    return rows
+
+
+def _heat(values: Float[np.ndarray, "h w"], size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+    """Colour numbers of patches from 0 to 1, enlarged before: mixed colours would lie beside the ramp."""
+    patches = Image.fromarray(np.nan_to_num(values).clip(0, 1).astype(np.float32))
+    return SALIENCY_COLORS[(np.asarray(patches.resize(size, Image.Resampling.BILINEAR)) * 255).round().astype(np.uint8)]
+
+
+def _overlaid(result: Result, frame: int, size: tuple[int, int]) -> UInt8[np.ndarray, "H W 3"]:
+    """Overlay moving objects at the size of the sheet, for outlines of one width."""
     moving = Image.fromarray(moving_ids(result.dynamic_mask[frame], result.instances[frame]))
-    moving = np.asarray(moving.resize(size, Image.Resampling.NEAREST))
-    return column | {"Dynamic": Image.fromarray(overlay(np.asarray(picture), moving))}
+    picture = Image.fromarray(result.images[frame]).resize(size, Image.Resampling.LANCZOS)
+    return overlay(np.asarray(picture), np.asarray(moving.resize(size, Image.Resampling.NEAREST)))

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
 from vggtjax.rendering.film import mp4_codec, write_film
-from vggtjax.results.previews import BACKGROUND, FAINT, TEXT, color_ramp
+from vggtjax.results.colors import hues
+from vggtjax.results.grid import Row, draw_grid, fitted
 from vggtjax.results.result import Result
 
 SEEN = 0.5  # visibility from which a point is drawn filled
-_COLORS = color_ramp("gist_rainbow")
+_COLORS = hues(256)
 _TAIL = 8  # frames of a point's past that are drawn
 _STRIP_FRAMES, _STRIP_WIDTH = 6, 1800
 _VIDEO_SIDE = 720  # least pixels of the video's longer side; frames are enlarged by whole numbers
 _FRAMES_PER_SECOND = 10
-_MARGIN, _GAP = 24, 6
 
 logger = logging.getLogger(__name__)
 
@@ -28,17 +28,11 @@ def track_strip(result: Result) -> UInt8[np.ndarray, "height width 3"]:
     """Draw up to six frames, evenly spread, with the position and the past of every track."""
     S, H, W = result.depth.shape
     shown = np.linspace(0, S - 1, min(S, _STRIP_FRAMES)).round().astype(int)
-    scale = max(_STRIP_WIDTH / len(shown) / W, 1e-3)
-    width, height = max(round(W * scale), 1), max(round(H * scale), 1)
-    strip = Image.new("RGB", (2 * _MARGIN + len(shown) * (width + _GAP) - _GAP, height + 2 * _MARGIN + 60), BACKGROUND)
-    draw = ImageDraw.Draw(strip)
+    size = fitted((H, W), (_STRIP_WIDTH // len(shown), _STRIP_WIDTH))
     count = _present(result.track_frames).size
-    draw.text((_MARGIN, _MARGIN), f"{count} track{'s' if count > 1 else ''}", TEXT, ImageFont.load_default(22))
-    for column, frame in enumerate(shown):
-        x = _MARGIN + column * (width + _GAP)
-        draw.text((x, _MARGIN + 32), f"frame {frame}", FAINT, ImageFont.load_default(15))
-        strip.paste(_drawn(result, int(frame), (width, height)), (x, _MARGIN + 60))
-    return np.asarray(strip)
+    frames = [np.asarray(_drawn(result, int(frame), size)) for frame in shown]
+    columns = [f"frame {frame}" for frame in shown]
+    return draw_grid(f"{count} track{'s' if count > 1 else ''}", columns, [Row("", frames)], size)
 
 
 def write_track_video(path: Path, result: Result) -> None:

@@ -7,24 +7,15 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
-from vggtjax.results.previews import (
-    BACKGROUND,
-    FAINT,
-    INSTANCE_COLORS,
-    TEXT,
-    color_depth,
-    inverse_depth_range,
-    overlay,
-)
+from vggtjax.results.grid import Row, draw_grid, fitted
+from vggtjax.results.previews import INSTANCE_COLORS, color_depth, inverse_depth_range, overlay
 
 _MOST_ROWS = 8
 _THUMBNAIL = (260, 200)  # widest and highest
-_MARGIN, _GAP, _HEADER, _LABEL = 24, 6, 76, 108
 _REST = np.array([48, 48, 54], np.uint8)
 _COLUMNS = ("first", "middle", "last", "depth", "dynamic", "parts", "flow")
-_UNMIXED = ("parts", "flow")  # mixed colours have no meaning
 
 
 def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
@@ -33,25 +24,9 @@ def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
     `scenes` are folders that `write_scenes` wrote, of images of one size.
     """
     chosen = [scenes[i] for i in np.linspace(0, len(scenes) - 1, min(len(scenes), _MOST_ROWS)).round().astype(int)]
-    rows = [_row(scene) for scene in chosen]
-    height, width = rows[0][0].shape[:2]
-    scale = min(_THUMBNAIL[0] / width, _THUMBNAIL[1] / height)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    step_x, step_y = size[0] + _GAP, size[1] + _GAP
-    left, top = _MARGIN + _LABEL, _MARGIN + _HEADER
-    right, bottom = left + len(_COLUMNS) * step_x - _GAP, top + len(rows) * step_y - _GAP
-    sheet = Image.new("RGB", (right + _MARGIN, bottom + _MARGIN), BACKGROUND)
-    draw = ImageDraw.Draw(sheet)
-    large, small = ImageFont.load_default(22), ImageFont.load_default(15)
-    draw.text((_MARGIN, _MARGIN), title, TEXT, large)
-    for x, name in zip(range(left, right, step_x), _COLUMNS, strict=True):
-        draw.text((x, top - 24), name, FAINT, small)
-    for y, scene, pictures in zip(range(top, bottom, step_y), chosen, rows, strict=True):
-        draw.text((_MARGIN, y), scene.name, TEXT, small)
-        for x, name, picture in zip(range(left, right, step_x), _COLUMNS, pictures, strict=True):
-            filtering = Image.Resampling.NEAREST if name in _UNMIXED else Image.Resampling.LANCZOS
-            sheet.paste(Image.fromarray(picture).resize(size, filtering), (x, y))
-    return sheet
+    rows = [Row(scene.name, _row(scene), sharp=True) for scene in chosen]
+    size = fitted(rows[0].pictures[0].shape[:2], _THUMBNAIL)
+    return Image.fromarray(draw_grid(title, _COLUMNS, rows, size))
 
 
 def color_parts(part_ids: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "H W 3"]:

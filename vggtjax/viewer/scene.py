@@ -8,13 +8,13 @@ import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
-from cmap import Colormap
 from jaxtyping import Float, Float32, UInt8, UInt16
 from PIL import Image
 
 from vggtjax.cameras import frustum_corners
 from vggtjax.errors import one_line
 from vggtjax.progress import Progress
+from vggtjax.results.colors import hues
 from vggtjax.results.frame import PLAIN_RATE, frame_of
 from vggtjax.results.result import Result
 from vggtjax.results.shown import ShownPoints, middle_and_radius, relative_steps, shown_points
@@ -185,8 +185,7 @@ def _tracks(result: Result, place: Place) -> dict[str, Any] | None:
         frame = frame_of(result, number)
         known = inside[number] & frame.valid[rows[number], columns[number]]
         positions[number, known] = place.points(frame.world_points()[rows[number], columns[number]][known])
-    hues = Colormap("hsv")(np.linspace(0, 1, count, endpoint=False))[:, :3]
-    return {"positions": positions.ravel(), "colors": (hues * 255).round().astype(np.uint8).ravel()}
+    return {"positions": positions.ravel(), "colors": hues(count).ravel()}
 
 
 def _sheet(result: Result) -> dict[str, Any]:
