@@ -1,7 +1,7 @@
 """Clips on a cluster of Ray: each good one once, whatever becomes of a worker; a sentence for what is no cluster."""
 
+import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -12,14 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.batch import dying_driver
 from tests.moving_ball import moving_ball
 from tests.room import make_room
 from tests.tiny import tiny_model
-from vggtjax.batch.cluster import _outcomes
-from vggtjax.batch.cluster_driver import Dispatcher, _Slot, shared
-from vggtjax.batch.cluster_options import Cluster
-from vggtjax.batch.cluster_worker import Job, Place, Started, Worker
+from vggtjax.batch.cluster import Cluster, Worker, reconstruct_on_cluster, shared
 from vggtjax.batch.destination import SETTINGS_NAME, LocalFolder
 from vggtjax.batch.recipe import BatchRecipe, ClipOutcome
 from vggtjax.checkpoint import save_model
@@ -53,19 +49,19 @@ def test_a_killed_worker_costs_its_clips_alone_and_they_are_run_again(tmp_path):
     out = tmp_path / "out"
     arguments = [*command, str(out), "--engine", "ray", "--address", "local", "--workers", "2"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    workers, done, said, killed = [], 0, [], False
+    done, said, killed = 0, [], False
     with subprocess.Popen(arguments, env=environment, **pipes) as running:
         assert running.stderr is not None
         for line in running.stderr:
             said.append(line)
-            workers += map(int, re.findall(r"ready: .*, process (\d+)", line))
             done += ": done" in line
-            if not killed and done >= 2 and len(workers) == 2:
-                os.kill(workers[0], signal.SIGKILL)
+            if not killed and done >= 2:
+                found = subprocess.run(["pgrep", "-f", "^ray::Worker.run"], capture_output=True, text=True, check=True)
+                os.kill(int(found.stdout.split()[0]), signal.SIGKILL)
                 killed = True
         table = running.stdout.read()  # type: ignore[union-attr]
     assert running.returncode == 0, said
-    assert sum("has ended; in its work: " in line for line in said) == 1
+    assert killed
     assert dict(line.split(maxsplit=1) for line in table.splitlines()[:4]) == {
         "clips": "8",
         "done": "7",
@@ -82,119 +78,82 @@ def test_a_killed_worker_costs_its_clips_alone_and_they_are_run_again(tmp_path):
     assert {path.name for path in out.iterdir()} == {path.name for path in (tmp_path / "alone").iterdir()}
 
 
-class Actors:
-    """Stands for Ray: remembers what was asked of which worker."""
+class FakeRay(SimpleNamespace):
+    """Stands for Ray, with two machines of a CPU: `answers` are those of workers, by the name of the clip."""
 
-    def __init__(self, monkeypatch):
-        self.answers, self.killed = {}, []
-        ray = SimpleNamespace(get=self.get, kill=self.killed.append)
-        monkeypatch.setitem(sys.modules, "ray", ray)
+    def __init__(self, answers):
+        self.calls, self.answers, self.options_given = {}, answers, {}
+        super().__init__(init=lambda **_: None, shutdown=lambda: None)
 
-    def get(self, reference):
-        answer = self.answers[reference]
+    def nodes(self):
+        return [{"Alive": True, "Resources": {"CPU": 1.0}}] * 2
+
+    def remote(self, kind):
+        return self
+
+    def options(self, **given):
+        self.options_given = given
+        return SimpleNamespace(remote=self._worker)
+
+    def _worker(self, *given):
+        def asked(*clip):
+            self.calls[len(self.calls)] = clip[0] if clip else "ready"
+            return len(self.calls) - 1
+
+        return SimpleNamespace(ready=SimpleNamespace(remote=asked), run=SimpleNamespace(remote=asked))
+
+    def wait(self, calls, timeout):
+        return calls[:1], calls[1:]
+
+    def get(self, call):
+        name = self.calls[call]
+        answer = self.answers.get(name, ClipOutcome(name, "done"))
+        answer = answer.pop(0) if isinstance(answer, list) else answer
         if isinstance(answer, Exception):
             raise answer
         return answer
 
 
-class Actor:
-    def __init__(self):
-        self.asked = []
-
-    def __getattr__(self, name):
-        return SimpleNamespace(remote=partial(self._ask, name))
-
-    def _ask(self, name, *arguments):
-        self.asked.append(name)
-        return (id(self), len(self.asked))
+READY = (running_versions(), {"size": 56}, "")
 
 
-def job(load, out, folder="."):
-    return Job(load, RECIPE, LocalFolder(out), folder, Cluster("ray", workers=2))
+def outcomes(monkeypatch, out, answers, said=()):
+    """Return the outcomes of clips a to d, by name, and the stand-in for Ray."""
+    ray = FakeRay({"ready": READY} | answers)
+    ray.exceptions = sys.modules["ray.exceptions"]
+    monkeypatch.setitem(sys.modules, "ray", ray)
+    notes = list(said)
+    sources = {name: f"{name}.mp4" for name in "abcd"}
+    made = reconstruct_on_cluster(print, sources, out, Cluster("ray"), RECIPE, note=notes.append)
+    return {outcome.name: outcome for outcome in made}, ray, notes
 
 
-@pytest.fixture
-def dispatcher(monkeypatch, tmp_path):
-    """Return a dispatcher of five clips with two workers that are ready, and what it has sent."""
-    actors, sent = Actors(monkeypatch), []
-    dispatcher = Dispatcher(job(dying_driver.no_model, tmp_path), {name: name for name in "abcde"}, sent.append)
-    it = SimpleNamespace(it=dispatcher, actors=actors, sent=sent)
-    dispatcher.begin([Actor(), Actor()])
-    for slot in dispatcher._slots:
-        begin(it, slot)
-    return it
-
-
-def begin(dispatcher, slot):
-    """Let a worker answer where it is, and that it is ready."""
-    end(dispatcher, slot, None, Place("host", dispatcher.it._slots.index(slot), running_versions()))
-    end(dispatcher, slot, None, Started({"size": 56}, ""))
-
-
-def end(dispatcher, slot, name, answer):
-    """Let a worker answer for a clip."""
-    reference = next(key for key, task in dispatcher.it._tasks.items() if task == (slot, name))
-    dispatcher.actors.answers[reference] = answer
-    dispatcher.it.finish(reference)
-
-
-def test_a_clip_that_ends_two_workers_fails_and_those_beside_it_do_not(dispatcher):
+def test_a_clip_that_ends_a_worker_twice_fails_and_the_others_do_not(monkeypatch, tmp_path):
     from ray.exceptions import RayActorError
 
-    it = dispatcher.it
-    it.assign()
-    first, second = it._slots
-    assert (first.clips, second.clips) == (["a", "c", "e"], ["b", "d"])
-    end(dispatcher, first, "c", RayActorError())
-    assert dispatcher.sent[-1] == "a worker (host, process 0) has ended; in its work: a, c, e"
-    again = it._slots[1]
-    assert again.actor is first.actor  # which Ray begins anew
-    begin(dispatcher, again)
-    it.assign()
-    assert again.clips == ["a"]  # alone, so that another end tells which clip it is
-    end(dispatcher, again, "a", ClipOutcome("a", "kept"))
-    assert dispatcher.sent[-1] == ClipOutcome("a", "done")  # the first worker had written it
-    it.assign()
-    assert again.clips == ["c"]
-    end(dispatcher, again, "c", RayActorError())
-    (outcome,) = [sent for sent in dispatcher.sent if getattr(sent, "status", "") == "failed"]
-    assert outcome.name == "c"
-    assert "two workers ended with it in their work" in outcome.reason
-    assert list(it._again) == ["e"]
-    assert second.clips == ["b", "d"]
-    assert dispatcher.actors.killed == []
+    made, ray, notes = outcomes(monkeypatch, tmp_path / "out", {"b": RayActorError()})
+    assert {name for name, outcome in made.items() if outcome.status == "done"} == set("acd")
+    assert "two workers ended with it in their work" in made["b"].reason
+    assert list(ray.calls.values()) == ["ready", "ready", "a", "b", "c", "d"]  # two workers, a clip each
+    assert ray.options_given == {"num_cpus": 1, "num_gpus": 0.0, "max_restarts": -1, "max_task_retries": 1}
+    assert notes == ["the first worker is ready"]
+    assert json.loads((tmp_path / "out" / SETTINGS_NAME).read_text())["size"] == 56
 
 
-def test_a_worker_that_never_begins_is_given_up(dispatcher):
-    from ray.exceptions import RayActorError
+def test_workers_of_other_code_and_other_files_and_those_that_cannot_begin(monkeypatch, tmp_path):
+    from ray.exceptions import RayActorError, RayTaskError
 
-    it = dispatcher.it
-    it._slots.clear()
-    it.begin([Actor()])
-    for _ in range(2):
-        end(dispatcher, it._slots[0], None, RayActorError())
-    with pytest.raises(ClusterError, match="workers ended 3 times in a row before they began"):
-        end(dispatcher, it._slots[0], None, RayActorError())
-    assert len(dispatcher.actors.killed) == 1
-
-
-def test_workers_of_other_code_and_other_files_are_refused(dispatcher):
-    from ray.exceptions import RayTaskError
-
-    slot = _Slot(Actor())
-    dispatcher.it._tasks["x"] = (slot, None)
-    with pytest.raises(
-        ClusterError, match=r"\(far, process 7\) runs vggtjax 0.0.9 .*, this command vggtjax .* the same"
-    ):
-        end(dispatcher, slot, None, Place("far", 7, "vggtjax 0.0.9 (sources 01234567) with jax 0.9"))
-    slot.place = Place("far", 7, running_versions())
-    dispatcher.it._tasks["x"] = (slot, None)
-    with pytest.raises(ClusterError, match="has another size than the one on host, process 0"):
-        end(dispatcher, slot, None, Started({"size": 70}, ""))
-    dispatcher.it._tasks["x"] = (slot, None)
-    problem = RayTaskError("start", "Traceback ...", InputError("no such model"), proctitle="a worker", ip="here")
-    with pytest.raises(ClusterError, match="cannot begin: no such model"):
-        end(dispatcher, slot, None, problem.as_instanceof_cause())
+    other = ("vggtjax 0.0.9 (sources 01234567) with jax 0.9", *READY[1:])
+    with pytest.raises(ClusterError, match=r"a worker runs vggtjax 0.0.9 .*, this command vggtjax .* the same"):
+        outcomes(monkeypatch, tmp_path / "a", {"ready": other})
+    smaller = (READY[0], {"size": 70}, "")
+    with pytest.raises(ClusterError, match="two workers have different size"):
+        outcomes(monkeypatch, tmp_path / "b", {"ready": [READY, smaller]})
+    problem = RayTaskError("ready", "Traceback ...", InputError("no such model"), proctitle="a worker", ip="here")
+    with pytest.raises(ClusterError, match="a worker cannot begin: no such model"):
+        outcomes(monkeypatch, tmp_path / "c", {"ready": problem.as_instanceof_cause()})
+    with pytest.raises(ClusterError, match="a worker cannot begin: "):
+        outcomes(monkeypatch, tmp_path / "d", {"ready": RayActorError()})
 
 
 @pytest.mark.parametrize(
@@ -213,27 +172,18 @@ def test_a_worker_does_a_clip_once(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # where the worker goes itself
     model = tiny_model()
     Image.fromarray(np.zeros((70, 98, 3), np.uint8)).save(tmp_path / "a.png")
-    worker = Worker()
-    assert worker.place() == Place(os.uname().nodename, os.getpid(), running_versions())
-    started = worker.start(job(lambda: (model, None), tmp_path / "out", str(tmp_path)))
-    assert isinstance(started, Started)
-    assert started.settings["method"] == "vggt"
+    worker = Worker(lambda: (model, None), RECIPE, LocalFolder(tmp_path / "out"), str(tmp_path), None)
+    versions, settings, _ = worker.ready()
+    assert (versions, settings["method"]) == (running_versions(), "vggt")
     worker._work.reconstruct_or_cut = lambda name, clip, seconds: make_room()  # type: ignore[union-attr]
     assert worker.run("a", "a.png") == ClipOutcome("a", "done", frames=1)
     assert worker.run("a", "a.png").status == "kept"
     assert "'b.png' does not exist" in worker.run("b", "b.png").reason
     worker._work.load = lambda source: 1 / 0  # type: ignore[union-attr]
     assert "ZeroDivisionError" in worker.run("c", "a.png").reason
-    worker.close()
     with pytest.raises(InputError, match="no such model"):
-        Worker().start(job(partial(_no_model, "no such model"), tmp_path, "/nowhere"))
+        Worker(partial(_no_model, "no such model"), RECIPE, LocalFolder(tmp_path), "/nowhere", None).ready()
 
 
 def _no_model(reason):
     raise InputError(reason)
-
-
-def test_a_driver_that_dies_is_one_sentence(monkeypatch, tmp_path):
-    monkeypatch.setattr("vggtjax.batch.cluster.drive", dying_driver.die)
-    with pytest.raises(ClusterError, match=r"the cluster has died \(Ray's last words: GCS is gone\); finished clips"):
-        list(_outcomes(job(dying_driver.no_model, tmp_path), {}, print))

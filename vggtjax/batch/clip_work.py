@@ -90,6 +90,17 @@ class ClipWork:
         """Read a clip of this machine."""
         return read_clip(open_source(source, undistort=self._recipe.undistort), self._recipe.sampling, self._fitter)
 
+    def run(self, name: str, source: ClipSource) -> ClipOutcome:
+        """Do all the work on a clip of this machine."""
+        clip = self.long_clip(source) or self.load(source)
+        seconds = StageSeconds()
+        result = clip if isinstance(clip, LongClip) else self.reconstruct_or_cut(name, clip, seconds)
+        if isinstance(clip, LongClip) or isinstance(result, LongClip):
+            del clip  # its frames are read again, window by window
+            assert isinstance(result, LongClip)
+            return self.run_long(name, source, result)
+        return self.write(name, clip, result, seconds.seconds)
+
     def run_long(self, name: str, source: ClipSource, clip: LongClip) -> ClipOutcome:
         """Reconstruct a clip in windows, and write its result."""
         recipe = self._recipe

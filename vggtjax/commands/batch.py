@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from vggtjax.batch.cluster_options import Cluster
+from vggtjax.batch.cluster import Cluster
 from vggtjax.batch.recipe import BatchRecipe, ClipOutcome
 from vggtjax.commands.arguments import CONSISTENT, BatchFolder, Shards, Sources
 from vggtjax.commands.models import ModelFiles, check_named, load_on_worker
@@ -27,7 +27,7 @@ def batch(
     recipe: Annotated[BatchRecipe, tyro.conf.arg(name="", help="")] = BatchRecipe(options=CONSISTENT),
     out: BatchFolder,
     shard: Shards = None,
-    cluster: Annotated[Cluster, tyro.conf.arg(name="cluster", help="")] = Cluster(),
+    cluster: Annotated[Cluster, tyro.conf.arg(name="cluster", help="")] = Cluster(),  # noqa: B008 (frozen)
 ) -> None:
     """Reconstruct many clips, each into a folder of its own; run the same command again to resume.
 

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from vggtjax.options import METHODS
+from vggtjax.results.colors import color_ramp
 from vggtjax.results.previews import (
     CONFIDENCE_COLORS,
     DEPTH_COLORS,
     INSTANCE_COLORS,
     MOST_MOTION,
     SALIENCY_COLORS,
-    color_ramp,
     inverse_depth_range,
     moving_ids,
 )
