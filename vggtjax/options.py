@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
-
-import tyro
+from typing import Any, Literal
 
 from vggtjax.config import (
     LARGEST,
@@ -22,11 +20,9 @@ from vggtjax.config import (
 )
 from vggtjax.errors import InputError, check_choice, whole_number
 from vggtjax.storage.backend import backend
-from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields, without_defaults
 
 Pass = Literal["first", "second"]
-_ShownDType = Literal["float32", "bfloat16"]  # on the command line
 MethodName = Literal["vggt", "vggt4d", "pose-decoupling", "hard-replacement", "4dvggt-d", "4dvggt-m"]
 
 
@@ -106,27 +102,12 @@ def pairs_to_try(pairs: Sequence[int], depth: int | None = None) -> tuple[int, .
 _READ_AFTER_THE_PASSES = ("method", "align_scale", "refine_mask", "refine_cameras", "consistent_depth")
 
 
-def _refine_mask(refine_mask: Switch = False, no_refine_mask: Switch = False) -> bool | None:
-    """Whether the mask is refined; the method's own choice by default.
-
-    Args:
-        refine_mask: remove pixels from the mask that agree with other frames, as vggt4d does.
-        no_refine_mask: leave the mask as it was mined, with vggt4d too.
-    """
-    if refine_mask and no_refine_mask:
-        raise InputError("--refine-mask and --no-refine-mask are opposites; give one of them")
-    return True if refine_mask else False if no_refine_mask else None
-
-
 _LATER = {
     "refine_cameras": False,
     "consistent_depth": False,
     "attention": "exact",
     "precision": "highest",
 }  # as in older results
-
-# The name puts both flags into the group of the method in the help.
-_RefineMask = Annotated[bool | None, tyro.conf.arg(constructor=_refine_mask, name="method", prefix_name=False)]
 
 
 @dataclass(frozen=True)
@@ -166,22 +147,19 @@ class Options:
     """
 
     method: MethodName = "4dvggt-d"
-    gram: InWords[Gram | None] = None
-    suppress: InWords[Suppress | None] = None
-    mask_pairs: InWords[int | None] = None
-    threshold: InWords[Threshold | None] = None
-    mask: InWords[Witness | None] = None
-    align_scale: Switch = False
+    gram: Gram | None = None
+    suppress: Suppress | None = None
+    mask_pairs: int | None = None
+    threshold: Threshold | None = None
+    mask: Witness | None = None
+    align_scale: bool = False
     smooth_frames: int = 1
-    refine_mask: _RefineMask = None
-    refine_cameras: Switch = False
-    consistent_depth: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = False
-    compute_dtype: Annotated[
-        ComputeDType | None,
-        tyro.conf.arg(name="dtype", constructor=_ShownDType, help_behavior_hint=""),  # pyright: ignore
-    ] = None
-    precision: InWords[Precision | None] = None
-    attention: InWords[Attention] = "exact"
+    refine_mask: bool | None = None
+    refine_cameras: bool = False
+    consistent_depth: bool = False
+    compute_dtype: ComputeDType | None = None
+    precision: Precision | None = None
+    attention: Attention = "exact"
 
     def __post_init__(self) -> None:
         find_method(self.method)

@@ -15,18 +15,21 @@ _Count = Annotated[int, Meta(ge=1, le=100_000)]
 
 @dataclass(frozen=True)
 class Limits:
-    """The bounds of a job, of the queue and of the disk. Raises InputError for a number below 1."""
+    """The bounds of a job, of the queue and of the disk. Raises InputError for a number below 1.
+
+    Attributes:
+        max_upload_mb: megabytes of the video, or of all pictures together
+        max_seconds: length of a video
+        max_frames: frames that are reconstructed of a video or of pictures
+        max_waiting: jobs that wait for their turn; one runs at a time
+        max_results: finished results on disk; older ones are removed
+    """
 
     max_upload_mb: _Count = 500
-    """megabytes of the video, or of all pictures together"""
     max_seconds: _Count = 300
-    """length of a video"""
     max_frames: _Count = 32
-    """frames that are reconstructed of a video or of pictures"""
     max_waiting: _Count = 8
-    """jobs that wait for their turn; one runs at a time"""
     max_results: _Count = 8
-    """finished results on disk; older ones are removed"""
 
     def __post_init__(self) -> None:
         check_fields(self)

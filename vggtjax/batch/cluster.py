@@ -11,7 +11,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import tyro
 from msgspec import Meta
 
 from vggtjax.batch.contact import contact_page
@@ -20,7 +19,6 @@ from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, counted, failed, inva
 from vggtjax.clips.fetched import Fetched
 from vggtjax.errors import ClusterError, InputError, VggtjaxError, check_extra, one_line
 from vggtjax.progress import Progress, no_progress
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import Count, check_fields
 from vggtjax.storage.remote import is_in_process, is_url
 from vggtjax.storage.versions import running_versions
@@ -44,10 +42,10 @@ class Cluster:
     """
 
     engine: Literal["local", "ray"] = "local"
-    address: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT|auto", help_behavior_hint="")] = None
-    workers: InWords[Count | None] = None
-    worker_cpus: InWords[Count | None] = None
-    worker_gpus: InWords[Annotated[float, Meta(ge=0, le=1024)] | None] = None
+    address: str | None = None
+    workers: Count | None = None
+    worker_cpus: Count | None = None
+    worker_gpus: Annotated[float, Meta(ge=0, le=1024)] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -9,10 +9,9 @@ import dataclasses
 from collections.abc import Collection, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
-import tyro
 
 from vggtjax.batch.destination import PAGE_NAME, SETTINGS_NAME
 from vggtjax.clips.masks import masks_digest
@@ -24,7 +23,6 @@ from vggtjax.options import Options
 from vggtjax.progress import Progress
 from vggtjax.results.saving import Saving
 from vggtjax.storage.file_digest import file_digest
-from vggtjax.storage.flags import InWords, Switch
 
 _TAKEN = ("", "..", SETTINGS_NAME, PAGE_NAME)
 
@@ -42,68 +40,18 @@ class ClipOutcome(NamedTuple):
     frames: int = 0
 
 
-def _devices(devices: Annotated[int, tyro.conf.arg(help_behavior_hint="(default: 1)")] = 1) -> int:
-    """Return the number.
-
-    Args:
-        devices: share the frames of a clip among so many devices, each with a copy of the weights
-    """
-    return devices
-
-
-def _no_memory_check(no_memory_check: Switch = False) -> bool:
-    """Return the choice.
-
-    Args:
-        no_memory_check: run all frames together, without comparing the memory that they need with what is free
-    """
-    return no_memory_check
-
-
-def _undistort(undistort: Annotated[bool, tyro.conf.arg(help_behavior_hint="")] = True) -> bool:
-    """Return whether frames are undistorted.
-
-    Args:
-        undistort: make frames of a capture with coefficients of its lens those of a pinhole camera (the default), or
-            leave them as they are and ignore the coefficients
-    """
-    return undistort
-
-
-def _pad_frames(pad_frames: Switch = False) -> bool:
-    """Return the choice.
-
-    Args:
-        pad_frames: pad clips to one of a few lengths, so that clips of similar length share compiled programs; for many
-            lengths on a GPU, where compiling takes longer than running
-    """
-    return pad_frames
-
-
-def _masks(masks: InWords[Path | None] = None) -> Path | None:
-    """Return the folder.
-
-    Args:
-        masks: folder with a folder of pictures for each clip, named like it, as --masks of vggtjax reconstruct takes
-            them; masks of other clips are mined
-    """
-    return masks
-
-
 @dataclass(frozen=True)
 class ClipRecipe:
-    """How a clip is read, reconstructed and written. The names of groups and flags are those of commands."""
+    """How a clip is read, reconstructed and written."""
 
-    sampling: Annotated[Sampling, tyro.conf.arg(name="input", help="")] = Sampling()
-    framing: Annotated[Framing, tyro.conf.arg(name="input", help="")] = Framing()
-    undistort: Annotated[bool, tyro.conf.arg(constructor=_undistort, name="input", prefix_name=False, help="")] = True
-    options: Annotated[Options, tyro.conf.arg(name="method", help="")] = Options()
-    devices: Annotated[int, tyro.conf.arg(constructor=_devices, name="limits", prefix_name=False, help="")] = 1
-    known: Annotated[KnownGeometry, tyro.conf.arg(name="known cameras and scale", help="")] = KnownGeometry()
-    unchecked: Annotated[
-        bool, tyro.conf.arg(constructor=_no_memory_check, name="limits", prefix_name=False, help="")
-    ] = False  # do not compare the memory that a clip needs with what is free
-    saving: Annotated[Saving, tyro.conf.arg(name="output", help="")] = Saving()
+    sampling: Sampling = Sampling()
+    framing: Framing = Framing()
+    undistort: bool = True
+    options: Options = Options()
+    devices: int = 1
+    known: KnownGeometry = KnownGeometry()
+    unchecked: bool = False  # do not compare the memory that a clip needs with what is free
+    saving: Saving = Saving()
 
     @property
     def needs_all_frames(self) -> list[str]:
@@ -142,10 +90,8 @@ class ClipRecipe:
 class BatchRecipe(ClipRecipe):
     """How all clips of a batch are read, reconstructed and written."""
 
-    pad_frames: Annotated[bool, tyro.conf.arg(constructor=_pad_frames, name="limits", prefix_name=False, help="")] = (
-        False
-    )
-    masks: Annotated[BatchMasks, tyro.conf.arg(constructor=_masks, name="input", prefix_name=False, help="")] = None
+    pad_frames: bool = False
+    masks: BatchMasks = None
 
     def __post_init__(self) -> None:
         if isinstance(self.masks, str):

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Annotated, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
-import tyro
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import ClipError, InputError, check_choice, whole_number
 from vggtjax.media.sampling import Frame
-from vggtjax.storage.flags import InWords
 
 Mode = Literal["crop", "pad"]
 
@@ -31,8 +29,8 @@ class Framing:
         size: side in pixels to run at, a multiple of the model's patch size; the model's own size by default
     """
 
-    mode: Annotated[Mode, tyro.conf.arg(name="preprocess")] = "crop"
-    size: InWords[int | None] = None
+    mode: Mode = "crop"
+    size: int | None = None
 
     def __post_init__(self) -> None:
         check_choice("mode", self.mode, get_args(Mode))

@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 import tyro
 
 from vggtjax.clips.preprocessing import Framing
+from vggtjax.commands.flags import Switch
 from vggtjax.options import Options
-from vggtjax.storage.flags import Switch
 
 _SOURCES = tyro.conf.arg(metavar="SOURCE [SOURCE ...]", help_behavior_hint="(required)")
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vggtjax.commands.flags import InWords
 from vggtjax.commands.report import Report
 from vggtjax.config import Gram
 from vggtjax.errors import InputError, share, whole_number
 from vggtjax.options import pairs_to_try
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.writing import check_file
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from vggtjax.commands.arguments import Overwrite, Revision
+from vggtjax.commands.flags import InWords
 from vggtjax.commands.models import at_revision, load
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.writing import check_free, writing
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import Annotated
 import tyro
 
 from vggtjax.batch.recipe import ClipRecipe
+from vggtjax.commands.flags import InWords, Switch
 from vggtjax.errors import InputError
-from vggtjax.storage.flags import InWords, Switch
 from vggtjax.windows.plan import Windows
 
 

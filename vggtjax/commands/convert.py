@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 import tyro
 
 from vggtjax.commands.arguments import Overwrite, Revision
+from vggtjax.commands.flags import InWords
 from vggtjax.commands.models import at_revision, load, read_config
 from vggtjax.commands.report import Report
 from vggtjax.results.saving import ForeignFormat, Saving
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.writing import check_file
 
 

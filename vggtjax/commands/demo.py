@@ -6,11 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from vggtjax.commands.arguments import CONSISTENT
+from vggtjax.commands.flags import Switch
 from vggtjax.commands.models import load
 from vggtjax.commands.report import Report
 from vggtjax.commands.view import serve
 from vggtjax.options import MethodName, Options
-from vggtjax.storage.flags import Switch
 
 
 def demo(

@@ -15,10 +15,10 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from vggtjax import __version__
+from vggtjax.commands.flags import InWords
 from vggtjax.commands.report import Report
 from vggtjax.errors import VggtjaxError, one_line
 from vggtjax.storage.cache import CONVERTED, cache_folder, cache_parts, clear_cache, size_of
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.free_memory import in_gigabytes
 
 PACKAGES = ("jax", "jaxlib", "flax", "numpy", "scipy", "pillow", "av", "safetensors", "tyro")

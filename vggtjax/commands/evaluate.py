@@ -12,13 +12,13 @@ import tyro
 from vggtjax.captures.files import folder_name
 from vggtjax.clips.preprocessing import Framing
 from vggtjax.commands.arguments import EvaluationFolder, Size
+from vggtjax.commands.flags import InWords
 from vggtjax.commands.models import ModelFiles
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, one_line
 from vggtjax.media.sampling import Sampling
 from vggtjax.options import METHODS, MethodName, Options, find_method
 from vggtjax.results.saving import READ_FORMATS, ReadFormat
-from vggtjax.storage.flags import InWords
 
 if TYPE_CHECKING:
     from vggtjax.evaluation.datasets.sequence import FrameChoice
@@ -45,13 +45,17 @@ class EvaluatedFrames(Sampling):
 
 @dataclass(frozen=True)
 class Candidates(ModelFiles):
-    """A model and its methods."""
+    """A model and its methods.
+
+    Attributes:
+        methods: methods, with commas: vggt, vggt4d, pose-decoupling, hard-replacement, 4dvggt-d, 4dvggt-m; all by
+            default
+    """
 
     model: Annotated[str | None, tyro.conf.arg(metavar="MODEL", help_behavior_hint="(required without --results)")] = (
         None
     )
     methods: Annotated[str | None, tyro.conf.arg(metavar="METHOD,METHOD", help_behavior_hint="")] = None
-    """methods, with commas: vggt, vggt4d, pose-decoupling, hard-replacement, 4dvggt-d, 4dvggt-m; all by default"""
 
     def source(self, report: Report, options: Options, framing: Framing) -> ModelSource:
         """Return the results of the model, loaded as a stage of the report."""
@@ -121,7 +125,7 @@ class ScoreOptions:
     gt: Annotated[str | None, tyro.conf.arg(metavar="{easi3r,lidar}", help_behavior_hint="")] = None
     depth_align: Literal["metric", "median", "scale", "least-absolute", "scale-shift"] = "scale"
     empty: Literal["davis", "vggt4d"] = "davis"
-    strict: bool = False
+    strict: Annotated[bool, tyro.conf.arg()] = False
 
 
 def evaluate(

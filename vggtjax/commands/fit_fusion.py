@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from msgspec import Meta
 
+from vggtjax.commands.flags import InWords
 from vggtjax.commands.models import load
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, check_extra
 from vggtjax.options import MethodName, Options
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import Count, check_fields
 
 if TYPE_CHECKING:
@@ -26,14 +26,17 @@ GENERATED = "generated"
 
 @dataclass(frozen=True)
 class Clips:
-    """Clips with true depth. Raises InputError for an invalid value."""
+    """Clips with true depth. Raises InputError for an invalid value.
+
+    Attributes:
+        data: clips with true depth: "generated=N" for N generated scenes, or DATASET=FOLDER as for evaluate
+        max_frames: largest number of frames to take of each clip; generated clips have 12 by default, and no fewer
+        size: side in pixels to run at; the model's own by default
+    """
 
     data: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATASET=FOLDER ...")] = ("generated=16",)
-    """clips with true depth: "generated=N" for N generated scenes, or DATASET=FOLDER as for evaluate"""
     max_frames: InWords[Count | None] = None
-    """largest number of frames to take of each clip; generated clips have 12 by default, and no fewer"""
     size: InWords[int | None] = None
-    """side in pixels to run at; the model's own by default"""
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -29,6 +29,7 @@ from vggtjax.commands.doctor import doctor
 from vggtjax.commands.evaluate import evaluate
 from vggtjax.commands.export import export
 from vggtjax.commands.fit_fusion import fit_fusion
+from vggtjax.commands.flags import REGISTRY
 from vggtjax.commands.overview import Command, overview
 from vggtjax.commands.process import check_limits, give_devices_threads
 from vggtjax.commands.reconstruct import reconstruct
@@ -203,7 +204,7 @@ def _read_by_tyro(name: str, arguments: Sequence[str]) -> Callable[[], int | Non
         return functools.partial(command, *positional, **options)
 
     config = (tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone)
-    return tyro.cli(ready, prog=f"vggtjax {name}", args=arguments, config=config)
+    return tyro.cli(ready, prog=f"vggtjax {name}", args=arguments, config=config, registry=REGISTRY)
 
 
 def print_help(name: str) -> None:

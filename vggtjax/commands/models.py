@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vggtjax.commands.arguments import ModelName, Revision
+from vggtjax.commands.flags import InWords
 from vggtjax.commands.report import Report
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.options import METHODS, Options, has_accelerator
 from vggtjax.storage.cache import enable_compilation_cache
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import read_json
 from vggtjax.storage.kept_memory import keep_freed_memory
 

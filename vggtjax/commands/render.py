@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 import tyro
 
 from vggtjax.commands.arguments import Overwrite, ResultPath
+from vggtjax.commands.flags import InWords
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, OutputError
 from vggtjax.results.saving import ReadFormat
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.writing import check_file
 
 _FILM = "turntable.mp4"

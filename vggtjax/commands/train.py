@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vggtjax.commands.flags import InWords
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, check_extra
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.kept_memory import run_in_calling_thread
 from vggtjax.storage.writing import check_file, check_free
 from vggtjax.training.options import RunOptions

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from vggtjax.commands.arguments import Overwrite
+from vggtjax.commands.flags import InWords, Switch
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError
 from vggtjax.results.saving import ReadFormat
-from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.interruption import handled
 from vggtjax.storage.writing import check_file
 

@@ -7,7 +7,6 @@ from typing import Annotated, Literal, NamedTuple
 
 from msgspec import Meta
 
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import check_fields
 
 ExportFormat = Literal[
@@ -65,7 +64,7 @@ class Exporting:
 
     points: Annotated[int, Meta(ge=1)] = 100_000
     confidence_percentile: Annotated[float, Meta(ge=0, lt=100)] = 20.0
-    voxel_size: InWords[Annotated[float, Meta(ge=1e-30, le=1e9)] | None] = None
+    voxel_size: Annotated[float, Meta(ge=1e-30, le=1e9)] | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import tyro
 
 from vggtjax.errors import InputError, one_line
-from vggtjax.storage.flags import InWords, Switch
 from vggtjax.storage.json_values import check_fields
 from vggtjax.storage.trajectories import Quaternion
 
@@ -24,10 +22,6 @@ class Baseline(NamedTuple):
     first: int
     second: int
     metres: float
-
-
-def _words(metavar: str):
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint="")
 
 
 @dataclass(frozen=True)
@@ -55,18 +49,16 @@ class KnownGeometry:
         leave_out: folder of pictures, one per frame, bright where depth is left out, such as in the sky
     """
 
-    intrinsics: Annotated[str | None, _words("FX,FY,CX,CY|FILE|source|exif")] = None
-    shared_focal: Switch = False
-    poses: Annotated[str | None, _words("FILE|source")] = None
-    quaternion: InWords[Quaternion | None] = None
-    baseline: Annotated[str | None, _words("I,J,METRES")] = None
-    camera_height: InWords[float | None] = None
-    known_depths: Annotated[
-        str | None, tyro.conf.arg(metavar="FILE|FOLDER|source", help_behavior_hint="", aliases=("--depths",))
-    ] = None
-    depths_per_metre: InWords[float | None] = None
-    robust: Switch = False
-    leave_out: InWords[Path | None] = None
+    intrinsics: str | None = None
+    shared_focal: bool = False
+    poses: str | None = None
+    quaternion: Quaternion | None = None
+    baseline: str | None = None
+    camera_height: float | None = None
+    known_depths: str | None = None
+    depths_per_metre: float | None = None
+    robust: bool = False
+    leave_out: Path | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.leave_out, str):

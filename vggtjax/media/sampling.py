@@ -8,15 +8,13 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Annotated, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
-import tyro
 from jaxtyping import Float32
 from PIL import Image
 
 from vggtjax.errors import ClipError, InputError, whole_number
-from vggtjax.storage.flags import InWords
 
 Item = TypeVar("Item")
 
@@ -40,18 +38,21 @@ class Frame:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Which frames of a source are taken. Raises InputError for a value out of range."""
+    """Which frames of a source are taken. Raises InputError for a value out of range.
+
+    Attributes:
+        start: first frame to take, counted from 0 in frames of the source
+        stride: take every n-th frame; every frame by default, in an evaluation those of the published protocol
+        fps: take so many frames per second of a video, by presentation time; not together with stride
+        max_frames: take at most so many frames; all by default
+        skip: frames to leave out, such as 0-2,17, counted as for start; none by default
+    """
 
     start: int = 0
-    """first frame to take, counted from 0 in frames of the source"""
-    stride: InWords[int | None] = None
-    """take every n-th frame; every frame by default, in an evaluation those of the published protocol"""
-    fps: InWords[float | None] = None
-    """take so many frames per second of a video, by presentation time; not together with stride"""
-    max_frames: InWords[int | None] = None
-    """take at most so many frames; all by default"""
-    skip: Annotated[str | None, tyro.conf.arg(metavar="N,N-N", help_behavior_hint="")] = None
-    """frames to leave out, such as 0-2,17, counted as for start; none by default"""
+    stride: int | None = None
+    fps: float | None = None
+    max_frames: int | None = None
+    skip: str | None = None
 
     def __post_init__(self) -> None:
         for name, lowest in (("start", 0), ("stride", 1), ("max_frames", 1)):

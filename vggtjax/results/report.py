@@ -62,14 +62,17 @@ class ErrorTable(NamedTuple):
 
 @dataclass(frozen=True)
 class RunFacts:
-    """What a report says of the run that made the result, and that is no part of the result itself."""
+    """What a report says of the run that made the result, and that is no part of the result itself.
+
+    Attributes:
+        seconds: by stage
+        errors: where the truth is known
+        truth: a picture of the result beside the truth
+    """
 
     seconds: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
-    """by stage"""
     errors: ErrorTable | None = None
-    """where the truth is known"""
     truth: UInt8[np.ndarray, "height width 3"] | None = None
-    """a picture of the result beside the truth"""
 
 
 def versions() -> dict[str, str]:

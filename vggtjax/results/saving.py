@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal, TypedDict, get_args
 
-import tyro
 from msgspec import Meta
 
 from vggtjax.errors import InputError, check_choice
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import check_fields
 
 Resolution = Literal["model", "original"]
@@ -43,16 +41,6 @@ def parse_groups(text: str) -> tuple[Group, ...]:
     return tuple(group for group in GROUPS if group in names)
 
 
-# One argument with commas; tyro's own reading of a tuple would take the words that follow.
-_Groups = tyro.constructors.PrimitiveConstructorSpec(
-    nargs=1,
-    metavar="GROUP,GROUP",
-    instance_from_str=lambda words: parse_groups(words[0]),
-    is_instance=lambda value: value is None or isinstance(value, tuple),
-    str_from_instance=lambda value: [",".join(value or GROUPS)],
-)
-
-
 @dataclass(frozen=True)
 class Saving:
     """How a result is written. Raises InputError for a percentile outside [0, 100) or an unknown name.
@@ -68,7 +56,7 @@ class Saving:
     confidence_percentile: Annotated[float, Meta(ge=0, lt=100)] = 20.0
     resolution: Resolution = "model"
     format: Format = "vggtjax"
-    only: InWords[Annotated[tuple[Group, ...] | None, _Groups]] = None
+    only: tuple[Group, ...] | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.only, str):

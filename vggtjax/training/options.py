@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from vggtjax.storage.flags import InWords
 from vggtjax.storage.json_values import Count, Positive, check_fields
 
 
@@ -23,7 +22,7 @@ class RunOptions:
 
     log_every: Count = 50
     checkpoint_seconds: Positive = 600.0
-    seconds: InWords[Positive | None] = None
+    seconds: Positive | None = None
     dtype: Literal["float32", "bfloat16"] = "float32"
 
     def __post_init__(self) -> None:

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vggtjax.errors import InputError, whole_number
-from vggtjax.storage.flags import InWords, Switch
 
 LEAST_OVERLAP = 2  # frames; one frame tells nothing of how cameras move
 
@@ -24,9 +23,9 @@ class Windows:
         no_loops: do not look for places that the camera comes back to
     """
 
-    window: InWords[int | None] = None
-    overlap: InWords[int | None] = None
-    no_loops: Switch = False
+    window: int | None = None
+    overlap: int | None = None
+    no_loops: bool = False
 
     def __post_init__(self) -> None:
         if self.window is None or self.window == 0:

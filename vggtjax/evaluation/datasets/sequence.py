@@ -194,14 +194,17 @@ Reader = Callable[..., Mapping[str, Opener]]  # of a root, and of a ground truth
 
 @dataclass(frozen=True)
 class Maps:
-    """Reads a file for each frame, at the size of its picture: each pixel takes the value of the file's around it."""
+    """Reads a file for each frame, at the size of its picture: each pixel takes the value of the file's around it.
+
+    Attributes:
+        resized: Sizes of the maps that were read at another size than their pictures, and of these, by frame.
+    """
 
     pictures: Sequence[Path]
     paths: Sequence[Path | None]
     read: Callable[[Path], Shaped[np.ndarray, "h w"]]
     strict: bool = False  # refuse another size
     resized: dict[int, tuple[tuple[int, ...], tuple[int, int]]] = field(default_factory=dict)
-    """Sizes of the maps that were read at another size than their pictures, and of these, by frame."""
 
     def __call__(self, frame: int) -> Shaped[np.ndarray, "h w"] | None:
         """Return a frame's map, None where it has no file. Raises OtherShapeError, and InputError for another file."""
