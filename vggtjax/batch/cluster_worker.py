@@ -11,7 +11,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from vggtjax.batch.cluster_options import Cluster
-from vggtjax.batch.destination import Destination
+from vggtjax.batch.destination import Destination, has_changed
 from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, failed
 from vggtjax.clips.fetched import Fetched
 from vggtjax.errors import OutputError, VggtjaxError, one_line
@@ -91,7 +91,7 @@ class Worker:
         from vggtjax.batch.clip_work import LongClip
 
         try:
-            if self._out.has(name):
+            if self._out.has(name) and not has_changed(self._out, name, source):
                 return ClipOutcome(name, "kept")
             with self._loading:
                 local = self._fetched.local(name, source)
