@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 from dataclasses import dataclass, field
@@ -91,6 +92,11 @@ class MotionConfig:
                 raise InputError(
                     f"cue '{cue.name}' has layers {cue.layers}; expected indices in [0, {self.reference_depth})"
                 )
+
+    @property
+    def digest(self) -> str:
+        """What tells this table from others, in results."""
+        return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()[:16]
 
     def layers(self, cue: Cue, depth: int) -> tuple[int, ...]:
         """Return the layers of `cue` in a model with `depth` pairs: round(l (depth - 1) / (reference_depth - 1)).

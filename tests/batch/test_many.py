@@ -1,6 +1,7 @@
 """Many clips in one call: all of them, in spite of a broken one, and after an interruption."""
 
 import dataclasses
+import shutil
 import tempfile
 from functools import partial
 from typing import Any
@@ -15,7 +16,7 @@ from tests.servers import empty_memory, served
 from tests.tiny import tiny_model
 from tests.videos import write_video
 from vggtjax import Reconstruction
-from vggtjax.batch.destination import PAGE_NAME, SETTINGS_NAME
+from vggtjax.batch.destination import CHANGED, PAGE_NAME, SETTINGS_NAME
 from vggtjax.batch.many import reconstruct_many
 from vggtjax.checkpoint import save_model
 from vggtjax.clips.sources import clips_by_name
@@ -75,6 +76,26 @@ def test_every_good_clip_is_there_once_and_the_broken_one_is_named(model, clips,
 
     with pytest.raises(InputError, match=rf"{SETTINGS_NAME} has other settings than this run"):
         next(run(method="4dvggt-d"))
+
+
+def test_a_clip_that_has_changed_since_is_done_again(model, tmp_path):
+    """By its arrays, or by the names, sizes and ends of its files; a copy elsewhere is the same clip."""
+    frames = (255 * moving_ball(2)[:, :70]).astype(np.uint8)
+    write_clip(tmp_path / "a", frames=2, rows=70)
+
+    def run(folder, array):
+        made = reconstruct_many(model, {"f": folder, "m": array}, tmp_path / "out", method="vggt", only=("depth",))
+        return {outcome.name: (outcome.status, outcome.reason) for outcome in made}
+
+    assert set(run(str(tmp_path / "a"), frames).values()) == {("done", "")}
+    copy = shutil.copytree(tmp_path / "a", tmp_path / "b", copy_function=shutil.copyfile)
+    assert set(run(str(copy), frames.copy()).values()) == {("kept", "")}
+    before = Reconstruction.load(tmp_path / "out/m").images
+    Image.fromarray(frames[1, :, ::-1]).save(copy / "1.png")
+    assert set(run(str(copy), frames[::-1]).values()) == {("done", CHANGED)}
+    np.testing.assert_array_equal(Reconstruction.load(tmp_path / "out/m").images, before[::-1])
+    shutil.rmtree(copy)
+    assert run(str(copy), frames[::-1])["f"] == ("kept", "")  # the clip is gone, its result is not
 
 
 def test_progress_counts_clips(model, tmp_path):

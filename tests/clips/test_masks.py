@@ -1,5 +1,6 @@
 """Masks that a user brings: names, order, crop and padding, and what the pipeline does with them."""
 
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ from PIL import Image, ImageOps
 
 from testing.seeded import seeded_images
 from tests.tiny import tiny_model
+from tests.videos import write_video
 from vggtjax import load_clip, reconstruct
 from vggtjax.clips.masks import MaskWarning, load_masks, masks_at_clip_pixels, read_mask
 from vggtjax.errors import ClipError, InputError
@@ -209,3 +211,14 @@ def test_masks_the_wrong_way_round_are_said(tmp_path, given, mode, size):
     with pytest.warns(MaskWarning, match=rf"9[5-9]\..% of the pixels move by these masks.*{advice}"):
         masks_at_clip_pixels(wrong if given == "folder" else masks, clip, clip)
     masks_at_clip_pixels(~masks, clip, clip)  # warnings are errors here
+
+
+@pytest.mark.parametrize(("first", "said"), [(0, False), (1, True), (2, False)])
+def test_masks_of_a_video_that_count_from_1_are_said(tmp_path, first, said):
+    write_video(tmp_path / "a.mp4", range(6))
+    clip = load_clip(str(tmp_path / "a.mp4"), start=3, max_frames=2, size=70, patch=14)
+    height, width = clip.source_size[0]
+    masks = [np.zeros((height, width), np.uint8)] * 6
+    folder = written(tmp_path / "masks", masks, [f"{first + number:06d}.png" for number in range(6)])
+    with pytest.warns(MaskWarning, match="000003 is taken for the 4th picture") if said else nullcontext():
+        load_masks(str(folder), clip)

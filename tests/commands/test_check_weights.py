@@ -1,5 +1,6 @@
 """check-weights: alone, and beside a stand-in for the public code that checks what it gets and gives stored numbers."""
 
+import hashlib
 import json
 import re
 import sys
@@ -149,6 +150,27 @@ def test_alone(capsys, seeded, monkeypatch, tmp_path):
     code, out, _ = run(capsys, seeded, tmp_path / "large.safetensors")
     assert code == 1
     assert re.search(r"all outputs are finite \| \d+ of \d+ values \| \*\*no\*\*", out)
+
+
+def test_the_table_says_which_file_was_checked_and_its_type(tmp_path, capsys, seeded):
+    folder, out = seeded[0], tmp_path / "half.safetensors"
+    converting = [
+        "convert",
+        folder / "tiny.safetensors",
+        out,
+        "--config",
+        folder / "config.json",
+        "--dtype",
+        "bfloat16",
+    ]
+    assert cli.main([*map(str, converting), "--heads", "camera,depth"]) == 0
+    assert cli.main(["check-weights", str(out), "--frames", "1"]) == 0
+    said = capsys.readouterr().out
+    digest = hashlib.sha256(out.read_bytes()).hexdigest()
+    assert f"| SHA-256 of half.safetensors, the file | {digest} |" in said
+    assert "| SHA-256 of tiny.safetensors, its source |" in said
+    assert "| weights | bfloat16 |" in said
+    assert "| heads | camera, depth |" in said
 
 
 def test_a_converted_file_and_the_embedded_model_alone(tiny_demo, capsys, seeded):

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from vggtjax.batch.contact import contact_page
-from vggtjax.batch.destination import Destination, LocalFolder, RemoteFolder, destination
+from vggtjax.batch.destination import Destination, LocalFolder, RemoteFolder, destination, has_changed
 from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, counted, failed, invalid_name
 from vggtjax.clips.fetched import Fetched
 from vggtjax.errors import ClusterError, InputError, VggtjaxError, check_extra, one_line
@@ -82,7 +82,7 @@ class Worker:
         """Do a clip, unless its result is there."""
         try:
             self.ready()
-            done = self._out.has(name)
+            done = self._out.has(name) and not has_changed(self._out, name, source)
             return ClipOutcome(name, "kept") if done else self._work.run(name, self._fetched.local(name, source))
         except Exception as error:  # a fault of this program, too, costs one clip and not the batch
             known = isinstance(error, VggtjaxError | MemoryError)

@@ -9,20 +9,23 @@ import json
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from vggtjax.batch.shards import SETTLING, Shard, running
+from vggtjax.clips.fingerprint import fingerprint
+from vggtjax.clips.sources import ClipSource, open_source
 from vggtjax.errors import InputError, one_line
-from vggtjax.results.archive import ARCHIVE_NAME, is_result
+from vggtjax.results.archive import ARCHIVE_NAME, is_result, source_fingerprint
 from vggtjax.results.disk import announce
 from vggtjax.storage.json_values import parse_json, read_json
 from vggtjax.storage.remote import check_url, exists, is_url, list_url, local_path, read_url, shown, upload, write_url
 from vggtjax.storage.writing import check_free, locked_folder, remove_leftovers, staging, writing
 
 SETTINGS_NAME, PAGE_NAME = "batch.json", "index.html"
+CHANGED = "its source has changed since the earlier result"
 _AT_ONCE = 16  # questions to a server
 _MOST_SETTINGS_BYTES = 2**20
 _MOST_NAMED = 8  # settings in a message
@@ -79,6 +82,10 @@ class LocalFolder:
         """Return the clips whose results are there."""
         return {name for name in names if self.has(name)}
 
+    def source_of(self, name: str) -> str | None:
+        """Return the fingerprint of the source that a clip's result was made of; None where it is unknown."""
+        return source_fingerprint(self.path / name / ARCHIVE_NAME)
+
     def check_space(self, name: str, needed: float) -> None:
         """Raise OutputError where there is no space for so many bytes; log how much a large result takes."""
         announce(self.path / name, needed)
@@ -122,6 +129,9 @@ class RemoteFolder:
         with ThreadPoolExecutor(_AT_ONCE) as pool:
             return {name for name, there in zip(asked, pool.map(self.has, asked), strict=True) if there}
 
+    def source_of(self, name: str) -> None:
+        """Return None: results at a URL are kept by their names, as reading each would take long."""
+
     def check_space(self, name: str, needed: float) -> None:
         """Raise OutputError where there is no space for so many bytes; log how much a large result takes."""
         announce(tempfile.gettempdir(), needed)
@@ -136,6 +146,15 @@ class RemoteFolder:
 
 
 Destination: TypeAlias = LocalFolder | RemoteFolder
+
+
+def has_changed(place: Destination, name: str, source: ClipSource) -> bool:
+    """Return whether the source of a clip is known to be another one than that of its result."""
+    if (of_result := place.source_of(name)) is None:
+        return False
+    with suppress(InputError, OSError):  # a source that is gone or at a URL: its result is kept
+        return fingerprint(open_source(source)) != of_result
+    return False
 
 
 def _settings_text(settings: dict[str, Any]) -> bytes:

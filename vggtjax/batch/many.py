@@ -11,7 +11,7 @@ from typing import Any
 
 from vggtjax.batch.clip_work import ClipWork, LongClip
 from vggtjax.batch.contact import contact_page
-from vggtjax.batch.destination import Destination, destination
+from vggtjax.batch.destination import CHANGED, Destination, destination, has_changed
 from vggtjax.batch.recipe import BatchRecipe, ClipOutcome, counted, failed, invalid_name
 from vggtjax.batch.shards import parse_shard
 from vggtjax.checkpoint import Model
@@ -41,7 +41,8 @@ def reconstruct_many(
     """Reconstruct clips, each into a folder of its own, and yield the outcome of each as it is finished.
 
     Clips of one shape share compiled programs. A clip that fails, also for a name that is not a plain file name, does
-    not stop the others. A later run with the same settings keeps finished clips, so an interrupted run resumes. A
+    not stop the others. A later run with the same settings keeps finished clips, so an interrupted run resumes; it does
+    those again whose arrays, or files by their names, sizes, first and last bytes, have changed. A
     clip's folder appears whole or not at all. A clip that does not fit in memory is run in windows, as by
     `reconstruct_long`, unless an option needs all frames at once; it then fails before it is read. index.html
     shows the clips finished so far, and why others failed.
@@ -95,10 +96,13 @@ def _outcomes(
     """Yield the outcomes of clips that cannot have a folder, then of kept ones, then of the others."""
     odd = {name: outcome for name in sources if (outcome := invalid_name(name)) is not None}
     yield from odd.values()
-    kept = place.finished(name for name in sources if name not in odd)
-    yield from (ClipOutcome(name, "kept") for name in sources if name in kept)
-    left = {name: source for name, source in sources.items() if name not in odd and name not in kept}
-    yield from counted(_reconstruct_all(work, left), len(left), progress)
+    there = place.finished(name for name in sources if name not in odd)
+    changed = {name for name in there if has_changed(place, name, sources[name])}
+    yield from (ClipOutcome(name, "kept") for name in sources if name in there - changed)
+    left = {name: source for name, source in sources.items() if name not in odd and name not in there - changed}
+    for outcome in counted(_reconstruct_all(work, left), len(left), progress):
+        again = outcome.name in changed and outcome.status == "done"
+        yield outcome._replace(reason=f"{CHANGED}; {outcome.reason}".rstrip("; ")) if again else outcome
 
 
 def _reconstruct_all(work: ClipWork, sources: Mapping[str, ClipSource]) -> Generator[ClipOutcome]:

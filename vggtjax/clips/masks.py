@@ -6,7 +6,7 @@ import hashlib
 import logging
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -31,6 +31,7 @@ from vggtjax.media.images import (
     stored_orientation,
     turned,
 )
+from vggtjax.media.video import VideoFile
 from vggtjax.storage.file_digest import file_digest
 
 logger = logging.getLogger(__name__)
@@ -46,7 +47,7 @@ _FEW_GREYS = 0.1  # share of the opaque pixels of a mask that are neither black 
 
 
 class MaskWarning(UserWarning):
-    """Given masks by which almost all moves: they may be the wrong way round."""
+    """Given masks by which almost all moves, or whose numbers may be those of other frames."""
 
 
 def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
@@ -76,6 +77,7 @@ def load_masks(folder: str | Path, clip: Clip) -> Bool[np.ndarray, "S H W"]:
         if twice := [name for name in clip.frame_names if names[name] > 1]:
             raise ClipError(f"{folder} has {names[twice[0]]} pictures named {twice[0]}; expected one for each frame")
         paths = [by_name[name] for name in clip.frame_names]
+        _warn_of_first_number(folder, by_name, clip)
     elif named or len(source.paths) != len(clip):
         missing = next(name for name in clip.frame_names if name not in by_name)
         raise ClipError(
@@ -111,6 +113,18 @@ def masks_at_clip_pixels(
     fitted = _fitted(np.asarray(masks), clip, loaded)
     _warn_of_inverted(fitted, clip, "masks: True is what moves; if it is what rests, give ~masks")
     return fitted
+
+
+def _warn_of_first_number(folder: str | Path, names: Iterable[str], clip: Clip) -> None:
+    """Give a MaskWarning where masks of a video are numbered from 1, as FFmpeg does, and its frames from 0."""
+    numbers = {int(name) for name in names if name.isdecimal()}
+    if 1 in numbers and 0 not in numbers and isinstance(clip.source, VideoFile):
+        name = clip.frame_names[0]
+        text = (
+            f"{folder} has masks from 1 on, and frames of a video count from 0: mask {name} is taken for the "
+            f"{int(name) + 1}th picture of the video; if the masks count from 1, as FFmpeg writes them, rename them"
+        )
+        warnings.warn(text, MaskWarning, stacklevel=4)
 
 
 def _warn_of_inverted(masks: Bool[np.ndarray, "S H W"], clip: Clip, advice: str) -> None:

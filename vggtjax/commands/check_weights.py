@@ -92,7 +92,8 @@ def check_weights(
         found = checks(own, equal)
         rows = parities(own, theirs, tolerance) if public is not None else []
         strict = {} if tensors is None else {"tensors": f"{tensors} of PyTorch in the file; none is unknown or missing"}
-        text = page(strict | model_facts(network, clip, seconds, public), found, rows)
+        converted = weights.path if weights is not None and tensors is None else None
+        text = page(strict | model_facts(network, clip, seconds, public, converted), found, rows)
         if out is not None:
             with writing(out / _REPORT) as temporary:
                 temporary.write_text(text, encoding="utf-8")

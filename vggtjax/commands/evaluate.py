@@ -205,6 +205,7 @@ def evaluate(
             "max_depth": labels.max_depth,
             "empty": scores.empty,
             "strict": scores.strict,
+            **({} if folders.results else {"consistent_depth": options.consistent_depth}),
             **source.settings,
         }
         store.begin()
@@ -245,17 +246,22 @@ def _print(
     from vggtjax.evaluation.records import summary
 
     report.means(summary(records))
-    failed: dict[tuple[str, str], list[str]] = {}  # methods of a sequence that fail for one reason
+    failed: dict[str, dict[str, list[str]]] = {}  # by reason: methods by sequence
     for record in records:
         if record.status == "failed":
-            failed.setdefault((record.name, record.reason), []).append(record.method)
-    for (name, reason), methods in failed.items():
-        report.line(f"{name}, {', '.join(methods)}: failed: {reason}")
+            failed.setdefault(record.reason, {}).setdefault(record.name, []).append(record.method)
+    for reason, found in failed.items():
+        names, methods = list(found), dict.fromkeys(method for some in found.values() for method in some)
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        report.line(f"{', '.join(names[:_SHOWN])}{more}, {', '.join(methods)}: failed: {reason}")
     for note in dict.fromkeys(note for record in records for note in record.notes):
         report.line(f"note: {note}")
     for warning in warnings:
         report.line(warning)
     report.line(str(settings["frames"]))
+    if (fitted := settings.get("consistent_depth")) is not None:
+        how = "fitted to the pixels, by" if fitted else "as predicted; reconstruct fits them to the pixels, and so does"
+        report.line(f"depth and cameras: {how} --consistent-depth")
     if not can_plot():
         report.line(NO_PLOTS)
     report.line(f"Look at {out / 'index.html'}")

@@ -6,6 +6,7 @@ import hashlib
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import version
+from pathlib import Path
 
 import jax
 
@@ -32,8 +33,10 @@ def page(facts: Mapping[str, str], found: Sequence[Check], parity: Sequence[Pari
     return "\n".join(parts)
 
 
-def model_facts(model: Model, frames: Frames, own_seconds: float, public: Facts | None) -> dict[str, str]:
-    """Return what was checked, on what, how fast, and in how much memory."""
+def model_facts(
+    model: Model, frames: Frames, own_seconds: float, public: Facts | None, converted: Path | None = None
+) -> dict[str, str]:
+    """Return what was checked, on what, how fast, and in how much memory; `converted` is the file that was checked."""
     S, H, W = frames.images.shape[:3]
     devices = jax.local_devices()
     times, peaks, versions = [f"vggtjax {own_seconds:.2f} s"], [f"vggtjax {_gigabytes(peak_bytes())}"], _versions()
@@ -46,22 +49,29 @@ def model_facts(model: Model, frames: Frames, own_seconds: float, public: Facts 
     return {
         "name": one_line(model.name, 100),
         **({"commit on the hub": model.revision} if model.revision else {}),
-        **{f"SHA-256 of {one_line(name, 100)}": digest for name, digest in _digests(model).items()},
+        **({} if converted is None else {f"SHA-256 of {one_line(converted.name, 100)}, the file": _digest(converted)}),
+        **{f"SHA-256 of {one_line(name, 100)}": digest for name, digest in _sources(model, converted).items()},
         "parameters": f"{model.summary()['parameters']}",
+        "weights": model.dtype,
         "heads": ", ".join(model.config.heads),
-        "frames": f"{S} of the embedded clip, {W} x {H} pixels, float32",
-        "seconds of a pass, all heads": ", ".join(times),
+        "frames": f"{S} of the embedded clip, {W} x {H} pixels, computed in float32",
+        "seconds of a pass, with these heads": ", ".join(times),
         "peak memory of the process": ", ".join(peaks),
         "device": device,
         "versions": ", ".join(versions),
     }
 
 
-def _digests(model: Model) -> Mapping[str, str]:
-    if model.origin or model.path is None:
-        return model.origin
-    with model.path.open("rb") as file:
-        return {model.path.name: hashlib.file_digest(file, "sha256").hexdigest()}
+def _sources(model: Model, converted: Path | None) -> Mapping[str, str]:
+    """Return the digests of the files that a conversion was made of, or of the model's own file."""
+    if converted is not None:
+        return {f"{name}, its source": digest for name, digest in model.origin.items()}
+    return model.origin or ({} if model.path is None else {model.path.name: _digest(model.path)})
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _versions() -> list[str]:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.fingerprint import fingerprint
 from vggtjax.clips.queries import Queries
 from vggtjax.clips.shots import looks_of
 from vggtjax.media.images import ImageFiles
@@ -84,7 +85,8 @@ def settings_of(
     """Return the settings that a result depends on besides the method, as JSON values."""
     settings = {name: value for name, value in options.to_json().items() if name != "method"}
     settings |= {"mode": clip.mode, "size": clip.size, "patch": clip.patch}
-    settings |= {"masks": mask_source}
+    settings |= {"masks": mask_source, "consistent_depth": options.consistent_depth, "cues": model.config.motion.digest}
+    settings |= {"source": fingerprint(clip.source)}
     settings |= {} if fusion is None else {"fusion": fusion_digest(fusion)}
     settings |= {"clip": clip.source.name} if clip.source.name else {}
     if isinstance(clip.source, ImageFiles) and (times := clip.source.times) is not None:

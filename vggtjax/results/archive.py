@@ -55,6 +55,13 @@ def is_result(path: Path) -> bool:
         return False
 
 
+def source_fingerprint(path: Path) -> str | None:
+    """Return the fingerprint of the source that a result was made of; None where the archive does not tell."""
+    with suppress(ResultError, LookupError, ValueError, RecursionError, TypeError):
+        return str(json.loads(read_arrays(path, ["settings"])["settings"].item())["source"])
+    return None
+
+
 def saved_names(path: Path) -> tuple[str, ...]:
     """Return the names of all files and folders of the result of an archive, which is the first; () if it is none."""
     if not is_result(path):

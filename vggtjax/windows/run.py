@@ -21,6 +21,7 @@ from jaxtyping import Array, Float32, UInt8
 from vggtjax.captures.frames import CaptureFrames
 from vggtjax.checkpoint import Model
 from vggtjax.clips.clip import Clip
+from vggtjax.clips.fingerprint import fingerprint
 from vggtjax.clips.masks import load_masks, masks_digest
 from vggtjax.clips.preprocessing import Fitter, Framing
 from vggtjax.clips.queries import Queries, check_queries, check_words, parse_queries
@@ -220,6 +221,7 @@ def run_windows(
         "sampling": dataclasses.asdict(plan.sampling),
         "fitter": dataclasses.asdict(plan.fitter),
         "windows": [frames, windows.window, windows.shared],
+        "source": fingerprint(opened),
     }
     if isinstance(opened, CaptureFrames) and opened.lenses_undone:
         decides["undistorted"] = opened.lenses_undone
