@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from tests.static_world import GRID, PATCH, StaticWorld
-from vggtjax.method.mask import mine_mask
-from vggtjax.method.matched_mask import mine_matched_mask
+from vggtjax.method.passes import mine
+from vggtjax.method.witnesses import Seen
+from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.frames import BY_FRAME, Frames
 from vggtjax.network.gathered_attention import gathered_attention
+from vggtjax.network.model import Predictions
 from vggtjax.network.pose import encode_pose
-from vggtjax.pipeline.devices import frames_mesh
+from vggtjax.pipeline.devices import frames_mesh, shard_frames
 from vggtjax.pipeline.lengths import shared_length
 
 COUNT, SIZE = 13, (6, 8)  # frames, which eight devices pad to 16
@@ -28,44 +30,50 @@ METHODS = {
 }
 
 mesh = frames_mesh(8)
-generator = np.random.default_rng(0)
-saliency = generator.random((1, shared_length(COUNT, mesh), *SIZE)).astype(np.float32)
-saliency[:, :, :2, 1:3] += 1
-saliency[:, COUNT:] = 40 * saliency[:, COUNT:] - 20  # of the frames that are added
-tokens = saliency.reshape(1, -1, 48, 1) + generator.normal(0, 0.01, (1, saliency.shape[1], 48, 3)).astype(np.float32)
-found = {}
-for method, options in METHODS.items():
-    alone = jax.jit(partial(mine_mask, size=SIZE, **options))(
-        jnp.asarray(saliency[:, :COUNT]), jnp.asarray(tokens[:, :COUNT])
+real, found = Frames(mesh, COUNT), {}
+
+
+def mined(evidence, first, tokens, images, how, frames=Frames()):
+    return mine(evidence, first, ClipBatch(images, tokens), **how, frames=frames)
+
+
+def compare(method, how, *inputs):
+    """Mine a clip on one device, and padded on eight."""
+    alone = jax.jit(lambda *x: mined(*x, how))(*inputs)
+    added = shared_length(COUNT, mesh) - COUNT
+    padded = jax.tree.map(lambda x: np.pad(x, ((0, 0), (0, added), *((0, 0),) * (x.ndim - 2)), mode="edge"), inputs)
+    shared = jax.jit(lambda *x: mined(*x, how, real))(*shard_frames(padded, mesh))
+    pairs = zip(*map(jax.tree.leaves, (alone, shared)), strict=True)
+    is_equal = (
+        all(np.allclose(a, b[:, :COUNT], atol=1e-4) for a, b in pairs) and not shared.dynamic_mask[:, COUNT:].any()
     )
-    frames = Frames(mesh, COUNT)
-    mine = frames.on_devices(partial(mine_mask, size=SIZE, frames=frames, **options), BY_FRAME, BY_FRAME)
-    shared = np.asarray(jax.jit(mine)(jnp.asarray(saliency), jnp.asarray(tokens)))
-    is_equal = np.array_equal(shared[:, :COUNT], alone) and not shared[:, COUNT:].any()
-    found[method] = float(np.mean(alone)), bool(is_equal)
+    found[method] = float(np.mean(alone.dynamic_mask)), bool(is_equal)
+    return alone
 
 
-def by_matches(frames, depth, cameras, matches, gram_mask, saliency, images):
-    pose_encoding = encode_pose(cameras.camera_from_world, cameras.intrinsics, (GRID[0] * PATCH, GRID[1] * PATCH))
-    return mine_matched_mask(matches, gram_mask, saliency, images, depth, pose_encoding, frames=frames)
-
+generator = np.random.default_rng(0)
+saliency = generator.random((1, COUNT, *SIZE)).astype(np.float32)
+saliency[:, :, :2, 1:3] += 1
+tokens = saliency.reshape(1, -1, 48, 1) + generator.normal(0, 0.01, (1, COUNT, 48, 3)).astype(np.float32)
+pictures = generator.random((1, COUNT, *SIZE, 3)).astype(np.float32)
+for method, options in METHODS.items():
+    compare(method, {"clusters": 0, "threshold": "otsu"} | options, Seen(saliency), None, tokens, pictures)
 
 world = StaticWorld(COUNT)
 moves = np.zeros((COUNT, *GRID), bool)
 moves[:, 2:4, 1:3] = True
 depth, moving = (np.kron(x.reshape(-1, *GRID), np.ones((1, PATCH, PATCH), x.dtype)) for x in (world.depth, moves))
-cameras = world.cameras._replace(intrinsics=world.cameras.intrinsics * np.array([[PATCH], [PATCH], [1]], np.float32))
+sides = (GRID[0] * PATCH, GRID[1] * PATCH)
+intrinsics = world.cameras.intrinsics * np.array([[PATCH], [PATCH], [1]], np.float32)
+pose = np.asarray(encode_pose(world.cameras.camera_from_world, intrinsics, sides))
 images = np.random.default_rng(0).random((COUNT, *depth.shape[1:], 3)).astype(np.float32) / 20 + moving[..., None] / 2
-inputs = (depth.astype(np.float32), cameras, world.matches(moves.reshape(COUNT, -1)), moving & False)
-inputs += (np.full(moves.shape, 0.5, np.float32), images.astype(np.float32))
-alone = jax.jit(partial(by_matches, Frames()))(*jax.tree.map(lambda x: jnp.asarray(x)[None], inputs))
-frames, added = Frames(mesh, COUNT), shared_length(COUNT, mesh) - COUNT
-padded = jax.tree.map(lambda x: np.pad(x, ((0, added), *((0, 0),) * (x.ndim - 1)), mode="edge")[None], inputs)
-shared = jax.jit(frames.on_devices(partial(by_matches, frames), *(BY_FRAME,) * 6))(*padded)
-is_equal = all(
-    np.allclose(a, b[:, :COUNT], atol=1e-4) for a, b in zip(*map(jax.tree.leaves, (alone, shared)), strict=True)
-)
-found["4dvggt-m"] = float(np.mean(alone.dynamic_mask)), is_equal and bool(alone.is_matched.all())
+matches = jax.tree.map(lambda x: np.asarray(x)[None], world.matches(moves.reshape(COUNT, -1)))
+evidence = Seen(np.full((1, *moves.shape), 0.5, np.float32), matches)
+first = Predictions(pose[None], depth[None].astype(np.float32))
+features = np.zeros((1, COUNT, GRID[0] * GRID[1], 3), np.float32)
+how = {"clusters": 0, "threshold": "otsu"}
+alone = compare("4dvggt-m", how, evidence, first, features, images[None].astype(np.float32))
+assert alone.is_matched.all()
 
 q, k, v = (
     jax.random.normal(key, (1, 8 * 60, 4, 16)).astype(jnp.bfloat16) for key in jax.random.split(jax.random.key(0), 3)

@@ -1,5 +1,6 @@
 """Otsu against scikit-image, upsampling, token masks."""
 
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -25,12 +26,15 @@ from vggtjax.method.mask import (
     smooth_over_time,
     upsample,
 )
-from vggtjax.network.frames import BY_FRAME, Frames
+from vggtjax.method.passes import mine
+from vggtjax.method.witnesses import Seen
+from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.frames import Frames
 
 _otsu = jax.jit(otsu_threshold)
 _multi_otsu = jax.jit(multi_otsu_threshold, static_argnames="bins")
 dynamic_pixels = jax.jit(eager.dynamic_pixels, static_argnames=("size", "threshold"))
-mine_mask = jax.jit(eager.mine_mask, static_argnames=("size", "clusters", "threshold", "smooth_frames", "frames"))
+mine_mask = jax.jit(eager.mine_mask, static_argnames=("size", "clusters", "threshold", "smooth_frames"))
 
 
 def cut_alike(values, threshold, other) -> bool:
@@ -214,18 +218,19 @@ def test_cluster_means_by_hand():
 @pytest.mark.parametrize("options", [{}, {"clusters": 3, "smooth_frames": 3}, {"threshold": "multi-otsu"}])
 def test_frames_that_make_shares_equal_change_no_mask(options):
     generator = np.random.default_rng(0)
-    saliency = generator.random((2, 7, 4, 4)).astype(np.float32)
+    saliency = generator.random((1, 7, 4, 4), np.float32)
     saliency[:, :, :2, 1:3] += 1
     saliency[:, 5:] = 40 * saliency[:, 5:] - 20  # of the two frames that are added
-    tokens = saliency.reshape(2, 7, 16, 1) + generator.normal(0, 0.01, (2, 7, 16, 3)).astype(np.float32)
+    tokens = saliency.reshape(1, 7, 16, 1) + generator.normal(0, 0.01, (1, 7, 16, 3)).astype(np.float32)
+    images = generator.random((1, 7, 16, 16, 3), np.float32)
+    how = {"clusters": 0, "threshold": "otsu"} | options
+
+    def mask(saliency, tokens, images, frames=Frames()):
+        return mine(Seen(saliency), None, ClipBatch(images, tokens), **how, frames=frames).dynamic_mask
+
+    alone = jax.jit(mask)(saliency[:, :5], tokens[:, :5], images[:, :5])
     frames = Frames(Mesh(np.array(jax.devices()[:1]), ("frames",)), 5)
-    alone = jax.jit(lambda saliency, tokens: mine_mask(saliency, tokens, (16, 16), **options))(
-        saliency[:, :5], tokens[:, :5]
-    )
-    mine = frames.on_devices(
-        lambda saliency, tokens: mine_mask(saliency, tokens, (16, 16), frames=frames, **options), BY_FRAME, BY_FRAME
-    )
-    shared = np.asarray(jax.jit(mine)(saliency, tokens))
+    shared = np.asarray(jax.jit(partial(mask, frames=frames))(saliency, tokens, images))
     assert np.array_equal(shared[:, :5], alone)
     assert not shared[:, 5:].any()
     assert 0.1 < shared[:, :5].mean() < 0.6

@@ -102,8 +102,11 @@ class Clips:
         S = self.images.shape[1]
         if not 1 <= self.counted <= S:
             raise InputError(f"frames is {self.counted}; expected a number from 1 to {S}, the frames of the images")
-        if self.query_points and self.padding(frames) is not None:
-            raise InputError("clips are padded and have query_points; tracking requires that all frames are real")
+        if self.query_points and (frames.mesh is not None or self.padding(frames) is not None):
+            raise InputError(
+                "clips with query_points are padded, or on several devices; points are followed on one device, in "
+                "clips whose frames are all real"
+            )
 
 
 def compute_by(options: Options, frames: Frames = Frames(), on_accelerator: bool | None = None) -> Compute:
@@ -154,7 +157,7 @@ def run_method(
         params, clips, config, options, masks=masks, both_outputs=both_outputs, compute=compute, step=step
     )
     frames = clips.real(compute.frames)
-    join = step("assemble", frames.on_devices(assemble, BY_FRAME, REPLICATED))
+    join = step("assemble", assemble)
     arrays = (passes._replace(patch_tokens=None, tracks=None), as_tree(fusion))
     made = join(*arrays, method=options.method, align_scale=options.align_scale, frames=frames)
     return made, passes
@@ -214,7 +217,7 @@ def run_passes(
     if masks is None:
         evidence, predicted = (seen, only(first, FIRST_OUTPUTS)) if mines_by_matches else (Seen(seen.saliency), None)
         arrays = (evidence, predicted, batch._replace(frame_count=None))
-        mining = step("dynamic mask", real.on_devices(mine, BY_FRAME, BY_FRAME, BY_FRAME))
+        mining = step("dynamic mask", mine)
         mined = mining(
             *arrays, clusters=method.clusters, threshold=threshold, smooth_frames=options.smooth_frames, frames=real
         )
@@ -250,7 +253,7 @@ def _follow(
     step: Step,
 ) -> dict[int, Tracks]:
     """Return tracks by the frame in which their points are given; the first pass has those of frame 0."""
-    follow = step("tracks", compute.frames.on_devices(track_from, REPLICATED, _CLIPS, REPLICATED, REPLICATED))
+    follow = step("tracks", track_from)
     tracks = {
         frame: follow(params, batch, points, np.asarray(frame, np.int32), config=config, compute=compute)
         for frame, points in query_points.items()

@@ -75,22 +75,22 @@ def assemble(
         method: a name of `METHODS`.
         align_scale: scale the second pass (depth and camera translations) by the median depth ratio over static
             pixels before it is used. Not in the paper.
-        frames: where the frames of the passes are; those after `frames.count` are left out, or meaningless.
+        frames: where the frames of the passes are; those after `frames.count` are left out.
     """
     row = find_method(method)
     check_fuses(fusion, method)
     if passes.second is None and row.needs_second_pass:
         raise InputError(f"method {method!r} needs the second pass, which was not run")
-    passes = frames.cut(passes)
+    passes = frames.whole(passes)
     first, second = passes.first, passes.second or passes.first
     scale = None
     if align_scale and passes.second is not None:
-        scale = scale_between(present(first.depth), present(second.depth), passes.dynamic_mask, frames)
+        scale = scale_between(present(first.depth), present(second.depth), passes.dynamic_mask)
     depth, confidence = _depth(passes, row.depth, scale)
     if fusion is None and row.depth == "fused" and passes.dynamic_mask.dtype != bool:
         fusion = paper_rule()  # the same rule, which blends by shares
     if fusion is not None:
-        depth, confidence = _by_rule(fusion, observe(passes, scale=scale, frames=frames))
+        depth, confidence = _by_rule(fusion, observe(passes, scale=scale))
     size = (depth.shape[2], depth.shape[3])
     extrinsics, intrinsics = decode_pose(present(second.pose_encoding), size)
     of_second = extrinsics if scale is None else extrinsics.at[..., 3].multiply(scale[:, None, None])

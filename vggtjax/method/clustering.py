@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from vggtjax.network.frames import Frames
 from vggtjax.network.precision import full_precision
 
 ITERATIONS = 300
@@ -36,7 +35,6 @@ def kmeans(
     weights: Float[Array, " N"] | None = None,
     *,
     restarts: int = 1,
-    frames: Frames = Frames(),
 ) -> Clusters:
     """Partition points into `clusters` groups of small squared distance to their means.
 
@@ -48,23 +46,21 @@ def kmeans(
         clusters: number of centres.
         weights: at least 0; points of weight 0 are labelled but move no centre. 1 if None.
         restarts: number of partitions from different seeds; the one of least inertia is returned.
-        frames: on which devices the other points are, whose order is that of the devices; labels are of the points
-            here.
     """
-    weights = frames.varying(jnp.ones(points.shape[0])) if weights is None else weights.astype(jnp.float32)
-    total = jnp.maximum(frames.sum(weights.sum()), 1e-30)
-    mean = frames.sum(jnp.einsum("n,nc->c", weights, points)) / total
+    weights = jnp.ones(points.shape[0]) if weights is None else weights.astype(jnp.float32)
+    total = jnp.maximum(weights.sum(), 1e-30)
+    mean = jnp.einsum("n,nc->c", weights, points) / total
     points = points - mean[None]  # squares of points far from the origin would cancel
-    variance = frames.sum(jnp.einsum("n,nc->c", weights, points**2)).mean() / total
+    variance = jnp.einsum("n,nc->c", weights, points**2).mean() / total
     keys = jax.random.split(key, restarts)
     partitions = jax.lax.map(
-        lambda key: _lloyd(_seeds(key, points, clusters, weights, frames), points, weights, variance, frames), keys
+        lambda key: _lloyd(_seeds(key, points, clusters, weights), points, weights, variance), keys
     )
     best = jax.tree.map(lambda leaf: leaf[jnp.argmin(partitions.inertia)], partitions)
     return best._replace(centres=best.centres + mean[None])
 
 
-def _lloyd(centres: Array, points: Array, weights: Array, variance: Array, frames: Frames) -> Clusters:
+def _lloyd(centres: Array, points: Array, weights: Array, variance: Array) -> Clusters:
     clusters = len(centres)
 
     def not_converged(state):
@@ -75,28 +71,26 @@ def _lloyd(centres: Array, points: Array, weights: Array, variance: Array, frame
         centres, _, count = state
         labels = jnp.argmin(_distances(points, centres), axis=1)
         member = jax.nn.one_hot(labels, clusters) * weights[:, None]
-        mass = frames.sum(member.sum(axis=0))[:, None]
-        means = frames.sum(jnp.einsum("nk,nc->kc", member, points)) / jnp.maximum(mass, 1e-30)
+        mass = member.sum(axis=0)[:, None]
+        means = jnp.einsum("nk,nc->kc", member, points) / jnp.maximum(mass, 1e-30)
         means = jnp.where(mass > 0, means, centres)
         return means, jnp.sum((means - centres) ** 2), count + 1
 
     centres, _, _ = jax.lax.while_loop(not_converged, iteration, (centres, jnp.inf, 0))
     distances = _distances(points, centres)
-    inertia = frames.sum((weights * jnp.maximum(distances.min(axis=1), 0)).sum())
+    inertia = (weights * jnp.maximum(distances.min(axis=1), 0)).sum()
     return Clusters(jnp.argmin(distances, axis=1).astype(jnp.int32), centres, inertia)
 
 
-def _seeds(
-    key: Array, points: Float[Array, "N C"], clusters: int, weights: Float[Array, " N"], frames: Frames
-) -> Float[Array, "K C"]:
+def _seeds(key: Array, points: Float[Array, "N C"], clusters: int, weights: Float[Array, " N"]) -> Float[Array, "K C"]:
     """Draw centres among the points by their squared distance to earlier centres, each the best of a few candidates."""
     trials = 2 + int(math.log(clusters))
     keys = jax.random.split(key, clusters)
 
     def draw(key: Array, mass: Float[Array, " N"], count: int) -> Float[Array, "T C"]:
-        cumulative = jnp.cumsum(frames.gather(mass, axis=0))
+        cumulative = jnp.cumsum(mass)
         index = jnp.searchsorted(cumulative, jax.random.uniform(key, (count,)) * cumulative[-1])
-        return frames.rows(points, jnp.minimum(index, len(cumulative) - 1))
+        return points[jnp.minimum(index, len(cumulative) - 1)]
 
     first = draw(keys[0], weights, 1)[0]
     centres = jnp.zeros((clusters, points.shape[1])).at[:].set(first[None])
@@ -105,7 +99,7 @@ def _seeds(
         centres, nearest = state
         candidates = draw(keys[i], weights * nearest, trials)
         distances = jnp.minimum(nearest[:, None], jnp.maximum(_distances(points, candidates), 0))  # [N, T]
-        best = jnp.argmin(frames.sum(jnp.einsum("n,nt->t", weights, distances)))
+        best = jnp.argmin(jnp.einsum("n,nt->t", weights, distances))
         return centres.at[i].set(candidates[best]), distances[:, best]
 
     nearest = jnp.maximum(_distances(points, first[None])[:, 0], 0)

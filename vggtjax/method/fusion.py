@@ -5,9 +5,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from vggtjax.method.median import median_over_frames
-from vggtjax.network.frames import Frames
-
 EPSILON = 1e-6
 
 
@@ -63,12 +60,16 @@ def scale_between(
     depth1: Float[Array, "B S H W"],
     depth2: Float[Array, "B S H W"],
     dynamic_mask: Bool[Array, "B S H W"] | Float[Array, "B S H W"],
-    frames: Frames = Frames(),
 ) -> Float[Array, " B"]:
     """Return the factor from depth2 to depth1 of each clip: the median ratio over static pixels, 1 without any.
 
     A pixel is static where its share is below 1/2, if the mask has shares.
     """
     ratio = jnp.where(dynamic_mask.astype(depth1.dtype) >= 0.5, jnp.nan, depth1 / depth2)
-    median = median_over_frames(ratio, frames)
+    median = clip_median(ratio)
     return jnp.where(jnp.isfinite(median), median, 1.0)
+
+
+def clip_median(values: Float[Array, "B S ..."]) -> Float[Array, " B"]:
+    """Return the median of each clip's values, NaN left out; NaN without any."""
+    return jnp.nanmedian(values.reshape(len(values), -1), axis=-1)

@@ -7,18 +7,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from vggtjax.errors import InputError
+from vggtjax.method.fusion import clip_median
 from vggtjax.method.fusion_family import Observations
 from vggtjax.method.mask import upsample
-from vggtjax.method.median import median_over_frames
 from vggtjax.method.passes import Passes
-from vggtjax.network.frames import Frames
 
 REACH = 64  # pixels; larger distances to the mask's edge are infinite
 _SMALLEST = 1e-6
 _STILL = -1e3  # margin of pixels that are static at any temperature
 
 
-def observe(passes: Passes, *, scale: Float[Array, " B"] | None = None, frames: Frames = Frames()) -> Observations:
+def observe(passes: Passes, *, scale: Float[Array, " B"] | None = None) -> Observations:
     """Return the inputs of `fuse` for two passes.
 
     The features are the saliency; log depth of pass 1 over the clip's median; exp(-d / patch size) with the distance
@@ -27,7 +26,6 @@ def observe(passes: Passes, *, scale: Float[Array, " B"] | None = None, frames: 
     Args:
         passes: both, with depth; the mask is boolean or of shares in [0, 1].
         scale: factor on the depth of the second pass, as from `scale_between`; 1 if None.
-        frames: where the frames of the passes are.
 
     Raises InputError where a pass, its depth or its confidence is missing.
     """
@@ -41,8 +39,7 @@ def observe(passes: Passes, *, scale: Float[Array, " B"] | None = None, frames: 
     dynamic = passes.dynamic_mask.astype(depth1.dtype)
     saliency = upsample(passes.saliency, (depth1.shape[2], depth1.shape[3]))
     hard = jax.lax.stop_gradient(dynamic) >= 0.5
-    waiting = depth1 if scale is None else frames.after(depth1, scale)  # another median
-    median = median_over_frames(waiting, frames)[:, None, None, None]
+    median = clip_median(depth1)[:, None, None, None]
     log_depth = jnp.log(jnp.maximum(depth1, _SMALLEST)) - jnp.log(jnp.maximum(median, _SMALLEST))
     patch_size = depth1.shape[2] // passes.saliency.shape[2]
     features = [saliency, log_depth, jax.vmap(jax.vmap(lambda frame: edge_proximity(frame, patch_size)))(hard), dynamic]
@@ -52,7 +49,7 @@ def observe(passes: Passes, *, scale: Float[Array, " B"] | None = None, frames: 
         depth2,
         _log_confidence(second.depth_confidence),
         dynamic,
-        jax.vmap(lambda saliency, hard: _margin(saliency, hard, frames))(saliency, hard),
+        jax.vmap(_margin)(saliency, hard),
         jnp.stack(features, axis=-1),
     )
 
@@ -89,21 +86,17 @@ def _squared_distance(mask: Bool[Array, "H W"]) -> Float[Array, "H W"]:
     return jax.lax.scan(nearer, column, jnp.arange(2 * REACH + 1))[0]
 
 
-def _margin(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"], frames: Frames) -> Float[Array, "S H W"]:
+def _margin(saliency: Float[Array, "S H W"], dynamic: Bool[Array, "S H W"]) -> Float[Array, "S H W"]:
     """Return the saliency minus the threshold of the mask, clipped to the mask's side of 0.
 
     The threshold is midway between the largest static and the smallest dynamic saliency, for a full mask 1/2 below the
     smallest. Saliency and mask disagree where the mask was supplied by the user or smoothed. An empty mask has no edge.
     """
-    still = ~dynamic
-    if (is_counted := frames.are_counted(len(saliency))) is not None:
-        still = still & is_counted[:, None, None]
-    low = frames.max(jnp.where(still, saliency, -jnp.inf).max())
-    high = frames.min(jnp.where(dynamic, saliency, jnp.inf).min())
+    low, high = jnp.where(dynamic, -jnp.inf, saliency).max(), jnp.where(dynamic, saliency, jnp.inf).min()
     low, high = jnp.where(jnp.isfinite(low), low, high - 1), jnp.where(jnp.isfinite(high), high, low + 1)
     margin = saliency - (low + high) / 2
     margin = jnp.where(dynamic, jnp.maximum(margin, 0), jnp.minimum(margin, -_SMALLEST))
-    return jnp.where(frames.any(dynamic.any()), margin, _STILL)
+    return jnp.where(dynamic.any(), margin, _STILL)
 
 
 def _log_confidence(confidence: Float[Array, "*S"]) -> Float[Array, "*S"]:

@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtjax.config import Threshold
 from vggtjax.method.clustering import kmeans
 from vggtjax.method.cues import normalise
-from vggtjax.network.frames import Frames
 from vggtjax.options import odd_frames
 
 BINS = 256
@@ -23,18 +22,15 @@ def upsample(saliency: Float[Array, "B S h w"], size: tuple[int, int]) -> Float[
     return jax.image.resize(saliency, (*saliency.shape[:2], *size), "bilinear", antialias=False)
 
 
-def otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS, frames: Frames = Frames()) -> Float[Array, ""]:
+def otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS) -> Float[Array, ""]:
     """Return Otsu's threshold: the bin centre of the largest variance between the two classes.
 
     The histogram has `bins` bins from the smallest to the largest value, as scikit-image's `threshold_otsu`. Of equal
-    centres the lowest is returned; of constant values, the value. With `frames` the values are of all devices.
+    centres the lowest is returned; of constant values, the value.
     """
-    is_counted = frames.are_counted(len(values))
-    low, high = _extremes(values, frames)
+    low, high = values.min(), values.max()
     index, centres = _binned(values, low, high, bins)
-    if is_counted is not None:  # others fall into a bin of their own
-        index = jnp.where(jnp.repeat(is_counted, values.size // len(values)), index, bins)
-    counts = frames.sum(jnp.bincount(index, length=bins + 1)[:bins])
+    counts = jnp.bincount(index, length=bins)
     counts = counts.astype(values.dtype) / counts.sum().astype(values.dtype)
     offsets = jnp.arange(bins, dtype=values.dtype) + 0.5  # means in units of bins, which keeps every sum of order one
     below, above = jnp.cumsum(counts), jnp.cumsum(counts[::-1])[::-1]
@@ -44,21 +40,13 @@ def otsu_threshold(values: Float[Array, "S ..."], bins: int = BINS, frames: Fram
     return jnp.where(high > low, centres[jnp.argmax(between)], low)
 
 
-def find_threshold(
-    pixels: Float[Array, "S H W"], threshold: Threshold = "otsu", frames: Frames = Frames()
-) -> Float[Array, ""]:
-    """Return the value at which a clip's saliency is cut. With `frames` the pixels are of all devices."""
-    if threshold == "otsu":
-        return otsu_threshold(pixels, frames=frames)
-    return multi_otsu_threshold(frames.gather(pixels, axis=0)[: frames.counted(len(pixels))])
+def find_threshold(pixels: Float[Array, "S H W"], threshold: Threshold = "otsu") -> Float[Array, ""]:
+    """Return the value at which a clip's saliency is cut."""
+    return otsu_threshold(pixels) if threshold == "otsu" else multi_otsu_threshold(pixels)
 
 
 def dynamic_pixels(
-    saliency: Float[Array, "B S h w"],
-    size: tuple[int, int],
-    *,
-    threshold: Threshold = "otsu",
-    frames: Frames = Frames(),
+    saliency: Float[Array, "B S h w"], size: tuple[int, int], *, threshold: Threshold = "otsu"
 ) -> Bool[Array, "B S H W"]:
     """Return the dynamic pixels of every clip by one threshold for all pixels of the clip.
 
@@ -68,18 +56,14 @@ def dynamic_pixels(
         saliency: of every patch, in [0, 1].
         size: height and width of the frames in pixels.
         threshold: "otsu" (at or above, 4DVGGT-D) or "multi-otsu" (above, VGGT4D).
-        frames: where the frames are; those that make shares equal have no dynamic pixels.
     """
-    is_counted = frames.are_counted(saliency.shape[1])
 
     def one_clip(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
-        low, high = _extremes(pixels, frames)
-        varies = high - low >= CONSTANT
-        cut = find_threshold(pixels, threshold, frames)
+        varies = pixels.max() - pixels.min() >= CONSTANT
+        cut = find_threshold(pixels, threshold)
         return (pixels >= cut if threshold == "otsu" else pixels > cut) & varies
 
-    mask = jax.vmap(one_clip)(upsample(saliency, size))
-    return mask if is_counted is None else mask & is_counted[None, :, None, None]
+    return jax.vmap(one_clip)(upsample(saliency, size))
 
 
 def mine_mask(
@@ -90,7 +74,6 @@ def mine_mask(
     clusters: int = 0,
     threshold: Threshold = "otsu",
     smooth_frames: int = 1,
-    frames: Frames = Frames(),
 ) -> Bool[Array, "B S H W"]:
     """Return a method's dynamic pixels: the saliency, averaged within clusters if requested, above a threshold.
 
@@ -104,42 +87,31 @@ def mine_mask(
         threshold: "otsu" or "multi-otsu".
         smooth_frames: odd number of frames over which the saliency is averaged before the threshold (see
             `smooth_over_time`; not in the papers).
-        frames: where the frames are; those that make shares equal change nothing and have no dynamic pixels.
     """
     saliency, patch_tokens = jax.lax.stop_gradient((saliency, patch_tokens))
     saliency = jnp.where(jnp.isfinite(saliency), saliency, 0)  # else one value would empty the masks of all frames
     if clusters:
-        saliency = smooth_by_clusters(saliency, patch_tokens, clusters, frames)
-    saliency = smooth_over_time(saliency, smooth_frames, frames)
-    return dynamic_pixels(saliency, size, threshold=threshold, frames=frames)
+        saliency = smooth_by_clusters(saliency, patch_tokens, clusters)
+    return dynamic_pixels(smooth_over_time(saliency, smooth_frames), size, threshold=threshold)
 
 
 def smooth_by_clusters(
-    saliency: Float[Array, "B S h w"],
-    patch_tokens: Float[Array, "B S P C"],
-    clusters: int,
-    frames: Frames = Frames(),
+    saliency: Float[Array, "B S h w"], patch_tokens: Float[Array, "B S P C"], clusters: int
 ) -> Float[Array, "B S h w"]:
     """Give every token the mean saliency of its cluster, min-max normalised per frame again (VGGT4D).
 
     The backbone's features of all frames of a clip are clustered together.
     """
-    is_counted = frames.are_counted(saliency.shape[1])
-    patch_tokens = frames.after(patch_tokens, saliency)  # clusters do not start beside attention
 
     def one_clip(clip: tuple[Array, Array]) -> Float[Array, "S h w"]:
         values, features = clip
-        weights = None if is_counted is None else jnp.repeat(is_counted, features.shape[1])
-        points = features.reshape(-1, features.shape[-1])
-        labels = kmeans(jax.random.key(0), points, clusters, weights, frames=frames).labels
-        return cluster_means(values, labels.reshape(values.shape), clusters, frames)
+        labels = kmeans(jax.random.key(0), features.reshape(-1, features.shape[-1]), clusters).labels
+        return cluster_means(values, labels.reshape(values.shape), clusters)
 
     return jax.lax.map(one_clip, (saliency, patch_tokens.astype(jnp.float32)))
 
 
-def smooth_over_time(
-    saliency: Float[Array, "B S h w"], smooth_frames: int, frames: Frames = Frames()
-) -> Float[Array, "B S h w"]:
+def smooth_over_time(saliency: Float[Array, "B S h w"], smooth_frames: int) -> Float[Array, "B S h w"]:
     """Average every patch over `smooth_frames` frames around its own; at the ends of the clip, over the existing ones.
 
     Patches are averaged at fixed places in the picture, which suits dense clips of slow cameras.
@@ -149,36 +121,18 @@ def smooth_over_time(
     smooth_frames = odd_frames(smooth_frames)
     if smooth_frames == 1:
         return saliency
-    S, reach = saliency.shape[1], smooth_frames // 2
-    every = frames.gather(saliency)[:, : frames.counted(S)]
-    near = jnp.abs(jnp.asarray(frames.numbers(S))[:, None] - jnp.arange(every.shape[1])[None]) <= reach
-    near = near.astype(saliency.dtype)
-    weights = near / near.sum(axis=1, keepdims=True).clip(1)
-    return jnp.einsum("st,bthw->bshw", weights, every, precision="highest")
+    number = jnp.arange(saliency.shape[1])
+    near = (jnp.abs(number[:, None] - number[None]) <= smooth_frames // 2).astype(saliency.dtype)
+    weights = near / near.sum(axis=1, keepdims=True)
+    return jnp.einsum("st,bthw->bshw", weights, saliency, precision="highest")
 
 
-def cluster_means(
-    saliency: Float[Array, "S h w"], labels: Int[Array, "S h w"], clusters: int, frames: Frames = Frames()
-) -> Float[Array, "S h w"]:
+def cluster_means(saliency: Float[Array, "S h w"], labels: Int[Array, "S h w"], clusters: int) -> Float[Array, "S h w"]:
     """Return every token's mean over its cluster, min-max normalised per frame."""
-    flat = labels.ravel()
-    if (is_counted := frames.are_counted(len(saliency))) is not None:  # others are in no cluster
-        flat = jnp.where(jnp.repeat(is_counted, flat.size // len(saliency)), flat, clusters)
-    zeros = frames.varying(jnp.zeros(clusters))
-    total = frames.sum(zeros.at[flat].add(saliency.ravel()))
-    count = frames.sum(zeros.at[flat].add(1))
+    flat, zeros = labels.ravel(), jnp.zeros(clusters)
+    total, count = zeros.at[flat].add(saliency.ravel()), zeros.at[flat].add(1)
     mean = (total / jnp.maximum(count, 1))[flat]
     return normalise(mean.reshape(1, len(saliency), -1))[0].reshape(saliency.shape)
-
-
-def _extremes(values: Float[Array, "S ..."], frames: Frames) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the smallest and the largest value of all counted frames."""
-    is_counted = frames.are_counted(len(values))
-    if is_counted is None:
-        return frames.min(values.min()), frames.max(values.max())
-    is_counted = is_counted.reshape(-1, *(1,) * (values.ndim - 1))
-    low, high = jnp.where(is_counted, values, jnp.inf).min(), jnp.where(is_counted, values, -jnp.inf).max()
-    return frames.min(low), frames.max(high)
 
 
 def _binned(

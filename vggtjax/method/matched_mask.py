@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -15,7 +14,6 @@ from vggtjax.method.edges import follow_edges
 from vggtjax.method.mask import otsu_threshold, upsample
 from vggtjax.method.matched_motion import FEWEST_FRAMES, motion
 from vggtjax.method.matches import Matches
-from vggtjax.network.frames import Frames
 from vggtjax.network.pose import decode_pose
 
 _TIMES_MEDIAN = 2.5  # Otsu's threshold alone would find something in static clips
@@ -36,8 +34,6 @@ def mine_matched_mask(
     images: Float[Array, "B S H W 3"],
     depth: Float[Array, "B S H W"],
     pose_encoding: Float[Array, "B S 9"],
-    *,
-    frames: Frames = Frames(),
 ) -> Mined:
     """Return dynamic pixels by matches. No gradient passes: a mask is a decision.
 
@@ -50,25 +46,15 @@ def mine_matched_mask(
         images: RGB in [0, 1].
         depth: of the first pass.
         pose_encoding: of the first pass.
-        frames: where the frames are; those that make shares equal change nothing and have no dynamic pixels.
     """
-    S, counted = images.shape[1], frames.counted(images.shape[1])
-    if counted < FEWEST_FRAMES:
+    S, grid = images.shape[1], (saliency.shape[2], saliency.shape[3])
+    if S < FEWEST_FRAMES:
         return Mined(gram_mask, jnp.ones_like(saliency), jnp.zeros(gram_mask.shape[:2], bool))
-    grid = (saliency.shape[2], saliency.shape[3])
     cameras = Cameras(*decode_pose(pose_encoding, grid))  # intrinsics in patches
     inputs = jax.lax.stop_gradient((matches, saliency, at_patches(depth, grid), cameras))
-    # On several devices the communications of the other mask come first.
-    whole = jax.tree.map(lambda x: frames.gather(frames.after(x, gram_mask))[:, :counted], inputs)
-    found = jax.lax.map(lambda clip: motion(clip[0], clip[1].reshape(counted, -1), clip[2], clip[3], grid), whole)
-    score = jnp.nan_to_num(found.score).reshape(-1, counted, *grid)
-    score = jnp.pad(score, ((0, 0), (0, frames.total(S) - counted), (0, 0), (0, 0)))
-    score = frames.share(score, S)
-    pixels = motion_pixels(score, images)
-
-    mask = jax.vmap(partial(is_moving, frames=frames))(pixels)
-    if (is_counted := frames.are_counted(S)) is not None:
-        mask = mask & is_counted[None, :, None, None]
+    found = jax.lax.map(lambda clip: motion(clip[0], clip[1].reshape(S, -1), clip[2], clip[3], grid), inputs)
+    score = jnp.nan_to_num(found.score).reshape(-1, S, *grid)
+    mask = jax.vmap(is_moving)(motion_pixels(score, images))
     mask = jnp.where(found.is_matched[:, None, None, None], mask, gram_mask)
     return Mined(mask, score, jnp.broadcast_to(found.is_matched[:, None], mask.shape[:2]))
 
@@ -79,7 +65,6 @@ def motion_pixels(motion: Float[Array, "B S h w"], images: Float[Array, "B S H W
     return follow_edges(upsample(motion, (H, W)), images, H // motion.shape[2])
 
 
-def is_moving(pixels: Float[Array, "S H W"], frames: Frames = Frames()) -> Bool[Array, "S H W"]:
+def is_moving(pixels: Float[Array, "S H W"]) -> Bool[Array, "S H W"]:
     """Return where the motion of a clip's pixels is above Otsu's threshold, and above 2.5 times its median."""
-    median = jnp.median(frames.gather(pixels, axis=0)[: frames.counted(len(pixels))])
-    return pixels >= jnp.maximum(otsu_threshold(pixels, frames=frames), _TIMES_MEDIAN * median)
+    return pixels >= jnp.maximum(otsu_threshold(pixels), _TIMES_MEDIAN * jnp.median(pixels))

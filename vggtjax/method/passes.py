@@ -20,7 +20,7 @@ from vggtjax.method.soft_mask import SoftMasking, soft_pixels
 from vggtjax.method.witnesses import Seen, Witnesses
 from vggtjax.network.backbone import patch_grid
 from vggtjax.network.clip_batch import ClipBatch
-from vggtjax.network.frames import Frames
+from vggtjax.network.frames import Frames, with_frames
 from vggtjax.network.layers import Params
 from vggtjax.network.model import FIELDS, Predictions, predict
 from vggtjax.network.precision import Compute
@@ -98,20 +98,20 @@ def mine(
         clusters: as for `mine_mask`, and so is `smooth_frames`.
         threshold: of the Gram saliency.
         smooth_frames: of the Gram saliency.
-        frames: where the frames are; those after `frames.count` are not read and have no dynamic pixels.
+        frames: where the frames are: every device mines all of them. Those after `frames.count` are not read, and have
+            no dynamic pixels.
     """
     S = clips.images.shape[1]
-    seen, first, clips = frames.cut((seen, first, clips._replace(frame_count=None)))
+    seen, first, clips = frames.whole((seen, first, clips._replace(frame_count=None)))
     images, size = clips.images, (clips.images.shape[2], clips.images.shape[3])
-    how = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames, "frames": frames}
+    how = {"clusters": clusters, "threshold": threshold, "smooth_frames": smooth_frames}
     mined = Mined(mine_mask(seen.saliency, present(clips.patch_tokens), size, **how))
     if seen.matches is not None:
         first = present(first)
         of_first = (present(first.depth), present(first.pose_encoding))
-        mined = mine_matched_mask(seen.matches, mined.dynamic_mask, seen.saliency, images, *of_first, frames=frames)
-    images = frames.after(images, mined)  # communications come one after another
-    moves = ~are_equal(images, frames)[:, None, None, None]
-    return frames.pad(mined._replace(dynamic_mask=mined.dynamic_mask & moves), S)
+        mined = mine_matched_mask(seen.matches, mined.dynamic_mask, seen.saliency, images, *of_first)
+    moves = ~are_equal(images)[:, None, None, None]
+    return with_frames(mined._replace(dynamic_mask=mined.dynamic_mask & moves), S)
 
 
 def mine_soft(
@@ -127,17 +127,14 @@ def mine_soft(
     Frames after `frames.count` are not read, and have shares of 0. All frames are on one device.
     """
     S = images.shape[1]
-    saliency, images = frames.cut((saliency, images))
+    saliency, images = frames.whole((saliency, images))
     shares = soft_pixels(saliency, masking, size=(images.shape[2], images.shape[3]), threshold=threshold)
-    return frames.pad(jnp.where(are_equal(images)[:, None, None, None], 0, shares), S)
+    return with_frames(jnp.where(are_equal(images)[:, None, None, None], 0, shares), S)
 
 
-def are_equal(images: Float[Array, "B S H W 3"], frames: Frames = Frames()) -> Bool[Array, " B"]:
+def are_equal(images: Float[Array, "B S H W 3"]) -> Bool[Array, " B"]:
     """Return the clips whose frames are all one picture, up to the noise of a codec."""
-    differ = ~same_picture(images, frames.of_first(images[:, :1]))
-    if (is_counted := frames.are_counted(images.shape[1])) is not None:
-        differ = differ & is_counted[None]
-    return ~frames.any(differ.any(axis=1))
+    return same_picture(images, images[:, :1]).all(axis=1)
 
 
 def second_pass(
@@ -206,11 +203,10 @@ def track_from(
         config: the model's configuration.
         compute: as for `predict`.
     """
-    frames = compute.frames
-    rolled = jax.tree.map(lambda x: frames.roll(x, -frame), clips)
+    rolled = jax.tree.map(lambda x: jnp.roll(x, -frame, axis=1), clips)
     predictions = predict(params, rolled, config, outputs=("tracks",), query_points=query_points, compute=compute)
     tracks = (predictions.tracks, predictions.track_visibility, predictions.track_confidence)
-    return Tracks(*(frames.roll(present(value), frame) for value in tracks))
+    return Tracks(*(jnp.roll(present(value), frame, axis=1) for value in tracks))
 
 
 def motion_saliency(

@@ -25,13 +25,14 @@ _Parameters = ParamSpec("_Parameters")
 class Frames:
     """Where the frames of a batch of clips are; static under jit.
 
-    Without a mesh all frames are here, and every method below is the identity or the plain reduction. With a mesh the
-    methods run inside `on_devices`, where device i holds frames i S to (i + 1) S - 1 and S is its own number of frames.
+    Without a mesh all frames are here, and every method below is the identity. With a mesh the methods run inside
+    `on_devices`, where device i holds frames i S to (i + 1) S - 1 and S is its own number of frames: the network runs
+    there, on its share. What comes after a pass reads all frames, on every device (`whole`).
 
     Attributes:
         mesh: devices along an axis named "frames"; None for frames that are all here.
         count: frames of each clip on all devices together; the frames after them make the shares equal, and do not
-            change them. None: all. Without a mesh, only `cut` and `pad` read it.
+            change them. None: all. Without a mesh, only `whole` reads it.
     """
 
     mesh: Mesh | None = None
@@ -81,23 +82,11 @@ class Frames:
             counts = frame_count
         return jnp.asarray(self.numbers(S))[None] < counts[:, None]
 
-    def are_counted(self, S: int) -> Bool[Array, " S"] | None:
-        """Return which of the S frames here are before `count`; None: all."""
-        real = self.are_real(None, 1, S)
-        return None if real is None else real[0]
-
-    def cut(self, tree: _Tree) -> _Tree:
-        """Return arrays [B, S, ...] without the frames after `count`, where all frames are here."""
-        is_whole = self.mesh is not None or self.count is None
-        return tree if is_whole else jax.tree.map(lambda x: x[:, : self.count], tree)
-
-    def pad(self, tree: _Tree, S: int) -> _Tree:
-        """Return arrays that `cut` made shorter with zeros after their frames, S in all."""
-
-        def padded(x: Array) -> Array:
-            return jnp.pad(x, ((0, 0), (0, S - x.shape[1]), *((0, 0),) * (x.ndim - 2)))
-
-        return tree if self.mesh is not None or self.count is None else jax.tree.map(padded, tree)
+    def whole(self, tree: _Tree) -> _Tree:
+        """Return whole arrays [B, S, ...] on every device, without frames after `count`; outside of `on_devices`."""
+        if (everywhere := self.sharding(REPLICATED)) is not None:
+            tree = jax.lax.with_sharding_constraint(tree, everywhere)
+        return tree if self.count is None else jax.tree.map(lambda x: x[:, : self.count], tree)
 
     def gather(self, x: Array, axis: int = 1) -> Array:
         """Return the frames of all devices, along `axis`."""
@@ -108,24 +97,6 @@ class Frames:
         if self.mesh is None:
             return x
         return jax.lax.dynamic_slice_in_dim(x, self.first(S), S, axis)
-
-    def rows(self, x: Array, index: Int[Array, " N"]) -> Array:
-        """Return rows of x along its first axis, by their numbers among the rows of all devices."""
-        if self.mesh is None:
-            return x[index]
-        here = index - self.first(len(x))
-        found = x[jnp.clip(here, 0, len(x) - 1)]
-        is_here = ((here >= 0) & (here < len(x))).reshape(-1, *(1,) * (x.ndim - 1))
-        return self.sum(jnp.where(is_here, found, 0))
-
-    def roll(self, x: Array, shift: Int[Array, ""] | Int[np.ndarray, ""]) -> Array:
-        """Return [B, S, ...] rolled by `shift` frames around the counted frames of each clip."""
-        if self.mesh is None:
-            return jnp.roll(x, shift, axis=1)
-        S = x.shape[1]
-        rolled = jnp.roll(self.gather(x)[:, : self.counted(S)], shift, axis=1)
-        padding = self.total(S) - rolled.shape[1]
-        return self.share(jnp.pad(rolled, ((0, 0), (0, padding), *((0, 0),) * (x.ndim - 2))), S)
 
     def around(self, x: Array, reach: int, axis: int = 1) -> tuple[Array, int | Int[Array, ""]]:
         """Return the frames up to `reach` before and after those here, and perhaps more; and the first one's number.
@@ -143,24 +114,6 @@ class Frames:
             pairs = [(i + shift, i) for i in range(devices) if 0 <= i + shift < devices]
             parts.append(jax.lax.ppermute(x, AXIS, pairs) if shift else x)
         return jnp.concatenate(parts, axis), self.first(S) - shares * S
-
-    def of_first(self, x: _Tree) -> _Tree:
-        """Return the arrays of the device with the first frame."""
-        if self.mesh is None:
-            return x
-        return self.sum(jax.tree.map(lambda leaf: jnp.where(jax.lax.axis_index(AXIS) == 0, leaf, 0), x))
-
-    def sum(self, x: _Tree) -> _Tree:
-        """Return the sum over devices."""
-        return x if self.mesh is None else jax.lax.psum(x, AXIS)
-
-    def max(self, x: Array) -> Array:
-        """Return the maximum over devices."""
-        return x if self.mesh is None else jax.lax.pmax(x, AXIS)
-
-    def min(self, x: Array) -> Array:
-        """Return the minimum over devices."""
-        return x if self.mesh is None else jax.lax.pmin(x, AXIS)
 
     def any(self, x: Bool[Array, ""]) -> Bool[Array, ""]:
         """Return whether x is true on any device."""
@@ -212,6 +165,11 @@ class OnDevices(Generic[_Parameters, _Tree]):
             return function(*(varying(x) if spec == REPLICATED else x for spec, x in pairs), **options)
 
         return jax.shard_map(share, mesh=self.mesh, in_specs=self.specs, out_specs=BY_FRAME)(*arguments)
+
+
+def with_frames(tree: _Tree, S: int) -> _Tree:
+    """Return arrays [B, s, ...] with zeros after their frames, S in all."""
+    return jax.tree.map(lambda x: jnp.pad(x, ((0, 0), (0, S - x.shape[1]), *((0, 0),) * (x.ndim - 2))), tree)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -180,7 +180,7 @@ def predict(
             return (pose,)
         head, projected = params[HEADS[name]], [tap[HEADS[name]] for tap in taps]
         if name == "tracks":
-            return predict_tracks(head, projected, query_points, config, grid, compute.frames)  # type: ignore[arg-type]
+            return predict_tracks(head, projected, query_points, config, grid)  # type: ignore[arg-type]
         regress = jax.checkpoint(predict_dense, static_argnums=(2, 3, 4, 5)) if compute.remat else predict_dense
         values, confidence = regress(head, projected, config, grid, name, compute.precision)
         return values[..., 0] if DENSE_HEADS[name].values == 1 else values, confidence

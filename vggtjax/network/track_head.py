@@ -13,9 +13,8 @@ from jaxtyping import Array, Float
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
+from vggtjax.network.attention import attention as attention_of
 from vggtjax.network.dpt_head import DPTFeatures, TapHead, add_positions, frames_at_once
-from vggtjax.network.frames import Frames
-from vggtjax.network.gathered_attention import gathered_attention
 from vggtjax.network.layers import MLP, Dense, LayerNorm, Params, apply, iterate, stack
 from vggtjax.network.precision import full_precision
 from vggtjax.network.resize import resize_aligned
@@ -46,7 +45,6 @@ def predict_tracks(
     query_points: Float[Array, "B Q 2"],
     config: VGGTConfig,
     grid: tuple[int, int],
-    frames: Frames = Frames(),
 ) -> Tracks:
     """Return the tracks of points of the first frame.
 
@@ -60,9 +58,8 @@ def predict_tracks(
         query_points: x, y in pixels of the first frame.
         config: the model's configuration.
         grid: rows and columns of patches.
-        frames: where the frames are: attention over time gathers keys and values of every track, all else is local.
     """
-    return apply(TrackHead(config), params, taps, query_points, grid, frames)
+    return apply(TrackHead(config), params, taps, query_points, grid)
 
 
 def smallest_side(config: VGGTConfig) -> int:
@@ -88,7 +85,6 @@ class TrackHead(TapHead):
         taps: list[Float[Array, "B S P F"]],
         query_points: Float[Array, "B Q 2"],
         grid: tuple[int, int],
-        frames: Frames = Frames(),
     ) -> Tracks:
         """Return the tracks of points of the first frame."""
         B, S = taps[0].shape[:2]
@@ -97,16 +93,16 @@ class TrackHead(TapHead):
         size = (maps.shape[2], maps.shape[3])
         query = query_points / STRIDE
         inside = jnp.clip(query, 0, jnp.asarray([[[size[1] - 1, size[0] - 1]]], query.dtype))
-        features = frames.of_first(jax.vmap(bilinear)(maps[:, 0], inside))  # [B, Q, F]
+        features = jax.vmap(bilinear)(maps[:, 0], inside)  # [B, Q, F]
         features = jnp.broadcast_to(features[:, None], (B, S, *features.shape[1:]))
         pyramid = _pyramid(maps, config.track_corr_levels, config.track_corr_radius)
         place = _position_embedding(inside, size, 3 * F + 4)[:, :, None]  # [B, Q, 1, E]
-        later = frames.numbers(S) > 0
+        later = np.arange(S) > 0
         kind = self.param("query_token", nn.initializers.zeros, (2, 3 * F + 4))[later.astype(np.int32)][
             None, None
         ]  # [1, 1, S, E]
         start = jnp.broadcast_to(query[:, None], (B, S, *query.shape[1:]))
-        compare, transform = MLP(C, F, name="correlation_mlp"), self._transformer(frames)
+        compare, transform = MLP(C, F, name="correlation_mlp"), self._transformer()
         feature_norm, feature_update = LayerNorm(name="feature_norm"), Dense(F, name="feature_update")
         scores = [Dense(1, name=name) for name in ("visibility", "confidence")]
 
@@ -125,7 +121,7 @@ class TrackHead(TapHead):
             positions = jnp.where(jnp.asarray(later)[None, :, None, None], positions + delta[..., :2], start)
             return positions, features + update
 
-        positions, features = iterate(self, iteration, (start, frames.varying(features)), ITERATIONS)
+        positions, features = iterate(self, iteration, (start, features), ITERATIONS)
         visibility, confidence = (jax.nn.sigmoid(score(features)[..., 0]) for score in scores)
         return Tracks(positions * STRIDE, visibility, confidence)
 
@@ -145,7 +141,7 @@ class TrackHead(TapHead):
 
         return frames_at_once(some_frames, taps, (h * p) * (w * p)).reshape(*taps[0].shape[:2], *size, F)
 
-    def _transformer(self, frames: Frames) -> Callable[[Float[Array, "B Q S E"]], Float[Array, "B Q S O"]]:
+    def _transformer(self) -> Callable[[Float[Array, "B Q S E"]], Float[Array, "B Q S O"]]:
         """Return the transformer: layers alternate over time in every track and over tracks in every frame.
 
         Tracks attend to each other through virtual tracks: these attend to all tracks and to one another, and all
@@ -168,7 +164,7 @@ class TrackHead(TapHead):
             return flow_projection(output_norm(tokens[:, : x.shape[1]] + start))
 
         def layer(tokens: Float[Array, "B N S C"], blocks: dict[str, Params]):
-            tokens = apply(block, blocks["time"], tokens, frames=frames)
+            tokens = apply(block, blocks["time"], tokens)
             tokens = tokens.swapaxes(1, 2)  # [B, S, N, C]
             points, virtual = tokens[:, :, :-VIRTUAL_TRACKS], tokens[:, :, -VIRTUAL_TRACKS:]
             virtual = apply(block, blocks["virtual_to_point"], virtual, points)
@@ -184,15 +180,15 @@ class TrackBlock(nn.Module):
 
     @nn.compact
     def __call__(
-        self, x: Float[Array, "B G T C"], context: Float[Array, "B G K C"] | None = None, frames: Frames = Frames()
+        self, x: Float[Array, "B G T C"], context: Float[Array, "B G K C"] | None = None
     ) -> Float[Array, "B G T C"]:
-        """Return the tokens after the block. With `frames`, T are frames, and attention is over all devices."""
+        """Return the tokens after the block."""
         B, G, T, C = x.shape
         x = LayerNorm(name="norm1")(x)
         source = x if context is None else LayerNorm(name="norm_context")(context)
         attention = SplitProjections(C, name="attention")
         q, k, v = (y.reshape(B * G, -1, HEADS, C // HEADS) for y in attention.heads(x, source))
-        out = gathered_attention(q, k, v, frames.are_real(None, B * G, T), frames).reshape(B, G, T, C)
+        out = attention_of(q, k, v).reshape(B, G, T, C)
         x = x + attention.project(out)
         return x + MLP(4 * C, C, name="mlp")(LayerNorm(name="norm2")(x))
 

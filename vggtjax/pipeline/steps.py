@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import jax
 
-from vggtjax.network.frames import OnDevices
 from vggtjax.progress import OnStage, Progress, no_stage
 from vggtjax.storage.free_memory import return_freed_memory
 
@@ -77,7 +76,7 @@ class Compile:
             if key not in self._compiling:
                 self._compiling[key] = _compiled(_jitted(function, tuple(static)).lower(*arguments, **static), leaves)
             compiling, outputs = self._compiling[key]
-            self._steps.append((name, compiling, isinstance(function, OnDevices)))
+            self._steps.append((name, compiling, _on_several_devices(leaves)))
             return outputs
 
         return compile_step
@@ -114,10 +113,14 @@ def _compiled(lowered: Any, arguments: Sequence[Any]) -> tuple[Future[Any], Any]
         return compiled
 
     compiling, outputs = _compilers().submit(compile_lowered), lowered.out_info
-    shardings = (getattr(leaf, "sharding", None) for leaf in arguments)
-    if any(sharding is not None and sharding.num_devices > 1 for sharding in shardings):
+    if _on_several_devices(arguments):
         outputs = jax.tree.map(_placed, outputs, compiling.result().output_shardings)  # the next step needs them
     return compiling, outputs
+
+
+def _on_several_devices(arrays: Sequence[Any]) -> bool:
+    shardings = (getattr(array, "sharding", None) for array in arrays)
+    return any(sharding is not None and sharding.num_devices > 1 for sharding in shardings)
 
 
 def _placed(output: Any, sharding: Any) -> jax.ShapeDtypeStruct:
