@@ -67,6 +67,7 @@ sides = (GRID[0] * PATCH, GRID[1] * PATCH)
 intrinsics = world.cameras.intrinsics * np.array([[PATCH], [PATCH], [1]], np.float32)
 pose = np.asarray(encode_pose(world.cameras.camera_from_world, intrinsics, sides))
 images = np.random.default_rng(0).random((COUNT, *depth.shape[1:], 3)).astype(np.float32) / 20 + moving[..., None] / 2
+images += np.linspace(0, 0.3, COUNT, dtype=np.float32)[:, None, None, None]  # not one picture many times
 matches = jax.tree.map(lambda x: np.asarray(x)[None], world.matches(moves.reshape(COUNT, -1)))
 evidence = Seen(np.full((1, *moves.shape), 0.5, np.float32), matches)
 first = Predictions(pose[None], depth[None].astype(np.float32))

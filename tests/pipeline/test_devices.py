@@ -27,9 +27,9 @@ WORKER = Path(__file__).with_name("devices_worker.py")
 NAMED = {  # in docs/how-to/several-devices.md
     "image features": set(),
     "first pass": {"all-gather", "collective-permute"},
-    "dynamic mask": {"all-gather", "all-reduce"},
+    "dynamic mask": {"all-gather"},
     "second pass": {"all-gather", "all-reduce"},
-    "assemble": {"all-reduce"},
+    "assemble": {"all-gather"},
 }
 CLOSE = 1e-5  # of the spread of an array
 
