@@ -25,7 +25,7 @@ from vggtjax.method.fusion_family import paper_rule
 from vggtjax.method.fusion_inputs import observe
 from vggtjax.method.passes import Passes
 from vggtjax.network.attention import attention
-from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.backbone import ClipBatch
 from vggtjax.network.frames import AXIS, BY_FRAME, REPLICATED, Frames, OnDevices
 from vggtjax.network.model import parameter_shapes, predict
 from vggtjax.network.narrow import narrowed

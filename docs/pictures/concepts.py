@@ -91,7 +91,7 @@ def _demo_clip(model: Model) -> Clip:
 
     import vggtjax
     from vggtjax.method.cues import GramCues
-    from vggtjax.network.clip_batch import ClipBatch
+    from vggtjax.network.backbone import ClipBatch
     from vggtjax.network.model import predict
     from vggtjax.pretrained.embedded import demo_clip
 
@@ -257,7 +257,7 @@ def matches(model: Model, clip: Clip) -> Figure:
     from vggtjax.method.matched_motion import motion
     from vggtjax.method.matches import frame_pairs, patch_centres
     from vggtjax.method.passes import first_pass
-    from vggtjax.network.clip_batch import ClipBatch
+    from vggtjax.network.backbone import ClipBatch
     from vggtjax.network.pose import decode_pose
     from vggtjax.results.previews import overlay
 

@@ -14,7 +14,7 @@ import numpy as np
 from tests.static_world import GRID, PATCH, StaticWorld
 from vggtjax.method.passes import mine
 from vggtjax.method.witnesses import Seen
-from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.backbone import ClipBatch
 from vggtjax.network.frames import BY_FRAME, Frames
 from vggtjax.network.gathered_attention import gathered_attention
 from vggtjax.network.model import Predictions

@@ -28,7 +28,7 @@ from vggtjax.method.mask import (
 )
 from vggtjax.method.passes import mine
 from vggtjax.method.witnesses import Seen
-from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.backbone import ClipBatch
 from vggtjax.network.frames import Frames
 
 _otsu = jax.jit(otsu_threshold)

@@ -24,8 +24,7 @@ from vggtjax.method.matched_motion import FEWEST_FRAMES
 from vggtjax.method.passes import Passes, first_pass, mine, mine_soft, only, second_pass, track_from
 from vggtjax.method.soft_mask import SoftMasking
 from vggtjax.method.witnesses import Seen
-from vggtjax.network.backbone import encode
-from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.backbone import ClipBatch, encode
 from vggtjax.network.frames import BY_FRAME, REPLICATED, Frames
 from vggtjax.network.given import as_array, as_images
 from vggtjax.network.layers import Params

@@ -18,8 +18,7 @@ from vggtjax.method.matched_mask import Mined, mine_matched_mask
 from vggtjax.method.matches import Matches
 from vggtjax.method.soft_mask import SoftMasking, soft_pixels
 from vggtjax.method.witnesses import Seen, Witnesses
-from vggtjax.network.backbone import patch_grid
-from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.backbone import ClipBatch, patch_grid
 from vggtjax.network.frames import Frames, with_frames
 from vggtjax.network.layers import Params
 from vggtjax.network.model import FIELDS, Predictions, predict

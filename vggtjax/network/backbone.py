@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from vggtjax.config import VGGTConfig
 from vggtjax.errors import InputError
@@ -18,6 +20,14 @@ IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
 REGISTERS = 4
 _EPSILON = 1e-6
+
+
+class ClipBatch(NamedTuple):
+    """Images of a batch of clips, and what travels with them through every pass."""
+
+    images: Float[Array, "B S H W 3"]  # RGB in [0, 1]
+    patch_tokens: Float[Array, "B S P C"] | None = None  # what `encode` returned; a pass without them computes them
+    frame_count: Int[Array, " B"] | None = None  # real frames of each clip, its first ones, at least one; None: all
 
 
 @full_precision

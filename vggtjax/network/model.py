@@ -16,9 +16,8 @@ from jaxtyping import Array, Bool, Float, Int
 from vggtjax.config import Suppress, VGGTConfig
 from vggtjax.errors import InputError
 from vggtjax.network.aggregator import SPECIAL_TOKENS, Accumulator, Aggregator, aggregate, identity
-from vggtjax.network.backbone import Backbone, encode, patch_grid
+from vggtjax.network.backbone import Backbone, ClipBatch, encode, patch_grid
 from vggtjax.network.camera_head import ITERATIONS, CameraHead, predict_pose
-from vggtjax.network.clip_batch import ClipBatch
 from vggtjax.network.dpt_head import DENSE_HEADS, DenseHead, predict_dense, project_tap
 from vggtjax.network.frames import Frames
 from vggtjax.network.given import as_array, as_images, check_floats

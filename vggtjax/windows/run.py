@@ -33,8 +33,7 @@ from vggtjax.method.assembly import check_fuses
 from vggtjax.method.fusion_family import FusionParams
 from vggtjax.method.fusion_file import check_kept, fusion_digest
 from vggtjax.method.passes import track_from
-from vggtjax.network.backbone import encode
-from vggtjax.network.clip_batch import ClipBatch
+from vggtjax.network.backbone import ClipBatch, encode
 from vggtjax.network.track_head import check_track_size
 from vggtjax.options import Options
 from vggtjax.pipeline.agreement import agree_with_pixels
