@@ -15,6 +15,7 @@ import jax
 
 from vggtjax.network.frames import OnDevices
 from vggtjax.progress import OnStage, Progress, no_stage
+from vggtjax.storage.cores import core_count
 from vggtjax.storage.free_memory import return_freed_memory
 
 _Parameters = ParamSpec("_Parameters")
@@ -130,7 +131,7 @@ def _compilers() -> ThreadPoolExecutor:
 
     On one core with two hyperthreads, two threads compiled a pass for 17 s where one took 15.
     """
-    return ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // 2), "compile")
+    return ThreadPoolExecutor(max(1, core_count() // 2), "compile")
 
 
 def _memory(compiled: Any, shared: bool) -> StageMemory | None:
