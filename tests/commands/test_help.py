@@ -14,10 +14,8 @@ def test_every_option_shows_its_values_and_what_it_does(name, width, capsys, mon
     for flag in ("--help", "-h"):
         assert cli.main([name, flag]) == 0
     page = capsys.readouterr().out
-    lines = page.splitlines()
-    assert (
-        max(len(line) for line in page.splitlines() if line.startswith(("╭", "│"))) == width
-    )  # paragraphs wrap by themselves
+    boxed = [line for line in page.splitlines() if line.startswith(("╭", "│"))]  # paragraphs are left to the terminal
+    assert max(map(len, boxed)) <= width
     assert f"usage: vggtjax {name} " in page
     assert not re.search(r"--\S+ STR\b", page)
     rows = re.findall(r"^│ (--.*?)│$\n^│(.*?)│$", page, flags=re.MULTILINE)
