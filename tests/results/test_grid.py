@@ -6,7 +6,7 @@ from vggtjax.results.grid import BACKGROUND, GAP, MARGIN, Row, draw_grid, fitted
 
 
 def test_every_picture_has_a_place_of_its_own():
-    shades = np.arange(10, 70, 10, np.uint8).reshape(2, 3)
+    shades = np.arange(10, 70, 10).reshape(2, 3)
     rows = [Row(f"row {i}", [np.full((4, 5, 3), shade, np.uint8) for shade in row]) for i, row in enumerate(shades)]
     sheet = draw_grid("A title", ["one", "two", "three"], rows, (250, 200), notes="first\nsecond")
     bottom, right = len(sheet) - MARGIN, sheet.shape[1] - MARGIN
