@@ -195,6 +195,9 @@ def _connect(address: str | None) -> None:
         raise ClusterError(
             f"no cluster at {address} can be joined ({_short(problem)}); start one with: ray start --head"
         ) from problem
+    from ray._private import worker
+
+    worker._worker_logs_enabled = False  # else it prints a line into our table for each worker that ends
 
 
 def shared(nodes: Sequence[Mapping[str, float]], cluster: Cluster, devices: int = 1) -> tuple[int, int, float]:
