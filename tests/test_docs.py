@@ -215,8 +215,7 @@ def test_the_reference_has_every_option():
     fields = [*dataclasses.fields(Options), *dataclasses.fields(Saving), *dataclasses.fields(Windows)]
     names = {"compute_dtype": "dtype"}
     flags = {f"--{names.get(field.name, field.name).replace('_', '-')}" for field in fields}
-    assert {flag for flag in flags if f"`{flag}" not in page} == set()
-    assert "│" not in page
+    assert {flag for flag in flags if not re.search(rf"{flag}(?![\w-])", page)} == set()
     assert "(required)" in page
 
 

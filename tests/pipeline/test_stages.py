@@ -18,6 +18,7 @@ from vggtjax.network.model import init_params, parameter_shapes
 from vggtjax.pipeline.fields import assembled_fields
 from vggtjax.pipeline.lengths import padded_frames
 from vggtjax.pipeline.run import compile_ahead
+from vggtjax.pipeline.steps import Compile, Execute
 from vggtjax.results.not_finite import NotFiniteWarning, warn_of_not_finite
 
 SIDE, OFFSETS = 70, MotionConfig().offsets
@@ -78,6 +79,27 @@ def test_what_is_compiled_ahead_is_not_compiled_again(model, ahead):
     assert all(need.output > 0 for need in needs.values())
     with pytest.raises(InputError, match="multiples of the patch size 14"):
         compile_ahead(model, 2, 20, 70)
+
+
+def test_equal_programs_are_compiled_once():
+    def scaled(x, *, factor):
+        return factor * x
+
+    compiler, counted = Compile(), []
+    shape, ones = jax.ShapeDtypeStruct((3, 2), np.float32), jnp.ones((3, 2))
+
+    def ahead():
+        for name, factor in (("a", 2), ("b", 2), ("c", 3)):
+            assert compiler(name, scaled)(shape, factor=factor).shape == (3, 2)
+        assert compiler.wait(lambda done, count: counted.append((done, count))).keys() == {"a", "b", "c"}
+
+    assert compilations(ahead) == 2
+    assert counted == [(1, 2), (2, 2)]
+    run = Execute()("d", scaled)
+    assert compilations(lambda: run(ones, factor=3)) == 0
+    assert (run(ones, factor=2) == 2).all()
+    assert compilations(lambda: run(ones, factor=4)) == 1
+    assert compilations(lambda: run(ones[:2], factor=3)) >= 1
 
 
 def test_a_padded_clip_gives_the_same_and_shares_its_programs(model, ahead):

@@ -16,8 +16,10 @@ from vggtjax.storage.kept_text import kept_text
 def folder(tmp_path, monkeypatch):
     """Keep texts, as commands do, where they enable jax's cache of compiled programs."""
     monkeypatch.setenv("VGGTJAX_CACHE", str(tmp_path))
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", str(compiled_folder()))
-    return tmp_path / "texts"
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(compiled_folder()))
+    yield tmp_path / "texts"
+    jax.config.update("jax_compilation_cache_dir", before)
 
 
 @pytest.mark.parametrize("damage", [b"", b'{"a": [1,', b"\xff" * 99])

@@ -139,7 +139,8 @@ def _computed(
         count, cpus, gpus = shared(nodes, cluster, recipe.devices)
         # Rounding goes by the number of threads, so only a number that the user gives limits them.
         given = load, recipe, out, os.getcwd(), None if gpus else cluster.worker_cpus  # noqa: PTH109 - text
-        actor = ray.remote(Worker).options(num_cpus=cpus, num_gpus=gpus, max_restarts=-1, max_task_retries=1)
+        remote: Any = ray.remote(Worker)
+        actor = remote.options(num_cpus=cpus, num_gpus=gpus, max_restarts=-1, max_task_retries=1)
         workers = [actor.remote(*given) for _ in range(min(count, len(sources)))]
         calls: dict[Any, tuple[Any, str | None]] = {worker.ready.remote(): (worker, None) for worker in workers}
         waiting, left, first = iter(sources.items()), len(sources), None
@@ -153,8 +154,8 @@ def _computed(
                     answer = ray.get(call)
                 except RayError as problem:  # the worker's process ended twice, or never began
                     if name is None:
-                        known = isinstance(problem, RayTaskError) and isinstance(problem.cause, VggtjaxError)
-                        words = problem.cause if known else _short(problem)
+                        cause = problem.cause if isinstance(problem, RayTaskError) else None
+                        words = cause if isinstance(cause, VggtjaxError) else _short(problem)
                         raise ClusterError(f"a worker cannot begin: {words}") from problem
                     answer = failed(name, ClusterError(f"two workers ended with it in their work: {_short(problem)}"))
                 if isinstance(answer, ClipOutcome):
@@ -194,6 +195,9 @@ def _connect(address: str | None) -> None:
         raise ClusterError(
             f"no cluster at {address} can be joined ({_short(problem)}); start one with: ray start --head"
         ) from problem
+    from ray._private import worker
+
+    worker._worker_logs_enabled = False  # else it prints a line into our table for each worker that ends
 
 
 def shared(nodes: Sequence[Mapping[str, float]], cluster: Cluster, devices: int = 1) -> tuple[int, int, float]:

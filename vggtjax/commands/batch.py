@@ -27,7 +27,7 @@ def batch(
     recipe: Annotated[BatchRecipe, tyro.conf.arg(name="", help="")] = BatchRecipe(options=CONSISTENT),
     out: BatchFolder,
     shard: Shards = None,
-    cluster: Annotated[Cluster, tyro.conf.arg(name="cluster", help="")] = Cluster(),  # noqa: B008 (frozen)
+    cluster: Annotated[Cluster, tyro.conf.arg(name="cluster", help="")] = Cluster(),
 ) -> None:
     """Reconstruct many clips, each into a folder of its own; run the same command again to resume.
 

@@ -68,7 +68,7 @@ def view(
     if not results:
         raise InputError("no result; name the folder of one, such as demo-output")
     if export is not None and export.suffix != ".html":
-        other = "; vggtjax export RESULT OUT.rrd --to rerun writes a recording" if export.suffix == ".viser" else ""
+        other = "; vggtjax export --to rerun writes a recording" if export.suffix == ".viser" else ""
         raise InputError(f"export is {export}; expected a name that ends with .html{other}")
     report = Report()
     with report.running():

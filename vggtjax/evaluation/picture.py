@@ -35,7 +35,7 @@ def truth_sheet(
     depths |= {"Depth found": result.depth, "Depth true": true_depth}
     masks = {"Moving found": result.dynamic_mask} if result.has_mask else {}
     masks |= {"Moving true": np.asarray(truth.dynamic_mask)}
-    rows = [Row("Picture", result.images[shown])]
+    rows = [Row("Picture", [*result.images[shown]])]
     for label, depth in depths.items():
         scaled = (depth * median_scale(depth, true_depth)).astype(np.float32)[shown]
         rows.append(Row(label, [color_depth(frame, everywhere, inverse_range) for frame in scaled]))

@@ -32,9 +32,6 @@ class Quantised(NamedTuple):
     scale: Float[Array, "*L 1 O"]
 
 
-STORED = (Quantised, Halves)
-
-
 def is_quantised(name: str) -> bool:
     """Return whether the parameter of this dotted name is stored in 8 bits: kernels of the blocks, 88 % of VGGT-1B."""
     return name.startswith(_BLOCKS) and name.endswith(".kernel")
@@ -58,7 +55,7 @@ def halves(kernel: np.ndarray) -> Halves:
 
 def is_stored(leaf: Any) -> bool:
     """Return whether a parameter is a kernel in another form."""
-    return isinstance(leaf, STORED)
+    return isinstance(leaf, Quantised | Halves)
 
 
 def as_multiplied(params: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar
 import jax
 
 from vggtjax.progress import OnStage, Progress, no_stage
+from vggtjax.storage.cores import core_count
 from vggtjax.storage.free_memory import return_freed_memory
 
 _Parameters = ParamSpec("_Parameters")
@@ -133,7 +134,7 @@ def _compilers() -> ThreadPoolExecutor:
 
     On one core with two hyperthreads, two threads compiled a pass for 17 s where one took 15.
     """
-    return ThreadPoolExecutor(max(1, (os.cpu_count() or 1) // 2), "compile")
+    return ThreadPoolExecutor(max(1, core_count() // 2), "compile")
 
 
 def _memory(compiled: Any, shared: bool) -> StageMemory | None:

@@ -68,14 +68,6 @@ def fit_field(
     return fields
 
 
-def at_places(
-    fields: Float64[np.ndarray, "S h w"], frame: Int[np.ndarray, " N"], place: Float[np.ndarray, "N 2"]
-) -> Float64[np.ndarray, " N"]:
-    """Return the fields at places, bilinear between the nodes."""
-    nodes, weights = _basis(place, fields.shape[1:])
-    return np.sum(fields.reshape(len(fields), -1)[frame[:, None], nodes] * weights, axis=1)
-
-
 def at_pixels(field: Float64[np.ndarray, "h w"], size: tuple[int, int]) -> Float64[np.ndarray, "H W"]:
     """Return a frame's field at the centres of pixels."""
     rows, columns = (_hat((np.arange(n) + 0.5) / n, k) for n, k in zip(size, field.shape, strict=True))

@@ -23,14 +23,12 @@ class Row(NamedTuple):
         pictures: [h, w, 3] each, of any size.
         notes: lines below the label.
         ramp: the colours of values, and words for the lowest and the highest.
-        sharp: colours are not mixed where pictures are enlarged.
     """
 
     label: str
     pictures: Sequence[UInt8[np.ndarray, "h w 3"]]
     notes: str = ""
     ramp: tuple[UInt8[np.ndarray, "256 3"], str, str] | None = None
-    sharp: bool = False
 
 
 def fitted(shape: tuple[int, int], most: tuple[int, int]) -> tuple[int, int]:
@@ -64,7 +62,7 @@ def draw_grid(
             sheet.paste(Image.fromarray(colors[None]).resize((width, 10)), (MARGIN, y + 24))
             draw.text((MARGIN, y + 38), lowest, FAINT, small)
             draw.text((MARGIN + width, y + 38), highest, FAINT, small, "ra")
-        filtering = Image.Resampling.NEAREST if row.sharp else Image.Resampling.LANCZOS
         for column, picture in enumerate(row.pictures):
-            sheet.paste(Image.fromarray(picture).resize(size, filtering), (left + column * step_x, y))
+            thumbnail = Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS)
+            sheet.paste(thumbnail, (left + column * step_x, y))
     return np.asarray(sheet)

@@ -148,7 +148,7 @@ def _rows(result: Result, shown: Int[np.ndarray, " F"], size: tuple[int, int]) -
     valid = result.valid_pixels
     inverse_range = inverse_depth_range(result.depth, valid)
     depths = [color_depth(result.depth[frame], valid[frame], inverse_range) for frame in shown]
-    rows = [Row("Picture", result.images[shown]), Row("Depth", depths, ramp=(DEPTH_COLORS, "far", "near"))]
+    rows = [Row("Picture", [*result.images[shown]]), Row("Depth", depths, ramp=(DEPTH_COLORS, "far", "near"))]
     if result.saliency is not None and np.nan_to_num(result.saliency).any():
         rows.append(Row("Saliency", [_heat(x, size) for x in result.saliency[shown]], ramp=(SALIENCY_COLORS, "0", "1")))
     if result.motion is not None:

@@ -24,8 +24,12 @@ def draw_sheet(scenes: Sequence[Path], title: str) -> Image.Image:
     `scenes` are folders that `write_scenes` wrote, of images of one size.
     """
     chosen = [scenes[i] for i in np.linspace(0, len(scenes) - 1, min(len(scenes), _MOST_ROWS)).round().astype(int)]
-    rows = [Row(scene.name, _row(scene), sharp=True) for scene in chosen]
-    size = fitted(rows[0].pictures[0].shape[:2], _THUMBNAIL)
+    pictures = [_row(scene) for scene in chosen]
+    size = fitted(pictures[0][0].shape[:2], _THUMBNAIL)
+    rows = []
+    for scene, (*mixed, parts, flow) in zip(chosen, pictures, strict=True):
+        unmixed = [Image.fromarray(picture).resize(size, Image.Resampling.NEAREST) for picture in (parts, flow)]
+        rows.append(Row(scene.name, [*mixed, *map(np.asarray, unmixed)]))  # their mixed colours would have no meaning
     return Image.fromarray(draw_grid(title, _COLUMNS, rows, size))
 
 

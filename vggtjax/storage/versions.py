@@ -10,7 +10,7 @@ from pathlib import Path
 _PACKAGE = Path(__file__).parents[1]
 
 
-def package_digest() -> str:
+def _package_digest() -> str:
     """Return a digest of all Python files of this package."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
@@ -22,7 +22,7 @@ def running_versions() -> str:
     """Return in words which code runs in this process: equal words, equal results."""
     from vggtjax import __version__
 
-    return f"vggtjax {__version__} (sources {package_digest()[:8]}) with jax {version('jax')}"
+    return f"vggtjax {__version__} (sources {_package_digest()[:8]}) with jax {version('jax')}"
 
 
 @cache
@@ -33,4 +33,4 @@ def source_digest() -> str:
     from vggtjax.storage.cores import core_count
 
     versions = [version(name) for name in ("jax", "jaxlib", "flax")]
-    return f"{' '.join(versions)} {jax.default_backend()} {core_count()} {package_digest()}"
+    return f"{' '.join(versions)} {jax.default_backend()} {core_count()} {_package_digest()}"

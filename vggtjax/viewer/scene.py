@@ -67,7 +67,7 @@ def scene_of(
     positions, frames, pixels = (np.concatenate(fields) for fields in zip(*parts, strict=True))
     points = ShownPoints(positions, frames, pixels)
     middle, radius = middle_and_radius(result)
-    all_widths = shown_widths(result, static, moving)
+    all_widths = _shown_widths(result, static, moving)
     widths = place.scale * np.concatenate([widths[order] for widths, order in zip(all_widths, orders, strict=True)])
     centre, radius = place.points(middle), radius * place.scale
     positions = place.points(points.positions)
@@ -125,7 +125,7 @@ def frame_rate(result: Result) -> float:
     return float(np.clip(1 / step, 0.5, 60)) if step > 0 else PLAIN_RATE
 
 
-def shown_widths(result: Result, static: ShownPoints, moving: list[ShownPoints]) -> list[Float32[np.ndarray, " N"]]:
+def _shown_widths(result: Result, static: ShownPoints, moving: list[ShownPoints]) -> list[Float32[np.ndarray, " N"]]:
     """Return the widths of the static points and of the moving ones of each frame, thinned as they are."""
     is_moving = result.valid_pixels & result.dynamic_mask
     pixels = [np.count_nonzero(result.valid_pixels & ~result.dynamic_mask), *np.count_nonzero(is_moving, axis=(1, 2))]
