@@ -37,9 +37,9 @@ def write_outputs(result: Reconstruction, saved: Path, on_stage: OnStage) -> tup
     except BaseException:
         shutil.rmtree(saved.parent, ignore_errors=True)
         raise
-    offered = [archive, saved / "report.html", viewer, film]
-    for path in {path for path in saved.rglob("*") if path.is_file()} - {*shown, *offered}:
+    for path in {path for path in saved.rglob("*") if path.is_file()} - {*shown}:
         path.unlink()  # the zip has it
     count, height, width = result.depth.shape
     moving = f", {result.dynamic_share:.1%} of them moving" if result.has_mask else ""
-    return f"{count} frames of {width} x {height} pixels{moving}. {result.model_note}", shown, offered
+    facts = f"**Done**: {count} frames of {width} x {height} pixels{moving}.\n\n{result.model_note}"
+    return facts, shown, [archive, viewer, film]

@@ -55,7 +55,7 @@ class Jobs:
             def advance(done: int, total: int | None) -> None:
                 if stop.is_set():
                     raise CancelledError
-                progress((done, total), desc=name)
+                progress((done, total) if total else 0, desc=name)
 
             advance(0, None)
             return nullcontext(advance)
@@ -111,7 +111,7 @@ def build_page(jobs: Jobs) -> gr.Blocks:
                     with gr.Tab("Sheet"):
                         sheet = gr.Image(label="Up to eight frames at a glance", elem_id="sheet")
                     with gr.Tab("Files"):
-                        offered = gr.File(label="Everything (zip), report, viewer, film", elem_id="downloads")
+                        offered = gr.File(label="Everything in a zip, viewer, film", elem_id="downloads")
         listener = {"api_visibility": "private", "show_progress_on": status, "concurrency_id": "job"}
         outputs = [status, results, viewer, film, layers, sheet, offered]
         demo, whole = gr.State(DEMO), gr.State(0)
@@ -126,7 +126,7 @@ def build_page(jobs: Jobs) -> gr.Blocks:
 
 
 def serve(runner: Runner, folder: Path, host: str, port: int, password: str | None, ready: Callable[[], None]) -> None:
-    """Serve the app until SIGINT. Without a password, requests must name this machine: no other site reaches it then."""
+    """Serve the app until SIGINT. Without a password, requests must name this machine; no other site can."""
     names = Middleware(TrustedHostMiddleware, allowed_hosts=["*"] if password else [*_THIS_MACHINE, host])
     page = build_page(jobs := Jobs(runner, folder))
     try:
