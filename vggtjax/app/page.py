@@ -21,7 +21,6 @@ from vggtjax.options import METHODS
 from vggtjax.progress import Progress
 
 USER = "vggtjax"  # the name to sign in with
-_THIS_MACHINE = ("localhost", "127.0.0.1", "[::1]")
 _DAY = (3600, 86400)  # seconds: every hour, uploads and results of yesterday go
 _PROGRESS = gr.Progress()
 _INTRODUCTION = """# vggtjax: a video in, a 4-D scene out
@@ -30,11 +29,8 @@ through: a viewer that opens offline, a film, the layers frame by frame, and a z
 _MODELS = "“demo” is small and knows generated scenes only; real footage needs VGGT-1B."
 _METHODS = "4dvggt-d is the paper's; 4dvggt-m has other masks; vggt is the fastest."
 _FPS = "0 spreads the frames over the whole video; else they are taken from its start."
-_LAYERS = "Picture and depth (red is near); confidence (yellow is sure) and what moves"
 _VIEWER = '<iframe src="gradio_api/file={}" title="3-D viewer" sandbox="allow-scripts allow-downloads"></iframe>'
-_OFF: Any = dict.fromkeys(
-    ("run_history", "enable_monitoring", "share", "inline", "ssr_mode", "pwa", "mcp_server"), False
-)
+_OFF: Any = dict.fromkeys(("run_history", "enable_monitoring", "share", "inline", "ssr_mode", "mcp_server"), False)
 
 
 class Jobs:
@@ -67,8 +63,7 @@ class Jobs:
         except CancelledError:
             raise gr.Error("cancelled", print_exception=False) from None
         except Exception as error:
-            text = html.escape(sentence(error, self.folder))
-            raise gr.Error(text, duration=None, title="No result", print_exception=False) from None
+            raise gr.Error(html.escape(sentence(error, self.folder)), duration=None, print_exception=False) from None
         viewer, *others = map(str, shown)
         return [facts, gr.Column(visible=True), _VIEWER.format(quote(viewer)), *others, [*map(str, offered)]]
 
@@ -92,13 +87,13 @@ def build_page(jobs: Jobs) -> gr.Blocks:
             with gr.Column(scale=2, min_width=320):
                 files = gr.File(label="Video, or pictures", file_count="multiple", file_types=["video", "image"])
                 gr.Markdown(f"At most {limits.max_upload_mb} MB, and {limits.max_seconds} s of video.")
+                start = gr.Button("Reconstruct", variant="primary", elem_id="start")
+                example = gr.Button("Try the demo clip", elem_id="example")
+                cancel = gr.Button("Cancel", variant="stop", elem_id="cancel")
                 model = gr.Dropdown(names, value=names[0], label="Model", info=_MODELS)
                 method = gr.Dropdown(list(METHODS), value="4dvggt-d", label="Method", info=_METHODS)
                 frames = gr.Slider(min(2, most - 1), most, min(16, most), step=1, label="Frames")
                 fps = gr.Slider(0, 30, 0, step=0.5, label="Frames per second", info=_FPS)
-                start = gr.Button("Reconstruct", variant="primary", elem_id="start")
-                example = gr.Button("Try the demo clip", elem_id="example")
-                cancel = gr.Button("Cancel", variant="stop", elem_id="cancel")
             with gr.Column(scale=5, min_width=320):
                 status = gr.Markdown("What comes out is shown here.", elem_id="status", container=True)
                 with gr.Column(visible=False) as results:
@@ -107,36 +102,39 @@ def build_page(jobs: Jobs) -> gr.Blocks:
                     with gr.Tab("Film"):
                         film = gr.Video(label="The camera circles the scene", autoplay=True, loop=True, elem_id="film")
                     with gr.Tab("Layers"):
-                        layers = gr.Video(label=_LAYERS, autoplay=True, loop=True, elem_id="layers")
+                        layers = gr.Video(
+                            label="Picture, depth, confidence, motion", autoplay=True, loop=True, elem_id="layers"
+                        )
                     with gr.Tab("Sheet"):
                         sheet = gr.Image(label="Up to eight frames at a glance", elem_id="sheet")
                     with gr.Tab("Files"):
                         offered = gr.File(label="Everything in a zip, viewer, film", elem_id="downloads")
         listener = {"api_visibility": "private", "show_progress_on": status, "concurrency_id": "job"}
         outputs = [status, results, viewer, film, layers, sheet, offered]
-        demo, whole = gr.State(DEMO), gr.State(0)
-        own_job: Any = start.click(jobs.run, [files, model, method, frames, fps], outputs, **listener)
-        demo_job: Any = example.click(jobs.run, [demo, demo, method, frames, whole], outputs, **listener)
-        cancel.click(jobs.stop, queue=False, api_visibility="private")
-        cancel.click(
-            lambda: "Cancelled.", None, status, cancels=[own_job, demo_job], queue=False, api_visibility="private"
-        )
+        own: Any = start.click(jobs.run, [files, model, method, frames, fps], outputs, **listener)
+        embedded = [gr.State(DEMO), gr.State(DEMO), method, frames, gr.State(0)]
+        demo: Any = example.click(jobs.run, embedded, outputs, **listener)
+        at_once: Any = {"queue": False, "api_visibility": "private"}
+        cancel.click(lambda: "Cancelled.", None, status, cancels=[own, demo], **at_once)
+        cancel.click(jobs.stop, **at_once)
         page.unload(jobs.stop)
     return page.queue(max_size=limits.max_waiting, default_concurrency_limit=1, api_open=False)
 
 
 def serve(runner: Runner, folder: Path, host: str, port: int, password: str | None, ready: Callable[[], None]) -> None:
     """Serve the app until SIGINT. Without a password, requests must name this machine; no other site can."""
-    names = Middleware(TrustedHostMiddleware, allowed_hosts=["*"] if password else [*_THIS_MACHINE, host])
+    hosts = ["*"] if password else ["localhost", "127.0.0.1", "[::1]", host]
+    only_hosts = Middleware(TrustedHostMiddleware, allowed_hosts=hosts)
     page = build_page(jobs := Jobs(runner, folder))
     try:
         page.launch(
             server_name=f"[{host}]" if ":" in host else host,
             server_port=port,
             auth=(USER, password) if password else None,
+            auth_message=f"Sign in as {USER}.",
             max_file_size=runner.limits.max_upload_mb * 1_000_000,
             allowed_paths=[str(jobs.results)],
-            app_kwargs={"middleware": [names], "openapi_url": None},
+            app_kwargs={"middleware": [only_hosts], "openapi_url": None},
             theme=Default(primary_hue="teal", font=("system-ui", "sans-serif"), font_mono=("monospace",)),
             css_paths=Path(__file__).with_name("page.css"),
             footer_links=[],
