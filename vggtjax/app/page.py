@@ -6,7 +6,7 @@ import html
 import threading
 from collections.abc import Callable
 from concurrent.futures import CancelledError
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -18,7 +18,6 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from vggtjax.app.run import DEMO, Runner, sentence
 from vggtjax.options import METHODS
-from vggtjax.progress import Progress
 
 USER = "vggtjax"  # the name to sign in with
 _DAY = (3600, 86400)  # seconds: every hour, uploads and results of yesterday go
@@ -30,7 +29,8 @@ _MODELS = "“demo” is small and knows generated scenes only; real footage nee
 _METHODS = "4dvggt-d is the paper's; 4dvggt-m has other masks; vggt is the fastest."
 _FPS = "0 spreads the frames over the whole video; else they are taken from its start."
 _VIEWER = '<iframe src="gradio_api/file={}" title="3-D viewer" sandbox="allow-scripts allow-downloads"></iframe>'
-_OFF: Any = dict.fromkeys(("run_history", "enable_monitoring", "share", "inline", "ssr_mode", "mcp_server"), False)
+_OFF = dict.fromkeys(("run_history", "enable_monitoring", "share", "inline", "ssr_mode", "mcp_server"), False)
+_PLAIN: Any = {"footer_links": [], "quiet": True, "prevent_thread_lock": True, **_OFF}
 
 
 class Jobs:
@@ -47,7 +47,7 @@ class Jobs:
         self._stop.set()  # of a job that gradio no longer waits for
         self._owner, self._stop = str(request.session_hash), (stop := threading.Event())
 
-        def on_stage(name: str) -> AbstractContextManager[Progress]:
+        def on_stage(name: str) -> nullcontext[Any]:
             def advance(done: int, total: int | None) -> None:
                 if stop.is_set():
                     raise CancelledError
@@ -123,8 +123,7 @@ def build_page(jobs: Jobs) -> gr.Blocks:
 
 def serve(runner: Runner, folder: Path, host: str, port: int, password: str | None, ready: Callable[[], None]) -> None:
     """Serve the app until SIGINT. Without a password, requests must name this machine; no other site can."""
-    hosts = ["*"] if password else ["localhost", "127.0.0.1", "[::1]", host]
-    only_hosts = Middleware(TrustedHostMiddleware, allowed_hosts=hosts)
+    by_name = Middleware(TrustedHostMiddleware, allowed_hosts=["localhost", "127.0.0.1", "[::1]", host])
     page = build_page(jobs := Jobs(runner, folder))
     try:
         page.launch(
@@ -134,13 +133,10 @@ def serve(runner: Runner, folder: Path, host: str, port: int, password: str | No
             auth_message=f"Sign in as {USER}.",
             max_file_size=runner.limits.max_upload_mb * 1_000_000,
             allowed_paths=[str(jobs.results)],
-            app_kwargs={"middleware": [only_hosts], "openapi_url": None},
+            app_kwargs={"middleware": [] if password else [by_name], "openapi_url": None},
             theme=Default(primary_hue="teal", font=("system-ui", "sans-serif"), font_mono=("monospace",)),
             css_paths=Path(__file__).with_name("page.css"),
-            footer_links=[],
-            quiet=True,
-            prevent_thread_lock=True,
-            **_OFF,
+            **_PLAIN,
         )
         ready()
         page.block_thread()
