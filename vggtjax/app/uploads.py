@@ -25,13 +25,13 @@ def checked_clip(files: Sequence[Path], frames: int, fps: float, limits: Limits)
     """
     files = in_order(files, lambda path: Path(path.name))
     names = ", ".join(one_line(path.name, 60) for path in files[:3])
+    if not all(path.is_file() for path in files):
+        raise ClipError(f"{names}: the upload is not here any more; send it again")
     is_video = any(map(is_video_name, files))
     if not is_video and not all(map(is_image_name, files)):
         raise ClipError(f"{names}: by its name this is no video and no picture; send one such as .mp4, .mov or .jpg")
-    if is_video and len(files) > 1:
-        raise ClipError(f"{len(files)} files with a video among them; send one video, or pictures only")
-    if len(files) > _MOST_PICTURES:
-        raise ClipError(f"{len(files)} pictures were sent; send at most {_MOST_PICTURES}")
+    if len(files) > (1 if is_video else _MOST_PICTURES):
+        raise ClipError(f"{len(files)} files were sent; send one video, or at most {_MOST_PICTURES} pictures")
     if (megabytes := sum(path.stat().st_size for path in files) / 1e6) > limits.max_upload_mb:
         raise ClipError(f"the upload has {megabytes:.1f} MB; send at most {limits.max_upload_mb} MB")
     source = open_source(files[0] if is_video else files)

@@ -45,7 +45,7 @@ def app(
             f"host is {host!r}, which other machines reach: give a --password to sign in with, or leave out --host"
         )
     if password is not None and len(password) < _LEAST_PASSWORD:
-        raise InputError(f"password has {len(password)} characters; expected at least {_LEAST_PASSWORD}")
+        raise InputError(f"password is {len(password)} characters long; expected at least {_LEAST_PASSWORD}")
     check_extra("the app", "app", "gradio")
     from vggtjax.app.run import Runner
 
