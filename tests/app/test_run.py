@@ -5,6 +5,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from tests.room import make_room
 from vggtjax.app import outputs
@@ -58,6 +59,16 @@ def test_a_cancelled_job_leaves_no_file(tmp_path):
     with pytest.raises(KeyError):
         Runner((), Limits()).run([], "demo", "vggt", 2, 0, tmp_path, on_stage)
     assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("tiny_demo", "reconstructed")
+@pytest.mark.parametrize(("name", "stem"), [("..<b> c.png", "b-c"), ("....png", "clip"), ("é" * 90 + ".png", "clip")])
+def test_results_have_safe_names(tmp_path, name, stem):
+    Image.new("RGB", (28, 28), "teal").save(tmp_path / name)
+    offered = Runner((), Limits()).run([tmp_path / name] * 2, "demo", "vggt", 2, 0, tmp_path, lambda _: nullcontext())[
+        2
+    ]
+    assert offered[0].name == f"{stem}-vggt.zip"
 
 
 def test_files_are_checked_before_the_model_is_loaded(tmp_path, monkeypatch):
