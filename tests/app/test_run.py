@@ -64,7 +64,7 @@ def test_a_cancelled_job_leaves_no_file(tmp_path):
 @pytest.mark.usefixtures("tiny_demo", "reconstructed")
 @pytest.mark.parametrize(("name", "stem"), [("..<b> c.png", "b-c"), ("....png", "clip"), ("é" * 90 + ".png", "clip")])
 def test_results_have_safe_names(tmp_path, name, stem):
-    Image.new("RGB", (28, 28), "teal").save(tmp_path / name)
+    Image.new("RGB", (28, 28), "teal").save(tmp_path / name, "PNG")
     offered = Runner((), Limits()).run([tmp_path / name] * 2, "demo", "vggt", 2, 0, tmp_path, lambda _: nullcontext())[
         2
     ]

@@ -108,19 +108,19 @@ def test_an_error_is_a_sentence_without_paths(client):
     "values", [("/etc/passwd", "vggt", 2, 0), ("demo", "other", 2, 0), ("demo", "vggt", 3, 0), ("demo", "vggt", 2, 31)]
 )
 def test_values_that_the_page_does_not_offer_are_refused(client, values):
-    said = run(client, upload(client, "a.png", b"words").json()[0], *values)
+    said = run(client, upload(client, "a.mp4", b"words").json()[0], *values)
     assert '"success":false' in said
-    assert "cannot read" not in said  # the picture was not opened
+    assert "cannot read" not in said  # the video was not opened
 
 
 def test_files_of_the_machine_are_not_read(client, tmp_path):
-    assert "cannot read" in run(client, upload(client, "a.png", b"words").json()[0])
-    (tmp_path / "a.png").write_bytes(b"private")
+    assert "cannot read" in run(client, upload(client, "a.mp4", b"words").json()[0])
+    (tmp_path / "a.mp4").write_bytes(b"private")
     for path in (
-        str(tmp_path / "a.png"),
+        str(tmp_path / "a.mp4"),
         "/etc/passwd",
         "/dev/zero",
-        upload(client, "b.png", b"").json()[0] + "/../../x",
+        upload(client, "b.mp4", b"").json()[0] + "/../../x",
     ):
         said = run(client, path)
         assert '"success":false' in said, path
