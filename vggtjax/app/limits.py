@@ -9,31 +9,24 @@ from msgspec import Meta
 
 from vggtjax.storage.json_values import check_fields
 
-LEAST_TOKEN = 16  # characters
 _Count = Annotated[int, Meta(ge=1, le=100_000)]
 
 
 @dataclass(frozen=True)
 class Limits:
-    """The bounds of a job, of the queue and of the disk. Raises InputError for a number below 1.
+    """The bounds of a job and of the queue. Raises InputError for a number below 1.
 
     Attributes:
         max_upload_mb: megabytes of the video, or of all pictures together
         max_seconds: length of a video
         max_frames: frames that are reconstructed of a video or of pictures
         max_waiting: jobs that wait for their turn; one runs at a time
-        max_results: finished results on disk; older ones are removed
     """
 
     max_upload_mb: _Count = 500
     max_seconds: _Count = 300
     max_frames: _Count = 32
     max_waiting: _Count = 8
-    max_results: _Count = 8
 
     def __post_init__(self) -> None:
         check_fields(self)
-
-    @property
-    def upload_bytes(self) -> int:
-        return self.max_upload_mb * 1_000_000

@@ -1,213 +1,145 @@
-"""The page: what to choose on the left, what comes out on the right; below each other on a phone."""
+"""The page and its server, of gradio's own parts: its queue runs one job at a time, its progress shows the stages."""
 
 from __future__ import annotations
 
-import asyncio
-import time
-from collections.abc import AsyncIterator
+import html
+import threading
+from collections.abc import Callable
+from concurrent.futures import CancelledError
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import gradio as gr
-import msgspec
-from gradio.themes import Base, Soft
+from gradio.themes import Default
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
 
-from vggtjax.app.jobs import Desk, Job, Request
-from vggtjax.app.models import DEMO
-from vggtjax.errors import InputError
+from vggtjax.app.run import DEMO, Runner, sentence
 from vggtjax.options import METHODS
-from vggtjax.storage.markup import macros
 
-RESULTS = "results"  # the path under which the server serves the folder of results
-_LOOK_EVERY = 0.3  # seconds
-_CLEAN_UP = (3600, 86400)  # seconds: every hour, uploads of yesterday go
-_HTML = macros("app/status.html")
-_FRAMES, _LEAST_FRAMES = 16, 2
-_MOST_FPS = 30
-_TITLE = "vggtjax: a video in, a 4-D scene out"
-_INTRODUCTION = (
-    "# vggtjax\nDrop a video. You get the **cameras**, the **depth** and a mask of **what moves** in every frame, and "
-    "a **4-D point cloud** to fly through: a viewer, a film and all files."
-)
-_LAYERS = "Picture and depth (red is near) above; confidence (yellow is sure) and what moves below."
-_SHEET = "Up to eight frames at a glance. A click opens the picture in full size."
-_FILM = "The camera circles the scene while the moving points play."
-CSS = (Path(__file__).with_name("page.css")).read_text(encoding="utf-8")
+USER = "vggtjax"  # the name to sign in with
+_DAY = (3600, 86400)  # seconds: every hour, uploads and results of yesterday go
+_PROGRESS = gr.Progress()
+_INTRODUCTION = """# vggtjax: a video in, a 4-D scene out
+You get the **cameras**, the **depth** and a mask of **what moves** in every frame, and a **4-D point cloud** to fly
+through: a viewer that opens offline, a film, the layers frame by frame, and a zip of all files."""
+_MODELS = "“demo” is small and knows generated scenes only; real footage needs VGGT-1B."
+_METHODS = "4dvggt-d is the paper's; 4dvggt-m has other masks; vggt is the fastest."
+_FPS = "0 spreads the frames over the whole video; else they are taken from its start."
+_VIEWER = '<iframe src="gradio_api/file={}" title="3-D viewer" sandbox="allow-scripts allow-downloads"></iframe>'
+_OFF = dict.fromkeys(("run_history", "enable_monitoring", "share", "inline", "ssr_mode", "mcp_server"), False)
+_PLAIN: Any = {"footer_links": [], "quiet": True, "prevent_thread_lock": True, **_OFF}
 
 
-def theme() -> Base:
-    """Return the look of the page, with fonts of the user's own system."""
-    fonts = ("system-ui", "-apple-system", "Segoe UI", "Roboto", "sans-serif")
-    mono = ("ui-monospace", "Menlo", "Consolas", "monospace")
-    look = Soft(primary_hue="teal", neutral_hue="slate", font=fonts, font_mono=mono)
-    return look.set(
-        block_title_background_fill="none",
-        block_title_background_fill_dark="none",
-        block_title_text_color="*body_text_color",
-        block_title_text_color_dark="*body_text_color",
-        block_title_padding="0",
-        block_label_background_fill="none",
-        block_label_background_fill_dark="none",
-        block_label_text_color="*body_text_color",
-        block_label_text_color_dark="*body_text_color",
-    )
+class Jobs:
+    """Runs the jobs of the page: a cancelled one goes on to its next step, for which the next one waits."""
 
+    def __init__(self, runner: Runner, folder: Path) -> None:
+        self.runner, self.folder, self.results = runner, folder, folder / "results"
+        self._turn, self._owner, self._stop = threading.Lock(), "", threading.Event()
 
-def build_page(desk: Desk) -> gr.Blocks:
-    """Return the page, whose jobs run at the desk."""
-    limits = desk.limits
-    with gr.Blocks(title=_TITLE, analytics_enabled=False, fill_width=True, delete_cache=_CLEAN_UP) as page:
-        gr.Markdown(_INTRODUCTION, elem_classes="introduction")
-        with gr.Row(elem_classes="columns"):
-            with gr.Column(scale=2, min_width=320):
-                files = gr.File(
-                    label="Video, or several pictures",
-                    file_count="multiple",
-                    file_types=["video", "image"],
-                    height=170,
-                    elem_id="clip",
-                )
-                gr.Markdown(
-                    f"At most {limits.max_upload_mb} MB, and {limits.max_seconds} s of video.", elem_classes="limits"
-                )
-                model = gr.Dropdown(
-                    list(desk.models.names),
-                    value=desk.models.names[0],
-                    label="Model",
-                    info="“demo” is small and knows generated scenes only; real footage needs VGGT-1B.",
-                )
-                method = gr.Dropdown(
-                    list(METHODS),
-                    value="4dvggt-d",
-                    label="Method",
-                    info="4dvggt-d is the paper's; 4dvggt-m has other masks; vggt is the fastest.",
-                )
-                frames = gr.Slider(
-                    min(_LEAST_FRAMES, limits.max_frames - 1),  # below its greatest
-                    limits.max_frames,
-                    value=min(_FRAMES, limits.max_frames),
-                    step=1,
-                    label="Frames",
-                    info="More frames see more of the scene, and take more time and memory.",
-                )
-                fps = gr.Slider(
-                    0,
-                    _MOST_FPS,
-                    value=0,
-                    step=0.5,
-                    label="Frames per second",
-                    info="0 spreads the frames over the whole video; else they are taken from its start.",
-                )
-                with gr.Row():
-                    start = gr.Button("Reconstruct", variant="primary", elem_id="start", min_width=120)
-                    cancel = gr.Button("Cancel", variant="stop", visible=False, elem_id="cancel", min_width=80)
-                example = gr.Button("Try the demo clip", variant="secondary", elem_id="example")
-            with gr.Column(scale=5, min_width=320):
-                progress = gr.HTML(_HTML.idle(), elem_id="progress")
-                with gr.Column(visible=False, elem_id="results") as results:
-                    with gr.Tabs():
-                        shown = []
-                        for name in ("Viewer", "Film", "Layers", "Sheet"):
-                            with gr.Tab(name, render_children=True):
-                                shown.append(gr.HTML(elem_id=name.lower()))
-                    shown.append(gr.HTML(elem_id="downloads"))
-        for block in (files, model, method, frames, fps):
-            block.async_move_resource_to_block_cache = _stays  # no address is fetched
-        # Every user may wait for a job here; the desk decides whose turn it is.
-        outputs = [progress, results, start, example, cancel, *shown]
-        listener = {
-            "outputs": outputs,
-            "concurrency_limit": None,
-            "preprocess": False,  # the callbacks check all values, and say what is wrong
-            "show_progress": "hidden",
-            "api_visibility": "private",
-        }
-        watched = _Watched(desk)
-        start.click(watched.own, [files, model, method, frames, fps], **listener)
-        example.click(watched.demo, [method, frames], **listener)
-        cancel.click(watched.cancel, None, None, queue=False, show_progress="hidden", api_visibility="private")
-        page.unload(watched.leave)
-    page.queue(max_size=10 * (limits.max_waiting + 1), api_open=False)
-    return page
-
-
-async def _stays(url_or_file_path: str | Path | None) -> str | None:
-    return None if url_or_file_path is None else str(url_or_file_path)
-
-
-class _File(msgspec.Struct):
-    """What counts of an upload's entry."""
-
-    path: str
-
-
-class _Watched:
-    """The page's callbacks."""
-
-    def __init__(self, desk: Desk) -> None:
-        self._desk = desk
-
-    async def own(
-        self, files: Any, model: Any, method: Any, frames: Any, fps: Any, request: gr.Request
-    ) -> AsyncIterator[list[Any]]:
-        """Run the user's own clip; files are entries of uploads."""
+    def run(self, request: gr.Request, files, model, method, frames, fps, progress=_PROGRESS) -> list[Any]:
+        """Return the page's outputs of uploaded files, or of `DEMO`, the embedded clip."""
         if not files:
-            yield _changes(_HTML.refusal("no clip yet: drop a video or pictures first, or try the demo clip"))
-            return
-        async for change in self._watch((files, model, method, frames, fps), request):
-            yield change
+            raise gr.Error("no clip yet: drop a video or pictures first, or try the demo clip", print_exception=False)
+        self._stop.set()  # of a job that gradio no longer waits for
+        self._owner, self._stop = str(request.session_hash), (stop := threading.Event())
 
-    async def demo(self, method: Any, frames: Any, request: gr.Request) -> AsyncIterator[list[Any]]:
-        """Run the embedded clip with the embedded model."""
-        async for change in self._watch(([], DEMO, method, frames, 0), request):
-            yield change
+        def on_stage(name: str) -> nullcontext[Any]:
+            def advance(done: int, total: int | None) -> None:
+                if stop.is_set():
+                    raise CancelledError
+                progress((done, total) if total else 0, desc=name)
 
-    def cancel(self, request: gr.Request) -> None:
-        self._desk.cancel(str(request.session_hash))
+            advance(0, None)
+            return nullcontext(advance)
 
-    def leave(self, request: gr.Request) -> None:
-        """Cancel the job of a closed page."""
-        self._desk.cancel(str(request.session_hash))
-
-    async def _watch(self, values: tuple[Any, ...], request: gr.Request) -> AsyncIterator[list[Any]]:
+        paths = [] if files == DEMO else [*map(Path, files)]
         try:
-            files, model, method, frames, fps = msgspec.convert(values, tuple[list[_File], str, str, int, float])
-            asked = Request(tuple(Path(file.path) for file in files), model, method, frames, fps or None)
-            job = await asyncio.to_thread(self._desk.submit, asked, str(request.session_hash))
-        except msgspec.ValidationError:
-            yield _changes(_HTML.refusal("the page sent a value of the wrong kind; load the page again"))
-            return
-        except InputError as error:
-            yield _changes(_HTML.refusal(str(error)))
-            return
-        try:
-            while not job.is_over:
-                yield _changes(_HTML.status(job, self._desk.ahead(job), time.monotonic()), is_open=True)
-                await asyncio.sleep(_LOOK_EVERY)
-            yield _changes(_HTML.status(job, 0, time.monotonic()), job)
-        finally:
-            job.cancel()  # where the page is closed meanwhile; nothing where the job is over
+            with self._turn:
+                facts, shown, offered = self.runner.run(paths, model, method, frames, fps, self.results, on_stage)
+        except CancelledError:
+            raise gr.Error("cancelled", print_exception=False) from None
+        except Exception as error:
+            raise gr.Error(html.escape(sentence(error, self.folder)), duration=None, print_exception=False) from None
+        viewer, *others = map(str, shown)
+        return [facts, gr.Column(visible=True), _VIEWER.format(quote(viewer)), *others, [*map(str, offered)]]
+
+    def stop(self, request: gr.Request) -> None:
+        """Cancel the job of a page, where it runs."""
+        if request.session_hash == self._owner:
+            self._stop.set()
+
+    def close(self) -> None:
+        """Cancel the job, and wait for its next step."""
+        self._stop.set()
+        self._turn.acquire()
 
 
-def _changes(text: str, job: Job | None = None, *, is_open: bool = False) -> list[Any]:
-    """Return the values of the page's outputs; results are shown with a job that is done."""
-    buttons = [gr.update(interactive=not is_open), gr.update(interactive=not is_open), gr.update(visible=is_open)]
-    if job is None or job.outputs is None or job.state != "done":
-        return [text, gr.update(visible=False), *buttons, *[gr.update() for _ in range(5)]]
-    outputs = job.outputs
+def build_page(jobs: Jobs) -> gr.Blocks:
+    """Return the page: what to choose on the left, what comes out on the right; below each other on a phone."""
+    limits, names, most = jobs.runner.limits, list(jobs.runner.names), jobs.runner.limits.max_frames
+    with gr.Blocks(title="vggtjax", analytics_enabled=False, delete_cache=_DAY) as page:
+        gr.Markdown(_INTRODUCTION)
+        with gr.Row():
+            with gr.Column(scale=2, min_width=320):
+                files = gr.File(label="Video, or pictures", file_count="multiple", file_types=["video", "image"])
+                gr.Markdown(f"At most {limits.max_upload_mb} MB, and {limits.max_seconds} s of video.")
+                start = gr.Button("Reconstruct", variant="primary", elem_id="start")
+                example = gr.Button("Try the demo clip", elem_id="example")
+                cancel = gr.Button("Cancel", variant="stop", elem_id="cancel")
+                model = gr.Dropdown(names, value=names[0], label="Model", info=_MODELS)
+                method = gr.Dropdown(list(METHODS), value="4dvggt-d", label="Method", info=_METHODS)
+                frames = gr.Slider(min(2, most - 1), most, min(16, most), step=1, label="Frames")
+                fps = gr.Slider(0, 30, 0, step=0.5, label="Frames per second", info=_FPS)
+            with gr.Column(scale=5, min_width=320):
+                status = gr.Markdown("What comes out is shown here.", elem_id="status", container=True)
+                with gr.Column(visible=False) as results:
+                    with gr.Tab("Viewer"):
+                        viewer = gr.HTML(elem_id="viewer")
+                    with gr.Tab("Film"):
+                        film = gr.Video(label="The camera circles the scene", autoplay=True, loop=True, elem_id="film")
+                    with gr.Tab("Layers"):
+                        layers = gr.Video(
+                            label="Picture, depth, confidence, motion", autoplay=True, loop=True, elem_id="layers"
+                        )
+                    with gr.Tab("Sheet"):
+                        sheet = gr.Image(label="Up to eight frames at a glance", elem_id="sheet")
+                    with gr.Tab("Files"):
+                        offered = gr.File(label="Everything in a zip, viewer, film", elem_id="downloads")
+        listener = {"api_visibility": "private", "show_progress_on": status, "concurrency_id": "job"}
+        outputs = [status, results, viewer, film, layers, sheet, offered]
+        own: Any = start.click(jobs.run, [files, model, method, frames, fps], outputs, **listener)
+        embedded = [gr.State(DEMO), gr.State(DEMO), method, frames, gr.State(0)]
+        demo: Any = example.click(jobs.run, embedded, outputs, **listener)
+        at_once: Any = {"queue": False, "api_visibility": "private"}
+        cancel.click(lambda: "Cancelled.", None, status, cancels=[own, demo], **at_once)
+        cancel.click(jobs.stop, **at_once)
+        page.unload(jobs.stop)
+    return page.queue(max_size=limits.max_waiting, default_concurrency_limit=1, api_open=False)
 
-    def address(path: Path) -> str:
-        """Return the address of a file of the job, below the page's own."""
-        return f"{RESULTS}/{quote(path.relative_to(job.folder.parent).as_posix())}"
 
-    return [
-        text,
-        gr.update(visible=True),
-        *buttons,
-        _HTML.viewer(address(outputs.viewer)),
-        _HTML.video(address(outputs.film), _FILM),
-        _HTML.video(address(outputs.layers), _LAYERS),
-        _HTML.picture(address(outputs.sheet), _SHEET),
-        _HTML.downloads(outputs, address),
-    ]
+def serve(runner: Runner, folder: Path, host: str, port: int, password: str | None, ready: Callable[[], None]) -> None:
+    """Serve the app until SIGINT. Without a password, requests must name this machine; no other site can."""
+    by_name = Middleware(TrustedHostMiddleware, allowed_hosts=["localhost", "127.0.0.1", "[::1]", host])
+    page = build_page(jobs := Jobs(runner, folder))
+    try:
+        page.launch(
+            server_name=f"[{host}]" if ":" in host else host,
+            server_port=port,
+            auth=(USER, password) if password else None,
+            auth_message=f"Sign in as {USER}.",
+            max_file_size=runner.limits.max_upload_mb * 1_000_000,
+            allowed_paths=[str(jobs.results)],
+            app_kwargs={"middleware": [] if password else [by_name], "openapi_url": None},
+            theme=Default(primary_hue="teal", font=("system-ui", "sans-serif"), font_mono=("monospace",)),
+            css_paths=Path(__file__).with_name("page.css"),
+            **_PLAIN,
+        )
+        ready()
+        page.block_thread()
+    finally:
+        jobs.close()
+        page.close(verbose=False)

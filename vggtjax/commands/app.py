@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import tempfile
+from pathlib import Path
 from typing import Annotated
 
 import tyro
 
-from vggtjax.app.limits import LEAST_TOKEN, Limits
+from vggtjax.app.limits import Limits
 from vggtjax.commands.report import Report
 from vggtjax.errors import InputError, check_extra
+from vggtjax.storage.interruption import handled
 
+_LEAST_PASSWORD = 8  # characters
+_SETTINGS = {"GRADIO_ANALYTICS_ENABLED": "False", "HF_HUB_DISABLE_TELEMETRY": "1"}
 _Models = Annotated[tuple[str, ...], tyro.conf.arg(metavar="MODEL [MODEL ...]", help_behavior_hint="(default: demo)")]
 
 
@@ -18,7 +25,7 @@ def app(
     model: _Models = (),
     host: Annotated[str, tyro.conf.arg(metavar="ADDRESS")] = "127.0.0.1",
     port: int = 7860,
-    token: Annotated[str | None, tyro.conf.arg(metavar="TOKEN", help_behavior_hint="")] = None,
+    password: Annotated[str | None, tyro.conf.arg(metavar="PASSWORD", help_behavior_hint="")] = None,
     limits: Annotated[Limits, tyro.conf.arg(name="limits")] = Limits(),
 ) -> None:
     """An app in the browser: drop a video, watch the stages, get viewer, film and files.
@@ -26,28 +33,39 @@ def app(
     Args:
         model: what users may choose, the first by default: a converted .safetensors, a PyTorch checkpoint, or a hub id
             such as facebook/VGGT-1B; "demo", the small demonstration model, always is a choice
-        host: address to listen on; with 0.0.0.0 other machines reach the app, and need its token
-        port: port to listen on
-        token: what a browser must send once, in the address; by default made up where other machines reach the app
+        host: address to listen on; with 0.0.0.0 other machines reach the app, which needs a --password then
+        port: port to listen on; 0 takes a free one
+        password: what people sign in with, as the user vggtjax; at least 8 characters
         limits: what users may ask
     """
-    check_extra("the app", "app", "gradio")
-    from vggtjax.app.jobs import Desk
-    from vggtjax.app.models import Models
-    from vggtjax.app.server import bounded_folder, build_application, serve
-    from vggtjax.viewer.door import Door, listening, token_for
+    from vggtjax.viewer.door import Door, is_loopback, listening
 
-    if token is not None and not (token.isascii() and token.isalnum() and len(token) >= LEAST_TOKEN):
-        raise InputError(f"token is {token!r}; expected letters and digits, at least {LEAST_TOKEN}")
-    report, models = Report(), Models(model)
-    with listening(host, port) as opened, bounded_folder() as folder:  # a port in use is found before the work
+    if password is None and not is_loopback(host):
+        raise InputError(
+            f"host is {host!r}, which other machines reach: give a --password to sign in with, or leave out --host"
+        )
+    if password is not None and len(password) < _LEAST_PASSWORD:
+        raise InputError(f"password is {len(password)} characters long; expected at least {_LEAST_PASSWORD}")
+    check_extra("the app", "app", "gradio")
+    from vggtjax.app.run import Runner
+
+    report, runner = Report(), Runner(model, limits)
+    with listening(host, port) as opened:  # a port in use is found before the work
+        port = opened.getsockname()[1]
         with report.running():
-            models.check(report.stage)
-        door = Door(host, opened.getsockname()[1], token or token_for(host))
-        desk = Desk(folder, models, limits)
-        try:
-            application = build_application(desk, door)
-            report.line(f"Open {door.url}  (Ctrl+C ends the app)")
-            serve(application, opened)
-        finally:
-            desk.close()
+            for name in reversed(runner.names):  # the default last; broken weights are met before the first job
+                with report.stage(f"load {name}") as progress:
+                    runner.model(name, progress)
+    signal.signal(signal.SIGTERM, _interrupt)
+    with tempfile.TemporaryDirectory(prefix="vggtjax-app-", ignore_cleanup_errors=True) as folder:
+        os.environ.update(_SETTINGS | {"GRADIO_TEMP_DIR": folder})  # before the import, where gradio reads them
+        from vggtjax.app.page import USER, serve
+
+        sign_in = f", and sign in as {USER} with the password" if password else ""
+        opening = f"Open {Door(host, port, None).url}{sign_in}  (Ctrl+C ends the app)"
+        serve(runner, Path(folder), host, port, password, lambda: report.line(opening))
+    handled()
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt

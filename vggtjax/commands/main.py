@@ -68,6 +68,8 @@ COMMANDS = {
 _OUT_OF_MEMORY = "out of memory; take fewer frames (--max-frames, --stride) or a smaller --size"
 _OLD_FLAGS = {"--mode": "--preprocess"}  # still understood
 _GONE = {  # a command, or one with a flag, or with a flag and its value: what to take instead
+    "app --token": "--password sets what people sign in with, as the user vggtjax",
+    "app --max-results": "results are removed after a day, and at the end of the app; leave it out",
     "export-model": "jax.export writes a model as a program, in the 25 lines of docs/how-to/jax-export.md",
     "train --workers": "a run takes one process; leave it out",
     "view --format viser": "vggtjax view RESULT --export PAGE.html writes a page that opens offline",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from colorsys import hsv_to_rgb
 
 import numpy as np
@@ -9,6 +10,7 @@ import skimage
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 from PIL import Image
 
+from vggtjax.progress import Progress, no_progress
 from vggtjax.results.colors import color_ramp
 from vggtjax.results.grid import BACKGROUND, Row, draw_grid, fitted
 from vggtjax.results.result import Result
@@ -130,6 +132,20 @@ def card(result: Result) -> UInt8[np.ndarray, "h w 3"]:
     gap = np.full((len(depth), max(4, depth.shape[1] // 60), 3), BACKGROUND, np.uint8)
     last = [gap, overlay_picture(result.images[frame], moving)] if result.has_mask else []
     return np.hstack([np.asarray(picture), gap, depth, *last])
+
+
+def layer_frames(result: Result, progress: Progress | None = None) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Draw each frame two by two: picture and depth above confidence and moving objects."""
+    valid, size = result.valid_pixels, enlarged(result.depth.shape[1:])
+    inverse_range = inverse_depth_range(result.depth, valid)
+    log_range = log_confidence_range(result.depth_confidence, valid)
+    for frame, picture in enumerate(result.images):
+        moving = moving_ids(result.dynamic_mask[frame], result.instances[frame])
+        confidence = color_confidence(result.depth_confidence[frame], valid[frame], log_range)
+        large, sure = (np.asarray(Image.fromarray(each).resize(size)) for each in (picture, confidence))
+        depth = depth_picture(result.depth[frame], valid[frame], inverse_range)
+        yield np.vstack([np.hstack([large, depth]), np.hstack([sure, overlay_picture(picture, moving)])])
+        (progress or no_progress)(frame + 1, len(valid))
 
 
 def contact_sheet(result: Result) -> UInt8[np.ndarray, "height width 3"]:

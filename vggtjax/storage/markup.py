@@ -6,7 +6,6 @@ import base64
 import io
 from functools import cache
 from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import jinja2
@@ -22,11 +21,6 @@ _QUALITY = 78  # of WebP
 def render(template: str, **values: object) -> str:
     """Return the text of a template, named by its path in the package; the filter `line(300)` bounds a text."""
     return _environment().get_template(template).render(values)
-
-
-def macros(template: str) -> Any:
-    """Return the macros of a template as functions that return text."""
-    return _environment().get_template(template).module
 
 
 @cache
